@@ -6,7 +6,9 @@ import sqlite3
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from typing import Final
+from typing import Annotated, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from sonarpost import wire
 from sonarpost.export.contacts import match_start_time
@@ -16,7 +18,8 @@ from sonarpost.review.local_frame import vehicle_position
 from sonarpost.services.console.store.database import insert_row
 from sonarpost.services.console.store.serialisers import CONTACT_QUERY, Json, contact_json, percent_received
 
-SORT_COLUMNS: Final[Mapping[str, str]] = {
+Sort = Literal["arrived", "updated", "confidence", "vehicle", "received", "review", "name", "range"]
+SORT_COLUMNS: Final[Mapping[Sort, str]] = {
     "arrived": "arrived_utc_s",
     "updated": "updated_utc_s",
     "confidence": "atd_confidence",
@@ -26,34 +29,32 @@ SORT_COLUMNS: Final[Mapping[str, str]] = {
     "name": "name",
     "range": "range_m",
 }
-REVIEW_FILTERS: Final = ("unreviewed", "mine_like", "not_mine_like", "unsure", "reviewed")
 _METRES_PER_DEGREE: Final = 111_000.0
 _RECORD_COLUMNS: Final = ("atd_class", "atd_confidence", "lat_deg", "lon_deg", "position_sigma_m")
 _IMAGE_COLUMNS: Final = ("version", "codec", "bytes_received", "bytes_total", "first_frame_utc_s", "last_frame_utc_s")
 
 
-@dataclass(frozen=True, slots=True)
-class ContactFilter:
-    """Filter, order and page of a contact list; None means no restriction.
+class ContactFilter(BaseModel):
+    """Filter, order and page of a contact list, as in a query string; None or empty means no restriction.
 
     Attributes:
-        review: One of `REVIEW_FILTERS`.
         min_confidence: Minimum confidence of the detector, 0 to 2.
-        text: Part of a name, class or remark.
-        sort: A key of `SORT_COLUMNS`.
+        text: Part of a name, class or remark; `q` in a query string.
     """
 
-    review: str | None = None
-    vehicle: str | None = None
-    vessel: str | None = None
-    min_confidence: float | None = None
+    model_config = ConfigDict(frozen=True, populate_by_name=True, allow_inf_nan=False)
+
+    review: Literal["unreviewed", "mine_like", "not_mine_like", "unsure", "reviewed"] | None = None
+    vehicle: Annotated[str, Field(max_length=40)] = ""
+    vessel: Annotated[str, Field(max_length=40)] = ""
+    min_confidence: Annotated[float, Field(ge=0, le=2)] | None = None
     complete: bool | None = None
-    group: str | None = None
-    text: str | None = None
-    sort: str = "updated"
-    descending: bool = True
-    offset: int = 0
-    limit: int = 100
+    group: Annotated[str, Field(max_length=20)] = ""
+    text: Annotated[str, Field(max_length=80, alias="q")] = ""
+    sort: Sort = "updated"
+    order: Literal["asc", "desc"] = "desc"
+    offset: Annotated[int, Field(ge=0, le=10**9)] = 0
+    limit: Annotated[int, Field(ge=1, le=500)] = 100
 
     def where(self) -> tuple[str, list[object]]:
         """Return the SQL condition, which contains only constants, and its parameters."""
@@ -63,9 +64,9 @@ class ContactFilter:
             conditions.append("c.review <> 'unreviewed'")
         for condition, value in (
             ("c.review = ?", None if self.review == "reviewed" else self.review),
-            ("c.vehicle_id = ?", self.vehicle),
-            ("c.vessel_id = ?", self.vessel),
-            ("c.group_id = ?", self.group),
+            ("c.vehicle_id = ?", self.vehicle or None),
+            ("c.vessel_id = ?", self.vessel or None),
+            ("c.group_id = ?", self.group or None),
             ("c.atd_confidence >= ?", self.min_confidence),
             ("c.complete = ?", None if self.complete is None else int(self.complete)),
         ):
@@ -188,8 +189,7 @@ def _assign_group(db: sqlite3.Connection, contact_id: str, radius_m: float) -> N
 def list_contacts(db: sqlite3.Connection, query: ContactFilter) -> Json:
     """Return a page of the contacts, and the counts of all contacts."""
     condition, values = query.where()
-    direction = "DESC" if query.descending else "ASC"
-    order = f"ORDER BY c.{SORT_COLUMNS[query.sort]} {direction}, c.id {direction}"
+    order = f"ORDER BY c.{SORT_COLUMNS[query.sort]} {query.order}, c.id {query.order}"
     # The inner query finds the page in an index, so that the sub-queries of the outer one run for these rows only.
     page = f"SELECT c.id FROM contact c WHERE {condition} {order} LIMIT ? OFFSET ?"  # noqa: S608  constants only
     rows = db.execute(f"{CONTACT_QUERY} WHERE c.id IN ({page}) {order}", (*values, query.limit, query.offset))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
@@ -60,6 +61,7 @@ class RequestBody(BaseModel):
 
 
 B = TypeVar("B", bound=RequestBody)
+M = TypeVar("M", bound=BaseModel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,16 +80,24 @@ class Call:
         return Actor(self.session.name, self.session.role, self.address)
 
     def parse_body(self, model: type[B]) -> B:
-        """Return the validated body.
-
-        Raises:
-            ApiError: The body is invalid; names the field.
-        """
-        try:
+        """Return the validated body; raise ApiError with the name of an invalid field."""
+        with _bad_request():
             return model.model_validate_json(self.body)
-        except ValidationError as error:
-            field, _, expected = first_error(error)
-            raise ApiError(400, "bad_request", expected, field or None) from error
+
+    def parse_query(self, model: type[M]) -> M:
+        """Return the validated query string; raise ApiError with the name of an invalid parameter."""
+        with _bad_request():
+            return model.model_validate(dict(self.request.query_params))
+
+
+@contextmanager
+def _bad_request() -> Iterator[None]:
+    """Convert an error of pydantic to an error response."""
+    try:
+        yield
+    except ValidationError as error:
+        field, _, expected = first_error(error)
+        raise ApiError(400, "bad_request", expected, field or None) from error
 
 
 Handler = Callable[[Call], Response]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 import uuid
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import BaseModel, Field
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
@@ -17,12 +16,11 @@ from sonarpost.review import rendering
 from sonarpost.review.measurement import Line, MeasurementKind
 from sonarpost.review.rendering import LAYERS, MAPS
 from sonarpost.services.console.state import ConsoleState, NotFoundError
-from sonarpost.services.console.store.contacts import REVIEW_FILTERS, SORT_COLUMNS, ContactFilter
+from sonarpost.services.console.store.contacts import ContactFilter
 from sonarpost.services.console.store.database import DisplayedImage, Permission
 from sonarpost.services.console.store.decisions import DecisionInput
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call, RequestBody
 
-_NUMBER = re.compile(r"-?\d{1,9}(\.\d{1,9})?")
 _Version = Annotated[int, Field(ge=1, le=2**31)]
 _Layer = Annotated[str, Field(max_length=20)]
 _Point = tuple[Annotated[float, Field(ge=0, le=4096)], Annotated[float, Field(ge=0, le=4096)]]
@@ -62,73 +60,17 @@ class _RequestBody(RequestBody):
     airtime_s: Annotated[float, Field(ge=0, le=1e6)] | None = None
 
 
-def number_parameter(call: Call, name: str, default: float | None, low: float, high: float) -> float | None:
-    """Return a number of the query string; `default` if it is absent.
-
-    Raises:
-        ApiError: It is not a number from `low` to `high`.
-    """
-    text = call.request.query_params.get(name)
-    if text is None:
-        return default
-    if _NUMBER.fullmatch(text) is None or not low <= float(text) <= high:
-        raise ApiError(400, "bad_request", f"a number from {low:g} to {high:g}", name)
-    return float(text)
+class _ImageQuery(BaseModel):
+    layer: Literal["raw", "enhanced", "grain"] = "raw"
+    map: Annotated[str, Field(pattern=f"^({'|'.join(MAPS)})$")] = "grey"
+    low: Annotated[float, Field(ge=0, le=99)] = 0
+    high: Annotated[float, Field(ge=1, le=100)] = 100
+    gamma: Annotated[float, Field(ge=0.2, le=5)] = 1
 
 
-def integer_parameter(call: Call, name: str, default: int, low: int, high: int) -> int:
-    """Return an integer of the query string; `default` if it is absent.
-
-    Raises:
-        ApiError: It is not an integer from `low` to `high`.
-    """
-    number = number_parameter(call, name, default, low, high)
-    if number is None or "." in call.request.query_params.get(name, ""):
-        raise ApiError(400, "bad_request", f"a whole number from {low} to {high}", name)
-    return int(number)
-
-
-def choice_parameter(call: Call, name: str, default: str, allowed: tuple[str, ...]) -> str:
-    """Return a word of the query string; `default` if it is absent.
-
-    Raises:
-        ApiError: It is not one of `allowed`.
-    """
-    text = call.request.query_params.get(name)
-    if text is None:
-        return default
-    if text not in allowed:
-        raise ApiError(400, "bad_request", "one of " + ", ".join(allowed), name)
-    return text
-
-
-def _text_parameter(call: Call, name: str, max_length: int) -> str | None:
-    text = call.request.query_params.get(name)
-    if text is not None and len(text) > max_length:
-        raise ApiError(400, "bad_request", f"at most {max_length} characters", name)
-    return text or None
-
-
-def contact_filter(call: Call) -> ContactFilter:
-    """Return the contact filter of a query string.
-
-    Raises:
-        ApiError: A parameter is invalid.
-    """
-    complete = choice_parameter(call, "complete", "", ("true", "false"))
-    return ContactFilter(
-        review=choice_parameter(call, "review", "", REVIEW_FILTERS) or None,
-        vehicle=_text_parameter(call, "vehicle", 40),
-        vessel=_text_parameter(call, "vessel", 40),
-        min_confidence=number_parameter(call, "min_confidence", None, 0, 2),
-        complete=complete == "true" if complete else None,
-        group=_text_parameter(call, "group", 20),
-        text=_text_parameter(call, "q", 80),
-        sort=choice_parameter(call, "sort", "updated", tuple(SORT_COLUMNS)),
-        descending=choice_parameter(call, "order", "desc", ("asc", "desc")) == "desc",
-        offset=integer_parameter(call, "offset", 0, 0, 10**9),
-        limit=integer_parameter(call, "limit", 100, 1, 500),
-    )
+class _MaskQuery(BaseModel):
+    layer: Literal["raw", "enhanced"] = "raw"
+    kind: Literal["missing", "guessed"] = "missing"
 
 
 class ContactRoutes:
@@ -147,7 +89,9 @@ class ContactRoutes:
             return Route(path, access.endpoint(handler, permission=permission), methods=["POST"])
 
         return [
-            Route("/api/contacts", read(lambda call: JSONResponse(state.list_contacts(contact_filter(call))))),
+            Route(
+                "/api/contacts", read(lambda call: JSONResponse(state.list_contacts(call.parse_query(ContactFilter))))
+            ),
             Route(contact, read(lambda call: JSONResponse(state.contact_detail(_id(call))))),
             Route(contact + "/costs", read(lambda call: JSONResponse({"costs": state.request_costs(_id(call))}))),
             Route(version + "/picture.png", read(self._image)),
@@ -163,36 +107,31 @@ class ContactRoutes:
     # Images
 
     def _image(self, call: Call) -> Response:
-        layer = choice_parameter(call, "layer", "raw", (*(layer.name for layer in LAYERS), "grain"))
-        colour_map = choice_parameter(call, "map", "grey", MAPS)
-        low = number_parameter(call, "low", 0, 0, 99) or 0.0
-        high = number_parameter(call, "high", 100, 1, 100) or 100.0
-        if low >= high:
+        query = call.parse_query(_ImageQuery)
+        if query.low >= query.high:
             raise ApiError(400, "bad_request", "less than high", "low")
-        gamma = number_parameter(call, "gamma", 1, 0.2, 5) or 1.0
 
         def draw(image: ReconstructedImage) -> bytes:
             grey = rendering.eight_bits(image.picture.to_array())
-            if layer == "enhanced":
+            if query.layer == "enhanced":
                 grey = rendering.enhance(grey, image.missing())
-            return rendering.encode_png(rendering.render(grey, colour_map, low, high, gamma))
+            return rendering.encode_png(rendering.render(grey, query.map, query.low, query.high, query.gamma))
 
-        if layer == "grain":
-            raise NotFoundError("image", "layer", layer, "a layer of this version")
-        measurable = next(known.measurable for known in LAYERS if known.name == layer)
+        if query.layer == "grain":
+            raise NotFoundError("image", "layer", query.layer, "a layer of this version")
+        measurable = next(known.measurable for known in LAYERS if known.name == query.layer)
         response = self._png_response(call, draw)
         response.headers["X-Measurable"] = "true" if measurable else "false"
         return response
 
     def _mask(self, call: Call) -> Response:
-        kind = choice_parameter(call, "kind", "missing", ("missing", "guessed"))
-        layer = choice_parameter(call, "layer", "raw", tuple(known.name for known in LAYERS))
+        query = call.parse_query(_MaskQuery)
 
         def draw(image: ReconstructedImage) -> bytes:
             mask = image.missing()
-            if kind == "guessed":
+            if query.kind == "guessed":
                 # Enhancement changes all received pixels. Missing pixels stay black.
-                mask = ~mask if layer != "raw" else np.zeros_like(mask)
+                mask = ~mask if query.layer != "raw" else np.zeros_like(mask)
             return rendering.encode_png(np.where(mask, np.uint8(255), np.uint8(0)))
 
         return self._png_response(call, draw)

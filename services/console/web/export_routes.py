@@ -8,7 +8,6 @@ import sqlite3
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -28,7 +27,6 @@ from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import ContactFilter, find_version, list_contacts
 from sonarpost.services.console.store.serialisers import Json, decode_image
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call
-from sonarpost.services.console.web.contact_routes import contact_filter
 
 MAX_CONTACTS: Final = 10_000
 _PAGE: Final = 500
@@ -68,7 +66,7 @@ class ExportRoutes:
         # The KMZ export reads images from files.
         with tempfile.TemporaryDirectory(prefix="sonarpost-export-") as folder:
             image_folder = Path(folder) if name.endswith(".kmz") else None
-            data = convert(self._contacts(contact_filter(call), image_folder))
+            data = convert(self._contacts(call.parse_query(ContactFilter), image_folder))
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(data, media_type=media_type, headers=headers)
 
@@ -76,7 +74,7 @@ class ExportRoutes:
         found: list[ExportContact] = []
         with self._state.database.read() as db:
             for offset in range(0, MAX_CONTACTS, _PAGE):
-                items = list_contacts(db, replace(query, offset=offset, limit=_PAGE))["items"]
+                items = list_contacts(db, query.model_copy(update={"offset": offset, "limit": _PAGE}))["items"]
                 assert isinstance(items, list)
                 found += [_export_contact(db, item, image_folder) for item in items]
                 if len(items) < _PAGE:
