@@ -71,8 +71,6 @@ class Archive:
             "Image stored" if new else "Image already stored",
             extra=kv(
                 vessel=image.vessel_id,
-                vehicle=image.vehicle_id,
-                image_id=image.image_id,
                 version=image.version,
                 transit_s=round(time.time() - relayed_utc_s, 1),
                 file=path,
@@ -104,15 +102,7 @@ class Archive:
                 self._files.add(path, text, last=True)
             if stored is None or not index.has_decision(decision.vessel_id, decision.decision_id):
                 self._decisions.append(decision)
-        log.info(
-            "Decision stored",
-            extra=kv(
-                vessel=decision.vessel_id,
-                vehicle=decision.vehicle_id,
-                image_id=decision.image_id,
-                verdict=decision.verdict,
-            ),
-        )
+        log.info("Decision stored", extra=kv(vessel=decision.vessel_id, verdict=decision.verdict))
         return stored is None
 
     def flush(self) -> None:

@@ -11,7 +11,6 @@ from dataclasses import replace
 import zenoh
 
 from sonarpost import keys, wire
-from sonarpost.archive.shore_files import decision_file_name
 from sonarpost.bus.connectivity import declare_presence
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem, OutboxItem, platform_of, queue_of
@@ -24,8 +23,6 @@ from sonarpost.services.c2 import tasking
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.tasking import Tasking
-
-__all__ = ["C2Service", "decision_file_name"]
 
 log = logging.getLogger(__name__)
 
@@ -169,12 +166,7 @@ class C2Service(Service[C2Config]):
         self._uncommitted[item.name] = packed
         effects.count("tasking_accepted")
         self._mark_changed(item.name)
-        log.info(
-            "Record queued for a vessel",
-            extra=kv(
-                vessel=vessel, kind=kind, record_id=record_id, vehicle=record.vehicle_id, image_id=record.image_id
-            ),
-        )
+        log.info("Record queued for a vessel", extra=kv(vessel=vessel, kind=kind, record_id=record_id))
 
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Store that a vessel has accepted or refused a record, in the transaction of its acknowledgement."""

@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 
 import zenoh
 
@@ -25,7 +26,6 @@ from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
 log = logging.getLogger(__name__)
 
 CONSUMER = "c2"
-SESSION_JOIN_S = 0.5
 # Advice and commands keep the urgency with which they arrived. A decision is small and awaited. The first version of
 # every image precedes more detail of any image.
 COMMAND_PRIORITY = 1
@@ -49,8 +49,6 @@ class Upstream:
         self.queue = CONSUMER if options.site == keys.SHORE else queue_of(CONSUMER, options.site)
         self._tls = tls
         self._session: zenoh.Session | None = None
-        self._thread: threading.Thread | None = None
-        self._stop = threading.Event()
         self._lock = threading.Lock()
 
     def queue_policy(self) -> QueuePolicy:
@@ -62,28 +60,21 @@ class Upstream:
         """Return the site's own session, None while it is not open."""
         return self._session
 
-    def start(self) -> None:
-        """Start to connect to the site's own router, if it has one."""
-        if self.options.router:
-            self._thread = threading.Thread(target=self._open, name=f"upstream-{self.options.site}", daemon=True)
-            self._thread.start()
-
-    def _open(self) -> None:
-        session = open_with_retry(self.options.router, self._stop, self._tls)
+    def connect(self, stopping: threading.Event) -> None:
+        """Connect to the site's own router; return when it is reached, or when `stopping` is set."""
+        session = open_with_retry(self.options.router, stopping, self._tls)
+        if session is None:
+            return
         with self._lock:
-            if session is not None and self._stop.is_set():
+            if stopping.is_set():
                 session.close()
                 return
             self._session = session
-        if session is not None:
-            router = ", ".join(self.options.router)
-            log.info("Router of a site reached", extra=kv(site=self.options.site, router=router))
+        router = ", ".join(self.options.router)
+        log.info("Router of a site reached", extra=kv(site=self.options.site, router=router))
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """Close the session; unacknowledged records stay in the store."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=SESSION_JOIN_S)
         with self._lock:
             if self._session is not None:
                 self._session.close()
@@ -219,13 +210,14 @@ class RelayService(Service[RelayConfig]):
                     tx.drop_queue(queue)
                 log.warning("Records dropped: site removed", extra=kv(queue=queue, records=depth.records))
         for upstream in self._upstreams.values():
-            upstream.start()
+            if upstream.options.router:
+                self.start_thread(partial(upstream.connect, self.stopping), f"upstream-{upstream.options.site}")
         self.start_thread(lambda: self._site_monitor.run(self.stopping), "site-monitor")
 
     def on_stop(self) -> None:
         """Close the sites' own sessions."""
         for upstream in self._upstreams.values():
-            upstream.stop()
+            upstream.close()
 
     def _removed_queues(self) -> list[str]:
         return [queue for queue in self.store.queues() if _is_site_queue(queue) and queue not in self._upstreams]
