@@ -127,9 +127,7 @@ Mark = Literal["exported_utc_s", "removed_utc_s"]
 class ShoreIndex:
     """Index of one `out_dir`, safe for several threads and processes.
 
-    Args:
-        out_dir: Folder of c2.
-        writable: False opens an existing index read-only.
+    Unless it is `writable`, an existing index is opened read-only.
 
     Raises:
         StoredFileError: There is no index, or the file is not one of this version.

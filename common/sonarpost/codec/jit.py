@@ -26,11 +26,7 @@ def jit(function: Callable[P, R], *, reorder_sums: bool = False) -> Callable[P, 
     """Return `function`, compiled on its first call.
 
     numba recompiles a cached function only when its own source file changes. Compiled functions therefore call only
-    functions of their own module.
-
-    Args:
-        function: The function.
-        reorder_sums: Whether the compiler may reorder sums of floating-point numbers.
+    functions of their own module. With `reorder_sums`, the compiler may reorder sums of floating-point numbers.
     """
     flags = {"reassoc", "contract", "nnan", "nsz"} if reorder_sums else False
     return cast(Callable[P, R], _numba().njit(cache=True, fastmath=flags)(function))

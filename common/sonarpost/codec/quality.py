@@ -19,11 +19,7 @@ SSIM_RADIUS_PX = 5  # an 11 x 11 window
 def psnr_db(original: Image, decoded: Image) -> float:
     """Return the peak signal-to-noise ratio in dB for a peak of 255; infinite for equal images.
 
-    PSNR = 10 log10(255^2 / mean((original - decoded)^2)).
-
-    Args:
-        original: Shape (height, width), uint8.
-        decoded: The same shape, uint8.
+    PSNR = 10 log10(255^2 / mean((original - decoded)^2)). Both images: shape (height, width), uint8.
 
     Raises:
         StreamError: The shapes differ, an image is empty, or a dtype is not uint8.
@@ -37,14 +33,10 @@ def psnr_db(original: Image, decoded: Image) -> float:
 def ssim(original: Image, decoded: Image) -> float:
     """Return the mean structural similarity, -1..1, 1 for equal images.
 
-    Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural similarity",
-    IEEE Trans. Image Processing 13(4), 2004: Gaussian window 11 x 11 with sigma 1.5 px, K1 = 0.01, K2 = 0.03, L = 255,
-    population (co)variances. As there, only places with the whole window inside the image count. A side shorter than
-    11 px is mirrored at its edges, and all of it counts.
-
-    Args:
-        original: Shape (height, width), uint8.
-        decoded: The same shape, uint8.
+    Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural similarity", IEEE
+    Trans. Image Processing 13(4), 2004: Gaussian window 11 x 11 with sigma 1.5 px, K1 = 0.01, K2 = 0.03, L = 255,
+    population (co)variances. As there, only places with the whole window inside the image count. A side shorter than 11
+    px is mirrored at its edges, and all of it counts. Both images: shape (height, width), uint8.
 
     Raises:
         StreamError: The shapes differ, an image is empty, or a dtype is not uint8.

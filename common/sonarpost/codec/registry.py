@@ -216,9 +216,7 @@ class CodecRegistry:
     def create_for_stream(self, stream: bytes, resources: CodecResources | None = None) -> Codec:
         """Create the codec that encoded a stream.
 
-        Args:
-            stream: The stream, or its header.
-            resources: The tile database, for a codec with a codebook.
+        The header of the stream is enough. A codec with a codebook needs the tile database.
 
         Raises:
             StreamError: The header is invalid or its codec is unknown.

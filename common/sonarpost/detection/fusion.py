@@ -125,13 +125,6 @@ def clutter_levels(
     within `clutter_radius_m` are sorted by evidence. The level is the evidence at the rank that corresponds to one
     candidate in every `clutter_area_m2`. A few true objects do not reach that rank, a field of rock does. Candidates
     within `separation_along_m` and `separation_across_m` belong to the same object and are excluded.
-
-    Args:
-        measurements: The candidates of one side.
-        evidence: Evidence of each, shape (candidates,).
-        grid: That side.
-        settings: Distances and area.
-        floor: The level where too few candidates exist.
     """
     count = len(measurements)
     if not count:

@@ -103,12 +103,6 @@ def cut_expanded(survey: Survey, detection: Detection, height_px: int, width_px:
     A pixel is the mean of the recorded ones of the four file values that it covers; 0 if there is none. The window is
     shifted at the borders of the recording like that of `cut_snippet`.
 
-    Args:
-        survey: The pings in which the contact was detected.
-        detection: The contact.
-        height_px: Rows of the snippet.
-        width_px: Columns of the snippet.
-
     Returns:
         Shape (height_px, width_px), uint8, smaller if the survey has less than twice the snippet's pings or samples.
         None if the result would cover no more seabed than the snippet in one direction.
@@ -160,11 +154,7 @@ def _file_values(
 ) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.bool_]]:
     """Return the file values of a window (0 where not recorded) and where they are recorded.
 
-    Args:
-        survey: The survey.
-        side: Port or starboard.
-        pings: First ping and number of pings.
-        samples: First sample and number of samples.
+    `pings` and `samples` are each the first index and the number.
     """
     (top, rows), (left, columns) = pings, samples
     raw = np.zeros((rows, columns), dtype=np.uint32)
@@ -246,12 +236,6 @@ def cut_ground_snippet(
     The bottom is assumed flat at the altitude of the contact. A pixel is the mean of the samples whose slant range it
     covers (interpolated where samples are coarser), in the pings that it covers, or in the nearest one. The highlight
     of the contact is always in the centre; pixels beyond the recording are unknown.
-
-    Args:
-        survey: The survey in which the contact was detected.
-        detection: The contact.
-        size_m: Side of the square.
-        pixel_m: Side of a pixel.
 
     Returns:
         The snippet; None if the altitude of the contact or the distance between pings is unknown.

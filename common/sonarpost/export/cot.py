@@ -24,18 +24,13 @@ MEASURED_IN_IMAGE: Final = "m-i"
 UNKNOWN: Final = "9999999.0"
 """CoT value of an unknown height or error."""
 
-# MIL-STD-2525B, subsurface, sea mine: G on the bottom, M moored, F floating.
+# MIL-STD-2525B, subsurface, sea mine: G on the bottom, M moored, F floating. The class may end in " mine".
 MINE_POSITIONS: Final[Mapping[str, str]] = {
     "bottom": "G",
-    "bottom mine": "G",
     "ground": "G",
-    "ground mine": "G",
     "moored": "M",
-    "moored mine": "M",
     "floating": "F",
-    "floating mine": "F",
     "drifting": "F",
-    "drifting mine": "F",
 }
 # Colours of the spots as signed 32-bit ARGB.
 _SPOT_COLOURS: Final[Mapping[ReviewState, int]] = {
@@ -79,7 +74,7 @@ def cot_type(contact: ExportContact, options: CotOptions | None = None) -> str:
         return BOTTOM_RETURN
     affiliation = (options or CotOptions()).mine_affiliation
     mlo_class = " ".join((decision.mlo_class or "").casefold().replace("_", " ").replace("-", " ").split())
-    position = MINE_POSITIONS.get(mlo_class)
+    position = MINE_POSITIONS.get(mlo_class.removesuffix(" mine"))
     return f"a-{affiliation}-{SEA_MINE}" + (f"-{position}" if position else "")
 
 
@@ -89,11 +84,6 @@ def cot_event(contact: ExportContact, now_utc_s: float, options: CotOptions | No
     `time` and `start` are the time of sending, because the clock of the vehicle may be wrong. The time of detection is
     in the remarks. `ce` is `position_sigma_m`, one standard deviation as CoT defines it. The height above the ellipsoid
     is unknown, because depth is measured from the surface.
-
-    Args:
-        contact: A contact with a position.
-        now_utc_s: Time of sending, UTC.
-        options: Lifetime and affiliation.
 
     Raises:
         ValueError: The contact has no position.

@@ -127,7 +127,6 @@ class CotSender:
         self._clock = clock
         self._wait = wait
         self._socket: socket.socket | None = None
-        self.connections = 0
 
     def __enter__(self) -> CotSender:
         return self
@@ -174,7 +173,6 @@ class CotSender:
             self._discard_input(self._socket)
         if self._socket is None:
             self._socket = self._connect()
-            self.connections += 1
         if self.endpoint.scheme != "udp":
             self._socket.sendall(b"".join(event + b"\n" for event in events))
             return

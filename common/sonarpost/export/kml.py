@@ -53,10 +53,7 @@ class _Overlay:
     """Image on the map, top along the heading: a KML LatLonBox and its counter-clockwise rotation about its centre."""
 
     png: bytes
-    north_deg: float
-    south_deg: float
-    east_deg: float
-    west_deg: float
+    box_deg: Mapping[str, float]
     rotation_deg: float
 
 
@@ -209,8 +206,8 @@ def _add_overlays(document: ET.Element, contacts: ContactSet, images: Mapping[st
         _child(_child(ground, "TimeStamp"), "when", utc_text(contact.image.first_frame_utc_s))
         _child(_child(ground, "Icon"), "href", f"overlays/{contact.uid}.png")
         box = _child(ground, "LatLonBox")
-        for name in ("north", "south", "east", "west"):
-            _child(box, name, repr(round(getattr(overlay, f"{name}_deg"), DEGREE_DECIMALS)))
+        for name, degrees in overlay.box_deg.items():
+            _child(box, name, repr(round(degrees, DEGREE_DECIMALS)))
         _child(box, "rotation", repr(round(overlay.rotation_deg, 2)))
 
 
@@ -260,7 +257,7 @@ def _overlay(contact: ExportContact, pixels: npt.NDArray[np.uint8]) -> _Overlay 
     # KML rotates counter-clockwise, and its range is -180 to 180 degrees.
     rotation_deg = math.remainder(-heading, 360.0)
     png = _png(Image.fromarray(np.ascontiguousarray(rotated)))
-    return _Overlay(png, north, south, east, west, rotation_deg)
+    return _Overlay(png, {"north": north, "south": south, "east": east, "west": west}, rotation_deg)
 
 
 def _icon_png(review: ReviewState, colour: str) -> bytes:

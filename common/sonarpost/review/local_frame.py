@@ -52,15 +52,7 @@ def vehicle_position(
     channel: str | None,
     ground_range_m: float | None,
 ) -> tuple[float, float] | None:
-    """Return (lat_deg, lon_deg) of the vehicle at the detection of an object; None if an argument is unknown.
-
-    Args:
-        lat_deg: Latitude of the object.
-        lon_deg: Longitude of the object.
-        heading_deg: True heading of the vehicle.
-        channel: `port` or `starboard`, the side of the object.
-        ground_range_m: Ground range from the track to the object.
-    """
+    """Return (lat_deg, lon_deg) of the vehicle at the detection of an object; None if an argument is unknown."""
     if lat_deg is None or lon_deg is None or heading_deg is None or channel is None or ground_range_m is None:
         return None
     # The vehicle is on the port side of an object on its starboard side.

@@ -79,13 +79,7 @@ class SignedCertificate:
 
 
 def create_authority(fleet: str, days: int, now_utc_s: float) -> SignedCertificate:
-    """Create a self-signed authority that can sign certificates of platforms but no other authority.
-
-    Args:
-        fleet: Name of the fleet.
-        days: Validity in days.
-        now_utc_s: Start of the validity.
-    """
+    """Create a self-signed authority that can sign certificates of platforms but no other authority."""
     now = _utc(now_utc_s)
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name(

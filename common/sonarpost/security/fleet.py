@@ -171,10 +171,7 @@ class Bundle:
 class Fleet:
     """Certificate authority in a folder.
 
-    Args:
-        folder: The folder.
-        passphrase: Returns the passphrase; called if the key is encrypted.
-        now_utc_s: The clock.
+    `passphrase` is called if the key is encrypted.
     """
 
     def __init__(

@@ -39,9 +39,6 @@ def read_image(path: Path) -> GreyImage:
     RGB of 8 or 16 bits with three equal channels is read as grey. A TIFF of several pages, an alpha channel, a
     palette, float, 1-bit or 32-bit samples are rejected.
 
-    Args:
-        path: The file.
-
     Returns:
         Shape (rows, columns), uint8 or uint16 as in the file; 0 is black (a white-is-zero TIFF is inverted).
 
@@ -67,10 +64,7 @@ def read_image(path: Path) -> GreyImage:
 def write_tiff(path: Path, image: GreyImage, description: str | None = None) -> None:
     """Write a grey image as uncompressed TIFF, atomically. The same image and description give the same bytes.
 
-    Args:
-        path: The file to create or replace.
-        image: Shape (rows, columns), uint8 or uint16.
-        description: Text for the ImageDescription tag, ASCII.
+    The image has shape (rows, columns), uint8 or uint16. The description, ASCII, is that of the TIFF tag.
 
     Raises:
         SurveyFileError: Another shape or depth, or a description that is not ASCII.
@@ -106,9 +100,7 @@ def tiff_bytes(path: Path, image: GreyImage, description: str | None = None) -> 
 def write_png(path: Path, image: GreyImage) -> None:
     """Write a grey image as PNG, atomically, without dates.
 
-    Args:
-        path: The file to create or replace.
-        image: Shape (rows, columns), uint8 or uint16.
+    The image has shape (rows, columns), uint8 or uint16.
 
     Raises:
         SurveyFileError: Another shape or depth.

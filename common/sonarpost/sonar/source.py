@@ -136,10 +136,6 @@ class InMemorySource(StreamedSource):
 def load_survey(source: SurveySource, max_bytes: int = MAX_HELD_BYTES) -> Survey:
     """Load a whole source into memory.
 
-    Args:
-        source: The recording.
-        max_bytes: Maximum size of its samples.
-
     Raises:
         SurveyFileError: The samples are larger, or the file cannot be read.
     """

@@ -38,10 +38,6 @@ def write_xtf(survey: Survey, path: Path) -> None:
     which the reader takes as None for a position, an altitude, or a field that is zero in every ping. For the same
     reason a heading of exactly 0 degrees is written as 360. The same survey gives the same bytes.
 
-    Args:
-        survey: The survey.
-        path: The file to create or replace.
-
     Raises:
         SurveyFileError: The format cannot represent the survey (more than six channels, a channel whose sample
             size changes, a sonar name over 15 ASCII characters, or a value out of range).

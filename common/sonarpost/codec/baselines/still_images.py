@@ -229,12 +229,7 @@ def avif_body(file: bytes, shape: tuple[int, ...]) -> bytes:
 
 
 def avif_file(frame: bytes, shape: tuple[int, ...]) -> bytes:
-    """Return the AVIF file around a sequence header and frame.
-
-    Args:
-        frame: AV1 sequence header and frame.
-        shape: (height_px, width_px).
-    """
+    """Return the AVIF file around a sequence header and frame."""
     payload = _AV1_DELIMITER + frame
     start = _box(b"ftyp", b"avif", bytes(4), b"avifmif1miaf")
     size = shape[1].to_bytes(4, "big") + shape[0].to_bytes(4, "big")

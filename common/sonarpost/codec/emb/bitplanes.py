@@ -96,13 +96,7 @@ def code_planes(
 
 
 def constrained_targets(targets: I32, state: CoefficientState, side: SideInfo) -> I32:
-    """Return the targets, changed as little as necessary to give the decisions that a stream already holds.
-
-    Args:
-        targets: Shape (layout.cells,), int32.
-        state: The coefficients in the stream.
-        side: The side information in the stream.
-    """
+    """Return the targets, changed as little as necessary to give the decisions that a stream already holds."""
     first = START_THRESHOLDS[side.start_step] << side.extra_planes
     # The last plane with a decision: if a plane only evaluated the coefficient, the plane before it.
     planes = np.where(state.planes > 0, state.planes - 1, np.maximum(-state.planes - 2, 0))

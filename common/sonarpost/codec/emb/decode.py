@@ -44,10 +44,7 @@ class DecodedCoefficients:
 def read_body(body: bytes, layout: Layout, model: Model) -> tuple[CoefficientState, SideInfo]:
     """Return the coefficients and the side information of a body.
 
-    Args:
-        body: Any bytes; the body may be truncated.
-        layout: Layout of the image size.
-        model: The model that encoded it.
+    The body may be truncated or damaged.
     """
     coder, state = Coder.reader(body), CoefficientState(layout)
     side = code_side_info(coder, model, SideInfo(0, 0))

@@ -103,12 +103,7 @@ class TrialEncoder:
     ) -> EncodedTrial:
         """Write bodies with several start steps and return the one with the smallest error.
 
-        Args:
-            targets: The coefficients to encode.
-            mean_index: See `SideInfo`.
-            region: Region of interest.
-            texture: See `SideInfo`.
-            start_steps: Start steps to try; empty: as in `SEARCHES`.
+        Without `start_steps`, those of `SEARCHES` are tried.
         """
         pixels = targets.plane.size
         searches = SEARCHES if self.model.perceptual is None else PERCEPTUAL_SEARCHES
@@ -149,11 +144,7 @@ def _mean_of_neighbours(errors: dict[int, int], step: int, count: int) -> int:
 def error_by_length(curve: I64, body_bytes: int, header_bytes: int, pixels: int) -> npt.NDArray[np.float64]:
     """Return the mean squared error by stream length, from the squared error by number of bytes.
 
-    Args:
-        curve: See `Coder.curve`.
-        body_bytes: Length of the body.
-        header_bytes: Length of the header.
-        pixels: Pixels of the image.
+    The squared error is `Coder.curve`.
 
     Returns:
         Shape (header_bytes + body_bytes + 1,), grey squared; infinite for lengths without an image.
@@ -171,9 +162,7 @@ def error_by_length(curve: I64, body_bytes: int, header_bytes: int, pixels: int)
 def structural_similarity(original: I64, decoded: I64) -> int:
     """Return the structural similarity at a half and a quarter of the size, weighted about as by MS-SSIM.
 
-    Args:
-        original: Shape (height_px, width_px), int64, grey 0..255.
-        decoded: Same shape.
+    Both images: shape (height_px, width_px), int64, grey 0..255.
     """
     a, b = _block_sums(original), _block_sums(decoded)
     half = _mean_similarity(a, b, 4)

@@ -82,13 +82,7 @@ def optimised_targets(plane: Plane, originals: I32, weights: Plane, layout: Layo
 
     A few rounds of iterated thresholding (Blumensath and Davies, 2008). Coefficients within the budget move half way to
     the value that alone minimises the error of the image. Those below the threshold show what they could contribute.
-
-    Args:
-        plane: Shape (height_px, width_px), int64: the image in 1/64 grey, minus its mean level.
-        originals: Its coefficients, flat, int32.
-        weights: As for `target_coefficients`.
-        layout: Layout of the image.
-        body_bytes: The budget of the body.
+    The arguments are those of `target_coefficients`.
 
     Returns:
         Shape (layout.cells,), int32, without weights.

@@ -122,12 +122,7 @@ class _EndOfStreamError(Exception):
 def code_side_info(coder: Coder, model: Model, side: SideInfo) -> SideInfo:
     """Write side information, or read what the stream determines of it.
 
-    If the budget ends within it, the coder stops.
-
-    Args:
-        coder: The range coder.
-        model: The networks.
-        side: Values to write; ignored when the coder reads.
+    If the budget ends within it, the coder stops. `side` is ignored when the coder reads.
     """
     mean_index = -1
     try:

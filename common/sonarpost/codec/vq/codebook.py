@@ -69,9 +69,7 @@ def to_bytes(codebook: Codebook) -> bytes:
 def from_bytes(data: bytes, where: str) -> Codebook:
     """Parse the content of a codebook file.
 
-    Args:
-        data: The whole file.
-        where: Name of the file, for messages.
+    `where` names the file in messages.
 
     Raises:
         CodebookError: Not a codebook, another version, truncated, or damaged (the SHA-256 at its end differs).

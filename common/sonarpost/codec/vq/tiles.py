@@ -175,10 +175,6 @@ def principal_basis(tiles: Tiles, dims: int) -> tuple[Tiles, Basis]:
     rounded to 1/4096. The first entry of largest magnitude of each component is positive. Components without variance
     are dropped, except the first.
 
-    Args:
-        tiles: Shape (n, pixels), uint8, n at least 1.
-        dims: Maximum number of components.
-
     Returns:
         Mean, shape (pixels,), uint8; basis, shape (1..dims, pixels), int16.
     """

@@ -63,13 +63,9 @@ def absorption_db_per_km(
 def noise_db_per_hz(frequency_hz: float, wind_m_per_s: float = 5.0, shipping: float = 0.5) -> float:
     """Return the spectrum level of ambient noise, dB re 1 uPa^2/Hz: turbulence, shipping, wind and thermal noise.
 
-    Source: Wenz's curves as given by Coates, "Underwater acoustic systems" (1990), and Stojanovic, "On the
-    relationship between capacity and distance in an underwater acoustic communication channel" (WUWNet 2006).
-
-    Args:
-        frequency_hz: Carrier frequency.
-        wind_m_per_s: Wind speed.
-        shipping: Shipping activity, 0 (none) to 1 (heavy).
+    Source: Wenz's curves as given by Coates, "Underwater acoustic systems" (1990), and Stojanovic, "On the relationship
+    between capacity and distance in an underwater acoustic communication channel" (WUWNet 2006). Shipping is an
+    activity from 0 (none) to 1 (heavy).
     """
     f = frequency_hz / 1000.0
     sources_db = (

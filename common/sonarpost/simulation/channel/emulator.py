@@ -35,34 +35,6 @@ MAX_PENDING_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class TimeScale:
-    """Maps a monotonic reading to simulated seconds: simulated = real x scale, from zero at `started_s`.
-
-    Attributes:
-        scale: Simulated seconds per real second, above zero and finite; 1 is real time.
-        started_s: The monotonic reading, in real seconds, at which simulated time is zero.
-
-    Raises:
-        ValueError: A scale that is not a positive finite number.
-    """
-
-    scale: float = 1.0
-    started_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"time scale: got {self.scale!r}, expected a finite number above zero")
-
-    def simulated_s(self, real_s: float) -> float:
-        """Return the simulated time at the monotonic reading `real_s`."""
-        return (real_s - self.started_s) * self.scale
-
-    def wait_s(self, simulated_s: float, real_s: float) -> float:
-        """Return the real seconds from the reading `real_s` until `simulated_s`, never below zero."""
-        return max(0.0, self.started_s + simulated_s / self.scale - real_s)
-
-
-@dataclass(frozen=True, slots=True)
 class Device:
     """The device by which a host reaches a modem: a path or a pyserial URL."""
 
@@ -92,9 +64,7 @@ class _State(Enum):
 class ChannelEmulator:
     """Emulated modems on pseudo-terminals or TCP ports, with the channel between them.
 
-    Args:
-        config: Modems, ports and channel.
-        echo: A second output for every line of the log.
+    `echo` is a second output for every line of the log.
     """
 
     def __init__(self, config: EmulatorConfig, echo: IO[str] | None = None) -> None:
@@ -107,7 +77,7 @@ class ChannelEmulator:
         self._log = PacketLog(None)
         self._thread: threading.Thread
         self._simulator: ChannelSimulator
-        self._clock: TimeScale
+        self._started_s = 0.0  # reading of the monotonic clock at simulated time zero
         self._wake_out = self._wake_in = -1
         self.failure: Exception | None = None
         """The error that ended the emulator; None while it runs and after `stop`."""
@@ -142,7 +112,7 @@ class ChannelEmulator:
             self.open()
         self._state = _State.RUNNING
         self._simulator = self._make_simulator()
-        self._clock = TimeScale(self.config.time_scale, time.monotonic())
+        self._started_s = time.monotonic()
         self._wake_out, self._wake_in = os.pipe()
         self._thread = threading.Thread(target=self._run, name="acoustic-channel", daemon=True)
         self._thread.start()
@@ -230,7 +200,7 @@ class ChannelEmulator:
             self.failure = failure
 
     def _now_s(self) -> float:
-        return self._clock.simulated_s(time.monotonic())
+        return (time.monotonic() - self._started_s) * self.config.time_scale
 
     def _step(self) -> None:
         for number, line in self._lines.items():
@@ -306,8 +276,8 @@ class ChannelEmulator:
 
     def _timeout_s(self) -> float:
         poll_ports = any(line.port.needs_polling for line in self._lines.values())
-        due_s = self._clock.wait_s(self._simulator.next_deadline_s(), time.monotonic())
-        return min(due_s, PORT_POLL_S if poll_ports else MAX_WAIT_S)
+        due_s = (self._simulator.next_deadline_s() - self._now_s()) / self.config.time_scale
+        return min(max(0.0, due_s), PORT_POLL_S if poll_ports else MAX_WAIT_S)
 
     def _finish(self) -> None:
         for line in self._lines.values():

@@ -163,9 +163,7 @@ class PtyPort(HostPort):
 class TcpPort(HostPort):
     """A TCP port for `socket://` URLs. A new client replaces the previous one, whose connection may be dead.
 
-    Args:
-        host: Address to listen on.
-        port: Port number, or 0 for a free one.
+    Port 0 selects a free one.
 
     Raises:
         PortError: The port cannot be opened.

@@ -86,12 +86,7 @@ class Fading:
     """Burst fading of every path after Gilbert (1960) and Elliott (1963), in continuous time.
 
     A path is clear or faded, and clear at time zero. The duration of each state is exponentially distributed. Both
-    directions of a path fade together.
-
-    Args:
-        seed: Seed of the simulation.
-        mean_clear_s: Mean duration of the clear state.
-        mean_fade_s: Mean duration of a fade; 0 disables fading.
+    directions of a path fade together. A mean fade of 0 s disables fading.
     """
 
     def __init__(self, seed: int, mean_clear_s: float, mean_fade_s: float) -> None:

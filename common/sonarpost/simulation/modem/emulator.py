@@ -33,7 +33,14 @@ from sonarpost.modem.micromodem.nmea import FieldReader, Sentence
 from sonarpost.simulation.channel.events import AcousticPacket, ArrivalEnded, ArrivalStarted
 from sonarpost.simulation.modem import commands
 from sonarpost.simulation.modem.receiver import HostOutput, PacketReport, Receiver
-from sonarpost.simulation.modem.settings import FIRMWARE_VERSIONS, EmulatedModemConfig, ModemClock, ModemSettings
+from sonarpost.simulation.modem.settings import (
+    FIRMWARE_VERSIONS,
+    REBOOT_S,
+    REVISION_PERIOD_S,
+    EmulatedModemConfig,
+    ModemClock,
+    ModemSettings,
+)
 from sonarpost.simulation.modem.transmitter import BusyError, Transmitter, TransponderRanging, TravelTimes
 
 _ERROR_FRAMING, _ERROR_UNKNOWN, _ERROR_FIELD, _ERROR_BUSY = 1, 2, 3, 4
@@ -118,7 +125,7 @@ class EmulatedMicroModem:
             self._write(line)
         self._ranging.poll(now)
         if was_busy or self.busy:
-            self._next_revision_s = max(self._next_revision_s, now + self.config.revision_period_s)
+            self._next_revision_s = max(self._next_revision_s, now + REVISION_PERIOD_S)
         elif self._next_revision_s <= now:
             self._send_revision("AUV", now)
 
@@ -145,7 +152,7 @@ class EmulatedMicroModem:
         if self.rebooting:
             return PacketReport(arrival, self.address, "rebooting")
         if self.busy:
-            self._next_revision_s = max(self._next_revision_s, arrival.time_s + self.config.revision_period_s)
+            self._next_revision_s = max(self._next_revision_s, arrival.time_s + REVISION_PERIOD_S)
         host_report = self._receiver.arrival_ended(arrival)
         reason = host_report.unreported_reason
         if not host_report.lines:
@@ -205,10 +212,9 @@ class EmulatedMicroModem:
         if role == "INIT" or self.settings.on("REV"):
             self._send("CAREV", self.clock.hhmmss(now), role, FIRMWARE_VERSIONS[self.config.generation])
         # The period starts at the due time, not at `now`, so that a late poll does not shift the following ones.
-        period_s = self.config.revision_period_s
-        missed = max(0, math.floor((now - self._next_revision_s) / period_s))
-        base_s = now if role == "INIT" else self._next_revision_s + missed * period_s
-        self._next_revision_s = base_s + period_s
+        missed = max(0, math.floor((now - self._next_revision_s) / REVISION_PERIOD_S))
+        base_s = now if role == "INIT" else self._next_revision_s + missed * REVISION_PERIOD_S
+        self._next_revision_s = base_s + REVISION_PERIOD_S
 
     def _on_configure(self, sentence: Sentence, _now: float) -> None:
         read = FieldReader(sentence, strict=True)
@@ -231,7 +237,7 @@ class EmulatedMicroModem:
         read.address(0, "source")
         read.address(1, "destination")
         read.integer(2, "minutes", 0, 0)
-        self._rebooted_at_s = max(now + self.config.reboot_s, self._transmitter.end_of_transmission_s(now))
+        self._rebooted_at_s = max(now + REBOOT_S, self._transmitter.end_of_transmission_s(now))
         self._transmitter.reset()
         self._receiver.reset()
         self._ranging.reset()

@@ -20,7 +20,7 @@ from sonarpost.simulation.channel.events import (
     PacketKind,
     PacketOutcome,
 )
-from sonarpost.simulation.modem.settings import EmulatedModemConfig, ModemClock, ModemSettings
+from sonarpost.simulation.modem.settings import BROADCAST_ADDRESSES, EmulatedModemConfig, ModemClock, ModemSettings
 from sonarpost.simulation.modem.statistics import PacketType, packet_type, receive_statistics
 
 _GOOD = frozenset({FrameOutcome.DELIVERED, FrameOutcome.DAMAGED})
@@ -155,7 +155,7 @@ class Receiver:
         return None if self._arriving else "rebooting"
 
     def _accepts(self, destination: int) -> bool:
-        addressed = destination == self._settings["SRC"] or destination in self._config.broadcast_addresses
+        addressed = destination == self._settings["SRC"] or destination in BROADCAST_ADDRESSES
         return self._config.promiscuous or addressed
 
     def _undecoded(self, arrival: ArrivalEnded, reason: str) -> HostReport:

@@ -15,6 +15,17 @@ from sonarpost.modem.micromodem import RATES
 FIRMWARE_VERSIONS: Mapping[int, str] = MappingProxyType({1: "0.93.0.09", 2: "2.0.27087"})
 """Version in `CAREV` by generation: four parts for the first, three for the second."""
 
+REVISION_PERIOD_S = 10.0
+"""Idle time before and between `CAREV,…,AUV`."""
+REBOOT_S = 1.0
+"""Time from `CCMSC` to `CAREV,…,INIT`."""
+MINI_AIRTIME_S = 0.9
+"""Air time of an acknowledgement, a ping or a mini-packet."""
+TURNAROUND_S = 0.2
+"""Time from the end of a packet to the automatic reply."""
+BROADCAST_ADDRESSES = frozenset({0, 15, 127})
+"""Destinations that address every modem."""
+
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.]{0,39}")
 _MAX_SETTINGS = 512
 _FACTORY = {
@@ -45,12 +56,7 @@ class EmulatedModemConfig:
         utc_at_zero_s: Reading of the modem's clock at simulated time zero, seconds since 1970 UTC.
         airtimes_s: Air times by rate number, where they differ from the nominal ones.
         data_timeout_s: Initial `DTO`, whole seconds.
-        revision_period_s: Idle time before and between `CAREV,…,AUV`.
-        reboot_s: Time from `CCMSC` to `CAREV,…,INIT`.
-        mini_airtime_s: Air time of an acknowledgement, a ping or a mini-packet.
-        turnaround_s: Time from the end of a packet to the automatic reply.
         promiscuous: Whether the host receives data addressed to other modems.
-        broadcast_addresses: Destinations that address every modem.
 
     Raises:
         ValueError: A value outside its bounds.
@@ -62,28 +68,18 @@ class EmulatedModemConfig:
     utc_at_zero_s: float = 0.0
     airtimes_s: Mapping[int, float] = field(default_factory=lambda: MappingProxyType({}))
     data_timeout_s: int = 2
-    revision_period_s: float = 10.0
-    reboot_s: float = 1.0
-    mini_airtime_s: float = 0.9
-    turnaround_s: float = 0.2
     promiscuous: bool = True
-    broadcast_addresses: frozenset[int] = frozenset({0, 15, 127})
 
     def __post_init__(self) -> None:
         if self.generation not in FIRMWARE_VERSIONS:
             raise ValueError(f"generation: got {self.generation!r}, expected 1 or 2")
         if self.statistics_version not in {6, 8}:
             raise ValueError(f"statistics_version: got {self.statistics_version!r}, expected 6 or 8")
-        times = {f"airtimes_s of rate {rate}": time_s for rate, time_s in self.airtimes_s.items()}
-        times |= {name: getattr(self, name) for name in ("revision_period_s", "mini_airtime_s")}
-        for name, time_s in times.items():
+        for rate, time_s in self.airtimes_s.items():
             if not (math.isfinite(time_s) and time_s > 0):
-                raise ValueError(f"{name}: got {time_s!r}, expected seconds above 0")
+                raise ValueError(f"airtimes_s of rate {rate}: got {time_s!r}, expected seconds above 0")
         if unknown := set(self.airtimes_s) - set(RATES):
             raise ValueError(f"airtimes_s: got rates {sorted(unknown)}, expected {min(RATES)}..{max(RATES)}")
-        for name in ("reboot_s", "turnaround_s"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected seconds, 0 or more")
 
     def airtime_s(self, rate: int) -> float:
         """Return the air time of a data packet of `rate`."""
@@ -165,9 +161,6 @@ class ModemClock:
 
     The clock has a pulse at every true second. A host sets it to the next second, shortly after the previous one. The
     clock shows that second at once and runs from the next pulse on.
-
-    Args:
-        utc_at_zero_s: True UTC at simulated time zero, seconds since 1970.
     """
 
     def __init__(self, utc_at_zero_s: float) -> None:

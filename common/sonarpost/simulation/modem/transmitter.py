@@ -16,7 +16,13 @@ from sonarpost.modem.micromodem import RATES, nmea
 from sonarpost.modem.micromodem.sentences import Cycle
 from sonarpost.simulation.channel.events import AcousticPacket, ArrivalEnded, PacketKind, PacketOutcome
 from sonarpost.simulation.modem import commands
-from sonarpost.simulation.modem.settings import EmulatedModemConfig, ModemClock, ModemSettings
+from sonarpost.simulation.modem.settings import (
+    MINI_AIRTIME_S,
+    TURNAROUND_S,
+    EmulatedModemConfig,
+    ModemClock,
+    ModemSettings,
+)
 from sonarpost.simulation.modem.statistics import transmit_statistics
 
 RANGING_PING_S = 0.01
@@ -166,7 +172,7 @@ class Transmitter:
             cycle.src,
             cycle.dest,
             cycle.rate,
-            self._config.mini_airtime_s,
+            MINI_AIRTIME_S,
             ack_requested=cycle.ack,
             announced_frames=cycle.nframes,
         )
@@ -201,7 +207,7 @@ class Transmitter:
         bits = () if is_ping else (f"{mini.bits:04X}",)
         self._say("CA" + sentence.kind[2:], mini.source, mini.destination, *bits)
         kind = PacketKind.PING if is_ping else PacketKind.MINI
-        airtime_s = self._config.mini_airtime_s
+        airtime_s = MINI_AIRTIME_S
         self.send(AcousticPacket(kind, mini.source, mini.destination, 0, airtime_s, mini=mini.bits), now)
 
     def send_flexible(self, sentence: nmea.Sentence, now: float) -> None:
@@ -215,7 +221,7 @@ class Transmitter:
         rest = command.data[commands.FLEXIBLE_MINI_BYTES :]
         frames = [command.data[: commands.FLEXIBLE_MINI_BYTES]]
         frames += [rest[at : at + rate.frame_bytes] for at in range(0, len(rest), rate.frame_bytes)]
-        airtime_s = self._config.mini_airtime_s + self._config.airtime_s(command.rate) * (len(frames) - 1) / rate.frames
+        airtime_s = MINI_AIRTIME_S + self._config.airtime_s(command.rate) * (len(frames) - 1) / rate.frames
         own = self._settings["SRC"]
         self.send(AcousticPacket(PacketKind.FLEXIBLE, own, dest, command.rate, airtime_s, tuple(frames), ack), now)
 
@@ -242,7 +248,7 @@ class Transmitter:
             self._request_frame(self._filling, arrival.time_s)
         if packet.destination != own:
             return
-        reply = (own, packet.source, 0, self._config.mini_airtime_s)
+        reply = (own, packet.source, 0, MINI_AIRTIME_S)
         acked = tuple(number for number in good_frames if number in packet.ack_frames)
         if packet.kind is PacketKind.PING:
             answer = AcousticPacket(PacketKind.PING_REPLY, *reply)
@@ -252,7 +258,7 @@ class Transmitter:
             answer = AcousticPacket(PacketKind.ACK, *reply, acked_frames=acked)
         else:
             return
-        self._waiting.append((arrival.time_s + self._config.turnaround_s, answer))
+        self._waiting.append((arrival.time_s + TURNAROUND_S, answer))
 
     def _say(self, kind: str, *fields: str | int) -> None:
         self._write(nmea.format(kind, *fields))

@@ -68,11 +68,7 @@ class SonarSettings:
 def echo_intensity(seabed: Seabed, track: Track, settings: SonarSettings, sign: int) -> FloatImage:
     """Return the mean echo intensity of one side, without speckle and noise: 1 is flat sand at half range.
 
-    Args:
-        seabed: The bottom with its objects.
-        track: Position and attitude of the sonar.
-        settings: Range and sampling.
-        sign: 1 for starboard, -1 for port.
+    `sign` is 1 for starboard, -1 for port.
 
     Returns:
         Shape (pings, samples), float32; sample 0 is nearest the vehicle.

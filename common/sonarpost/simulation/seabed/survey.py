@@ -158,9 +158,6 @@ class SimulatedSurvey:
 def simulate_survey(spec: SurveySpec) -> SimulatedSurvey:
     """Simulate a survey line.
 
-    Args:
-        spec: Specification.
-
     Returns:
         The survey, whose path contains the seed as there is no file, and the truth in order of pings.
 
