@@ -19,7 +19,7 @@ import numpy as np
 from sonarpost import wire
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
-from sonarpost.detection.association import AssociationRule, DetectionPosition
+from sonarpost.detection.association import DetectionPosition
 from sonarpost.logs import kv
 from sonarpost.messages import Snippet
 from sonarpost.sonar.geometry import Position, offset_between_m
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 FORMAT: Final = 1
 MAX_SONARS: Final = 8
 _STATE_PREFIX: Final = "seam:"
-_SAME_OBJECT: Final = AssociationRule(along_m=3.0, across_m=math.nextafter(3.0, math.inf), overlapping=True)
+_SAME_OBJECT_M: Final = (3.0, math.nextafter(3.0, math.inf))
 """Detections less than 3 m apart are one object, as within a file; across-track also at exactly 3 m."""
 _MIN_GAP_LIMIT_S: Final = 1.0
 _GAP_LIMIT_INTERVALS: Final = 3.0
@@ -66,7 +66,7 @@ class BoundaryDetection(DetectionPosition):
 
     def is_same_object(self, other: DetectionPosition) -> bool:
         """Return whether both detections are of one object."""
-        return _SAME_OBJECT.matches(self, other, abs(self.slant_range_m - other.slant_range_m))
+        return self.is_near(other, *_SAME_OBJECT_M, overlapping=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from sonarpost.detection.association import DEFAULT_ROW_SPACING_M, AssociationRule, DetectionPosition
+from sonarpost.detection.association import DEFAULT_ROW_SPACING_M, DetectionPosition
 from sonarpost.detection.detector import detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import Side
@@ -15,24 +15,27 @@ POSITION = DetectionPosition(Side.PORT, 50, 46, 54, 11.0, 0.1)
 
 
 @pytest.mark.parametrize("overlapping", [True, False])
-def test_match_requires_both_distances_and_same_side(overlapping):
-    rule = AssociationRule(2.0, 1.5, overlapping)
-    assert rule.matches(POSITION, POSITION.shifted(19), 1.49)
-    assert not rule.matches(POSITION, POSITION.shifted(20), 1.49)
-    assert not rule.matches(POSITION, POSITION.shifted(-20), 1.49)
-    assert not rule.matches(POSITION, POSITION, 1.5)
-    assert not rule.matches(POSITION, replace(POSITION, side=Side.STARBOARD), 0.0)
+def test_near_requires_both_distances_and_same_side(overlapping):
+    def near(one, other):
+        return one.is_near(other, 2.0, 1.5, overlapping=overlapping)
+
+    farther_out = replace(POSITION, slant_range_m=12.25)
+    assert near(POSITION, farther_out.shifted(19))
+    assert not near(POSITION, farther_out.shifted(20))
+    assert not near(POSITION, farther_out.shifted(-20))
+    assert not near(POSITION, replace(POSITION, slant_range_m=12.5))
+    assert not near(POSITION, replace(POSITION, side=Side.STARBOARD))
     coarser = replace(POSITION, along_m=0.2)
-    assert not rule.matches(coarser, POSITION.shifted(10), 0.0), "the row spacing of the first position applies"
-    assert rule.matches(POSITION.shifted(10), coarser, 0.0)
+    assert not near(coarser, POSITION.shifted(10)), "the row spacing of the first position applies"
+    assert near(POSITION.shifted(10), coarser)
 
 
-def test_overlapping_rows_match_only_if_enabled():
+def test_overlapping_rows_are_near_only_if_enabled():
     extended = replace(POSITION, row=90, first_row=53, end_row=127)
-    assert AssociationRule(3.0, 3.0, overlapping=True).matches(POSITION, extended, 0.0)
-    assert not AssociationRule(3.0, 3.0, overlapping=False).matches(POSITION, extended, 0.0)
-    assert not AssociationRule(3.0, 3.0, overlapping=True).matches(POSITION, replace(extended, first_row=54), 0.0)
-    assert not AssociationRule(3.0, 3.0, overlapping=True).matches(POSITION, extended, 3.0)
+    assert POSITION.is_near(extended, 3.0, 3.0, overlapping=True)
+    assert not POSITION.is_near(extended, 3.0, 3.0)
+    assert not POSITION.is_near(replace(extended, first_row=54), 3.0, 3.0, overlapping=True)
+    assert not POSITION.is_near(replace(extended, slant_range_m=14.0), 3.0, 3.0, overlapping=True)
 
 
 def test_position_of_detection_in_stream(make_survey):

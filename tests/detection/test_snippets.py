@@ -33,12 +33,12 @@ def test_default_snippet_is_centred_on_highlight_and_shadow(found):
     survey, detection = found
     snippet = cut_snippet(survey, detection)
     assert snippet.image.shape == snippet.image16.shape == (100, 100)
-    assert snippet.target_row == 50
-    assert snippet.target_column == 50 - detection.shadow_samples // 2
+    row, column = detection.ping_index - snippet.first_ping_index, detection.sample - snippet.first_sample
+    assert row == 50
+    assert column == 50 - detection.shadow_samples // 2
     assert (snippet.pixel_along_m, snippet.pixel_across_m) == (detection.pixel_along_m, 20 / 512)
     assert np.array_equal(snippet.image16, raw_window(survey, Side.STARBOARD, snippet))
     # Bright at the target, dark to its right, because the nadir is to the left.
-    row, column = snippet.target_row, snippet.target_column
     shadow_column = column + 6 + detection.shadow_samples // 2
     assert snippet.image[row - 2 : row + 3, column - 3 : column + 4].mean() > 180
     assert snippet.image[row - 2 : row + 3, shadow_column - 5 : shadow_column + 6].mean() < 60
@@ -50,10 +50,8 @@ def test_window_is_shifted_at_borders(found, ping, sample, height, width):
     snippet = cut_snippet(survey, replace(detection, ping_index=ping, sample=sample), height, width)
     assert snippet.image.shape == (min(height, 200), min(width, 512))
     assert raw_window(survey, Side.STARBOARD, snippet).shape == snippet.image.shape
-    assert snippet.first_ping_index + snippet.target_row == ping
-    assert snippet.first_sample + snippet.target_column == sample
-    assert 0 <= snippet.target_row < snippet.image.shape[0]
-    assert 0 <= snippet.target_column < snippet.image.shape[1]
+    assert 0 <= ping - snippet.first_ping_index < snippet.image.shape[0]
+    assert 0 <= sample - snippet.first_sample < snippet.image.shape[1]
 
 
 def test_missing_samples_are_black_and_do_not_change_contrast(found):

@@ -63,31 +63,17 @@ class DetectionPosition:
         """Return the place with `rows` added to its rows."""
         return replace(self, row=self.row + rows, first_row=self.first_row + rows, end_row=self.end_row + rows)
 
-
-@dataclass(frozen=True, slots=True)
-class AssociationRule:
-    """Condition under which two detections are one object: same side, and near in both directions.
-
-    Attributes:
-        along_m: Centres nearer than this are near along-track.
-        across_m: Centres nearer than this are near across-track.
-        overlapping: Highlights with a common row are also near along-track: a detection at a boundary covers only a
-            part of the object.
-    """
-
-    along_m: float
-    across_m: float
-    overlapping: bool
-
-    def matches(self, one: DetectionPosition, other: DetectionPosition, across_m: float) -> bool:
-        """Return whether two detections are one object.
+    def is_near(self, other: DetectionPosition, along_m: float, across_m: float, *, overlapping: bool = False) -> bool:
+        """Return whether two detections are one object: on the same side, and near in both directions.
 
         Args:
-            one: A detection; its distance between rows is used.
-            other: Another one, with rows of the same stream.
-            across_m: Their distance across-track: by slant range, or by samples if the sampling is the same.
+            other: Another detection, with rows of the same stream.
+            along_m: Centres nearer than this are near along-track, at the distance between rows of this detection.
+            across_m: Centres nearer than this in slant range are near across-track.
+            overlapping: Whether highlights with a common row are also near along-track: a detection at a boundary
+                covers only a part of the object.
         """
-        if one.side is not other.side or not across_m < self.across_m:
+        if self.side is not other.side or not abs(self.slant_range_m - other.slant_range_m) < across_m:
             return False
-        overlap = self.overlapping and one.first_row < other.end_row and other.first_row < one.end_row
-        return overlap or abs(one.row - other.row) * one.along_m < self.along_m
+        overlap = overlapping and self.first_row < other.end_row and other.first_row < self.end_row
+        return overlap or abs(self.row - other.row) * self.along_m < along_m

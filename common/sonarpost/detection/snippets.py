@@ -47,8 +47,6 @@ class SurveySnippet:
             column 0 nearest the vehicle (nadir to the left on both sides).
         image16: The same window, uint16: the values of the file, divided by `divisor16` if they exceed 16 bits.
         divisor16: File value per step of `image16`; 1 for files of 8 or 16 bits.
-        target_row: Row of the contact's highlight in the image.
-        target_column: Its column.
         first_ping_index: Index into `Survey.pings` of row 0.
         first_sample: Sample index of column 0.
         pixel_along_m: Distance between rows; None if the survey does not contain it.
@@ -58,8 +56,6 @@ class SurveySnippet:
     image: npt.NDArray[np.uint8]
     image16: npt.NDArray[np.uint16]
     divisor16: int
-    target_row: int
-    target_column: int
     first_ping_index: int
     first_sample: int
     pixel_along_m: float | None
@@ -88,8 +84,6 @@ def cut_snippet(
         image=to_grey(raw, known),
         image16=(raw // divisor).astype(np.uint16),
         divisor16=divisor,
-        target_row=detection.ping_index - top,
-        target_column=detection.sample - left,
         first_ping_index=top,
         first_sample=left,
         pixel_along_m=detection.pixel_along_m,

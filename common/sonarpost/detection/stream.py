@@ -11,9 +11,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
-from sonarpost.detection.association import AssociationRule, DetectionPosition
+from sonarpost.detection.association import DetectionPosition
 from sonarpost.detection.detector import Detection, detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.geometry import ping_spacing_m
@@ -54,19 +54,10 @@ class StreamContact:
         return replace(self.detection, ping_index=self.ping, highlight_pings=(first + shift, last + shift))
 
 
-@dataclass(frozen=True, slots=True)
-class _Origin:
+class _Origin(NamedTuple):
     file: int
     path: Path
     ping: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Reported:
-    """Place and sample of a contact that was returned already."""
-
-    place: DetectionPosition
-    sample: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,13 +68,13 @@ class _FileEnd:
         survey: The last pings, of one file or several.
         origins: File number, path and index in that file of each of them.
         held: Contacts held back near the end.
-        reported: Contacts returned already; row 0 is the first ping of `survey`.
+        reported: Places of the contacts returned already; row 0 is the first ping of `survey`.
     """
 
     survey: Survey
     origins: tuple[_Origin, ...]
     held: tuple[StreamContact, ...]
-    reported: tuple[_Reported, ...]
+    reported: tuple[DetectionPosition, ...]
 
 
 class StreamDetector:
@@ -97,10 +88,6 @@ class StreamDetector:
     def __init__(self, settings: DetectorSettings | None = None, options: SurveyOptions | None = None) -> None:
         self._settings = settings if settings is not None else DetectorSettings()
         self._options = options if options is not None else SurveyOptions()
-        # A contact is returned only if it lies `HELD_BACK_M` before the end: both detections then have the same centre.
-        self._rule = AssociationRule(
-            self._settings.separation_along_m, self._settings.separation_across_m, overlapping=False
-        )
         self._end: _FileEnd | None = None
         self._files = 0
 
@@ -115,7 +102,7 @@ class StreamDetector:
         origins = tuple(_Origin(self._files, survey.path, row) for row in range(len(survey.pings)))
         self._files += 1
         released: tuple[StreamContact, ...] = ()
-        reported: tuple[_Reported, ...] = ()
+        reported: tuple[DetectionPosition, ...] = ()
         first_row = 0
         if before is not None and is_continuation(before.survey, survey):
             first_row = max(0, len(before.survey.pings) - self._pings(before.survey, HELD_BACK_M))
@@ -125,14 +112,14 @@ class StreamDetector:
         elif before is not None:
             released = before.held
         found = [
-            StreamContact(origins[d.ping_index].file, origins[d.ping_index].path, origins[d.ping_index].ping, d, survey)
+            StreamContact(*origins[d.ping_index], d, survey)
             for d in detect(survey, self._settings, self._options)
             if d.ping_index >= first_row and not self._is_reported(d, reported)
         ]
         end = len(survey.pings) - self._pings(survey, HELD_BACK_M)
         held = tuple(c for c in found if c.detection.ping_index >= end)
         final = tuple(c for c in found if c.detection.ping_index < end)
-        self._end = self._end_of(survey, origins, held, (*reported, *(self._report(c.detection) for c in final)))
+        self._end = self._end_of(survey, origins, held, (*reported, *(self._place(c.detection) for c in final)))
         return _by_confidence((*released, *final))
 
     def finish(self) -> tuple[StreamContact, ...]:
@@ -145,26 +132,22 @@ class StreamDetector:
         survey: Survey,
         origins: tuple[_Origin, ...],
         held: tuple[StreamContact, ...],
-        reported: tuple[_Reported, ...],
+        reported: tuple[DetectionPosition, ...],
     ) -> _FileEnd:
         cut = max(0, len(survey.pings) - self._pings(survey, OVERLAP_M))
-        kept = tuple(replace(each, place=each.place.shifted(-cut)) for each in reported if each.place.row >= cut)
+        kept = tuple(place.shifted(-cut) for place in reported if place.row >= cut)
         return _FileEnd(replace(survey, pings=survey.pings[cut:]), origins[cut:], held, kept)
 
     def _pings(self, survey: Survey, length_m: float) -> int:
         return math.ceil(length_m / (ping_spacing_m(survey) or self._settings.assumed_row_along_m))
 
-    def _report(self, detection: Detection) -> _Reported:
-        along_m = self._settings.assumed_row_along_m
-        return _Reported(DetectionPosition.of_detection(detection, default_along_m=along_m), detection.sample)
+    def _place(self, detection: Detection) -> DetectionPosition:
+        return DetectionPosition.of_detection(detection, default_along_m=self._settings.assumed_row_along_m)
 
-    def _is_reported(self, detection: Detection, reported: Sequence[_Reported]) -> bool:
-        new = self._report(detection)
-        # Files of a line have the same sampling, so the distance across-track is counted in samples.
-        return any(
-            self._rule.matches(new.place, other.place, abs(new.sample - other.sample) * detection.pixel_across_m)
-            for other in reported
-        )
+    def _is_reported(self, detection: Detection, reported: Sequence[DetectionPosition]) -> bool:
+        # A contact is returned only if it lies `HELD_BACK_M` before the end: both detections then have the same centre.
+        new, limits_m = self._place(detection), (self._settings.separation_along_m, self._settings.separation_across_m)
+        return any(new.is_near(place, *limits_m) for place in reported)
 
 
 def is_continuation(before: Survey, after: Survey) -> bool:

@@ -82,7 +82,7 @@ def optimised_targets(plane: Plane, originals: I32, weights: Plane, layout: Layo
 
     A few rounds of iterated thresholding (Blumensath and Davies, 2008). Coefficients within the budget move half way to
     the value that alone minimises the error of the image. Those below the threshold show what they could contribute.
-    The arguments are those of `target_coefficients`.
+    `originals` are the coefficients of the plane, flat, int32; the other arguments are those of `target_coefficients`.
 
     Returns:
         Shape (layout.cells,), int32, without weights.
