@@ -4,7 +4,7 @@
 
 Real processes, each with its own store: a router and a relay for each vessel, the router of the shore site, and c2,
 which writes the files of every image. Vehicles, acoustic channel and decompressor are replaced by one load process a
-vessel: it queues a reconstructed image of 100 x 300 px for the relay in its durable outbox, for each of its vehicles
+vessel: it queues a reconstructed image of 300 x 100 px for the relay in its durable outbox, for each of its vehicles
 once every `--every` seconds at a random phase. All processes run on this host and share one clock. The latency of an
 image is the time from queueing it, before it is written to disk, until a subscriber at the shore site receives it from
 c2, after c2 has written its files.

@@ -3,7 +3,7 @@
     python -m research.relay_throughput [--decisions 20000] [--pictures 2000] [--dir DIR]
 
 There are two processes: the far side with the router, and this one. For records of two sizes (a decision, and an image
-of 100 x 300 px) these are measured:
+of 300 x 100 px) these are measured:
 
 - sequential: acknowledged queries without storage, one at a time, through the router to a queryable that replies at
   once;
@@ -111,7 +111,7 @@ def decision(number: int) -> Decision:
 
 
 def image(number: int) -> ReconstructedImage:
-    """Return an image of 100 x 300 px, 30 kB."""
+    """Return an image of 300 x 100 px, 30 kB."""
     return noise_image(VESSEL, "uuv-1", f"{number:04d}", number, float(number))
 
 

@@ -3,7 +3,7 @@
     python -m venv somewhere && somewhere/bin/pip install . faiss-cpu
     somewhere/bin/python -m research.tile_search
 
-Both programs search the 15,992 tiles of `nominal-10`, in 70 coordinates, for the tiles of an image of 140 x 80 px
+Both programs search the 15,992 tiles of `nominal-10`, in 70 coordinates, for the tiles of an image of 80 x 140 px
 (112 tiles). They search for the nearest tile (as in the paper), and for the eight nearest (which the codec `vq` then
 compares in all pixels). The time includes the projection of the tiles of the image. Each image is searched by both
 programs, one after the other, in alternating order. Other load of the host therefore slows both, and the result is the
@@ -60,7 +60,7 @@ def main() -> int:
     database = load_default(10).tiles
     images = [cut_tiles(image, 10) for image in _images(args.images, args.pictures)]
     if not images:
-        print(f"tile_search: no image of {HEIGHT_PX} x {WIDTH_PX} px or more in {args.images}", file=sys.stderr)
+        print(f"tile_search: no image of {WIDTH_PX} x {HEIGHT_PX} px or more in {args.images}", file=sys.stderr)
         return 2
     index = faiss.IndexFlatL2(database.dims)
     index.add(_coordinates(database, database.tiles))
@@ -138,7 +138,7 @@ def _choose_method(faiss: object, index: object, database: TileDatabase, images:
 
 
 def _images(folder: Path | None, count: int) -> list[npt.NDArray[np.uint8]]:
-    """Return images of 140 x 80 px: centres of the images of a folder, or parts of simulated lines."""
+    """Return images of 80 x 140 px: centres of the images of a folder, or parts of simulated lines."""
     if folder is not None:
         paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".tif", ".tiff"))
         images = (to_uint8(read_image(path)) for path in paths)

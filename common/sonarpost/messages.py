@@ -79,7 +79,7 @@ class Pixels(Record):
         height_px, width_px, bits = info.data["height_px"], info.data["width_px"], info.data["bits"]
         expected = height_px * width_px * bits // 8
         if len(data) != expected:
-            raise ValueError(f"{expected} bytes for {height_px} x {width_px} px of {bits} bits, not {len(data)}")
+            raise ValueError(f"{expected} bytes for {width_px} x {height_px} px of {bits} bits, not {len(data)}")
         return data
 
     @classmethod

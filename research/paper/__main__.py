@@ -199,7 +199,7 @@ def page(
 
 
 _TABLE2_NOTE = (
-    f"Means over {{images}} images of {HEIGHT_PX} x {WIDTH_PX} px ({PIXELS} B): {{origin}}. The budget of each "
+    f"Means over {{images}} images of {WIDTH_PX} x {HEIGHT_PX} px ({PIXELS} B): {{origin}}. The budget of each "
     "codec follows from the paper's ratio for such an image (vq has its natural size); bytes include the header."
 )
 _FIG3_NOTE = (

@@ -35,7 +35,7 @@ class PaperFigure:
         title: Name in tables.
         codec: The corresponding codec of this package.
         variant: Beginning of the variant, for vq.
-        paper_bytes: Bytes of the paper for 49 x 113 px.
+        paper_bytes: Bytes of the paper for 113 x 49 px.
         paper_psnr: PSNR of the paper, dB.
     """
 

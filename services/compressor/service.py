@@ -102,7 +102,7 @@ class CompressorService(Service[CompressorConfig]):
                 vehicle=image.vehicle_id,
                 contact_id=snippet.contact.contact_id,
                 image_id=image.image_id,
-                pixels=f"{image.height_px}x{image.width_px}",
+                pixels=f"{image.width_px}x{image.height_px}",
                 bytes=len(stream),
                 encode_ms=round(1000 * (time.perf_counter() - started), 1),
             ),

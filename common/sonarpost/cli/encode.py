@@ -150,7 +150,7 @@ def _decode_file(path: Path, folder: Path, tiles: TileDatabase | None) -> str:
         mask = folder / f"{path.stem}.missing.png"
         write_png(mask, decoded.missing.astype(np.uint8) * np.uint8(255))
         missing = f", {100 * decoded.missing.mean():.1f} % missing (white in {mask.name}): {'; '.join(decoded.notes)}"
-    return f"{path} -> {target}: {header.height_px} x {header.width_px} px{missing}"
+    return f"{path} -> {target}: {header.width_px} x {header.height_px} px{missing}"
 
 
 def _read_stream(path: Path) -> bytes:

@@ -1,4 +1,4 @@
-"""Measure the time of a codec on the validation images of 140 x 80 px: processor time of one thread.
+"""Measure the time of a codec on the validation images of 80 x 140 px: processor time of one thread.
 
 OMP_NUM_THREADS=1 python -m research.training.emb.timing --pool /tmp/emb/pool.npz
 """

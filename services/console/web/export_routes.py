@@ -183,7 +183,7 @@ def _time_text(utc_s: object) -> str:
 
 def _scale_text(record: Json, image: ReconstructedImage) -> str:
     along, across = record.get("pixel_along_m"), record.get("pixel_across_m")
-    size = f"{image.picture.height_px} x {image.picture.width_px} px"
+    size = f"{image.picture.width_px} x {image.picture.height_px} px"
     if not isinstance(along, float) or not isinstance(across, float):
         return f"{size}, scale unknown; raw, as received"
     metres = f"{image.picture.height_px * along:.1f} m along x {image.picture.width_px * across:.1f} m across the track"

@@ -48,7 +48,7 @@ def _sheet_contacts(watcher: Watcher, settings: ChainSettings) -> list[SheetCont
     for image_id, encoded in by_confidence:
         snippet, received = watcher.snippets.get(encoded.contact.contact_id), watcher.shore.get(image_id)
         original = None if snippet is None else to_uint8(snippet.picture.to_array())
-        size = f"{encoded.height_px} x {encoded.width_px} px"
+        size = f"{encoded.width_px} x {encoded.height_px} px"
         raw = f"{size}, {encoded.height_px * encoded.width_px} B"
         place = f"{_position(watcher, image_id, encoded)}   confidence {_confidence(encoded)}"
         contacts.append(

@@ -23,7 +23,7 @@ PLATFORM_OF = {
 }
 HEALTH_INTERVAL_S = 0.25
 STREAM_BYTES = 200
-"""Stream length with v1: what the paper's codec makes of 80 x 140 px, so that both can be compared."""
+"""Stream length with v1: what the paper's codec makes of 140 x 80 px, so that both can be compared."""
 
 
 @dataclass(frozen=True)
