@@ -29,8 +29,10 @@ from sonarpost.link.receiver import (
 )
 from sonarpost.link.state import Byte, Errors, PartReader, Parts, below, pack_part, prefixed
 
-_MAX_UNANSWERED: Final = 6
-"""Feedback without an answer is repeated so many times, after twice the interval each time."""
+_MAX_UNANSWERED: Final = 24
+"""Maximum number of repetitions of feedback that no frame of the vehicle follows."""
+_MAX_WAIT_INTERVALS: Final = 10
+"""The wait between repetitions doubles from one feedback interval up to this many (10 min by default)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +218,7 @@ class VesselEndpoint:
             return True
         unanswered = self._unanswered.get(source, -1)
         if unanswered >= 0:
-            wait_s = self.v1.config.feedback_interval_s * 2**unanswered
+            wait_s = self.v1.config.feedback_interval_s * min(2**unanswered, _MAX_WAIT_INTERVALS)
             if unanswered >= _MAX_UNANSWERED or now - self._feedback_s.get(source, 0.0) < wait_s:
                 return False
         return self.v1.feedback_is_due(source, now)
