@@ -78,14 +78,13 @@ class AtomicFiles:
         """Return the content of an uncommitted file that was added with `last`, or None."""
         return self._texts.get(path)
 
-    def add(self, path: Path, data: bytes, *, last: bool = False, mode: int = 0o644) -> None:
+    def add(self, path: Path, data: bytes, *, last: bool = False) -> None:
         """Write a temporary file for `path`.
 
         Args:
             path: The file to create or replace; its folder must exist.
             data: Content of the file.
             last: The file marks the others as complete: it is renamed after they are on the disk.
-            mode: Its permissions, independent of the umask.
 
         Raises:
             OSError: It cannot be written; the files added before are not affected.
@@ -94,7 +93,7 @@ class AtomicFiles:
         self._staged.append(_Staged(descriptor, Path(name), path, last))
         try:
             # mkstemp creates files that only their owner can read.
-            os.fchmod(descriptor, mode)
+            os.fchmod(descriptor, PUBLIC_FILE)
             with os.fdopen(descriptor, "wb", closefd=False) as file:
                 file.write(data)
         except BaseException:

@@ -123,10 +123,9 @@ class FleetMonitor:
         images = [image.model_dump() for image in state.images]
         return {**body, "age_s": age_s, "stale": age_s > self._stale_s, "images": images}
 
-    def service_list(self, now_s: float | None = None) -> list[Json]:
+    def service_list(self) -> list[Json]:
         """Return the state of all services."""
-        now = time.monotonic() if now_s is None else now_s
-        return [_service_json(status) for status in self.services.state(now).services]
+        return [_service_json(status) for status in self.services.state(time.monotonic()).services]
 
 
 def unknown_vehicle_json(name: str) -> Json:

@@ -30,13 +30,12 @@ def client_config(endpoints: Sequence[str], tls: TlsConfig | None = None) -> zen
     return _config("client", listen=(), connect=endpoints, tls=tls)
 
 
-def router_config(listen: Sequence[str], connect: Sequence[str] = (), tls: TlsConfig | None = None) -> zenoh.Config:
+def router_config(listen: Sequence[str], connect: Sequence[str] = ()) -> zenoh.Config:
     """Return the configuration of an embedded router that links to the routers in `connect`.
 
-    It has no access control: every certificate of the fleet has all rights. `sonarpost pki router-config` writes
-    configurations with access control.
+    It has neither TLS nor access control. `sonarpost pki router-config` writes configurations with both.
     """
-    return _config("router", listen=listen, connect=connect, tls=tls)
+    return _config("router", listen=listen, connect=connect, tls=None)
 
 
 def _config(mode: str, listen: Sequence[str], connect: Sequence[str], tls: TlsConfig | None) -> zenoh.Config:
