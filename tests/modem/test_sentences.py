@@ -20,7 +20,6 @@ from sonarpost.modem.micromodem import (
     TransmitStatistics,
     nmea,
 )
-from sonarpost.modem.micromodem.command_queue import clock_command, query_command, set_command
 from sonarpost.modem.micromodem.nmea import Sentence
 from sonarpost.modem.micromodem.requests import flexible_command, mini_command, ping_command
 from sonarpost.modem.micromodem.sentences import (
@@ -39,6 +38,7 @@ from sonarpost.modem.micromodem.sentences import (
     parse_clock,
     transmit_data,
 )
+from sonarpost.modem.micromodem.supervisor import clock_command, query_command, set_command
 
 NINE_O_CLOCK = datetime(2016, 10, 12, 9, 0, 5, tzinfo=UTC)
 PARSED = [

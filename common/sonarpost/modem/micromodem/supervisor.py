@@ -1,19 +1,16 @@
-"""Supervision of the modem: configures it, checks that it answers, and recovers it after a restart or a failure."""
+"""Supervision of the modem: configures it, checks that it answers, and recovers it after a restart or a failure.
+
+Configuration commands are sent one after the other. Each is repeated without an answer, and finally given up.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from datetime import datetime
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import Enum, auto
 
-from sonarpost.modem.micromodem.command_queue import (
-    CommandProgress,
-    CommandQueue,
-    ModemCommand,
-    clock_command,
-    query_command,
-    set_command,
-)
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.events import (
     ClockConfirmed,
@@ -25,7 +22,59 @@ from sonarpost.modem.micromodem.events import (
     UnhandledSentence,
 )
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.sentences import ConfigurationSetting, Revision, parse_clock
+from sonarpost.modem.micromodem.sentences import ISO_SECONDS, ConfigurationSetting, Revision, parse_clock
+
+_OPTIONAL_TRIES = 2
+
+
+@dataclass(frozen=True, slots=True)
+class ModemCommand:
+    """A command and its expected answer.
+
+    Attributes:
+        sentence: The command.
+        answer: The expected answer; `_answers` defines the accepted differences.
+        required: Whether the driver cannot work without the answer.
+        tries: How often the command is sent, None for the configured number.
+    """
+
+    sentence: Sentence
+    answer: Sentence
+    required: bool = True
+    tries: int | None = None
+
+    @property
+    def text(self) -> str:
+        """The command as text for events and logs."""
+        return ",".join((self.sentence.kind, *self.sentence.fields))
+
+
+def set_command(name: str, value: int, *, required: bool = True) -> ModemCommand:
+    """Return the command that sets a value; the modem echoes name and value."""
+    fields = (name, str(value))
+    tries = None if required else _OPTIONAL_TRIES
+    return ModemCommand(Sentence("CCCFG", fields), Sentence("CACFG", fields), required, tries)
+
+
+def query_command(name: str, value: int) -> ModemCommand:
+    """Return the command that queries a value, and expects this one."""
+    return ModemCommand(Sentence("CCCFQ", (name,)), Sentence("CACFG", (name, str(value))))
+
+
+def clock_command(utc: datetime, generation: int | None) -> ModemCommand:
+    """Return the command that sets the modem's clock; the modem echoes the time.
+
+    It is sent only once, as its time is past at the second try. A modem of unknown generation gets the command of the
+    first.
+    """
+    utc = utc.astimezone(UTC)
+    if generation == 2:
+        text = utc.strftime(ISO_SECONDS)
+        command, answer = Sentence("CCTMS", (text, "0")), Sentence("CATMS", ("0", text))
+    else:
+        fields = tuple(str(value) for value in utc.timetuple()[:6])
+        command, answer = Sentence("CCCLK", fields), Sentence("CACLK", fields)
+    return ModemCommand(command, answer, required=False, tries=1)
 
 
 class Phase(Enum):
@@ -38,24 +87,31 @@ class Phase(Enum):
 
 
 class ModemSupervisor:
-    """Brings the modem to READY, and back to READY after any failure."""
+    """Brings the modem to READY, and back to READY after any failure.
+
+    Attributes:
+        phase: State towards the modem. While CONFIGURING or CHECKING, commands wait for their answers.
+        firmware: Version reported by the modem, or None.
+    """
 
     def __init__(self, config: MicroModemConfig, send: Callable[[Sentence], None]) -> None:
         self.phase = Phase.CLOSED
         self.firmware: str | None = None
         self._config = config
-        self._commands = CommandQueue(config, send)
+        self._send = send
         self._alive_s = 0.0
         self._last_sentence_s: float | None = None
-        self._attempts = 0
         self._unresponsive = False
+        self._commands: deque[ModemCommand] = deque()  # the one that waits for its answer first
+        self._attempts = 0  # of the first command
+        self._earlier_attempts = 0  # of the first command before the configuration began again
+        self._failed_attempts = 0
+        self._sent_s = self._due_s = 0.0
 
     @property
-    def deadline_s(self) -> float | None:
+    def deadline_s(self) -> float:
         """When the next command or the next check is due."""
-        if self.phase is Phase.READY:
-            return self._alive_s + self._config.keepalive_s
-        return self._commands.deadline_s
+        return self._alive_s + self._config.keepalive_s if self.phase is Phase.READY else self._due_s
 
     @property
     def generation(self) -> int | None:
@@ -72,7 +128,7 @@ class ModemSupervisor:
     def close(self) -> None:
         """Stop: the port was closed."""
         self.phase = Phase.CLOSED
-        self._commands.stop()
+        self._commands.clear()
 
     def note_sentence(self, now: float) -> None:
         """Record that a valid sentence was received."""
@@ -80,9 +136,8 @@ class ModemSupervisor:
 
     def check(self, now: float, command: ModemCommand | None = None) -> None:
         """Require the answer to a command, by default the query of the address, before anything else is sent."""
-        self.phase = Phase.CHECKING
-        self._commands.begin([command or query_command("SRC", self._config.address)], now)
-        self._commands.poll(now)
+        self._begin(Phase.CHECKING, [command or query_command("SRC", self._config.address)], now)
+        self.poll(now, may_check=False)
 
     def set_clock(self, utc: datetime, now: float) -> None:
         """Send the time."""
@@ -103,7 +158,7 @@ class ModemSupervisor:
             SentenceError: A wrong field.
         """
         setting = ConfigurationSetting.parse(sentence)
-        if self._commands.receive(sentence, now) or self.phase is Phase.CONFIGURING:
+        if self._is_answered(sentence, now) or self.phase is Phase.CONFIGURING:
             return []
         if setting.name == "SRC" and setting.number != self._config.address:
             # Another program has set it, or the sentence of a restart was lost.
@@ -118,52 +173,94 @@ class ModemSupervisor:
             SentenceError: A wrong field.
         """
         utc = parse_clock(sentence)
-        if self._commands.receive(sentence, now):
-            return [ClockConfirmed(utc)]
-        return [UnhandledSentence(sentence)]
+        return [ClockConfirmed(utc) if self._is_answered(sentence, now) else UnhandledSentence(sentence)]
+
+    def _is_answered(self, sentence: Sentence, now: float) -> bool:
+        """Return whether a sentence is the answer to the first command, which is then removed."""
+        if not self._commands or self._attempts == 0:
+            return False
+        if _answers(sentence, self._commands[0].answer):
+            self._remove_first(now)
+            return True
+        # The modem is busy with a dump: a longer wait has no cost, while a repeated query would prolong the dump.
+        latest_s = self._sent_s + self._config.dump_limit_s
+        self._due_s = max(self._due_s, min(now + self._config.dump_quiet_s, latest_s))
+        return False
 
     def poll(self, now: float, *, may_check: bool) -> list[ModemEvent]:
         """Do what is due; query a silent modem only with `may_check` (no exchange is in progress)."""
         if self.phase is Phase.CLOSED:
             return []
         if self.phase is Phase.READY:
-            if may_check and now >= self._alive_s + self._config.keepalive_s:
+            if may_check and now >= self.deadline_s:
                 self.check(now)
             return []
-        self._commands.poll(now)
-        events: list[ModemEvent] = [SettingUnconfirmed(command.text) for command in self._commands.take_unconfirmed()]
-        if self._commands.progress is CommandProgress.DONE:
+        events: list[ModemEvent] = []
+        while self._commands and now >= self._due_s:
+            command = self._commands[0]
+            if self._attempts < (command.tries or self._config.tries):
+                self._attempts += 1
+                # Only required commands wait longer at each try.
+                attempt = self._earlier_attempts + self._attempts if command.required else 1
+                self._sent_s, self._due_s = now, now + self._config.reply_wait_s(attempt)
+                self._send(command.sentence)
+            elif command.required:
+                events += self._failed(command, now)
+            else:
+                events.append(SettingUnconfirmed(command.text))
+                self._remove_first(now)
+        if not self._commands:
             events += self._done(now)
-        elif self._commands.progress is CommandProgress.FAILED:
-            events += self._failed(now)
         return events
 
     def _done(self, now: float) -> list[ModemEvent]:
-        self._commands.stop()
         was_configuring, self.phase = self.phase is Phase.CONFIGURING, Phase.READY
         self._alive_s = now
-        self._attempts = 0
+        self._failed_attempts = 0
         if not was_configuring:
             return []
         self._unresponsive = False
         return [ModemReady(self._config.address, self.firmware)]
 
-    def _failed(self, now: float) -> list[ModemEvent]:
+    def _failed(self, command: ModemCommand, now: float) -> list[ModemEvent]:
+        """Configure the modem again; report the first failure."""
         events: list[ModemEvent] = []
-        self._attempts += self._config.tries
+        self._failed_attempts += self._config.tries
         if not self._unresponsive:
             self._unresponsive = True
             silent_s = None if self._last_sentence_s is None else now - self._last_sentence_s
-            events.append(ModemUnresponsive(self._commands.current.text, self._attempts, silent_s))
-        self._configure(now, self._attempts)
-        self._commands.poll(now)
+            events.append(ModemUnresponsive(command.text, self._failed_attempts, silent_s))
+        self._configure(now, self._failed_attempts)
         return events
 
-    def _configure(self, start_s: float, earlier_attempts: int = 0) -> None:
-        self.phase = Phase.CONFIGURING
-        self._attempts = earlier_attempts
+    def _configure(self, start_s: float, failed_attempts: int = 0) -> None:
+        self._failed_attempts = failed_attempts
         address = self._config.address
         commands = [set_command("SRC", address), set_command("CST", 1)]
         commands += [set_command(name, value, required=False) for name, value in self._config.settings]
         commands += [query_command("SRC", address), query_command("CST", 1)]
-        self._commands.begin(commands, start_s, earlier_attempts)
+        self._begin(Phase.CONFIGURING, commands, start_s, failed_attempts)
+
+    def _begin(self, phase: Phase, commands: Iterable[ModemCommand], start_s: float, earlier_attempts: int = 0) -> None:
+        """Send commands from `start_s` on; `earlier_attempts` lengthen the first wait."""
+        self.phase = phase
+        self._commands = deque(commands)
+        self._attempts, self._earlier_attempts = 0, earlier_attempts
+        self._due_s = start_s
+
+    def _remove_first(self, now: float) -> None:
+        self._commands.popleft()
+        self._attempts = self._earlier_attempts = 0
+        self._due_s = now
+
+
+def _answers(sentence: Sentence, expected: Sentence) -> bool:
+    """Return whether a sentence is the expected answer; leading zeros and additional fields are accepted."""
+    if sentence.kind != expected.kind or len(sentence.fields) < len(expected.fields):
+        return False
+    return all(_normalised(a) == _normalised(b) for a, b in zip(expected.fields, sentence.fields, strict=False))
+
+
+def _normalised(text: str) -> str:
+    text = text.strip()
+    return (text.lstrip("0") or "0") if text.isdigit() else text
