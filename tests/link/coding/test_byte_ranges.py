@@ -70,12 +70,13 @@ def test_partial_bytes_behave_like_a_map_of_positions(pieces: list[tuple[int, by
     [
         (b"", "msgpack"),
         (b"\xc1", "msgpack"),
-        (msgpack.packb(5), "a length up to 65535, and pieces"),
-        (msgpack.packb([-1, []]), "a length up to 65535, and pieces"),
-        (msgpack.packb([MAX_PARTIAL_BYTES + 1, []]), "a length up to 65535, and pieces"),
-        (msgpack.packb([4, [[3, b"ab"]]]), "[position, bytes] within 4 bytes"),
-        (msgpack.packb([4, [[-1, b"ab"]]]), "[position, bytes] within 4 bytes"),
-        (msgpack.packb([4, [[0, b""]]]), "[position, bytes] within 4 bytes"),
+        (msgpack.packb(5), "expected a list"),
+        (msgpack.packb([4]), "pieces: got 'nothing'"),
+        (msgpack.packb([-1, []]), "length: got -1, expected 0..65535"),
+        (msgpack.packb([MAX_PARTIAL_BYTES + 1, []]), "length: got 65536, expected 0..65535"),
+        (msgpack.packb([4, [[3, b"ab"]]]), "expected bytes within 4"),
+        (msgpack.packb([4, [[-1, b"ab"]]]), "pieces[0][0]: got -1, expected 0..65535"),
+        (msgpack.packb([4, [[0, b""]]]), "expected bytes within 4"),
     ],
 )
 def test_malformed_partial_bytes_are_refused(packed: bytes, expected: str) -> None:

@@ -313,14 +313,15 @@ class BlockBuilder:
         arrive = arrivals(frames, self.config.planned_channels, self.config.depth)
         plan = plan_layers(distortion, self.symbol_bytes, arrive, first, later)
         unlayered = plan_unlayered(distortion, self.symbol_bytes, arrive, first)
-        if unlayered is not None and (plan is None or unlayered[1] >= plan.expected_db):
+        if unlayered is not None and (plan is None or unlayered[1] >= plan[1]):
             source = unlayered[0]
             room = source * self.symbol_bytes
             stops = _fitted_stops(images, starts, distortion.stops(room - first), room, None)
             return self._unlayered(images, stops, source, frames, final=True)
-        if plan is None or plan.expected_db <= 0:
+        if plan is None or plan[1] <= 0:
             return None
-        lengths = plan.layering.lengths(self.symbol_bytes)
+        layering = plan[0]
+        lengths = layering.lengths(self.symbol_bytes)
         objects: list[bytes] = []
         begins, total = starts, 0
         below: Sequence[PieceEnd] | None = None
@@ -330,7 +331,7 @@ class BlockBuilder:
             layer = _pieces(images, begins, stops, final=number == len(lengths) - 1)
             objects.append(layer.pack(length, below))
             begins, below = stops, layer.ends
-        return self._block(SymbolKind.LAYERED, objects, images, starts, begins, frames, layering=plan.layering)
+        return self._block(SymbolKind.LAYERED, objects, images, starts, begins, frames, layering=layering)
 
     def _unlayered(
         self, images: Sequence[OutgoingImage], stops: Sequence[int], source: int, planned: int, *, final: bool

@@ -6,15 +6,19 @@ Ranges are half-open, `[start, stop)`. A set of them is sorted and disjoint, and
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import msgpack
 
 from sonarpost.errors import FrameError
+from sonarpost.link.state import Bounds, from_plain, unpack_plain
 
 Range = tuple[int, int]
 Ranges = tuple[Range, ...]
 MAX_PARTIAL_BYTES = 0xFFFF
 """Longest byte string of a saved state."""
+
+_Position = Annotated[int, Bounds(0, MAX_PARTIAL_BYTES)]
 
 
 def add_range(ranges: Ranges, start: int, stop: int) -> Ranges:
@@ -50,6 +54,12 @@ def gaps_within(ranges: Ranges, start: int, stop: int) -> Ranges:
 def count_positions(ranges: Ranges) -> int:
     """Return how many positions `ranges` covers."""
     return sum(stop - start for start, stop in ranges)
+
+
+@dataclass(frozen=True, slots=True)
+class _SavedBytes:
+    length: _Position
+    pieces: list[tuple[_Position, bytes]]
 
 
 @dataclass(eq=False, slots=True)
@@ -105,18 +115,11 @@ class PartialBytes:
         Raises:
             FrameError: `packed` is something else.
         """
-        try:
-            match msgpack.unpackb(packed):
-                case [int(length), list(pieces)] if 0 <= length <= MAX_PARTIAL_BYTES:
-                    found = cls(bytearray(length))
-                case _:
-                    raise FrameError("partial bytes", "", packed, f"a length up to {MAX_PARTIAL_BYTES}, and pieces")
-        except (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException) as error:
-            raise FrameError("partial bytes", "", packed, "msgpack") from error
-        for piece in pieces:
-            match piece:
-                case [int(start), bytes(data)] if data and start >= 0 and start + len(data) <= length:
-                    found.write(start, data)
-                case _:
-                    raise FrameError("partial bytes", "piece", piece, f"[position, bytes] within {length} bytes")
+        where = "partial bytes"
+        saved = from_plain(_SavedBytes, unpack_plain(list, packed, where), where)
+        found = cls(bytearray(saved.length))
+        for start, data in saved.pieces:
+            if not data or start + len(data) > saved.length:
+                raise FrameError(where, "piece", (start, len(data)), f"bytes within {saved.length}")
+            found.write(start, data)
         return found

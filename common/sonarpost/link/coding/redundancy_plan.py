@@ -129,19 +129,6 @@ class GroupDistortion:
         return [int(stop) for stop in self.starts + more]
 
 
-@dataclass(frozen=True, slots=True)
-class LayerPlan:
-    """Layers and their expected gain.
-
-    Attributes:
-        layering: The layers of the block.
-        expected_db: Expected gain over the previews, summed over the images of the group.
-    """
-
-    layering: Layering
-    expected_db: float
-
-
 @cache
 def _compositions(layers: int) -> Counts:
     """Return all ways to write 16 as a sum of `layers` positive numbers, shape (ways, layers)."""
@@ -152,12 +139,12 @@ def _compositions(layers: int) -> Counts:
 
 def plan_layers(
     distortion: GroupDistortion, symbol_bytes: int, arrive: Values, first_overhead: int, next_overhead: int
-) -> LayerPlan | None:
-    """Return the layers with the greatest expected gain, None if the frames are too few.
+) -> tuple[Layering, float] | None:
+    """Return the layers with the greatest expected gain, and this gain; None if the frames are too few.
 
     Tries all divisions of a symbol into one to four layers in steps of a sixteenth, with the thresholds on a grid over
-    the number of frames that may arrive. The expected gain is the sum over layers of
-    (gain(bytes up to l) - gain(bytes up to l - 1)) P(at least k_l frames arrive).
+    the number of frames that may arrive. The expected gain, in dB over the previews and summed over the images, is the
+    sum over layers of (gain(bytes up to l) - gain(bytes up to l - 1)) P(at least k_l frames arrive).
 
     Args:
         distortion: Of the group's images.
@@ -174,7 +161,7 @@ def plan_layers(
     high = min(int(useful[-1]), frames)
     if low > high or symbol_bytes < SHARES:
         return None
-    best: tuple[float, Layering] | None = None
+    best: tuple[Layering, float] | None = None
     for first in sorted({int(n) for n in np.linspace(low, high, min(_FIRST_TRIES, high - low + 1))}):
         for layers in range(1, MAX_LAYERS + 1):
             for step in _STEPS if layers > 1 else (0,):
@@ -184,10 +171,10 @@ def plan_layers(
                 value, place = _best_shares(
                     distortion, symbol_bytes, needs, at_least[needs], first_overhead, next_overhead
                 )
-                if best is None or value > best[0]:
+                if best is None or value > best[1]:
                     shares = tuple(int(s) for s in _compositions(layers)[place])
-                    best = value, Layering(first, step, shares)
-    return None if best is None else LayerPlan(best[1], best[0])
+                    best = Layering(first, step, shares), value
+    return best
 
 
 def plan_unlayered(

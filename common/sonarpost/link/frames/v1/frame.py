@@ -139,28 +139,18 @@ def pack_segments(segments: Iterable[Segment], frame_bytes: int, protection: Fra
         raise FrameError("acoustic frame", "segments", 0, "at least one")
     body = bytearray()
     for segment in listed:
-        check_segment(segment)
-        body.append(segment.kind)
-        if segment.kind != SegmentKind.CONTACT:
-            body.append(len(segment.data))
-        body += segment.data
+        length, is_contact = len(segment.data), segment.kind == SegmentKind.CONTACT
+        if not 1 <= segment.kind < 32:
+            raise FrameError("acoustic frame", "segment kind", segment.kind, "1..31")
+        if length != CONTACT_SEGMENT_BYTES if is_contact else length > MAX_SEGMENT_BYTES:
+            expected = f"{CONTACT_SEGMENT_BYTES} bytes of a contact, at most {MAX_SEGMENT_BYTES} of others"
+            raise FrameError("acoustic frame", "segment", f"{length} bytes", expected)
+        body += bytes([segment.kind] if is_contact else [segment.kind, length]) + segment.data
     room = segments_room(frame_bytes, protection)
     if len(body) > room:
         raise FrameError("acoustic frame", "segments", f"{len(body)} bytes", f"at most {room} bytes")
     body[0] |= _SEGMENTS << 5
     return _protected(bytes(body.ljust(room, b"\0")), protection)
-
-
-def check_segment(segment: Segment) -> None:
-    """Raise FrameError if the kind or the length of a segment is invalid."""
-    if not 1 <= segment.kind < 32:
-        raise FrameError("acoustic frame", "segment kind", segment.kind, "1..31")
-    fits = len(segment.data) <= MAX_SEGMENT_BYTES
-    if segment.kind == SegmentKind.CONTACT:
-        fits = len(segment.data) == CONTACT_SEGMENT_BYTES
-    if not fits:
-        expected = f"{CONTACT_SEGMENT_BYTES} bytes of a contact, at most {MAX_SEGMENT_BYTES} of others"
-        raise FrameError("acoustic frame", "segment", f"{len(segment.data)} bytes", expected)
 
 
 def _protected(covered: bytes, protection: FrameProtection | None) -> bytes:

@@ -438,17 +438,15 @@ class V1Sender:
         if isinstance(feedback, RefineRequest):
             self.refine(feedback, now)
             return
-        self._resume_retired(feedback)
         self.state.tracker.measure(feedback, receiver, self.state.frames_sent)
         self._apply(feedback, now, receiver)
 
     def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int = 0) -> None:
         """Process the feedback of a mini-packet, on one block."""
-        feedback = Feedback(block_number, 0, (missing_symbols,))
-        self._resume_retired(feedback)
-        self._apply(feedback, now, receiver)
+        self._apply(Feedback(block_number, 0, (missing_symbols,)), now, receiver)
 
     def _apply(self, feedback: Feedback, now: float, receiver: int) -> None:
+        self._resume_retired(feedback)
         self.blocks, done = self.state.tracker.apply(feedback, self.blocks, self.config, now, receiver)
         record_delivered(self.kept, done)
 
