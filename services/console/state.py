@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 from sonarpost import wire
-from sonarpost.errors import BadInputError
 from sonarpost.messages import Advice, Command, CommandKind, Decision, DownlinkState, ReconstructedImage, TaskingState
 from sonarpost.review.costs import request_cost
 from sonarpost.review.measurement import Line, measure_line
@@ -16,7 +15,7 @@ from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.events import EventHub
 from sonarpost.services.console.fleet import FleetMonitor, fleet_json
 from sonarpost.services.console.store import contacts, decisions, requests
-from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter
+from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter, NotFoundError
 from sonarpost.services.console.store.database import (
     ID_COLUMN,
     RECORD_TYPES,
@@ -42,10 +41,6 @@ from sonarpost.services.console.store.serialisers import (
 
 FRAME_HEADER_BYTES = 13
 """Header of a frame in the format of the paper; a v1 header is shorter."""
-
-
-class NotFoundError(BadInputError):
-    """There is no such contact, version or file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,9 +149,7 @@ class ConsoleState:
         contact_id = None
         with self.database.transaction() as db:
             if table == "decision":
-                if decisions.apply_acknowledgement(db, record_id, consumer, reason, now):
-                    row = find_record(db, "decision", record_id)
-                    contact_id = row and str(row["contact_id"])
+                contact_id = decisions.apply_acknowledgement(db, record_id, consumer, reason, now)
             elif table == "request":
                 state = "asked" if reason is None else "refused"
                 contact_id = requests.update_request_state(db, record_id, state, reason or "", None, now)
@@ -238,10 +231,7 @@ class ConsoleState:
 
     def _contact_json(self, contact_id: str) -> Json:
         with self.database.read() as db:
-            row = contacts.find_contact(db, contact_id)
-        if row is None:
-            raise NotFoundError("contact", "id", contact_id, "a contact")
-        return contact_json(row)
+            return contact_json(contacts.find_contact(db, contact_id))
 
     def image(self, contact_id: str, version: int) -> ReconstructedImage:
         """Return the record of an image version."""
@@ -255,12 +245,11 @@ class ConsoleState:
 
     def request_costs(self, contact_id: str) -> list[Json]:
         """Return the cost of each kind of request for a contact."""
-        vehicle_id = str(self._contact_json(contact_id)["vehicle_id"])
-        rate = self.fleet.uplink_rate(vehicle_id, self.config.assumed_rate)
         with self.database.read() as db:
             row = contacts.find_contact(db, contact_id)
-            assert row is not None
             first = contacts.find_version(db, contact_id, 1)
+        vehicle_id = row["vehicle_id"]
+        rate = self.fleet.uplink_rate(vehicle_id, self.config.assumed_rate)
         # An expanded image has about the length of this image's first version, before more detail was requested.
         expanded_bytes = (0 if first is None else decode_image(first).bytes_total) or row["bytes_total"]
         found: list[Json] = []
@@ -306,7 +295,6 @@ class ConsoleState:
             ConflictError: Another decision was stored after the contact was displayed.
             BadInputError: The displayed image is not a version of this contact.
         """
-        self._contact_json(contact_id)
         with self.database.transaction() as db:
             decision_id = decisions.add_decision(db, contact_id, entered, actor, self.clock(), self._delivery_states())
         decision = self._publish_action("decision", contact_id, decision_id)
@@ -319,7 +307,6 @@ class ConsoleState:
             ConflictError: See `decide`.
             BadInputError: `decision_id` is not the valid decision.
         """
-        self._contact_json(contact_id)
         states = self._delivery_states()
         with self.database.transaction() as db:
             new_id = decisions.undo_decision(db, contact_id, decision_id, revision, actor, self.clock(), states)
@@ -337,7 +324,6 @@ class ConsoleState:
         Raises:
             BadInputError: The request is not possible, or one of this kind is in progress.
         """
-        self._contact_json(contact_id)
         with self.database.transaction() as db:
             command_id = requests.add_request(db, contact_id, kind, airtime_s, actor, self.clock())
         return self._publish_action("request", contact_id, command_id)

@@ -60,6 +60,9 @@ class Inbox:
         on_refused: Called with each error that caused a record to be refused.
         check_capacity: Called with the key before a record is stored; raises RetryLaterError if there is no space.
         delivery_only_keys: Key expressions on which plain publications are ignored.
+
+    Attributes:
+        storage_failing: Whether records cannot be stored at present, for example because of a full disk.
     """
 
     def __init__(
@@ -81,7 +84,7 @@ class Inbox:
         self._check_capacity = check_capacity
         self._messages: queue.Queue[_Message] = queue.Queue(QUEUE_LIMIT)
         self._stop = threading.Event()
-        self._storage_failing = False
+        self.storage_failing = False
         self._retained: list[_Message] = []
         self._no_capacity: dict[str, str | None] = {}
         self._thread = threading.Thread(target=self._run, name=f"inbox-{consumer}", daemon=True)
@@ -91,11 +94,6 @@ class Inbox:
             self._declared.append(session.declare_queryable(keys.delivery_query(key, consumer), self._on_query))
             if key not in delivery_only_keys:
                 self._declared.append(session.declare_subscriber(key, self._on_sample))
-
-    @property
-    def storage_failing(self) -> bool:
-        """Whether records cannot be stored at present, for example because of a full disk."""
-        return self._storage_failing
 
     def close(self) -> None:
         """Stop receiving; uncommitted records are not acknowledged, their producers send them again."""
@@ -157,15 +155,15 @@ class Inbox:
             with self._store.transaction() as tx:
                 replies = [self._store_message(tx, message) for message in messages]
         except DeliveryError as error:
-            if not self._storage_failing:
+            if not self.storage_failing:
                 log.exception("Records cannot be stored; senders keep them", extra=kv(error=str(error)))
-            self._storage_failing = True
+            self.storage_failing = True
             self._retained = [message for message in messages if message.query is None]
             later: Replies = AckReply("later", reason=str(error)[:MAX_REASON])
             return [later] * len(messages)
-        if self._storage_failing:
+        if self.storage_failing:
             log.info("Records can be stored again")
-        self._storage_failing = False
+        self.storage_failing = False
         return replies
 
     # Store

@@ -11,6 +11,7 @@ from typing import Annotated, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from sonarpost import wire
+from sonarpost.errors import BadInputError
 from sonarpost.export.contacts import match_start_time
 from sonarpost.messages import ReconstructedImage
 from sonarpost.review.grouping import Look, nearest_group
@@ -79,6 +80,10 @@ class ContactFilter(BaseModel):
             conditions.append("(" + " OR ".join(f"c.{column} LIKE ? ESCAPE '\\'" for column in columns) + ")")
             values += [pattern] * len(columns)
         return " AND ".join(conditions) or "1", values
+
+
+class NotFoundError(BadInputError):
+    """There is no such contact, version or file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,9 +217,15 @@ def count_contacts(db: sqlite3.Connection) -> ContactCounts:
     return ContactCounts(total, unreviewed)
 
 
-def find_contact(db: sqlite3.Connection, contact_id: str) -> sqlite3.Row | None:
-    """Return the row of a contact, for `contact_json`; None if there is none."""
+def find_contact(db: sqlite3.Connection, contact_id: str) -> sqlite3.Row:
+    """Return the row of a contact, for `contact_json`.
+
+    Raises:
+        NotFoundError: There is no such contact.
+    """
     row: sqlite3.Row | None = db.execute(f"{CONTACT_QUERY} WHERE c.id = ?", (contact_id,)).fetchone()
+    if row is None:
+        raise NotFoundError("contact", "id", contact_id, "a contact")
     return row
 
 

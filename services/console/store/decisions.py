@@ -177,8 +177,8 @@ def apply_downlink_state(db: sqlite3.Connection, state: DownlinkState) -> bool:
 
 def apply_acknowledgement(
     db: sqlite3.Connection, decision_id: str, consumer: str, reason: str | None, now_utc_s: float
-) -> bool:
-    """Update a decision after a consumer on the vessel stored or refused it; return whether it has changed.
+) -> str | None:
+    """Update a decision after a consumer stored or refused it; return the contact identifier, None without a change.
 
     Args:
         db: Connection in a transaction.
@@ -190,14 +190,14 @@ def apply_acknowledgement(
     row = find_record(db, "decision", decision_id)
     column, stored = ("shore", "relay") if consumer == "relay" else ("vehicle", "asked")
     if row is None or row[column] != "waiting":
-        return False
+        return None
     db.execute(
         f"UPDATE decision SET {column} = ?, reason = ?, changed_utc_s = ? WHERE decision_id = ?",  # noqa: S608
         (stored if reason is None else "refused", reason or row["reason"], now_utc_s, decision_id),
     )
     if column == "shore" and reason is None:
         db.execute("UPDATE decision SET relayed_utc_s = ? WHERE decision_id = ?", (now_utc_s, decision_id))
-    return True
+    return str(row["contact_id"])
 
 
 def mark_delivered_to_shore(db: sqlite3.Connection, before_utc_s: float) -> list[str]:
@@ -213,7 +213,6 @@ def mark_delivered_to_shore(db: sqlite3.Connection, before_utc_s: float) -> list
 def _check_revision(db: sqlite3.Connection, contact_id: str, revision: int) -> sqlite3.Row:
     """Return the row of a contact if it still has the displayed revision."""
     row = find_contact(db, contact_id)
-    assert row is not None  # The caller has checked that the contact exists.
     if row["revision"] != revision:
         last = None if row["last_decision"] is None else find_record(db, "decision", row["last_decision"])
         raise ConflictError(contact_json(row), None if last is None else decision_json(last))

@@ -63,7 +63,6 @@ def add_request(
         BadInputError: The request is not possible, or one of this kind is in progress.
     """
     row = find_contact(db, contact_id)
-    assert row is not None  # The caller has checked that the contact exists.
     if reason := unavailable_reason(row, kind):
         raise BadInputError("request", "kind", kind, f"another kind: {reason}")
     in_progress = db.execute(

@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.logs import kv
 from sonarpost.review.measurement import NotMeasurableError
-from sonarpost.services.console.state import NotFoundError
+from sonarpost.services.console.store.contacts import NotFoundError
 from sonarpost.services.console.store.database import Actor, Permission, Side
 from sonarpost.services.console.store.decisions import ConflictError
 from sonarpost.services.console.store.serialisers import Json

@@ -15,8 +15,8 @@ from sonarpost.messages import Advice, CommandKind, ReconstructedImage, Verdict
 from sonarpost.review import rendering
 from sonarpost.review.measurement import Line, MeasurementKind
 from sonarpost.review.rendering import LAYERS, MAPS
-from sonarpost.services.console.state import ConsoleState, NotFoundError
-from sonarpost.services.console.store.contacts import ContactFilter
+from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.store.contacts import ContactFilter, NotFoundError
 from sonarpost.services.console.store.database import DisplayedImage, Permission
 from sonarpost.services.console.store.decisions import DecisionInput
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call, RequestBody

@@ -9,7 +9,8 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from sonarpost.review.local_frame import LocalFrame
-from sonarpost.services.console.state import ConsoleState, NotFoundError
+from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.store.contacts import NotFoundError
 from sonarpost.services.console.store.serialisers import Json
 from sonarpost.services.console.web.access import AccessControl, Call
 
