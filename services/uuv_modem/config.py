@@ -1,4 +1,4 @@
-"""Configuration of the vehicle's modem: the `[uuv_modem]` table."""
+"""Configuration of the service: the `[uuv_modem]` table."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ Seconds = Annotated[float, Field(gt=0, le=86400)]
 
 
 class UuvModemConfig(ModemServiceConfig):
-    """Where pictures and messages go, how fast, and when.
+    """Destination, rate, redundancy, medium access and consumers of the acoustic link.
 
     Attributes:
-        address: The vehicle's modem.
-        destination: The vessel's modem; 1 in the paper.
+        address: Address of the vehicle's modem.
+        destination: Address of the vessel's modem; 1 in the paper.
         link: Wire format: "v1", or "paper" for the paper's.
         rate: Micro-Modem rate 0 to 6; the paper uses 4 in a tank and 1 at sea.
-        retry_s: Wait before a packet that the modem could not send is tried again.
-        allowed_rates: v1: other rates that may be used when the measured loss makes them better.
-        expected_loss: v1: share of frames lost, until reports tell.
-        feedback: v1: "auto" sends what reports ask for as long as reports come, "never" ignores them.
-        frames_per_image: v1: frames a picture costs on average without reports.
-        stream_bytes: v1: most bytes of a picture's stream that are sent unasked with reports.
-        group_delay_s: v1: how long an image waits, after its preview, for others to be coded together with it.
-        image_airtime_share: v1: share of frames that pictures get however many messages wait.
-        aging_s: v1: a message becomes one level more urgent for each such time that it waits.
-        max_messages: v1: most messages that wait; more stay with their programs.
-        mac: v1: "continuous" sends at once, "tdma" in slots, "polled" when asked, "csma" after random waits.
+        retry_s: Wait before a packet that the modem could not send is sent again.
+        allowed_rates: v1: further rates that are used when they are faster at the measured loss.
+        expected_loss: v1: share of frames lost, until feedback has measured it.
+        feedback: v1: "auto" sends what feedback requests while feedback arrives, "never" ignores feedback.
+        frames_per_image: v1: average frames for an image without feedback.
+        stream_bytes: v1: with feedback, maximum bytes of an image's stream that are sent without a command.
+        group_delay_s: v1: how long an announced image waits for others, to be coded in one group with them.
+        image_airtime_share: v1: share of frames for images, however many messages wait.
+        aging_s: v1: a message becomes one level more urgent each time it has waited so long.
+        max_messages: v1: maximum number of waiting messages; further ones stay with their senders.
+        mac: v1: "continuous" sends at once, "tdma" in slots, "polled" on request, "csma" after random waits.
         tx_burst_s: Continuous: time of transmission between two receive windows.
         rx_window_s: Continuous: length of a receive window, 0 for none. A packet that begins in it is received to its
             end, so it must cover the vessel's `holdoff_s`, the two-way travel time and one second.
-        holdoff_s: Continuous and random: how long after others were heard it does not begin; they may go on.
-        tdma_cycle_s: TDMA: length of the frame of slots; it begins at multiples of this since 1970-01-01 UTC.
-        slot_start_s: TDMA: where in the frame the slot begins.
+        holdoff_s: Continuous, csma: silence of other stations before this one sends.
+        tdma_cycle_s: TDMA: length of the cycle; cycles begin at multiples of it since 1970-01-01 UTC.
+        slot_start_s: TDMA: start of the slot in the cycle.
         slot_s: TDMA: length of the slot.
-        guard_s: TDMA: end of the slot that stays silent.
-        mean_backoff_s: Random: mean of the waits.
-        queue_interval_s: v1: how often the state of the queue is published.
-        refine_consumers: v1: services that take commands to refine, resend or widen a picture.
-        revisit_consumers: v1: services that take commands to revisit a position.
-        decision_consumers: v1: services that take operators' decisions.
+        guard_s: TDMA: time at the end of the slot without transmission.
+        mean_backoff_s: CSMA: mean of the random waits.
+        queue_interval_s: Maximum time between two publications of the queue state.
+        refine_consumers: v1: services that receive the commands refine, resend and expand.
+        revisit_consumers: v1: services that receive the command revisit.
+        decision_consumers: v1: services that receive operators' decisions.
     """
 
     address: Annotated[int, Field(ge=0, le=127)] = 3
@@ -90,7 +90,9 @@ class UuvModemConfig(ModemServiceConfig):
         return self
 
     def new_mac(self) -> MediumAccess:
-        """Return the medium access control (MAC) policy."""
+        """Return the policy of medium access control; the `paper` format always sends at once."""
+        if self.link == "paper":
+            return Continuous()
         match self.mac:
             case "continuous":
                 return Continuous(self.tx_burst_s, self.rx_window_s, self.holdoff_s)
@@ -102,7 +104,7 @@ class UuvModemConfig(ModemServiceConfig):
                 return Csma(self.mean_backoff_s, holdoff_s=self.holdoff_s, seed=self.address)
 
     def queue_config(self) -> QueueConfig:
-        """Return how the queue behaves."""
+        """Return the configuration of the `v1` transmit queue."""
         return QueueConfig(
             rates=tuple(sorted({self.rate, *self.allowed_rates})),
             first_rate=self.rate,

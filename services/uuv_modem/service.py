@@ -1,334 +1,315 @@
-"""Sends pictures and messages through the vehicle's modem, by the v1 link or as the paper does."""
+"""Sends images and messages through the vehicle's modem, and receives feedback and commands from the vessel."""
 
 from __future__ import annotations
 
 import logging
 import queue
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Final
 
-import msgpack
 import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem
-from sonarpost.errors import RetryLaterError
-from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.paper.sender import Packet, plan_packets
+from sonarpost.errors import BadInputError, DeliveryError, RetryLaterError
 from sonarpost.logs import kv
-from sonarpost.messages import (
-    AcousticFrame,
-    Contact,
-    EncodedImage,
-    OutgoingMessage,
-    QueuedImage,
-    QueueState,
-    Record,
+from sonarpost.messages import AcousticFrame, EncodedImage, OutgoingMessage, Record
+from sonarpost.modem.micromodem import (
+    RATES,
+    FrameDecoded,
+    FrameReceived,
+    MiniPacketReceived,
+    ModemEvent,
+    PacketFailed,
+    PacketSent,
+    PollReceived,
 )
-from sonarpost.modem.micromodem import RATES, ModemEvent, PacketFailed, PacketSent
 from sonarpost.runtime.modem_service import ModemService
-from sonarpost.runtime.service import ServiceStoppingError, UnitOfWork
+from sonarpost.runtime.service import UnitOfWork
 from sonarpost.services.uuv_modem.config import UuvModemConfig
-from sonarpost.services.uuv_modem.line import IMAGES_ACCEPTED, VehicleEndpoint
-from sonarpost.services.uuv_modem.line_runner import TAKEN, LineRunner
-from sonarpost.sonar.survey import Side
+from sonarpost.services.uuv_modem.vehicle_endpoint import VehicleEndpoint
 
 log = logging.getLogger(__name__)
 
-_PROGRESS = "progress"
-_WAIT_S = 0.2
-MAX_IMAGES_TOLD = 500
-_LAST_TIME_UTC_S = 0xFFFF_FFFE
-"""The latest second the contact record of the link can name, in the year 2106."""
+MAX_UNSAVED: Final = 1000
+"""Events that are kept while the store cannot be written; further frames are dropped, and the vessel repeats them."""
+SAVE_AGAIN_S: Final = 0.5
+_MAX_WAIT_S: Final = 0.2
+_MIN_WAIT_S: Final = 0.005
+_STATE_INTERVAL_S: Final = 0.2
+"""Minimum time between two publications of the queue state when images were accepted or sent."""
 
 
 class UuvModemService(ModemService[UuvModemConfig]):
     """The vehicle's end of the acoustic link.
 
-    With `link = "v1"` accepted records go from the inbox to the queue, which `LineRunner` works off. With "paper" an
-    image leaves the inbox when its last packet has gone into the water. How far either has come is kept with every
-    packet, so that a restart sends at most one packet twice; the receiver knows repeated frames.
+    `handle` adds a record to the transmit queue. The transaction that removes the record from the inbox also writes the
+    queue. The link's thread sends the packets, and commits each before it is sent: a restart sends at most one packet
+    twice.
+
+    Raises:
+        ConfigError: The port has an unsupported kind of URL, or the key file cannot be read.
     """
 
     NAME = "uuv_modem"
+    BATCH = 64
 
     def __init__(self, platform: PlatformConfig, config: UuvModemConfig) -> None:
         super().__init__(platform, config)
-        self._outcomes: queue.Queue[PacketSent | PacketFailed] = queue.Queue()
-        self._packet_number = 0
-        self._line: VehicleEndpoint | None = None
-        self._line_trouble = ""
-        self._runner: LineRunner | None = None
-        if config.link == "v1":
-            try:
-                self._line, self._runner = self._new_line()
-            except BaseException:
-                self.store.close()
-                raise
+        try:
+            self._migrate()
+            self._endpoint = VehicleEndpoint(platform, config, self.store)
+        except BaseException:
+            self.store.close()
+            raise
+        self._mac = config.new_mac()
+        self._events: queue.SimpleQueue[ModemEvent | None] = queue.SimpleQueue()
+        self._unsaved: list[Callable[[], None]] = []  # changes of the endpoint that are not committed yet
+        self._packet_id: int | None = None  # the packet that the modem is sending
+        self._offered: tuple[bytes, ...] = ()  # frames for the next poll
+        self._retry_at_s = 0.0
+        self._previous_end_s: float | None = None
+        self._packet_s: dict[int, float] = {}  # measured duration of a packet by rate
+        self._packets = 0
+        self._link_error = ""
+        self._published_at_s: float | None = None
+        self._published_images = (0, 0)
 
-    def _new_line(self) -> tuple[VehicleEndpoint, LineRunner]:
-        line = VehicleEndpoint(self.platform, self.config, self.store, _summary_of_image, self.count)
-        runner = LineRunner(
-            line,
-            self.modem,
-            self.config,
-            self.config.new_mac(),
-            self.stopping,
-            show=self._show,
-            tell=self._tell_queue,
-            problem=self._line_problem,
-            count=self.count,
-        )
-        return line, runner
+    def _migrate(self) -> None:
+        """Return records to the inbox that version 0.1 stored between the inbox and the queue.
+
+        An image that version 0.1 was sending in the `paper` format is sent again from its beginning.
+        """
+        with self.store.transaction() as tx:
+            for name in self.store.state_names("arrival/") if self.config.link == "v1" else ():
+                payload = self.store.get_state(name) or b""
+                is_message = wire.unpack_map(payload, name).get("type") == OutgoingMessage.TYPE
+                own_key = keys.message_outgoing if is_message else keys.image_encoded
+                tx.accept(own_key(self.platform.id), payload)
+                tx.delete_state(name)
+            tx.delete_state("progress")
+
+    def on_start(self) -> None:
+        """Open the port and start the link's thread."""
+        super().on_start()
+        if self.config.mac == "polled" and self.config.link == "v1":
+            self.modem.set_poll_handler(self._answer_poll)
+        self.start_thread(self._run_link, "link")
+
+    # Records of the vehicle's programs
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """Encoded images of this vehicle, and with v1 other traffic."""
+        """Return encoded images of this vehicle, and with `v1` messages of its programs."""
         images: dict[str, type[Record]] = {keys.image_encoded(self.platform.id): EncodedImage}
         if self.config.link == "v1":
             images[keys.message_outgoing(self.platform.id)] = OutgoingMessage
         return images
 
     def validate(self, key: str, record: Record) -> None:
-        """Refuse what can never be sent, while its sender can still be told."""
+        """Refuse a record that the wire format cannot carry."""
         assert isinstance(record, (EncodedImage, OutgoingMessage))
-        if self._line is not None:
-            self._line.check(record)
-        elif isinstance(record, EncodedImage):
-            self._plan(record)
+        self._endpoint.check(record)
 
     def check_capacity(self, key: str) -> None:
-        """Leave messages with their programs while too many wait."""
-        if (
-            self._line is not None
-            and key == keys.message_outgoing(self.platform.id)
-            and not self._line.queue.accepts_messages
-        ):
-            raise RetryLaterError(f"{key}: {self.config.max_messages} messages wait already")
-
-    def on_start(self) -> None:
-        """Open the port, and go on with what was under way."""
-        super().on_start()
-        if self._line is not None and self._runner is not None:
-            self._line.load(self.platform.id, time.time())
-            self.start_thread(self._runner.run, "link")
-        else:
-            self.start_thread(self._publish_paper_queue, "queue state")
-
-    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
-        """As the base does, and wake the link."""
-        superseded = super().commit_batch(handled)
-        if self._runner is not None:
-            self._runner.take(None)
-        return superseded
-
-    def gauges(self) -> Mapping[str, float]:
-        """Return what waits for the water."""
-        line = self._line
-        if line is None:
-            return super().gauges()
-        # Read while the link works on it: numbers of one moment or the next, never of a half-done change.
-        return {
-            **super().gauges(),
-            **line.queue.gauges(),
-        }
-
-    def degraded_reason(self) -> str:
-        """Return what is wrong with the port, the modem or the link's disk."""
-        return super().degraded_reason() or self._line_trouble
-
-    def _line_problem(self, detail: str) -> None:
-        if detail and detail != self._line_trouble:
-            log.error("The link waits", extra=kv(reason=detail))
-        self._line_trouble = detail
+        """Leave records with their senders below the disk reserve, and messages while `max_messages` wait."""
+        super().check_capacity(key)
+        if key == keys.message_outgoing(self.platform.id) and not self._endpoint.queue.accepts_messages:
+            raise RetryLaterError(f"{key}: {self.config.max_messages} messages wait")
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """Queue a record, or with the paper's link send an image, however long it takes."""
-        if self._line is not None:
-            effects.put_state(self._line.arrival_name(), effects.payload)
-            return
-        assert isinstance(record, EncodedImage)
-        packets = self._plan(record)
-        done = self._packets_done(record, len(packets))
-        log.info("Sending", extra=kv(image_id=record.image_id, packets=len(packets), already_sent=done))
-        for number in range(done, len(packets)):
-            self._send(packets[number])
-            if number + 1 < len(packets):
-                self._remember(record, number + 1)
-        effects.delete_state(_PROGRESS)
-        effects.put_state(IMAGES_ACCEPTED, str(int(self.store.get_state(IMAGES_ACCEPTED) or b"0") + 1).encode())
-        effects.count("images_sent")
-        log.info("Image sent", extra=kv(image_id=record.image_id, contact_id=record.contact.contact_id))
+        """Add a record to the transmit queue."""
+        assert isinstance(record, (EncodedImage, OutgoingMessage))
+        self._endpoint.add(record, time.time())
+
+    def _handle_batch(self, items: Sequence[InboxItem]) -> None:
+        with self._endpoint.step():
+            super()._handle_batch(items)
+        self._events.put(None)
+
+    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
+        """Commit effects together with the changes of the endpoint."""
+        with self._endpoint.step():
+            return super().commit_batch([*handled, (self._endpoint.take_changes(), None)])
+
+    # Events of the modem
 
     def on_modem_event(self, event: ModemEvent) -> None:
-        """Hand the fate of packets, and with v1 what is heard, to the sending thread."""
-        if self._runner is not None:
-            if isinstance(event, TAKEN):
-                self._runner.take(event)
-        elif isinstance(event, (PacketSent, PacketFailed)):
-            self._outcomes.put(event)
+        """Pass an event to the link's thread."""
+        self._events.put(event)
 
-    def _plan(self, image: EncodedImage) -> tuple[Packet, ...]:
-        rate = RATES[self.config.rate]
-        summary = summary_of(image.contact, image.height_px, image.width_px)
-        return plan_packets(image.image_id, image.stream, summary, rate.frames, rate.frame_bytes)
+    def _answer_poll(self, poll: PollReceived) -> Sequence[bytes]:
+        """Return the frames for another modem that polls this one; called in the modem's thread."""
+        frames = self._offered[: poll.frames]
+        if any(len(frame) > poll.frame_bytes for frame in frames):
+            log.warning("Polled at a rate with shorter frames", extra=kv(rate=poll.rate, configured=self.config.rate))
+            return ()
+        return frames
 
-    def _packets_done(self, image: EncodedImage, packets: int) -> int:
-        """Return how many packets of this image have gone, 0 when they were planned for another rate."""
-        kept = self.store.get_state(_PROGRESS)
-        if kept is None:
-            return 0
-        progress = msgpack.unpackb(kept)
-        same = (progress["image_id"], progress["rate"], progress["of"]) == (image.image_id, self.config.rate, packets)
-        return int(progress["done"]) if same else 0
+    def _process_events(self, wait_s: float) -> None:
+        try:
+            self._process(self._events.get(timeout=max(_MIN_WAIT_S, min(wait_s, _MAX_WAIT_S))))
+            while True:
+                self._process(self._events.get_nowait())
+        except queue.Empty:
+            return
 
-    def _remember(self, image: EncodedImage, done: int) -> None:
-        rate, packets = self.config.rate, len(self._plan(image))
-        progress = {"image_id": image.image_id, "rate": rate, "of": packets, "done": done}
-        with self.store.transaction() as tx:
-            tx.put_state(_PROGRESS, msgpack.packb(progress))
+    def _process(self, event: ModemEvent | None) -> None:
+        """Process an event, except for its changes of the endpoint, which `_save` makes and commits."""
+        now = time.time()
+        match event:
+            case PacketSent():
+                self._packet_sent(event, now)
+            case PacketFailed():
+                self._packet_failed(event, now)
+            case FrameDecoded():
+                self._mac.channel_busy(now)
+            case FrameReceived(dest=self.config.address):
+                self._receive(partial(self._endpoint.receive, event.src, event.data, now))
+            case MiniPacketReceived(dest=self.config.address):
+                self._receive(partial(self._endpoint.receive_mini, event.src, event.bits, now))
+            case _:
+                pass
 
-    def _send(self, packet: Packet) -> None:
-        """Send one packet, trying until the modem has sent it."""
-        while True:
-            packet_id = self.modem.send_packet(self.config.destination, self.config.rate, packet)
-            outcome = self._wait_for(packet_id)
-            if isinstance(outcome, PacketSent):
-                self._show(outcome)
-                return
-            self.count("packets_failed")
-            log.warning("Packet not sent, trying again", extra=kv(reason=outcome.reason, maybe=outcome.maybe_sent))
-            if self.stopping.wait(self.config.retry_s):
-                raise ServiceStoppingError
+    def _receive(self, change: Callable[[], None]) -> None:
+        if len(self._unsaved) < MAX_UNSAVED:
+            self._unsaved.append(change)
+        else:
+            self.count("frames_dropped")
 
-    def _wait_for(self, packet_id: int) -> PacketSent | PacketFailed:
+    def _packet_sent(self, sent: PacketSent, now: float) -> None:
+        if self._packet_id not in (None, sent.packet_id):
+            return
+        self._packet_id = None
+        self._offered = ()
+        packet_s = max(0.0, sent.finished_s - sent.started_s)
+        self._packet_s[sent.rate] = packet_s
+        self._mac.sent(now - packet_s, now)
+        interval_s = packet_s if self._previous_end_s is None else now - self._previous_end_s
+        self._previous_end_s = now
+        self._unsaved.append(partial(self._endpoint.packet_sent, sent.frames, interval_s, now))
+        self._publish_packet(sent, now)
+
+    def _packet_failed(self, failed: PacketFailed, now: float) -> None:
+        if self._packet_id not in (None, failed.packet_id):
+            return
+        self._packet_id = None
+        self._retry_at_s = now + self.config.retry_s
+        self.count("packets_failed")
+        log.warning("Packet not sent; retrying", extra=kv(reason=failed.reason, maybe_sent=failed.maybe_sent))
+
+    # The link's thread
+
+    def _run_link(self) -> None:
+        wait_s = 0.0
         while not self.stopping.is_set():
+            self._process_events(wait_s)
+            error = ""
             try:
-                outcome = self._outcomes.get(timeout=_WAIT_S)
-            except queue.Empty:
-                continue
-            if outcome.packet_id == packet_id:
-                return outcome
-        raise ServiceStoppingError
+                now = time.time()
+                self._save()
+                wait_s = self._send(now)
+                self._publish_queue_state(now)
+            except (DeliveryError, BadInputError) as failure:
+                # Nothing is sent until the changes are committed.
+                error = str(failure)
+                if error != self._link_error:
+                    log.error("Link cannot send", extra=kv(reason=error))
+                self.stopping.wait(SAVE_AGAIN_S)
+            self._link_error = error
 
-    def _show(self, sent: PacketSent) -> None:
-        """Publish the frames for observers."""
-        self._packet_number += 1
+    def _save(self) -> None:
+        """Change the endpoint by the events, and commit.
+
+        Raises:
+            DeliveryError: The store cannot be written; the next call repeats the changes.
+        """
+        with self._endpoint.step():
+            for change in self._unsaved:
+                change()
+            if self._endpoint.changed:
+                self.commit(UnitOfWork())
+        self._unsaved.clear()
+
+    def _send(self, now: float) -> float:
+        """Send a packet if one is due; return the time until then, in seconds.
+
+        Raises:
+            DeliveryError: The store cannot be written.
+            FrameError: Authentication has no counters left.
+        """
+        if self._packet_id is not None:
+            return _MAX_WAIT_S
+        with self._endpoint.step():
+            packet = self._endpoint.queue.in_flight
+            rate = packet.rate if packet else self._endpoint.queue.rate
+            mac_wait_s = self._mac.wait_s(self._packet_s.get(rate, RATES[rate].airtime_s), now)
+            polled = mac_wait_s is None
+            retry_wait_s = self._retry_at_s - now
+            if retry_wait_s > self.config.retry_s:
+                retry_wait_s = 0.0  # the clock was set back
+            wait_s = max(mac_wait_s or 0.0, retry_wait_s)
+            if wait_s > 0 or not (polled or self.modem.ready):
+                return wait_s or _MAX_WAIT_S
+            packet = self._endpoint.next_packet(now)
+            if packet is None:
+                self._previous_end_s = None
+                return _MAX_WAIT_S
+            if self._endpoint.changed:
+                self.commit(UnitOfWork())
+            if polled:
+                self._offered = packet.frames
+            else:
+                self._packet_id = self.modem.send_packet(self.config.destination, packet.rate, packet.frames)
+            return _MAX_WAIT_S
+
+    # Publications and health
+
+    def _publish_packet(self, sent: PacketSent, now: float) -> None:
+        self._packets += 1
         self.count("packets_sent")
         self.count("frames_sent", len(sent.frames))
-        now_utc_s = time.time()
         for number, data in enumerate(sent.frames, start=1):
             frame = AcousticFrame(
                 direction="tx",
                 platform_id=self.platform.id,
-                time_utc_s=now_utc_s,
+                time_utc_s=now,
                 source=self.config.address,
                 destination=sent.dest,
                 rate=sent.rate,
-                packet=self._packet_number,
+                packet=self._packets,
                 frame_number=number,
                 frame_count=len(sent.frames),
                 data=data,
             )
-            self._publish(frame)
+            self._publish(keys.acoustic_tx(self.platform.id), frame)
 
-    def _publish(self, frame: AcousticFrame) -> None:
+    def _publish_queue_state(self, now: float) -> None:
+        """Publish the state of the queue if it is due.
+
+        Raises:
+            DeliveryError: The state cannot be reloaded after a failed commit.
+        """
+        images = (self._endpoint.images_accepted, self._endpoint.queue.images_waiting)
+        interval_s = self.config.queue_interval_s
+        if images != self._published_images:
+            interval_s = min(interval_s, _STATE_INTERVAL_S)
+        if self._published_at_s is None or not 0 <= now - self._published_at_s < interval_s:
+            self._published_at_s, self._published_images = now, images
+            self._publish(keys.acoustic_queue(self.platform.id), self._endpoint.queue_state(now))
+
+    def _publish(self, key: str, record: Record) -> None:
         try:
-            key = keys.acoustic_tx(self.platform.id)
-            self.session.put(key, wire.encode(frame), encoding=wire.encoding_of(AcousticFrame))
+            self.session.put(key, wire.encode(record), encoding=wire.encoding_of(type(record)))
         except zenoh.ZError as error:
-            # The frame has gone into the water; that nobody could watch must not send it again.
-            log.warning("Frame not shown to observers", extra=kv(error=str(error)))
+            log.warning("Record not published", extra=kv(key=key, error=str(error)))
 
-    def _tell_queue(self, now_utc_s: float) -> None:
-        """Publish what waits and when it is expected to have gone."""
-        assert self._line is not None
-        waiting = self._line.queue
-        expected = waiting.expected(now_utc_s)
-        images = tuple(
-            QueuedImage(
-                image_id=each.image_id,
-                contact_id=each.contact_id,
-                bytes_left=each.bytes_left,
-                preview_utc_s=each.preview_s,
-                expected_utc_s=each.done_s,
-            )
-            for each in expected[:MAX_IMAGES_TOLD]
-        )
-        state = QueueState(
-            platform_id=self.platform.id,
-            time_utc_s=now_utc_s,
-            rate=waiting.rate,
-            frame_loss=waiting.measured_loss,
-            packet_interval_s=min(waiting.packet_interval_s, 86400.0),
-            messages_waiting=waiting.messages_waiting,
-            message_bytes=waiting.message_bytes,
-            images_waiting=len(expected),
-            images=images,
-            images_accepted=self._line.images_accepted,
-        )
-        self._publish_state(state)
+    def gauges(self) -> Mapping[str, float]:
+        """Return the state of the modem and of the transmit queue."""
+        return {**super().gauges(), **self._endpoint.queue.gauges()}
 
-    def _publish_paper_queue(self) -> None:
-        """Publish how many images wait in the inbox, every 0.2 s while that changes."""
-        published: tuple[int, int] | None = None
-        published_s = 0.0
-        while not self.stopping.wait(0.2):
-            sent = self.store.get_state(IMAGES_ACCEPTED)
-            waiting = self.store.inbox_depth()
-            if sent != self.store.get_state(IMAGES_ACCEPTED):
-                continue  # an image has gone between the two reads
-            accepted = int(sent or b"0") + waiting
-            if (waiting, accepted) == published and time.monotonic() - published_s < self.config.queue_interval_s:
-                continue
-            published, published_s = (waiting, accepted), time.monotonic()
-            self._publish_state(
-                QueueState(
-                    platform_id=self.platform.id,
-                    time_utc_s=time.time(),
-                    rate=self.config.rate,
-                    frame_loss=None,
-                    packet_interval_s=RATES[self.config.rate].airtime_s,
-                    messages_waiting=0,
-                    message_bytes=0,
-                    images_waiting=waiting,
-                    images=(),
-                    images_accepted=accepted,
-                )
-            )
-
-    def _publish_state(self, state: QueueState) -> None:
-        try:
-            key = keys.acoustic_queue(self.platform.id)
-            self.session.put(key, wire.encode(state), encoding=wire.encoding_of(QueueState))
-        except zenoh.ZError as error:
-            log.warning("State of the queue not published", extra=kv(error=str(error)))
-
-
-def _summary_of_image(image: EncodedImage) -> ContactSummary:
-    return summary_of(image.contact, image.height_px, image.width_px)
-
-
-def summary_of(contact: Contact, height_px: int, width_px: int) -> ContactSummary:
-    """Return what of a contact travels by sound, with the size of its picture.
-
-    What the record cannot hold travels as unknown: a vehicle's wrong clock must not cost the picture.
-    """
-    time_utc_s = contact.time_utc_s
-    has_fix = contact.lat_deg is not None and contact.lon_deg is not None
-    return ContactSummary(
-        height_px=height_px,
-        width_px=width_px,
-        lat_deg=contact.lat_deg if has_fix else None,
-        lon_deg=contact.lon_deg if has_fix else None,
-        time_utc_s=time_utc_s if time_utc_s is not None and time_utc_s <= _LAST_TIME_UTC_S else None,
-        confidence=contact.atd_confidence,
-        heading_deg=contact.heading_deg,
-        altitude_m=contact.altitude_m,
-        depth_m=contact.depth_m,
-        side=Side(contact.channel) if contact.channel else None,
-        ground_range_m=contact.ground_range_m if contact.channel else None,
-        pixel_along_m=contact.pixel_along_m,
-        pixel_across_m=contact.pixel_across_m,
-        position_sigma_m=contact.position_sigma_m if has_fix else None,
-    )
+    def degraded_reason(self) -> str:
+        """Return why the port, the modem or the link does not work."""
+        return super().degraded_reason() or self._link_error

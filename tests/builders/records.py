@@ -1,8 +1,21 @@
-"""Records for the tests of several services: a reconstructed image, a decision, a command."""
+"""Records for the tests of several services: images, a message, a decision, a command."""
 
 from __future__ import annotations
 
-from sonarpost.messages import Command, Decision, Pixels, ReconstructedImage
+import time
+
+import numpy as np
+
+from sonarpost.link.frames.paper.frame import format_image_id
+from sonarpost.messages import (
+    Command,
+    Contact,
+    Decision,
+    EncodedImage,
+    OutgoingMessage,
+    Pixels,
+    ReconstructedImage,
+)
 
 FIRST_S = 1_700_000_000.0
 
@@ -57,3 +70,31 @@ def command_record(kind: str, image_id: str) -> Command:
         issued_by="modem 1",
         issued_utc_s=1476262800.0,
     )
+
+
+def encoded_image(number: int, length: int = 300) -> EncodedImage:
+    """Return the image of contact c<number>; its stream has a valid header and a random body."""
+    return EncodedImage(
+        vehicle_id="uuv-1",
+        image_id=format_image_id(number),
+        contact=Contact(contact_id=f"c{number}", vehicle_id="uuv-1", lat_deg=56.4, lon_deg=-5.6, atd_confidence=1.5),
+        codec="emb",
+        model="",
+        height_px=80,
+        width_px=80,
+        stream=b"\x00\x00\x33" + np.random.default_rng(number).bytes(length - 3),
+        original_sha256="0" * 64,
+    )
+
+
+def outgoing_message(message_id: str, **changes: object) -> OutgoingMessage:
+    """Return a message whose data is its identifier; `changes` override fields."""
+    fields: dict[str, object] = {
+        "message_id": message_id,
+        "source": "autonomy",
+        "priority": 3,
+        "created_utc_s": time.time(),
+        "lifetime_s": 600.0,
+        "data": message_id.encode(),
+    }
+    return OutgoingMessage.model_validate(fields | changes)

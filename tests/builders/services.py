@@ -64,6 +64,7 @@ def short_retry_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sonarpost.services.decompressor.service.RETRY_AFTER_S", 0.05)
     monkeypatch.setattr("sonarpost.services.decompressor.service.QUIET_S", 0.05)
     monkeypatch.setattr("sonarpost.services.op_modem.service.SAVE_AGAIN_S", 0.05)
+    monkeypatch.setattr("sonarpost.services.uuv_modem.service.SAVE_AGAIN_S", 0.05)
 
 
 class ServiceRunner:

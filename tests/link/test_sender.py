@@ -96,11 +96,12 @@ def test_a_restart_at_any_moment_repeats_at_most_one_packet(new: NewSender) -> N
         restarted.add_image(image(number), 0.0)
     while (expected := steady.next_packet(now)) is not None:
         assert restarted.next_packet(now) == expected
+        assert restarted.images_waiting == steady.images_waiting == steady.gauges()["images_waiting"]
         for _ in range(2):  # before the packet is sent, and before the state says that it was
             parts = restarted.parts()
             restarted = new()
             assert restarted.restore(parts) == {}
-            assert restarted.next_packet(now) == expected
+            assert restarted.in_flight == restarted.next_packet(now) == expected
         assert restarted.expected(now) == steady.expected(now)
         steady.sent(expected.frames, 6.0)
         restarted.sent(expected.frames, 6.0)

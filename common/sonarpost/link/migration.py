@@ -175,6 +175,30 @@ def endpoint_parts(data: bytes) -> dict[str, bytes]:
     return parts
 
 
+def vehicle_parts(saved: Parts) -> tuple[dict[str, bytes], Errors]:
+    """Convert the parts of a vehicle's endpoint: queue, receiver and authentication; newer parts stay as they are.
+
+    Returns:
+        The new parts, and why parts of version 0.1 were skipped.
+    """
+    parts, errors = dict(saved), dict[str, FrameError]()
+    if any(name.startswith(("queue/core", "queue/picture/")) for name in saved):
+        old_queue = {name: parts.pop(name) for name in saved if name.startswith("queue/") or name == "packet"}
+        found, skipped = queue_parts({name.removeprefix("queue/"): data for name, data in old_queue.items()})
+        parts |= prefixed("queue/", found)
+        errors |= {name if name == "packet" else f"queue/{name}": error for name, error in skipped.items()}
+    for name, prefix, convert in (
+        ("heard", "receiver/", v1_receiver_parts),
+        ("seal", "authentication/", authentication_parts),
+    ):
+        if name in saved:
+            try:
+                parts |= prefixed(prefix, convert(saved[name]))
+            except FrameError as error:
+                errors[name] = error
+    return parts, errors
+
+
 def queue_parts(parts: Parts) -> tuple[dict[str, bytes], Errors]:
     """Convert the parts of a transmit queue, and the packet in flight in the part `packet`.
 

@@ -100,6 +100,11 @@ class ImageSender(ABC):
     def is_idle(self) -> bool:
         """Whether there is nothing to send, and nothing that feedback can request."""
 
+    @property
+    @abstractmethod
+    def images_waiting(self) -> int:
+        """Number of images of which something is still to be sent."""
+
     @abstractmethod
     def add_image(self, image: ImageToSend, now: float) -> bool:
         """Add an image; return False if nothing has to be sent for it.
@@ -147,9 +152,9 @@ class ImageSender(ABC):
     def expected(self, now: float) -> list[ExpectedDelivery]:
         """Return when each image is expected to be sent, the first to end first."""
 
-    @abstractmethod
     def gauges(self) -> Mapping[str, float]:
         """Return figures for the health record. Another thread may call this at any time."""
+        return {"images_waiting": float(self.images_waiting), "rate": float(self.rate)}
 
     @abstractmethod
     def parts(self) -> dict[str, bytes]:

@@ -96,7 +96,7 @@ def unpack_plain(kind: type[_T], data: bytes, where: str) -> _T:
     return plain
 
 
-def prefixed(prefix: str, parts: Parts) -> dict[str, bytes]:
+def prefixed(prefix: str, parts: Mapping[str, _T]) -> dict[str, _T]:
     """Return the parts with `prefix` before their names."""
     return {prefix + name: data for name, data in parts.items()}
 

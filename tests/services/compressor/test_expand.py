@@ -18,7 +18,7 @@ from sonarpost.services.atd_stub.survey_detection import snippet_of
 from sonarpost.services.compressor.encoding import expand
 from sonarpost.services.op_modem.station import order_of
 from sonarpost.services.uuv_modem.config import UuvModemConfig
-from sonarpost.services.uuv_modem.orders import ReceivedCommands
+from sonarpost.services.uuv_modem.received_commands import ReceivedCommands
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 
 IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
@@ -82,11 +82,11 @@ def test_expand_of_a_detection_shows_twice_the_ground(start_service, runner, atd
     first = modem.received[0]
     # A command on the vessel, bytes on the acoustic link, a command again on the vehicle.
     downlink_bytes = dl.pack(order_of(command_record("wider", first.image_id), 7))
-    outcome, handed = ReceivedCommands("uuv-1", UuvModemConfig(port="unused")).take(
+    outcome, received = ReceivedCommands("uuv-1", UuvModemConfig(port="unused")).accept(
         1, dl.unpack(downlink_bytes), first.image_id
     )
-    assert (outcome, handed.consumers) == (dl.CommandOutcome.ACCEPTED, ("compressor",))
-    runner.peer("uuv-1", "vehicle_commands").send(handed.key, "compressor", handed.record)
+    assert (outcome, received.consumers) == (dl.CommandOutcome.ACCEPTED, ("compressor",))
+    runner.peer("uuv-1", "vehicle_commands").send(received.key, "compressor", received.record)
     eventually(lambda: len(modem.received) == 2)
     expanded = modem.received[1]
     decoded = {image.image_id: emb.decode(image.stream).image.astype(float) for image in (first, expanded)}

@@ -32,7 +32,7 @@ CONNECT_S = 20.0
 IDLE_GAUGES: Mapping[str, tuple[str, ...]] = {
     "atd_stub": ("files_waiting", "contacts_waiting", "outbox"),
     "compressor": ("inbox", "outbox"),
-    "uuv_modem": ("inbox",),
+    "uuv_modem": ("inbox", "images_waiting"),
     "op_modem": ("outbox", "unsaved"),
     "decompressor": ("inbox", "outbox", "images_waiting"),
     "relay": ("inbox", "outbox"),

@@ -131,6 +131,11 @@ class TransmitQueue(ImageSender):
         return self.messages.waiting_bytes
 
     @property
+    def images_waiting(self) -> int:
+        """Number of images of which something is still to be sent."""
+        return len(self.open_numbers())
+
+    @property
     def is_idle(self) -> bool:
         """Whether there is nothing to send, and nothing that feedback can request."""
         return self.sender.is_idle and not self.messages.waiting and self.in_flight is None
@@ -138,9 +143,9 @@ class TransmitQueue(ImageSender):
     def gauges(self) -> Mapping[str, float]:
         """Return figures for the health record."""
         return {
+            **super().gauges(),
             "messages_waiting": float(len(self.messages.waiting)),
             "messages_expired": float(self.messages.expired),
-            "rate": float(self.rate),
             "frame_loss": self.planned_loss,
         }
 

@@ -16,7 +16,6 @@ The top half always precedes the bottom half: embedded codecs put the coarse ima
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -81,6 +80,9 @@ class PaperProgress:
 class PaperSender(ImageSender):
     """Transmit queue of the `paper` format: each image's packets are sent once, images in the order of arrival.
 
+    Attributes:
+        images: Images of which packets are still to be sent, in the order of sending.
+
     Args:
         rate: Number of the modem's rate.
     """
@@ -88,7 +90,7 @@ class PaperSender(ImageSender):
     def __init__(self, rate: int) -> None:
         super().__init__(RATES[rate].airtime_s)
         self._rate = rate
-        self._images: list[WaitingImage] = []
+        self.images: list[WaitingImage] = []
         self._next_order = 1
         self._packets_sent = 0
 
@@ -100,11 +102,12 @@ class PaperSender(ImageSender):
     @property
     def is_idle(self) -> bool:
         """Whether there is nothing to send."""
-        return not self._images
+        return not self.images
 
-    def gauges(self) -> Mapping[str, float]:
-        """Return figures for the health record."""
-        return {"rate": float(self.rate)}
+    @property
+    def images_waiting(self) -> int:
+        """Number of images of which packets are still to be sent."""
+        return len(self.images)
 
     def add_image(self, image: ImageToSend, now: float) -> bool:
         """Add an image and return True: an image that arrives again is sent again.
@@ -116,7 +119,7 @@ class PaperSender(ImageSender):
         contact = image.contact.rounded()
         added = WaitingImage(self._next_order, image.image_id, image.contact_id, contact, image.stream)
         self._plan(added)
-        self._images.append(added)
+        self.images.append(added)
         self._next_order += 1
         return True
 
@@ -125,16 +128,16 @@ class PaperSender(ImageSender):
         return plan_packets(image.image_id, image.stream, image.contact, rate.frames, rate.frame_bytes)
 
     def _select_packet(self, now: float) -> OutgoingPacket | None:
-        if not self._images:
+        if not self.images:
             return None
-        return OutgoingPacket(self.rate, self._plan(self._images[0])[self._packets_sent])
+        return OutgoingPacket(self.rate, self._plan(self.images[0])[self._packets_sent])
 
     def _packet_sent(self) -> tuple[str, ...]:
         self._packets_sent += 1
-        if self._packets_sent < len(self._plan(self._images[0])):
+        if self._packets_sent < len(self._plan(self.images[0])):
             return ()
         self._packets_sent = 0
-        return (self._images.pop(0).image_id,)
+        return (self.images.pop(0).image_id,)
 
     def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int) -> None:
         """Do nothing: the format has no feedback."""
@@ -143,7 +146,7 @@ class PaperSender(ImageSender):
         """Return when each image is expected to be sent, in the order of sending."""
         found: list[ExpectedDelivery] = []
         packets_before = 0
-        for place, image in enumerate(self._images):
+        for place, image in enumerate(self.images):
             packets = self._plan(image)
             left = packets[self._packets_sent :] if place == 0 else packets
             preview_s = now + (packets_before + 1) * self.packet_interval_s if len(left) == len(packets) else None
@@ -155,8 +158,8 @@ class PaperSender(ImageSender):
 
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`: the images, and the progress of the first."""
-        parts = {f"image/{image.order}": pack_part(image) for image in self._images}
-        order = self._images[0].order if self._images else self._next_order
+        parts = {f"image/{image.order}": pack_part(image) for image in self.images}
+        order = self.images[0].order if self.images else self._next_order
         progress = PaperProgress(order, self.rate, self._packets_sent, self.packet_interval_s)
         return {**parts, "progress": pack_part(progress)}
 
@@ -167,12 +170,14 @@ class PaperSender(ImageSender):
         """
         reader = PartReader(parts, "paper sender state")
         images = reader.read_group("image", WaitingImage, apply=self._plan)
-        self._images = sorted(images, key=lambda image: image.order)
+        self.images = sorted(images, key=lambda image: image.order)
         progress = reader.read("progress", PaperProgress) or PaperProgress(1, self.rate, 0, self.packet_interval_s)
         self._next_order = max([progress.order, *(image.order + 1 for image in images)])
         self.packet_interval_s = progress.packet_interval_s
-        if self._images and (progress.order, progress.rate) == (self._images[0].order, self.rate):
-            self._packets_sent = min(progress.packets_sent, len(self._plan(self._images[0])) - 1)
+        if self.images and (progress.order, progress.rate) == (self.images[0].order, self.rate):
+            self._packets_sent = min(progress.packets_sent, len(self._plan(self.images[0])) - 1)
+        # The state may be restored while the modem sends this packet.
+        self.in_flight = self._select_packet(0.0)
         return reader.errors
 
 
