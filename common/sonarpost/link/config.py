@@ -32,8 +32,8 @@ class SenderConfig:
         stream_bytes: Bytes of a stream that are planned at first; only with feedback.
         group_images: Maximum number of images in a group; 0 for as many as fill about 144 frames (`group_size`).
         depth: Groups that are sent at a time; their frames are interleaved against bursts.
-        group_delay_s: How long an image waits for others of its group.
-        max_defer_s: With feedback, how long without one until a few more symbols are sent.
+        group_delay_s: Maximum time that an image waits for others of its group.
+        max_defer_s: With feedback, time without one after which a few more symbols are sent.
         kept_images: Images to keep after they were sent, to refine them on request.
         announce: Whether contacts whose group waits are sent once before the detail of others.
 
@@ -91,8 +91,8 @@ class ReceiverConfig:
         max_contacts: Contacts to keep of each vehicle.
         block_memory_s: Time after its last symbol at which a block is deleted.
         contact_memory_s: Time after its last frame at which a contact is deleted.
-        feedback_interval_frames: Feedback is due after this many frames ...
-        feedback_interval_s: ... or this long after the last one, while something is missing.
+        feedback_interval_frames: While something is missing, feedback is due this many frames after the last one.
+        feedback_interval_s: While something is missing, feedback is also due this long after the last one.
 
     Raises:
         ConfigError: A value out of range.
@@ -120,13 +120,13 @@ class QueueConfig:
         burst_frames: Mean number of frames lost in a row.
         feedback: "never", or "auto": with feedback as long as it arrives.
         feedback_memory_s: How long after the last feedback another one is expected, while frames are sent.
-        max_defer_s: How long without feedback until a few more symbols are sent, in case all were lost.
+        max_defer_s: Time without feedback after which a few more symbols are sent, in case all were lost.
         image_airtime_share: Share of frames for images, however many messages wait.
         aging_s: Waiting time that makes a message one level more urgent.
         max_messages: Maximum number of waiting messages.
         frames_per_image: See `SenderConfig`.
         stream_bytes: See `SenderConfig`.
-        group_delay_s: How long an announced image waits for others of its group.
+        group_delay_s: Maximum time that an announced image waits for others of its group.
         kept_images: See `SenderConfig`.
 
     Raises:

@@ -19,7 +19,7 @@ class MediumAccess(ABC):
     """A policy of medium access.
 
     Args:
-        holdoff_s: How long after the last transmission of another station this one does not start: it may continue.
+        holdoff_s: Time after a transmission of another station without a packet of this one: the other may continue.
 
     Raises:
         ConfigError: A time out of range (also in the derived classes).
@@ -32,7 +32,7 @@ class MediumAccess(ABC):
 
     @abstractmethod
     def wait_s(self, packet_s: float, now: float) -> float | None:
-        """Return how long to wait before the next packet may start; None if only another station can request it.
+        """Return how long to wait before the next packet; None if it may only follow a request of another station.
 
         Args:
             packet_s: Time from the command to the modem to the end of the packet.
@@ -58,7 +58,7 @@ class Continuous(MediumAccess):
     Modems are half-duplex: a station that always sends receives nothing.
 
     Args:
-        tx_burst_s: How long it sends before a pause; a silence of its own counts as a pause.
+        tx_burst_s: How long it sends before a pause; a silence of this station counts as a pause.
         rx_window_s: Length of a pause; 0 for none.
         holdoff_s: See `MediumAccess`.
     """

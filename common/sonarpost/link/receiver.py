@@ -33,7 +33,7 @@ class ImageUpdate:
         contact: The contact record, None until it arrives.
         stream: The codec's stream, header first, with zeros in the ranges `missing`. Empty until a header arrives.
         missing: Ranges [start, stop) of `stream` that have not arrived, sorted and disjoint.
-        complete: Whether all arrived that the vehicle has planned to send so far.
+        complete: Whether everything has arrived that the vehicle has planned to send so far.
         received_bytes: Bytes of the image that arrived. The `paper` format does not count the stream header.
         total_bytes: Length of the image in the same count, 0 while it is unknown.
         frames: Frames that contributed. Always 0 with `v1`, where a frame can serve several images.
@@ -152,7 +152,7 @@ class FrameReceiver(Protocol):
     def accept(self, source: int, frame: bytes, now: float) -> list[Event]:
         """Process a frame after `poll(now)`; return the events of both.
 
-        Never raises because of `frame`: it reports one it cannot use as `FrameRejected`.
+        Never raises because of `frame`: an invalid one gives a `FrameRejected`.
 
         Args:
             source: Modem address of the sender.
@@ -168,10 +168,10 @@ class FrameReceiver(Protocol):
 
 
 class CombinedReceiver:
-    """Receives both wire formats and decides for every frame which of them it has.
+    """Receives both wire formats, and determines the format of each frame.
 
     A frame is of `v1` if `v1` accepts its checksum, and otherwise of `paper` if its fields are valid there. A frame of
-    one format is mistaken for the other once in 2^16 or less.
+    one format passes as one of the other with a probability of at most 2^-16.
 
     Args:
         v1: Receiver of `v1`, None to reject this format.

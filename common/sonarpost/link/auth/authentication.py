@@ -272,7 +272,7 @@ class FrameAuthenticator:
             expected = f"one not accepted before, above {max(-1, window.newest - WINDOW)}"
             raise FrameError(where, "counter", counter, expected)
         if counter > window.newest + self.settings.counter_step - WINDOW:
-            # Thousands of counters were tried for this tag. A second frame shortly after it makes up for that.
+            # A false tag passes more easily, as thousands of counters were tried: a second frame must confirm it.
             before = self._ahead.get(source)
             if before is None or not 0 < counter - before <= self.settings.counter_step - WINDOW:
                 self._ahead[source] = counter

@@ -268,7 +268,7 @@ class BlockBuilder:
         previews = self._block(SymbolKind.PREVIEW, [data], images, [0] * len(images), stops, planned, _PREVIEW_URGENCY)
         for image in images:
             if image.sent == shape.prefix_bytes == image.goal_bytes(self.config.stream_bytes):
-                image.sent -= 1  # a full entry cannot say that the stream ends; a piece of one byte does
+                image.sent -= 1  # a full entry has no mark of the stream's end; a piece of one byte has one
         if self.config.feedback:
             return [previews, *self.unlayered(images)]
         frames = min(round(self.config.frames_per_image * len(images)) - planned, erasure_code.MAX_SYMBOLS)

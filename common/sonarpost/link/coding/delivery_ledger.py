@@ -1,4 +1,4 @@
-"""What receivers have, according to their feedback: complete blocks, missing parts of images, and the loss.
+"""State of the delivery according to feedback: complete blocks, missing parts of images, and the loss.
 
 A complete block means that its parts of images are delivered. A block that the sender gave up delivers nothing: it was
 sent without feedback, left the window, or has another frame length. Its parts are missing until another block delivers

@@ -6,10 +6,10 @@ polynomial of degree below k with the source symbols at x_0 .. x_(k-1). Any k va
 Solomon, "Polynomial codes over certain finite fields", J. SIAM 8(2), 1960), so encoding and recovery are one Lagrange
 interpolation. The bytes at the same position of all symbols form one code word.
 
-In a layered block each symbol has a slice of every layer, and layer l can be recovered from any k_l symbols. More
-symbols give more layers, whichever they are (Albanese, Blomer, Edmonds, Luby, Sudan, "Priority encoding transmission",
-IEEE Trans. Information Theory 42, 1996). A descriptor of four bytes defines the layers. Each symbol carries one byte of
-its code, and any four give it.
+In a layered block each symbol has a slice of every layer, and layer l can be recovered from any k_l symbols. Only the
+number of symbols determines the number of layers (Albanese, Blomer, Edmonds, Luby, Sudan, "Priority encoding
+transmission", IEEE Trans. Information Theory 42, 1996). A descriptor of four bytes defines the layers. Each symbol
+carries one byte of the coded descriptor; any four symbols recover it.
 """
 
 from __future__ import annotations

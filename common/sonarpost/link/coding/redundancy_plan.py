@@ -1,7 +1,7 @@
-"""What to send: the value of the bytes of images, the layers of a group of images, and the number of symbols.
+"""Redundancy plan: the gain of the bytes of images, the layers of a group of images, and the number of symbols.
 
-Inputs are the measured loss and the codec's estimates of distortion. Nothing here is part of the format: a sender may
-plan differently, and every receiver still understands it.
+Inputs are the measured loss and the codec's estimates of distortion. Nothing here is part of the wire format: receivers
+decode the frames of any plan.
 """
 
 from __future__ import annotations
@@ -241,7 +241,7 @@ def copies(channel: LossChannel, missed: float = 0.01, limit: int = 8) -> int:
 def symbols_to_send(missing_symbols: int, channel: LossChannel, caution: float = 1.5) -> int:
     """Return how many symbols to send before the next feedback.
 
-    Fewer than the average need: feedback requests the rest, while symbols beyond the need are useless.
+    The number is below the average need: feedback requests the rest, and symbols beyond the need are wasted.
 
     Args:
         missing_symbols: Symbols that are missing at the receiver.

@@ -93,7 +93,7 @@ class MessageQueue:
             del self.known[next(iter(self.known))]
         active = {m.source for m in self.waiting.values()}
         if source not in active:
-            # A silent program gets no credit: otherwise it could block all others for as long.
+            # A program that was silent has no credit: with it, the program could block all others.
             floor = min((self.served.get(name, 0) for name in active), default=0)
             self.served[source] = max(self.served.get(source, 0), floor)
         message = QueuedMessage(self.next_key, message_id, source, priority, added_s, expires_s, data)

@@ -60,7 +60,7 @@ from sonarpost.modem.micromodem.sentences import (
 )
 from sonarpost.modem.micromodem.statistics import TransmitStatistics
 from sonarpost.modem.micromodem.supervisor import ModemSupervisor, Phase
-from sonarpost.modem.micromodem.transmit_cycle import OutgoingPacket, TransmitCycle, check_packet
+from sonarpost.modem.micromodem.transmit_cycle import QueuedPacket, TransmitCycle, check_packet
 
 
 class MicroModem:
@@ -78,7 +78,7 @@ class MicroModem:
         self._reception = ReceptionTracker(config)
         self._cycle: TransmitCycle | None = None
         self._request: RequestExchange | None = None
-        self._queue: deque[OutgoingPacket | ModemRequest] = deque()
+        self._queue: deque[QueuedPacket | ModemRequest] = deque()
         self._poll_handler: Callable[[PollReceived], Sequence[bytes]] | None = None
         self._next_id = 1
         self._out = bytearray()
@@ -161,7 +161,7 @@ class MicroModem:
             FrameError: An address, a rate or frames that the modem cannot send.
         """
         check_packet(destination, rate, frames)
-        packet = OutgoingPacket(self._next_id, destination, rate, tuple(bytes(f) for f in frames), ack, now)
+        packet = QueuedPacket(self._next_id, destination, rate, tuple(bytes(f) for f in frames), ack, now)
         self._enqueue(packet, now)
         return packet.packet_id
 
@@ -302,7 +302,7 @@ class MicroModem:
         if not (self._queue and channel_free and self._idle and self.phase is Phase.READY):
             return
         item = self._queue.popleft()
-        if isinstance(item, OutgoingPacket):
+        if isinstance(item, QueuedPacket):
             self._cycle = TransmitCycle(item, self.config, self._send, now)
         else:
             self._request = RequestExchange(item, self.config, self._send, now)
@@ -312,7 +312,7 @@ class MicroModem:
         self._enqueue(request, now)
         return request.request_id
 
-    def _enqueue(self, item: OutgoingPacket | ModemRequest, now: float) -> None:
+    def _enqueue(self, item: QueuedPacket | ModemRequest, now: float) -> None:
         self._next_id += 1
         if len(self._queue) >= self.config.queued_packets:
             self._events.append(item.failed(FailureReason.QUEUE_FULL))
@@ -383,7 +383,7 @@ class MicroModem:
         if not frames:
             return True
         check_packet(poll.dest, poll.rate, frames)
-        packet = OutgoingPacket(self._next_id, poll.dest, poll.rate, frames, poll.ack, now)
+        packet = QueuedPacket(self._next_id, poll.dest, poll.rate, frames, poll.ack, now)
         self._next_id += 1
         self._cycle = TransmitCycle(packet, self.config, self._send, now, polled=cycle)
         return True

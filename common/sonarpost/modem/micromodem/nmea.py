@@ -152,7 +152,7 @@ class LineAssembler:
         return items
 
     def reset(self) -> None:
-        """Drop the unfinished line and what was learnt: the port was closed."""
+        """Delete the unfinished line, and accept lines without a checksum again: the port was closed."""
         self._checksums_seen = False
         self._line.clear()
         self._length = 0
@@ -192,8 +192,8 @@ class FieldReader:
         sentence: The sentence.
         kinds: Accepted kinds; any when empty.
         at_least: Required number of fields.
-        strict: Reject missing fields, and integers with blanks or a plus sign. Modems are read with tolerance, hosts
-            strictly.
+        strict: Reject missing fields, and integers with blanks or a plus sign. The driver reads sentences of modems
+            with tolerance; the emulator reads those of hosts strictly.
 
     Raises:
         SentenceError: Another kind, or too few fields. The methods raise it for a field of another type or range.

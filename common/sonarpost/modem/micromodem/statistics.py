@@ -124,7 +124,7 @@ class TransmitStatistics:
 
 
 def _read(read: FieldReader, attributes: Sequence[Field[Any]]) -> dict[str, Any]:
-    """Return the values of attributes, which have the order of the fields of the sentence, each read by its type."""
+    """Return the values of attributes by name; their order is that of the sentence, and the type selects the reader."""
     readers: dict[object, Callable[[int, str], object]] = {
         "int": lambda index, name: read.integer(index, name, 0, 255),
         "str": read.text,

@@ -24,7 +24,7 @@ from sonarpost.modem.micromodem.statistics import TransmitStatistics
 
 
 @dataclass(frozen=True, slots=True)
-class OutgoingPacket:
+class QueuedPacket:
     """A queued packet."""
 
     packet_id: int
@@ -81,7 +81,7 @@ class TransmitCycle:
 
     def __init__(
         self,
-        packet: OutgoingPacket,
+        packet: QueuedPacket,
         config: MicroModemConfig,
         send: Callable[[Sentence], None],
         now: float,

@@ -6,7 +6,7 @@ import zlib
 from dataclasses import dataclass, field
 from typing import Annotated, Final
 
-from sonarpost.errors import BadInputError, FrameError
+from sonarpost.errors import FrameError
 from sonarpost.link.coding.block_decoder import BlockDecoder, DecodedObject, SymbolChunk
 from sonarpost.link.coding.byte_ranges import PartialBytes
 from sonarpost.link.config import ReceiverConfig
@@ -380,9 +380,9 @@ class V1Receiver:
         for item in [content] if isinstance(content, Symbol) else content:
             try:
                 events += self._process(peer, item, now, where)
-            except BadInputError as error:
+            except FrameError as reason:
                 self.counts.rejected += 1
-                events.append(FrameRejected(source, _as_frame_error(error, where), now))
+                events.append(FrameRejected(source, reason, now))
         for event in events:
             self.counts.updates += isinstance(event, ImageUpdate)
             self.counts.complete += isinstance(event, ImageUpdate) and event.complete
@@ -477,7 +477,3 @@ def _restored_blocks(reader: PartReader, table: str, address: int) -> dict[int, 
         blocks[block.number] = block
         reader.read_group(f"{table}-symbols/{address}/{block.number}", SymbolChunk, apply=block.restore_chunk)
     return blocks
-
-
-def _as_frame_error(error: BadInputError, where: str) -> FrameError:
-    return error if isinstance(error, FrameError) else FrameError(where, error.field, error.value, error.expected)

@@ -55,7 +55,7 @@ from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_
 
 _MIN_PREFIX_BYTES: Final = 16
 _MAX_SYMBOL_FACTOR: Final = 4
-"""Limit of the symbols sent of a block without feedback while other images wait, in its source symbols."""
+"""Maximum ratio of symbols sent to source symbols, of a block without feedback while other images wait."""
 _NO_FEEDBACK_CAUTION: Final = -2.5
 """Argument `caution` of `symbols_to_send` for a block without feedback: 2.5 standard deviations above the average."""
 _ANY_PRIORITY: Final = -(2**31)
@@ -88,15 +88,15 @@ class WaitingImages:
 class V1Sender:
     """Sends contacts, their images and messages.
 
-    With feedback, an image is delivered when feedback has confirmed all of its blocks. The sender repairs, when nothing
-    new is due, what it sent without feedback and what it gave up. It can do so as long as the image is kept.
+    With feedback, an image is delivered when feedback has confirmed all of its blocks. When no new group is due, the
+    sender repairs kept images: it sends again the parts that it sent without feedback or gave up.
 
     Attributes:
         waiting: Images that no block holds yet.
         blocks: Blocks that are being sent, the oldest first.
         retired: Blocks that were sent without feedback, and that feedback can still mention.
         kept: Images by number, the oldest first, including those that wait.
-        may_repair: Whether a part of an image may be missing at receivers, and in no block.
+        may_repair: Whether a part of a kept image may be neither delivered nor in a block.
         state: The rest of the state.
 
     Args:
