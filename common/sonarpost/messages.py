@@ -73,7 +73,7 @@ class Pixels(Record):
 
     @field_validator("data")
     @classmethod
-    def _length_fits(cls, data: bytes, info: ValidationInfo) -> bytes:
+    def _check_length(cls, data: bytes, info: ValidationInfo) -> bytes:
         if not {"height_px", "width_px", "bits"} <= info.data.keys():
             return data  # one of these fields is invalid, and the error is about it
         height_px, width_px, bits = info.data["height_px"], info.data["width_px"], info.data["bits"]
@@ -329,7 +329,7 @@ class ReconstructedImage(Record):
 
     @field_validator("picture_sha256")
     @classmethod
-    def _is_of_the_picture(cls, sha256: str, info: ValidationInfo) -> str:
+    def _check_digest(cls, sha256: str, info: ValidationInfo) -> str:
         picture = info.data.get("picture")
         if isinstance(picture, Pixels) and picture.sha256 != sha256:
             raise ValueError(f"{picture.sha256}, the sha256 of the picture's bytes")
@@ -337,7 +337,7 @@ class ReconstructedImage(Record):
 
     @field_validator("missing_mask")
     @classmethod
-    def _fits_the_picture(cls, mask: bytes, info: ValidationInfo) -> bytes:
+    def _check_mask(cls, mask: bytes, info: ValidationInfo) -> bytes:
         picture = info.data.get("picture")
         if isinstance(picture, Pixels):
             size = (picture.height_px * picture.width_px + 7) // 8
@@ -538,7 +538,7 @@ class Command(Record):
 
     @field_validator("image_id")
     @classmethod
-    def _names_an_image(cls, image_id: str | None, info: ValidationInfo) -> str | None:
+    def _check_image_id(cls, image_id: str | None, info: ValidationInfo) -> str | None:
         kind = info.data.get("kind")
         if image_id is None and kind in ("refine", "resend", "wider"):
             raise ValueError("the image to show more around" if kind == "wider" else f"the image to {kind}")
@@ -546,9 +546,9 @@ class Command(Record):
 
     @field_validator("lat_deg", "lon_deg")
     @classmethod
-    def _says_where(cls, degrees: float | None, info: ValidationInfo) -> float | None:
+    def _check_position(cls, degrees: float | None, info: ValidationInfo) -> float | None:
         if degrees is None and info.data.get("kind") == "revisit":
-            raise ValueError("where to revisit")
+            raise ValueError("the position to revisit")
         return degrees
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
 import sys
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from research.user_study.server import Answers, Folders, StudyApp
 from research.user_study.trials import results, table
 from sonarpost.errors import ConfigError
 from sonarpost.services.console.web.server import WebServer
+from sonarpost.stop_signals import stop_on_signals
 
 FILE_NAME = "panel.db"
 
@@ -82,16 +81,13 @@ def _print_results(path: Path, *, as_json: bool) -> int:
 
 
 def _serve(server: WebServer) -> None:
-    stopped = threading.Event()
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stopped.set())
-    server.start()
-    try:
-        while server.running and not stopped.wait(0.5):
-            pass
-    finally:
-        server.stop()
+    with stop_on_signals() as stop:
+        server.start()
+        try:
+            while server.running and not stop.wait(0.5):
+                pass
+        finally:
+            server.stop()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -51,7 +51,7 @@ class EventHub:
             self._subscribers.add(notify)
 
     def unsubscribe(self, notify: Callable[[], None]) -> None:
-        """Stop to call `notify`."""
+        """Stop calling `notify`."""
         with self._lock:
             self._subscribers.discard(notify)
 

@@ -26,7 +26,7 @@ from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
 log = logging.getLogger(__name__)
 
 CONSUMER = "c2"
-# Advice and commands keep the urgency with which they arrived. A decision is small and awaited. The first version of
+# Advice and commands keep the priority with which they arrived. Decisions are small and urgent. The first version of
 # every image precedes more detail of any image.
 COMMAND_PRIORITY = 1
 ADVICE_PRIORITY = 2

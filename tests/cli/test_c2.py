@@ -240,7 +240,7 @@ def test_command_is_sent_before_a_comment(capsys, c2, router):
         (["comment", "uuv-1", "--vessel", "vessel-1"], "image_id"),
         (["comment", "uuv-1/aaaa", "--vessel", "vessel-1"], "image_id"),
         (["comment", "uuv-1/AAAA", "--vessel", "vessel-1", "--confidence", "2"], "confidence"),
-        (["command", "uuv-1", "--vessel", "vessel-1", "--kind", "revisit"], "where to revisit"),
+        (["command", "uuv-1", "--vessel", "vessel-1", "--kind", "revisit"], "the position to revisit"),
         (["command", "uuv-1", "--vessel", "vessel-1", "--kind", "refine"], "the image to refine"),
     ],
 )

@@ -49,7 +49,7 @@ class ConnectivityState(Enum):
     NO_REPLY = "no reply"
 
 
-# Faults that need a person: a wrong certificate or access control list.
+# Faults that a person has to correct: a wrong certificate or access control list.
 FAULTS = (ConnectivityState.TLS_REFUSED, ConnectivityState.DENIED)
 
 

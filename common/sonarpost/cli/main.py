@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from sonarpost import __version__
 from sonarpost.errors import SonarpostError
 
-# Where each command is. Only the module of the command that is called is imported: all of them together take seconds.
+# Module of each command. Only the module of the given command is imported: all of them together take seconds.
 COMMANDS = {
     "demo": "demo",
     "run": "run",
@@ -50,7 +50,7 @@ EXIT_INTERRUPTED = 130
 
 
 def parser(command: str = "") -> argparse.ArgumentParser:
-    """Return the parser of one command, or of all of them where the name is not one."""
+    """Return the parser of one command, or of all commands for any other name."""
     whole = argparse.ArgumentParser(
         prog="sonarpost",
         description="Send images of sonar contacts from an underwater vehicle to a vessel and a shore site.",
@@ -64,7 +64,7 @@ def parser(command: str = "") -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit status (2: wrong input, with one line that says what)."""
+    """Run the command; return the exit status (2: invalid input, reported in one line)."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     new_name = RENAMED_COMMANDS.get(" ".join(given[:2])) or RENAMED_COMMANDS.get(" ".join(given[:1]))
     if new_name is not None:
@@ -90,7 +90,7 @@ def exit_status(run: Callable[[], int], prog: str = "sonarpost") -> int:
         return EXIT_ERROR
     except OSError as error:
         if isinstance(error, BrokenPipeError):
-            # The reader of our output has left (`| head`): not an error, and nothing more can be said to it.
+            # The reader has closed the output (`| head`): not an error.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
         print(f"{prog}: {error}", file=sys.stderr)

@@ -70,13 +70,13 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--range-loss", action="store_true", help="lose frames also by signal-to-noise ratio")
     parser.add_argument("--seed", type=int, metavar="N", help="seed of every random draw (default: 0)")
     parser.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="simulated seconds per second")
-    parser.add_argument("--log", type=Path, metavar="FILE", help="append the outcome of every packet, as JSON lines")
+    parser.add_argument("--log", type=Path, metavar="FILE", help="append the result of every packet, as JSON lines")
     parser.add_argument("--json", action="store_true", help="print the outcome of every packet, as JSON lines")
     parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Run the emulator until SIGINT or SIGTERM; return 0, or 1 when it failed."""
+    """Run the emulator until SIGINT or SIGTERM; return 0, or 1 if it failed."""
     with stop_on_signals() as stop:
         return _serve(parsed, stop)
 
@@ -111,7 +111,7 @@ def _print(line: str) -> None:
 
 
 def _discard_unread() -> None:
-    """Redirect output that has no reader any more, about which Python would report an error at exit."""
+    """Redirect output without a reader, for which Python would report an error at exit."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:
@@ -124,7 +124,7 @@ def _config(parsed: argparse.Namespace) -> EmulatorConfig:
     """Return the configuration that the command line describes.
 
     Raises:
-        ConfigError: A value out of its bounds, named as the library names it.
+        ConfigError: A value is out of range.
     """
     if parsed.renamed_water is not None:
         raise ConfigError("command line", "--water", parsed.renamed_water, "its new name, --channel")

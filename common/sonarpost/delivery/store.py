@@ -2,7 +2,7 @@
 
 The file uses WAL and synchronous=FULL. A received record is committed to `inbox` before it is acknowledged. Handling a
 record removes it from the inbox, adds new records to `outbox` and changes `state` in **one** transaction. A process
-that is killed at any moment therefore loses and duplicates nothing.
+that is killed at any moment therefore neither loses nor duplicates a record.
 """
 
 from __future__ import annotations
