@@ -125,7 +125,7 @@ def normalise_image(image: ScaledImage, side: Side) -> LevelGrid | None:
     floor = 0.02 * float(np.nanmedian(seabed))
     ratio = ((cells + floor) / (seabed + floor)).astype(np.float32)
     none = np.zeros(cells.shape[0], dtype=np.int64)
-    return LevelGrid(side, levels_of_ratio(ratio), ratio, none, none, columns, cell_m, row_m, row_is_measured=True)
+    return LevelGrid(side, levels_of_ratio(ratio), none, none, columns, cell_m, row_m, row_is_measured=True)
 
 
 def _without_padding(values: FloatImage) -> FloatImage:

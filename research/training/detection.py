@@ -104,7 +104,7 @@ def side_candidates(simulated_survey: SimulatedSurvey) -> list[SideCandidates]:
             index = object_at(simulated_survey.truth, side, candidate.measurement.row, sample, scale)
             objects.append(None if index is None else simulated_survey.truth[index])
         no_levels = np.broadcast_to(np.float32(0.0), grid.level.shape)
-        found.append(SideCandidates(replace(grid, level=no_levels, ratio=no_levels), candidates, objects))
+        found.append(SideCandidates(replace(grid, level=no_levels), candidates, objects))
     return found
 
 

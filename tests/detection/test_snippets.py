@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.detection.detector import detect
-from sonarpost.detection.snippets import cut_expanded, cut_ground_snippet, cut_snippet, to_grey
+from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image, to_grey
 from sonarpost.sonar.survey import ChannelPing, Side
 
 
@@ -159,33 +159,27 @@ def test_missing_samples_do_not_darken_expanded_snippet(found):
     assert np.abs(with_gaps[untouched].astype(int) - complete[untouched]).max() <= 6
 
 
-def test_ground_snippet_is_centred_at_its_scale(make_survey):
+def test_ground_image_is_centred_at_its_scale(make_survey):
     survey = make_survey({"pings": 10, "samples": 25, "shadow_samples": 40})
     (found,) = detect(survey)
-    cut = cut_ground_snippet(survey, found, size_m=8.0, pixel_m=0.1)
-    assert cut.image.shape == cut.known.shape == (80, 80)
-    assert cut.pixel_m == 0.1
-    assert cut.known.all()
-    assert cut.image[38:42, 37:43].mean() > 180
-    assert cut.image[38:42, 50:56].mean() < 60
+    image = ground_projected_image(survey, found, 80, 80, 0.1)
+    assert image.shape == (80, 80)
+    assert image[38:42, 37:43].mean() > 180
+    assert image[38:42, 50:56].mean() < 60
     # The object is 1.0 m long along-track: about ten rows of 0.1 m.
-    bright = cut.image[:, 37:43].mean(axis=1) > 150
+    bright = image[:, 37:43].mean(axis=1) > 150
     assert np.count_nonzero(bright) == pytest.approx(10, abs=3)
 
 
-def test_ground_snippet_beyond_recording_is_unknown(make_survey):
+def test_ground_image_is_black_beyond_recording(make_survey):
     survey = make_survey({"ping": 8})
     (found,) = detect(survey)
-    cut = cut_ground_snippet(survey, found, size_m=10.0, pixel_m=0.2)
-    assert not cut.known[:15].any()
-    assert (cut.image[~cut.known] == 0).all()
-    assert cut.known[30:].all()
+    image = ground_projected_image(survey, found, 50, 50, 0.2)
+    assert not image[:15].any()
+    assert image[30:].any(axis=1).all()
 
 
-def test_no_ground_snippet_without_navigation(make_survey):
+def test_no_ground_image_without_navigation(make_survey):
     survey = make_survey({}, navigation=False)
     (found,) = detect(survey)
-    assert cut_ground_snippet(survey, found) is None
-    for size_m, pixel_m in ((0.0, 0.1), (10.0, 0.0), (1.0, 2.0), (1000.0, 0.01)):
-        with pytest.raises(ValueError, match="size_m, pixel_m"):
-            cut_ground_snippet(survey, found, size_m, pixel_m)
+    assert ground_projected_image(survey, found, 100, 100, 0.1) is None

@@ -13,7 +13,7 @@ from sonarpost.cli.detect import annotated_waterfall
 from sonarpost.detection.detector import detect
 from sonarpost.detection.normalisation import normalise_side
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.snippets import cut_expanded, cut_ground_snippet, cut_snippet, ground_projected_image
+from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image
 from sonarpost.detection.stream import StreamDetector, is_continuation
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
@@ -91,7 +91,6 @@ def test_snippets_are_those_of_first_frequency(sample, samples, range_m, make_su
         assert other.first_sample == one.first_sample
         np.testing.assert_array_equal(other.image16, one.image16)
     np.testing.assert_array_equal(cut_expanded(both, found, 80, 140), cut_expanded(alone, found, 80, 140))
-    np.testing.assert_array_equal(cut_ground_snippet(both, found).image, cut_ground_snippet(alone, found).image)
     np.testing.assert_array_equal(
         ground_projected_image(both, found, 80, 140, 0.1), ground_projected_image(alone, found, 80, 140, 0.1)
     )

@@ -48,10 +48,10 @@ def test_interval_mean_weights_partial_samples():
     np.testing.assert_allclose(interval_means(samples, edges), [10, (5 + 20) / 1.5, 40, 40, (10 + 80) / 1.25])
 
 
-def test_interval_beyond_samples_or_too_narrow_is_nan():
+def test_interval_beyond_samples_or_empty_is_nan():
     samples = np.array([10, 20], np.uint16)
-    means = interval_means(samples, np.array([0.0, 0.0, 0.25, 1.0, 2.0, 2.5]), min_width=0.25)
-    np.testing.assert_array_equal(means, [np.nan, np.nan, 10, 20, np.nan])
+    means = interval_means(samples, np.array([0.0, 0.0, 0.25, 1.0, 2.0, 2.5]))
+    np.testing.assert_array_equal(means, [np.nan, 10, 10, 20, np.nan])
 
 
 @pytest.mark.parametrize("spacing", [0.0, -1.0, 1e-9, float("nan")])

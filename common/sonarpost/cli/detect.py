@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw
 from sonarpost.cli.parsers import Subparsers
 from sonarpost.detection.detector import MINE_LIKE, Detection
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.snippets import cut_ground_snippet, cut_snippet, to_grey
+from sonarpost.detection.snippets import cut_snippet, ground_projected_image, to_grey
 from sonarpost.detection.stream import StreamContact, StreamDetector
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
@@ -32,6 +32,10 @@ _HEADER = (
     "  n  conf  class      side       ping  sample  range_m  length_m  width_m  shadow_m  height_m  position"
     "                sigma_m"
 )
+
+# Size of the snippets that are projected to the bottom: 10 m x 10 m.
+_GROUND_PX = 100
+_GROUND_PIXEL_M = 0.1
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -156,9 +160,9 @@ def _write_snippets(folder: Path, result: FileResult) -> None:
     for number, contact in enumerate(result.contacts, start=1):
         name = f"{result.survey.path.stem}-{number:03d}"
         _write_png(folder / f"{name}.png", Image.fromarray(cut_snippet(contact.survey, contact.detection).image))
-        ground = cut_ground_snippet(contact.survey, contact.detection)
+        ground = ground_projected_image(contact.survey, contact.detection, _GROUND_PX, _GROUND_PX, _GROUND_PIXEL_M)
         if ground is not None:
-            _write_png(folder / f"{name}-ground.png", Image.fromarray(ground.image))
+            _write_png(folder / f"{name}-ground.png", Image.fromarray(ground))
 
 
 def _write_png(path: Path, image: Image.Image) -> None:

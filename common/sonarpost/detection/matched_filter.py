@@ -28,12 +28,10 @@ class MatchedResponse:
     Attributes:
         score: Shape (pings, cells), float32, in noise units, 0 without response; the cell is the highlight's centre.
         highlight_index: Same shape, index of the highlight size with the best response.
-        shadow_index: Same shape, index of the shadow length with the best response.
     """
 
     score: FloatImage
     highlight_index: npt.NDArray[np.int8]
-    shadow_index: npt.NDArray[np.int8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +43,6 @@ class Peak:
     score: float
     highlight_rows: int
     highlight_cells: int
-    shadow_cells: int
 
 
 def matched_response(grid: LevelGrid, settings: DetectorSettings) -> MatchedResponse:
@@ -61,21 +58,19 @@ def matched_response(grid: LevelGrid, settings: DetectorSettings) -> MatchedResp
     shape = grid.level.shape
     best = np.zeros(shape, dtype=np.float32)
     best_size = np.zeros(shape, dtype=np.int8)
-    best_length = np.zeros(shape, dtype=np.int8)
     for i, (rows, cells) in enumerate(sizes):
         along = (-(rows // 2), rows - rows // 2)
         bright = in_noise_units(integral.mean(along, (-(cells // 2), cells - cells // 2)), half)
         bright = np.maximum(np.nan_to_num(bright), 0.0)
         start = cells - cells // 2
-        for j, length in enumerate(lengths):
+        for length in lengths:
             dark = -in_noise_units(integral.mean(along, (start, start + length)), half)
             joint = np.sqrt(bright * np.maximum(np.nan_to_num(dark), 0.0))
             better = joint > best
             best[better] = joint[better]
             best_size[better] = i
-            best_length[better] = j
     best[~np.isfinite(grid.level)] = 0.0
-    return MatchedResponse(best, best_size, best_length)
+    return MatchedResponse(best, best_size)
 
 
 def highlight_size_cells(grid: LevelGrid, size_m: tuple[float, float]) -> tuple[int, int]:
@@ -93,9 +88,7 @@ def peaks(response: MatchedResponse, grid: LevelGrid, settings: DetectorSettings
     found = []
     for row, cell in zip(rows[order].tolist(), cells[order].tolist(), strict=True):
         highlight = highlight_size_cells(grid, settings.highlight_sizes_m[response.highlight_index[row, cell]])
-        shadow_m = settings.shadow_lengths_m[response.shadow_index[row, cell]]
-        shadow_cells = max(2, round(shadow_m / grid.cell_across_m))
-        found.append(Peak(row, cell, float(score[row, cell]), *highlight, shadow_cells))
+        found.append(Peak(row, cell, float(score[row, cell]), *highlight))
     return tuple(found)
 
 

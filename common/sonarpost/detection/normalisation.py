@@ -33,7 +33,6 @@ class LevelGrid:
         side: Port or starboard.
         level: Shape (pings, cells), float32, base-2 logarithm of echo over local median; NaN in the water column,
             beyond the end of a ping, and in a ping without this channel. Column 0 is nearest the vehicle.
-        ratio: Same shape, the same before the logarithm (1.0 is ordinary seabed); NaN at the same cells.
         bottom_cell: Shape (pings,), the first seabed cell (the number of cells if there is none).
         first_return_cell: Shape (pings,), the cell of the first bottom return, where slant range equals altitude.
         samples_per_cell: Number of file samples averaged into one cell.
@@ -44,7 +43,6 @@ class LevelGrid:
 
     side: Side
     level: FloatImage
-    ratio: FloatImage
     bottom_cell: IntVector
     first_return_cell: IntVector
     samples_per_cell: int
@@ -95,7 +93,6 @@ def normalise_side(
     return LevelGrid(
         side=side,
         level=levels_of_ratio(ratio),
-        ratio=ratio,
         bottom_cell=bottom,
         first_return_cell=first_return,
         samples_per_cell=samples_per_cell,

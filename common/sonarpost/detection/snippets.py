@@ -1,39 +1,31 @@
 """Snippets: the pixels of a contact, cut from a survey.
 
 - `cut_snippet` and `cut_expanded` keep the resolution of the recording (pings by samples of slant range).
-- `ground_projected_image` projects to the bottom for the snippets of contact records: rows and columns of fixed size
-  in metres, counted from below the sonar, with the altitude of each ping. It averages the echo strength, with the
-  weight of the recorder applied, over the fraction of every ping that a row covers.
-- `cut_ground_snippet` projects to the bottom for files: a square with the contact in its centre, at the altitude of
-  the contact. It averages the values of the file over whole pings, and reports which pixels are unknown.
+- `ground_projected_image` projects to the bottom: rows and columns of fixed size in metres, counted from below the
+  sonar, with the altitude of each ping. It averages the echo strength, with the weight of the recorder applied, over
+  the fraction of every ping that a row covers.
 
-The two projections differ pixel by pixel and are not interchangeable. All images are grey as `to_grey` maps it, with 0
-where nothing was recorded.
+All images are grey as `to_grey` maps it, with 0 where nothing was recorded.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from sonarpost.detection.detector import Detection
-from sonarpost.sonar.geometry import ground_to_slant_range_m
-from sonarpost.sonar.ground_range import MAX_COLUMNS, ground_range_image, interval_means
+from sonarpost.sonar.ground_range import MAX_COLUMNS, ground_range_image
 from sonarpost.sonar.survey import FloatImage, Side, Survey
 
 SNIPPET_HEIGHT_PX = 100
 SNIPPET_WIDTH_PX = 100
-MAX_SIDE_PX = 4096
 
 # Percentiles of the window that map to grey 0 and 255, so that a single glint does not darken the rest.
 LOW_PERCENTILE = 0.5
 HIGH_PERCENTILE = 99.5
 
-_MIN_PIXEL_SAMPLES = 1e-9
-"""At the nadir a pixel may span less of a ping; its mean would be rounding error."""
 _GREY_STEPS = 1 << 24
 """Steps of echo strength before the mapping to grey."""
 
@@ -192,22 +184,6 @@ def _window(centre: int, size: int, limit: int) -> tuple[int, int]:
 
 
 @dataclass(frozen=True, slots=True)
-class GroundSnippet:
-    """A square of seabed with a contact in its centre.
-
-    Attributes:
-        image: Shape (n, n), uint8; rows along-track in the order of recording, columns over ground range, nadir to
-            the left on both sides; 0 where nothing was recorded.
-        known: Same shape, True where recorded.
-        pixel_m: Side of a pixel on the bottom, the same along-track and across-track.
-    """
-
-    image: npt.NDArray[np.uint8]
-    known: npt.NDArray[np.bool_]
-    pixel_m: float
-
-
-@dataclass(frozen=True, slots=True)
 class _GroundPlace:
     """Place of a contact on the bottom: ground range, altitude of the sonar above it, distance between pings."""
 
@@ -220,58 +196,6 @@ def _ground_place(detection: Detection) -> _GroundPlace | None:
     if detection.altitude_m is None or detection.ground_range_m is None or detection.pixel_along_m is None:
         return None
     return _GroundPlace(detection.altitude_m, detection.ground_range_m, detection.pixel_along_m)
-
-
-def cut_ground_snippet(
-    survey: Survey, detection: Detection, size_m: float = 10.0, pixel_m: float = 0.1
-) -> GroundSnippet | None:
-    """Cut the seabed around a contact with fixed size and scale.
-
-    The bottom is assumed flat at the altitude of the contact. A pixel is the mean of the samples whose slant range it
-    covers (interpolated where samples are coarser), in the pings that it covers, or in the nearest one. The highlight
-    of the contact is always in the centre; pixels beyond the recording are unknown.
-
-    Returns:
-        The snippet; None if the altitude of the contact or the distance between pings is unknown.
-
-    Raises:
-        ValueError: A size or pixel that is not positive, or more than 4096 pixels a side.
-    """
-    if not (size_m > 0 and pixel_m > 0 and 1 <= size_m / pixel_m <= MAX_SIDE_PX):
-        raise ValueError(f"size_m, pixel_m: got {size_m}, {pixel_m}, expected above 0 and 1 to {MAX_SIDE_PX} pixels")
-    place = _ground_place(detection)
-    if place is None:
-        return None
-    count = math.ceil(size_m / pixel_m)
-    edges_m = place.range_m + (np.arange(count + 1) - count / 2) * pixel_m
-    slant_m = ground_to_slant_range_m(np.maximum(edges_m, 0.0), place.altitude_m)
-    first = detection.ping_index + 0.5 - count / 2 * pixel_m / place.along_m
-    values = np.full((count, count), np.nan)
-    for row in range(count):
-        top = first + row * pixel_m / place.along_m
-        bottom = top + pixel_m / place.along_m
-        rows = range(max(round(top), 0), min(round(bottom), len(survey.pings))) or range(
-            math.floor(top), math.floor(top) + 1
-        )
-        lines = [_ping_means(survey, detection, ping, slant_m) for ping in rows if 0 <= ping < len(survey.pings)]
-        if lines:
-            stacked = np.stack(lines)
-            recorded = np.isfinite(stacked).any(axis=0)
-            values[row, recorded] = np.nanmean(stacked[:, recorded], axis=0)
-    values[:, edges_m[:-1] < 0] = np.nan
-    known = np.isfinite(values)
-    raw = np.rint(np.where(known, values, 0.0)).astype(np.uint32)
-    return GroundSnippet(to_grey(raw, known), known, pixel_m)
-
-
-def _ping_means(
-    survey: Survey, detection: Detection, ping: int, slant_m: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
-    """Return the mean of one ping's samples between neighbouring slant ranges, NaN beyond its end."""
-    channel = survey.pings[ping].channel(detection.side)
-    if channel is None or not len(channel.samples):
-        return np.full(len(slant_m) - 1, np.nan)
-    return interval_means(channel.samples, slant_m / channel.sample_spacing_m, min_width=_MIN_PIXEL_SAMPLES)
 
 
 def ground_projected_image(

@@ -29,13 +29,11 @@ class HostCertificate:
 
     Attributes:
         common_name: Name that identifies the host at other routers.
-        serial: Serial number, hexadecimal.
         not_after: End of the validity.
         warnings: Deficiencies that do not prevent operation, for the log.
     """
 
     common_name: str
-    serial: str
     not_after: datetime
     warnings: tuple[str, ...] = ()
 
@@ -60,7 +58,7 @@ def check_tls_files(tls: TlsConfig, now_utc_s: float) -> HostCertificate:
     _check_validity("certificate", tls.certificate, own, now_utc_s)
     # While a fleet changes its authority, the file also holds the old one, which can expire.
     _check_validity("ca", tls.ca, max(signers, key=lambda signer: signer.not_valid_after_utc), now_utc_s)
-    return HostCertificate(common_name_of(own), f"{own.serial_number:x}", own.not_valid_after_utc, tuple(warnings))
+    return HostCertificate(common_name_of(own), own.not_valid_after_utc, tuple(warnings))
 
 
 class TlsMonitor:

@@ -53,7 +53,7 @@ def ground_range_image(survey: Survey, side: Side, altitude_m: FloatArray, spaci
     return image
 
 
-def interval_means(samples: Samples | FloatImage, edges: FloatArray, *, min_width: float = 0.0) -> FloatArray:
+def interval_means(samples: Samples | FloatImage, edges: FloatArray) -> FloatArray:
     """Return the mean of a ping's samples between neighbouring edges.
 
     A sample that contains an edge contributes to both intervals in proportion, so an interval within one sample has
@@ -62,15 +62,14 @@ def interval_means(samples: Samples | FloatImage, edges: FloatArray, *, min_widt
     Args:
         samples: Samples of one channel, or their echo strength, shape (n,), any number dtype, n from 1.
         edges: In samples from the beginning of the first one, not decreasing, from 0 on, shape (m + 1,).
-        min_width: An interval must be wider than this number of samples.
 
     Returns:
-        Shape (m,), float64; NaN where an interval ends beyond the last sample or is not wider than `min_width`.
+        Shape (m,), float64; NaN where an interval is empty or ends beyond the last sample.
     """
     cumulative = np.concatenate([[0.0], np.cumsum(samples, dtype=np.float64)])
     totals = np.diff(np.interp(edges, np.arange(len(cumulative)), cumulative))
     widths = np.diff(edges)
-    inside = (edges[1:] <= len(samples)) & (widths > min_width)
+    inside = (edges[1:] <= len(samples)) & (widths > 0)
     means = np.full(len(widths), np.nan)
     means[inside] = totals[inside] / widths[inside]
     return means

@@ -102,7 +102,6 @@ class QuantisedImage:
     """A quantised image.
 
     Attributes:
-        scale: n, in 32nds of the sides of the original.
         prefix: Body bytes with scale and levels.
         levels: Grey level of each symbol, shape (symbols,).
         lengths: Code length of each symbol.
@@ -110,7 +109,6 @@ class QuantisedImage:
         bits: Length of the body in bits.
     """
 
-    scale: int
     prefix: bytes
     levels: Integers
     lengths: list[int]
@@ -188,7 +186,7 @@ def _spaced(image: Image, step: int) -> QuantisedImage | None:
         return None
     symbols = (image.astype(np.int64) - low) // step
     prefix = bytes([FULL_SCALE - 1, MAX_CHOSEN_LEVELS - 1 + step, low, count - 1])
-    return _quantised(FULL_SCALE, prefix, _spaced_levels(low, step, count), symbols)
+    return _quantised(prefix, _spaced_levels(low, step, count), symbols)
 
 
 def _spaced_levels(low: int, step: int, count: int) -> Integers:
@@ -207,7 +205,7 @@ def _chosen_levels(image: Image, scale: int, counts: Iterable[int]) -> Iterator[
         means = np.add.reduceat(greys * pixels.astype(np.float64), first) / np.add.reduceat(pixels, first)
         levels = np.floor(means + 0.5).astype(np.int64)
         symbols = np.searchsorted(greys[first], image, side="right") - 1
-        yield _quantised(scale, bytes([scale - 1, len(levels) - 1, *levels.tolist()]), levels, symbols)
+        yield _quantised(bytes([scale - 1, len(levels) - 1, *levels.tolist()]), levels, symbols)
 
 
 def _optimal_group_starts(greys: Floats, pixels: Floats) -> Integers:
@@ -235,13 +233,13 @@ def _optimal_group_starts(greys: Floats, pixels: Floats) -> Integers:
     return starts
 
 
-def _quantised(scale: int, prefix: bytes, levels: Integers, symbols: Integers) -> QuantisedImage:
+def _quantised(prefix: bytes, levels: Integers, symbols: Integers) -> QuantisedImage:
     counts = np.bincount(symbols.ravel(), minlength=len(levels)).tolist()
     lengths = code_lengths(counts)
     bits = 8 * len(prefix) + sum(c * length for c, length in zip(counts, lengths, strict=True))
     if len(levels) > 2:
         bits += sum(len(_gamma(value)) for value in _differences(lengths))
-    return QuantisedImage(scale, prefix, levels, lengths, symbols, bits)
+    return QuantisedImage(prefix, levels, lengths, symbols, bits)
 
 
 def code_lengths(counts: list[int]) -> list[int]:

@@ -49,22 +49,6 @@ class RegionOfInterest:
             if not low <= value < SIXTEENTHS:
                 raise StreamError("region of interest", name, value, f"{low}..{SIXTEENTHS - 1} sixteenths")
 
-    @classmethod
-    def around(
-        cls, top_px: int, left_px: int, bottom_px: int, right_px: int, height_px: int, width_px: int
-    ) -> RegionOfInterest:
-        """Return the smallest region with these first and last rows and columns.
-
-        Raises:
-            StreamError: They are outside the image.
-        """
-        return cls(
-            top_px * SIXTEENTHS // height_px,
-            left_px * SIXTEENTHS // width_px,
-            bottom_px * SIXTEENTHS // height_px,
-            right_px * SIXTEENTHS // width_px,
-        )
-
 
 def region_weights(layout: Layout, region: RegionOfInterest | None) -> I64:
     """Return the weight of every coefficient in the flat layout, in 1/256. The lowest band keeps unit weight."""

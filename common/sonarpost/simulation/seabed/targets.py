@@ -79,17 +79,8 @@ class SeabedObject:
 
 def random_object(kind: ObjectKind, along_m: float, across_m: float, rng: np.random.Generator) -> SeabedObject:
     """Return an object with random dimensions typical of its kind, random orientation, and slight or no burial."""
-    length_m, width_m, height_m = _random_size(kind, rng)
-    return SeabedObject(
-        kind=kind,
-        along_m=along_m,
-        across_m=across_m,
-        length_m=length_m,
-        width_m=width_m,
-        height_m=height_m,
-        orientation_deg=float(rng.uniform(0, 360)),
-        seed=int(rng.integers(0, 2**31)),
-    )
+    size_m, orientation_deg = _random_size(kind, rng), float(rng.uniform(0, 360))
+    return SeabedObject(kind, along_m, across_m, *size_m, orientation_deg, seed=int(rng.integers(0, 2**31)))
 
 
 def _random_size(kind: ObjectKind, rng: np.random.Generator) -> tuple[float, float, float]:

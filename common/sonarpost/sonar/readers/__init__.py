@@ -7,10 +7,11 @@ without its dot, the object is the reader (example: docs/how-to/survey-reader.md
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from typing import Final
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.options import SurveyOptions
@@ -23,25 +24,11 @@ from sonarpost.sonar.survey import Survey
 SurveyReader = Callable[[Path, SurveyOptions], SurveySource]
 
 ENTRY_POINTS = "sonarpost.survey_readers"
-_READERS: dict[str, SurveyReader] = {}
-
-
-def register_reader(suffixes: Iterable[str], reader: SurveyReader) -> None:
-    """Register a reader for file name suffixes.
-
-    Args:
-        suffixes: Each with a leading dot, in any case. The longest matching suffix selects the reader.
-        reader: The function or class that opens the files.
-
-    Raises:
-        ValueError: A suffix has no dot, or already has another reader.
-    """
-    for suffix in suffixes:
-        key = suffix.lower()
-        if not key.startswith(".") or len(key) < 2:
-            raise ValueError(f"{suffix!r} is not a file suffix")
-        if _READERS.setdefault(key, reader) is not reader:
-            raise ValueError(f"{suffix!r} already has a reader")
+_READERS: Final[Mapping[str, SurveyReader]] = {
+    ".xtf": XtfSource,
+    ".dat": HumminbirdSource,
+    ".waterfall.toml": WaterfallSource,
+}
 
 
 def supported_suffixes() -> tuple[str, ...]:
@@ -102,10 +89,6 @@ def _plug_ins() -> dict[str, EntryPoint]:
     """Return suffix to entry point. A plug-in is imported only when its suffix is used."""
     return {f".{point.name.lower()}": point for point in entry_points(group=ENTRY_POINTS)}
 
-
-register_reader((".xtf",), XtfSource)
-register_reader((".dat",), HumminbirdSource)
-register_reader((".waterfall.toml",), WaterfallSource)
 
 SUPPORTED_SUFFIXES: tuple[str, ...] = (".xtf",)
 """Formats of a single file, which a folder can be watched for; the others consist of several files."""

@@ -60,7 +60,6 @@ _GEODETIC: Final = 1.006_764_292_7
 class _Record:
     fields: dict[int, int]
     samples: bytes
-    place: str
 
 
 class HumminbirdSource(StreamedSource):
@@ -193,7 +192,7 @@ def _records(file: CheckedFile) -> Iterator[_Record]:
         count = fields[_SAMPLES]
         if not 1 <= count <= _MAX_SAMPLES:
             raise file.error(f"{place}, number of samples", count, f"1 to {_MAX_SAMPLES}")
-        yield _Record(fields, reader.read(count, place), place)
+        yield _Record(fields, reader.read(count, place))
         number += 1
 
 
