@@ -29,7 +29,7 @@ QUIET_S = 1.5
 """Real time without a change after which an idle chain has finished."""
 STALLED_S = 60.0
 """Real time without a change after which the demo ends although the chain is busy."""
-MAX_FEEDBACK_INTERVALS = 12
+MAX_FEEDBACK_INTERVALS = 60
 """Feedback intervals without a change, on top of `STALLED_S`, while the vessel still repeats feedback."""
 IMAGE_SUFFIXES = (".tif", ".tiff", ".png")
 
