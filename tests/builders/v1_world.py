@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.config import ReceiverConfig, SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.v1.frame import FrameProtection, Segment, SegmentKind, pack_segments
+from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
 from sonarpost.link.frames.v1.payload_objects import Feedback
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
@@ -43,7 +44,7 @@ def next_frames(sender: V1Sender, count: int, now: float) -> tuple[bytes, ...]:
     return tuple(frame for frame in frames if frame is not None)
 
 
-def feedback_frame(feedback: Feedback, protection: FrameProtection | None = None) -> bytes:
+def feedback_frame(feedback: Feedback, protection: FrameAuthenticator | None = None) -> bytes:
     """Return the frame of 32 bytes that carries a feedback."""
     return pack_segments([Segment(SegmentKind.FEEDBACK, feedback.pack())], 32, protection)
 

@@ -111,7 +111,7 @@ class SavedWindow:
 
 
 class FrameAuthenticator:
-    """Protects the frames of this station and verifies those of others: a `FrameProtection`.
+    """Protects the frames of this station and verifies those of others.
 
     Counters must be reserved before they are used, so that no crash leads to the same counter twice:
 

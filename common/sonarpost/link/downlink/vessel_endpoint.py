@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import Final
 
 from sonarpost.errors import FrameError
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.downlink.commands import CommandTracker, PendingCommand
 from sonarpost.link.downlink.messages import ConfirmationMessage, DataMessage, unpack
 from sonarpost.link.frames.paper.receiver import PaperReceiver
-from sonarpost.link.frames.v1.frame import FrameProtection, Segment, SegmentKind, pack_segments, segments_room
+from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments, segments_room
 from sonarpost.link.frames.v1.payload_objects import Feedback
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.receiver import (
@@ -93,7 +94,7 @@ class VesselEndpoint:
         commands: CommandTracker,
         config: ReceiverConfig | None = None,
         *,
-        protection: FrameProtection | None = None,
+        protection: FrameAuthenticator | None = None,
         feedback: bool = True,
         wire_formats: Sequence[WireFormat] = ("v1",),
         pairing_timeout_s: float = 60.0,

@@ -11,12 +11,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.coding.blocks import OutgoingImage
 from sonarpost.link.coding.channel_capacity import LossChannel, RateSelector
 from sonarpost.link.coding.redundancy_plan import copies, quality_curve
 from sonarpost.link.config import QueueConfig, SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
-from sonarpost.link.frames.v1.frame import FrameProtection
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, Feedback, RefineRequest
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.queue.messages import FILLER_PRIORITY, MessageQueue
@@ -76,7 +76,9 @@ class TransmitQueue(ImageSender):
 
     carries_messages = True
 
-    def __init__(self, config: QueueConfig, *, first_block: int = 0, protection: FrameProtection | None = None) -> None:
+    def __init__(
+        self, config: QueueConfig, *, first_block: int = 0, protection: FrameAuthenticator | None = None
+    ) -> None:
         super().__init__(RATES[config.first_rate].airtime_s)
         self.config = config
         self.rate_selector = RateSelector(config.rates, config.first_rate)

@@ -21,11 +21,11 @@ from sonarpost.link.frames.paper.frame import (
     ContactFrame,
     HalfFrame,
     format_image_id,
-    frame_checksum,
     half_bounds,
     is_image_id,
     parse_frame,
 )
+from sonarpost.link.frames.v1.frame import checksum
 
 GOLDEN = json.loads((GOLDEN_FOLDER / "link" / "paper_frames.json").read_text())
 HEADER = StreamHeader(0x10, 0xBEEF, 113, 49)
@@ -73,7 +73,7 @@ def test_golden_rejected_frames(case: dict[str, Any]) -> None:
 
 
 def test_checksum_has_the_published_check_value() -> None:
-    assert frame_checksum(b"123456789") == 0x29B1
+    assert checksum(b"123456789") == 0x29B1
 
 
 @given(st.binary(max_size=300))
@@ -109,7 +109,7 @@ def test_plausible_bytes_parse_or_raise_frame_error(
 )
 def test_contact_bytes_with_a_correct_checksum_parse_or_raise_frame_error(record: bytes, image_id: str) -> None:
     body = b"C" + image_id.encode() + record
-    data = body + frame_checksum(body).to_bytes(2, "big")
+    data = body + checksum(body).to_bytes(2, "big")
     try:
         frame = parse_frame(data)
     except FrameError:

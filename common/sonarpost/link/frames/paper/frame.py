@@ -8,7 +8,6 @@ docs/specifications/acoustic-paper.md is the specification.
 
 from __future__ import annotations
 
-import binascii
 import re
 import struct
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import Literal
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX, StreamHeader, tag_length
 from sonarpost.errors import BadInputError, FrameError
 from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary
+from sonarpost.link.frames.v1.frame import checksum
 
 HalfName = Literal["top", "bottom"]
 
@@ -51,14 +51,6 @@ def half_bounds(body_length: int, half: HalfName) -> tuple[int, int]:
     """Return the byte range [start, stop) of the body that `half` covers; the top half has the odd byte."""
     middle = (body_length + 1) // 2
     return (0, middle) if half == "top" else (middle, body_length)
-
-
-def frame_checksum(data: bytes) -> int:
-    """Return CRC-16/IBM-3740 of `data` (also called CCITT-FALSE).
-
-    Polynomial 0x1021, initial value 0xFFFF, not reflected, no final exclusive-or; of b"123456789" it is 0x29B1.
-    """
-    return binascii.crc_hqx(data, 0xFFFF)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +121,7 @@ class ContactFrame:
     def pack(self) -> bytes:
         """Return the 32 bytes, checksum included."""
         body = _CONTACT_TYPE + self.image_id.encode("ascii") + self.contact.pack()
-        return body + struct.pack(">H", frame_checksum(body))
+        return body + struct.pack(">H", checksum(body))
 
 
 def parse_frame(data: bytes, where: str = "acoustic frame") -> HalfFrame | ContactFrame:
@@ -171,7 +163,7 @@ def _parse_contact(data: bytes) -> ContactFrame:
     if len(data) < CONTACT_FRAME_SIZE:
         raise FrameError("contact frame", "length", len(data), f"at least {CONTACT_FRAME_SIZE} bytes")
     body, (sent,) = data[: CONTACT_FRAME_SIZE - 2], struct.unpack_from(">H", data, CONTACT_FRAME_SIZE - 2)
-    computed = frame_checksum(body)
+    computed = checksum(body)
     if sent != computed:
         raise FrameError("contact frame", "checksum", f"0x{sent:04X}", f"0x{computed:04X}")
     return ContactFrame(_parse_image_id(data), ContactSummary.unpack(body[5:]))

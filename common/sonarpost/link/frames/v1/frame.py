@@ -10,9 +10,12 @@ import binascii
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from sonarpost.errors import FrameError
+
+if TYPE_CHECKING:
+    from sonarpost.link.auth.authentication import FrameAuthenticator
 
 MIN_FRAME_BYTES: Final = 32
 MAX_FRAME_BYTES: Final = 256
@@ -51,27 +54,6 @@ class SegmentKind(IntEnum):
 
 CONTACT_SEGMENT_BYTES: Final = 29
 MAX_SEGMENT_BYTES: Final = 255
-
-
-class FrameProtection(Protocol):
-    """Authenticates and can encrypt frames; implemented by `sonarpost.link.auth.authentication`."""
-
-    @property
-    def overhead_bytes(self) -> int:
-        """Bytes that it adds to a frame."""
-
-    def protect(self, covered: bytes) -> bytes:
-        """Return what to send instead of `covered`, the frame after its checksum: `overhead_bytes` longer.
-
-        The first byte is unchanged. If this raises, no counter was used.
-        """
-
-    def verify(self, source: int, protected: bytes, where: str) -> bytes:
-        """Return what the sender passed to `protect`; may change state (counters against replay).
-
-        Raises:
-            FrameError: The source did not send it with the common key (field `tag`), or it is a replay (`counter`).
-        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,17 +100,17 @@ class Segment:
 Content = Symbol | tuple[Segment, ...]
 
 
-def pack_symbol(symbol: Symbol, protection: FrameProtection | None = None) -> bytes:
+def pack_symbol(symbol: Symbol, protection: FrameAuthenticator | None = None) -> bytes:
     """Return the frame of one symbol, 5 bytes longer than the symbol (and its tag)."""
     return _protected(symbol.head() + symbol.data, protection)
 
 
-def segments_room(frame_bytes: int, protection: FrameProtection | None = None) -> int:
+def segments_room(frame_bytes: int, protection: FrameAuthenticator | None = None) -> int:
     """Return how many bytes of segments (see `Segment.size`) a frame holds."""
     return frame_bytes - _CRC_BYTES - (0 if protection is None else protection.overhead_bytes)
 
 
-def pack_segments(segments: Iterable[Segment], frame_bytes: int, protection: FrameProtection | None = None) -> bytes:
+def pack_segments(segments: Iterable[Segment], frame_bytes: int, protection: FrameAuthenticator | None = None) -> bytes:
     """Return a frame of segments, padded with zeros to `frame_bytes`.
 
     Raises:
@@ -153,19 +135,22 @@ def pack_segments(segments: Iterable[Segment], frame_bytes: int, protection: Fra
     return _protected(bytes(body.ljust(room, b"\0")), protection)
 
 
-def _protected(covered: bytes, protection: FrameProtection | None) -> bytes:
+def _protected(covered: bytes, protection: FrameAuthenticator | None) -> bytes:
     if protection is not None:
         covered = protection.protect(bytes([covered[0] | _TAG_BIT]) + covered[1:])
     return checksum(covered).to_bytes(_CRC_BYTES, "big") + covered
 
 
 def checksum(covered: bytes) -> int:
-    """Return CRC-16/IBM-3740 (polynomial 0x1021, initial value 0xFFFF, not reflected)."""
+    """Return CRC-16/IBM-3740, also called CCITT-FALSE.
+
+    Polynomial 0x1021, initial value 0xFFFF, not reflected, no final exclusive-or; of b"123456789" it is 0x29B1.
+    """
     return binascii.crc_hqx(covered, 0xFFFF)
 
 
 def parse_frame(
-    frame: bytes, source: int = 0, protection: FrameProtection | None = None, where: str = "acoustic frame"
+    frame: bytes, source: int = 0, protection: FrameAuthenticator | None = None, where: str = "acoustic frame"
 ) -> Content:
     """Parse a frame from a modem.
 

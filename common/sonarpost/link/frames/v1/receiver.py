@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Final
 
 from sonarpost.errors import FrameError
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.coding.block_decoder import BlockDecoder, DecodedObject, SymbolChunk
 from sonarpost.link.coding.byte_ranges import PartialBytes
 from sonarpost.link.config import ReceiverConfig
@@ -14,7 +15,6 @@ from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import (
     BLOCKS,
-    FrameProtection,
     Segment,
     SegmentKind,
     Symbol,
@@ -354,7 +354,7 @@ class V1Receiver:
         protection: Verifies frames.
     """
 
-    def __init__(self, config: ReceiverConfig | None = None, *, protection: FrameProtection | None = None) -> None:
+    def __init__(self, config: ReceiverConfig | None = None, *, protection: FrameAuthenticator | None = None) -> None:
         self.config = config or ReceiverConfig()
         self._protection = protection
         self._sources: dict[int, PeerState] = {}  # the one whose last frame is oldest first

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Final
 
 from sonarpost.errors import FrameError, StreamError
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.coding.blocks import (
     BlockBuilder,
     OutgoingImage,
@@ -33,7 +34,6 @@ from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import (
     BLOCKS,
     HEADER_BYTES,
-    FrameProtection,
     Segment,
     SegmentKind,
     Symbol,
@@ -106,7 +106,7 @@ class V1Sender:
     """
 
     def __init__(
-        self, config: SenderConfig, *, first_block: int = 0, protection: FrameProtection | None = None
+        self, config: SenderConfig, *, first_block: int = 0, protection: FrameAuthenticator | None = None
     ) -> None:
         self.config = config
         self._protection = protection
