@@ -69,7 +69,14 @@ RENAMED_KEYS: Mapping[str, Mapping[str, str]] = {
         "report_frames": "feedback_interval_frames",
         "report_s": "feedback_interval_s",
     },
-    "decompressor": {"catalogues": "codebooks", "links": "wire_formats", "picture_consumers": "image_consumers"},
+    "decompressor": {
+        "catalogues": "codebooks",
+        "links": "op_modem.wire_formats",
+        "pairing_timeout_s": "op_modem.pairing_timeout_s",
+        "picture_consumers": "image_consumers",
+        "vehicles": "op_modem.vehicles",
+        "wire_formats": "op_modem.wire_formats",
+    },
     "console": {"session_most_s": "session_max_s", "side": "role"},
 }
 

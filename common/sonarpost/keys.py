@@ -55,9 +55,17 @@ def acoustic_tx(platform: str) -> str:
 def acoustic_rx(platform: str) -> str:
     """A frame that this platform's modem received.
 
-    Record: acoustic_frame. From: op_modem. To: decompressor. Delivery: durable, priority 4.
+    Record: acoustic_frame. From: op_modem. To: watchers. Delivery: plain, priority 5.
     """
     return _of(platform, "acoustic/rx")
+
+
+def acoustic_image(vessel: str) -> str:
+    """The coded content of an image, after more of it arrived.
+
+    Record: received_image. From: op_modem. To: decompressor. Delivery: durable, priority 4.
+    """
+    return _of(vessel, "acoustic/image")
 
 
 def acoustic_queue(platform: str) -> str:

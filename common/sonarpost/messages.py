@@ -276,6 +276,62 @@ class AcousticFrame(Record):
     quality: LinkQuality | None = None
 
 
+class ReceivedImage(Record):
+    """The coded content of an image as far as the vessel has received it.
+
+    A later record of the same image has a higher `version` and replaces the earlier ones.
+
+    Attributes:
+        vessel_id: Vessel that received it.
+        vehicle_id: Vehicle that sent it, identified by the address of its modem.
+        image_id: Identifier of the image on the acoustic link.
+        version: 1 for the first record of this image; counts up as more of it arrives.
+        contact: The contact as far as the acoustic link carries it. None if the contact frame has not arrived.
+        height_px: Rows of the image, from the contact frame. None if not known.
+        width_px: Columns of the image, from the contact frame. None if not known.
+        stream: The codec's stream, header included, with zeros in the ranges `missing`. Empty if no header has arrived.
+        missing: Ranges of `stream` that have not arrived: first byte and the byte after the last one, ascending.
+        missing_halves: Halves (in the sense of the paper) of which no byte arrived.
+        complete: Everything arrived that the vehicle has planned to send so far.
+        bytes_received: Bytes of the stream that arrived.
+        bytes_total: Length of the stream; 0 if not known.
+        frames_received: Acoustic frames used; 0 if the wire format does not count them.
+        conflicts: Frames that contradict others of this image.
+        first_frame_utc_s: Arrival of the first frame, by the vessel's clock.
+        last_frame_utc_s: Arrival of the last frame that contributed.
+    """
+
+    TYPE: ClassVar[str] = "received_image"
+
+    vessel_id: PlatformId
+    vehicle_id: PlatformId
+    image_id: ImageId
+    version: Ordinal
+    contact: Contact | None
+    height_px: Annotated[int, Field(ge=1, le=4096)] | None
+    width_px: Annotated[int, Field(ge=1, le=4096)] | None
+    stream: Annotated[bytes, Field(max_length=65542)]
+    missing: tuple[tuple[Count, Count], ...]
+    missing_halves: tuple[Literal["top", "bottom"], ...]
+    complete: bool
+    bytes_received: Count
+    bytes_total: Count
+    frames_received: Count
+    conflicts: Count
+    first_frame_utc_s: Time
+    last_frame_utc_s: Time
+
+    @field_validator("missing")
+    @classmethod
+    def _fit_the_stream(cls, missing: tuple[tuple[int, int], ...], info: ValidationInfo) -> tuple[tuple[int, int], ...]:
+        stream = info.data.get("stream")
+        if isinstance(stream, bytes):
+            bounds = [bound for first_and_stop in missing for bound in first_and_stop]
+            if bounds != sorted(set(bounds)) or (bounds and bounds[-1] > len(stream)):
+                raise ValueError(f"ascending, separate ranges within the {len(stream)} bytes of the stream")
+        return missing
+
+
 class ReconstructedImage(Record):
     """An image as the vessel decoded it (the paper's imgToDecompress on the operator's side).
 

@@ -266,6 +266,8 @@ def _type(schema: Mapping[str, Any]) -> str:
         name = schema["$ref"].rpartition("/")[2]
         return next((f"[{t.TYPE}](#{t.TYPE})" for t in record_types() if t.__name__ == name), name)
     match schema.get("type"):
+        case "array" if "prefixItems" in schema:
+            return "array of " + ", ".join(_type(item) for item in schema["prefixItems"])
         case "array":
             return f"array of {_type(schema['items'])}"
         case "object":

@@ -1,4 +1,4 @@
-"""From what the link gave out to the record of a reconstructed picture."""
+"""Decoding of received images: from a `ReceivedImage` to a `ReconstructedImage`."""
 
 from __future__ import annotations
 
@@ -12,24 +12,23 @@ from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.codec import codebook_tag
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CodebookError
-from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.receiver import ImageUpdate
-from sonarpost.messages import Contact, Pixels, ReconstructedImage
+from sonarpost.link.receiver import has_header, received_mask
+from sonarpost.messages import Pixels, ReceivedImage, ReconstructedImage
+
+_UNKNOWN_SIDE_PX = 16
 
 
 class Decoder:
-    """Decodes with whichever of its codebooks the sender used.
+    """Decodes images of every codec, with the codebook that their stream names.
 
     Args:
-        vessel_id: Name of the vessel in the records.
         codebooks: Names or files of tile codebooks.
 
     Raises:
         CodebookError: A codebook cannot be read, or two have the same tag.
     """
 
-    def __init__(self, vessel_id: str, codebooks: Sequence[str]) -> None:
-        self._vessel_id = vessel_id
+    def __init__(self, codebooks: Sequence[str]) -> None:
         self._tiles: dict[int, TileDatabase] = {}
         for name in codebooks:
             tiles = open_codebook(name).tiles
@@ -38,95 +37,64 @@ class Decoder:
                 raise CodebookError(name, "identity", tiles.identity, f"a tag other than {tag:#06x}, which is taken")
             self._tiles[tag] = tiles
 
-    def image(self, event: ImageUpdate, vehicle_id: str) -> ReconstructedImage:
-        """Decode an image as far as it has arrived; without a stream header all of it is missing.
+    def decode(self, received: ReceivedImage) -> ReconstructedImage:
+        """Decode the received part of an image; without a stream header all pixels are missing.
 
         Raises:
-            CodebookError: It was made with a codebook that is not at hand.
-            StreamError: It cannot be decoded.
+            CodebookError: The codebook of the image is not configured.
+            StreamError: The stream cannot be decoded.
         """
-        if not event.has_header:
-            contact = event.contact
-            shape = (contact and contact.height_px) or 16, (contact and contact.width_px) or 16
+        if not has_header(received.stream):
+            shape = received.height_px or _UNKNOWN_SIDE_PX, received.width_px or _UNKNOWN_SIDE_PX
             decoded = DecodedImage(np.zeros(shape, dtype=np.uint8), np.ones(shape, dtype=np.bool_))
-            return self._record(event, vehicle_id, decoded, None, ["only the contact record arrived"])
-        codec = self._codec(StreamHeader.unpack(event.stream), event)
-        decoded = codec.decode(event.stream, event.received_mask())
+            return _record(received, decoded, None, ["only the contact record arrived"])
+        codec = self._codec(received)
+        decoded = codec.decode(received.stream, received_mask(received.stream, received.missing))
         notes = list(decoded.notes)
-        if event.conflicts:
-            notes.append(f"{event.conflicts} frames disagreed with others of this image")
-        return self._record(event, vehicle_id, decoded, codec, notes)
+        if received.conflicts:
+            notes.append(f"{received.conflicts} frames disagreed with others of this image")
+        return _record(received, decoded, codec, notes)
 
-    def _codec(self, header: StreamHeader, event: ImageUpdate) -> Codec:
+    def _codec(self, received: ReceivedImage) -> Codec:
+        header = StreamHeader.unpack(received.stream)
         registry, tiles = default_registry(), None
-        # The tag of a codec without tiles is that of another kind of model, or of none.
+        # The tag of a codec without tiles identifies another kind of model, or none.
         if registry.spec_for_id(header.codec_id).needs_tiles:
-            tag = header.model_tag
-            tiles = self._tiles.get(tag)
+            tiles = self._tiles.get(header.model_tag)
             if tiles is None:
-                own = ", ".join(f"{known:#06x}" for known in self._tiles)
-                where = f"image {event.image_id}"
-                raise CodebookError(where, "model_tag", f"{tag:#06x}", f"a codebook at hand: {own}")
-        return registry.create_for_stream(event.stream, CodecResources(tiles))
+                known = ", ".join(f"{tag:#06x}" for tag in self._tiles)
+                where = f"image {received.image_id}"
+                raise CodebookError(where, "model_tag", f"{header.model_tag:#06x}", f"a configured codebook: {known}")
+        return registry.create_for_stream(received.stream, CodecResources(tiles))
 
-    def _record(
-        self,
-        event: ImageUpdate,
-        vehicle_id: str,
-        decoded: DecodedImage,
-        codec: Codec | None,
-        notes: Sequence[str],
-    ) -> ReconstructedImage:
-        picture = Pixels.from_array(decoded.image)
-        return ReconstructedImage(
-            vessel_id=self._vessel_id,
-            vehicle_id=vehicle_id,
-            image_id=event.image_id,
-            version=event.version,
-            contact=contact_of(event, vehicle_id),
-            codec=codec.name if codec else "",
-            model=codec.model_hash if codec else "",
-            picture=picture,
-            picture_sha256=picture.sha256,
-            complete=event.complete and not decoded.missing.any(),
-            missing_fraction=float(decoded.missing.mean()),
-            missing_mask=pack_mask(decoded.missing),
-            missing_halves=event.missing_halves,
-            bytes_received=event.received_bytes,
-            bytes_total=event.total_bytes,
-            frames_received=event.frames,
-            first_frame_utc_s=event.first_frame_s,
-            last_frame_utc_s=event.last_frame_s,
-            notes=tuple(notes),
-        )
+
+def _record(
+    received: ReceivedImage, decoded: DecodedImage, codec: Codec | None, notes: Sequence[str]
+) -> ReconstructedImage:
+    picture = Pixels.from_array(decoded.image)
+    return ReconstructedImage(
+        vessel_id=received.vessel_id,
+        vehicle_id=received.vehicle_id,
+        image_id=received.image_id,
+        version=received.version,
+        contact=received.contact,
+        codec=codec.name if codec else "",
+        model=codec.model_hash if codec else "",
+        picture=picture,
+        picture_sha256=picture.sha256,
+        complete=received.complete and not decoded.missing.any(),
+        missing_fraction=float(decoded.missing.mean()),
+        missing_mask=pack_mask(decoded.missing),
+        missing_halves=received.missing_halves,
+        bytes_received=received.bytes_received,
+        bytes_total=received.bytes_total,
+        frames_received=received.frames_received,
+        first_frame_utc_s=received.first_frame_utc_s,
+        last_frame_utc_s=received.last_frame_utc_s,
+        notes=tuple(notes),
+    )
 
 
 def pack_mask(missing: Mask) -> bytes:
-    """Return the mask as the record carries it: empty when nothing is missing."""
+    """Return the mask of missing pixels as the record has it: empty if nothing is missing."""
     return np.packbits(missing).tobytes() if missing.any() else b""
-
-
-def contact_of(event: ImageUpdate, vehicle_id: str) -> Contact | None:
-    """Return the contact as the vessel knows it, None when its record has not arrived.
-
-    The vehicle's own contact identifier does not travel; on this side a contact is vehicle and image identifier.
-    """
-    summary: ContactSummary | None = event.contact
-    if summary is None:
-        return None
-    return Contact(
-        contact_id=f"{vehicle_id}/{event.image_id}",
-        vehicle_id=vehicle_id,
-        channel=summary.side.value if summary.side else None,
-        time_utc_s=summary.time_utc_s,
-        lat_deg=summary.lat_deg,
-        lon_deg=summary.lon_deg,
-        position_sigma_m=summary.position_sigma_m,
-        depth_m=summary.depth_m,
-        altitude_m=summary.altitude_m,
-        heading_deg=summary.heading_deg,
-        ground_range_m=summary.ground_range_m,
-        atd_confidence=summary.confidence,
-        pixel_along_m=summary.pixel_along_m,
-        pixel_across_m=summary.pixel_across_m,
-    )

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.mac import Tdma
+from sonarpost.link.receiver import WireFormat
 from sonarpost.messages import PlatformId
 from sonarpost.modem.micromodem import RATES
 from sonarpost.runtime.modem_service import ModemServiceConfig
@@ -18,35 +19,44 @@ Seconds = Annotated[float, Field(gt=0, le=86400)]
 
 
 class OpModemConfig(ModemServiceConfig):
-    """The operator's modem: what it hears, and what it says to the vehicles.
+    """Configuration of the vessel's modem and of its end of the acoustic link.
 
     Attributes:
-        address: Set at start-up; 1 as in the paper.
-        link: "v1", or "paper" for listening only.
-        vehicles: Names of the vehicles by the modem addresses they send from; an address that is not listed has the
-            name modem-{address}.
-        downlink_rate: v1: Micro-Modem rate of what is sent; 0 carries farthest.
-        retry_s: v1: wait for a confirmation before an order is sent again; doubled each time, up to eightfold.
-        command_lifetime_s: v1: how long after it was issued an order is repeated.
-        feedback: v1: whether vehicles are told what is lacking of their pictures.
-        feedback_interval_s: v1: least time between two reports while something is lacking, ...
-        feedback_interval_frames: v1: ... and so many frames.
-        mac: v1: "csma" speaks when no vehicle has been heard for a while, "tdma" in its slot, "polled" asks each
-            vehicle in turn, and speaks between.
-        holdoff_s: v1: how long nothing must have been heard.
-        max_defer_s: v1: after so long without a quiet moment it speaks between two packets.
-        tdma_cycle_s: TDMA: length of the frame of slots; it begins at multiples of this since 1970-01-01 UTC.
-        slot_start_s: TDMA: where in the frame the slot begins.
+        address: Modem address of the vessel, set at start-up; 1 in the paper.
+        link: "v1" sends commands and feedback; "paper" receives only.
+        wire_formats: Accepted wire formats; each frame identifies its own. With `acoustic_key_file`, "v1" only.
+        pairing_timeout_s: "paper" format: wait for the rest of an image after its last frame.
+        vehicles: Vehicle names by modem address; a vehicle that is not listed is named modem-{address}.
+        image_consumers: Services on the vessel that receive the coded images.
+        message_consumers: Services on the vessel that receive the vehicles' messages; without any, messages are
+            published only.
+        downlink_rate: Micro-Modem rate of sent packets; rate 0 has the longest range.
+        retry_s: Wait for a confirmation before a command is repeated; doubled after each repetition, up to eight times
+            this value.
+        command_lifetime_s: Time after its issue for which a command is repeated.
+        feedback: Whether feedback is sent to the vehicles.
+        feedback_interval_s: Minimum time between two feedback messages to a vehicle, unless feedback_interval_frames
+            arrive earlier.
+        feedback_interval_frames: Number of received frames after which feedback is sent earlier.
+        mac: Medium access: "csma" sends after the channel was free for holdoff_s, "tdma" in a time slot, "polled" polls
+            each vehicle in turn and sends between the polls.
+        holdoff_s: CSMA: minimum time without a received frame before a packet is sent.
+        max_defer_s: CSMA: time after which a pending packet is sent between two received packets.
+        tdma_cycle_s: TDMA: length of the cycle of slots; cycles begin at multiples of it since 1970-01-01 UTC.
+        slot_start_s: TDMA: start of the vessel's slot in the cycle.
         slot_s: TDMA: length of the slot.
-        guard_s: TDMA: end of the slot that stays silent.
-        poll_interval_s: Poll: from one question to the next.
-        poll_rate: Poll: rate that is asked for.
-        message_consumers: v1: services on the vessel that take messages of vehicles.
+        guard_s: TDMA: guard time at the end of the slot.
+        poll_interval_s: Polled: time between two polls.
+        poll_rate: Polled: Micro-Modem rate that vehicles are polled with.
     """
 
     address: Annotated[int, Field(ge=0, le=127)] = 1
     link: Literal["v1", "paper"] = "v1"
+    wire_formats: Annotated[tuple[WireFormat, ...], Field(min_length=1)] = ("v1", "paper")
+    pairing_timeout_s: Seconds = 120.0
     vehicles: dict[Annotated[str, Field(pattern=r"^[0-9]{1,3}$")], PlatformId] = Field(default_factory=dict)
+    image_consumers: tuple[ConsumerName, ...] = ("decompressor",)
+    message_consumers: tuple[ConsumerName, ...] = ()
     downlink_rate: RateNumber = 0
     retry_s: Seconds = 60.0
     command_lifetime_s: Annotated[float, Field(gt=0, le=604800)] = 6 * 3600.0
@@ -62,13 +72,14 @@ class OpModemConfig(ModemServiceConfig):
     guard_s: Annotated[float, Field(ge=0, le=86400)] = 1.0
     poll_interval_s: Seconds = 10.0
     poll_rate: RateNumber = 1
-    message_consumers: tuple[ConsumerName, ...] = ()
 
     @model_validator(mode="after")
-    def _is_possible(self) -> OpModemConfig:
+    def _check(self) -> OpModemConfig:
         addresses = [int(address) for address in self.vehicles]
         if len(set(self.vehicles.values())) != len(addresses) or any(address > 127 for address in addresses):
             raise ValueError("addresses 0 to 127, and each vehicle's name once")
+        if self.transmits and "v1" not in self.wire_formats:
+            raise ValueError('wire_formats with "v1" where link = "v1"')
         if self.mac != "tdma":
             return self
         if self.slot_start_s + self.slot_s > self.tdma_cycle_s:
@@ -78,12 +89,17 @@ class OpModemConfig(ModemServiceConfig):
             raise ValueError(f"slot_s - guard_s of at least {packet_s} s, a packet of downlink_rate")
         return self
 
+    @property
+    def transmits(self) -> bool:
+        """Whether the vessel sends to vehicles."""
+        return self.link == "v1"
+
     def slots(self) -> Tdma:
         """Return the slots of "tdma"."""
         return Tdma(self.tdma_cycle_s, self.slot_start_s, self.slot_s, self.guard_s)
 
     def receiver_config(self) -> ReceiverConfig:
-        """Return when reports are due."""
+        """Return the configuration of the `v1` receiver."""
         return ReceiverConfig(
             feedback_interval_s=self.feedback_interval_s, feedback_interval_frames=self.feedback_interval_frames
         )
@@ -93,7 +109,7 @@ class OpModemConfig(ModemServiceConfig):
         return self.vehicles.get(str(address), f"modem-{address}")
 
     def address_of(self, vehicle_id: str) -> int | None:
-        """Return the modem address of a vehicle, None where nobody has that name."""
+        """Return the modem address of a vehicle, None if no vehicle has this name."""
         for address, name in self.vehicles.items():
             if name == vehicle_id:
                 return int(address)

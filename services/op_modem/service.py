@@ -1,4 +1,4 @@
-"""Listens to the vessel's modem, hands every frame on, and speaks to the vehicles."""
+"""op_modem: receives the vehicles' frames, assembles images from them, and sends commands and feedback."""
 
 from __future__ import annotations
 
@@ -6,53 +6,48 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from pydantic import ValidationError
 
-from sonarpost import keys
+from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
-from sonarpost.errors import DeliveryError
+from sonarpost.errors import DeliveryError, PayloadError
+from sonarpost.link.downlink.vessel_endpoint import ReceivedContent
+from sonarpost.link.receiver import ImageUpdate
 from sonarpost.logs import kv
-from sonarpost.messages import AcousticFrame, LinkQuality
-from sonarpost.modem.micromodem import (
-    RATES,
-    FrameDecoded,
-    FrameReceived,
-    LinkStatistics,
-    ModemEvent,
-    PacketFailed,
-    PacketReceived,
-    PacketSent,
-)
+from sonarpost.messages import AcousticFrame, LinkQuality, ReceivedImage, ReceivedMessage
+from sonarpost.modem.micromodem import FrameDecoded, ModemEvent, PacketFailed, PacketReceived, PacketSent
 from sonarpost.runtime.service import UnitOfWork
-from sonarpost.services.op_modem.arriving import pack, unpack
 from sonarpost.services.op_modem.config import OpModemConfig
-from sonarpost.services.op_modem.frame_images import image_ids_of_frame
-from sonarpost.services.op_modem.orders_service import DownlinkService
+from sonarpost.services.op_modem.downlink_service import DownlinkService
+from sonarpost.services.op_modem.packets import pack_partial, quality_of, received_frame, unpack_partial
+from sonarpost.services.op_modem.vessel_endpoint import VesselLink
 
 log = logging.getLogger(__name__)
 
 _PACKETS = "packets"
-_ARRIVING = "arriving"
-SAVE_AGAIN_S = 1.0
+_PARTIAL_PACKET = "arriving"
+_QUEUE_0_1 = "decompressor"
+"""Queue in which version 0.1 kept received frames."""
+TICK_S = 0.1
+SAVE_RETRY_S = 1.0
 MAX_UNSAVED = 10_000
-MAX_FRAMES = 8
+BROADCAST = 127
 
 
 class OpModemService(DownlinkService):
     """The vessel's end of the acoustic link.
 
-    Every frame the modem delivers is taken, also one addressed to somebody else: a picture overheard is a picture.
-    The frames of a packet are handed on together, with its statistics; until its end each is kept on the disk as it
-    comes. While the disk refuses, they are kept in memory and saved later.
+    The service processes every frame that the modem delivers. It sends the coded content of each image to
+    `image_consumers`, again after more of it arrived. One transaction holds everything that follows from a packet: the
+    state of the receivers, the images, and the state of commands and feedback. While the disk rejects it, packets wait
+    in memory. The frames of an unfinished packet are stored as they arrive.
 
-    With `link = "v1"` it also speaks: commands and decisions to vehicles, each until the vehicle has confirmed it or it
-    has expired, and reports of what is lacking. What it has heard and what it owes is kept in the transaction of
-    whatever changed it.
+    With `link = "v1"` the service also sends commands, decisions and feedback to the vehicles.
 
     Raises:
-        ConfigError: The key file cannot be read or is not the owner's alone.
+        ConfigError: The key file cannot be read or is not private to its owner, or no wire format remains with a key.
     """
 
     NAME = "op_modem"
@@ -61,161 +56,236 @@ class OpModemService(DownlinkService):
         super().__init__(platform, config)
         self._quality = LinkQuality()
         self._unsaved: deque[tuple[PacketReceived, float]] = deque()
-        self._lock = threading.Lock()
+        self._unsaved_lock = threading.Lock()
+        self._storage_error = ""
+        self._rejections = 0
+        self._last_rejection = ""
+
+    def start(self) -> bool:
+        """Process the frames that version 0.1 left in the outbox, then start."""
+        self._process_queued_frames()
+        return super().start()
 
     def on_start(self) -> None:
-        """Hand on what a killed process had heard of a packet, and open the port."""
-        kept = self.store.get_state(_ARRIVING)
-        if (interrupted := unpack(kept) if kept is not None else None) is not None:
-            self._keep(*interrupted)
-            self._save()
+        """Process the unfinished packet of a killed process, then open the port."""
+        saved = self.store.get_state(_PARTIAL_PACKET)
+        if (interrupted := unpack_partial(saved) if saved is not None else None) is not None:
+            self._add_unsaved(*interrupted)
+            self._process_received()
+        self.publish_open_commands()
         super().on_start()
-        self.start_thread(self._save_later, "save")
-        self.begin_speaking()
+        self.start_thread(self._run, "link")
 
     def on_stop(self) -> None:
-        """Close the port, and try once more to save what is not on the disk yet."""
+        """Close the port and process the packets in memory."""
         super().on_stop()
-        self._save()
+        self._process_received()
+        self._log_rejections()
         if self._unsaved:
-            log.error("Packets are lost, the disk refused them to the end", extra=kv(packets=len(self._unsaved)))
+            log.error("Packets lost: the disk rejected them until the stop", extra=kv(packets=len(self._unsaved)))
 
     def on_modem_event(self, event: ModemEvent) -> None:
-        """Take a packet, whose frames come with it, and before its end each of them."""
+        """Process a received packet, store a frame of an unfinished one, or record the end of a transmission."""
         if isinstance(event, (PacketSent, PacketFailed)):
-            self._packet_is_over(event)
+            self.packet_ended(event)
         elif isinstance(event, FrameDecoded):
-            self._turn.heard(time.monotonic())
-            self._arriving.append(event.frame)
-            self._keep_arriving()
+            self._gate.frame_received(time.monotonic())
+            self._partial_packet.append(event.frame)
+            self._store_partial_packet()
         elif isinstance(event, PacketReceived):
-            self._turn.heard(time.monotonic())
+            self._gate.frame_received(time.monotonic())
             self.count("packets_received")
             self.count("frames_received", len(event.frames))
             self.count("frames_bad", event.bad_frames)
             self._quality = quality_of(event.statistics) or self._quality
-            self._arriving = []
-            self._keep(event, time.time())
-            self._save()
+            self._partial_packet = []
+            self._add_unsaved(event, time.time())
+            self._process_received()
 
     def gauges(self) -> Mapping[str, float]:
-        """Return how many packets are not on the disk yet, and what the modem measured of the last one."""
+        """Return the state of modem, link and store, and the quality of the last measured packet."""
         measured = {"snr_in_db": self._quality.snr_in_db, "snr_out_db": self._quality.snr_out_db}
         return {
             **super().gauges(),
             "unsaved": float(len(self._unsaved)),
-            **self._station_gauges(),
+            **self.link_gauges(),
             **{name: value for name, value in measured.items() if value is not None},
         }
 
-    def _keep_arriving(self) -> None:
+    def degraded_reason(self) -> str:
+        """Return why the store, the port, the modem or the transmission does not work."""
+        return self._storage_error or super().degraded_reason()
+
+    def _run(self) -> None:
+        next_report_s = 0.0
+        while not self.stopping.wait(SAVE_RETRY_S if self._storage_error else TICK_S):
+            self._process_received()
+            self.transmit()
+            if time.monotonic() >= next_report_s:
+                self._log_rejections()
+                next_report_s = time.monotonic() + self.platform.health_interval_s
+
+    def _log_rejections(self) -> None:
+        if self._rejections:
+            log.warning("Frames rejected", extra=kv(rejected=self._rejections, last_reason=self._last_rejection))
+            self._rejections = 0
+
+    # Received packets
+
+    def _store_partial_packet(self) -> None:
         try:
             with self.store.transaction() as tx:
-                tx.put_state(_ARRIVING, pack(self._arriving, time.time()))
+                tx.put_state(_PARTIAL_PACKET, pack_partial(self._partial_packet, time.time()))
         except DeliveryError as error:
-            # They are in memory, and come with their packet; a disk that is full is told then.
-            log.warning("Frames of an unfinished packet are not on the disk", extra=kv(error=str(error)))
+            # The frames are in memory and arrive again with their packet.
+            log.warning("Frames of an unfinished packet not stored", extra=kv(error=str(error)))
 
-    def _keep(self, packet: PacketReceived, heard_utc_s: float) -> None:
-        with self._lock:
+    def _add_unsaved(self, packet: PacketReceived, received_utc_s: float) -> None:
+        with self._unsaved_lock:
             if len(self._unsaved) >= MAX_UNSAVED:
                 self._unsaved.popleft()
                 self.count("packets_lost")
-                log.error("The oldest unsaved packet is lost", extra=kv(unsaved=len(self._unsaved)))
-            self._unsaved.append((packet, heard_utc_s))
+                log.error("Oldest packet in memory dropped", extra=kv(unsaved=len(self._unsaved)))
+            self._unsaved.append((packet, received_utc_s))
 
-    def _save(self) -> None:
-        with self._lock:
+    def _process_received(self) -> None:
+        """Process the packets in memory, oldest first, then the images whose wait has ended."""
+        error = ""
+        with self._unsaved_lock:
             try:
                 while self._unsaved:
-                    self._commit_packet(*self._unsaved[0])
+                    self._process_packet(*self._unsaved[0])
                     self._unsaved.popleft()
-            except DeliveryError as error:
-                self.set_degraded(str(error))
-                return
-        self.set_degraded("")
+                self._send_due_images()
+            except DeliveryError as caught:
+                error = str(caught)
+            before, self._storage_error = self._storage_error, error
+        if error and not before:
+            log.error("Received frames cannot be stored; retrying", extra=kv(error=error))
+        elif before and not error:
+            log.info("Received frames stored again")
 
-    def _save_later(self) -> None:
-        while not self.stopping.wait(SAVE_AGAIN_S):
-            if self._unsaved:
-                self._save()
-
-    def _commit_packet(self, packet: PacketReceived, heard_utc_s: float) -> None:
-        """Owe a packet's frames to the decompressor, numbered on from the last packet ever received."""
+    def _process_packet(self, packet: PacketReceived, received_utc_s: float) -> None:
         if not packet.frames:
             return
         number = int(self.store.get_state(_PACKETS) or b"0") + 1
         effects = UnitOfWork()
-        key = keys.acoustic_rx(self.platform.id)
-        with self._station_lock:
-            changed = self._hear(packet, heard_utc_s, effects) if self._speaks else ()
-            self._commit_frames(packet, number, heard_utc_s, effects, key)
-        self._show(changed, heard_utc_s)
-        log.info(
-            "Packet received",
-            extra=kv(
-                source=packet.src,
-                rate=packet.rate,
-                frames=len(packet.frames),
-                bad=packet.bad_frames,
-                image_id=",".join(_images_of(packet)) or None,
-            ),
-        )
-
-    def _commit_frames(
-        self, packet: PacketReceived, number: int, heard_utc_s: float, effects: UnitOfWork, key: str
-    ) -> None:
+        frames: list[AcousticFrame] = []
         for frame in packet.frames:
             try:
-                effects.send(key, "decompressor", self._record(frame, packet, number, heard_utc_s))
+                frames.append(received_frame(self.platform.id, frame, packet, number, received_utc_s))
             except ValidationError as error:
-                # No Micro-Modem sends such a frame: a fault on the serial line that its checksum missed.
+                # No Micro-Modem sends such a frame: an error on the serial line that its checksum did not detect.
                 reason = f"frame {frame.frame_number} of {len(frame.data)} bytes: {error.errors()[0]['msg']}"
-                log.error("Frame refused", extra=kv(source=frame.src, reason=reason))
-                effects.quarantine(key, frame.data, reason)
+                log.error("Frame quarantined", extra=kv(source=frame.src, reason=reason))
+                effects.quarantine(keys.acoustic_rx(self.platform.id), frame.data, reason)
                 effects.count("frames_refused")
-        effects.put_state(_PACKETS, str(number).encode())
-        # The frames of the next packet may have begun to arrive.
-        effects.put_state(_ARRIVING, pack(self._arriving, heard_utc_s))
-        self.commit(effects)
+        with self._link_step() as link:
+            contents = [(frame, self._accept(link, frame)) for frame in frames]
+            images = [update for _, content in contents for update in content.images]
+            rejected = [reason for _, content in contents for reason in content.rejected]
+            messages = [self._message(frame, data) for frame, content in contents for data in content.messages]
+            self._send_images(images, effects)
+            for message in messages:
+                for consumer in self.config.message_consumers:
+                    effects.send(keys.message_received(self.platform.id), consumer, message)
+            effects.count("frames_rejected", len(rejected))
+            effects.count("messages_received", len(messages))
+            self._save_state(effects)
+            effects.put_state(_PACKETS, str(number).encode())
+            # Frames of the next packet may have arrived.
+            effects.put_state(_PARTIAL_PACKET, pack_partial(self._partial_packet, received_utc_s))
+            self.commit(effects)
+        for record in frames:
+            self.publish(keys.acoustic_rx(self.platform.id), record)
+        for message in messages if not self.config.message_consumers else ():
+            self.publish(keys.message_received(self.platform.id), message)
+        self._publish_states([command for _, content in contents for command in content.commands])
+        if rejected:
+            self._rejections, self._last_rejection = self._rejections + len(rejected), str(rejected[-1])
+        log.info(
+            "Packet received",
+            extra=kv(source=packet.src, rate=packet.rate, frames=len(packet.frames), bad=packet.bad_frames),
+        )
+        self._log_images(images)
 
-    def _record(self, frame: FrameReceived, packet: PacketReceived, number: int, heard_utc_s: float) -> AcousticFrame:
-        return AcousticFrame(
-            direction="rx",
-            platform_id=self.platform.id,
-            time_utc_s=heard_utc_s,
-            source=frame.src,
-            destination=frame.dest,
-            rate=frame.rate if frame.rate in RATES else None,
-            packet=number,
-            frame_number=frame.frame_number,
-            frame_count=_within(packet.nframes, MAX_FRAMES),
-            data=frame.data,
-            quality=quality_of(packet.statistics),
+    def _accept(self, link: VesselLink, frame: AcousticFrame) -> ReceivedContent:
+        """Pass a frame to the endpoint; only a frame to this modem or to all can hold messages for this vessel."""
+        addressed = frame.destination in (self.config.address, BROADCAST) and frame.source != BROADCAST
+        overheard = not (addressed and self.config.transmits)
+        return link.endpoint.accept(frame.source, frame.data, frame.time_utc_s, overheard=overheard)
+
+    def _message(self, frame: AcousticFrame, data: bytes) -> ReceivedMessage:
+        return ReceivedMessage(
+            vessel_id=self.platform.id,
+            vehicle_id=self.config.name_of(frame.source),
+            received_utc_s=frame.time_utc_s,
+            data=data,
         )
 
+    def _send_due_images(self) -> None:
+        """Send the images whose wait for more frames has ended."""
+        with self._link_lock:
+            if self._link.endpoint.next_deadline() is None:
+                return
+            with self._link_step() as link:
+                images = link.endpoint.poll(time.time())
+                if images:
+                    effects = UnitOfWork()
+                    self._send_images(images, effects)
+                    self._save_state(effects)
+                    self.commit(effects)
+                self._is_committed = True
+        self._log_images(images)
 
-def _images_of(packet: PacketReceived) -> list[str]:
-    """Return the images a packet's frames belong to, as far as their wire format says it."""
-    named = [image_ids_of_frame(frame.data) for frame in packet.frames]
-    return sorted({image_id for names in named if names is not None for image_id in names.split(",")})
+    def _send_images(self, images: Sequence[ImageUpdate], effects: UnitOfWork) -> None:
+        for image in images:
+            payload = wire.encode(self._link.image_record(image))
+            for consumer in self.config.image_consumers:
+                effects.send_payload(keys.acoustic_image(self.platform.id), consumer, payload, ReceivedImage)
+            effects.count("images_received")
 
+    def _log_images(self, images: Sequence[ImageUpdate]) -> None:
+        for image in images:
+            log.info(
+                "Image received",
+                extra=kv(
+                    vehicle=self.config.name_of(image.source),
+                    image_id=image.image_id,
+                    version=image.version,
+                    bytes=image.received_bytes,
+                    complete=image.complete,
+                ),
+            )
 
-def quality_of(statistics: LinkStatistics | None) -> LinkQuality | None:
-    """Return the part of the modem's statistics that travels with a frame."""
-    if statistics is None:
-        return None
-    return LinkQuality(
-        snr_in_db=statistics.snr_in_db,
-        snr_out_db=statistics.snr_out_db,
-        spl_db=None if statistics.spl_db is None else float(statistics.spl_db),
-        mse_db=statistics.mse_db,
-        doppler=statistics.doppler,
-        frames=_within(statistics.nframes),
-        bad_frames=_within(statistics.nbad),
-    )
+    # Migration
 
+    def _process_queued_frames(self) -> None:
+        """Process the frames that version 0.1 queued for the decompressor.
 
-def _within(number: int | None, high: int | None = None) -> int | None:
-    """Return a count the modem has told, None where it is none."""
-    return number if number is not None and number >= 0 and (high is None or number <= high) else None
+        The v1 receiver has already processed those addressed to this vessel, but its images were not sent. They are
+        sent again from its state.
+        """
+        key = keys.acoustic_rx(self.platform.id)
+        numbers = self.store.queued_numbers(_QUEUE_0_1, 2**31)
+        items = [item for item in self.store.queued_items(_QUEUE_0_1, numbers) if item.key == key]
+        if not items:
+            return
+        effects = UnitOfWork()
+        frames: list[AcousticFrame] = []
+        for item in items:
+            try:
+                frames.append(wire.decode(AcousticFrame, item.payload, item.key))
+            except PayloadError as error:
+                effects.quarantine(item.key, item.payload, str(error))
+        with self._link_step() as link:
+            if frames:
+                self._send_images(link.endpoint.v1.repeat_updates(min(frame.time_utc_s for frame in frames)), effects)
+            for frame in frames:
+                self._send_images(self._accept(link, frame).images, effects)
+            self._save_state(effects)
+            with self.store.transaction() as tx:
+                effects.write(tx)
+                tx.remove_acknowledged(_QUEUE_0_1, [item.seq for item in items])
+            self._is_committed = True
+        log.info("Frames of version 0.1 processed", extra=kv(frames=len(items)))

@@ -22,6 +22,7 @@ from sonarpost.messages import (
     Pixels,
     QueuedImage,
     QueueState,
+    ReceivedImage,
     ReceivedMessage,
     ReconstructedImage,
     Record,
@@ -134,6 +135,31 @@ def images(draw: st.DrawFn) -> ReconstructedImage:
 
 
 @st.composite
+def received_images(draw: st.DrawFn) -> ReceivedImage:
+    stream = draw(st.binary(max_size=64))
+    bounds = sorted(draw(st.sets(st.integers(0, len(stream)), max_size=6)))
+    return ReceivedImage(
+        vessel_id=draw(_name),
+        vehicle_id=draw(_name),
+        image_id=draw(_image_id),
+        version=draw(_ordinal),
+        contact=draw(_maybe(contacts)),
+        height_px=draw(_maybe(st.integers(1, 4096))),
+        width_px=draw(_maybe(st.integers(1, 4096))),
+        stream=stream,
+        missing=tuple(zip(bounds[::2], bounds[1::2], strict=False)),
+        missing_halves=draw(st.sampled_from([(), ("top",), ("bottom",), ("top", "bottom")])),
+        complete=draw(st.booleans()),
+        bytes_received=draw(_count),
+        bytes_total=draw(_count),
+        frames_received=draw(_count),
+        conflicts=draw(_count),
+        first_frame_utc_s=draw(_time),
+        last_frame_utc_s=draw(_time),
+    )
+
+
+@st.composite
 def commands(draw: st.DrawFn) -> Command:
     kind = draw(st.sampled_from(["refine", "resend", "revisit", "wider"]))
     place = kind == "revisit"
@@ -152,6 +178,7 @@ def commands(draw: st.DrawFn) -> Command:
 STRATEGIES: dict[type[Record], st.SearchStrategy[Any]] = {
     Contact: contacts,
     Pixels: pixels(),
+    ReceivedImage: received_images(),
     Snippet: st.builds(Snippet, contact=contacts, picture=pixels(), source=_text(0, 2000), wide=_maybe(pixels())),
     EncodedImage: st.builds(
         EncodedImage,

@@ -61,9 +61,7 @@ class PeerService(Service[ServiceConfig]):
 def short_retry_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten the delays before retries; these tests count retries, not seconds."""
     monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.05)
-    monkeypatch.setattr("sonarpost.services.decompressor.service.RETRY_AFTER_S", 0.05)
-    monkeypatch.setattr("sonarpost.services.decompressor.service.QUIET_S", 0.05)
-    monkeypatch.setattr("sonarpost.services.op_modem.service.SAVE_AGAIN_S", 0.05)
+    monkeypatch.setattr("sonarpost.services.op_modem.service.SAVE_RETRY_S", 0.05)
     monkeypatch.setattr("sonarpost.services.uuv_modem.service.SAVE_AGAIN_S", 0.05)
 
 

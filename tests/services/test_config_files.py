@@ -107,4 +107,4 @@ def test_both_ends_of_the_link_fit_together():
     assert isinstance(vessel, ModemServiceConfig)
     assert uuv.destination == vessel.address != uuv.address
     assert compressor.codebook in decompressor.codebooks
-    assert decompressor.vehicles[str(uuv.address)] == load(path_of("uuv"), "atd_stub", table_of("atd_stub"), {})[0].id
+    assert vessel.vehicles[str(uuv.address)] == load(path_of("uuv"), "atd_stub", table_of("atd_stub"), {})[0].id

@@ -1,130 +1,130 @@
-"""op_modem: whatever the modem hears is on the disk and handed on, also what was sent to somebody else."""
+"""op_modem: receives all frames, assembles images, loses and repeats nothing across kills, full disks and restarts."""
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
+import msgpack
+import numpy as np
 import pytest
-from builders.common import eventually
+from builders.common import GOLDEN_FOLDER, eventually
+from builders.vessel_frames import CONTACT, packet, preview_frame, received
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonarpost import keys
-from sonarpost.messages import AcousticFrame
-from sonarpost.modem.micromodem import FrameReceived, LinkStatistics, PacketReceived, nmea
+from sonarpost import keys, wire
+from sonarpost.errors import DeliveryError
+from sonarpost.link import migration
+from sonarpost.link.coding.channel_capacity import LossChannel
+from sonarpost.link.config import SenderConfig
+from sonarpost.link.downlink.messages import image_of_number
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import ContactFrame
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.receiver import ImageUpdate
+from sonarpost.link.state import below
+from sonarpost.messages import AcousticFrame, ReceivedImage
+from sonarpost.modem.micromodem import FrameDecoded, LinkStatistics, nmea
 from sonarpost.services.op_modem import service as op_modem
 from sonarpost.services.op_modem.config import OpModemConfig
-from sonarpost.services.op_modem.service import OpModemService, quality_of
+from sonarpost.services.op_modem.packets import quality_of
+from sonarpost.services.op_modem.service import OpModemService
 
-RX = keys.acoustic_rx("vessel-1")
+VESSEL = "vessel-1"
+RX, IMAGE = keys.acoustic_rx(VESSEL), keys.acoustic_image(VESSEL)
+SECOND = image_of_number(2)
 
 
 @pytest.fixture
 def begin(runner, platform, modem_pair):
     def start(**options):
         usual = {"port": modem_pair.port(modem_pair.VESSEL)}
-        return runner.start(OpModemService(platform("vessel-1"), OpModemConfig(**(usual | options))))
+        return runner.start(OpModemService(platform(VESSEL), OpModemConfig(**(usual | options))))
 
     return start
 
 
 @pytest.fixture
 def decompressor(runner):
-    return runner.peer("vessel-1", "decompressor", {RX: AcousticFrame})
+    return runner.peer(VESSEL, "decompressor", {IMAGE: ReceivedImage})
 
 
-def frame(number=1, data=b"x", src=3, rate=1):
-    return FrameReceived(src, 1, False, number, data, 0.0, rate, None)
+@pytest.fixture
+def observed(watch):
+    """Return the frames published for observers so far."""
+    samples = watch(RX)
+    return lambda: [wire.decode(AcousticFrame, s.payload.to_bytes(), RX) for s in samples]
 
 
-def packet(*frames, bad=0, nframes=None, rate=1, statistics=None):
-    return PacketReceived(frames, bad, len(frames) if nframes is None else nframes, 3, 1, rate, statistics, not bad)
+def numbers(peer):
+    """Return (image number, version) of the received images."""
+    return [(int(image.image_id, 36), image.version) for image in peer.received]
 
 
 def sentences(number, data, src=3, dest=1):
-    """The sentences of a received packet of one frame."""
+    """Return the modem's sentences for a received packet of one frame."""
     clock = "20161012000000.000000,0,21286,38,0125,0141,07,00,00,00,00"
     quality = "141,12.5,9.50,-100,-9.50,-01,0.00,51,25000,5000"
     statistics = f"6,0,{clock},1,{src:03d},{dest:03d},0,3,1,0,{quality}"
     return nmea.format("CARXD", src, dest, 0, number, data.hex().upper()) + nmea.format("CACST", *statistics.split(","))
 
 
-def test_packets_are_handed_on_with_their_numbers(modem_pair, begin, decompressor, check_monitoring):
+def test_packets_are_published_with_consecutive_numbers(modem_pair, begin, observed, check_monitoring):
     modem_pair.start()
     service = begin()
     eventually(lambda: service.health().state == "ok")
     for n in range(3):
-        service.on_modem_event(packet(frame(1, bytes([n])), frame(2, bytes([n, n])), bad=1, nframes=3))
-    eventually(lambda: len(decompressor.received) == 6)
-    assert [(f.packet, f.frame_number, f.data) for f in decompressor.received] == [
+        service.on_modem_event(packet(received(bytes([n]), 1), received(bytes([n, n]), 2), bad=1, nframes=3))
+    eventually(lambda: len(observed()) == 6)
+    assert [(f.packet, f.frame_number, f.data) for f in observed()] == [
         (n + 1, k, bytes([n] * k)) for n in range(3) for k in (1, 2)
     ]
-    assert {(f.frame_count, f.rate, f.source, f.destination) for f in decompressor.received} == {(3, 1, 3, 1)}
+    assert {(f.frame_count, f.rate, f.source, f.destination) for f in observed()} == {(3, 1, 3, 1)}
     counters = service.health().counters
     assert (counters["packets_received"], counters["frames_received"], counters["frames_bad"]) == (3, 6, 3)
     check_monitoring(service)
 
 
-def test_packets_are_numbered_on_after_a_restart(modem_pair, begin, runner, decompressor):
+def test_packet_numbers_continue_after_a_restart(begin, runner, observed):
     for number in range(1, 4):
         service = begin()
-        service.on_modem_event(packet(frame()))
-        eventually(lambda n=number: len(decompressor.received) == n)
+        service.on_modem_event(packet(b"x"))
+        eventually(lambda n=number: len(observed()) == n)
         runner.stop(service)
-    assert [f.packet for f in decompressor.received] == [1, 2, 3]
+    assert [f.packet for f in observed()] == [1, 2, 3]
 
 
-def test_frames_of_a_packet_whose_end_a_killed_process_did_not_see_are_handed_on(
-    modem_pair, begin, runner, decompressor, serial_cable
-):
-    modem_pair.start()
-    line = serial_cable(modem_pair.port(modem_pair.VESSEL))
-    service = begin(port=line.port)
-    eventually(lambda: service.health().state == "ok")
-    line.say(nmea.format("CARXP", 1) + nmea.format("CACYC", 0, 3, 1, 1, 0, 3))
-    for n, data in enumerate((b"first", b"second"), start=1):
-        line.say(nmea.format("CARXD", 3, 1, 0, n, data.hex()))
-    eventually(lambda: b"second" in (service.store.get_state("arriving") or b""), what="frames on the disk")
-    assert decompressor.received == []
-    killed = service.store.get_state("arriving")
-    runner.stop(service)  # which writes the packet down as it is, so the disk is put back as a kill leaves it
-    service = OpModemService(service.platform, service.config)
-    with service.store.transaction() as tx:
-        tx.put_state("arriving", killed)
-    runner.start(service)
-    eventually(lambda: [f.packet for f in decompressor.received] == [1, 1, 2, 2])
-    del decompressor.received[:2]
-    assert [(f.data, f.frame_number, f.rate, f.quality, f.frame_count) for f in decompressor.received] == [
-        (b"first", 1, 1, None, None),
-        (b"second", 2, 1, None, None),
-    ]
-    assert b"second" not in service.store.get_state("arriving")
-    line.say(sentences(1, b"after"))
-    eventually(lambda: len(decompressor.received) == 3)
-    assert decompressor.received[2].data == b"after"
-
-
-def test_frames_heard_while_nobody_takes_them_wait_over_a_restart(begin, runner):
-    service = begin()
-    service.on_modem_event(packet(frame(1, b"kept")))
+def test_images_wait_for_their_consumer_over_a_restart(begin, runner):
+    service = begin(vehicles={"3": "uuv-1"})
+    service.on_modem_event(packet(preview_frame(2, 40, 128)))
     assert service.health().gauges["outbox"] == 1
     runner.stop(service)
     begin()
-    late = runner.peer("vessel-1", "decompressor", {RX: AcousticFrame})
-    eventually(lambda: [f.data for f in late.received] == [b"kept"])
+    late = runner.peer(VESSEL, "decompressor", {IMAGE: ReceivedImage})
+    eventually(lambda: len(late.received) == 1)
+    [image] = late.received
+    assert (image.vessel_id, image.vehicle_id, image.image_id, image.version) == (VESSEL, "uuv-1", SECOND, 1)
+    assert (image.contact.contact_id, image.contact.lat_deg) == (f"uuv-1/{SECOND}", 56.4)
+    assert (image.height_px, image.width_px, len(image.stream), image.bytes_received) == (40, 60, 40, 40)
+    assert (image.missing, image.complete, image.bytes_total) == ((), False, 0)
 
 
-def test_a_frame_for_somebody_else_is_taken_and_link_quality_with_it(modem_pair, begin, decompressor, serial_cable):
+def test_overheard_frame_gives_images_and_its_link_quality(modem_pair, begin, decompressor, observed, serial_cable):
     modem_pair.start()
     line = serial_cable(modem_pair.port(modem_pair.VESSEL))
     service = begin(port=line.port)
     eventually(lambda: service.modem.ready)
-    line.say(sentences(1, b"overheard", dest=9))
-    eventually(lambda: len(decompressor.received) == 1)
-    got = decompressor.received[0]
-    assert (got.destination, got.data, got.rate, got.frame_count) == (9, b"overheard", 1, 1)
+    line.say(sentences(1, preview_frame(2), dest=9))
+    eventually(lambda: numbers(decompressor) == [(2, 1)])
+    [got] = observed()
+    assert (got.destination, got.data, got.rate, got.frame_count) == (9, preview_frame(2), 1, 1)
     assert (got.quality.snr_in_db, got.quality.frames, got.quality.bad_frames) == (12.5, 1, 0)
+    assert decompressor.received[0].vehicle_id == "modem-3"
 
 
-def test_garbage_on_the_line_is_counted_and_frames_after_it_are_taken(modem_pair, begin, decompressor, serial_cable):
+def test_invalid_sentences_are_counted_and_later_frames_processed(modem_pair, begin, observed, serial_cable):
     modem_pair.start()
     line = serial_cable(modem_pair.port(modem_pair.VESSEL))
     service = begin(port=line.port)
@@ -138,30 +138,35 @@ def test_garbage_on_the_line_is_counted_and_frames_after_it_are_taken(modem_pair
     line.say(nmea.format("CARXD", 3, 1, 0, 1, "0g") + nmea.format("CARXD", 300, 1, 0, 1, "00"))
     eventually(lambda: service.health().counters.get("sentences_rejected", 0) >= 4)
     line.say(sentences(1, b"good"))
-    eventually(lambda: [f.data for f in decompressor.received] == [b"good"])
+    eventually(lambda: [f.data for f in observed()] == [b"good"])
     assert service.health().state == "ok"
 
 
-@pytest.mark.parametrize("bad", [frame(9), frame(200), frame(1, bytes(2049))], ids=["number", "number-200", "length"])
-def test_a_frame_no_modem_sends_is_kept_apart_and_jams_nothing(bad, begin, decompressor, refused, caplog):
+@pytest.mark.parametrize(
+    "bad",
+    [received(number=9), received(number=200), received(bytes(2049)), received(src=200)],
+    ids=["number", "number-200", "length", "source"],
+)
+def test_invalid_frame_is_quarantined_and_blocks_nothing(bad, begin, decompressor, observed, refused, caplog):
     service = begin()
-    service.on_modem_event(packet(frame(1, b"before"), bad))
-    service.on_modem_event(packet(frame(1, b"after")))
-    eventually(lambda: [f.data for f in decompressor.received] == [b"before", b"after"])
+    service.on_modem_event(packet(received(preview_frame(1)), bad))
+    service.on_modem_event(packet(preview_frame(2)))
+    eventually(lambda: numbers(decompressor) == [(1, 1), (2, 1)])
+    assert len(observed()) == 2
     [(key, reason)] = refused(service)
     assert key == RX
     assert f"frame {bad.frame_number} of {len(bad.data)} bytes" in reason
     assert service.health().counters["frames_refused"] == 1
     assert service.health().gauges["unsaved"] == 0
-    assert any(r.message == "Frame refused" for r in caplog.records)
+    assert any(r.message == "Frame quarantined" for r in caplog.records)
 
 
-def test_impossible_circumstances_of_a_good_frame_are_unknown(begin, decompressor):
+def test_impossible_statistics_are_published_as_unknown(begin, observed):
     service = begin()
     odd = LinkStatistics(mode=0, arrival_time="", clock="", nframes=-5, nbad=-1, snr_in_db=7.5)
-    service.on_modem_event(packet(frame(1, b"good", rate=77), nframes=200, rate=77, statistics=odd))
-    eventually(lambda: len(decompressor.received) == 1)
-    got = decompressor.received[0]
+    service.on_modem_event(packet(received(b"good", rate=77), nframes=200, rate=77, statistics=odd))
+    eventually(lambda: len(observed()) == 1)
+    [got] = observed()
     assert (got.data, got.rate, got.frame_count) == (b"good", None, None)
     assert (got.quality.snr_in_db, got.quality.frames, got.quality.bad_frames) == (7.5, None, None)
 
@@ -172,13 +177,13 @@ real = st.none() | st.floats(allow_nan=False, allow_infinity=False)
 
 @settings(max_examples=200, deadline=None)
 @given(snr_in_db=real, snr_out_db=real, spl_db=number, mse_db=real, doppler=real, nframes=number, nbad=number)
-def test_whatever_a_modem_measures_fits_the_record(**measured):
+def test_every_measurement_of_a_modem_fits_the_record(**measured):
     quality = quality_of(LinkStatistics(mode=0, arrival_time="", clock="", **measured))
     assert quality.snr_in_db == measured["snr_in_db"]
     assert quality.frames is None or quality.frames == measured["nframes"] >= 0
 
 
-def test_a_port_that_is_not_there_is_named_and_used_when_it_comes(modem_pair, begin):
+def test_missing_port_is_named_and_used_when_it_appears(modem_pair, begin):
     service = begin()
     eventually(lambda: modem_pair.port(modem_pair.VESSEL) in service.health().detail)
     assert service.health().state == "degraded"
@@ -191,49 +196,219 @@ def test_a_port_that_is_not_there_is_named_and_used_when_it_comes(modem_pair, be
     eventually(lambda: service.health().state == "ok")
 
 
-def test_a_full_disk_keeps_frames_in_memory_and_saves_them_later(begin, decompressor):
+def test_full_disk_keeps_packets_in_memory_until_they_can_be_stored(begin, runner, observed, caplog):
+    caplog.set_level("INFO")
     service = begin()
     service.store._db.execute("PRAGMA max_page_count=1")
-    frames = [bytes([n]) * 2000 for n in range(20)]
-    for data in frames:
-        service.on_modem_event(packet(frame(1, data)))
+    for number in range(1, 21):
+        service.on_modem_event(packet(preview_frame(number, 220, 256)))
     assert service.health().state == "degraded"
     assert "disk is full" in service.health().detail
-    unsaved = service.health().gauges["unsaved"]
-    assert unsaved >= 15
+    assert service.health().gauges["unsaved"] >= 15
+    assert len(observed()) <= 5
     service.store._db.execute("PRAGMA max_page_count=1000000")
-    eventually(lambda: len(decompressor.received) == len(frames))
-    assert [f.data for f in decompressor.received] == frames
-    assert [f.packet for f in decompressor.received] == list(range(1, 21))
-    assert service.health().gauges["unsaved"] == 0
+    decompressor = runner.peer(VESSEL, "decompressor", {IMAGE: ReceivedImage})
+    eventually(lambda: numbers(decompressor) == [(number, 1) for number in range(1, 21)])
+    eventually(lambda: [f.packet for f in observed()] == list(range(1, 21)))
     eventually(lambda: "disk is full" not in service.health().detail)
+    assert service.health().gauges["unsaved"] == 0
+    messages = [r.message for r in caplog.records]
+    assert messages.count("Received frames cannot be stored; retrying") == 1
+    assert messages.count("Received frames stored again") == 1
 
 
-def test_frames_of_a_full_disk_are_saved_at_the_stop(begin, runner):
+def test_packets_of_a_full_disk_are_stored_at_the_stop(begin, runner):
     service = begin()
-    # Nobody tries again by itself any more: only the stop is left.
-    service.stopping.set()
+    service.stopping.set()  # ends the thread that retries
     service.store._db.execute("PRAGMA max_page_count=1")
-    for n in range(20):
-        service.on_modem_event(packet(frame(1, bytes([n]) * 2000)))
+    for number in range(1, 21):
+        service.on_modem_event(packet(preview_frame(number, 220, 256)))
     assert service.health().gauges["unsaved"] > 0
     service.store._db.execute("PRAGMA max_page_count=1000000")
     runner.stop(service)
     begin()
-    late = runner.peer("vessel-1", "decompressor", {RX: AcousticFrame})
-    eventually(lambda: [f.data[0] for f in late.received] == list(range(20)))
+    decompressor = runner.peer(VESSEL, "decompressor", {IMAGE: ReceivedImage})
+    eventually(lambda: numbers(decompressor) == [(number, 1) for number in range(1, 21)])
 
 
-def test_memory_is_bounded_and_what_it_drops_is_said(begin, monkeypatch, caplog, decompressor):
+def test_memory_is_bounded_and_dropped_packets_are_counted(begin, monkeypatch, caplog, runner):
     monkeypatch.setattr(op_modem, "MAX_UNSAVED", 5)
     service = begin()
     service.store._db.execute("PRAGMA max_page_count=1")
-    for n in range(30):
-        service.on_modem_event(packet(frame(1, bytes([n]) * 2000)))
+    for number in range(1, 31):
+        service.on_modem_event(packet(preview_frame(number, 220, 256)))
     assert service.health().gauges["unsaved"] == 5
     lost = service.health().counters["packets_lost"]
     assert lost >= 15
-    assert sum(r.message == "The oldest unsaved packet is lost" for r in caplog.records) == lost
+    assert sum(r.message == "Oldest packet in memory dropped" for r in caplog.records) == lost
     service.store._db.execute("PRAGMA max_page_count=1000000")
+    decompressor = runner.peer(VESSEL, "decompressor", {IMAGE: ReceivedImage})
     eventually(lambda: len(decompressor.received) == 30 - lost)
-    assert decompressor.received[-1].data[0] == 29
+    assert numbers(decompressor)[-1] == (30, 1)
+
+
+def test_frames_of_a_failed_commit_are_new_when_they_are_processed_again(begin, decompressor, monkeypatch):
+    service = begin()
+    commits = []
+    commit = OpModemService.commit
+
+    def fail_twice(self, effects, item=None):
+        commits.append(effects)
+        if len(commits) <= 2:
+            raise DeliveryError("disk is full")
+        commit(self, effects, item)
+
+    monkeypatch.setattr(OpModemService, "commit", fail_twice)
+    service.on_modem_event(packet(preview_frame(1), preview_frame(2)))
+    eventually(lambda: numbers(decompressor) == [(1, 1), (2, 1)])
+    assert service._link.endpoint.v1.counts.frames == 2
+
+
+def test_rejected_frames_are_counted_and_logged_once_per_interval(begin, caplog, decompressor):
+    service = begin()
+    service.on_modem_event(packet(b"neither", b"of", b"both formats", preview_frame(2)))
+    assert service.health().counters["frames_rejected"] == 3
+    eventually(lambda: any(r.message == "Frames rejected" for r in caplog.records))
+    [line] = [r for r in caplog.records if r.message == "Frames rejected"]
+    assert vars(line)["fields"]["rejected"] == 3
+    assert "acoustic frame from modem 3" in vars(line)["fields"]["last_reason"]
+    eventually(lambda: numbers(decompressor) == [(2, 1)])
+
+
+@pytest.mark.parametrize("wire_formats", [("v1",), ("paper",)])
+def test_wire_format_that_is_not_configured_is_rejected(wire_formats, begin, decompressor):
+    service = begin(wire_formats=wire_formats, pairing_timeout_s=0.2, link="paper")
+    service.on_modem_event(packet(preview_frame(2), ContactFrame("00A1", ContactSummary()).pack()))
+    assert service.health().counters["frames_rejected"] == 1
+    eventually(lambda: len(decompressor.received) == 1)
+    assert decompressor.received[0].image_id == (SECOND if wire_formats == ("v1",) else "00A1")
+
+
+def test_image_of_the_paper_format_is_sent_after_the_timeout(begin, decompressor):
+    service = begin(pairing_timeout_s=0.3)
+    service.on_modem_event(packet(ContactFrame("00A1", ContactSummary(lat_deg=1.0, lon_deg=2.0)).pack()))
+    assert service.health().gauges["images_waiting"] == 1.0
+    assert service.health().gauges["images_incomplete"] == 1.0
+    eventually(lambda: len(decompressor.received) == 1)
+    [image] = decompressor.received
+    assert (image.stream, image.missing_halves, image.complete) == (b"", ("top", "bottom"), False)
+    assert service.health().gauges["images_waiting"] == 0.0
+
+
+# Kills and migration
+
+
+@pytest.fixture
+def kill(runner, begin):
+    """Stop a service, restore the state that a kill would have left on the disk, and start it again."""
+
+    def restart(service):
+        folder = service.platform.state_dir
+        with service._unsaved_lock, service._link_lock:
+            saved = {p.name: p.read_bytes() for p in folder.glob("op_modem.db*") if not p.name.endswith("-shm")}
+        runner.stop(service)
+        for path in folder.glob("op_modem.db*"):
+            path.unlink()
+        for name, data in saved.items():
+            (folder / name).write_bytes(data)
+        return begin(vehicles={"3": "uuv-1"})
+
+    return restart
+
+
+def test_kill_between_any_two_frames_loses_and_repeats_no_image(begin, kill, decompressor):
+    sender = V1Sender(SenderConfig(frame_bytes=64, channels=(LossChannel(0.2),), frames_per_image=6))
+    for number in range(1, 4):
+        stream = b"\x20" + np.random.default_rng(number).bytes(150)
+        sender.add_image(number, replace(CONTACT, time_utc_s=1_475_568_000.0 + number), stream, 0.0)
+    frames = []
+    while (data := sender.next_frame(0.0)) is not None:
+        frames.append(data)
+    receiver = V1Receiver()
+    expected = [
+        (e.image_id, e.version, e.stream)
+        for data in frames
+        for e in receiver.accept(3, data, 0.0)
+        if isinstance(e, ImageUpdate)
+    ]
+    service = begin(vehicles={"3": "uuv-1"})
+    partial = []
+    for count, data in enumerate(frames, start=1):
+        partial.append(received(data, len(partial) + 1))
+        service.on_modem_event(FrameDecoded(partial[-1]))
+        if count % 3 == 0:
+            service = kill(service)  # inside a packet: the next start processes its frames
+            partial = []
+        elif len(partial) == 2 and count % 2 == 0:
+            service.on_modem_event(packet(*partial))
+            partial = []
+            if count % 4 == 0:
+                service = kill(service)  # between two packets
+    service.on_modem_event(packet(*partial))
+    eventually(lambda: len(decompressor.received) >= len(expected))
+    assert [(i.image_id, i.version, i.stream) for i in decompressor.received] == expected
+    assert {i.image_id for i in decompressor.received if i.complete} == {image_of_number(n) for n in (1, 2, 3)}
+
+
+def test_unfinished_packet_is_published_after_a_kill_without_statistics(begin, kill, observed):
+    service = begin()
+    for number, data in enumerate((b"first", b"second"), start=1):
+        service.on_modem_event(FrameDecoded(received(data, number)))
+    assert observed() == []
+    service = kill(service)
+    eventually(lambda: len(observed()) == 2)
+    assert [(f.data, f.frame_number, f.rate, f.quality, f.frame_count) for f in observed()] == [
+        (b"first", 1, 1, None, None),
+        (b"second", 2, 1, None, None),
+    ]
+    service.on_modem_event(packet(b"after"))
+    eventually(lambda: [f.packet for f in observed()] == [1, 1, 2])
+
+
+def old_store(service, *, state=None, frames=()):
+    """Fill the store of a service that is not started as version 0.1 did."""
+    with service.store.transaction() as tx:
+        if state is not None:
+            tx.put_state("station", state)
+        for data, time_utc_s in frames:
+            record = AcousticFrame(
+                direction="rx", platform_id=VESSEL, time_utc_s=time_utc_s, source=3, destination=1, rate=1, packet=1,
+                frame_number=1, frame_count=1, data=data,
+            )  # fmt: skip
+            tx.send(RX, "decompressor", wire.encode(record), encoding=wire.encoding_of(AcousticFrame))
+
+
+@pytest.fixture
+def unstarted(platform, modem_pair):
+    config = OpModemConfig(port=modem_pair.port(modem_pair.VESSEL), vehicles={"3": "uuv-1"})
+    return OpModemService(platform(VESSEL), config)
+
+
+def test_frames_that_version_0_1_queued_are_processed(unstarted, runner, decompressor):
+    old_store(unstarted, frames=[(preview_frame(number), 1e9 + number) for number in range(1, 4)])
+    service = runner.start(unstarted)
+    eventually(lambda: numbers(decompressor) == [(1, 1), (2, 1), (3, 1)])
+    assert [image.first_frame_utc_s for image in decompressor.received] == [1e9 + number for number in range(1, 4)]
+    eventually(lambda: service.health().gauges["outbox"] == 0)
+
+
+def test_images_of_queued_frames_that_version_0_1_had_processed_are_sent_again(unstarted, runner, decompressor):
+    case = json.loads((GOLDEN_FOLDER / "link-state-0.1" / "endpoint.json").read_text(encoding="utf-8"))
+    state = msgpack.unpackb(bytes.fromhex(case["state"]), strict_map_key=False)
+    receiver = V1Receiver()
+    receiver.restore(below("v1/", migration.endpoint_parts(bytes.fromhex(case["state"]))))
+    images = sorted(receiver._sources[3].images.values(), key=lambda image: image.last_frame_s)
+    known = [image for image in images if image.contact is not None]
+    assert len(known) >= 2
+    since_s = known[1].last_frame_s
+    resent = {image.number: image for image in known if image.last_frame_s >= since_s}
+    assert 0 < len(resent) < len(known)
+    old_store(unstarted, state=msgpack.packb({"link": state}), frames=[(b"already processed", since_s)])
+    service = runner.start(unstarted)
+    eventually(lambda: len(decompressor.received) == len(resent))
+    for image in decompressor.received:
+        before = resent[int(image.image_id, 36)]
+        assert image.version == before.version + 1
+        assert image.stream == bytes(before.stream.data[: before.stream.prefix_bytes])
+    assert service.health().gauges["commands_open"] == len(service._link.commands.open_commands)
+    assert service.store.get_state("station") is None

@@ -1,38 +1,42 @@
-"""op_modem with v1: orders reach a vehicle through emulated modems and are confirmed, whatever is lost or restarted."""
+"""op_modem with v1: commands and feedback reach a vehicle through emulated modems, also after losses and restarts."""
 
 from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import pytest
 from builders.common import eventually
 from builders.v1_world import next_frames
+from builders.vessel_frames import CONTACT, packet
 from pydantic import ValidationError
 
 from sonarpost import keys, wire
-from sonarpost.errors import PayloadError
+from sonarpost.errors import ConfigError, DeliveryError, PayloadError
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink import messages as dl
 from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import ContactFrame
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.receiver import FeedbackReceived, MessageReceived
-from sonarpost.messages import AcousticFrame, Command, Decision, DownlinkState, ReceivedMessage
-from sonarpost.modem.micromodem import FrameReceived, MicroModem, MicroModemConfig, PacketReceived
+from sonarpost.messages import Command, Decision, DownlinkState, ReceivedImage, ReceivedMessage
+from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, PacketReceived
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialPort
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService
-from sonarpost.services.op_modem.speaking import TransmitGate
+from sonarpost.services.op_modem.transmit_gate import TransmitGate
 
 VESSEL = "vessel-1"
-RX, DECISION, STATE = keys.acoustic_rx(VESSEL), keys.contact_decision(VESSEL), keys.acoustic_downlink(VESSEL)
+RX, IMAGE = keys.acoustic_rx(VESSEL), keys.acoustic_image(VESSEL)
+DECISION, STATE = keys.contact_decision(VESSEL), keys.acoustic_downlink(VESSEL)
 VERDICT = Decision(
     decision_id="d-1",
     vessel_id=VESSEL,
@@ -99,17 +103,17 @@ def states(watch):
 
 
 class Vehicle:
-    """The far end on its own modem: takes orders, confirms each copy unless it is to be silent."""
+    """The vehicle's end on its own modem; confirms each copy of a command after the first `silent` ones."""
 
     def __init__(self, port, key=None, *, silent=0):
-        self.orders, self.reports, self.silent = [], [], silent
-        seal = None
+        self.commands, self.feedback, self.silent = [], [], silent
+        authenticator = None
         if key is not None:
-            seal = FrameAuthenticator(key, 3, Direction.FROM_VEHICLE)
-            seal.grant(10_000)
-        self.receiver = V1Receiver(protection=seal)
+            authenticator = FrameAuthenticator(key, 3, Direction.FROM_VEHICLE)
+            authenticator.grant(10_000)
+        self.receiver = V1Receiver(protection=authenticator)
         self.sender = V1Sender(
-            SenderConfig(frame_bytes=64, channels=(LossChannel(0.1),), feedback=True), protection=seal
+            SenderConfig(frame_bytes=64, channels=(LossChannel(0.1),), feedback=True), protection=authenticator
         )
         link = SerialPort(port, 19200)
         self.modem = ModemRunner(MicroModem(MicroModemConfig(3), port), link, self.on_event)
@@ -120,14 +124,14 @@ class Vehicle:
         for frame in event.frames:
             for found in self.receiver.accept(frame.src, frame.data, time.time()):
                 if isinstance(found, FeedbackReceived):
-                    self.reports.append(found.feedback)
+                    self.feedback.append(found.feedback)
                 elif isinstance(found, MessageReceived):
                     self.take(dl.unpack(found.data))
 
-    def take(self, order):
-        self.orders.append(order)
-        if len(self.orders) > self.silent:
-            answer = dl.ConfirmationMessage(((order.token, dl.CommandOutcome.ACCEPTED),))
+    def take(self, command):
+        self.commands.append(command)
+        if len(self.commands) > self.silent:
+            answer = dl.ConfirmationMessage(((command.token, dl.CommandOutcome.ACCEPTED),))
             self.sender.add_message(dl.pack(answer), time.time(), times=1)
             self.send()
 
@@ -149,21 +153,16 @@ def vehicle(modem_pair):
         each.modem.stop()
 
 
-def packet(*frames, dest=1, src=3):
-    heard = tuple(FrameReceived(src, dest, False, n, data, 0.0, 1, None) for n, data in enumerate(frames, start=1))
-    return PacketReceived(heard, 0, len(frames), src, dest, 1, None, True)
-
-
 def confirmation_of(record_id, kind="command", outcome=dl.CommandOutcome.ACCEPTED):
     answer = dl.pack(dl.ConfirmationMessage(((dl.token_of(record_id, kind), outcome),)))
     return pack_segments([Segment(SegmentKind.MESSAGE, b"\x01" + answer)], 32)
 
 
-@pytest.mark.parametrize("sealed", [False, True])
-def test_orders_go_through_the_water_and_are_confirmed(sealed, modem_pair, begin, console, states, vehicle, key_file):
+@pytest.mark.parametrize("authenticated", [False, True])
+def test_commands_are_sent_and_confirmed(authenticated, modem_pair, begin, console, states, vehicle, key_file):
     modem_pair.start()
-    far = vehicle(key=read_key(key_file) if sealed else None)
-    service = begin(key_file=key_file if sealed else None)
+    far = vehicle(key=read_key(key_file) if authenticated else None)
+    service = begin(key_file=key_file if authenticated else None)
     sent = {
         "c-1": command(),
         "c-2": command("resend", "c-2"),
@@ -183,66 +182,66 @@ def test_orders_go_through_the_water_and_are_confirmed(sealed, modem_pair, begin
         steps = [state.state for state in states(record_id)]
         assert steps[0] == "asked"
         assert set(steps[1:-1]) == {"sent"}
-    by_kind = {type(order): order for order in far.orders}
+    by_kind = {type(found): found for found in far.commands}
     assert by_kind[dl.RefineMessage].number == by_kind[dl.ResendMessage].number == by_kind[dl.ExpandMessage].number == 7
     assert (by_kind[dl.RevisitMessage].lat_deg, by_kind[dl.RevisitMessage].lon_deg) == (41.5, -70.5)
-    judged = by_kind[dl.DecisionMessage]
-    assert (judged.verdict, judged.confidence, judged.version) == ("mine_like", 0.5, 2)
-    assert "Manta".startswith(judged.mlo_class)
-    eventually(lambda: service.health().gauges["orders_open"] == 0.0)
-    if sealed:
+    decided = by_kind[dl.DecisionMessage]
+    assert (decided.verdict, decided.confidence, decided.version) == ("mine_like", 0.5, 2)
+    assert "Manta".startswith(decided.mlo_class)
+    eventually(lambda: service.health().gauges["commands_open"] == 0.0)
+    if authenticated:
         assert service.health().gauges["frames_genuine"] >= 4
 
 
-def test_an_order_is_repeated_until_it_is_confirmed(modem_pair, begin, console, states, vehicle):
+def test_command_is_repeated_until_it_is_confirmed(modem_pair, begin, console, states, vehicle):
     modem_pair.start()
     far = vehicle(silent=2)
     begin()
     console.send(keys.command(VESSEL, "refine"), "op_modem", command())
     eventually(lambda: states("c-1") and states("c-1")[-1].state == "confirmed", timeout_s=60)
-    assert len(far.orders) >= 3
-    assert len(set(far.orders)) == 1
+    assert len(far.commands) >= 3
+    assert len(set(far.commands)) == 1
     assert states("c-1")[-1].times_sent >= 3
 
 
-def test_an_order_waits_over_a_kill_and_the_same_record_is_one_order(
+def test_command_survives_a_restart_and_the_same_record_is_added_once(
     modem_pair, begin, runner, console, states, vehicle
 ):
     service = begin()  # no modem yet
-    asked = command()
-    console.send(keys.command(VESSEL, "refine"), "op_modem", asked, asked)
-    eventually(lambda: service.health().counters.get("orders_repeated") == 1)
+    record = command()
+    console.send(keys.command(VESSEL, "refine"), "op_modem", record, record)
+    eventually(lambda: service.health().counters.get("commands_repeated") == 1)
     runner.stop(service)
     modem_pair.start()
     far = vehicle()
     service = begin()
     eventually(lambda: states("c-1") and states("c-1")[-1].state == "confirmed", timeout_s=60)
-    assert {order.token for order in far.orders} == {dl.token_of("c-1", "command")}
-    console.send(keys.command(VESSEL, "refine"), "op_modem", asked)  # a second site asks the same
-    eventually(lambda: service.health().counters.get("orders_repeated") == 1)
-    assert service.health().gauges["orders_open"] == 0.0
+    assert {found.token for found in far.commands} == {dl.token_of("c-1", "command")}
+    console.send(keys.command(VESSEL, "refine"), "op_modem", record)  # from a second site
+    eventually(lambda: service.health().counters.get("commands_repeated") == 1)
+    assert service.health().gauges["commands_open"] == 0.0
 
 
-def test_confirmations_and_messages_are_kept_with_the_frame_they_came_in(begin, runner, console, states):
-    takes = runner.peer(VESSEL, "bridge", {keys.message_received(VESSEL): ReceivedMessage})
+def test_confirmations_and_messages_are_committed_with_their_frame(begin, runner, console, states):
+    bridge = runner.peer(VESSEL, "bridge", {keys.message_received(VESSEL): ReceivedMessage})
     service = begin(message_consumers=("bridge",))
     console.send(keys.command(VESSEL, "refine"), "op_modem", command())
-    eventually(lambda: service.health().gauges["orders_open"] == 1.0)
+    eventually(lambda: service.health().gauges["commands_open"] == 1.0)
     data = pack_segments([Segment(SegmentKind.MESSAGE, b"\x02" + dl.pack(dl.DataMessage(b"battery 80")))], 32)
     elsewhere = confirmation_of("c-1")
-    service.on_modem_event(packet(elsewhere, dest=9))  # overheard: not for this vessel
-    assert service.health().gauges["orders_open"] == 1.0
+    service.on_modem_event(packet(elsewhere, dest=9))  # to another vessel
+    assert service.health().gauges["commands_open"] == 1.0
     service.on_modem_event(packet(data, confirmation_of("c-1", outcome=dl.CommandOutcome.UNKNOWN_IMAGE), data))
     eventually(lambda: states("c-1") and states("c-1")[-1].state == "refused")
     assert states("c-1")[-1].reason == "unknown image"
     runner.stop(service)
     service = begin(message_consumers=("bridge",))
     service.on_modem_event(packet(data))
-    assert service.health().gauges["orders_open"] == 0.0
-    eventually(lambda: [(m.vehicle_id, m.data) for m in takes.received] == [("uuv-1", b"battery 80")])
+    assert service.health().gauges["commands_open"] == 0.0
+    eventually(lambda: [(m.vehicle_id, m.data) for m in bridge.received] == [("uuv-1", b"battery 80")])
 
 
-def test_without_consumers_messages_are_shown(begin, watch):
+def test_messages_without_consumers_are_published(begin, watch):
     seen = watch(keys.message_received(VESSEL))
     service = begin()
     service.on_modem_event(
@@ -253,16 +252,16 @@ def test_without_consumers_messages_are_shown(begin, watch):
     assert (record.vehicle_id, record.data) == ("modem-5", b"x")
 
 
-def test_an_order_that_nobody_confirms_expires(modem_pair, begin, console, states):
+def test_unconfirmed_command_expires(modem_pair, begin, console, states):
     begin(command_lifetime_s=0.3)
     console.send(keys.command(VESSEL, "refine"), "op_modem", command())
     eventually(lambda: [state.state for state in states("c-1")] == ["asked", "expired"])
-    console.send(DECISION, "op_modem", VERDICT)  # decided long ago
+    console.send(DECISION, "op_modem", VERDICT)  # an old decision
     eventually(lambda: [state.state for state in states("d-1")] == ["expired"])
 
 
-def test_reports_tell_the_vehicle_what_is_lacking(modem_pair, begin, vehicle, runner):
-    decompressor = runner.peer(VESSEL, "decompressor", {RX: AcousticFrame})
+def test_feedback_names_the_missing_symbols(modem_pair, begin, vehicle, watch):
+    observed = watch(RX)
     modem_pair.start()
     far = vehicle()
     service = begin(feedback_interval_s=0.5)
@@ -272,9 +271,11 @@ def test_reports_tell_the_vehicle_what_is_lacking(modem_pair, begin, vehicle, ru
         far.sender.add_image(number, contact, bytes([0x20]) + bytes(range(150)), time.time())
     next_frames(far.sender, 2, time.time())  # lost
     far.send()
-    eventually(lambda: len(far.reports) >= 1, timeout_s=60)
-    assert sum(far.reports[0].missing) > 0
-    assert len(decompressor.received) == 3
+    eventually(lambda: len(far.feedback) >= 1, timeout_s=60)
+    assert sum(far.feedback[0].missing) > 0
+    assert len(observed) == 3
+    assert service.health().gauges["feedback_open"] == 1.0
+    assert service.health().gauges["images_incomplete"] > 0.0
 
 
 @pytest.mark.parametrize(
@@ -288,84 +289,196 @@ def test_reports_tell_the_vehicle_what_is_lacking(modem_pair, begin, vehicle, ru
         (DECISION, VERDICT.model_copy(update={"decided_utc_s": 5e9}), "time"),
     ],
 )
-def test_what_can_never_be_sent_is_refused(key, record, field, begin):
+def test_record_that_can_never_be_sent_is_rejected(key, record, field, begin):
     service = begin()
     with pytest.raises(PayloadError) as caught:
         service.validate(key, record)
     assert caught.value.field == field
 
 
-def test_an_order_is_checked_while_the_station_is_busy(begin, console, states):
+def test_command_is_validated_while_the_link_is_locked(begin, console, states):
     service = begin()
-    with service._station_lock:
-        # Taken into the inbox, within a transaction, while a thread that will want a transaction has the station.
+    with service._link_lock:
+        # The inbox validates inside a transaction while another thread holds the lock and will open a transaction.
         console.send(keys.command(VESSEL, "refine"), "op_modem", command())
-        eventually(lambda: service.store.inbox_depth() == 1, timeout_s=10, what="order in the inbox")
+        eventually(lambda: service.store.inbox_depth() == 1, timeout_s=10, what="command in the inbox")
     eventually(lambda: [state.state for state in states("c-1")] == ["asked"])
 
 
-def test_vehicles_without_a_name_can_be_told_too(begin):
+def test_vehicle_without_a_name_receives_commands(begin):
     begin().validate(keys.command(VESSEL, "refine"), command(vehicle_id="modem-5"))
 
 
-def test_with_the_papers_link_it_only_listens(begin):
+def test_service_with_the_paper_link_does_not_transmit(begin):
     service = begin(link="paper")
     assert service.consumed_keys() == {}
     service.on_modem_event(packet(confirmation_of("c-1")))
-    assert "frames_foreign" not in service.health().counters
+    assert service.health().counters["messages_received"] == 0
+    assert service.health().gauges["feedback_open"] == 0.0
 
 
-def test_frames_without_the_key_change_nothing(begin, console, key_file):
+def test_frames_without_authentication_change_nothing(begin, console, key_file):
     service = begin(key_file=key_file)
     console.send(keys.command(VESSEL, "refine"), "op_modem", command())
-    eventually(lambda: service.health().gauges["orders_open"] == 1.0)
+    eventually(lambda: service.health().gauges["commands_open"] == 1.0)
     service.on_modem_event(packet(confirmation_of("c-1")))
-    assert service.health().gauges["orders_open"] == 1.0
-    assert service.health().counters["frames_foreign"] == 1
+    assert service.health().gauges["commands_open"] == 1.0
+    assert service.health().counters["frames_rejected"] == 1
 
 
-def test_a_state_that_cannot_be_read_is_left_and_said(begin, runner, caplog):
+@pytest.fixture
+def decompressor(runner):
+    return runner.peer(VESSEL, "decompressor", {IMAGE: ReceivedImage})
+
+
+def vehicle_frames(numbers, authenticator=None):
+    """Return all frames of some images, in the order of transmission."""
+    config = SenderConfig(frame_bytes=64, channels=(LossChannel(0.3),), frames_per_image=6)
+    sender = V1Sender(config, protection=authenticator)
+    for number in numbers:
+        sender.add_image(number, replace(CONTACT, time_utc_s=1e9 + number), b"\x20" + bytes([number] * 150), 0.0)
+    frames = []
+    while (data := sender.next_frame(0.0)) is not None:
+        frames.append(data)
+    return frames
+
+
+def vehicle_authenticator(key_file, first_counter=0):
+    authenticator = FrameAuthenticator(read_key(key_file), 3, Direction.FROM_VEHICLE, first_counter=first_counter)
+    authenticator.grant(authenticator.settings.lifetime_frames)
+    return authenticator
+
+
+def complete(peer):
+    return {int(image.image_id, 36) for image in peer.received if image.complete}
+
+
+def test_both_wire_formats_are_received_side_by_side(begin, decompressor):
+    service = begin(pairing_timeout_s=0.2)
+    contact_frame = ContactFrame("0A1B", CONTACT).pack()
+    for data in vehicle_frames([1, 2]):
+        service.on_modem_event(packet(data, contact_frame))
+    eventually(lambda: complete(decompressor) == {1, 2})
+    eventually(lambda: "0A1B" in {image.image_id for image in decompressor.received})
+    assert service.health().counters["frames_rejected"] == 0
+
+
+def test_only_authenticated_frames_count_and_each_once(begin, runner, decompressor, key_file):
+    service = begin(key_file=key_file)
+    genuine = vehicle_frames([1, 2], vehicle_authenticator(key_file))
+    forged = vehicle_frames([3, 4])
+    for data in (*forged, *genuine):
+        service.on_modem_event(packet(data))
+    eventually(lambda: complete(decompressor) == {1, 2})
+    for data in genuine:
+        service.on_modem_event(packet(data, src=4))  # with the address of another vehicle
+    assert service.health().counters["frames_rejected"] == len(forged) + len(genuine)
+    runner.stop(service)
+    service = begin(key_file=key_file)
+    for data in genuine:
+        service.on_modem_event(packet(data))  # replayed after a restart
+    assert service.health().counters["frames_rejected"] == len(genuine)
+    for data in vehicle_frames([5], vehicle_authenticator(key_file, len(genuine))):
+        service.on_modem_event(packet(data))
+    eventually(lambda: complete(decompressor) == {1, 2, 5})
+    assert {int(image.image_id, 36) for image in decompressor.received} == {1, 2, 5}
+
+
+def test_authenticated_frame_of_a_failed_commit_is_no_replay(begin, decompressor, key_file, monkeypatch):
+    service = begin(key_file=key_file)
+    commit, failed = OpModemService.commit, []
+
+    def fail_first(self, effects, item=None):
+        if len(failed) < 2:
+            failed.append(effects)
+            raise DeliveryError("disk is full")
+        commit(self, effects, item)
+
+    monkeypatch.setattr(OpModemService, "commit", fail_first)
+    for data in vehicle_frames([1], vehicle_authenticator(key_file)):
+        service.on_modem_event(packet(data))
+    eventually(lambda: complete(decompressor) == {1})
+    assert len(failed) == 2
+    assert service.health().gauges["frames_replayed"] == 0.0
+    assert service.health().counters["frames_rejected"] == 0
+
+
+def test_key_requires_the_format_with_authentication(begin, key_file):
+    with pytest.raises(ConfigError, match="wire_formats"):
+        begin(key_file=key_file, link="paper", wire_formats=("paper",))
+
+
+def test_feedback_is_open_until_everything_arrived(begin, decompressor):
+    service = begin()
+    frames = vehicle_frames([1, 2])
+    assert service.health().gauges["feedback_open"] == 0.0
+    service.on_modem_event(packet(frames[0]))
+    assert service.health().gauges["feedback_open"] == 1.0
+    assert service.health().gauges["images_incomplete"] >= 1.0
+    for data in frames[1:]:
+        service.on_modem_event(packet(data))
+    eventually(lambda: complete(decompressor) == {1, 2})
+    assert service.health().gauges["images_incomplete"] == 0.0
+
+
+def test_vehicle_of_another_vessel_gets_no_feedback(begin, runner, decompressor):
+    service = begin()
+    first, *others = vehicle_frames([1, 2])
+    service.on_modem_event(packet(first, dest=9))
+    assert service.health().gauges["feedback_open"] == 0.0
+    runner.stop(service)
+    service = begin()
+    assert service.health().gauges["feedback_open"] == 0.0
+    service.on_modem_event(packet(others[0]))
+    assert service.health().gauges["feedback_open"] == 1.0
+    for data in others[1:]:
+        service.on_modem_event(packet(data, dest=9))
+    assert service.health().gauges["feedback_open"] == 0.0
+    eventually(lambda: complete(decompressor) == {1, 2})
+
+
+def test_unreadable_state_is_discarded_and_counted(begin, runner, caplog):
     service = begin()
     with service.store.transaction() as tx:
         tx.put_state("station", b"\xc1")
     runner.stop(service)
     service = begin()
     assert service.health().counters["states_discarded"] == 1
-    assert service.health().gauges["orders_open"] == 0.0
+    assert service.health().gauges["commands_open"] == 0.0
 
 
-def turn(**options):
+def gate(**options):
     return TransmitGate(OpModemConfig(port="x", **options))
 
 
-def test_it_speaks_when_it_has_been_quiet_or_it_has_waited_long():
-    mine = turn(holdoff_s=2.0, max_defer_s=60.0)
-    ask = {"receiving": False, "wanted": True}
-    mine.heard(100.0)
-    assert not mine.may_speak(101.0, 0.0, **ask)
-    assert mine.may_speak(102.0, 0.0, **ask)
-    assert not mine.may_speak(102.0, 0.0, receiving=True, wanted=True)
-    assert not mine.may_speak(102.0, 0.0, receiving=False, wanted=False)
+def test_csma_sends_after_the_holdoff_or_the_maximum_wait():
+    mine = gate(holdoff_s=2.0, max_defer_s=60.0)
+    ask = {"receiving": False, "pending": True}
+    mine.frame_received(100.0)
+    assert not mine.may_transmit(101.0, 0.0, **ask)
+    assert mine.may_transmit(102.0, 0.0, **ask)
+    assert not mine.may_transmit(102.0, 0.0, receiving=True, pending=True)
+    assert not mine.may_transmit(102.0, 0.0, receiving=False, pending=False)
     mine.failed(102.0)
-    assert not mine.may_speak(103.0, 0.0, **ask)
+    assert not mine.may_transmit(103.0, 0.0, **ask)
     for now_s in range(103, 163):
-        mine.heard(float(now_s))
-        assert not mine.may_speak(now_s + 0.5, 0.0, **ask)
-    mine.heard(164.0)
-    assert mine.may_speak(164.1, 0.0, **ask)
+        mine.frame_received(float(now_s))
+        assert not mine.may_transmit(now_s + 0.5, 0.0, **ask)
+    mine.frame_received(164.0)
+    assert mine.may_transmit(164.1, 0.0, **ask)
 
 
-def test_it_speaks_in_its_slot_only():
-    mine = turn(mac="tdma", tdma_cycle_s=60.0, slot_start_s=50.0, slot_s=10.0, guard_s=1.0)
-    spoken = [at for at in range(120) if mine.may_speak(float(at), float(at), receiving=False, wanted=True)]
-    assert spoken == [50, 51, 52, 53, 54, 110, 111, 112, 113, 114]
+def test_tdma_sends_in_its_slot_only():
+    mine = gate(mac="tdma", tdma_cycle_s=60.0, slot_start_s=50.0, slot_s=10.0, guard_s=1.0)
+    sent = [at for at in range(120) if mine.may_transmit(float(at), float(at), receiving=False, pending=True)]
+    assert sent == [50, 51, 52, 53, 54, 110, 111, 112, 113, 114]
 
 
 def test_vehicles_are_polled_in_turn():
-    mine = turn(mac="polled", poll_interval_s=10.0)
-    asked = [(at, mine.vehicle_to_poll(float(at), [3, 5])) for at in range(0, 40, 5)]
-    assert [pair for pair in asked if pair[1] is not None] == [(0, 3), (10, 5), (20, 3), (30, 5)]
-    assert turn().vehicle_to_poll(0.0, [3]) is None
+    mine = gate(mac="polled", poll_interval_s=10.0)
+    polls = [(at, mine.vehicle_to_poll(float(at), [3, 5])) for at in range(0, 40, 5)]
+    assert [pair for pair in polls if pair[1] is not None] == [(0, 3), (10, 5), (20, 3), (30, 5)]
+    assert gate().vehicle_to_poll(0.0, [3]) is None
 
 
 @pytest.mark.parametrize(
@@ -375,25 +488,26 @@ def test_vehicles_are_polled_in_turn():
         {"vehicles": {"300": "uuv-1"}},
         {"mac": "tdma", "slot_start_s": 55.0},
         {"mac": "tdma", "slot_start_s": 0.0, "slot_s": 3.0},
+        {"wire_formats": ("paper",)},
     ],
 )
-def test_configurations_that_cannot_work_are_refused(options):
+def test_invalid_configuration_is_rejected(options):
     with pytest.raises(ValidationError):
         OpModemConfig(port="x", **options)
 
 
-def test_a_vehicle_is_asked_for_a_packet_and_answers(modem_pair, begin, vehicle, runner):
-    decompressor = runner.peer(VESSEL, "decompressor", {RX: AcousticFrame})
+def test_polled_vehicle_sends_a_packet(modem_pair, begin, vehicle, watch):
+    observed = watch(RX)
     modem_pair.start()
     far = vehicle()
-    asked = threading.Event()
+    polled_once = threading.Event()
 
     def uplink(polled):
-        asked.set()
+        polled_once.set()
         return (b"polled",)
 
     far.modem.set_poll_handler(uplink)
     eventually(lambda: far.modem.ready)
     begin(mac="polled", poll_interval_s=0.2)
-    assert asked.wait(30)
-    eventually(lambda: any(frame.data.startswith(b"polled") for frame in decompressor.received), timeout_s=30)
+    assert polled_once.wait(30)
+    eventually(lambda: any(b"polled" in sample.payload.to_bytes() for sample in observed), timeout_s=30)

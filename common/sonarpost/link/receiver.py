@@ -60,12 +60,7 @@ class ImageUpdate:
     @property
     def has_header(self) -> bool:
         """Whether the stream has a header, so that a codec can decode it."""
-        try:
-            StreamHeader.unpack(self.stream)
-        except StreamError:
-            # Too short so far, or invalid: `MAX_SIZE` bytes always hold a header, valid or not.
-            return len(self.stream) >= StreamHeader.MAX_SIZE
-        return True
+        return has_header(self.stream)
 
     @property
     def missing_halves(self) -> tuple[HalfName, ...]:
@@ -90,10 +85,33 @@ class ImageUpdate:
         Raises:
             StreamError: The stream has no valid header.
         """
-        received = np.ones(len(self.stream), dtype=np.bool_)
-        for start, stop in self.missing:
-            received[start:stop] = False
-        return received[StreamHeader.unpack(self.stream).size :]
+        return received_mask(self.stream, self.missing)
+
+
+def has_header(stream: bytes) -> bool:
+    """Return whether the received part of a stream has a header, so that a codec can decode it."""
+    try:
+        StreamHeader.unpack(stream)
+    except StreamError:
+        # Too short so far, or invalid: `MAX_SIZE` bytes always hold a header, valid or not.
+        return len(stream) >= StreamHeader.MAX_SIZE
+    return True
+
+
+def received_mask(stream: bytes, missing: Ranges) -> Mask:
+    """Return shape (bytes of the body,), True where a byte of a stream arrived.
+
+    Args:
+        stream: The stream, header first.
+        missing: Ranges of `stream` that have not arrived.
+
+    Raises:
+        StreamError: The stream has no valid header.
+    """
+    received = np.ones(len(stream), dtype=np.bool_)
+    for start, stop in missing:
+        received[start:stop] = False
+    return received[StreamHeader.unpack(stream).size :]
 
 
 @dataclass(frozen=True, slots=True)

@@ -231,6 +231,63 @@ def test_failed_feedback_is_repeated():
     assert mute.next_packet(1, 32, 61.0) is None
 
 
+def lost_image_frames():
+    """Return a frame of an incomplete block and the other frames of the same image."""
+    vehicle = Vehicle(SenderConfig(frame_bytes=64, channels=(LossChannel(0.3),), frames_per_image=6))
+    vehicle.sender.add_image(7, ContactSummary(height_px=40, width_px=60), bytes([0x20]) + bytes(range(200)), 0.0)
+    frames = []
+    while (frame := vehicle.sender.next_frame(0.0)) is not None:
+        frames.append(frame)
+    return frames
+
+
+def test_open_feedback_is_counted_until_it_is_no_longer_useful():
+    first, *others = lost_image_frames()
+    link = VesselEndpoint(CommandTracker(30.0), ReceiverConfig(feedback_interval_s=10.0))
+    mute = VesselEndpoint(CommandTracker(30.0), feedback=False)
+    assert (link.feedback_open, link.incomplete_images) == (0, 0)
+    for endpoint in (link, mute):
+        endpoint.accept(UUV, first, 0.0)
+    assert (link.feedback_open, mute.feedback_open) == (1, 0)
+    assert link.incomplete_images == mute.incomplete_images
+    now = 0.0
+    while link.feedback_open:
+        now += 10.0
+        assert now < 10_000.0
+        packet = link.next_packet(1, 32, now)
+        if packet is not None:
+            link.sent(packet, now)
+    assert link.next_packet(1, 32, now + 3600.0) is None
+    for frame in others:
+        link.accept(UUV, frame, now)
+    assert link.incomplete_images == 0
+
+
+def test_overheard_vehicle_gets_no_feedback_and_its_messages_are_ignored():
+    first, second, *_ = lost_image_frames()
+    link = VesselEndpoint(CommandTracker(30.0), ReceiverConfig(feedback_interval_s=10.0))
+    assert len(link.accept(UUV, first, 0.0, overheard=True).images) == 1
+    assert len(link.accept(UUV + 1, first, 0.0).images) == 1
+    message = pack_segments([Segment(SegmentKind.MESSAGE, b"\x01" + dl.pack(dl.DataMessage(b"text")))], 32)
+    assert link.accept(UUV, message, 0.0, overheard=True).messages == ()
+    for endpoint in (link, restarted(link)):
+        assert endpoint.feedback_open == 1
+        assert endpoint.next_packet(1, 32, 3600.0).address == UUV + 1
+    link.accept(UUV, b"rejected", 1.0, overheard=True)
+    link.accept(UUV, second, 1.0)
+    assert link.feedback_open == 2
+    assert link.accept(UUV, b"rejected", 2.0, overheard=True).rejected
+    assert link.feedback_open == 2
+
+
+def test_updates_of_recent_images_are_repeated_as_the_next_version():
+    link = VesselEndpoint(CommandTracker(30.0))
+    updates = [update for at, frame in enumerate(lost_image_frames()) for update in link.accept(UUV, frame, at).images]
+    assert link.v1.repeat_updates(updates[-1].last_frame_s + 1.0) == []
+    [again] = link.v1.repeat_updates(updates[-1].last_frame_s)
+    assert again == replace(updates[-1], version=updates[-1].version + 1)
+
+
 def test_messages_are_returned_once_and_invalid_ones_rejected():
     link = VesselEndpoint(CommandTracker(30.0))
     sender = V1Sender(SenderConfig(channels=(LossChannel(0.3),)))

@@ -16,7 +16,7 @@ from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import Origin
 from sonarpost.services.atd_stub.survey_detection import snippet_of
 from sonarpost.services.compressor.encoding import expand
-from sonarpost.services.op_modem.station import order_of
+from sonarpost.services.op_modem.vessel_endpoint import message_of
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.received_commands import ReceivedCommands
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
@@ -81,7 +81,7 @@ def test_expand_of_a_detection_shows_twice_the_ground(start_service, runner, atd
     eventually(lambda: len(modem.received) == 1)
     first = modem.received[0]
     # A command on the vessel, bytes on the acoustic link, a command again on the vehicle.
-    downlink_bytes = dl.pack(order_of(command_record("wider", first.image_id), 7))
+    downlink_bytes = dl.pack(message_of(command_record("wider", first.image_id), 7))
     outcome, received = ReceivedCommands("uuv-1", UuvModemConfig(port="unused")).accept(
         1, dl.unpack(downlink_bytes), first.image_id
     )

@@ -80,7 +80,7 @@ def test_contact_is_received_measured_and_decided(
     users = Users(tmp_path / "state" / "vessel-1" / FILE_NAME)
     users.add("anna", "operator", "correct horse battery")
     console = runner.start(ConsoleService(platform("vessel-1"), ConsoleConfig(port=0, vehicles=VEHICLES)))
-    decompressor = {"out_dir": tmp_path / "out", "image_consumers": ("relay", "console"), "vehicles": VEHICLES}
+    decompressor = {"out_dir": tmp_path / "out", "image_consumers": ("relay", "console")}
     runner.start(DecompressorService(platform("vessel-1"), DecompressorConfig(**decompressor)))
     op_modem = {"port": modem_pair.port(modem_pair.VESSEL), "vehicles": VEHICLES, "retry_s": 0.5, "holdoff_s": 0.05}
     runner.start(OpModemService(platform("vessel-1"), OpModemConfig(**op_modem)))

@@ -161,10 +161,9 @@ def _service_table(settings: ChainSettings, service: str) -> str:
         + f"destination = {VESSEL_ADDRESS}\nrate = {settings.rate}\n"
         + _vehicle_link(settings),
         "op_modem": modem.format(name="op_modem", port=settings.modem_port(VESSEL_ADDRESS), address=VESSEL_ADDRESS)
+        + f"pairing_timeout_s = {settings.pairing_timeout_s:.3f}\n"
         + _vessel_link(settings),
-        "decompressor": f'[decompressor]\nout_dir = "{settings.vessel_images}"\n'
-        f"pairing_timeout_s = {settings.pairing_timeout_s:.3f}\ncodebooks = [{codebooks}]\n"
-        f'vehicles = {{ {UUV_ADDRESS} = "{UUV}" }}\n'
+        "decompressor": f'[decompressor]\nout_dir = "{settings.vessel_images}"\ncodebooks = [{codebooks}]\n'
         + ("" if page is None else 'image_consumers = ["relay", "console"]\n'),
         "relay": "[relay]\n" + ("" if page is None else 'advice_consumers = ["console"]\n'),
         "c2": f'[c2]\nout_dir = "{settings.shore_images.parent}"\n',

@@ -33,8 +33,8 @@ IDLE_GAUGES: Mapping[str, tuple[str, ...]] = {
     "atd_stub": ("files_waiting", "contacts_waiting", "outbox"),
     "compressor": ("inbox", "outbox"),
     "uuv_modem": ("inbox", "images_waiting"),
-    "op_modem": ("outbox", "unsaved"),
-    "decompressor": ("inbox", "outbox", "images_waiting"),
+    "op_modem": ("outbox", "unsaved", "images_waiting"),
+    "decompressor": ("inbox", "outbox"),
     "relay": ("inbox", "outbox"),
     "c2": ("inbox",),
 }

@@ -72,9 +72,15 @@ class DownlinkPacket:
 
 @dataclass(frozen=True, slots=True)
 class EndpointState:
-    """Saved state of the endpoint itself. `message_number`: of the next message."""
+    """Saved state of the endpoint itself.
+
+    Attributes:
+        message_number: Number of the next message.
+        overheard: Modem addresses of the vehicles whose last frame was addressed to another station.
+    """
 
     message_number: Byte = 0
+    overheard: tuple[Byte, ...] = ()
 
 
 class VesselEndpoint:
@@ -113,11 +119,27 @@ class VesselEndpoint:
         self._unanswered: dict[int, int] = {}
         self._feedback_s: dict[int, float] = {}
         self._feedback_failed: set[int] = set()
+        self._overheard: set[int] = set()
 
-    def accept(self, source: int, frame: bytes, now: float) -> ReceivedContent:
-        """Process a frame to this vessel or to all stations. Never raises because of `frame`."""
+    def accept(self, source: int, frame: bytes, now: float, *, overheard: bool = False) -> ReceivedContent:
+        """Process a frame. Never raises because of `frame`.
+
+        Args:
+            source: Modem address of the sender.
+            frame: The frame as the modem delivered it.
+            now: UTC in seconds.
+            overheard: The frame was addressed to another station. Only its images are used, and its sender gets no
+                feedback until it sends a frame to this station.
+        """
+        events = self._receiver.accept(source, frame, now)
+        if overheard:
+            content = self._content([event for event in events if not isinstance(event, MessageReceived)])
+            self._overheard |= set() if content.rejected else {source}
+            return content
+        content = self._content(events)
+        self._overheard.discard(source)
         self._unanswered.pop(source, None)
-        return self._content(self._receiver.accept(source, frame, now))
+        return content
 
     def poll(self, now: float) -> tuple[ImageUpdate, ...]:
         """Return the images that are due without a frame."""
@@ -126,6 +148,27 @@ class VesselEndpoint:
     def next_deadline(self) -> float | None:
         """Return when `poll` has the next image, None if no image waits."""
         return self._receiver.next_deadline()
+
+    @property
+    def feedback_open(self) -> int:
+        """Number of vehicles to which feedback is due, or will be repeated if they send nothing.
+
+        The feedback that only announces the vessel, long after the last one, does not count.
+        """
+        return sum(
+            self._feedback
+            and source not in self._overheard
+            and (
+                source in self._feedback_failed
+                or (self._unanswered.get(source, -1) < _MAX_UNANSWERED and self.v1.feedback_is_useful(source))
+            )
+            for source in self.v1.sources
+        )
+
+    @property
+    def incomplete_images(self) -> int:
+        """Number of known images of which not everything has arrived."""
+        return self.v1.incomplete_images + self.paper.incomplete_images
 
     def _content(self, events: Sequence[Event]) -> ReceivedContent:
         images: list[ImageUpdate] = []
@@ -213,7 +256,7 @@ class VesselEndpoint:
         return feedback is not None and packer.add(Segment(SegmentKind.FEEDBACK, feedback.pack()))
 
     def _feedback_is_due(self, source: int, now: float) -> bool:
-        if not self._feedback:
+        if not self._feedback or source in self._overheard:
             return False
         if source in self._feedback_failed:
             return True
@@ -239,7 +282,7 @@ class VesselEndpoint:
         The times of feedback are not saved: after a restart feedback can be a little early.
         """
         return {
-            "endpoint": pack_part(EndpointState(self._message_number)),
+            "endpoint": pack_part(EndpointState(self._message_number, tuple(sorted(self._overheard)))),
             **prefixed("v1/", self.v1.parts()),
             **prefixed("paper/", self.paper.parts()),
             **prefixed("commands/", self.commands.parts()),
@@ -250,6 +293,7 @@ class VesselEndpoint:
         reader = PartReader(parts, "vessel endpoint state")
         state = reader.read("endpoint", EndpointState) or EndpointState()
         self._message_number = state.message_number
+        self._overheard = set(state.overheard)
         errors = dict(reader.errors)
         for prefix, restore in (
             ("v1/", self.v1.restore),

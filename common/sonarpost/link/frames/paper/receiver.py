@@ -272,6 +272,11 @@ class PaperReceiver:
         """Return when the next wait ends, None when no image is open."""
         return min((i.wait_from_s + self._timeout_s for i in self._images.values() if i.open), default=None)
 
+    @property
+    def incomplete_images(self) -> int:
+        """Number of stored images whose body has not arrived completely."""
+        return sum(not image.complete for image in self._images.values())
+
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`: counters and images."""
         images = {f"image/{image.source}/{image.image_id}": pack_part(image) for image in self._images.values()}

@@ -298,11 +298,18 @@ class PeerState:
         if self.newest_block < 0:
             return False
         since_feedback_s = now - self.feedback_s
-        useful = self.is_incomplete or self.redundant_symbols > 0 or self.feedback_frames == 0
         frames = self.frames - self.feedback_frames
         return (
-            useful and (since_feedback_s >= config.feedback_interval_s or frames >= config.feedback_interval_frames)
+            self.feedback_is_useful
+            and (since_feedback_s >= config.feedback_interval_s or frames >= config.feedback_interval_frames)
         ) or (frames > 0 and since_feedback_s >= _PRESENCE_S)
+
+    @property
+    def feedback_is_useful(self) -> bool:
+        """Whether feedback is useful, see `feedback_is_due`; the announcement after `_PRESENCE_S` does not count."""
+        return self.newest_block >= 0 and (
+            self.is_incomplete or self.redundant_symbols > 0 or self.feedback_frames == 0
+        )
 
     def parts(self) -> dict[str, bytes]:
         """Return the state to save: the sender, its images, its blocks, and their symbols."""
@@ -439,6 +446,23 @@ class V1Receiver:
         """Whether feedback to a sender is useful now."""
         peer = self._sources.get(source)
         return peer is not None and peer.feedback_is_due(now, self.config)
+
+    def feedback_is_useful(self, source: int) -> bool:
+        """Whether feedback to a sender is useful, now or after the interval of feedback."""
+        peer = self._sources.get(source)
+        return peer is not None and peer.feedback_is_useful
+
+    @property
+    def incomplete_images(self) -> int:
+        """Number of known images of which not everything has arrived that their senders have planned so far."""
+        return sum(not image.complete for peer in self._sources.values() for image in peer.images.values())
+
+    def repeat_updates(self, since_s: float) -> list[ImageUpdate]:
+        """Return the content of all images that received a frame at `since_s` or later, as their next version."""
+        images = [i for peer in self._sources.values() for i in peer.images.values() if i.last_frame_s >= since_s]
+        for image in images:
+            image.reported = (-1, False)
+        return [update for image in images if (update := image.next_update()) is not None]
 
     def mini_feedback(self, source: int) -> int | None:
         """Return 13 bits for a mini-packet: the oldest incomplete block. None if all are complete."""

@@ -1,0 +1,309 @@
+"""Downlink of op_modem: commands and feedback for vehicles, and the saved state of the link endpoint."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+
+import zenoh
+
+from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig
+from sonarpost.delivery.records import InboxItem
+from sonarpost.errors import ConfigError, DeliveryError, FrameError, PayloadError
+from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.auth.key import Direction
+from sonarpost.link.downlink.commands import PendingCommand
+from sonarpost.link.downlink.vessel_endpoint import DownlinkPacket
+from sonarpost.link.state import SavedParts
+from sonarpost.logs import kv
+from sonarpost.messages import Command, Decision, Record
+from sonarpost.modem.micromodem import RATES, FrameReceived, PacketFailed, PacketSent
+from sonarpost.runtime.modem_service import ModemService
+from sonarpost.runtime.service import UnitOfWork
+from sonarpost.security.acoustic_key import read_key
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.packets import sent_frames
+from sonarpost.services.op_modem.transmit_gate import TransmitGate
+from sonarpost.services.op_modem.vessel_endpoint import VesselLink
+
+log = logging.getLogger(__name__)
+
+_STATE_0_1 = "station"
+"""The whole state in one value, as version 0.1 saved it."""
+_PARTS = "station/"
+_COUNTER_LIMIT = "seal-limit/"
+
+
+class DownlinkService(ModemService[OpModemConfig]):
+    """Sends commands and feedback to vehicles; `OpModemService` adds the reception.
+
+    Several threads use the link endpoint: the one with `_link_lock`. After a failed commit the endpoint in memory is
+    ahead of the disk; the next step then begins with the last committed state.
+
+    Raises:
+        ConfigError: The key file cannot be read or is not private to its owner, or no wire format remains with a key.
+    """
+
+    def __init__(self, platform: PlatformConfig, config: OpModemConfig) -> None:
+        # Before the store is opened, so that a configuration error leaves no open store.
+        self._key = None if platform.acoustic_key_file is None else read_key(platform.acoustic_key_file)
+        if self._key is not None and "v1" not in config.wire_formats:
+            raise ConfigError("[op_modem]", "wire_formats", config.wire_formats, '"v1" where acoustic_key_file is set')
+        super().__init__(platform, config)
+        self._partial_packet: list[FrameReceived] = []
+        self._gate = TransmitGate(config)
+        self._link_lock = threading.RLock()
+        self._link = self._new_link()
+        self._saved_parts = SavedParts({})
+        self._is_committed = False
+        self._in_flight: tuple[int, DownlinkPacket] | None = None
+        self._transmit_error = ""
+        self._new_commands: list[PendingCommand] = []
+
+    def _new_link(self) -> VesselLink:
+        authenticator = None
+        if self._key is not None:
+            limit = int(self.store.get_state(_COUNTER_LIMIT + self._key.fingerprint) or b"0")
+            address = self.config.address
+            authenticator = FrameAuthenticator(self._key, address, Direction.TO_VEHICLE, first_counter=limit)
+        return VesselLink(self.platform.id, self.config, authenticator)
+
+    # Commands
+
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
+        """Return commands and decisions for vehicles; nothing if the vessel does not transmit."""
+        if not self.config.transmits:
+            return {}
+        return {keys.command_all(self.platform.id): Command, keys.contact_decision(self.platform.id): Decision}
+
+    def validate(self, key: str, record: Record) -> None:
+        """Reject a record that can never be sent."""
+        assert isinstance(record, (Command, Decision))
+        if isinstance(record, Command) and key != keys.command(self.platform.id, record.kind):
+            raise PayloadError(key, "kind", record.kind, "the kind in the key")
+        if isinstance(record, Decision) and record.vessel_id != self.platform.id:
+            raise PayloadError(key, "vessel_id", record.vessel_id, self.platform.id)
+        # Without the lock: this runs inside a transaction, and the holder of the lock may be waiting for one.
+        self._link.check(record, key)
+
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+        """Add a command or a decision; a repeated one changes nothing."""
+        assert isinstance(record, (Command, Decision))
+        self._load()
+        command = self._link.add(record, time.time())
+        if command is None:
+            effects.count("commands_repeated")
+            return
+        effects.count("commands_received")
+        self._save_state(effects)
+        self._new_commands.append(command)
+
+    def _handle_item(self, item: InboxItem) -> None:
+        with self._link_lock:
+            self._new_commands.clear()
+            super()._handle_item(item)
+            added = tuple(self._new_commands)
+        self._publish_states(added)
+
+    # State of the endpoint
+
+    def commit(self, effects: UnitOfWork, item: InboxItem | None = None) -> None:
+        """Commit the effects and the state of the endpoint."""
+        with self._link_lock:
+            super().commit(effects, item)
+            self._is_committed = True
+
+    @contextmanager
+    def _link_step(self) -> Iterator[VesselLink]:
+        """Lock the endpoint for a step that ends with a commit."""
+        with self._link_lock:
+            self._load()
+            yield self._link
+
+    def _load(self) -> None:
+        """Restore the last committed state if the endpoint may be ahead of it; requires the lock."""
+        if not self._is_committed:
+            self._link = self._new_link()
+            names = self.store.state_names(_PARTS)
+            parts = {name.removeprefix(_PARTS): self.store.get_state(name) or b"" for name in names}
+            self._saved_parts = SavedParts(parts)
+            errors = self._link.restore(parts)
+            old = self.store.get_state(_STATE_0_1)
+            if not parts and old is not None:
+                try:
+                    self._link.restore_old(old)
+                except FrameError as error:
+                    errors = {_STATE_0_1: error}
+            for name, reason in errors.items():
+                self.count("states_discarded")
+                log.error("Discarding an unreadable part of the link state", extra=kv(part=name, reason=str(reason)))
+        self._is_committed = False
+
+    def _save_state(self, effects: UnitOfWork) -> None:
+        """Add the changed parts of the endpoint's state to a unit of work."""
+        parts = self._link.parts()
+        for name, data in self._saved_parts.changes(parts).items():
+            if data is None:
+                effects.delete_state(_PARTS + name)
+            else:
+                effects.put_state(_PARTS + name, data)
+        effects.delete_state(_STATE_0_1)
+        self._saved_parts.commit(parts)
+
+    # Transmission
+
+    def publish_open_commands(self) -> None:
+        """Publish the state of the open commands after a start."""
+        with self._link_step() as link:
+            open_commands = link.commands.open_commands
+            self._is_committed = True
+        if self.config.transmits:
+            self._publish_states(open_commands)
+
+    def transmit(self) -> None:
+        """Close expired commands, and send a packet or a poll if one is due and the channel is free."""
+        if not self.config.transmits:
+            return
+        error = ""
+        try:
+            self._expire_commands()
+            self._send_if_due()
+        except (OSError, DeliveryError) as caught:
+            error = f"{type(caught).__name__}: {caught}"
+        except FrameError as caught:
+            # The key is used up, or a command is too long for a downlink_rate that was lowered later.
+            error = str(caught)
+            if error != self._transmit_error:
+                log.error("Packet cannot be built", extra=kv(reason=error))
+        if error:
+            self._gate.failed(time.monotonic())
+        self._transmit_error = error
+
+    def _expire_commands(self) -> None:
+        now = time.time()
+        with self._link_lock:
+            if all(command.expires_s > now for command in self._link.commands.open_commands):
+                return
+            with self._link_step() as link:
+                expired = link.commands.expire(now)
+                effects = UnitOfWork()
+                effects.count("commands_expired", len(expired))
+                self._save_state(effects)
+                self.commit(effects)
+        self._publish_states(expired)
+
+    def _send_if_due(self) -> None:
+        if self._in_flight is not None or not self.modem.ready or self.modem.queued:
+            return
+        now_s, now = time.monotonic(), time.time()
+        receiving = self.modem.receiving or bool(self._partial_packet)
+        with self._link_lock:
+            pending = self._link.endpoint.due_address(now) is not None
+            if self._gate.may_transmit(now_s, now, receiving=receiving, pending=pending):
+                self._send(now)
+            elif not pending and not receiving:
+                self._poll_vehicle(now_s)
+
+    def _send(self, now: float) -> None:
+        """Build the next packet, commit the state that follows from it, and send it; requires the lock."""
+        rate = RATES[self.config.downlink_rate]
+        with self._link_step() as link:
+            self._reserve_counters(link.authenticator)
+            packet = link.endpoint.next_packet(rate.frames, rate.frame_bytes, now)
+            effects = UnitOfWork()
+            self._save_state(effects)
+            self.commit(effects)
+            if packet is not None:
+                packet_id = self.modem.send_packet(packet.address, rate.number, packet.frames)
+                self._in_flight = (packet_id, packet)
+
+    def _reserve_counters(self, authenticator: FrameAuthenticator | None) -> None:
+        """Store the limit of the authentication counters before they are used."""
+        if authenticator is None or self._key is None or (limit := authenticator.requested_limit) is None:
+            return
+        with self.store.transaction() as tx:
+            tx.put_state(_COUNTER_LIMIT + self._key.fingerprint, str(limit).encode())
+        authenticator.grant(limit)
+
+    def _poll_vehicle(self, now_s: float) -> None:
+        address = self._gate.vehicle_to_poll(now_s, sorted(int(address) for address in self.config.vehicles))
+        if address is not None:
+            self.modem.request_packet(address, self.config.poll_rate, RATES[self.config.poll_rate].frames)
+            self.count("polls_sent")
+
+    def packet_ended(self, event: PacketSent | PacketFailed) -> None:
+        """Record that the modem has sent a packet, or failed to."""
+        now = time.time()
+        with self._link_lock:
+            if self._in_flight is None or self._in_flight[0] != event.packet_id:
+                return
+            packet = self._in_flight[1]
+            self._in_flight = None
+            if isinstance(event, PacketFailed):
+                self._link.endpoint.failed(packet)
+                self._gate.failed(time.monotonic())
+                self.count("packets_failed")
+                log.warning("Packet not sent", extra=kv(destination=packet.address, reason=event.reason))
+                return
+            changed = self._commit_sent(packet, now)
+        for record in sent_frames(self.platform.id, self.config.address, event, now):
+            self.publish(keys.acoustic_tx(self.platform.id), record)
+        self._publish_states(changed)
+
+    def _commit_sent(self, packet: DownlinkPacket, now: float) -> tuple[PendingCommand, ...]:
+        with self._link_step() as link:
+            changed = link.endpoint.sent(packet, now)
+            effects = UnitOfWork()
+            effects.count("packets_sent")
+            effects.count("feedback_sent", int(packet.has_feedback))
+            self._save_state(effects)
+            try:
+                self.commit(effects)
+            except DeliveryError as error:
+                # The packet is sent again; the vehicle recognises a repeated command by its token.
+                log.warning("Sent packet not committed", extra=kv(error=str(error)))
+        return changed
+
+    # Publications and health
+
+    def _publish_states(self, commands: Iterable[PendingCommand]) -> None:
+        now = time.time()
+        for command in commands:
+            self.publish(keys.acoustic_downlink(self.platform.id), self._link.state_record(command, now))
+            log.info(
+                "Command state changed",
+                extra=kv(
+                    vehicle=command.vehicle, kind=command.kind, record_id=command.record_id, state=str(command.state)
+                ),
+            )
+
+    def publish(self, key: str, record: Record) -> None:
+        """Publish a record for subscribers, without durable delivery."""
+        try:
+            self.session.put(key, wire.encode(record), encoding=wire.encoding_of(type(record)))
+        except zenoh.ZError as error:
+            log.warning("Record not published", extra=kv(key=key, error=str(error)))
+
+    def link_gauges(self) -> Mapping[str, float]:
+        """Return the state of commands, images, feedback and authentication."""
+        with self._link_lock:
+            endpoint, authenticator = self._link.endpoint, self._link.authenticator
+            gauges = {
+                "commands_open": float(len(self._link.commands.open_commands)),
+                "feedback_open": float(endpoint.feedback_open),
+                "images_incomplete": float(endpoint.incomplete_images),
+                "images_waiting": float(endpoint.next_deadline() is not None),
+            }
+            if authenticator is not None:
+                counts = authenticator.counts
+                gauges |= {"frames_forged": float(counts.forged), "frames_replayed": float(counts.replayed)}
+                gauges |= {"frames_genuine": float(counts.genuine), "key_frames_left": float(authenticator.frames_left)}
+            return gauges
+
+    def degraded_reason(self) -> str:
+        """Return why the port, the modem or the transmission does not work."""
+        return super().degraded_reason() or self._transmit_error

@@ -1,0 +1,101 @@
+"""Packets of the modem: as records, and the frames of an unfinished packet as saved state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgpack
+
+from sonarpost.messages import AcousticFrame, LinkQuality
+from sonarpost.modem.micromodem import RATES, FrameReceived, LinkStatistics, PacketReceived, PacketSent
+
+_MAX_FRAMES = 8
+
+
+def pack_partial(frames: Sequence[FrameReceived], received_utc_s: float) -> bytes:
+    """Return the frames of an unfinished packet as bytes for the store."""
+    saved = [[f.src, f.dest, f.ack, f.frame_number, f.data, f.rate] for f in frames]
+    return bytes(msgpack.packb({"heard_utc_s": received_utc_s, "frames": saved}))
+
+
+def unpack_partial(saved: bytes) -> tuple[PacketReceived, float] | None:
+    """Return the packet of `pack_partial`, without statistics, and its time; None if it has no frames."""
+    state = msgpack.unpackb(saved)
+    frames = tuple(
+        FrameReceived(src, dest, ack, number, data, 0.0, rate, None)
+        for src, dest, ack, number, data, rate in state["frames"]
+    )
+    if not frames:
+        return None
+    first = frames[0]
+    packet = PacketReceived(frames, 0, None, first.src, first.dest, first.rate, None, complete=False)
+    return packet, float(state["heard_utc_s"])
+
+
+def received_frame(
+    vessel_id: str, frame: FrameReceived, packet: PacketReceived, number: int, received_utc_s: float
+) -> AcousticFrame:
+    """Return the record of a received frame.
+
+    Args:
+        vessel_id: Name of the vessel.
+        frame: The frame.
+        packet: Its packet.
+        number: Number of the packet on this vessel.
+        received_utc_s: End of the packet.
+
+    Raises:
+        ValidationError: No Micro-Modem sends such a frame.
+    """
+    return AcousticFrame(
+        direction="rx",
+        platform_id=vessel_id,
+        time_utc_s=received_utc_s,
+        source=frame.src,
+        destination=frame.dest,
+        rate=frame.rate if frame.rate in RATES else None,
+        packet=number,
+        frame_number=frame.frame_number,
+        frame_count=_within(packet.nframes, _MAX_FRAMES),
+        data=frame.data,
+        quality=quality_of(packet.statistics),
+    )
+
+
+def sent_frames(vessel_id: str, source: int, packet: PacketSent, sent_utc_s: float) -> list[AcousticFrame]:
+    """Return the records of the frames of a packet that was sent."""
+    return [
+        AcousticFrame(
+            direction="tx",
+            platform_id=vessel_id,
+            time_utc_s=sent_utc_s,
+            source=source,
+            destination=packet.dest,
+            rate=packet.rate,
+            packet=packet.packet_id,
+            frame_number=number,
+            frame_count=len(packet.frames),
+            data=data,
+        )
+        for number, data in enumerate(packet.frames, start=1)
+    ]
+
+
+def quality_of(statistics: LinkStatistics | None) -> LinkQuality | None:
+    """Return the modem's statistics as a record; an impossible count becomes None."""
+    if statistics is None:
+        return None
+    return LinkQuality(
+        snr_in_db=statistics.snr_in_db,
+        snr_out_db=statistics.snr_out_db,
+        spl_db=None if statistics.spl_db is None else float(statistics.spl_db),
+        mse_db=statistics.mse_db,
+        doppler=statistics.doppler,
+        frames=_within(statistics.nframes),
+        bad_frames=_within(statistics.nbad),
+    )
+
+
+def _within(number: int | None, high: int | None = None) -> int | None:
+    """Return a count if it is in 0..high, else None."""
+    return number if number is not None and number >= 0 and (high is None or number <= high) else None

@@ -1,0 +1,214 @@
+"""The vessel's link endpoint in terms of records: commands in, image and state records out."""
+
+from __future__ import annotations
+
+import msgpack
+
+from sonarpost.errors import FrameError, PayloadError
+from sonarpost.link import migration
+from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.downlink import messages as dl
+from sonarpost.link.downlink.commands import MAX_PENDING, CommandTracker, PendingCommand
+from sonarpost.link.downlink.vessel_endpoint import VesselEndpoint
+from sonarpost.link.frames.v1.frame import segments_room
+from sonarpost.link.receiver import ImageUpdate
+from sonarpost.link.state import Parts, below, prefixed, unpack_plain
+from sonarpost.messages import Command, Contact, Decision, DownlinkState, ReceivedImage
+from sonarpost.modem.micromodem import RATES
+from sonarpost.services.op_modem.config import OpModemConfig
+
+_LINK, _AUTHENTICATION = "link/", "authentication/"
+_MESSAGE_OVERHEAD_BYTES = 3  # kind, length and number of a message segment
+LATEST_UTC_S = 2**32 - 1
+
+
+class VesselLink:
+    """The endpoint with its commands and its authentication. Not thread-safe.
+
+    Args:
+        vessel_id: Name of the vessel in records.
+        config: Configuration of op_modem.
+        authenticator: Authenticates frames; None without a key.
+    """
+
+    def __init__(self, vessel_id: str, config: OpModemConfig, authenticator: FrameAuthenticator | None = None) -> None:
+        self._vessel_id = vessel_id
+        self._config = config
+        self.authenticator = authenticator
+        self.commands = CommandTracker(config.retry_s)
+        self.endpoint = VesselEndpoint(
+            self.commands,
+            config.receiver_config(),
+            protection=authenticator,
+            feedback=config.feedback and config.transmits,
+            wire_formats=config.wire_formats,
+            pairing_timeout_s=config.pairing_timeout_s,
+        )
+
+    def check(self, record: Command | Decision, where: str) -> None:
+        """Reject a record that can never be sent.
+
+        Raises:
+            PayloadError: The modem address of the vehicle is unknown, the time does not fit the link, or too many
+                commands are open.
+        """
+        if self._config.address_of(record.vehicle_id) is None:
+            raise PayloadError(where, "vehicle_id", record.vehicle_id, "a vehicle of [op_modem] vehicles")
+        issued = _issued_utc_s(record)
+        if issued > LATEST_UTC_S:
+            raise PayloadError(where, "time", issued, f"a time to {LATEST_UTC_S} s")
+        if len(self.commands.open_commands) >= MAX_PENDING:
+            raise PayloadError(where, "", f"{MAX_PENDING} open commands", "one at most fewer")
+
+    def add(self, record: Command | Decision, now: float) -> PendingCommand | None:
+        """Add a command or a decision; return None if it was added before.
+
+        Raises:
+            FrameError: It does not fit a frame.
+            PayloadError: See `check`.
+        """
+        kind = record.kind if isinstance(record, Command) else "decision"
+        record_id = record.command_id if isinstance(record, Command) else record.decision_id
+        if self.commands.find(kind, record_id) is not None:
+            return None
+        self.check(record, f"{kind} {record_id}")
+        address = self._config.address_of(record.vehicle_id)
+        assert address is not None
+        token = self.commands.free_token(kind, record_id)
+        message = dl.pack(message_of(record, token), self._message_bytes)
+        # The lifetime begins now if the clock of the sender is ahead of this one.
+        expires_at = min(_issued_utc_s(record), now) + self._config.command_lifetime_s
+        command = PendingCommand(kind, record_id, record.vehicle_id, address, token, message, now, expires_at)
+        return self.commands.add(command, now)
+
+    @property
+    def _message_bytes(self) -> int:
+        """Maximum length of a message in one frame."""
+        frame_bytes = RATES[self._config.downlink_rate].frame_bytes
+        return min(255, segments_room(frame_bytes, self.authenticator)) - _MESSAGE_OVERHEAD_BYTES
+
+    def state_record(self, command: PendingCommand, now: float) -> DownlinkState:
+        """Return the record of a command's progress."""
+        return DownlinkState.model_validate(
+            {
+                "vessel_id": self._vessel_id,
+                "vehicle_id": command.vehicle,
+                "kind": command.kind,
+                "record_id": command.record_id,
+                "state": str(command.state),
+                "times_sent": command.times_sent,
+                "expires_utc_s": max(0.0, command.expires_s),
+                "changed_utc_s": now,
+                "reason": command.reason,
+            }
+        )
+
+    def image_record(self, update: ImageUpdate) -> ReceivedImage:
+        """Return the record of an image's received content."""
+        return received_image(update, self._vessel_id, self._config.name_of(update.source))
+
+    def parts(self) -> dict[str, bytes]:
+        """Return the state to save, see `sonarpost.link.state`."""
+        parts = prefixed(_LINK, self.endpoint.parts())
+        if self.authenticator is None:
+            return parts
+        return {**parts, **prefixed(_AUTHENTICATION, self.authenticator.parts())}
+
+    def restore(self, parts: Parts) -> dict[str, FrameError]:
+        """Replace the state by saved parts; return why parts were skipped. The state of another key is ignored."""
+        errors = {_LINK + name: error for name, error in self.endpoint.restore(below(_LINK, parts)).items()}
+        if self.authenticator is not None:
+            skipped = self.authenticator.restore(below(_AUTHENTICATION, parts))
+            errors |= {_AUTHENTICATION + name: error for name, error in skipped.items()}
+        return errors
+
+    def restore_old(self, saved: bytes) -> None:
+        """Replace the state by that of version 0.1.
+
+        Raises:
+            FrameError: Not a state of version 0.1.
+        """
+        state = unpack_plain(dict, saved, "op_modem state")
+        if not isinstance(state.get("link"), dict):
+            raise FrameError("op_modem state", "link", saved[:20], "a map")
+        parts = prefixed(_LINK, migration.endpoint_parts(msgpack.packb(state["link"])))
+        if isinstance(state.get("seal"), dict):
+            parts |= prefixed(_AUTHENTICATION, migration.authentication_parts(msgpack.packb(state["seal"])))
+        self.restore(parts)
+
+
+def received_image(update: ImageUpdate, vessel_id: str, vehicle_id: str) -> ReceivedImage:
+    """Return the record of an image's received content.
+
+    The link does not carry the detector's contact identifier: the record has vehicle and image identifier instead.
+
+    Raises:
+        ValidationError: A value does not fit the record.
+    """
+    summary = update.contact
+    contact = (
+        None
+        if summary is None
+        else Contact(
+            contact_id=f"{vehicle_id}/{update.image_id}",
+            vehicle_id=vehicle_id,
+            channel=summary.side.value if summary.side else None,
+            time_utc_s=summary.time_utc_s,
+            lat_deg=summary.lat_deg,
+            lon_deg=summary.lon_deg,
+            position_sigma_m=summary.position_sigma_m,
+            depth_m=summary.depth_m,
+            altitude_m=summary.altitude_m,
+            heading_deg=summary.heading_deg,
+            ground_range_m=summary.ground_range_m,
+            atd_confidence=summary.confidence,
+            pixel_along_m=summary.pixel_along_m,
+            pixel_across_m=summary.pixel_across_m,
+        )
+    )
+    return ReceivedImage(
+        vessel_id=vessel_id,
+        vehicle_id=vehicle_id,
+        image_id=update.image_id,
+        version=update.version,
+        contact=contact,
+        height_px=None if summary is None else summary.height_px,
+        width_px=None if summary is None else summary.width_px,
+        stream=update.stream,
+        missing=update.missing,
+        missing_halves=update.missing_halves,
+        complete=update.complete,
+        bytes_received=update.received_bytes,
+        bytes_total=update.total_bytes,
+        frames_received=update.frames,
+        conflicts=update.conflicts,
+        first_frame_utc_s=update.first_frame_s,
+        last_frame_utc_s=update.last_frame_s,
+    )
+
+
+def message_of(record: Command | Decision, token: int) -> dl.DownlinkCommand:
+    """Return the acoustic message of a record.
+
+    Raises:
+        FrameError: A field does not fit.
+    """
+    issued = int(_issued_utc_s(record))
+    if isinstance(record, Decision):
+        number = dl.number_of_image(record.image_id)
+        return dl.DecisionMessage(
+            token, issued, number, record.image_version, record.verdict, record.confidence, record.mlo_class or ""
+        )
+    if record.kind == "revisit":
+        assert record.lat_deg is not None
+        assert record.lon_deg is not None
+        return dl.RevisitMessage(token, issued, record.lat_deg, record.lon_deg)
+    assert record.image_id is not None
+    number = dl.number_of_image(record.image_id)
+    if record.kind == "refine":
+        return dl.RefineMessage(token, issued, number)
+    return (dl.ExpandMessage if record.kind == "wider" else dl.ResendMessage)(token, issued, number)
+
+
+def _issued_utc_s(record: Command | Decision) -> float:
+    return record.decided_utc_s if isinstance(record, Decision) else record.issued_utc_s
