@@ -197,7 +197,7 @@ class EncodedImage(Record):
 
     Attributes:
         vehicle_id: Vehicle that encoded it.
-        image_id: Identifier of the image on the acoustic link; repeats after 1679616 images.
+        image_id: Identifier of the image on the acoustic link; 1 to 65535 in base 36, repeated after 65535 images.
         contact: The contact that the image shows.
         codec: Name of the codec.
         model: Identity of the codebook or model that the decoder needs; empty if it needs none.

@@ -37,7 +37,7 @@ def get_codec(name: str = "emb", **options: Unpack[CodecOptions]) -> Codec:
 
     Args:
         name: One of `codec_names()`.
-        **options: See `CodecOptions`.
+        **options: `model` of emb; `codebook` and `packing` of vq, as for `sonarpost encode`.
 
     Raises:
         ConfigError: No codec has this name, or it does not have this option or value.
@@ -66,7 +66,7 @@ def encode(
         image: Shape (16..512, 16..512), uint8 or uint16; uint16 is mapped to 8 bits over its own range.
         codec: One of `codec_names()`.
         budget: Maximum length of the stream in bytes; None: the codec's default size or quality.
-        **options: See `CodecOptions`.
+        **options: `model` of emb; `codebook` and `packing` of vq, as for `sonarpost encode`.
 
     Returns:
         The stream, header included.

@@ -44,7 +44,12 @@ class SurveyInfo:
 
 
 class SurveySource(ABC):
-    """An open recording: its description, and iteration over its pings, any number of times."""
+    """An open recording: its description, and iteration over its pings, any number of times.
+
+    Attributes:
+        info: Line, sonar, sides, number of pings and warnings.
+        options: Options with which it was opened.
+    """
 
     info: SurveyInfo
     options: SurveyOptions

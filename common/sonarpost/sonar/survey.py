@@ -56,7 +56,21 @@ class ChannelPing:
 
 @dataclass(frozen=True, slots=True)
 class Ping:
-    """One ping: navigation and channels. A value that the file does not contain is None."""
+    """One ping: navigation and channels. A value that the file does not contain is None.
+
+    Attributes:
+        number: Number in the file.
+        time_utc_s: Time of transmission, seconds since 1970-01-01 UTC.
+        channels: Channels of both sides.
+        lat_deg: Latitude of the sonar, WGS 84, north positive.
+        lon_deg: Longitude of the sonar, east positive.
+        heading_deg: Heading, clockwise from true north.
+        altitude_m: Altitude above the seabed.
+        depth_m: Depth below the surface.
+        speed_mps: Speed, forward positive.
+        pitch_deg: Pitch as recorded.
+        roll_deg: Roll as recorded.
+    """
 
     number: int
     time_utc_s: float
