@@ -1,4 +1,4 @@
-"""Surveys read in blocks and strips, with bounded memory."""
+"""Surveys read in strips, with bounded memory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.source import InMemorySource, blocks, load_survey, strips
+from sonarpost.sonar.source import InMemorySource, load_survey, strips
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 
 
@@ -67,27 +67,6 @@ def test_strips_read_stream_lazily():
     first = next(strips(stream(), 10, 2))
     assert len(first.pings) == 10
     assert len(read) <= 16
-
-
-@pytest.mark.parametrize(("length", "overlap"), [(1, 0), (3, 0), (3, 2), (5, 5), (12, 0), (12, 3), (100, 9), (2, 7)])
-def test_blocks_contain_every_ping_once_with_overlap(small_survey, length, overlap):
-    source = InMemorySource(small_survey(pings=12), SurveyOptions())
-    new = []
-    for lead, survey in blocks(source, length, overlap):
-        numbers = [ping.number for ping in survey]
-        assert numbers == list(range(numbers[0], numbers[-1] + 1))
-        new_numbers = numbers[lead : lead + length]
-        assert lead == min(overlap, new_numbers[0] - 10)
-        assert numbers[-1] == min(new_numbers[-1] + overlap, 21)
-        new += new_numbers
-    assert new == list(range(10, 22))
-
-
-def test_invalid_block_lengths_are_rejected(small_survey):
-    source = InMemorySource(small_survey(), SurveyOptions())
-    for length, overlap in ((0, 0), (1, -1)):
-        with pytest.raises(ValueError, match="block"):
-            list(blocks(source, length, overlap))
 
 
 def test_load_survey_limits_number_of_samples(small_survey):

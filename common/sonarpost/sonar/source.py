@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Self
 
 from sonarpost.errors import SurveyFileError
@@ -17,7 +14,7 @@ from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.survey import Ping, Side, Survey
 
 MAX_HELD_BYTES: Final = 1 << 30
-"""Maximum size of the samples of a survey in memory; a longer recording is read in blocks."""
+"""Maximum size of the samples of a survey in memory; a longer recording is read in strips."""
 STRIP_BYTES: Final = 1 << 26
 """Target size of the samples of a strip; the detector needs about twenty times as much memory."""
 
@@ -68,9 +65,7 @@ class SurveySource(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -150,39 +145,9 @@ def load_survey(source: SurveySource, max_bytes: int = MAX_HELD_BYTES) -> Survey
     for ping in source.pings():
         held += _size_bytes(ping)
         if held > max_bytes:
-            raise SurveyFileError(str(info.path), "samples", f"more than {max_bytes} bytes", "a recording in blocks")
+            raise SurveyFileError(str(info.path), "samples", f"more than {max_bytes} bytes", "a recording in strips")
         pings.append(ping)
     return Survey(info.path, info.sonar_id, info.line_name, tuple(pings), info.warnings)
-
-
-def blocks(source: SurveySource, length: int = 1000, overlap: int = 0) -> Iterator[tuple[int, Survey]]:
-    """Divide a recording into surveys that fit into memory.
-
-    Args:
-        source: The recording.
-        length: New pings of each block, at least 1.
-        overlap: Pings before and after the new ones, for filters with a neighbourhood.
-
-    Yields:
-        The number of overlap pings at the beginning of the block, and the block. Its last `overlap` pings are overlap
-        as well, except in the last block.
-
-    Raises:
-        ValueError: A length below 1 or an overlap below 0.
-        SurveyFileError: The file cannot be read.
-    """
-    if length < 1 or overlap < 0:
-        raise ValueError(f"block of {length} with overlap {overlap}, expected at least 1 and 0")
-    info = source.info
-    pings = source.pings()
-    before: deque[Ping] = deque(maxlen=overlap)
-    ahead = list(islice(pings, length + overlap))
-    while ahead:
-        rows = (*before, *ahead)
-        yield len(before), Survey(info.path, info.sonar_id, info.line_name, rows, info.warnings)
-        new, rest = ahead[:length], ahead[length:]
-        before.extend(new)
-        ahead = rest + list(islice(pings, length + overlap - len(rest))) if len(new) == length else []
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from sonarpost.sonar.bottom_track import altitudes_m
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.ground_range import beam_normalised, ground_range_image
 from sonarpost.sonar.readers import open_survey
-from sonarpost.sonar.source import SurveySource, blocks
+from sonarpost.sonar.source import SurveySource, strips
 from sonarpost.sonar.survey import Ping, Side, Survey
 
 FloatArray = npt.NDArray[np.float64]
@@ -31,7 +31,7 @@ SIDE_PX = 500
 MAX_ROWS = 1500
 _MAX_ROWS_OPTION = 20_000
 _LEFT_PX, _BOTTOM_PX, _TOP_PX, _RIGHT_PX = 150, 34, 22, 30
-_BLOCK_PINGS, _OVERLAP_PINGS = 1000, 50
+_STRIP_PINGS, _MARGIN_PINGS = 1000, 50
 _TRACK_PX, _MARGIN_PX = 800, 60
 _MAX_FIXES = 4096
 _INK, _PAPER, _BOTTOM_COLOUR = (20, 20, 20), (245, 245, 245), (255, 190, 0)
@@ -190,7 +190,7 @@ def reduce_survey(source: SurveySource, *, over_ground: bool, max_rows: int = MA
     times: list[float] = []
     numbers: list[int] = []
     first = 0
-    for survey, altitude_m in _blocks_with_altitude(source):
+    for survey, altitude_m in _parts_with_altitude(source):
         row_of_ping = (first + np.arange(len(survey.pings))) // per_row
         image = _both_sides(survey, altitude_m if over_ground else np.zeros_like(altitude_m), max_range_m)
         valid = np.isfinite(image)
@@ -207,13 +207,14 @@ def reduce_survey(source: SurveySource, *, over_ground: bool, max_rows: int = MA
     return Reduced(echo, np.where(known > 0, heights / np.maximum(known, 1), np.nan), times, numbers, max_range_m)
 
 
-def _blocks_with_altitude(source: SurveySource) -> Iterator[tuple[Survey, FloatArray]]:
-    """Yield blocks of the recording with their altitudes; bottom tracking includes pings of the neighbouring blocks."""
-    for lead, survey in blocks(source, _BLOCK_PINGS, _OVERLAP_PINGS):
-        end = min(lead + _BLOCK_PINGS, len(survey.pings))
-        altitude_m = altitudes_m(survey)[lead:end]
-        part = Survey(survey.path, survey.sonar_id, survey.line_name, survey.pings[lead:end])
-        yield part, altitude_m
+def _parts_with_altitude(source: SurveySource) -> Iterator[tuple[Survey, FloatArray]]:
+    """Yield the recording in parts with their altitudes; bottom tracking includes pings of the neighbouring parts."""
+    info = source.info
+    for strip in strips(source.pings(), _STRIP_PINGS, 2 * _MARGIN_PINGS):
+        survey = Survey(info.path, info.sonar_id, info.line_name, strip.pings)
+        begin = _MARGIN_PINGS if strip.first_row else 0
+        end = len(strip.pings) - (0 if strip.is_last else _MARGIN_PINGS)
+        yield replace(survey, pings=strip.pings[begin:end]), altitudes_m(survey)[begin:end]
 
 
 def _both_sides(survey: Survey, altitude_m: FloatArray, max_range_m: float) -> FloatArray:
