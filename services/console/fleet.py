@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from sonarpost.messages import AcousticFrame, QueueState
 from sonarpost.monitoring.fleet import FleetTracker, ServiceStatus
-from sonarpost.review.local_frame import distance_m
+from sonarpost.review.positions import distance_m
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.serialisers import Json
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import hashlib
-import io
 import json
 import time
 from collections.abc import Sequence
@@ -24,6 +23,7 @@ from sonarpost.detection.snippets import cut_snippet, ground_projected_image, to
 from sonarpost.detection.stream import StreamContact, StreamDetector
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
+from sonarpost.sonar.image_files import encode_png, write_png
 from sonarpost.sonar.options import SurveyOptions, load_options
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Side, Survey
@@ -89,7 +89,8 @@ def run(parsed: argparse.Namespace) -> int:
             _print_table(result)
         if parsed.plot is not None:
             path = _plot_path(parsed.plot, result.survey.path, several=len(files) > 1)
-            _write_png(path, annotated_waterfall(result.survey, [c.in_file() for c in result.contacts]))
+            image = annotated_waterfall(result.survey, [contact.in_file() for contact in result.contacts])
+            write_atomically(path, encode_png(image))
         if parsed.snippets is not None:
             _write_snippets(parsed.snippets, result)
     if parsed.json:
@@ -159,16 +160,10 @@ def _write_snippets(folder: Path, result: FileResult) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for number, contact in enumerate(result.contacts, start=1):
         name = f"{result.survey.path.stem}-{number:03d}"
-        _write_png(folder / f"{name}.png", Image.fromarray(cut_snippet(contact.survey, contact.detection).image))
+        write_png(folder / f"{name}.png", cut_snippet(contact.survey, contact.detection).image)
         ground = ground_projected_image(contact.survey, contact.detection, _GROUND_PX, _GROUND_PX, _GROUND_PIXEL_M)
         if ground is not None:
-            _write_png(folder / f"{name}-ground.png", Image.fromarray(ground))
-
-
-def _write_png(path: Path, image: Image.Image) -> None:
-    buffer = io.BytesIO()
-    image.save(buffer, format="PNG")
-    write_atomically(path, buffer.getvalue())
+            write_png(folder / f"{name}-ground.png", ground)
 
 
 @dataclass

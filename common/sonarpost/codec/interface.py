@@ -262,11 +262,6 @@ def before_gap(body: bytes, received: Mask | None) -> tuple[bytes, list[str]]:
     return body[: gaps[0]], [f"body byte {gaps[0]} of {len(body)} did not arrive; later bytes are not used"]
 
 
-def squared_error(image: Image, other: Image) -> int:
-    """Return the sum of the squared differences of two images of the same shape."""
-    return int(((image.astype(np.int64) - other) ** 2).sum())
-
-
 def check_received(received: Mask, body_bytes: int) -> None:
     """Raise StreamError unless `received` has one bool for each body byte."""
     if received.shape != (body_bytes,) or received.dtype != np.bool_:

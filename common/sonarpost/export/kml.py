@@ -25,7 +25,7 @@ from sonarpost.export.tables import DEGREE_DECIMALS, Value, contact_properties
 from sonarpost.export.text import html_text, utc_text, xml_text
 from sonarpost.files import write_atomically
 from sonarpost.sonar.geometry import Position, offset_position
-from sonarpost.sonar.image_files import read_image
+from sonarpost.sonar.image_files import encode_png, read_image
 
 NAMESPACE: Final = "http://www.opengis.net/kml/2.2"
 COLOURS: Final[Mapping[ReviewState, str]] = {
@@ -86,7 +86,7 @@ def kmz_bytes(contacts: ContactSet) -> tuple[bytes, tuple[BadInputError, ...]]:
         except BadInputError as error:
             problems.append(error)
         else:
-            images[contact.uid] = _ContactImage(_png(Image.fromarray(pixels)), _overlay(contact, pixels))
+            images[contact.uid] = _ContactImage(encode_png(Image.fromarray(pixels)), _overlay(contact, pixels))
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         _add_file(archive, "doc.kml", _document(contacts, images, icons=True))
@@ -256,7 +256,7 @@ def _overlay(contact: ExportContact, pixels: npt.NDArray[np.uint8]) -> _Overlay 
         return None  # Readers disagree about boxes across the date line.
     # KML rotates counter-clockwise, and its range is -180 to 180 degrees.
     rotation_deg = math.remainder(-heading, 360.0)
-    png = _png(Image.fromarray(np.ascontiguousarray(rotated)))
+    png = encode_png(Image.fromarray(np.ascontiguousarray(rotated)))
     return _Overlay(png, {"north": north, "south": south, "east": east, "west": west}, rotation_deg)
 
 
@@ -274,10 +274,4 @@ def _icon_png(review: ReviewState, colour: str) -> bytes:
             draw.polygon([(middle, low), (high, high), (low, high)], colour, "black", 2)
         case "unreviewed":
             draw.rectangle((low, low, high, high), colour, "black", 2)
-    return _png(image)
-
-
-def _png(image: Image.Image) -> bytes:
-    buffer = io.BytesIO()
-    image.save(buffer, format="PNG")
-    return buffer.getvalue()
+    return encode_png(image)

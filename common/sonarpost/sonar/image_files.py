@@ -116,8 +116,13 @@ def png_bytes(path: Path, image: GreyImage) -> bytes:
         SurveyFileError: Another shape or depth.
     """
     _check_writable(path, image)
+    return encode_png(Image.fromarray(np.ascontiguousarray(image)))
+
+
+def encode_png(image: Image.Image) -> bytes:
+    """Return an image of Pillow as PNG, without dates."""
     buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(image)).save(buffer, format="PNG")
+    image.save(buffer, format="PNG")
     return buffer.getvalue()
 
 

@@ -14,8 +14,7 @@ from sonarpost import wire
 from sonarpost.errors import BadInputError
 from sonarpost.export.contacts import match_start_time
 from sonarpost.messages import ReconstructedImage
-from sonarpost.review.grouping import Look, nearest_group
-from sonarpost.review.local_frame import vehicle_position
+from sonarpost.review.positions import Look, nearest_group, vehicle_position
 from sonarpost.services.console.store.database import insert_row
 from sonarpost.services.console.store.serialisers import CONTACT_QUERY, Json, contact_json, percent_received
 
@@ -110,7 +109,7 @@ def store_image(
         image: The record.
         rate: Latest Micro-Modem rate of the vehicle; None if unknown.
         now_utc_s: Time of arrival.
-        radius_m: Distance limit for grouping; see `review.grouping.group_distance_limit_m`.
+        radius_m: Distance limit for grouping; see `review.positions.group_distance_limit_m`.
 
     Returns:
         The contact identifier, and whether the contact is new; None if the version is already stored.

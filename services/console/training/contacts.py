@@ -15,7 +15,7 @@ from sonarpost.codec.interface import Codec, DecodedImage, StreamHeader
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.codec import VqCodec
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
-from sonarpost.review.local_frame import destination
+from sonarpost.review.positions import destination
 from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Survey

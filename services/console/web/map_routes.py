@@ -8,7 +8,7 @@ from pathlib import Path
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from sonarpost.review.local_frame import LocalFrame
+from sonarpost.review.positions import LocalFrame
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import NotFoundError
 from sonarpost.services.console.store.serialisers import Json

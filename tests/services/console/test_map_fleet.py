@@ -8,7 +8,7 @@ import pytest
 from builders.console import image_record
 
 from sonarpost.messages import AcousticFrame, LinkQuality, QueuedImage, QueueState
-from sonarpost.review.local_frame import LocalFrame, destination, distance_m, vehicle_position
+from sonarpost.review.positions import LocalFrame, destination, distance_m, vehicle_position
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from sonarpost.errors import DeliveryError
 from sonarpost.messages import Advice, Decision, DownlinkState
-from sonarpost.review.grouping import Look, nearest_group
+from sonarpost.review.positions import Look, nearest_group
 from sonarpost.services.console.store.contacts import ContactFilter
 from sonarpost.services.console.store.database import Actor, DisplayedImage
 from sonarpost.services.console.store.decisions import ConflictError, DecisionInput

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import io
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from sonarpost.files import write_atomically
 from sonarpost.sonar.bottom_track import altitudes_m
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.ground_range import beam_normalised, ground_range_image
+from sonarpost.sonar.image_files import encode_png
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import SurveySource, strips
 from sonarpost.sonar.survey import Ping, Side, Survey
@@ -81,15 +81,9 @@ def run(parsed: argparse.Namespace) -> int:
         parsed.out.mkdir(parents=True, exist_ok=True)
         for kind, image in images.items():
             target = parsed.out / f"{name}-{kind}.png"
-            write_atomically(target, _png(image))
+            write_atomically(target, encode_png(image))
             print(target)
     return 0
-
-
-def _png(image: Image.Image) -> bytes:
-    buffer = io.BytesIO()
-    image.save(buffer, format="PNG")
-    return buffer.getvalue()
 
 
 def thinned_track(pings: Iterable[Ping]) -> list[Position]:

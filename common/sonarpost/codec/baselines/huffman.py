@@ -26,15 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image as Pillow
 
-from sonarpost.codec.interface import (
-    DecodedImage,
-    Image,
-    Mask,
-    SnippetPixels,
-    decoder_input,
-    encoder_input,
-    squared_error,
-)
+from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decoder_input, encoder_input
 from sonarpost.errors import ConfigError, StreamError
 
 DEFAULT_LEVELS = 4
@@ -158,7 +150,7 @@ def _best_candidate(image: Image, limit_bits: int) -> QuantisedImage | None:
     best, best_error = None, 0
     for candidate in _candidates(image, limit_bits):
         reconstructed = _enlarge(candidate.levels[candidate.symbols].astype(np.uint8), image.shape)
-        error = squared_error(reconstructed, image)
+        error = int(((reconstructed.astype(np.int64) - image) ** 2).sum())
         if best is None or error < best_error:
             best, best_error = candidate, error
         if error == 0:

@@ -25,15 +25,7 @@ from typing import ClassVar
 import numpy as np
 from PIL import Image as Pillow
 
-from sonarpost.codec.interface import (
-    DecodedImage,
-    Image,
-    Mask,
-    SnippetPixels,
-    decode_whole_body,
-    encoder_input,
-    squared_error,
-)
+from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decode_whole_body, encoder_input
 from sonarpost.errors import ConfigError, StreamError
 
 RAW_CODEC_ID = 0x02
@@ -184,7 +176,7 @@ class Jpeg2000Codec:
                     reconstructed = _shifted(
                         _decode(codestream(grey.shape[0], grey.shape[1], decompositions, packets)), -shift
                     )
-                    error = squared_error(reconstructed, grey)
+                    error = int(((reconstructed.astype(np.int64) - grey) ** 2).sum())
                     yield _Candidate(decompositions, shift, packets, error)
 
 

@@ -26,15 +26,7 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.interface import (
-    DecodedImage,
-    Image,
-    Mask,
-    SnippetPixels,
-    decoder_input,
-    encoder_input,
-    squared_error,
-)
+from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decoder_input, encoder_input
 from sonarpost.errors import ConfigError, StreamError
 
 Integers = npt.NDArray[np.int64]
@@ -87,7 +79,7 @@ class SpihtCodec:
             return header.pack() + _write_body(coefficients, mean, 0, trees, self.maxloop or DEFAULT_MAXLOOP, None)
         loops, length = self.maxloop or MAX_PLANES, budget_bytes - header.size
         bodies = [_write_body(coefficients, mean, phase, trees, loops, length) for phase in range(4)]
-        errors = [squared_error(_read_body(body, trees), grey) for body in bodies]
+        errors = [int(((_read_body(body, trees).astype(np.int64) - grey) ** 2).sum()) for body in bodies]
         return header.pack() + bodies[errors.index(min(errors))]
 
     def decode(self, stream: bytes, received: Mask | None = None) -> DecodedImage:

@@ -30,15 +30,7 @@ import numpy as np
 from PIL import Image as Pillow
 from PIL import features
 
-from sonarpost.codec.interface import (
-    DecodedImage,
-    Image,
-    Mask,
-    SnippetPixels,
-    decode_whole_body,
-    encoder_input,
-    squared_error,
-)
+from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decode_whole_body, encoder_input
 from sonarpost.errors import ConfigError, StreamError
 
 DEFAULT_QUALITY = 30
@@ -139,7 +131,7 @@ def _search_quality(image_format: StillImageFormat, grey: Image, limit_bytes: in
             high = quality - 1
             continue
         low = quality + 1
-        error = squared_error(_decode(image_format, body, grey.shape), grey)
+        error = int(((_decode(image_format, body, grey.shape).astype(np.int64) - grey) ** 2).sum())
         if best is None or error < best_error:
             best, best_error = body, error
     return best
