@@ -23,6 +23,9 @@ from sonarpost.wire import expected_text
 
 ENVIRONMENT_PREFIX = "SONARPOST_"
 
+ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
+"""Name of a service that records are delivered to, as in `sonarpost.keys`."""
+
 SERVICES = (
     "atd_stub",
     "compressor",

@@ -7,11 +7,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sonarpost.config import ServiceConfig
+from sonarpost.config import ConsumerName, ServiceConfig
 from sonarpost.keys import SHORE
 from sonarpost.messages import Latitude, Longitude, PlatformId
 
-ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 HostName = Annotated[str, Field(pattern=r"^[A-Za-z0-9.:\[\]_-]{1,253}$")]
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 

@@ -5,9 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from sonarpost.config import ServiceConfig
-
-ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
+from sonarpost.config import ConsumerName, ServiceConfig
 
 
 class DecompressorConfig(ServiceConfig):

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from sonarpost.config import ConsumerName
 from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.mac import Tdma
 from sonarpost.link.receiver import WireFormat
@@ -13,7 +14,6 @@ from sonarpost.messages import PlatformId
 from sonarpost.modem.micromodem import RATES
 from sonarpost.runtime.modem_service import ModemServiceConfig
 
-ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 RateNumber = Annotated[int, Field(ge=min(RATES), le=max(RATES))]
 Seconds = Annotated[float, Field(gt=0, le=86400)]
 

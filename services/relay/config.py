@@ -7,11 +7,9 @@ from typing import Annotated
 
 from pydantic import Field, field_validator
 
-from sonarpost.config import ServiceConfig
+from sonarpost.config import ConsumerName, ServiceConfig
 from sonarpost.keys import SHORE
 from sonarpost.messages import PlatformId
-
-ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 
 
 class UpstreamOptions(ServiceConfig):

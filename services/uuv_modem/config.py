@@ -6,12 +6,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from sonarpost.config import ConsumerName
 from sonarpost.link.config import QueueConfig
 from sonarpost.link.mac import Continuous, Csma, MediumAccess, Polled, Tdma
 from sonarpost.modem.micromodem import RATES
 from sonarpost.runtime.modem_service import ModemServiceConfig
 
-ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 RateNumber = Annotated[int, Field(ge=min(RATES), le=max(RATES))]
 Seconds = Annotated[float, Field(gt=0, le=86400)]
 
