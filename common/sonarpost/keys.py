@@ -47,7 +47,7 @@ def image_encoded(vehicle: str) -> str:
 def acoustic_tx(platform: str) -> str:
     """A frame that this platform's modem transmitted.
 
-    Record: acoustic_frame. From: uuv_modem. To: watchers. Delivery: plain, priority 5.
+    Record: acoustic_frame. From: uuv_modem, op_modem. To: watchers. Delivery: plain, priority 5.
     """
     return _of(platform, "acoustic/tx")
 
