@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,9 @@ from sonarpost.link.state import Bounds, check_bounds
 from sonarpost.modem.micromodem import RATES
 
 Values = npt.NDArray[np.float64]
+
+_LOSS_MEMORY_S: Final = 1800.0
+"""How long a measured loss is valid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +100,11 @@ class RateSelector:
     """Selects the rate with the most payload per second, and tests the others from time to time.
 
     The loss at a rate that was not used recently is unknown. It is assumed to be that of the next slower rate with a
-    known loss. So a faster rate is tried once in `memory_s`, and left as soon as its loss is measured.
+    known loss. So a faster rate is tried every half hour, and left as soon as its loss is measured.
 
     Args:
         allowed: Numbers of the allowed rates.
         current: The rate in use.
-        memory_s: How long a measurement is valid.
         losses: Loss and time of the measurement, by rate.
 
     Raises:
@@ -111,7 +113,6 @@ class RateSelector:
 
     allowed: Sequence[int]
     current: int
-    memory_s: float = 1800.0
     losses: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -125,7 +126,7 @@ class RateSelector:
 
     def select(self, now: float) -> int:
         """Make the best rate, with an ideal erasure code, the current one and return it."""
-        self.losses = {n: (loss, at) for n, (loss, at) in self.losses.items() if 0 <= now - at <= self.memory_s}
+        self.losses = {n: (loss, at) for n, (loss, at) in self.losses.items() if 0 <= now - at <= _LOSS_MEMORY_S}
         if self.current not in self.losses:
             return self.current  # a rate on trial stays until its loss is measured
         goodput_bps: dict[int, float] = {}

@@ -91,14 +91,13 @@ def encode(source: Bytes, indices: Sequence[int]) -> Bytes:
     """
     count = source.shape[0]
     _check(count, indices)
-    out = np.empty((len(indices), source.shape[1]), np.uint8)
-    parity = sorted({i for i in indices if i >= count})
-    rows: dict[int, Bytes] = {}
-    if parity:
-        made = _multiply(_interpolation(tuple(range(count)), tuple(parity)), source)
-        rows = dict(zip(parity, made, strict=True))
-    for at, index in enumerate(indices):
-        out[at] = source[index] if index < count else rows[index]
+    chosen = np.asarray(indices, np.int64)
+    is_source = chosen < count
+    out = np.empty((chosen.size, source.shape[1]), np.uint8)
+    out[is_source] = source[chosen[is_source]]
+    if not is_source.all():
+        parity = tuple(chosen[~is_source].tolist())
+        out[~is_source] = _multiply(_interpolation(tuple(range(count)), parity), source)
     return out
 
 

@@ -207,7 +207,7 @@ class MessageSender:
         return found
 
     def release(self, frame: int) -> None:
-        """Allow copies from frame number `frame` on that keep a distance from earlier ones: nothing else is left."""
+        """Allow all copies from frame number `frame` on: there is nothing to send between them."""
         for message in self.waiting:
             if message.after_frame > frame:
                 message.after_frame = frame
