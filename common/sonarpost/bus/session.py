@@ -27,7 +27,8 @@ def client_config(endpoints: Sequence[str], tls: TlsConfig | None = None) -> zen
         endpoints: The router's endpoints.
         tls: The host's own certificate for `tls/...` endpoints, where both sides present one.
     """
-    return _config("client", listen=(), connect=endpoints, tls=tls)
+    connect = {"endpoints": list(endpoints), "timeout_ms": OPEN_TIMEOUT_MS}
+    return _config({"mode": "client", "listen": {"endpoints": []}, "connect": connect}, tls)
 
 
 def router_config(listen: Sequence[str], connect: Sequence[str] = ()) -> zenoh.Config:
@@ -35,33 +36,32 @@ def router_config(listen: Sequence[str], connect: Sequence[str] = ()) -> zenoh.C
 
     It has neither TLS nor access control. `sonarpost pki router-config` writes configurations with both.
     """
-    return _config("router", listen=listen, connect=connect, tls=None)
+    settings: dict[str, object] = {
+        "mode": "router",
+        "listen": {"endpoints": list(listen), "timeout_ms": 0, "exit_on_failure": True},
+        "connect": {
+            "endpoints": list(connect),
+            "timeout_ms": -1,
+            "exit_on_failure": False,
+            "retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        },
+    }
+    return _config(settings, None)
 
 
-def _config(mode: str, listen: Sequence[str], connect: Sequence[str], tls: TlsConfig | None) -> zenoh.Config:
+def _config(settings: dict[str, object], tls: TlsConfig | None) -> zenoh.Config:
     # Images are published in bursts: with a full queue, a publication waits briefly before it is dropped.
     drop = {"wait_before_drop": WAIT_BEFORE_DROP_US, "max_wait_before_drop_fragments": 2 * WAIT_BEFORE_DROP_US}
     link: dict[str, object] = {"tx": {"lease": 3000, "queue": {"congestion_control": {"drop": drop}}}}
     if tls is not None:
         link["tls"] = tls_settings(tls)
-    settings: dict[str, object] = {
-        "mode": mode,
-        "listen": {"endpoints": list(listen)},
-        "connect": {"endpoints": list(connect), "timeout_ms": OPEN_TIMEOUT_MS},
+    common = {
         # Endpoints are configured: discovery could join foreign networks, and its delay would slow every start.
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         # On one host, shared memory would bypass the network link and hide its behaviour.
         "transport": {"shared_memory": {"enabled": False}, "link": link},
     }
-    if mode == "router":
-        settings["connect"] = {
-            "endpoints": list(connect),
-            "timeout_ms": -1,
-            "exit_on_failure": False,
-            "retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
-        }
-        settings["listen"] = {"endpoints": list(listen), "timeout_ms": 0, "exit_on_failure": True}
-    return zenoh.Config.from_json5(json.dumps(settings))
+    return zenoh.Config.from_json5(json.dumps(settings | common))
 
 
 def tls_settings(tls: TlsConfig) -> dict[str, object]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -157,7 +157,6 @@ class FleetWatcher:
         self._poll_s = poll_s
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
-        self._clock: Callable[[], float] = time.monotonic
 
     def __enter__(self) -> FleetWatcher:
         self._thread.start()
@@ -169,7 +168,7 @@ class FleetWatcher:
 
     def state(self) -> FleetState:
         """Return the present state."""
-        return self.fleet.state(self._clock())
+        return self.fleet.state(time.monotonic())
 
     def _run(self) -> None:
         session = open_with_retry(self._endpoints, self._stop, self._tls)
@@ -185,7 +184,7 @@ class FleetWatcher:
 
     def _on_health(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            self.fleet.add(str(sample.key_expr), sample.payload.to_bytes(), self._clock())
+            self.fleet.add(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic())
 
     def _poll(self, session: zenoh.Session) -> None:
         """Query the tokens; this also finds tokens that ended during a link cut."""
@@ -197,4 +196,4 @@ class FleetWatcher:
         except zenoh.ZError as error:
             log.warning("Liveliness tokens not received", extra=kv(error=str(error)))
             tokens = None
-        self.fleet.set_alive(tokens, self._clock())
+        self.fleet.set_alive(tokens, time.monotonic())
