@@ -26,6 +26,7 @@ from sonarpost.messages import (
     ImageId,
     Ordinal,
     PlatformId,
+    ReconstructedImage,
     Record,
     Sha256,
     Text,
@@ -73,6 +74,15 @@ class SideCar(Record):
     width_px: Annotated[int, Field(ge=1, le=4096)]
 
 
+def contact_uid(image: SideCar | ReconstructedImage) -> str:
+    """Return the permanent identifier of a contact: sonarpost.vessel-1.uuv-1.20161012T090001Z.00A7.
+
+    The time of the first frame makes it unique over all missions.
+    """
+    first = datetime.fromtimestamp(int(image.first_frame_utc_s), UTC).strftime("%Y%m%dT%H%M%SZ")
+    return f"sonarpost.{image.vessel_id}.{image.vehicle_id}.{first}.{image.image_id}"
+
+
 @dataclass(frozen=True, slots=True)
 class ExportContact:
     """One contact to export.
@@ -89,9 +99,8 @@ class ExportContact:
 
     @property
     def uid(self) -> str:
-        """Permanent identifier, for example sonarpost.vessel-1.uuv-1.20161012T090001Z.00A7."""
-        first = datetime.fromtimestamp(int(self.image.first_frame_utc_s), UTC).strftime("%Y%m%dT%H%M%SZ")
-        return f"sonarpost.{self.image.vessel_id}.{self.image.vehicle_id}.{first}.{self.image.image_id}"
+        """Permanent identifier, see `contact_uid`."""
+        return contact_uid(self.image)
 
     @property
     def name(self) -> str:

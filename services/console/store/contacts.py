@@ -5,14 +5,13 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from sonarpost import wire
 from sonarpost.errors import BadInputError
-from sonarpost.export.contacts import match_start_time
+from sonarpost.export.contacts import contact_uid, match_start_time
 from sonarpost.messages import ReconstructedImage
 from sonarpost.review.positions import Look, nearest_group, vehicle_position
 from sonarpost.services.console.store.database import insert_row
@@ -93,12 +92,6 @@ class ContactCounts:
     unreviewed: int
 
 
-def contact_id_of(image: ReconstructedImage) -> str:
-    """Return the contact identifier, equal to the `uid` of exports. Its time makes it unique over all missions."""
-    first = datetime.fromtimestamp(int(image.first_frame_utc_s), UTC).strftime("%Y%m%dT%H%M%SZ")
-    return f"sonarpost.{image.vessel_id}.{image.vehicle_id}.{first}.{image.image_id}"
-
-
 def store_image(
     db: sqlite3.Connection, image: ReconstructedImage, rate: int | None, now_utc_s: float, radius_m: float
 ) -> tuple[str, bool] | None:
@@ -114,7 +107,7 @@ def store_image(
     Returns:
         The contact identifier, and whether the contact is new; None if the version is already stored.
     """
-    contact_id = contact_id_of(image)
+    contact_id = contact_uid(image)
     added = db.execute(
         "INSERT OR IGNORE INTO version VALUES (?, ?, ?, ?, ?)",
         (contact_id, image.version, now_utc_s, rate, wire.encode(image)),

@@ -14,6 +14,7 @@ from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import Codec, DecodedImage, StreamHeader
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.codec import VqCodec
+from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
 from sonarpost.review.positions import destination
 from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
@@ -27,7 +28,6 @@ _VERSION_BYTES: Final = (24, 64, 128, _STREAM_BYTES)
 """Received bytes of the versions of an image with the codec emb."""
 _LINES: Final = 5
 """Simulated survey lines. Later contacts reuse their images at other positions."""
-_ALPHABET: Final = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 Snippet = npt.NDArray[np.uint8]
 
@@ -143,7 +143,7 @@ def simulated_contacts(seed: int, first_utc_s: float) -> Iterator[SimulatedConta
                 contact = _contact(simulated.survey, target, vehicle, draws, len(made))
                 snippet, expanded = (cut_snippet(simulated.survey, target, look, scale) for scale in (1, 2))
                 versions = _versions(codec, snippet, incomplete=draws.random() < 0.5)
-                made.append(SimulatedContact(contact, _image_id(len(made)), versions, codec, snippet, expanded))
+                made.append(SimulatedContact(contact, format_image_id(len(made)), versions, codec, snippet, expanded))
                 yield made[-1]
     yield from _repeated_contacts(made, draws)
 
@@ -163,7 +163,7 @@ def _repeated_contacts(made: list[SimulatedContact], draws: random.Random) -> It
         confidence = round(min(2.0, max(0.1, (contact.atd_confidence or 1.0) + draws.gauss(0, 0.1))), 2)
         changes = {"contact_id": f"training-{number}", "lat_deg": lat, "lon_deg": lon, "atd_confidence": confidence}
         moved = contact.model_copy(update=changes)
-        yield replace(known, contact=moved, image_id=_image_id(number), versions=known.versions[-1:])
+        yield replace(known, contact=moved, image_id=format_image_id(number), versions=known.versions[-1:])
         number += 1
 
 
@@ -251,16 +251,3 @@ def _versions(codec: Codec, snippet: Snippet, *, incomplete: bool) -> tuple[Imag
     half = ImageVersion(len(stream) // 2, len(stream), 2, codec.decode(stream, first_half))
     whole = ImageVersion(len(stream), len(stream), 4, codec.decode(stream))
     return (half,) if incomplete else (half, whole)
-
-
-def expanded_image_id(count: int) -> str:
-    """Return the identifier of an expanded image, counted from 0. They count down, those of contacts count up."""
-    return _image_id(len(_ALPHABET) ** 4 - 1 - count)
-
-
-def _image_id(number: int) -> str:
-    digits = ""
-    for _ in range(4):
-        number, digit = divmod(number, len(_ALPHABET))
-        digits = _ALPHABET[digit] + digits
-    return digits

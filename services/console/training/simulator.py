@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from sonarpost import keys, wire
+from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.messages import (
     AcousticFrame,
     Advice,
@@ -28,7 +29,6 @@ from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.training.contacts import (
     VEHICLES,
     SimulatedContact,
-    expanded_image_id,
     simulated_contacts,
 )
 
@@ -161,7 +161,8 @@ class TrainingSimulator:
         if cached is None or command.kind == "revisit":
             return
         if is_expand and image_id not in self._expanded:
-            expanded = cached.simulated.expanded(expanded_image_id(len(self._expanded)))
+            # Identifiers of expanded images count down from the last one, those of contacts count up.
+            expanded = cached.simulated.expanded(format_image_id(-1 - len(self._expanded)))
             if expanded is not None:
                 self._expanded[image_id] = expanded.image_id
                 self._transfers.append(_Transfer(expanded, now_utc_s))
