@@ -201,7 +201,7 @@ def test_an_image_planned_for_another_rate_is_sent_from_its_beginning() -> None:
 
 def test_the_paper_format_has_no_messages_and_no_feedback() -> None:
     sender = PaperSender(1)
-    assert not sender.carries_messages
+    assert not sender.accepts_messages
     with pytest.raises(FrameError, match="carries images only"):
         sender.add_message("m", "program", b"data", 0.0)
     assert sender.refine(1, 0, 0.0) is False

@@ -13,6 +13,7 @@ from typing import Annotated, Final
 from sonarpost.errors import FrameError
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
+from sonarpost.link.queue.messages import MessageQueue
 from sonarpost.link.state import Bounds, Errors, Parts
 from sonarpost.modem.micromodem import RATES
 
@@ -76,7 +77,8 @@ class ImageSender(ABC):
     """A transmit queue. By default the wire format has no messages.
 
     Attributes:
-        carries_messages: Whether the wire format has messages.
+        messages: Messages of which nothing has been sent.
+        max_messages: Maximum number of these; 0 if the wire format has no messages.
         packet_interval_s: Smoothed time from one packet to the next.
         in_flight: The packet that `next_packet` returned last, without the frames that have been sent.
 
@@ -84,10 +86,11 @@ class ImageSender(ABC):
         packet_interval_s: The first value.
     """
 
-    carries_messages = False
+    max_messages = 0
 
     def __init__(self, packet_interval_s: float) -> None:
         self.packet_interval_s = packet_interval_s
+        self.messages = MessageQueue()
         self.in_flight: OutgoingPacket | None = None
 
     @property
@@ -192,17 +195,17 @@ class ImageSender(ABC):
     @property
     def accepts_messages(self) -> bool:
         """Whether the queue has room for another message."""
-        return self.carries_messages
+        return len(self.messages.waiting) < self.max_messages
 
     @property
     def messages_waiting(self) -> int:
         """Number of messages of which nothing has been sent."""
-        return 0
+        return len(self.messages.waiting)
 
     @property
     def message_bytes(self) -> int:
         """Total length of these messages."""
-        return 0
+        return self.messages.waiting_bytes
 
     def add_message(
         self, message_id: str, source: str, data: bytes, now: float, *, priority: int = 4, lifetime_s: float = 3600.0

@@ -74,13 +74,12 @@ class TransmitQueue(ImageSender):
         ConfigError: An unknown rate.
     """
 
-    carries_messages = True
-
     def __init__(
         self, config: QueueConfig, *, first_block: int = 0, protection: FrameAuthenticator | None = None
     ) -> None:
         super().__init__(RATES[config.first_rate].airtime_s)
         self.config = config
+        self.max_messages = config.max_messages
         self.rate_selector = RateSelector(config.rates, config.first_rate)
         self.sender = V1Sender(
             SenderConfig(
@@ -96,7 +95,6 @@ class TransmitQueue(ImageSender):
             first_block=first_block,
             protection=protection,
         )
-        self.messages = MessageQueue()
         self.last_feedback_s: float | None = None
         self._frames_at_feedback = 0
         self._image_credit = 0.0
@@ -116,21 +114,6 @@ class TransmitQueue(ImageSender):
     def planned_loss(self) -> float:
         """Share of frames lost that plans use."""
         return self.sender.config.worst.loss
-
-    @property
-    def accepts_messages(self) -> bool:
-        """Whether the queue has room for another message."""
-        return len(self.messages.waiting) < self.config.max_messages
-
-    @property
-    def messages_waiting(self) -> int:
-        """Number of waiting messages."""
-        return len(self.messages.waiting)
-
-    @property
-    def message_bytes(self) -> int:
-        """Total length of the waiting messages."""
-        return self.messages.waiting_bytes
 
     @property
     def images_waiting(self) -> int:
