@@ -6,7 +6,7 @@ and maps with its immutable content. Each function returns the parts that `resto
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from typing import Any, Final, TypeVar
 
@@ -63,17 +63,16 @@ _RENAMED: Final[dict[type, dict[str, str]]] = {
 }
 """Fields of version 0.1 that have other names now."""
 _T = TypeVar("_T")
-_A = TypeVar("_A")
-_Map = dict[str, Any]
+_Map = Mapping[str, Any]
 
 
-def _converts(convert: Callable[[_A], _T]) -> Callable[[_A], _T]:
-    """Make a function raise FrameError, and no other error, for malformed state."""
+def _converts(convert: Callable[[_Map], _T]) -> Callable[[_Map | bytes], _T]:
+    """Make a function unpack its argument, and raise FrameError and no other error for malformed state."""
 
     @wraps(convert)
-    def converted(argument: _A) -> _T:
+    def converted(state: _Map | bytes) -> _T:
         try:
-            return convert(argument)
+            return convert(unpack_plain(dict, state, _WHERE) if isinstance(state, bytes) else state)
         except BadInputError as error:
             raise FrameError(_WHERE, error.field, error.value, error.expected) from error
         except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
@@ -95,16 +94,15 @@ def _read(kind: type[_T], entry: _Map, **values: object) -> _T:
 
 
 @_converts
-def v1_receiver_parts(data: bytes) -> dict[str, bytes]:
+def v1_receiver_parts(state: _Map) -> dict[str, bytes]:
     """Convert the state of the `v1` receiver.
+
+    Args:
+        state: The saved bytes, or the map in them; so for all functions that take a `state`.
 
     Raises:
         FrameError: Not a state of version 0.1. All functions of this module raise it.
     """
-    return _v1_receiver_parts(unpack_plain(dict, data, _WHERE))
-
-
-def _v1_receiver_parts(state: _Map) -> dict[str, bytes]:
     parts = {"counts": pack_part(_read(V1ReceiverCounts, _state(state)["counts"]))}
     for order, source in enumerate(state["sources"]):
         peer = _read(PeerState, source, order=order)
@@ -137,10 +135,9 @@ def _packed_stream(pieces: list[tuple[int, bytes]], length: int) -> object:
 
 
 @_converts
-def paper_receiver_parts(data: bytes) -> dict[str, bytes]:
+def paper_receiver_parts(state: _Map) -> dict[str, bytes]:
     """Convert the state of the `paper` receiver."""
-    state = _state(unpack_plain(dict, data, _WHERE))
-    parts = {"counts": pack_part(_read(PaperReceiverCounts, state["counts"]))}
+    parts = {"counts": pack_part(_read(PaperReceiverCounts, _state(state)["counts"]))}
     for order, entry in enumerate(state["images"]):
         candidates = [
             {"header": c["header"], "body": _packed_stream(c["pieces"], c["body_length"]), "frames": c["frames"]}
@@ -152,10 +149,9 @@ def paper_receiver_parts(data: bytes) -> dict[str, bytes]:
 
 
 @_converts
-def authentication_parts(data: bytes) -> dict[str, bytes]:
+def authentication_parts(state: _Map) -> dict[str, bytes]:
     """Convert the state of the authentication."""
-    state = _state(unpack_plain(dict, data, _WHERE))
-    counts = to_plain(_read(AuthenticationCounts, state["counts"]))
+    counts = to_plain(_read(AuthenticationCounts, _state(state)["counts"]))
     parts = {"authentication": pack_part(_read(AuthenticationState, state, counts=counts))}
     for source, newest, seen in state["windows"]:
         window = SavedWindow(source, ReplayWindow(newest, int.from_bytes(seen, "big")))
@@ -164,11 +160,10 @@ def authentication_parts(data: bytes) -> dict[str, bytes]:
 
 
 @_converts
-def endpoint_parts(data: bytes) -> dict[str, bytes]:
+def endpoint_parts(state: _Map) -> dict[str, bytes]:
     """Convert the state of the vessel's endpoint: its receiver, its commands and its message number."""
-    state = _state(unpack_plain(dict, data, _WHERE))
-    parts = {"endpoint": pack_part(_read(EndpointState, state))}
-    parts |= prefixed("v1/", _v1_receiver_parts(state["receiver"]))
+    parts = {"endpoint": pack_part(_read(EndpointState, _state(state)))}
+    parts |= prefixed("v1/", v1_receiver_parts(state["receiver"]))
     for order, entry in enumerate(_state(state["orders"])["orders"], start=1):
         command = _read(PendingCommand, entry, order=order)
         parts[f"commands/command/{command.token}"] = pack_part(command)
@@ -207,26 +202,17 @@ def queue_parts(parts: Parts) -> tuple[dict[str, bytes], Errors]:
         restored queue sends all of them again.
     """
     errors: dict[str, FrameError] = {}
-    maps: dict[str, _Map] = {}
     converted: dict[str, bytes] = {}
-    for name, data in parts.items():
+    converters = {"picture": _image_parts, "message": _message_parts, "packet": _packet_parts}
+    for name in sorted(parts, key=lambda name: name == "core"):  # the core last: it replaces images without progress
+        kind = name.partition("/")[0]
         try:
-            maps[name] = unpack_plain(dict, data, _WHERE)
+            if kind in converters:
+                converted |= converters[kind](parts[name])
+            elif kind == "core":
+                converted |= _core_parts(parts)
         except FrameError as error:
             errors[name] = error
-    converters: dict[str, Callable[[_Map], dict[str, bytes]]] = {
-        "picture": _image_parts,
-        "message": _message_parts,
-        "packet": _packet_parts,
-        "core": lambda core: _core_parts((core, maps)),
-    }
-    for name in sorted(maps, key=lambda name: name == "core"):  # the core last: it replaces images without progress
-        convert = converters.get(name.partition("/")[0])
-        if convert is not None:
-            try:
-                converted |= convert(maps[name])
-            except FrameError as error:
-                errors[name] = error
     return converted, errors
 
 
@@ -249,9 +235,9 @@ def _packet_parts(entry: _Map) -> dict[str, bytes]:
 
 
 @_converts
-def _core_parts(content: tuple[_Map, dict[str, _Map]]) -> dict[str, bytes]:
+def _core_parts(saved: Parts) -> dict[str, bytes]:
     """Convert the part `core`, and the images and blocks (in the other parts) whose progress it has."""
-    core, maps = _state(content[0]), content[1]
+    core = _state(unpack_plain(dict, saved["core"], _WHERE))
     sender = _state(core["sender"])
     losses = {rate: [loss, measured_s] for rate, loss, measured_s in core["losses"]}
     tracker = [dict(sender["receivers"]), {receiver: measured for receiver, *measured in sender["meters"]}]
@@ -271,7 +257,7 @@ def _core_parts(content: tuple[_Map, dict[str, _Map]]) -> dict[str, bytes]:
         image_id, contact_id = names.get(number, _UNNAMED)
         image = _read(
             OutgoingImage,
-            maps[f"picture/{number}"],
+            unpack_plain(dict, saved[f"picture/{number}"], _WHERE),
             image_id=image_id,
             contact_id=contact_id,
             order=order,
@@ -284,7 +270,7 @@ def _core_parts(content: tuple[_Map, dict[str, _Map]]) -> dict[str, bytes]:
         parts[f"image-progress/{number}"] = pack_part(image, "progress")
     for retired, entries in ((False, core["blocks"]), (True, core.get("past", []))):
         for entry in entries:
-            fixed = maps[f"block/{entry['number']}"]
+            fixed = unpack_plain(dict, saved[f"block/{entry['number']}"], _WHERE)
             layering, missing = fixed["layering"] or None, dict(entry["needs"])
             block = _read(SendBlock, {**fixed, **entry}, layering=layering, missing=missing, retired=retired)
             parts[f"block/{block.number}"] = pack_part(block)
