@@ -24,7 +24,7 @@ from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
-from sonarpost.link.receiver import FeedbackReceived, ImageUpdate
+from sonarpost.link.receiver import FeedbackReceived, ImageUpdate, received_mask
 
 SEQUENTIAL_HEADER_BYTES: Final = 4
 """Header of a frame of the sequential scheme: checksum, image and position."""
@@ -206,7 +206,7 @@ def run_paper(images: Sequence[LinkImage], codecs: Codecs, setting: Setting) -> 
             quality = image_quality(image.pixels, np.zeros_like(image.pixels))
             delivered.append(Delivered(quality, RECORD_SIZE if has_contact else 0, False, False))  # noqa: FBT003
             continue
-        quality = codecs.paper_quality(image, last.stream, last.received_mask())
+        quality = codecs.paper_quality(image, last.stream, received_mask(last.stream, last.missing))
         header_bytes = len(last.stream) - last.total_bytes
         payload = last.received_bytes + header_bytes + (RECORD_SIZE if has_contact else 0)
         delivered.append(Delivered(quality, payload, has_contact, last.complete))

@@ -21,7 +21,15 @@ from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
-from sonarpost.link.receiver import CombinedReceiver, Event, FrameReceiver, FrameRejected, ImageUpdate
+from sonarpost.link.receiver import (
+    CombinedReceiver,
+    Event,
+    FrameReceiver,
+    FrameRejected,
+    ImageUpdate,
+    has_header,
+    received_mask,
+)
 
 VEHICLE = 3
 HEADER = StreamHeader(0x10, 0xBEEF, 80, 80)
@@ -92,7 +100,7 @@ def test_all_frames_give_a_complete_image(wire: Format) -> None:
     assert (last.source, last.image_id, last.complete) == (VEHICLE, "00A7", True)
     assert (last.stream, last.missing, last.missing_halves) == (stream, (), ())
     assert last.contact == contact(number_of_image("00A7"))
-    assert last.received_mask().tolist() == [True] * 200
+    assert received_mask(last.stream, last.missing).tolist() == [True] * 200
     assert last.received_bytes == last.total_bytes
     assert last.first_frame_s == 10.0
     assert 10.0 <= last.last_frame_s < 10.0 + len(frames)
@@ -121,8 +129,8 @@ def test_missing_ranges_hold_zeros_and_the_rest_is_right(wire: Format, lost: set
             update.stream == bytes(0 if i in missing else byte for i, byte in enumerate(stream))[: len(update.stream)]
         )
         assert not (update.complete and missing)
-        if update.has_header:
-            mask = update.received_mask()
+        if has_header(update.stream):
+            mask = received_mask(update.stream, update.missing)
             assert mask.tolist() == [i not in missing for i in range(HEADER.size, len(update.stream))]
         else:
             assert (update.stream, update.missing_halves) == (b"", ("top", "bottom"))

@@ -1,1 +1,1 @@
-"""The acoustic link without input or output: wire formats, fragments, assembly."""
+"""The acoustic link without input or output: wire formats, coding, authentication, queues and medium access."""

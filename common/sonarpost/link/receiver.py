@@ -58,14 +58,9 @@ class ImageUpdate:
     last_frame_s: float
 
     @property
-    def has_header(self) -> bool:
-        """Whether the stream has a header, so that a codec can decode it."""
-        return has_header(self.stream)
-
-    @property
     def missing_halves(self) -> tuple[HalfName, ...]:
         """The halves of the image, as the `paper` format divides it, of which no byte arrived."""
-        if not self.has_header:
+        if not has_header(self.stream):
             return "top", "bottom"
         if not self.missing:
             return ()
@@ -79,14 +74,6 @@ class ImageUpdate:
             if start < stop and not covered_within(received, start + header_bytes, stop + header_bytes)
         )
 
-    def received_mask(self) -> Mask:
-        """Return shape (bytes of the body,), True where a byte arrived: the argument `received` of `Codec.decode`.
-
-        Raises:
-            StreamError: The stream has no valid header.
-        """
-        return received_mask(self.stream, self.missing)
-
 
 def has_header(stream: bytes) -> bool:
     """Return whether the received part of a stream has a header, so that a codec can decode it."""
@@ -99,7 +86,7 @@ def has_header(stream: bytes) -> bool:
 
 
 def received_mask(stream: bytes, missing: Ranges) -> Mask:
-    """Return shape (bytes of the body,), True where a byte of a stream arrived.
+    """Return shape (bytes of the body,), True where a byte arrived: the argument `received` of `Codec.decode`.
 
     Args:
         stream: The stream, header first.

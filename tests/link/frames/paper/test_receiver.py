@@ -17,7 +17,7 @@ from sonarpost.codec.interface import StreamHeader
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, format_image_id, half_bounds
 from sonarpost.link.frames.paper.receiver import ImageCandidate, PaperReceiver, PaperReceiverCounts, PendingImage
-from sonarpost.link.receiver import Event, FrameRejected, ImageUpdate
+from sonarpost.link.receiver import Event, FrameRejected, ImageUpdate, received_mask
 
 GOLDEN = json.loads((GOLDEN_FOLDER / "link" / "paper_receiver.json").read_text())["scenarios"]
 HEADER = StreamHeader(0x10, 0xBEEF, 113, 49)
@@ -106,7 +106,17 @@ def test_update_has_times_stream_and_mask() -> None:
     assert (event.first_frame_s, event.last_frame_s) == (10, 12)
     assert event.contact == CONTACT
     assert event.stream == HEADER.pack() + BODY[:2] + bytes(3) + BODY[5:8] + bytes(1)
-    assert event.received_mask().tolist() == [True, True, False, False, False, True, True, True, False]
+    assert received_mask(event.stream, event.missing).tolist() == [
+        True,
+        True,
+        False,
+        False,
+        False,
+        True,
+        True,
+        True,
+        False,
+    ]
     assert event.missing_halves == ()
     assert receiver.next_deadline() is None
 
@@ -264,7 +274,7 @@ def test_frame_without_body_bytes_announces_the_image() -> None:
     receiver.accept(2, half("bottom")[:16], 0)
     (event,) = images(receiver.poll(60))
     assert (received_of(event), body_of(event), event.missing_halves) == ((), bytes(9), ("top", "bottom"))
-    assert event.received_mask().tolist() == [False] * 9
+    assert received_mask(event.stream, event.missing).tolist() == [False] * 9
 
 
 def test_identifier_reused_after_memory_s_is_a_new_image() -> None:

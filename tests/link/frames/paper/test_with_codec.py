@@ -10,7 +10,7 @@ from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import Packet, plan_packets
-from sonarpost.link.receiver import ImageUpdate
+from sonarpost.link.receiver import ImageUpdate, received_mask
 
 HEIGHT_PX, WIDTH_PX, TILE_PX = 80, 140, 10
 CONTACT = ContactSummary(height_px=HEIGHT_PX, width_px=WIDTH_PX, lat_deg=44.7, lon_deg=-63.6)
@@ -51,7 +51,7 @@ def test_received_half_is_decoded_at_its_place(
     assert len(packets) == 2
     event = send(packets, set(lost))
     assert event.contact == CONTACT.rounded()  # in both packets
-    decoded = codec.decode(event.stream, event.received_mask())
+    decoded = codec.decode(event.stream, received_mask(event.stream, event.missing))
     assert np.array_equal(decoded.image[received_rows], image[received_rows])
     lost_rows = np.ones(HEIGHT_PX, dtype=bool)
     lost_rows[received_rows] = False
