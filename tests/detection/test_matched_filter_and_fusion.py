@@ -19,7 +19,7 @@ from sonarpost.detection.candidates import (
     geometry_score,
     measure,
 )
-from sonarpost.detection.detector import CLUTTER, MINE_LIKE, classify, height_from_shadow_m
+from sonarpost.detection.detector import CLUTTER, MINE_LIKE, classify, find_structures, height_from_shadow_m
 from sonarpost.detection.fusion import (
     FILTERS,
     FusionModel,
@@ -32,7 +32,6 @@ from sonarpost.detection.fusion import (
 from sonarpost.detection.matched_filter import IntegralImage, in_noise_units, matched_response, peaks
 from sonarpost.detection.normalisation import normalise_side
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.structures import find_structures
 from sonarpost.sonar.survey import Side
 
 SETTINGS = DetectorSettings()

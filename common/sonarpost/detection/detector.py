@@ -1,20 +1,144 @@
-"""Detection of contacts in a survey."""
+"""Detection of contacts in a survey: compact objects from the filters, and large structures.
+
+Large structures (wrecks, walls) are a deep shadow of several square metres with a highlight before it. The filters for
+compact objects compare a place with the seabed around it, but a wreck fills that neighbourhood. Its shadow is
+detectable: metres wide and without echo. Shadows of ripples, stones and rock are lit from other sides. Each connected
+dark region of at least 7 m² whose near edge is bright for a good part of its length is a structure.
+
+Outcrops of rock cast such shadows too, but in large numbers: each distant region of comparable size reduces the
+confidence. The simulator has no wrecks, so this confidence is not calibrated: 1.0 is the minimum area with a bright
+edge along half of its length, and it increases with both.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final
 
-from sonarpost.detection.candidates import Candidate, FilterScores, find_candidates
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from sonarpost.detection.candidates import Candidate, FilterScores, Measurement, find_candidates
 from sonarpost.detection.fusion import fused_confidences, suppress_duplicates
 from sonarpost.detection.normalisation import FloatVector, LevelGrid, normalise_side
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.structures import find_structures, is_part_of_structure
 from sonarpost.sonar.bottom_track import altitudes_m
 from sonarpost.sonar.geometry import Position, georeference, sample_slant_range_m, slant_to_ground_range_m
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import SurveySource, load_survey
 from sonarpost.sonar.survey import Side, Survey
+
+_SMOOTH_M: Final = 0.4
+_DARK_LEVEL: Final = -1.3
+_BRIGHT_LEVEL: Final = 0.6
+_MIN_AREA_M2: Final = 7.0
+_EDGE_M: Final = 1.2
+"""The highlight of a structure lies within this distance before its shadow."""
+_EDGE_SHARE: Final = 0.5
+_MIN_EDGE_SHARE: Final = 0.25
+_MAX_LENGTH_M: Final = 60.0
+_NEAR_M: Final = 2.0
+_SEPARATE_M: Final = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """A structure as a candidate, with its confidence and the area of its shadow in slant range."""
+
+    confidence: float
+    candidate: Candidate
+    area_m2: float
+
+
+def find_structures(grid: LevelGrid) -> list[Structure]:
+    """Return the structures of one side, most confident first."""
+    size = (max(1, round(_SMOOTH_M / grid.row_along_m)), max(1, round(_SMOOTH_M / grid.cell_across_m)))
+    known = np.isfinite(grid.level)
+    level = ndimage.uniform_filter(np.where(known, grid.level, 0.0).astype(np.float32), size=size, mode="nearest")
+    labels, _ = ndimage.label(known & (level < _DARK_LEVEL))
+    areas_m2 = np.bincount(labels.ravel()) * (grid.row_along_m * grid.cell_across_m)
+    found = []
+    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+        if box is None or areas_m2[number] < _MIN_AREA_M2:
+            continue
+        if (box[0].stop - box[0].start) * grid.row_along_m > _MAX_LENGTH_M:
+            continue
+        structure = _structure(grid, level, labels[box] == number, (box[0].start, box[1].start), areas_m2[number])
+        if structure is not None:
+            found.append(structure)
+    weighted = [replace(s, confidence=s.confidence / (1 + _comparable(s, found, grid))) for s in found]
+    return sorted(weighted, key=lambda s: -s.confidence)
+
+
+def is_part_of_structure(contact: Candidate, structure: Candidate, grid: LevelGrid) -> bool:
+    """Return whether the centre of a contact lies in or within 2 m of a structure's highlight or shadow."""
+    rows, cells = _NEAR_M / grid.row_along_m, _NEAR_M / grid.cell_across_m
+    centre, large = contact.measurement, structure.measurement
+    along = large.rows[0] - rows <= centre.row < large.rows[1] + rows
+    return along and large.cells[0] - cells <= centre.cell < large.cells[1] + large.shadow_cells + cells
+
+
+def _comparable(one: Structure, found: list[Structure], grid: LevelGrid) -> int:
+    """Return how many others of at least half the area are too far away to be parts of the same structure."""
+    count = 0
+    for other in found:
+        along_m = abs(other.candidate.measurement.row - one.candidate.measurement.row) * grid.row_along_m
+        across_m = abs(other.candidate.measurement.cell - one.candidate.measurement.cell) * grid.cell_across_m
+        count += other.area_m2 >= one.area_m2 / 2 and max(along_m, across_m) > _SEPARATE_M
+    return count
+
+
+def _structure(
+    grid: LevelGrid,
+    level: npt.NDArray[np.float32],
+    dark: npt.NDArray[np.bool_],
+    corner: tuple[int, int],
+    area: np.float64,
+) -> Structure | None:
+    """Return the structure that casts a shadow; None if less than a quarter of its near edge is bright.
+
+    Args:
+        grid: One side of a survey.
+        level: Its smoothed levels.
+        dark: The cells of the shadow within its bounding box.
+        corner: First row and cell of that box.
+        area: Area of the shadow in square metres.
+    """
+    area_m2 = float(area)
+    reach = max(2, round(_EDGE_M / grid.cell_across_m))
+    rows = np.flatnonzero(dark.any(axis=1))
+    near = corner[1] + dark[rows].argmax(axis=1)
+    columns = near[:, None] - 1 - np.arange(reach)[None, :]
+    strip = np.where(columns >= 0, level[corner[0] + rows[:, None], np.maximum(columns, 0)], -np.inf)
+    bright = strip > _BRIGHT_LEVEL
+    lit = bright.any(axis=1)
+    share = float(lit.mean())
+    if share < _MIN_EDGE_SHARE:
+        return None
+    lit_rows = rows[lit]
+    middle = int(np.flatnonzero(lit)[np.argmax(strip[lit].max(axis=1))])
+    cells = bright[middle].nonzero()[0]
+    last, first = int(near[middle]) - int(cells[0]), int(near[middle]) - 1 - int(cells[-1])
+    shadow_end = corner[1] + int(np.flatnonzero(dark[rows[middle]])[-1]) + 1
+    confidence = 2.0 * area_m2 / (area_m2 + _MIN_AREA_M2) * min(1.0, share / _EDGE_SHARE)
+    patch = grid.level[corner[0] : corner[0] + dark.shape[0], corner[1] : corner[1] + dark.shape[1]]
+    measurement = Measurement(
+        row=corner[0] + int(rows[middle]),
+        cell=(first + last) // 2,
+        rows=(corner[0] + int(lit_rows[0]), corner[0] + int(lit_rows[-1]) + 1),
+        cells=(max(first, 0), last),
+        shadow_cells=shadow_end - last,
+        shadow_is_cut=shadow_end >= grid.level.shape[1],
+        matched=0.0,
+        cfar=float(strip[lit].max(axis=1).mean()),
+        shadow=float(-np.nanmean(patch[dark])),
+        shadow_rows=int(rows[-1] - rows[0]) + 1,
+    )
+    scores = FilterScores(0.0, measurement.cfar, measurement.shadow, 0.0, min(1.0, share))
+    return Structure(confidence, Candidate(measurement, scores), area_m2)
+
 
 MINE_LIKE = "mine-like"
 CLUTTER = "clutter"

@@ -8,10 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.codec.emb import rate_distortion_opt, transform
-from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.codec.emb.codec import EmbCodec, EncodedTrial, TrialEncoder, next_step
 from sonarpost.codec.emb.coder import Coder
 from sonarpost.codec.emb.decode import read_body
-from sonarpost.codec.emb.encode import EncodedTrial, TrialEncoder, next_step
 from sonarpost.codec.emb.rate_distortion_opt import TargetCoefficients
 from sonarpost.codec.emb.side_info import UNIT_WEIGHT, RegionOfInterest, SideInfo, region_weights
 from sonarpost.codec.emb.transform import layout_of

@@ -12,9 +12,8 @@ from scipy import ndimage
 
 from research.common.quality import ms_ssim
 from sonarpost.codec.emb import perceptual_weights, transform
-from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.codec.emb.codec import EmbCodec, structural_similarity
 from sonarpost.codec.emb.coder import UNIT_SCALE, CoefficientState
-from sonarpost.codec.emb.encode import structural_similarity
 from sonarpost.codec.emb.model import shipped_models
 from sonarpost.codec.emb.side_info import RegionOfInterest
 from sonarpost.codec.emb.transform import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, layout_of

@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from sonarpost.simulation.seabed.echo import SonarSettings, Track, echo_intensity, received_amplitude
+from sonarpost.simulation.seabed.survey import SurveySpec, Track, echo_intensity, received_amplitude
 from sonarpost.simulation.seabed.targets import ObjectKind, SeabedObject, place_object
 from sonarpost.simulation.seabed.terrain import Seabed
 
-SETTINGS = SonarSettings(samples=1024, range_m=30.0, ping_spacing_m=0.1)
+SPEC = SurveySpec(samples=1024, range_m=30.0, speed_mps=1.5, ping_rate_hz=15.0)
 ALTITUDE_M = 5.0
 
 
@@ -25,12 +25,12 @@ def straight_track(pings: int = 200) -> Track:
 
 
 def sample_of(ground_m: float, height_m: float = 0.0) -> float:
-    return math.hypot(ground_m, ALTITUDE_M - height_m) / SETTINGS.sample_m
+    return math.hypot(ground_m, ALTITUDE_M - height_m) / SPEC.sample_m
 
 
 def test_water_column_is_dark_and_ends_at_the_altitude():
-    image = echo_intensity(flat_bed(), straight_track(), SETTINGS, 1)
-    first = ALTITUDE_M / SETTINGS.sample_m
+    image = echo_intensity(flat_bed(), straight_track(), SPEC, 1)
+    first = ALTITUDE_M / SPEC.sample_m
     assert image[:, : int(first) - 3].max() == 0
     assert image[:, int(first) : int(first) + 4].min() > 0.02
     # Flat sand is 1 at half range by definition, and constant along the track.
@@ -43,7 +43,7 @@ def test_shadow_length_follows_geometry(sign, across_m):
     bed = flat_bed()
     cone = SeabedObject(ObjectKind.TRUNCATED_CONE, 10.0, across_m, 1.0, 1.0, 0.45)
     place_object(bed, cone)
-    image = echo_intensity(bed, straight_track(), SETTINGS, sign)
+    image = echo_intensity(bed, straight_track(), SPEC, sign)
     row = image[100]
     usual = np.median(np.delete(image, slice(90, 111), axis=0), axis=0)
     # The far rim of the flat top, 0.275 m from the centre, casts the end of the shadow.
@@ -60,7 +60,7 @@ def test_shadow_length_follows_geometry(sign, across_m):
     assert bright.size >= 4
     assert sample_of(abs(across_m) - 0.6) - 8 < bright.min() < bright.max() < dark.min() + 6
     # The other side does not show the object.
-    other = echo_intensity(bed, straight_track(), SETTINGS, -sign)
+    other = echo_intensity(bed, straight_track(), SPEC, -sign)
     np.testing.assert_allclose(other, other[:1].repeat(200, axis=0), rtol=1e-3)
 
 
@@ -69,7 +69,7 @@ def test_taller_object_casts_a_longer_shadow():
     for height in (0.2, 0.5, 1.0):
         bed = flat_bed()
         place_object(bed, SeabedObject(ObjectKind.TRUNCATED_CONE, 10.0, 15.0, 1.0, 1.0, height))
-        image = echo_intensity(bed, straight_track(), SETTINGS, 1)
+        image = echo_intensity(bed, straight_track(), SPEC, 1)
         lengths.append(int((image[100, 400:] < 0.25 * image[20, 400:]).sum()))
     assert lengths[0] * 1.8 < lengths[1] < lengths[2] / 1.6
 
@@ -80,7 +80,7 @@ def test_beam_widens_with_range():
         bed.backscatter[:] = 0.0
         column = round((across_m + 32.5) / 0.05)
         bed.backscatter[259:262, column - 3 : column + 4] = 1.0
-        image = echo_intensity(bed, straight_track(), dataclasses.replace(SETTINGS, ping_spacing_m=0.02), 1)
+        image = echo_intensity(bed, straight_track(), dataclasses.replace(SPEC, speed_mps=15.0 * 0.02), 1)
         profile = image[:, round(sample_of(across_m))]
         return int((profile > profile.max() / 2).sum())
 
@@ -91,7 +91,7 @@ def test_beam_widens_with_range():
 def test_speckle_statistics_match_recordings():
     rng = np.random.default_rng(0)
     flat = np.full((300, 1024), 1.0, np.float32)
-    amplitude = received_amplitude(flat, np.full(300, ALTITUDE_M), SETTINGS, rng)[:, 300:700]
+    amplitude = received_amplitude(flat, np.full(300, ALTITUDE_M), SPEC, rng)[:, 300:700]
     rows = amplitude / amplitude.mean(axis=1, keepdims=True)
     assert 0.3 < rows.std() < 0.45
     off = rows - rows.mean()
