@@ -56,8 +56,8 @@ class UnsentRecord:
 class ConsoleState:
     """The console's state. Every change is stored in the database, and published as an event.
 
-    Every method that changes the state raises DeliveryError if the database refuses the change. Every method with a
-    contact identifier, and with a version, raises NotFoundError if there is none.
+    Every method that changes the state raises DeliveryError if the database refuses the change. A method raises
+    NotFoundError for an unknown contact identifier or version.
 
     Attributes:
         clock: UTC seconds.

@@ -176,6 +176,7 @@ class ShoreIndex:
     def _writing(self) -> Iterator[sqlite3.Connection]:
         with self._lock:
             try:
+                # The connection commits at the end of its block, and rolls back after an exception.
                 with self._db:
                     self._db.execute("BEGIN IMMEDIATE")
                     yield self._db

@@ -160,6 +160,7 @@ class Store:
         with self._lock:
             tx = Transaction(self._db, self._in_flight)
             try:
+                # The connection commits at the end of its block, and rolls back after an exception.
                 with self._db:
                     self._db.execute("BEGIN IMMEDIATE")
                     yield tx

@@ -58,11 +58,11 @@ class FleetCollector(Collector):
         ages = ((_labels(s), s.age_s) for s in state.services if s.age_s is not None)
         yield _gauge("health_age_seconds", "Time since the arrival of the last health record", ages)
         fresh = {_labels(s): s.health for s in state.services if s.health and (s.age_s or 0.0) <= self._stale_after_s}
-        states = [((*of, name), float(health.state == name)) for of, health in fresh.items() for name in STATES]
+        states = [((*key, name), float(health.state == name)) for key, health in fresh.items() for name in STATES]
         yield _gauge("state", "1 for the present state of the service", states, (*LABELS, "state"))
-        started = ((of, health.started_utc_s) for of, health in fresh.items())
+        started = ((key, health.started_utc_s) for key, health in fresh.items())
         yield _gauge("started_time_seconds", "Start of the process, Unix time", started)
-        sent = ((of, health.time_utc_s) for of, health in fresh.items())
+        sent = ((key, health.time_utc_s) for key, health in fresh.items())
         yield _gauge("health_time_seconds", "Time in the last health record, by the platform's clock", sent)
         yield from _values(fresh)
 
@@ -75,8 +75,8 @@ def _gauge(
     name: str, text: str, values: Iterable[tuple[Sequence[str], float]] = (), labels: Sequence[str] = LABELS
 ) -> GaugeMetricFamily:
     gauge = GaugeMetricFamily(f"sonarpost_{name}", text, labels=labels)
-    for of, value in values:
-        gauge.add_metric(of, value)
+    for label_values, value in values:
+        gauge.add_metric(label_values, value)
     return gauge
 
 

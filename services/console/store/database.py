@@ -160,6 +160,7 @@ class SqliteFile:
         Raises:
             DeliveryError: The transaction failed, for example because of a full disk, and was rolled back.
         """
+        # The connection commits at the end of its block, and rolls back after an exception.
         with self.read() as db, db:
             db.execute("BEGIN IMMEDIATE")
             yield db
