@@ -42,8 +42,8 @@ from sonarpost.bus.session import client_config
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Pixels, ReconstructedImage, Record
-from sonarpost.parent_process import EXIT_WITH_PARENT
 from sonarpost.runtime.service import Service, UnitOfWork
+from sonarpost.stop_signals import EXIT_WITH_PARENT
 
 DRAIN_TIMEOUT_S = 120.0
 SAMPLE_S = 5.0

@@ -1,11 +1,18 @@
-"""Signals that end a command: SIGINT and SIGTERM."""
+"""Signals that end a process: SIGINT and SIGTERM, and the end of its parent."""
 
 from __future__ import annotations
 
+import ctypes
+import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+EXIT_WITH_PARENT = "SONARPOST_EXIT_WITH_PARENT"
+EXIT_ORPHANED = 1
+_PR_SET_PDEATHSIG = 1
 
 
 @contextmanager
@@ -24,3 +31,14 @@ def stop_on_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def exit_with_parent() -> None:
+    """End this process when its parent ends, if `SONARPOST_EXIT_WITH_PARENT` holds the parent's process id (Linux)."""
+    parent = os.environ.get(EXIT_WITH_PARENT)
+    if parent is None or not sys.platform.startswith("linux"):
+        return
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != int(parent):
+        # The parent ended before prctl took effect.
+        os._exit(EXIT_ORPHANED)

@@ -36,7 +36,7 @@ from sonarpost import wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Health, ReconstructedImage
-from sonarpost.parent_process import EXIT_WITH_PARENT
+from sonarpost.stop_signals import EXIT_WITH_PARENT
 
 SHORE = "shore-1"
 PROCESSES = ("router-vessel", "router-shore", "relay", "c2")

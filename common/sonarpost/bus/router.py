@@ -27,9 +27,8 @@ from sonarpost.bus.session import router_config
 from sonarpost.config import TlsConfig
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError, SonarpostError
 from sonarpost.messages import Health, ServiceState
-from sonarpost.parent_process import exit_with_parent
 from sonarpost.security.tls_files import TlsMonitor
-from sonarpost.stop_signals import stop_on_signals
+from sonarpost.stop_signals import exit_with_parent, stop_on_signals
 
 log = logging.getLogger(__name__)
 

@@ -14,8 +14,8 @@ from types import FrameType
 
 from sonarpost import config, logs
 from sonarpost.errors import ConfigError, SonarpostError
-from sonarpost.parent_process import exit_with_parent
 from sonarpost.runtime.service import C, Service
+from sonarpost.stop_signals import exit_with_parent
 
 log = logging.getLogger(__name__)
 

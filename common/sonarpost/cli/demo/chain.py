@@ -11,7 +11,7 @@ from typing import IO
 
 from sonarpost.cli.demo.settings import PLATFORM_OF, ChainSettings, write_config
 from sonarpost.errors import SonarpostError
-from sonarpost.parent_process import EXIT_WITH_PARENT
+from sonarpost.stop_signals import EXIT_WITH_PARENT
 
 STOP_S = 5.0
 ROUTERS = ("router-uuv", "router-vessel", "router-shore")
