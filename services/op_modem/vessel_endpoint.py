@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import msgpack
-
 from sonarpost.errors import FrameError, PayloadError
 from sonarpost.link import migration
 from sonarpost.link.auth.authentication import FrameAuthenticator
@@ -131,9 +129,9 @@ class VesselLink:
         state = unpack_plain(dict, saved, "op_modem state")
         if not isinstance(state.get("link"), dict):
             raise FrameError("op_modem state", "link", saved[:20], "a map")
-        parts = prefixed(_LINK, migration.endpoint_parts(msgpack.packb(state["link"])))
+        parts = prefixed(_LINK, migration.endpoint_parts(state["link"]))
         if isinstance(state.get("seal"), dict):
-            parts |= prefixed(_AUTHENTICATION, migration.authentication_parts(msgpack.packb(state["seal"])))
+            parts |= prefixed(_AUTHENTICATION, migration.authentication_parts(state["seal"]))
         self.restore(parts)
 
 
