@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from itertools import count
 from typing import Annotated, Final
 
 from sonarpost.errors import FrameError
@@ -95,12 +96,8 @@ class CommandTracker:
 
     def free_token(self, kind: str, record_id: str) -> int:
         """Return the token for a new record: the first of `token_of` that no other command has."""
-        attempt = 0
-        while (
-            token := token_of(record_id, "decision" if kind == "decision" else "command", attempt)
-        ) in self._commands:
-            attempt += 1
-        return token
+        tokens = (token_of(record_id, "decision" if kind == "decision" else "command", n) for n in count())
+        return next(token for token in tokens if token not in self._commands)
 
     def add(self, command: PendingCommand, now: float) -> PendingCommand:
         """Add a command with a `free_token`; return it with its state. A late command expires at once.

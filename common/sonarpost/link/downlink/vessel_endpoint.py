@@ -309,24 +309,25 @@ class _FramePacker:
 
     def __init__(self, max_frames: int, room_bytes: int) -> None:
         self.frames: list[list[Segment]] = []
-        self._room: list[int] = []
         self._max_frames = max_frames
         self._room_bytes = room_bytes
 
+    def _place(self, segment: Segment) -> int | None:
+        """Return the index of the first frame with room for a segment, possibly a new one."""
+        used = [sum(each.size for each in frame) for frame in self.frames]
+        used += [0] if len(used) < self._max_frames else []
+        return next((n for n, size in enumerate(used) if size + segment.size <= self._room_bytes), None)
+
     def fits(self, segment: Segment) -> bool:
         """Whether there is room for a segment."""
-        new = len(self.frames) < self._max_frames and segment.size <= self._room_bytes
-        return new or any(segment.size <= room for room in self._room)
+        return self._place(segment) is not None
 
     def add(self, segment: Segment) -> bool:
         """Add a segment if there is room; return whether there was."""
-        if not self.fits(segment):
-            return False
-        place = next((n for n, room in enumerate(self._room) if segment.size <= room), None)
+        place = self._place(segment)
         if place is None:
-            place = len(self.frames)
+            return False
+        if place == len(self.frames):
             self.frames.append([])
-            self._room.append(self._room_bytes)
         self.frames[place].append(segment)
-        self._room[place] -= segment.size
         return True

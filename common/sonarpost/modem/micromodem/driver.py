@@ -443,20 +443,15 @@ class MicroModem:
     def _on_ping_received(self, sentence: Sentence, now: float) -> None:
         self._events.append(PingReceived.parse(sentence))
 
-    def _on_ping_answered(self, sentence: Sentence, now: float) -> None:
-        answer = PingAnswered.parse(sentence)
+    def _on_answer(self, sentence: Sentence, now: float) -> None:
+        is_ping = sentence.kind == "CAMPR"
+        answer = PingAnswered.parse(sentence) if is_ping else MiniPacketAnswered.parse(sentence)
         if self._request is not None:
-            self._request.on_answer(RequestKind.PING, answer.src)
+            self._request.on_answer(RequestKind.PING if is_ping else RequestKind.MINI_PACKET, answer.src)
         self._events.append(answer)
 
     def _on_mini_received(self, sentence: Sentence, now: float) -> None:
         self._events.append(MiniPacketReceived.parse(sentence))
-
-    def _on_mini_answered(self, sentence: Sentence, now: float) -> None:
-        answer = MiniPacketAnswered.parse(sentence)
-        if self._request is not None:
-            self._request.on_answer(RequestKind.MINI_PACKET, answer.src)
-        self._events.append(answer)
 
     def _on_flexible_data(self, sentence: Sentence, now: float) -> None:
         self._events.append(FlexibleDataReceived(ReceivedFlexibleData.parse(sentence), now))
@@ -498,8 +493,8 @@ class MicroModem:
         "CAMUC": _on_request_echo,
         "CATDP": _on_request_echo,
         "CAMPA": _on_ping_received,
-        "CAMPR": _on_ping_answered,
+        "CAMPR": _on_answer,
         "CAMUA": _on_mini_received,
-        "CAMUR": _on_mini_answered,
+        "CAMUR": _on_answer,
         "CARDP": _on_flexible_data,
     }
