@@ -13,7 +13,7 @@ from sonarpost.archive.image_files import add_image, image_file_name
 from sonarpost.archive.shore_files import (
     decision_file_name,
     delete_image_files,
-    image_row_of_record,
+    image_row,
     index_missing_files,
     remove_temporary_files,
     select_for_removal,
@@ -116,7 +116,9 @@ class Archive:
             decisions, self._decisions = self._decisions, []
             files, self._files = self._files, AtomicFiles()
             files.commit()
-            rows: list[ImageRow | DecisionRow] = [image_row_of_record(self._out_dir, i, at) for i, at in images]
+            rows: list[ImageRow | DecisionRow] = [
+                image_row(self._out_dir, image_file_name(i), i, at, time.time()) for i, at in images
+            ]
             rows += [DecisionRow.of(decision, time.time()) for decision in decisions]
             if rows:
                 self.index().put(rows)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pydantic import ValidationError
 
-from sonarpost.archive.image_files import image_file_name
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex
 from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import DECISIONS, SideCar
@@ -72,11 +70,6 @@ def image_row(
         atd_confidence=contact.atd_confidence if contact else None,
         size_bytes=sum((folder / f"{name}{suffix}").stat().st_size for suffix in SUFFIXES),
     )
-
-
-def image_row_of_record(out_dir: Path, image: ReconstructedImage, relayed_utc_s: float) -> ImageRow:
-    """Return the index row of an image that was just written."""
-    return image_row(out_dir, image_file_name(image), image, relayed_utc_s, time.time())
 
 
 def index_missing_files(out_dir: Path, index: ShoreIndex) -> int:

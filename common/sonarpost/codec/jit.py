@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import importlib
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Final, ParamSpec, Protocol, TypeVar, cast
+from typing import Any, Final, ParamSpec, TypeVar, cast
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -45,7 +45,7 @@ class CompilationLog:
         self.cache_folders: set[Path] = set()
         self._announced: set[str] = set()
 
-    def notify(self, event: _NumbaEvent) -> None:
+    def notify(self, event: Any) -> None:  # noqa: ANN401 numba has no types
         """Handle an event of numba: the start or the end of a compilation."""
         dispatcher = event.data["dispatcher"]
         names = dispatcher.py_func.__module__.split(".")
@@ -58,20 +58,6 @@ class CompilationLog:
             self._announced.add(codec)
             seconds = COMPILE_S[codec]
             log.info("Preparing machine code for the %s codec: about %d s, once for each installation", codec, seconds)
-
-
-class _Stats(Protocol):
-    cache_path: str
-
-
-class _Dispatcher(Protocol):
-    py_func: Callable[..., object]
-    stats: _Stats
-
-
-class _NumbaEvent(Protocol):
-    is_start: bool
-    data: Mapping[str, _Dispatcher]
 
 
 compilation_log = CompilationLog()

@@ -139,12 +139,6 @@ def test_every_size_is_decomposed_as_far_as_possible(codec: Jpeg2000Codec, size:
     assert psnr_db(image, decoded.image) > 18
 
 
-@pytest.mark.parametrize("quality_db", [0.5, 61.0, float("nan")])
-def test_quality_out_of_range_is_rejected(quality_db: float) -> None:
-    with pytest.raises(ConfigError, match="quality_db"):
-        Jpeg2000Codec(quality_db=quality_db)
-
-
 def test_codestream_of_another_size_is_rejected_before_decoding() -> None:
     inside = codestream(512, 512, 5, b"\0" * 20)
     for header in (StreamHeader(0x02, 0, 80, 80), StreamHeader(0x02, 0, 17, 80)):

@@ -103,20 +103,10 @@ class Jpeg2000Codec:
 
     Attributes:
         packets_only: Whether only the packets are sent.
-        quality_db: Target PSNR of OpenJPEG without a budget, 1..60 dB.
-
-    Raises:
-        ConfigError: `quality_db` is out of range.
     """
 
     packets_only: bool = False
-    quality_db: float = DEFAULT_QUALITY_DB
     model_hash: ClassVar[str] = ""
-
-    def __post_init__(self) -> None:
-        low, high = _SEARCH_DB
-        if not low <= self.quality_db <= high:
-            raise ConfigError(f"codec {self.name}", "quality_db", self.quality_db, f"{low}..{high}")
 
     @property
     def name(self) -> str:
@@ -129,7 +119,7 @@ class Jpeg2000Codec:
         return PACKETS_CODEC_ID if self.packets_only else RAW_CODEC_ID
 
     def encode(self, image: SnippetPixels, budget_bytes: int | None = None) -> bytes:
-        """Return the stream (see `Codec.encode`); without a budget, at `quality_db`."""
+        """Return the stream (see `Codec.encode`); without a budget, at a target PSNR of 22 dB."""
         grey, header = encoder_input(self, image)
         best = min(self._candidates(grey, header.size, budget_bytes), key=lambda c: c.error, default=None)
         if best is None:
@@ -169,7 +159,7 @@ class Jpeg2000Codec:
                 overhead = header_bytes + len(self._body(_Candidate(decompositions, shift, b"", 0), grey.shape))
                 shifted = _shifted(grey, shift)
                 if budget_bytes is None:
-                    packets: bytes | None = _encode(shifted, decompositions, self.quality_db)
+                    packets: bytes | None = _encode(shifted, decompositions, DEFAULT_QUALITY_DB)
                 else:
                     packets = _search(shifted, decompositions, budget_bytes - overhead)
                 if packets is not None:

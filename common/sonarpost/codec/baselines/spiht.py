@@ -27,11 +27,11 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decoder_input, encoder_input
-from sonarpost.errors import ConfigError, StreamError
+from sonarpost.errors import StreamError
 
 Integers = npt.NDArray[np.int64]
 
-DEFAULT_MAXLOOP = 7  # the larger SPIHT image in Fig. 2 of the paper
+DEFAULT_PASSES = 7  # the larger SPIHT image in Fig. 2 of the paper
 MAX_PLANES = 20
 """The energy of 512 x 512 px keeps every coefficient below plane 18."""
 FRACTION_BITS = 8
@@ -48,27 +48,14 @@ _LOW_GAIN, _HIGH_GAIN = 75340, 57008
 
 @dataclass(frozen=True)
 class SpihtCodec:
-    """SPIHT without arithmetic coding. Implements `sonarpost.codec.Codec`.
+    """SPIHT without arithmetic coding. Implements `sonarpost.codec.Codec`."""
 
-    Attributes:
-        maxloop: Maximum number of bit-plane passes, the option of that name in the paper. None: 7 without a budget,
-            unlimited with a budget.
-
-    Raises:
-        ConfigError: `maxloop` is out of range.
-    """
-
-    maxloop: int | None = None
     name: ClassVar[str] = "spiht"
     codec_id: ClassVar[int] = 0x04
     model_hash: ClassVar[str] = ""
 
-    def __post_init__(self) -> None:
-        if self.maxloop is not None and not 1 <= self.maxloop <= MAX_PLANES:
-            raise ConfigError("codec spiht", "maxloop", self.maxloop, f"1..{MAX_PLANES}, or none")
-
     def encode(self, image: SnippetPixels, budget_bytes: int | None = None) -> bytes:
-        """Return the stream (see `Codec.encode`). It uses the whole budget unless it reaches `maxloop` or plane 0."""
+        """Return the stream (see `Codec.encode`): the whole budget, or seven bit-plane passes without one."""
         grey, header = encoder_input(self, image)
         if budget_bytes is not None and budget_bytes < header.size + 2:
             raise StreamError("codec spiht", "budget_bytes", budget_bytes, f"at least {header.size + 2} B")
@@ -76,9 +63,9 @@ class SpihtCodec:
         mean = (int(grey.sum(dtype=np.int64)) // grey.size) // _MEAN_STEP
         coefficients = forward_transform(grey, _MEAN_STEP * mean + _MEAN_STEP // 2, trees)
         if budget_bytes is None:
-            return header.pack() + _write_body(coefficients, mean, 0, trees, self.maxloop or DEFAULT_MAXLOOP, None)
-        loops, length = self.maxloop or MAX_PLANES, budget_bytes - header.size
-        bodies = [_write_body(coefficients, mean, phase, trees, loops, length) for phase in range(4)]
+            return header.pack() + _write_body(coefficients, mean, 0, trees, DEFAULT_PASSES, None)
+        length = budget_bytes - header.size
+        bodies = [_write_body(coefficients, mean, phase, trees, MAX_PLANES, length) for phase in range(4)]
         errors = [int(((_read_body(body, trees).astype(np.int64) - grey) ** 2).sum()) for body in bodies]
         return header.pack() + bodies[errors.index(min(errors))]
 
@@ -96,9 +83,9 @@ class SpihtCodec:
 
 
 def _write_body(
-    coefficients: Integers, mean: int, phase: int, trees: WaveletTrees, loops: int, length: int | None
+    coefficients: Integers, mean: int, phase: int, trees: WaveletTrees, passes: int, length: int | None
 ) -> bytes:
-    """Return a body of at most `length` bytes and at most `loops` planes."""
+    """Return a body of at most `length` bytes and at most `passes` planes."""
     state = CoderState.for_encoding(coefficients, phase, trees)
     top = state.planes - 1
     bits = bytearray()
@@ -111,7 +98,7 @@ def _write_body(
         return bit
 
     with suppress(EndOfBits):
-        run_passes(trees, range(top, max(top - loops, -1), -1), state, write)
+        run_passes(trees, range(top, max(top - passes, -1), -1), state, write)
     prefix = f"{mean:05b}{phase:02b}{top:05b}".encode()
     return np.packbits(np.frombuffer(bytes(bit - ord("0") for bit in prefix) + bits, np.uint8)).tobytes()
 

@@ -251,7 +251,6 @@ class EmbCodec:
             model.
         send_texture: Whether streams carry the strength of the image's texture (4 bytes); see `speckle_layer`.
         start_steps: Start steps to try; empty: see `SEARCHES`.
-        price: See `kernel.code_band`.
 
     Raises:
         ConfigError: No model has this name.
@@ -260,7 +259,6 @@ class EmbCodec:
     model: str | Model = DEFAULT_MODEL
     send_texture: bool = False
     start_steps: tuple[int, ...] = ()
-    price: int = _PRICE
     name: ClassVar[str] = NAME
 
     def __post_init__(self) -> None:
@@ -306,7 +304,7 @@ class EmbCodec:
         mean_index = min((int(grey.astype(np.int64).sum()) // grey.size + MEAN_STEP // 2) // MEAN_STEP, 63)
         targets = _targets(grey, mean_index * MEAN_STEP, region, limit, self.network)
         texture = measure_speckle(grey, targets.layout) if self.send_texture else None
-        encoder = TrialEncoder(self.network, limit, self.price)
+        encoder = TrialEncoder(self.network, limit, _PRICE)
         best = encoder.best(targets, mean_index, region, texture, self.start_steps)
         estimate = error_by_length(best.curve, len(best.body), header.size, grey.size)
         return Encoded(header.pack() + best.body, estimate)

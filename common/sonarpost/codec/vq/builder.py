@@ -79,9 +79,6 @@ class BuildProgress:
         image_number: Position in the list of images, from 0.
         done_in_round: Images of this round that are done, including those of an interrupted run.
         images_in_round: Images of this round.
-        name: Name of the image.
-        fom: Figure of merit of the image before its tiles were added; NaN for the first image.
-        added: Tiles that the image added.
         tiles: Tiles stored now.
     """
 
@@ -90,9 +87,6 @@ class BuildProgress:
     image_number: int
     done_in_round: int
     images_in_round: int
-    name: str
-    fom: float
-    added: int
     tiles: int
 
 
@@ -224,11 +218,11 @@ class _BuildRun:
             for position, image_number in enumerate(chosen, 1):
                 if self.tile_set.full or (number, image_number) in self.completed:
                     continue
-                fom, added = _learn(self.tile_set, self._load(image_number), settings, merit)
+                added = _learn(self.tile_set, self._load(image_number), settings, merit)
                 entry = JournalEntry(EntryKind.IMAGE, number, image_number, self.hashes[image_number], added)
                 self.journal.append(entry)
-                place = (number, len(rounds), image_number, position, len(chosen), self.images[image_number].name)
-                self.progress(BuildProgress(*place, fom, added.shape[0], len(self.tile_set)))
+                place = (number, len(rounds), image_number, position, len(chosen))
+                self.progress(BuildProgress(*place, len(self.tile_set)))
 
     def run_pass(self, tiles: Tiles, number: int, passes: int) -> Tiles:
         """Run one refinement pass, or return its result from the journal."""
@@ -271,17 +265,16 @@ class _BuildRun:
             raise CodebookError(self.journal.name, "pass", self._images_hash.hex(), wanted)
 
 
-def _learn(tile_set: IncrementalTileSet, image: Image, settings: Round, merit: FigureOfMerit) -> tuple[float, Tiles]:
-    """Apply Table IV to one image; return its figure of merit before, and the added tiles."""
+def _learn(tile_set: IncrementalTileSet, image: Image, settings: Round, merit: FigureOfMerit) -> Tiles:
+    """Apply Table IV to one image; return the added tiles."""
     tiles = cut_tiles(image, tile_set.tile_px)
     if len(tile_set) == 0:
-        return math.nan, tile_set.add_far(tiles, np.full(tiles.shape[0], np.inf), 0.0)
+        return tile_set.add_far(tiles, np.full(tiles.shape[0], np.inf), 0.0)
     index, squared = tile_set.nearest(tiles)
     reconstructed = join_tiles(tile_set.tiles_at(index), image.shape[0], image.shape[1], tile_set.tile_px)
-    fom = merit(image, reconstructed)
-    if fom >= settings.fom_below:
-        return fom, tiles[:0]
-    return fom, tile_set.add_far(tiles, squared, settings.distance_above)
+    if merit(image, reconstructed) >= settings.fom_below:
+        return tiles[:0]
+    return tile_set.add_far(tiles, squared, settings.distance_above)
 
 
 def refine_once(
