@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from sonarpost import keys, wire
 from sonarpost.delivery.store import Store
@@ -22,8 +22,8 @@ from sonarpost.services.op_modem.vessel_endpoint import received_image
 
 log = logging.getLogger(__name__)
 
-_PARTS, _AUTHENTICATION = "receivers/", "authentication/"
-_WHOLE_STATES = {
+_AUTHENTICATION = "authentication/"
+_STATES = {
     "receiver": ("paper/", migration.paper_receiver_parts),
     "receiver-v1": ("v1/", migration.v1_receiver_parts),
     "seal": (_AUTHENTICATION, migration.authentication_parts),
@@ -43,10 +43,10 @@ def migrate_store(store: Store, vessel_id: str, read_key: Callable[[], AcousticK
         read_key: Returns the key of the acoustic link; called if there is something to convert.
     """
     items = [item for item in store.inbox_items(2**31) if item.key == keys.acoustic_rx(vessel_id)]
-    states = [name for name in (*_WHOLE_STATES, *store.state_names(_PARTS)) if store.get_state(name) is not None]
+    states = {name: state for name in _STATES if (state := store.get_state(name)) is not None}
     if not items and not states:
         return
-    endpoint = _restored(store, states, read_key())
+    endpoint = _restored(states, read_key())
     images: list[ImageUpdate] = []
     with store.transaction() as tx:
         for item in items:
@@ -66,15 +66,14 @@ def migrate_store(store: Store, vessel_id: str, read_key: Callable[[], AcousticK
     log.info("Store of version 0.1 converted", extra=kv(frames=len(items), images=len(images)))
 
 
-def _restored(store: Store, states: list[str], key: AcousticKey | None) -> VesselEndpoint:
+def _restored(states: Mapping[str, bytes], key: AcousticKey | None) -> VesselEndpoint:
     """Return an endpoint with the saved state; state that cannot be read is logged and skipped."""
-    saved = {name: store.get_state(name) or b"" for name in states}
-    parts = below(_PARTS, saved)
+    parts: dict[str, bytes] = {}
     errors: dict[str, FrameError] = {}
-    for name in _WHOLE_STATES.keys() & saved.keys() if not parts else ():
-        prefix, convert = _WHOLE_STATES[name]
+    for name, state in states.items():
+        prefix, convert = _STATES[name]
         try:
-            parts |= prefixed(prefix, convert(saved[name]))
+            parts |= prefixed(prefix, convert(state))
         except FrameError as error:
             errors[name] = error
     # The authenticator verifies only, so its address is not used.
