@@ -149,28 +149,30 @@ class VehicleEndpoint:
             except BadInputError as error:
                 errors[_COMMANDS] = error
         for name, reason in errors.items():
-            log.error("Discarding an unreadable part of the link state", extra=kv(part=name, reason=str(reason)))
-            if name in saved:
-                self._effects.quarantine(f"state {self._prefix}{name}", saved[name], str(reason))
+            self._discard(self._prefix + name, saved.get(name, b""), reason)
         if errors:
             self._effects.count("states_discarded")
         if self._is_v1:
             self._add_images_of_paper_queue()
         self.changed = True
 
+    def _discard(self, name: str, data: bytes, reason: BadInputError) -> None:
+        log.error("Discarding an unreadable part of the link state", extra=kv(part=name, reason=str(reason)))
+        self._effects.quarantine(f"state {name}", data, str(reason))
+
     def _add_images_of_paper_queue(self) -> None:
         """Move images that still waited when the configuration changed from the `paper` format to `v1`."""
         parts = self._saved_parts(_PAPER)
         paper_queue = PaperSender(self._config.rate)
-        paper_queue.restore(below(_QUEUE, parts))
+        for name, reason in paper_queue.restore(below(_QUEUE, parts)).items():
+            self._discard(_PAPER + _QUEUE + name, parts[_QUEUE + name], reason)
         for waiting in paper_queue.images:
             image = ImageToSend(waiting.image_id, waiting.contact_id, waiting.contact, waiting.stream)
             try:
                 self._check_image(image)
                 self.queue.add_image(image, 0.0)
             except BadInputError as error:
-                log.error("Image rejected", extra=kv(image_id=image.image_id, reason=str(error)))
-                self._effects.quarantine(f"state {_PAPER}{image.image_id}", image.stream, str(error))
+                self._discard(f"{_PAPER}{_QUEUE}image/{waiting.order}", image.stream, error)
         for name in parts:
             self._effects.delete_state(_PAPER + name)
 

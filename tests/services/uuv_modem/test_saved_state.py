@@ -142,15 +142,20 @@ def test_records_that_version_0_1_held_before_its_queue_are_queued(start_service
     assert again.store.state_names("arrival/") == again.store.state_names("progress") == ()
 
 
-def test_images_of_the_paper_queue_are_sent_with_v1_after_a_change_of_the_format(start_service, compressor, runner):
+def test_images_of_the_paper_queue_are_sent_with_v1_after_a_change_of_the_format(
+    start_service, compressor, runner, refused
+):
     service = start_service(link="paper")
-    compressor.send(IMAGES, "uuv_modem", encoded_image(1), encoded_image(2))
-    eventually(lambda: service._endpoint.images_accepted == 2)
+    compressor.send(IMAGES, "uuv_modem", encoded_image(1), encoded_image(2), encoded_image(3))
+    eventually(lambda: service._endpoint.images_accepted == 3)
+    with service._endpoint.step(), service.store.transaction() as tx:
+        tx.put_state("paper/queue/image/3", b"\xc1")
     runner.stop(service)
     again = start_service(link="v1")
     eventually(lambda: again.store.state_names("paper/") == ())
     assert [e.image_id for e in again._endpoint.queue.expected(0.0)] == ["0001", "0002"]
-    assert again._endpoint.images_accepted == 2
+    assert [key for key, _ in refused(again)] == ["state paper/queue/image/3"]
+    assert again._endpoint.images_accepted == 3
 
 
 def test_records_are_not_accepted_below_the_disk_reserve(start_service):
