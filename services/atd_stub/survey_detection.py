@@ -208,7 +208,7 @@ def snippet_of(survey: Survey, detection: Detection, origin: Origin, vehicle_id:
     """
     size = (config.snippet_height_px, config.snippet_width_px)
     cut = cut_snippet(survey, detection, *size)
-    image, along_m, across_m = cut.image, cut.pixel_along_m, cut.pixel_across_m
+    image, along_m, across_m = cut.image, detection.pixel_along_m, detection.pixel_across_m
     expanded = None
     if config.snippet_pixel_m > 0:
         ground = ground_projected_image(survey, detection, *size, config.snippet_pixel_m)

@@ -36,7 +36,6 @@ def test_default_snippet_is_centred_on_highlight_and_shadow(found):
     row, column = detection.ping_index - snippet.first_ping_index, detection.sample - snippet.first_sample
     assert row == 50
     assert column == 50 - detection.shadow_samples // 2
-    assert (snippet.pixel_along_m, snippet.pixel_across_m) == (detection.pixel_along_m, 20 / 512)
     assert np.array_equal(snippet.image16, raw_window(survey, Side.STARBOARD, snippet))
     # Bright at the target, dark to its right, because the nadir is to the left.
     shadow_column = column + 6 + detection.shadow_samples // 2

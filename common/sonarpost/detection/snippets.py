@@ -41,8 +41,6 @@ class SurveySnippet:
         divisor16: File value per step of `image16`; 1 for files of 8 or 16 bits.
         first_ping_index: Index into `Survey.pings` of row 0.
         first_sample: Sample index of column 0.
-        pixel_along_m: Distance between rows; None if the survey does not contain it.
-        pixel_across_m: Slant range of a column.
     """
 
     image: npt.NDArray[np.uint8]
@@ -50,8 +48,6 @@ class SurveySnippet:
     divisor16: int
     first_ping_index: int
     first_sample: int
-    pixel_along_m: float | None
-    pixel_across_m: float
 
 
 def cut_snippet(
@@ -78,8 +74,6 @@ def cut_snippet(
         divisor16=divisor,
         first_ping_index=top,
         first_sample=left,
-        pixel_along_m=detection.pixel_along_m,
-        pixel_across_m=detection.pixel_across_m,
     )
 
 

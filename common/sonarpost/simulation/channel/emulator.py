@@ -286,7 +286,15 @@ class ChannelEmulator:
             for output in self._simulator.discard_outputs(number):
                 self._log_unreported(output, "emulator stopped")
         self._write("stop")
-        self._write("totals", **self._log.totals().to_json(), in_flight=self._simulator.channel.in_flight)
+        totals = self._log.totals()
+        self._write(
+            "totals",
+            transmitted=totals.transmitted,
+            heard=totals.reported,
+            not_heard=totals.unreported,
+            frames=totals.frames,
+            in_flight=self._simulator.channel.in_flight,
+        )
 
     def _write(self, event: str, **fields: object) -> None:
         self._log.write(event, self._now_s(), time.time(), **fields)

@@ -50,15 +50,6 @@ class PacketTotals:
     unreported: Mapping[str, int]
     frames: Mapping[str, int]
 
-    def to_json(self) -> dict[str, object]:
-        """Return the fields of a `totals` line."""
-        return {
-            "transmitted": self.transmitted,
-            "heard": self.reported,
-            "not_heard": self.unreported,
-            "frames": self.frames,
-        }
-
 
 class PacketLog:
     """Writes the log and counts packets and frames.
