@@ -171,8 +171,10 @@ def test_reader_finds_single_parts_and_groups() -> None:
     assert "tail" not in reader
     assert reader.read("head", Inner) == Inner(1)
     assert reader.read("tail", Inner) is None
-    assert reader.groups("image") == ["image/12", "image/3"]
-    assert reader.groups("block") == []
+    assert len(reader.read_group("image", Inner)) == 3
+    assert len(reader.read_group("image/3", Inner)) == 2
+    assert reader.read_group("image/1", Inner) == []
+    assert reader.read_group("block", Inner) == []
 
 
 def test_saved_parts_returns_only_the_changes() -> None:

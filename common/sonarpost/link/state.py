@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import math
 import types
+from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache
+from itertools import takewhile
 from typing import Annotated, Final, NamedTuple, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import msgpack
@@ -141,16 +143,10 @@ class PartReader:
         self.errors: dict[str, FrameError] = {}
         self._where = where
         self._parts = parts
-        self._groups: dict[str, list[str]] = {}
-        for name in sorted(parts):
-            self._groups.setdefault(name.rpartition("/")[0], []).append(name)
+        self._names = sorted(parts)
 
     def __contains__(self, name: str) -> bool:
         return name in self._parts
-
-    def groups(self, first: str) -> list[str]:
-        """Return the names of the groups below `first`: for example image/3 of image/3/7."""
-        return sorted(group for group in self._groups if group.startswith(f"{first}/"))
 
     def read(self, name: str, kind: type[_T]) -> _T | None:
         """Return the part `name`, None if there is none or it cannot be read."""
@@ -162,14 +158,16 @@ class PartReader:
         """Return the parts `group`/..., in the order of their names.
 
         Args:
-            group: The name up to the last slash.
+            group: The name up to a slash.
             kind: Type of the parts.
             progress: The group of the parts with the `PROGRESS` fields, if there are any. These fields have their
                 defaults where such a part is missing or cannot be read.
             apply: Receives each part; raises BadInputError to reject it.
         """
         found: list[_T] = []
-        for name in self._groups.get(group, []):
+        prefix = f"{group}/"
+        names = self._names[bisect_left(self._names, prefix) :]
+        for name in takewhile(lambda name: name.startswith(prefix), names):
             second = progress + name.removeprefix(group)
             part = self._read(name, kind, apply, second) if progress and second in self else None
             part = part or self._read(name, kind, apply)

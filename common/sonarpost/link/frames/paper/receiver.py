@@ -286,9 +286,7 @@ class PaperReceiver:
         """Replace the state by saved parts; the settings stay. Return why parts were skipped."""
         reader = PartReader(parts, "paper receiver state")
         self.counts = reader.read("counts", PaperReceiverCounts) or PaperReceiverCounts()
-        images = [
-            image for group in reader.groups("image") for image in reader.read_group(group, PendingImage, apply=_check)
-        ]
+        images = reader.read_group("image", PendingImage, apply=_check)
         self._images = {(i.source, i.image_id): i for i in sorted(images, key=lambda image: image.order)}
         return reader.errors
 

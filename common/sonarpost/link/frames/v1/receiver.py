@@ -485,8 +485,7 @@ class V1Receiver:
         reader = PartReader(parts, "v1 receiver state")
         self.counts = reader.read("counts", V1ReceiverCounts) or V1ReceiverCounts()
         peers = {peer.address: peer for peer in reader.read_group("peer", PeerState)}
-        images = [image for group in reader.groups("image") for image in reader.read_group(group, AssembledImage)]
-        for image in sorted(images, key=lambda image: image.order):
+        for image in sorted(reader.read_group("image", AssembledImage), key=lambda image: image.order):
             peers.setdefault(image.source, PeerState(image.source, image.last_frame_s)).images[image.number] = image
         for address, peer in peers.items():
             peer.blocks = _restored_blocks(reader, "block", address)
