@@ -11,8 +11,11 @@ import time
 from pathlib import Path
 
 import pytest
+from builders.chain import snippet
 from builders.common import eventually
 from PIL import Image
+
+from sonarpost.sonar.image_files import write_png, write_tiff
 
 pytestmark = pytest.mark.chain
 
@@ -91,18 +94,39 @@ def test_real_survey_arrives_with_its_contacts_and_positions(tmp_path: Path, dat
         assert contact["lon_deg"] == pytest.approx(-68.8283, abs=0.002)
 
 
-def test_folder_of_snippets_is_sent(tmp_path: Path) -> None:
-    from builders.chain import snippet
-
-    from sonarpost.sonar.image_files import write_png, write_tiff
-
-    folder = tmp_path / "snippets"
+def snippet_folder(parent: Path) -> Path:
+    folder = parent / "snippets"
     folder.mkdir()
     write_png(folder / "a.png", snippet(1))
     write_tiff(folder / "b.tiff", snippet(2).astype("uint16") * 200)
     (folder / "notes.txt").write_text("not an image")
-    result = run_demo(tmp_path / "out", "--images", str(folder), "--time-scale", "60")
+    return folder
+
+
+def test_folder_of_snippets_is_sent(tmp_path: Path) -> None:
+    result = run_demo(tmp_path / "out", "--images", str(snippet_folder(tmp_path)), "--time-scale", "60")
     assert result["contacts"] == result["images_complete"] == 2
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        ({"DECOMPRESSOR__IMAGE_CONSUMERS": "[]"}, "FAILED: 2 images missing at the shore site"),
+        (
+            {"UUV_MODEM__FEEDBACK": "never", "UUV_MODEM__EXPECTED_LOSS": "0.0", "OP_MODEM__FEEDBACK": "false"},
+            "incomplete at the shore site",
+        ),
+    ],
+)
+def test_demo_fails_when_an_image_is_missing_or_incomplete(
+    broken: dict[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in broken.items():
+        monkeypatch.setenv(f"SONARPOST_{name}", value)
+    options = ("--images", str(snippet_folder(tmp_path)), "--time-scale", "60", "--loss", "0.5")
+    done = subprocess.run(demo(tmp_path / "out", *options), capture_output=True, text=True, timeout=150, check=False)
+    assert done.returncode == 1
+    assert message in " ".join(done.stderr.split())
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
