@@ -292,9 +292,10 @@ class DownlinkService(ModemService[OpModemConfig]):
         """Return the state of commands, images, feedback and authentication."""
         with self._link_lock:
             endpoint, authenticator = self._link.endpoint, self._link.authenticator
+            feedback_in_flight = self._in_flight is not None and self._in_flight[1].has_feedback
             gauges = {
                 "commands_open": float(len(self._link.commands.open_commands)),
-                "feedback_open": float(endpoint.feedback_open),
+                "feedback_open": float(max(endpoint.feedback_open, feedback_in_flight)),
                 "images_incomplete": float(endpoint.incomplete_images),
                 "images_waiting": float(endpoint.next_deadline() is not None),
             }

@@ -19,6 +19,7 @@ from sonarpost.link.auth.key import Direction
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink import messages as dl
+from sonarpost.link.downlink.vessel_endpoint import DownlinkPacket
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
@@ -419,6 +420,12 @@ def test_feedback_is_open_until_everything_arrived(begin, decompressor):
         service.on_modem_event(packet(data))
     eventually(lambda: complete(decompressor) == {1, 2})
     assert service.health().gauges["images_incomplete"] == 0.0
+    service._in_flight = (1, DownlinkPacket(3, (), (), has_feedback=True))
+    service._link.endpoint.v1.feedback(3, time.time())
+    assert service._link.endpoint.feedback_open == 0
+    assert service.health().gauges["feedback_open"] == 1.0
+    service._in_flight = None
+    assert service.health().gauges["feedback_open"] == 0.0
 
 
 def test_vehicle_of_another_vessel_gets_no_feedback(begin, runner, decompressor):
