@@ -82,6 +82,6 @@ def test_encode_command_prints_the_message_once_to_standard_error(tmp_path: Path
         write_png(tmp_path / "images" / f"{name}.png", snippet(32, 48))
     command = ("-m", "sonarpost.cli.main", "encode", str(tmp_path / "images"))
     first = run(tmp_path / "cache", *command)
-    assert first.stderr.splitlines() == [MESSAGE.format(codec="vq", seconds=2)]
+    assert first.stderr.splitlines() == [MESSAGE.format(codec="emb", seconds=20)]
     assert "2 of 2 files done" in first.stdout
     assert run(tmp_path / "cache", *command).stderr == ""

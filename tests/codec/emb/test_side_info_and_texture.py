@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.coder import Coder
+from sonarpost.codec.emb.decode import measure_speckle, synthesise_speckle
 from sonarpost.codec.emb.model import shipped_models
 from sonarpost.codec.emb.side_info import (
     INSIDE_WEIGHT,
@@ -23,7 +24,6 @@ from sonarpost.codec.emb.side_info import (
     code_side_info,
     region_weights,
 )
-from sonarpost.codec.emb.speckle_synthesis import measure_speckle, synthesise_speckle
 from sonarpost.codec.emb.transform import layout_of
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import StreamError

@@ -27,12 +27,19 @@ from sonarpost.codec.emb.bitplanes import (
     reconstructed_coefficients,
 )
 from sonarpost.codec.emb.coder import Coder, CoefficientState
-from sonarpost.codec.emb.decode import DecodedCoefficients, decoded_image, grey_of, image_before_enhancer, read_body
+from sonarpost.codec.emb.decode import (
+    DecodedCoefficients,
+    decoded_image,
+    grey_of,
+    image_before_enhancer,
+    measure_speckle,
+    read_body,
+    synthesise_speckle,
+)
 from sonarpost.codec.emb.kernel import I64
 from sonarpost.codec.emb.model import Model, shipped_models
 from sonarpost.codec.emb.rate_distortion_opt import TargetCoefficients, target_coefficients
 from sonarpost.codec.emb.side_info import MEAN_STEP, RegionOfInterest, SideInfo, code_side_info, region_weights
-from sonarpost.codec.emb.speckle_synthesis import measure_speckle, synthesise_speckle
 from sonarpost.codec.emb.transform import layout_of
 from sonarpost.codec.interface import (
     MAX_SIDE_PX,

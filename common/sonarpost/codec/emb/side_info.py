@@ -80,7 +80,7 @@ class SideInfo:
         mean_index: Mean grey / 4, 0..63; -1 if the stream is too short.
         start_step: 0..7; -1 if the stream is too short. Then nothing after it is known.
         region: Region of interest.
-        texture: Strength of the image's texture in each band, 0..15; see `speckle_synthesis`.
+        texture: Strength of the image's texture in each band, 0..15; see `decode`.
         extra_planes: Planes above the usual first one, 0..6, for images that are half black and half white.
     """
 
