@@ -1,4 +1,4 @@
-"""What many tests share: an in-process Zenoh router, platforms in a temporary folder, waiting for a condition."""
+"""Fixtures of many tests (in-process Zenoh router, platforms in a temporary folder) and the order of the suite."""
 
 from __future__ import annotations
 
@@ -17,27 +17,33 @@ from xdist.scheduler import LoadFileScheduling
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.config import PlatformConfig
 
-# A suite that a script starts in the background has SIGINT ignored, and child processes would inherit that.
+# SIGINT is ignored in a suite started in the background, and child processes would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# An example that waits for the disk of a loaded machine is slow, not wrong; pytest-timeout ends what hangs.
+# On a loaded machine an example may wait for the disk. pytest-timeout ends a test that hangs.
 settings.register_profile("sonarpost", deadline=None)
 settings.load_profile("sonarpost")
 
 
-class OneChainAtATime(LoadFileScheduling):
-    """Gives a file's tests to one worker, and those of many real processes to one, one after the other."""
+PROCESS_TESTS = ("tests/system/chain/", "tests/system/faults/", "tests/system/compose/")
 
-    PROCESSES = ("tests/system/chain/", "tests/system/faults/", "tests/system/compose/")
+
+class ProcessTestsInOneWorker(LoadFileScheduling):
+    """Assigns the tests of a file to one worker, and all tests of many real processes to one worker."""
 
     def _split_scope(self, nodeid: str) -> str:
-        return "processes" if nodeid.startswith(self.PROCESSES) else super()._split_scope(nodeid)
+        return "processes" if nodeid.startswith(PROCESS_TESTS) else super()._split_scope(nodeid)
 
 
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> OneChainAtATime:
-    """Schedule `make test`, which runs two tests at a time."""
-    return OneChainAtATime(config, log)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> ProcessTestsInOneWorker:
+    """Return the scheduler of `make test`, which runs two tests at a time."""
+    return ProcessTestsInOneWorker(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the tests of many real processes first: one worker runs them all, the other one the rest."""
+    items.sort(key=lambda item: not item.nodeid.startswith(PROCESS_TESTS))
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from sonarpost.codec.vq.builder import BuildProgress, RefinementProgress
 
 
 def progress(done: int, total: int = 100, round_number: int = 0) -> BuildProgress:
-    return BuildProgress(round_number, 2, done, done, total, "name", 30.0, 5, 10 * done)
+    return BuildProgress(round_number, 2, done, done, total, 10 * done)
 
 
 def test_log_gets_a_line_every_ten_seconds() -> None:

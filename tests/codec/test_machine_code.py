@@ -53,35 +53,26 @@ def run(cache: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True, check=True)
 
 
-@pytest.mark.timeout(900)  # compiles everything: 20 s on an idle machine
-def test_prepared_machine_code_is_complete(tmp_path: Path) -> None:
-    first = run(tmp_path, "-m", "sonarpost.cli.main", "prepare").stdout.splitlines()
-    assert first[0] == "Preparing machine code: emb, model standard"
-    assert first[-1].startswith("Machine code is ready: compiled=")
-    assert str(tmp_path) in first[-1]
-    assert list(tmp_path.rglob("*.nbc"))
-    second = run(tmp_path, "-m", "sonarpost.cli.main", "prepare").stdout.splitlines()
-    assert second[-1] == "Machine code is ready: the cache holds all functions"
-    # Encoding and decoding in another process, with all options, compiles nothing and logs nothing.
-    assert run(tmp_path, "-c", ENCODE_AND_DECODE).stdout.splitlines() == ["compiled 0"]
-
-
-@pytest.mark.timeout(900)  # compiles the decoder of emb: 15 s on an idle machine
-def test_compilation_is_logged_once_for_each_codec(tmp_path: Path) -> None:
-    lines = run(tmp_path, "-c", DECODE_TWICE).stdout.splitlines()
-    assert lines == [
-        "INFO sonarpost.codec.jit " + MESSAGE.format(codec="emb", seconds=20),
-        "INFO sonarpost.codec.jit " + MESSAGE.format(codec="vq", seconds=2),
-    ]
-
-
-@pytest.mark.timeout(900)
-def test_encode_command_prints_the_message_once_to_standard_error(tmp_path: Path) -> None:
-    (tmp_path / "images").mkdir()
+@pytest.mark.timeout(900)  # compiles everything: 30 s on an idle machine
+def test_first_use_prints_the_message_once_and_prepare_completes_the_cache(tmp_path: Path) -> None:
+    cache, images = tmp_path / "cache", tmp_path / "images"
+    images.mkdir()
     for name in ("a", "b"):
-        write_png(tmp_path / "images" / f"{name}.png", snippet(32, 48))
-    command = ("-m", "sonarpost.cli.main", "encode", str(tmp_path / "images"))
-    first = run(tmp_path / "cache", *command)
+        write_png(images / f"{name}.png", snippet(32, 48))
+    encode = ("-m", "sonarpost.cli.main", "encode", str(images))
+    first = run(cache, *encode)
     assert first.stderr.splitlines() == [MESSAGE.format(codec="emb", seconds=20)]
     assert "2 of 2 files done" in first.stdout
-    assert run(tmp_path / "cache", *command).stderr == ""
+    assert run(cache, *encode).stderr == ""
+    assert run(cache, "-c", DECODE_TWICE).stdout.splitlines()[-1:] == [
+        "INFO sonarpost.codec.jit " + MESSAGE.format(codec="vq", seconds=2)
+    ]
+    prepared = run(cache, "-m", "sonarpost.cli.main", "prepare").stdout.splitlines()
+    assert prepared[0] == "Preparing machine code: emb, model standard"
+    assert prepared[-1].startswith("Machine code is ready: compiled=")
+    assert str(cache) in prepared[-1]
+    assert list(cache.rglob("*.nbc"))
+    again = run(cache, "-m", "sonarpost.cli.main", "prepare").stdout.splitlines()
+    assert again[-1] == "Machine code is ready: the cache holds all functions"
+    # Encoding and decoding in another process, with all options, compiles nothing and logs nothing.
+    assert run(cache, "-c", ENCODE_AND_DECODE).stdout.splitlines() == ["compiled 0"]
