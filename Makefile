@@ -26,9 +26,9 @@ $(STAMP): $(RUN_TIME) requirements-dev.lock
 demo: $(RUN_TIME)
 	$(BIN)/sonarpost demo $(ARGS)
 
-# Two workers; the tests of a file run in one worker, those with real processes one after the other (tests/conftest.py).
+# Three workers: many tests wait for processes. Order and assignment to workers: tests/conftest.py.
 test: setup
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(BIN)/python -m pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 # Tests of several minutes each: long outages, processes killed at random for five minutes.
 test-long: setup

@@ -27,22 +27,24 @@ settings.load_profile("sonarpost")
 
 
 PROCESS_TESTS = ("tests/system/chain/", "tests/system/faults/", "tests/system/compose/")
+"""Folders of tests with many real processes."""
 
 
 class ProcessTestsInOneWorker(LoadFileScheduling):
-    """Assigns the tests of a file to one worker, and all tests of many real processes to one worker."""
+    """Assigns the tests of a file to one worker, and those of a folder of `PROCESS_TESTS` to one worker."""
 
     def _split_scope(self, nodeid: str) -> str:
-        return "processes" if nodeid.startswith(PROCESS_TESTS) else super()._split_scope(nodeid)
+        folder = next((folder for folder in PROCESS_TESTS if nodeid.startswith(folder)), None)
+        return super()._split_scope(nodeid) if folder is None else folder
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> ProcessTestsInOneWorker:
-    """Return the scheduler of `make test`, which runs two tests at a time."""
+    """Return the scheduler of `make test`, which runs three tests at a time."""
     return ProcessTestsInOneWorker(config, log)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the tests of many real processes first: one worker runs them all, the other one the rest."""
+    """Run the tests of many real processes first: they take longest and mostly wait."""
     items.sort(key=lambda item: not item.nodeid.startswith(PROCESS_TESTS))
 
 

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 EXIT_WITH_PARENT = "SONARPOST_EXIT_WITH_PARENT"
 EXIT_ORPHANED = 1
 _PR_SET_PDEATHSIG = 1
+_WAKE_S = 0.5
 
 
 @contextmanager
@@ -31,6 +32,16 @@ def stop_on_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def wait_until_set(stop: threading.Event) -> None:
+    """Wait in the main thread for an event that a signal handler sets.
+
+    Python runs the handler when the main thread wakes. The system can deliver the signal to another thread, which does
+    not wake the main thread, so the wait has a limit and is repeated.
+    """
+    while not stop.wait(_WAKE_S):
+        pass
 
 
 def exit_with_parent() -> None:

@@ -189,7 +189,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
         self._mac.sent(now - packet_s, now)
         interval_s = packet_s if self._previous_end_s is None else now - self._previous_end_s
         self._previous_end_s = now
-        self._unsaved.append(partial(self._endpoint.packet_sent, sent.frames, interval_s, now))
+        self._unsaved.append(partial(self._endpoint.packet_sent, sent.frames, interval_s))
         self._publish_packet(sent, now)
 
     def _packet_failed(self, failed: PacketFailed, now: float) -> None:

@@ -355,12 +355,11 @@ class VehicleEndpoint:
             tx.put_state(self._limit_name, str(limit).encode())
         self.authenticator.grant(limit)
 
-    def packet_sent(self, frames: tuple[bytes, ...], interval_s: float, now: float) -> None:
+    def packet_sent(self, frames: tuple[bytes, ...], interval_s: float) -> None:
         """Record that frames of the packet in flight were sent; see `ImageSender.sent`."""
-        contacts = {image.image_id: image.contact_id for image in self.queue.expected(now)}
-        for image_id in self.queue.sent(frames, interval_s):
+        for image in self.queue.sent(frames, interval_s):
             self._effects.count("images_sent")
-            fields = kv(vehicle=self._platform_id, image_id=image_id, contact_id=contacts.get(image_id))
+            fields = kv(vehicle=self._platform_id, image_id=image.image_id, contact_id=image.contact_id)
             log.info("Image sent", extra=fields)
         self.changed = True
 

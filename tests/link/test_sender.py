@@ -83,7 +83,7 @@ def test_sent_returns_every_image_once(new: NewSender) -> None:
         sender.add_image(image(number), 0.0)
     ended: list[str] = []
     while (packet := sender.next_packet(0.0)) is not None:
-        ended += sender.sent(packet.frames, 6.0)
+        ended += [sent.image_id for sent in sender.sent(packet.frames, 6.0)]
     assert sorted(ended) == ["0001", "0002", "0003"]
     assert sender.sent((), 6.0) == ()
 
@@ -184,7 +184,7 @@ def test_an_image_of_the_paper_format_that_arrives_twice_is_sent_twice() -> None
         assert sender.add_image(image(1), 0.0)
     ended: list[str] = []
     while (packet := sender.next_packet(0.0)) is not None:
-        ended += sender.sent(packet.frames, 6.0)
+        ended += [sent.image_id for sent in sender.sent(packet.frames, 6.0)]
     assert ended == ["0001", "0001"]
 
 

@@ -56,6 +56,11 @@ sys.exit(main(Tiny, TinyConfig))
 Start = Callable[..., subprocess.Popen[str]]
 
 
+def other_thread_of(process: subprocess.Popen[str]) -> int:
+    """Return the identifier of a thread that is not the main thread."""
+    return max(int(entry.name) for entry in Path(f"/proc/{process.pid}/task").iterdir())
+
+
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
     """Starts the tiny service with the given configuration."""
@@ -110,6 +115,14 @@ def end(process: subprocess.Popen[str], number: signal.Signals) -> tuple[int, fl
     process.send_signal(number)
     _, err = process.communicate(timeout=20)
     return process.returncode, time.monotonic() - began, err
+
+
+def test_signal_that_another_thread_receives_stops_a_service(start: Start, tmp_path: Path, router: str) -> None:
+    process = start(configuration(tmp_path, router))
+    read_until(process, "Service started")
+    time.sleep(0.3)  # the main thread waits
+    os.kill(other_thread_of(process), signal.SIGTERM)
+    assert process.wait(timeout=10) == 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -28,7 +28,7 @@ from sonarpost.config import TlsConfig
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError, SonarpostError
 from sonarpost.messages import Health, ServiceState
 from sonarpost.security.tls_files import TlsMonitor
-from sonarpost.stop_signals import exit_with_parent, stop_on_signals
+from sonarpost.stop_signals import exit_with_parent, stop_on_signals, wait_until_set
 
 log = logging.getLogger(__name__)
 
@@ -176,7 +176,7 @@ def run(config: zenoh.Config) -> int:
         with stop_on_signals() as stop, zenoh.open(config) as session:
             monitor.start(session)
             log.info("Router started", extra=logs.kv(listen=listen, connect=connect))
-            stop.wait()
+            wait_until_set(stop)
             monitor.close()
     except (zenoh.ZError, SonarpostError) as error:
         log.error("Router cannot start", extra=logs.kv(listen=listen, error=str(error)))

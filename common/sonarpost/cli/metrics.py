@@ -13,7 +13,7 @@ from sonarpost.cli.shared import add_router_options, router_of
 from sonarpost.errors import PortError
 from sonarpost.monitoring.fleet import FleetTracker, FleetWatcher
 from sonarpost.monitoring.metrics import FleetCollector, registry_of
-from sonarpost.stop_signals import stop_on_signals
+from sonarpost.stop_signals import stop_on_signals, wait_until_set
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ def run(parsed: argparse.Namespace) -> int:
             with watcher:
                 fields = logs.kv(address=parsed.address, port=server.server_port, router=", ".join(endpoints))
                 log.info("Metrics server started", extra=fields)
-                stop.wait()
+                wait_until_set(stop)
         finally:
             server.shutdown()
             server.server_close()

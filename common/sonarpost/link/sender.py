@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 from sonarpost.errors import FrameError
 from sonarpost.link.frames.contact_record import ContactSummary
@@ -73,6 +73,18 @@ class ExpectedDelivery:
     done_s: float
 
 
+class SentImage(NamedTuple):
+    """An image of which nothing is left to send now.
+
+    Attributes:
+        image_id: Four characters 0-9A-Z.
+        contact_id: Identifier of its contact on the vehicle.
+    """
+
+    image_id: str
+    contact_id: str
+
+
 class ImageSender(ABC):
     """A transmit queue. By default the wire format has no messages.
 
@@ -130,7 +142,7 @@ class ImageSender(ABC):
     def _select_packet(self, now: float) -> OutgoingPacket | None:
         """Return the next packet, None if there is nothing to send."""
 
-    def sent(self, frames: Sequence[bytes], interval_s: float) -> tuple[str, ...]:
+    def sent(self, frames: Sequence[bytes], interval_s: float) -> tuple[SentImage, ...]:
         """Record that frames of the packet have been sent.
 
         Args:
@@ -138,7 +150,7 @@ class ImageSender(ABC):
             interval_s: Time from the packet before to this one, or the length of this one after a silence.
 
         Returns:
-            Identifiers of the images of which nothing is left to send now.
+            The images of which nothing is left to send now.
         """
         self.packet_interval_s += _SMOOTHING * (interval_s - self.packet_interval_s)
         if self.in_flight is None:
@@ -148,8 +160,8 @@ class ImageSender(ABC):
         return () if left else self._packet_sent()
 
     @abstractmethod
-    def _packet_sent(self) -> tuple[str, ...]:
-        """Return the identifiers of the images that the packet completes."""
+    def _packet_sent(self) -> tuple[SentImage, ...]:
+        """Return the images that the packet completes."""
 
     @abstractmethod
     def expected(self, now: float) -> list[ExpectedDelivery]:

@@ -15,7 +15,7 @@ from types import FrameType
 from sonarpost import config, logs
 from sonarpost.errors import ConfigError, SonarpostError
 from sonarpost.runtime.service import C, Service
-from sonarpost.stop_signals import exit_with_parent
+from sonarpost.stop_signals import exit_with_parent, wait_until_set
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ def _run(service: Service[C]) -> int:
         signal.signal(number, on_signal)
     try:
         if service.start():
-            service.stopping.wait()
+            wait_until_set(service.stopping)
     except (OSError, SonarpostError) as error:
         log.error("Service cannot start", extra=logs.kv(reason=str(error)))
         service.failed = True

@@ -109,21 +109,22 @@ def test_folder_of_snippets_is_sent(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("broken", "message"),
+    ("loss", "broken", "message"),
     [
-        ({"DECOMPRESSOR__IMAGE_CONSUMERS": "[]"}, "FAILED: 2 images missing at the shore site"),
+        ("0", {"DECOMPRESSOR__IMAGE_CONSUMERS": "[]"}, "FAILED: 2 images missing at the shore site"),
         (
+            "0.5",
             {"UUV_MODEM__FEEDBACK": "never", "UUV_MODEM__EXPECTED_LOSS": "0.0", "OP_MODEM__FEEDBACK": "false"},
             "incomplete at the shore site",
         ),
     ],
 )
 def test_demo_fails_when_an_image_is_missing_or_incomplete(
-    broken: dict[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    loss: str, broken: dict[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in broken.items():
         monkeypatch.setenv(f"SONARPOST_{name}", value)
-    options = ("--images", str(snippet_folder(tmp_path)), "--time-scale", "60", "--loss", "0.5")
+    options = ("--images", str(snippet_folder(tmp_path)), "--time-scale", "60", "--loss", loss)
     done = subprocess.run(demo(tmp_path / "out", *options), capture_output=True, text=True, timeout=150, check=False)
     assert done.returncode == 1
     assert message in " ".join(done.stderr.split())

@@ -195,8 +195,9 @@ def _vehicle_link(settings: ChainSettings) -> str:
     scale = settings.time_scale
     return (
         f'link = "v1"\nexpected_loss = {min(settings.loss, 0.9)}\nstream_bytes = {STREAM_BYTES}\n'
-        f"tx_burst_s = {60 / scale:.3f}\nrx_window_s = {10 / scale + 0.5:.3f}\nqueue_interval_s = 0.2\n"
-        f"group_delay_s = {20 / scale:.3f}\nretry_s = 0.2\nreply_timeout_s = {settings.reply_timeout_s:.3f}\n"
+        f"tx_burst_s = {60 / scale:.3f}\nrx_window_s = {10 / scale + 0.5:.3f}\nholdoff_s = {5 / scale + 0.1:.3f}\n"
+        f"queue_interval_s = 0.2\ngroup_delay_s = {20 / scale:.3f}\nretry_s = 0.2\n"
+        f"reply_timeout_s = {settings.reply_timeout_s:.3f}\n"
     )
 
 

@@ -20,7 +20,7 @@ from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, Feedback, RefineRequest
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.queue.messages import FILLER_PRIORITY, MessageQueue
-from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket, RateNumber
+from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket, RateNumber, SentImage
 from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
 from sonarpost.modem.micromodem import RATES
 
@@ -286,9 +286,10 @@ class TransmitQueue(ImageSender):
             )
             loaded += len(message.data)
 
-    def _packet_sent(self) -> tuple[str, ...]:
-        ended = self._open_before_packet - self.open_numbers()
-        return tuple(image_id for number in sorted(ended) if (image_id := self.image_id_of(number)) is not None)
+    def _packet_sent(self) -> tuple[SentImage, ...]:
+        ended = sorted(self._open_before_packet - self.open_numbers())
+        kept = [image for number in ended if (image := self.sender.kept.get(number)) is not None]
+        return tuple(SentImage(image.image_id, image.contact_id) for image in kept)
 
     def open_numbers(self) -> set[int]:
         """Return the contact numbers of the images of which something is still to be sent."""

@@ -32,7 +32,7 @@ from sonarpost.link.frames.paper.frame import (
     half_bounds,
 )
 from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
-from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket
+from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket, SentImage
 from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
 from sonarpost.modem.micromodem import RATES
 
@@ -132,12 +132,13 @@ class PaperSender(ImageSender):
             return None
         return OutgoingPacket(self.rate, self._plan(self.images[0])[self._packets_sent])
 
-    def _packet_sent(self) -> tuple[str, ...]:
+    def _packet_sent(self) -> tuple[SentImage, ...]:
         self._packets_sent += 1
         if self._packets_sent < len(self._plan(self.images[0])):
             return ()
         self._packets_sent = 0
-        return (self.images.pop(0).image_id,)
+        image = self.images.pop(0)
+        return (SentImage(image.image_id, image.contact_id),)
 
     def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int) -> None:
         """Do nothing: the format has no feedback."""
