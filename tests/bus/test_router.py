@@ -89,8 +89,13 @@ def test_linked_routers_with_files_forward_a_record(start: Start, tmp_path: Path
         subscriber = ashore.declare_subscriber("sonarpost/test", lambda _sample: received.set())
         publisher = aboard.declare_publisher("sonarpost/test")
         eventually(lambda: bool(publisher.matching_status.matching), 20, "the subscriber at the vessel's router")
-        publisher.put(b"here")
-        assert received.wait(10)
+
+        def forwarded() -> bool:
+            publisher.put(b"here")
+            return received.wait(0.2)
+
+        # Repeated: the vessel's router can report a subscriber before the link to it is complete.
+        eventually(forwarded, 20, "the record at the shore router")
         subscriber.undeclare()
     for process in processes:
         process.send_signal(signal.SIGTERM)
