@@ -65,7 +65,7 @@ def test_first_use_prints_the_message_once_and_prepare_completes_the_cache(tmp_p
     assert "2 of 2 files done" in first.stdout
     assert run(cache, *encode).stderr == ""
     assert run(cache, "-c", DECODE_TWICE).stdout.splitlines()[-1:] == [
-        "INFO sonarpost.codec.jit " + MESSAGE.format(codec="vq", seconds=2)
+        "WARNING sonarpost.codec.jit " + MESSAGE.format(codec="vq", seconds=2)
     ]
     prepared = run(cache, "-m", "sonarpost.cli.main", "prepare").stdout.splitlines()
     assert prepared[0] == "Preparing machine code: emb, model standard"

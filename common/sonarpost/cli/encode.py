@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from sonarpost.cli.parsers import Subparsers
-from sonarpost.cli.prepare import log_preparation_to_stderr
 from sonarpost.codec import Codec, StreamHeader, codec_names, decode_image, get_codec
 from sonarpost.codec.api import CodecOptions
 from sonarpost.codec.registry import RETIRED_NAMES, CodecResources, default_registry
@@ -74,7 +73,6 @@ def run_encode(args: argparse.Namespace) -> int:
         for name in registry.names():
             print(f"{name:16} {registry.spec(name).summary}")
         return 0
-    log_preparation_to_stderr()
     options: CodecOptions = {} if args.model is None else {"model": args.model}
     if registry.spec(args.codec).needs_tiles:
         options |= {"codebook": args.codebook, "packing": args.packing}
@@ -89,7 +87,6 @@ def run_encode(args: argparse.Namespace) -> int:
 
 def run_decode(args: argparse.Namespace) -> int:
     """Decode; return 0, or 1 if any file of the folder could not be decoded."""
-    log_preparation_to_stderr()
     suffixes = (*(f".{name}" for name in (*codec_names(), *RETIRED_NAMES)), TEXT_SUFFIX)
     # Opened before the loop: an unreadable codebook is one error, not one for each file.
     tiles = open_codebook(args.codebook).tiles if args.codebook is not None else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 import time
 
 from sonarpost.cli.parsers import Subparsers
@@ -26,6 +25,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(_: argparse.Namespace) -> int:
     """Compile what the cache on disk does not hold; return 0."""
     started_s = time.monotonic()
+    logging.getLogger("sonarpost.codec.jit").setLevel(logging.ERROR)  # the steps are printed here
     prepare_machine_code(lambda step: print(f"Preparing machine code: {step}", flush=True))
     if not compilation_log.compiled:
         print("Machine code is ready: the cache holds all functions")
@@ -34,16 +34,3 @@ def run(_: argparse.Namespace) -> int:
     after_s = time.monotonic() - started_s
     print(f"Machine code is ready: compiled={compilation_log.compiled} after_s={after_s:.1f} in {folders}")
     return 0
-
-
-class _StderrHandler(logging.Handler):
-    def emit(self, record: logging.LogRecord) -> None:
-        print(record.getMessage(), file=sys.stderr)
-
-
-def log_preparation_to_stderr() -> None:
-    """Print a line to the standard error stream when a codec compiles its machine code in this process."""
-    logger = logging.getLogger("sonarpost.codec.jit")
-    logger.setLevel(logging.INFO)
-    if not any(isinstance(handler, _StderrHandler) for handler in logger.handlers):
-        logger.addHandler(_StderrHandler())

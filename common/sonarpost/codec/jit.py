@@ -57,7 +57,10 @@ class CompilationLog:
         if codec not in self._announced:
             self._announced.add(codec)
             seconds = COMPILE_S[codec]
-            log.info("Preparing machine code for the %s codec: about %d s, once for each installation", codec, seconds)
+            # A warning, so that it is visible in a program without a logging configuration.
+            log.warning(
+                "Preparing machine code for the %s codec: about %d s, once for each installation", codec, seconds
+            )
 
 
 compilation_log = CompilationLog()
