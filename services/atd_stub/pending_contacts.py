@@ -32,7 +32,7 @@ class PendingContacts:
         return len(self._store.state_names(_PREFIX))
 
     def add(self, effects: UnitOfWork, snippets: Sequence[Snippet]) -> None:
-        """Add snippets."""
+        """Queue snippets by falling confidence, then in the order of detection."""
         for snippet in snippets:
             confidence = snippet.contact.atd_confidence
             rank = round((_MAX_CONFIDENCE - (confidence or 0.0)) * _STEPS) + (confidence is None)

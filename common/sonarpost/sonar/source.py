@@ -137,7 +137,7 @@ def load_survey(source: SurveySource, max_bytes: int = MAX_HELD_BYTES) -> Survey
     """Load a whole source into memory.
 
     Raises:
-        SurveyFileError: The samples are larger, or the file cannot be read.
+        SurveyFileError: The samples need more than `max_bytes`, or the file cannot be read.
     """
     info = source.info
     held = 0

@@ -73,7 +73,8 @@ def test_demo_delivers_a_simulated_survey(tmp_path: Path) -> None:
     sidecars = [json.loads(p.read_text()) for p in (out / "shore" / "images" / "vessel-1").glob("*.json")]
     assert all(s["contact"]["lat_deg"] and s["contact"]["lon_deg"] for s in sidecars)
     assert processes_of(out) == []
-    again = run_demo(out, "--paper", "--time-scale", "60", "--rate", "4", "--loss", "0.3", "--seed", "5")
+    snippets = ("--images", str(snippet_folder(tmp_path)))
+    again = run_demo(out, "--paper", *snippets, "--time-scale", "60", "--rate", "4", "--loss", "0.5", "--seed", "5")
     assert isinstance(again["frames_lost"], int)
     assert again["frames_lost"] > 0
     assert again["images_shore"] == again["images_vessel"]
