@@ -22,6 +22,7 @@ from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.readers import SUPPORTED_SUFFIXES
+from sonarpost.sonar.survey import Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
 MARKER = ".sonarpost-demo"
@@ -89,6 +90,7 @@ def run(parsed: argparse.Namespace) -> int:
     logging.getLogger("sonarpost.bus.session").setLevel(logging.ERROR)
     started = time.monotonic()
     inputs = _inputs(parsed)
+    simulated = _simulate(parsed.seed, console) if inputs is None else None
     folder = _fresh_folder(parsed.out)
     ports = free_ports(4)
     settings = ChainSettings(
@@ -105,7 +107,7 @@ def run(parsed: argparse.Namespace) -> int:
     page = OperatorPage(settings) if parsed.console else None
     with Chain(settings) as chain, Watcher(settings) as watcher:
         # During the start of the services: the vehicle processes files when it is ready.
-        files = _deposit(inputs, settings, parsed.seed, console)
+        files = _deposit(inputs, simulated, settings, console)
         with console.status("starting three routers and eight services"):
             watcher.wait_until_started(chain.check)
         if page is not None:
@@ -165,18 +167,26 @@ def _print_refused(settings: ChainSettings, console: Console) -> int:
     return len(reasons)
 
 
-def _deposit(inputs: tuple[Path, ...] | None, settings: ChainSettings, seed: int, console: Console) -> int:
+def _simulate(seed: int, console: Console) -> Survey:
+    """Return a simulated survey; print what it holds."""
+    with console.status("simulating a survey of 1000 pings"):
+        simulated = simulate_survey(SurveySpec(seed=seed, seabed=SeabedKind.SAND, targets=6, clutter=6))
+    mines = sum(truth.is_mine_like for truth in simulated.truth)
+    console.print(
+        f"simulated survey of {len(simulated.survey.pings)} pings over sand: "
+        f"{mines} mine-like objects, {len(simulated.truth) - mines} others"
+    )
+    return simulated.survey
+
+
+def _deposit(
+    inputs: tuple[Path, ...] | None, simulated: Survey | None, settings: ChainSettings, console: Console
+) -> int:
     """Put the input files into the folder that the vehicle polls; return their number."""
-    if inputs is None:
-        with console.status("simulating a survey of 1000 pings"):
-            simulated = simulate_survey(SurveySpec(seed=seed, seabed=SeabedKind.SAND, targets=6, clutter=6))
-        write_xtf(simulated.survey, settings.incoming / f"simulated-{seed}.xtf")
-        mines = sum(truth.is_mine_like for truth in simulated.truth)
-        console.print(
-            f"simulated survey of {len(simulated.survey.pings)} pings over sand: "
-            f"{mines} mine-like objects, {len(simulated.truth) - mines} others"
-        )
+    if simulated is not None:
+        write_xtf(simulated, settings.incoming / f"simulated-{settings.seed}.xtf")
         return 1
+    assert inputs is not None
     for path in inputs:
         partial = settings.incoming / f".{path.name}"
         shutil.copyfile(path, partial)
