@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost import keys, logs, wire
-from sonarpost.logs import JsonFormatter, TextFormatter, context_of_payload, kv
+from sonarpost.logs import IntervalLog, JsonFormatter, TextFormatter, context_of_payload, kv
 from sonarpost.messages import Contact, Decision, Pixels, Relayed, Snippet
 
 
@@ -245,3 +245,40 @@ def test_context_of_every_record_type(name: str) -> None:
     if not isinstance(record, Relayed):
         known = {field: value for field, value in expected.items() if value is not None}
         assert context_of_payload(wire.encode(record)) == known
+
+
+def interval_log(now: list[float], interval_s: float = 60.0) -> IntervalLog:
+    return IntervalLog(logging.getLogger("n"), logging.WARNING, "Record refused", interval_s, lambda: now[0])
+
+
+def logged(caplog: pytest.LogCaptureFixture) -> list[object]:
+    return [vars(r)["fields"] for r in caplog.records]
+
+
+def test_interval_log_writes_one_line_an_interval(caplog: pytest.LogCaptureFixture) -> None:
+    now = [1000.0]
+    refused = interval_log(now)
+    for number in range(6001):
+        now[0] = 1000.0 + number / 50
+        refused.log(number=number)
+    assert logged(caplog) == [
+        {"number": 0},
+        {"number": 3000, "suppressed": 2999},
+        {"number": 6000, "suppressed": 2999},
+    ]
+
+
+def test_interval_log_writes_the_end_of_a_burst(caplog: pytest.LogCaptureFixture) -> None:
+    now = [0.0]
+    refused = interval_log(now)
+    for number in range(5):
+        refused.log(number=number)
+    refused.flush()
+    assert len(caplog.records) == 1, "the interval has not ended"
+    now[0] = 60.0
+    refused.flush()
+    refused.flush()
+    assert logged(caplog)[1:] == [{"number": 4, "suppressed": 3}]
+    refused.log(number=5)
+    refused.flush(stopping=True)
+    assert logged(caplog)[2:] == [{"number": 5}], "one occurrence alone has no count"

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import re
 import sys
-from collections.abc import Mapping
+import threading
+import time
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -95,6 +98,70 @@ def fields_of(record: logging.LogRecord) -> dict[str, object]:
     """Return the fields of a line: the log context, overridden by the fields of the call."""
     context = _context.get()
     return {**({} if context is None else context.fields()), **getattr(record, "fields", {})}
+
+
+class IntervalLog:
+    """Logs one repeated event at most once an interval. Threads may share an instance.
+
+    The first occurrence is logged at once. Each line has the fields of one occurrence. Its field
+    `suppressed` is the number of occurrences since the previous line that were not logged.
+
+    Args:
+        logger: Logger of the module.
+        level: Level of the lines, for example `logging.WARNING`.
+        message: Message of the lines.
+        interval_s: Shortest time between two lines, seconds.
+        clock: Monotonic time in seconds.
+    """
+
+    def __init__(
+        self,
+        logger: logging.Logger,
+        level: int,
+        message: str,
+        interval_s: float = 60.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._logger = logger
+        self._level = level
+        self._message = message
+        self._interval_s = interval_s
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._next_line_s = -math.inf
+        self._suppressed = 0
+        self._last_fields: dict[str, object] = {}
+
+    def log(self, **fields: object) -> None:
+        """Log an occurrence with its fields, or count it as suppressed."""
+        with self._lock:
+            now = self._clock()
+            if now < self._next_line_s:
+                self._suppressed += 1
+                self._last_fields = fields
+                return
+            suppressed, self._suppressed = self._suppressed, 0
+            self._next_line_s = now + self._interval_s
+        self._write(fields, suppressed)
+
+    def flush(self, *, stopping: bool = False) -> None:
+        """Log the last suppressed occurrence if its interval has ended, or at once with `stopping`.
+
+        The owner calls this periodically, so that the end of a burst is logged, and when it stops.
+        """
+        with self._lock:
+            now = self._clock()
+            if not self._suppressed or (now < self._next_line_s and not stopping):
+                return
+            suppressed, self._suppressed = self._suppressed - 1, 0
+            fields = self._last_fields
+            self._next_line_s = now + self._interval_s
+        self._write(fields, suppressed)
+
+    def _write(self, fields: dict[str, object], suppressed: int) -> None:
+        if suppressed:
+            fields = {**fields, "suppressed": suppressed}
+        self._logger.log(self._level, self._message, extra=kv(**fields))
 
 
 def _time_text(record: logging.LogRecord) -> str:
