@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 class DecompressorService(Service[DecompressorConfig]):
-    """The decoder of the vessel. It has no state besides the records that it has not handled or sent.
+    """The decoder of the vessel. It has no state except the records that it has not handled or sent.
 
     Raises:
         CodebookError: A configured codebook cannot be read.

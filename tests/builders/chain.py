@@ -12,10 +12,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from sonarpost import keys
 from sonarpost.cli.demo.chain import Chain
 from sonarpost.cli.demo.outcome import Outcome, evaluate
-from sonarpost.cli.demo.settings import ChainSettings, free_ports
+from sonarpost.cli.demo.settings import VESSEL, ChainSettings, free_ports
 from sonarpost.cli.demo.watch import Watcher
+from sonarpost.link.frames.paper.frame import parse_frame
+from sonarpost.messages import AcousticFrame, ReceivedImage
 from sonarpost.sonar.image_files import write_png
 
 IMAGES = 6
@@ -31,10 +34,40 @@ def snippet(number: int) -> npt.NDArray[np.uint8]:
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
+class VesselWatcher(Watcher):
+    """Collects also what op_modem received, in the paper's format.
+
+    Attributes:
+        images_with_frames: Images of which a frame was published. A frame is published once, after op_modem has
+            committed it: a kill between the two leaves the frame out here.
+        images_received: Images of which a received_image was published. The outbox publishes each record that it has
+            not delivered, again after a restart.
+    """
+
+    def __init__(self, settings: ChainSettings) -> None:
+        super().__init__(settings)
+        self.images_with_frames: set[str] = set()
+        self.images_received: set[str] = set()
+
+    def __enter__(self) -> VesselWatcher:
+        super().__enter__()
+        vessel = self._open(self.settings.router_ports[1])
+        self._subscribe(vessel, keys.acoustic_rx(VESSEL), AcousticFrame, self._on_frame)
+        self._subscribe(vessel, keys.acoustic_image(VESSEL), ReceivedImage, self._on_received_image)
+        return self
+
+    def _on_frame(self, frame: AcousticFrame) -> None:
+        if self.settings.link == "paper":
+            self.images_with_frames.add(parse_frame(frame.data).image_id)
+
+    def _on_received_image(self, image: ReceivedImage) -> None:
+        self.images_received.add(image.image_id)
+
+
 class RunningChain:
     """A started chain and its observer."""
 
-    def __init__(self, chain: Chain, watcher: Watcher) -> None:
+    def __init__(self, chain: Chain, watcher: VesselWatcher) -> None:
         self.chain = chain
         self.watcher = watcher
         self.settings = chain.settings
@@ -97,7 +130,7 @@ def start_chain(tmp_path: Path) -> Iterator[Callable[..., RunningChain]]:
             )
             settings = dataclasses.replace(settings, **changes)  # type: ignore[arg-type]
             chain = stack.enter_context(Chain(settings))
-            watcher = stack.enter_context(Watcher(settings))
+            watcher = stack.enter_context(VesselWatcher(settings))
             watcher.wait_until_started(chain.check)
             return RunningChain(chain, watcher)
 

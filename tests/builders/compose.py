@@ -208,7 +208,7 @@ def docker(*arguments: str, check: bool = True) -> str:
 
 @pytest.fixture(scope="session")
 def project() -> Iterator[Project]:
-    """The running chain; it is taken away with its volumes, whatever happened."""
+    """The running chain, removed with its volumes after the last test, also after failures."""
     name = os.environ.get("SONARPOST_COMPOSE_PROJECT")
     if name is None:
         pytest.skip("starts containers: `make test-compose` runs it")

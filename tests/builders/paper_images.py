@@ -1,4 +1,4 @@
-"""Updates of images in the terms of the paper's format: stream header, body, and what of the body has arrived."""
+"""Updates of images in the terms of the paper's format: stream header, body, and received ranges of the body."""
 
 from __future__ import annotations
 

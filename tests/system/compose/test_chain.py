@@ -1,6 +1,6 @@
 """The chain in containers, one story: it starts, carries pictures, is disturbed, stopped, upgraded, filled up.
 
-Each test goes on from where the one before it has left the chain, as a deployment would.
+Each test starts from the state in which the previous one left the chain, as in a deployment.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def test_a_simulated_survey_is_ashore_as_it_is_aboard(project: Project) -> None:
 
 def test_people_see_the_contacts_on_both_consoles_after_logging_in(project: Project) -> None:
     contacts = project.contacts()
-    password = "not-a-secret-of-anybody"
+    password = "not-a-real-password"
     for service, platform in (("console", "vessel"), ("console-shore", "shore")):
         add = ["user", "add", "anna", "--role", "operator", "--config", f"/etc/sonarpost/{platform}.toml"]
         add_user = ["sh", "-c", f"echo {password} | sonarpost console {' '.join(add)} --password-stdin"]

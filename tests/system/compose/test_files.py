@@ -59,7 +59,7 @@ def test_networks_of_platforms_lead_nowhere_and_only_routers_meet() -> None:
         "console-shore",
     ]
     for name in ("console", "console-shore"):
-        # Pages are served to this host alone unless somebody says otherwise.
+        # Pages are served to this host only, unless the environment names another address.
         assert re.search(r'ports: \["\$\{\w+:-127\.0\.0\.1:\d+\}:8470"\]', blocks()[name]), name
     for name, block in blocks().items():
         if "profiles: [uuv]" in block:
@@ -73,7 +73,7 @@ def test_every_variable_is_in_the_example_with_its_default() -> None:
     used = variables(COMPOSE.read_text()) | variables((REPOSITORY / "docker-compose.modem.yml").read_text())
     assert set(used) <= set(known)
     assert set(known) - set(used) == {"COMPOSE_FILE"}
-    # Where a value is an example rather than the default, the comment says so.
+    # Other values are examples, marked in the comment.
     same = {name for name, default in used.items() if known[name].strip() == default}
     assert {"SONARPOST_IMAGE", "ROUTER_IMAGE", "SHORE_PUBLISH", "SIM_TIME_SCALE", "LOG_LEVEL", "CODEC"} <= same
 

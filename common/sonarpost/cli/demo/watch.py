@@ -13,13 +13,10 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
-from sonarpost.errors import FrameError, PayloadError, PortError
+from sonarpost.errors import PayloadError, PortError
 from sonarpost.link.downlink.messages import image_of_number, number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.paper.frame import parse_frame
 from sonarpost.link.frames.paper.sender import plan_packets
-from sonarpost.link.frames.v1.receiver import V1Receiver
-from sonarpost.link.receiver import ImageUpdate
 from sonarpost.messages import AcousticFrame, EncodedImage, Health, QueueState, ReconstructedImage, Record, Snippet
 from sonarpost.modem.micromodem import RATES
 
@@ -48,7 +45,6 @@ class Watcher:
         encoded: By the identifier that an image has on the vessel.
         vessel: Latest version of each image on the vessel, by image identifier.
         shore: The same, as published at the shore site.
-        accepted: Images of which op_modem received a frame.
         health: Latest health report by service.
         queue: Latest state of the vehicle's transmit queue.
         packets_sent: Packets that the vehicle sent.
@@ -61,10 +57,8 @@ class Watcher:
         self.encoded: dict[str, EncodedImage] = {}
         self.vessel: dict[str, ReconstructedImage] = {}
         self.shore: dict[str, ReconstructedImage] = {}
-        self.accepted: set[str] = set()
         self.health: dict[str, Health] = {}
         self.queue: QueueState | None = None
-        self._v1 = V1Receiver()
         self.packets_sent = 0
         self.changes = 0
         self._packets: set[tuple[float, int]] = set()
@@ -77,7 +71,6 @@ class Watcher:
         self._subscribe(uuv, keys.image_encoded(UUV), EncodedImage, self._on_encoded)
         self._subscribe(uuv, keys.acoustic_tx(UUV), AcousticFrame, self._on_sent)
         self._subscribe(uuv, keys.acoustic_queue(UUV), QueueState, self._on_queue)
-        self._subscribe(vessel, keys.acoustic_rx(VESSEL), AcousticFrame, self._on_received)
         self._subscribe(vessel, keys.image_reconstructed(VESSEL), ReconstructedImage, self._on_vessel)
         self._subscribe(shore, keys.shore_image(VESSEL), ReconstructedImage, self._on_shore)
         for session, platform in ((uuv, UUV), (uuv, WATER), (vessel, VESSEL), (shore, SHORE)):
@@ -133,17 +126,6 @@ class Watcher:
             self._packets.add(packet)
             self.packets_sent += 1
             self.changes += 1
-
-    def _on_received(self, frame: AcousticFrame) -> None:
-        if self.settings.link == "v1":
-            for event in self._v1.accept(frame.source, frame.data, frame.time_utc_s):
-                if isinstance(event, ImageUpdate):
-                    self.accepted.add(event.image_id)
-            return
-        try:
-            self.accepted.add(parse_frame(frame.data).image_id)
-        except FrameError as error:
-            log.warning("%s", error)
 
     def _on_vessel(self, image: ReconstructedImage) -> None:
         self._latest(self.vessel, image)
