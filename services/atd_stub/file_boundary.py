@@ -169,11 +169,9 @@ class FileEndStore:
 
     def __init__(self, store: Store) -> None:
         self._ends: dict[str, FileEnd] = {}
-        for name in store.state_names(_STATE_PREFIX):
-            packed = store.get_state(name)
-            assert packed is not None
+        for name, packed in store.states(_STATE_PREFIX).items():
             try:
-                self._ends[name] = unpack(packed)
+                self._ends[_STATE_PREFIX + name] = unpack(packed)
             except ValueError as error:
                 # It stays in the store for the version that wrote it.
                 log.warning("Ignoring unreadable file end", extra=kv(reason=str(error)))

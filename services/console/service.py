@@ -169,14 +169,12 @@ class ConsoleService(Service[ConsoleConfig]):
         self._wake.set()
 
     def _apply_acknowledgements(self) -> None:
-        for name in self.store.state_names(_ACKNOWLEDGED):
-            value = self.store.get_state(name)
-            table, consumer, record_id = name.removeprefix(_ACKNOWLEDGED).split("/", 2)
-            if value is not None:
-                # A refusal always has a reason.
-                self.state.apply_acknowledgement(cast("Table", table), record_id, consumer, value.decode() or None)
+        for name, value in self.store.states(_ACKNOWLEDGED).items():
+            table, consumer, record_id = name.split("/", 2)
+            # A refusal always has a reason.
+            self.state.apply_acknowledgement(cast("Table", table), record_id, consumer, value.decode() or None)
             with self.store.transaction() as tx:
-                tx.delete_state(name)
+                tx.delete_state(_ACKNOWLEDGED + name)
 
     # Subscriptions
 

@@ -128,8 +128,7 @@ class DownlinkService(ModemService[OpModemConfig]):
         """Restore the last committed state if the endpoint may be ahead of it; requires the lock."""
         if not self._is_committed:
             self._link = self._new_link()
-            names = self.store.state_names(_PARTS)
-            parts = {name.removeprefix(_PARTS): self.store.get_state(name) or b"" for name in names}
+            parts = self.store.states(_PARTS)
             self._saved_parts = SavedParts(parts)
             errors = self._link.restore(parts)
             old = self.store.get_state(_STATE_0_1)
@@ -146,11 +145,7 @@ class DownlinkService(ModemService[OpModemConfig]):
     def _save_state(self, effects: UnitOfWork) -> None:
         """Add the changed parts of the endpoint's state to a unit of work."""
         parts = self._link.parts()
-        for name, data in self._saved_parts.changes(parts).items():
-            if data is None:
-                effects.delete_state(_PARTS + name)
-            else:
-                effects.put_state(_PARTS + name, data)
+        effects.put_states(_PARTS, self._saved_parts.changes(parts))
         effects.delete_state(_STATE_0_1)
         self._saved_parts.commit(parts)
 

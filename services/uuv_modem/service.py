@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 MAX_UNSAVED: Final = 1000
 """Events that are kept while the store cannot be written; further frames are dropped, and the vessel repeats them."""
 SAVE_AGAIN_S: Final = 0.5
+_ARRIVAL_0_1: Final = "arrival/"
 _MAX_WAIT_S: Final = 0.2
 _MIN_WAIT_S: Final = 0.005
 _STATE_INTERVAL_S: Final = 0.2
@@ -84,12 +85,12 @@ class UuvModemService(ModemService[UuvModemConfig]):
         An image that version 0.1 was sending in the `paper` format is sent again from its beginning.
         """
         with self.store.transaction() as tx:
-            for name in self.store.state_names("arrival/") if self.config.link == "v1" else ():
-                payload = self.store.get_state(name) or b""
+            arrived = self.store.states(_ARRIVAL_0_1) if self.config.link == "v1" else {}
+            for name, payload in arrived.items():
                 is_message = wire.unpack_map(payload, name).get("type") == OutgoingMessage.TYPE
                 own_key = keys.message_outgoing if is_message else keys.image_encoded
                 tx.accept(own_key(self.platform.id), payload)
-                tx.delete_state(name)
+                tx.delete_state(_ARRIVAL_0_1 + name)
             tx.delete_state("progress")
 
     def on_start(self) -> None:

@@ -135,7 +135,7 @@ class VehicleEndpoint:
 
     def _load(self) -> None:
         self._reset()
-        saved = self._saved_parts(self._prefix)
+        saved = self._store.states(self._prefix)
         self._saved = SavedParts(saved)
         parts, skipped = migration.vehicle_parts(saved)
         errors: dict[str, BadInputError] = dict(skipped)
@@ -162,7 +162,7 @@ class VehicleEndpoint:
 
     def _add_images_of_paper_queue(self) -> None:
         """Move images that still waited when the configuration changed from the `paper` format to `v1`."""
-        parts = self._saved_parts(_PAPER)
+        parts = self._store.states(_PAPER)
         paper_queue = PaperSender(self._config.rate)
         for name, reason in paper_queue.restore(below(_QUEUE, parts)).items():
             self._discard(_PAPER + _QUEUE + name, parts[_QUEUE + name], reason)
@@ -176,10 +176,6 @@ class VehicleEndpoint:
         for name in parts:
             self._effects.delete_state(_PAPER + name)
 
-    def _saved_parts(self, prefix: str) -> dict[str, bytes]:
-        names = self._store.state_names(prefix)
-        return {name.removeprefix(prefix): self._store.get_state(name) or b"" for name in names}
-
     def take_changes(self) -> UnitOfWork:
         """Return what to commit in this step: the changed parts of the state, and new records for consumers."""
         parts = {**prefixed(_QUEUE, self.queue.parts()), **prefixed(_RECEIVER, self._receiver.parts())}
@@ -187,11 +183,7 @@ class VehicleEndpoint:
         if self.authenticator is not None:
             parts |= prefixed(_AUTHENTICATION, self.authenticator.parts())
         effects, self._effects = self._effects, UnitOfWork()
-        for name, data in self._saved.changes(parts).items():
-            if data is None:
-                effects.delete_state(self._prefix + name)
-            else:
-                effects.put_state(self._prefix + name, data)
+        effects.put_states(self._prefix, self._saved.changes(parts))
         self._saved.commit(parts)
         effects.put_state(_IMAGES_ACCEPTED, str(self.images_accepted).encode())
         self.changed = False

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import ROWS_PER_STATEMENT, Transaction, runs
+from sonarpost.delivery.transaction import ROWS_PER_STATEMENT, Transaction, UnitOfWork, runs
 from sonarpost.errors import DeliveryError
 
 
@@ -37,6 +37,24 @@ def test_state_is_remembered_replaced_and_forgotten(tmp_path: Path) -> None:
         tx.delete_state("a")
         assert store.get_state("a") is None
     assert store.get_state("a") is None
+    store.close()
+
+
+def test_states_below_a_prefix_are_changed_together_and_read_together(tmp_path: Path) -> None:
+    store = Store(tmp_path / "s.db")
+    effects = UnitOfWork()
+    effects.put_states("part/", {"a": b"1", "b": b"", "c": b"3"})
+    effects.put_state("party", b"other")
+    with store.transaction() as tx:
+        effects.write(tx)
+    assert store.states("part/") == {"a": b"1", "b": b"", "c": b"3"}
+    effects = UnitOfWork()
+    effects.put_states("part/", {"a": b"2", "c": None})
+    with store.transaction() as tx:
+        effects.write(tx)
+    assert store.states("part/") == {"a": b"2", "b": b""}
+    assert store.states("absent/") == {}
+    assert store.get_state("party") == b"other"
     store.close()
 
 

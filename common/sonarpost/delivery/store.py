@@ -305,6 +305,13 @@ class Store:
         found = self._query("SELECT name FROM state WHERE name >= ? AND name < ?", (prefix, prefix + "\U0010ffff"))
         return tuple(str(row[0]) for row in found)
 
+    def states(self, prefix: str) -> dict[str, bytes]:
+        """Return all values whose names start with `prefix`, by the rest of their names."""
+        found = self._query(
+            "SELECT name, value FROM state WHERE name >= ? AND name < ?", (prefix, prefix + "\U0010ffff")
+        )
+        return {str(name).removeprefix(prefix): bytes(value) for name, value in found}
+
     def close(self) -> None:
         """Close the file."""
         with self._lock, self._reader_lock:

@@ -6,7 +6,7 @@ import hashlib
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from functools import cache
 
 from sonarpost import wire
@@ -60,6 +60,14 @@ class UnitOfWork:
     def put_state(self, name: str, value: bytes) -> None:
         """Store `value` under `name`."""
         self._writes.append(lambda tx: tx.put_state(name, value))
+
+    def put_states(self, prefix: str, values: Mapping[str, bytes | None]) -> None:
+        """Store each value under its name below `prefix`; delete the names whose value is None."""
+        for name, value in values.items():
+            if value is None:
+                self.delete_state(prefix + name)
+            else:
+                self.put_state(prefix + name, value)
 
     def delete_state(self, name: str) -> None:
         """Delete the value under `name`."""
