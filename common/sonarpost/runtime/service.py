@@ -31,7 +31,7 @@ from sonarpost.delivery.records import InboxItem, OutboxItem
 from sonarpost.delivery.store import HANDLING_RESERVE_BYTES, DiskReserve, Store
 from sonarpost.delivery.transaction import Transaction, UnitOfWork
 from sonarpost.errors import BadInputError, DeliveryError
-from sonarpost.logs import kv, log_context
+from sonarpost.logs import IntervalLog, kv, log_context
 from sonarpost.messages import Health, Record, ServiceState
 from sonarpost.monitoring.heartbeat import Heartbeat
 from sonarpost.security.tls_files import TlsMonitor
@@ -96,6 +96,7 @@ class Service(ABC, Generic[C]):
         self._outbox: Outbox | None = None
         self._token: zenoh.LivelinessToken | None = None
         self._threads: list[threading.Thread] = []
+        self._interval_logs: list[IntervalLog] = []
         self._heartbeat = Heartbeat.from_environment(os.environ, platform.state_dir, platform.health_interval_s)
 
     # Hooks of a subclass
@@ -230,6 +231,7 @@ class Service(ABC, Generic[C]):
                 thread.join(timeout=1.0)
             self._session.close()
         self.store.close()
+        self._flush_interval_logs(stopping=True)
         log.info("Service stopped")
 
     def start_thread(self, target: Callable[[], None], name: str) -> None:
@@ -365,6 +367,16 @@ class Service(ABC, Generic[C]):
         with self._counter_lock:
             self._counters[name] += by
 
+    def interval_log(self, logger: logging.Logger, level: int, message: str) -> IntervalLog:
+        """Return a log for a repeated event, at most one line a minute; the service also logs the end of a burst."""
+        made = IntervalLog(logger, level, message)
+        self._interval_logs.append(made)
+        return made
+
+    def _flush_interval_logs(self, *, stopping: bool = False) -> None:
+        for interval_log in self._interval_logs:
+            interval_log.flush(stopping=stopping)
+
     def set_degraded(self, reason: str) -> None:
         """Report the service as degraded in health and log; an empty reason reports it as recovered."""
         if reason == self._degraded:
@@ -412,6 +424,7 @@ class Service(ABC, Generic[C]):
     def _report(self) -> None:
         while not self.stopping.wait(self.platform.health_interval_s):
             self._publish_health(None)
+            self._flush_interval_logs()
 
     def _publish_health(self, state: ServiceState | None) -> None:
         try:
