@@ -22,6 +22,7 @@ from typing import IO, Any
 
 from sonarpost.delivery.records import SITE_SEPARATOR, InboxItem, OutboxItem
 from sonarpost.delivery.transaction import Transaction, runs
+from sonarpost.delivery.watermark import LostRecords, Watermark, lost_records
 from sonarpost.errors import DeliveryError, RetryLaterError
 
 CACHE_KB = 8000
@@ -95,6 +96,7 @@ class Store:
         path: The SQLite file.
         origin: Random identity of the store, 16 bytes.
         inbox_changed: Set when a record was added to the inbox.
+        lost: Report of lost commits that no operator has cleared; None if there is none.
 
     Raises:
         DeliveryError: The file cannot be opened or is not a store of this version.
@@ -106,6 +108,8 @@ class Store:
         self._reader_lock = threading.Lock()
         self._outbox_listeners: list[threading.Event] = []
         self._in_flight: set[tuple[str, int]] = set()
+        self._watermark = Watermark(path)
+        self.lost: LostRecords | None = None
         self.inbox_changed = threading.Event()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -144,6 +148,15 @@ class Store:
             self._reader.close()
             self._db.close()
             raise DeliveryError(f"{self.path}: store version {version!r}, expected {SCHEMA_VERSION}")
+        self._check_watermark()
+
+    def _check_watermark(self) -> None:
+        """Report lost commits, then write the side-car of this store."""
+        with self.transaction():
+            self._watermark.check(self._db)
+            self.lost = lost_records(self._db)
+        with self.transaction():
+            self._watermark.start(self._db)
 
     def _meta(self, name: str, initial: bytes) -> bytes:
         self._db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?)", (name, initial))
@@ -165,6 +178,8 @@ class Store:
                     self._db.execute("BEGIN IMMEDIATE")
                     yield tx
                     tx.flush()
+                if tx.assigned or tx.wrote_inbox:
+                    self._watermark.committed(self._db, tx.assigned.items(), inbox=tx.wrote_inbox)
             except sqlite3.Error as error:
                 raise DeliveryError(f"{self.path}: {error}") from error
         if tx.wrote_outbox:
@@ -317,6 +332,7 @@ class Store:
         with self._lock, self._reader_lock:
             self._reader.close()
             self._db.close()
+            self._watermark.close()
             self._lock_file.close()
 
 

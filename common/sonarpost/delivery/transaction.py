@@ -97,6 +97,7 @@ class Transaction:
         wrote_outbox: Whether a record was added to the outbox.
         wrote_inbox: Whether a record was added to the inbox.
         superseded: Number of queued records that newer editions replaced.
+        assigned: Highest number that was assigned in each queue with new records.
     """
 
     def __init__(self, connection: sqlite3.Connection, in_flight: Set[tuple[str, int]] = frozenset()) -> None:
@@ -106,7 +107,7 @@ class Transaction:
         self.wrote_inbox = False
         self.superseded = 0
         self._windows: dict[bytes, DuplicateWindow] = {}
-        self._last_seq: dict[str, int] = {}
+        self.assigned: dict[str, int] = {}
         self._new_outbox: list[tuple[object, ...]] = []
         self._new_topics: set[tuple[str, str]] = set()
         self._new_inbox: list[tuple[object, ...]] = []
@@ -127,7 +128,7 @@ class Transaction:
     def _flush_outbox(self) -> None:
         if self._new_outbox:
             _insert_rows(self._db, "outbox", _OUTBOX, self._new_outbox)
-            self._db.executemany("INSERT OR REPLACE INTO outbox_next VALUES (?, ?)", self._last_seq.items())
+            self._db.executemany("INSERT OR REPLACE INTO outbox_next VALUES (?, ?)", self.assigned.items())
             self._new_outbox.clear()
             self._new_topics.clear()
 
@@ -167,11 +168,11 @@ class Transaction:
         return seq
 
     def _next_seq(self, queue: str) -> int:
-        if queue not in self._last_seq:
+        if queue not in self.assigned:
             row = self._db.execute("SELECT seq FROM outbox_next WHERE consumer = ?", (queue,)).fetchone()
-            self._last_seq[queue] = int(row[0]) if row else 0
-        self._last_seq[queue] += 1
-        return self._last_seq[queue]
+            self.assigned[queue] = int(row[0]) if row else 0
+        self.assigned[queue] += 1
+        return self.assigned[queue]
 
     def _editions(self, queue: str, topic: str) -> list[tuple[int, int, int, int]]:
         """Return (seq, edition, position, priority) of a topic's records in a queue."""

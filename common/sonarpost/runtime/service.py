@@ -397,6 +397,7 @@ class Service(ABC, Generic[C]):
             detail
             or self._disk_reserve.degraded_reason()
             or self.degraded_reason()
+            or self._lost_records()
             or self._tls.degraded_reason(now_utc_s)
         )
         warnings = (self.warning(), self._tls.warning(now_utc_s))
@@ -419,6 +420,14 @@ class Service(ABC, Generic[C]):
             detail="; ".join(text for text in (detail, *warnings) if text)[:MAX_DETAIL],
             counters=counters,
             gauges=gauges,
+        )
+
+    def _lost_records(self) -> str:
+        if self.store.lost is None:
+            return ""
+        records = str(self.store.lost) or "none"
+        return (
+            f"commits of {self.store.path.name} are lost; records possibly lost: {records}; see `sonarpost store check`"
         )
 
     def _report(self) -> None:
