@@ -299,6 +299,16 @@ def delivery_query_any(key: str) -> str:
     return f"{key}/handoff/*"
 
 
+def writer_of(key: str) -> str:
+    """Return the part of a key that access control grants to one group of peers.
+
+    It is `{site}/inbox/{vessel}` for the inbox of a vessel, otherwise the platform and the first word behind it: a
+    console may write below `{site}/tasking` under any name.
+    """
+    parts = key.split("/")
+    return "/".join(parts[: 5 if parts[3:4] == ["inbox"] else 4])
+
+
 def presence(vessel: str, service: str, site: str = SHORE) -> str:
     """Presence query of a vessel to a service of the shore site, and its reply.
 

@@ -153,7 +153,7 @@ class Project:
         """Return how many contacts the vehicle has handed on, told by its store."""
         script = (
             "import sqlite3; db = sqlite3.connect('file:/var/lib/sonarpost/state/compressor.db?mode=ro', uri=True); "
-            "print(db.execute('SELECT COALESCE(SUM(seq), 0) FROM seen_upto').fetchone()[0])"
+            "print(db.execute('SELECT COALESCE(SUM(highest), 0) FROM received_window').fetchone()[0])"
         )
         return int(self.inside("compressor", script))
 

@@ -5,25 +5,30 @@ from __future__ import annotations
 import hashlib
 import itertools
 import random
+import time
 
 import pytest
 from builders.store_steps import ORIGIN
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sonarpost.delivery import partial_records
 from sonarpost.delivery.records import ReceivedChunk
 from sonarpost.delivery.store import Store
 
+KEY = "sonarpost/v1/shore/inbox/vessel-1"
+OTHER_KEY = "sonarpost/v1/shore/inbox/vessel-2"
 
-def chunks(data: bytes, *cuts: int, seq: int = 1) -> list[ReceivedChunk]:
+
+def chunks(data: bytes, *cuts: int, seq: int = 1, origin: bytes = ORIGIN) -> list[ReceivedChunk]:
     sha = hashlib.sha256(data).digest()
     edges = [0, *cuts, len(data)]
-    return [ReceivedChunk(ORIGIN, seq, len(data), sha, a, data[a:b]) for a, b in itertools.pairwise(edges)]
+    return [ReceivedChunk(origin, seq, len(data), sha, a, data[a:b]) for a, b in itertools.pairwise(edges)]
 
 
-def add(store: Store, chunk: ReceivedChunk) -> bytes | int:
+def add(store: Store, chunk: ReceivedChunk, key: str = KEY) -> bytes | int:
     with store.transaction() as tx:
-        return tx.add_chunk(chunk)
+        return tx.add_chunk(key, chunk)
 
 
 def partials(store: Store) -> int:
@@ -72,12 +77,15 @@ def test_chunks_of_two_records_do_not_mix(store: Store) -> None:
     assert (add(store, a[1]), add(store, b[1])) == (b"aaaa", b"bbbb")
 
 
-def test_other_record_with_the_same_number_restarts_the_transfer(store: Store) -> None:
-    add(store, chunks(b"old record", 5)[0])
-    new = chunks(b"new record", 5)
-    assert add(store, new[1]) == 0
-    assert add(store, new[0]) == 5
-    assert add(store, new[1]) == b"new record"
+def test_other_record_with_the_same_number_does_not_disturb_the_transfer(store: Store) -> None:
+    first, second = chunks(b"old record", 5), chunks(b"new record", 5)
+    assert add(store, first[0]) == 5
+    assert add(store, second[1]) == 0
+    assert add(store, second[0]) == 5
+    assert add(store, first[0], OTHER_KEY) == 5
+    assert add(store, first[1]) == b"old record"
+    assert add(store, second[1]) == b"new record"
+    assert add(store, first[1], OTHER_KEY) == b"old record"
 
 
 def test_damaged_record_restarts_the_transfer(store: Store) -> None:
@@ -90,15 +98,8 @@ def test_damaged_record_restarts_the_transfer(store: Store) -> None:
     assert add(store, second) == b"0123456789"
 
 
-def test_accepting_a_record_deletes_its_chunks(store: Store) -> None:
-    add(store, chunks(b"0123456789", 5)[0])
-    with store.transaction() as tx:
-        tx.accept("k", b"0123456789", ORIGIN, 1)
-    assert partials(store) == 0
-
-
-def test_only_the_most_recent_partial_records_are_kept(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sonarpost.delivery.transaction.MAX_PARTIAL_RECORDS", 3)
+def test_only_the_most_recent_records_of_a_writer_are_kept(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(partial_records, "MAX_WRITER_RECORDS", 3)
     firsts = {seq: chunks(b"0123456789", 4, seq=seq) for seq in range(1, 5)}
     for seq in (1, 2, 3):
         assert add(store, firsts[seq][0]) == 4
@@ -108,3 +109,65 @@ def test_only_the_most_recent_partial_records_are_kept(store: Store, monkeypatch
     # The second record was deleted; its producer starts again at offset 0.
     assert add(store, firsts[2][1]) == 0
     assert add(store, firsts[1][1]) == b"0123456789"
+
+
+def test_size_of_incomplete_records_of_a_writer_is_limited(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(partial_records, "MAX_WRITER_BYTES", 100)
+    other = chunks(bytes(200), 90)
+    assert add(store, other[0], OTHER_KEY) == 90
+    for seq in range(1, 6):
+        assert add(store, chunks(bytes([seq]) * 200, 40, seq=seq)[0]) == 40
+    assert partials(store) == 3
+    assert add(store, other[1], OTHER_KEY) == bytes(200)
+
+
+def test_origin_with_many_bytes_loses_its_records_first(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On one key, a flood of incomplete records does not interrupt the transfer of another origin."""
+    monkeypatch.setattr(partial_records, "MAX_WRITER_RECORDS", 4)
+    first, second = chunks(b"0123456789", 4)
+    assert add(store, first) == 4
+    for seq in range(1, 20):
+        add(store, chunks(b"abcdefghij", 4, seq=seq, origin=b"f" * 16)[0])
+    assert partials(store) == 4
+    assert add(store, second) == b"0123456789"
+
+
+def test_many_names_below_one_prefix_count_as_one_writer(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A console may write below tasking under any name; the total limit then affects its own records only."""
+    monkeypatch.setattr(partial_records, "MAX_RECORDS", 6)
+    monkeypatch.setattr(partial_records, "MAX_WRITER_RECORDS", 5)
+    first, second = chunks(bytes(100), 60)
+    assert add(store, first) == 60
+    for number in range(30):
+        key = f"sonarpost/v1/shore/tasking/name-{number}/advice"
+        assert add(store, chunks(b"0123456789", 1, origin=bytes([number]) * 16)[0], key) == 1
+    assert partials(store) == 6
+    assert add(store, second) == bytes(100)
+
+
+def test_total_limit_deletes_records_of_the_largest_writer(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(partial_records, "MAX_BYTES", 100)
+    small = chunks(bytes(50), 10)
+    assert add(store, small[0]) == 10
+    for seq in (1, 2, 3):
+        assert add(store, chunks(bytes([seq]) * 90, 40, seq=seq)[0], OTHER_KEY) == 40
+    assert partials(store) == 3
+    assert add(store, small[1]) == bytes(50)
+
+
+def test_incomplete_record_expires(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_ns = time.time_ns()
+    add(store, chunks(b"0123456789", 4)[0])
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns + (partial_records.EXPIRE_AFTER_S + 60) * 1_000_000_000)
+    assert add(store, chunks(b"abcdefghij", 4, seq=2)[0]) == 4
+    assert partials(store) == 1
+    assert store._query("SELECT COUNT(*) FROM partial_piece") == [(1,)]
+
+
+def test_reclaim_deletes_the_records_of_the_largest_writer(store: Store) -> None:
+    add(store, chunks(bytes(100), 40)[0])
+    add(store, chunks(bytes(100), 60)[0], OTHER_KEY)
+    for expected in (60, 40, 0):
+        with store.transaction() as tx:
+            assert tx.reclaim_partial_records() == expected
+    assert partials(store) == 0

@@ -54,7 +54,7 @@ def test_store_of_another_version_is_rejected(tmp_path: Path) -> None:
     with sqlite3.connect(path) as db:
         db.execute("UPDATE meta SET value = ? WHERE name = 'version'", (b"99",))
     db.close()
-    with pytest.raises(DeliveryError, match="store version b'99', expected 2"):
+    with pytest.raises(DeliveryError, match="store version b'99', expected 3"):
         Store(path)
 
 

@@ -1,22 +1,24 @@
-"""Inbox of the durable store: deduplication, persistence until handled, limits of a read."""
+"""Inbox of the durable store: duplicates, persistence until handled, limits of a read."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from builders.store_steps import ORIGIN
+from builders.store_steps import record
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sonarpost.delivery import duplicate_window
+from sonarpost.delivery.records import ReceivedChunk
 from sonarpost.delivery.store import Store
 
 
 def test_record_stays_in_the_inbox_until_handled(tmp_path: Path) -> None:
     store = Store(tmp_path / "s.db")
     with store.transaction() as tx:
-        assert tx.accept("k", b"1")
-        assert tx.accept("k", b"2")
+        tx.accept("k", b"1")
+        tx.accept("k", b"2")
     store.close()
     store = Store(tmp_path / "s.db")
     first, second = store.inbox_items(9)
@@ -28,40 +30,86 @@ def test_record_stays_in_the_inbox_until_handled(tmp_path: Path) -> None:
     store.close()
 
 
-@given(st.lists(st.tuples(st.sampled_from([b"a" * 16, b"b" * 16]), st.integers(1, 30)), max_size=80))
-@settings(max_examples=30)
-def test_each_sequence_number_is_accepted_once_in_any_order(
-    tmp_path_factory: pytest.TempPathFactory, arrivals: list[tuple[bytes, int]]
+ARRIVAL = st.tuples(
+    st.sampled_from(["k/a", "k/b"]),
+    st.sampled_from([b"a" * 16, b"b" * 16]),
+    st.integers(1, 30),
+    st.sampled_from([b"x", b"y"]),
+    st.integers(0, 29),
+)
+
+
+@given(st.lists(ARRIVAL, max_size=80))
+@settings(max_examples=40)
+def test_record_is_a_duplicate_only_with_the_same_key_origin_number_and_digest(
+    tmp_path_factory: pytest.TempPathFactory, arrivals: list[tuple[str, bytes, int, bytes, int]]
 ) -> None:
     store = Store(tmp_path_factory.mktemp("seen") / "s.db")
-    accepted = set()
-    for origin, seq in arrivals:
+    accepted: set[tuple[str, bytes, int, bytes]] = set()
+    for key, origin, seq, payload, done_up_to in arrivals:
+        chunk = record(seq, payload, origin, done_up_to)
         with store.transaction() as tx:
-            assert tx.was_received(origin, seq) == ((origin, seq) in accepted)
-            assert tx.accept("k", b"x", origin, seq) == ((origin, seq) not in accepted)
-        accepted.add((origin, seq))
+            of_window = {n for k, o, n, _ in accepted if (k, o) == (key, origin)}
+            assert tx.highest(key, origin)[0] == max(of_window, default=0)
+            assert tx.was_received(key, chunk) == ((key, origin, seq, payload) in accepted)
+            if not tx.was_received(key, chunk):
+                tx.accept(key, payload, chunk)
+            assert tx.was_received(key, chunk)
+        accepted.add((key, origin, seq, payload))
     assert store.inbox_depth() == len(accepted)
-    # Only numbers above the first gap are stored individually.
-    kept = {(bytes(o), s) for o, s in store._query("SELECT origin, seq FROM seen")}  # type: ignore[arg-type]
-    above_gap = set()
-    for origin in (b"a" * 16, b"b" * 16):
-        numbers = {seq for o, seq in accepted if o == origin}
-        upto = 0
-        while upto + 1 in numbers:
-            upto += 1
-        above_gap |= {(origin, seq) for seq in numbers if seq > upto}
-    assert kept == above_gap
     store.close()
 
 
-def test_refused_record_is_never_accepted(store: Store) -> None:
+def receive(store: Store, key: str, *chunks: ReceivedChunk) -> None:
     with store.transaction() as tx:
-        assert not tx.was_refused(ORIGIN, 1)
-        tx.mark_refused(ORIGIN, 1)
-        tx.mark_refused(ORIGIN, 1)
-        assert tx.was_refused(ORIGIN, 1)
-        assert not tx.accept("k", b"x", ORIGIN, 1)
-    assert store.inbox_depth() == 0
+        for chunk in chunks:
+            tx.accept(key, chunk.data, chunk)
+
+
+def digests(store: Store) -> set[int]:
+    return {int(row[0]) for row in store._query("SELECT seq FROM received")}
+
+
+def test_statement_of_the_producer_never_marks_a_number_as_received(store: Store) -> None:
+    receive(store, "k", record(1 << 62, b"valid", done_up_to=(1 << 62) - 1))
+    with store.transaction() as tx:
+        assert not tx.was_received("k", record(1, b"later record"))
+
+
+def test_only_old_digests_below_the_statement_are_deleted(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(duplicate_window, "KEPT_DIGESTS", 10)
+    monkeypatch.setattr(duplicate_window, "PRUNE_EVERY", 20)
+    receive(store, "k", *(record(seq, b"x") for seq in range(1, 40)))
+    assert digests(store) == set(range(1, 40))
+    receive(store, "k", record(40, b"x", done_up_to=5))
+    assert digests(store) == set(range(6, 41))
+    receive(store, "k", *(record(seq, b"x", done_up_to=59) for seq in range(41, 66)))
+    assert digests(store) == set(range(56, 66))
+
+
+def test_number_of_digests_is_limited(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(duplicate_window, "MAX_DIGESTS", 30)
+    monkeypatch.setattr(duplicate_window, "PRUNE_EVERY", 10)
+    for first in range(1, 101, 10):
+        receive(store, "k", *(record(seq, b"x") for seq in range(first, first + 10)))
+        assert len(digests(store)) <= 40
+    assert 100 in digests(store)
+
+
+def test_least_recently_used_window_of_a_writer_is_deleted(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A console that writes under many names and origins does not displace the window of a vessel."""
+    monkeypatch.setattr(duplicate_window, "MAX_WINDOWS", 3)
+    vessel_key = "sonarpost/v1/shore/inbox/vessel-1"
+    receive(store, vessel_key, record(1, b"image"))
+    for number in range(8):
+        key = f"sonarpost/v1/shore/tasking/vessel-{number}/advice"
+        receive(store, key, record(1, b"advice", bytes([number]) * 16))
+    assert len(store._query("SELECT 1 FROM received_window")) == 4
+    assert len(store._query("SELECT 1 FROM received")) == 4
+    with store.transaction() as tx:
+        assert tx.was_received(vessel_key, record(1, b"image"))
+        assert tx.was_received(key, record(1, b"advice", bytes([7]) * 16))
+        assert not tx.was_received("sonarpost/v1/shore/tasking/vessel-0/advice", record(1, b"advice", bytes(16)))
 
 
 @pytest.mark.parametrize(("max_bytes", "count"), [(None, 4), (0, 1), (10, 1), (29, 2), (30, 3), (1000, 4)])

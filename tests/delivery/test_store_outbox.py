@@ -62,6 +62,11 @@ def test_two_stores_have_different_origins(tmp_path: Path) -> None:
     a, b = Store(tmp_path / "a.db"), Store(tmp_path / "b.db")
     assert a.origin != b.origin
     assert len(a.origin) == len(b.origin) == 16
+    send(a, b"x")
+    send(b, b"x")
+    origins = {item.origin for store in (a, b) for item in queued_items(store, "c", 9)}
+    assert len(origins) == 2
+    assert not origins & {a.origin, b.origin}
     a.close()
     b.close()
 

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from builders.store_steps import ORIGIN, fail_within, queued_items, send
+from builders.store_steps import fail_within, queued_items, record, send
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -60,14 +60,19 @@ def test_states_below_a_prefix_are_changed_together_and_read_together(tmp_path: 
 
 KILLED = """
 import itertools, sys
+from hashlib import sha256
 from pathlib import Path
+from sonarpost.delivery.records import ReceivedChunk
 from sonarpost.delivery.store import Store
 store = Store(Path(sys.argv[1]))
 first = int(store.get_state("n") or b"0") + 1
 for n in itertools.count(first):
     with store.transaction() as tx:
         for part in range(5):
-            assert tx.accept("k", b"%d/%d" % (n, part), b"o" * 16, 5 * n + part - 4)
+            payload = b"%d/%d" % (n, part)
+            chunk = ReceivedChunk(b"o" * 16, 5 * n + part - 4, len(payload), sha256(payload).digest(), 0, payload)
+            assert not tx.was_received("k", chunk)
+            tx.accept("k", payload, chunk)
         for item in store.inbox_items(3):
             tx.remove_handled(item)
             tx.send("k", "c", item.payload, encoding="e")
@@ -89,8 +94,8 @@ def check_complete(path: Path, reported: int) -> None:
         b"%d/%d" % (n, p) for n in range(1, done + 1) for p in range(5)
     ]
     assert [item.seq for item in queued] == list(range(1, len(queued) + 1))
-    assert store._query("SELECT seq FROM seen_upto") == [(5 * done,)]
-    assert store._query("SELECT COUNT(*) FROM seen") == [(0,)]
+    assert store._query("SELECT highest FROM received_window") == [(5 * done,)]
+    assert store._query("SELECT COUNT(*) FROM received") == [(5 * done,)]
     store.close()
 
 
@@ -149,15 +154,15 @@ def test_threads_write_one_at_a_time(store: Store) -> None:
 def test_transaction_reads_its_own_writes(store: Store) -> None:
     def write(tx: Transaction) -> None:
         tx.put_state("a", b"1")
-        tx.accept("k", b"x", ORIGIN, 3)
+        tx.accept("k", b"x", record(3, b"x"))
         assert store.get_state("a") == b"1"
-        assert tx.was_received(ORIGIN, 3)
+        assert tx.was_received("k", record(3, b"x"))
 
     with pytest.raises(ZeroDivisionError):
         fail_within(store, write)
     with store.transaction() as tx:
         assert store.get_state("a") is None
-        assert not tx.was_received(ORIGIN, 3)
+        assert not tx.was_received("k", record(3, b"x"))
 
 
 @given(st.sets(st.integers(-50, 50)))
@@ -189,7 +194,7 @@ def test_rollback_discards_collected_rows(store: Store) -> None:
     def fail() -> None:
         with store.transaction() as tx:
             tx.send("k", "c", b"x", encoding="")
-            tx.accept("k", b"x", ORIGIN, 1)
+            tx.accept("k", b"x", record(1, b"x"))
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
@@ -197,4 +202,4 @@ def test_rollback_discards_collected_rows(store: Store) -> None:
     assert store.outbox_depth() == store.inbox_depth() == 0
     with store.transaction() as tx:
         assert tx.send("k", "c", b"x", encoding="") == 1
-        assert not tx.was_received(ORIGIN, 1)
+        assert not tx.was_received("k", record(1, b"x"))

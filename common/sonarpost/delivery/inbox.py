@@ -8,7 +8,7 @@ import queue
 import threading
 from collections.abc import Callable, Collection
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import zenoh
 
@@ -189,23 +189,24 @@ class Inbox:
         return self._store_record(tx, message.key, message.payload, None)
 
     def _store_chunk(self, tx: Transaction, key: str, chunk: ReceivedChunk) -> AckReply:
-        if chunk.done_up_to:
-            tx.mark_done_up_to(chunk.origin, chunk.done_up_to)
-        if tx.was_refused(chunk.origin, chunk.seq):
-            return AckReply("refused", reason="refused before; the reason is in the consumer's log and store")
-        if tx.was_received(chunk.origin, chunk.seq):
-            return AckReply("stored")
+        highest, sha256 = tx.highest(key, chunk.origin)
+        reply = AckReply("stored") if tx.was_received(key, chunk) else self._store_new_chunk(tx, key, chunk)
+        return replace(reply, highest=highest, highest_sha256=sha256) if chunk.offset == 0 else reply
+
+    def _store_new_chunk(self, tx: Transaction, key: str, chunk: ReceivedChunk) -> AckReply:
         try:
             self._require_capacity(key)
-            record = tx.add_chunk(chunk)
-            if isinstance(record, int):
-                return AckReply("more", next_offset=record)
-            if hashlib.sha256(record).digest() != chunk.sha256:
-                where = key + self._key_suffix
-                return self._refused(PayloadError(where, "sha256", chunk.sha256.hex(), "the digest of the record"))
-            return self._store_record(tx, key, record, chunk)
         except RetryLaterError as error:
+            if tx.reclaim_partial_records():
+                log.warning("Incomplete records deleted, to accept complete ones", extra=kv(reason=str(error)))
             return AckReply("later", reason=str(error)[:MAX_REASON])
+        record = tx.add_chunk(key, chunk)
+        if isinstance(record, int):
+            return AckReply("more", next_offset=record)
+        if hashlib.sha256(record).digest() != chunk.sha256:
+            where = key + self._key_suffix
+            return self._refused(PayloadError(where, "sha256", chunk.sha256.hex(), "the digest of the record"))
+        return self._store_record(tx, key, record, chunk)
 
     def _refused(self, error: PayloadError) -> AckReply:
         self._on_refused(error)
@@ -232,23 +233,16 @@ class Inbox:
                 raise
             except BadInputError as error:
                 self._on_refused(error)
-                return self._quarantine(tx, key, payload, chunk, str(error))
+                return self._quarantine(tx, key, payload, str(error))
             except Exception as error:
                 # An unexpected exception must neither block later records nor lose this one.
                 log.exception("Record quarantined after an unexpected exception", extra=kv(key=key))
-                return self._quarantine(tx, key, payload, chunk, f"{type(error).__name__}: {error}")
-        if chunk is None:
-            tx.accept(key, payload)
-        else:
-            tx.accept(key, payload, chunk.origin, chunk.seq)
+                return self._quarantine(tx, key, payload, f"{type(error).__name__}: {error}")
+        tx.accept(key, payload, chunk)
         return AckReply("stored")
 
-    def _quarantine(
-        self, tx: Transaction, key: str, payload: bytes, chunk: ReceivedChunk | None, reason: str
-    ) -> AckReply:
+    def _quarantine(self, tx: Transaction, key: str, payload: bytes, reason: str) -> AckReply:
         tx.quarantine("in", key, payload, reason)
-        if chunk is not None:
-            tx.mark_refused(chunk.origin, chunk.seq)
         return AckReply("refused", reason=reason)
 
     def _reply(self, messages: list[_Message], replies: list[Replies]) -> None:

@@ -129,6 +129,11 @@ class Outbox:
         sender = self._senders.get(queue)
         return 0 if sender is None else sender.acknowledged_count
 
+    def warning(self) -> str:
+        """Return a warning if the store was restored from an older copy; empty if it was not."""
+        queues = ", ".join(queue for queue, sender in tuple(self._senders.items()) if sender.restored)
+        return f"{self._store.path.name} is older than its last delivery to {queues}" if queues else ""
+
     def close(self) -> None:
         """Stop sending; unacknowledged records stay in the store."""
         self._stop.set()
@@ -155,6 +160,8 @@ class QueueSender:
     Attributes:
         responding: Whether the consumer replied to the last query.
         acknowledged_count: Number of records that the consumer has accepted since the start.
+        restored: Whether the consumer has accepted records that the store does not contain: it was restored from an
+            older copy.
     """
 
     def __init__(
@@ -167,10 +174,10 @@ class QueueSender:
     ) -> None:
         self.responding = False
         self.acknowledged_count = 0
+        self.restored = False
         self._default_session = session
         self._store = store
         self._queue = queue
-        self._origin = store.origin_of(queue)
         self._policy = policy
         self._on_acknowledged = on_acknowledged
         self._scheduler = DeliveryScheduler(policy.bytes_per_s, time.monotonic())
@@ -294,10 +301,10 @@ class QueueSender:
         if len(chunks) == 1:
             start, end = chunks[0].start, chunks[0].end
             payload = items[0].payload[start:end]
-            attachment = protocol.attachment(self._origin, items[0], start, done_up_to)
+            attachment = protocol.attachment(items[0].origin, items[0], start, done_up_to)
         else:
             payload = b"".join(item.payload for item in items)
-            attachment = protocol.batch_attachment(self._origin, items, done_up_to)
+            attachment = protocol.batch_attachment(items[0].origin, items, done_up_to)
         replies = session.get(
             keys.delivery_query(items[0].key, consumer_of(items[0].queue)),
             timeout=REPLY_TIMEOUT_S,
@@ -320,7 +327,7 @@ class QueueSender:
             item.payload,
             encoding=item.encoding,
             priority=PRIORITIES[item.priority],
-            attachment=protocol.attachment(self._origin, item),
+            attachment=protocol.attachment(protocol.watcher_origin(item.origin), item),
         )
 
     # Replies
@@ -369,6 +376,8 @@ class QueueSender:
             if len(chunks) == 1:
                 reply = AckReply.unpack(payload, where)
                 self._max_batch = reply.max_batch
+                if reply.highest and self._scheduler.probing:
+                    self._check_age(chunks[0].transfer.item, reply)
                 return [reply]
             replies = protocol.unpack_replies(payload, len(chunks), where)
         except PayloadError as error:
@@ -379,6 +388,20 @@ class QueueSender:
                 self._batch_refused = True
             raise _NoReplyError(f"batch not accepted: {replies.status} {replies.reason}")
         return replies
+
+    def _check_age(self, item: OutboxItem, reply: AckReply) -> None:
+        """Use a new origin if the store is older than what the consumer has accepted from it."""
+        if self.restored or not self._store.is_older_than(
+            self._queue, item.origin, reply.highest, reply.highest_sha256
+        ):
+            return
+        with self._store.transaction() as tx:
+            tx.renew_origin(self._queue)
+        self.restored = True
+        log.warning(
+            "Store is older than its last delivery; new records get a new origin",
+            extra=kv(consumer=self._queue, store=self._store.path, accepted=reply.highest),
+        )
 
     def _apply(self, chunk: Chunk, reply: AckReply) -> None:
         transfer = chunk.transfer

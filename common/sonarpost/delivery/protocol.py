@@ -8,6 +8,7 @@ older version. `docs/specifications/zenoh.md` specifies the messages for other l
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -67,6 +68,8 @@ class _Reply(_Fields):
     next: _Natural
     reason: str = ""
     takes: _Natural = 0
+    highest: _Natural = 0
+    digest: Annotated[bytes, Field(max_length=32)] = b""
 
 
 class _BatchReply(_Fields):
@@ -84,17 +87,32 @@ class AckReply:
         next_offset: Next offset of the record that the consumer requires, in bytes.
         reason: Explanation, for people.
         max_batch: Number of records that the consumer accepts in one query; 0 for one.
+        highest: Highest sequence number that the consumer had accepted from this queue on this key before the query;
+            stated in replies to the first chunk of a record, otherwise 0. A producer that has not assigned this number
+            runs on an older copy of its store.
+        highest_sha256: Digest of the record with this number; empty if `highest` is 0.
     """
 
     status: AckStatus
     next_offset: int = 0
     reason: str = ""
     max_batch: int = field(default=0, compare=False)
+    highest: int = field(default=0, compare=False)
+    highest_sha256: bytes = field(default=b"", compare=False)
 
     def pack(self, max_batch: int = 0) -> bytes:
         """Return the reply as msgpack, announcing `max_batch` unless it is 0."""
-        fields = {"v": SINGLE_VERSION, "status": self.status, "next": self.next_offset, "reason": self.reason}
-        return _pack(fields | ({"takes": max_batch} if max_batch else {}))
+        fields: dict[str, object] = {
+            "v": SINGLE_VERSION,
+            "status": self.status,
+            "next": self.next_offset,
+            "reason": self.reason,
+        }
+        if max_batch:
+            fields["takes"] = max_batch
+        if self.highest:
+            fields |= {"highest": self.highest, "digest": self.highest_sha256}
+        return _pack(fields)
 
     @classmethod
     def unpack(cls, payload: bytes, where: str) -> AckReply:
@@ -104,7 +122,16 @@ class AckReply:
             PayloadError: It is not a reply of this protocol.
         """
         reply = wire.validated(_Reply, wire.unpack_map(payload, where), where)
-        return cls(reply.status, reply.next, reply.reason, reply.takes)
+        return cls(reply.status, reply.next, reply.reason, reply.takes, reply.highest, reply.digest)
+
+
+def watcher_origin(origin: bytes) -> bytes:
+    """Return the identity of a queue for watchers, 16 bytes.
+
+    Only producer and consumer know the origin itself: with it, a peer that may write to the same key could send records
+    in the name of the queue.
+    """
+    return hashlib.sha256(b"watcher" + origin).digest()[:16]
 
 
 def attachment(origin: bytes, item: OutboxItem, offset: int = 0, done_up_to: int = 0) -> bytes:

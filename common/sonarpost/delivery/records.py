@@ -10,7 +10,8 @@ SITE_SEPARATOR = "@"
 def queue_of(consumer: str, platform: str) -> str:
     """Return the queue name of a consumer that runs on several platforms, for example `c2@shore-2`.
 
-    Each queue has its own sequence numbers and its own origin. An unresponsive consumer does not delay other queues.
+    Each queue has its own sequence numbers and its own random origin. An unresponsive consumer does not delay other
+    queues.
     """
     return f"{consumer}{SITE_SEPARATOR}{platform}"
 
@@ -46,6 +47,7 @@ class OutboxItem:
         payload: The record's bytes.
         sha256: SHA-256 digest of the payload, 32 bytes.
         position: Order among records of equal priority; a newer edition inherits it from the one it replaces.
+        origin: Identity of the queue when the record was queued, 16 bytes.
     """
 
     queue: str
@@ -56,6 +58,7 @@ class OutboxItem:
     payload: bytes
     sha256: bytes
     position: int = field(default=0, compare=False)
+    origin: bytes = field(default=b"", compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +72,7 @@ class ReceivedChunk:
         sha256: SHA-256 digest of the whole record.
         offset: Position of the chunk in the record, in bytes.
         data: Bytes of the chunk.
-        done_up_to: The producer no longer holds this sequence number and all below it.
+        done_up_to: The producer states that it no longer holds this sequence number and all below it.
     """
 
     origin: bytes

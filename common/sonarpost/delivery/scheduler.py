@@ -243,7 +243,7 @@ class DeliveryScheduler:
                 continue
             item = transfer.item
             free_bytes -= len(item.payload) + (0 if self._bucket is None else BATCH_RECORD_OVERHEAD_BYTES)
-            alike = item.key == first.item.key and item.priority == first.item.priority and transfer.untouched
+            alike = transfer.untouched and _batch_key(item) == _batch_key(first.item)
             if free_bytes < 0 or not alike:
                 break
             chunks.append(Chunk(transfer, 0, len(item.payload), transfer.attempt))
@@ -299,3 +299,8 @@ class DeliveryScheduler:
         for transfer in self.active.values():
             transfer.attempt += 1
             transfer.sent = transfer.received
+
+
+def _batch_key(item: OutboxItem) -> tuple[str, bytes, int]:
+    """Return what the records of one query have in common."""
+    return item.key, item.origin, item.priority

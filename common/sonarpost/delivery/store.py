@@ -29,7 +29,7 @@ CACHE_KB = 8000
 """Page cache: records in flight are deleted without reading them from the disk."""
 HANDLING_RESERVE_BYTES = 8_388_608
 """Free space for handling the accepted records: deleting rows writes to the write-ahead log."""
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
@@ -37,18 +37,22 @@ CREATE TABLE IF NOT EXISTS outbox (
     consumer TEXT NOT NULL, seq INTEGER NOT NULL, key TEXT NOT NULL, encoding TEXT NOT NULL, priority INTEGER NOT NULL,
     payload BLOB NOT NULL, sha256 BLOB NOT NULL, created_utc_s REAL NOT NULL,
     topic TEXT NOT NULL DEFAULT '', edition INTEGER NOT NULL DEFAULT 0, place INTEGER NOT NULL DEFAULT 0,
-    PRIMARY KEY (consumer, seq));
-CREATE TABLE IF NOT EXISTS outbox_next (consumer TEXT PRIMARY KEY, seq INTEGER NOT NULL) WITHOUT ROWID;
+    origin BLOB NOT NULL DEFAULT x'', PRIMARY KEY (consumer, seq));
+CREATE TABLE IF NOT EXISTS outbox_next (
+    consumer TEXT PRIMARY KEY, seq INTEGER NOT NULL, origin BLOB NOT NULL DEFAULT x'') WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS inbox (
     id INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT NOT NULL, payload BLOB NOT NULL, origin BLOB, seq INTEGER,
     received_utc_s REAL NOT NULL);
-CREATE TABLE IF NOT EXISTS seen (origin BLOB NOT NULL, seq INTEGER NOT NULL, PRIMARY KEY (origin, seq)) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS seen_upto (origin BLOB PRIMARY KEY, seq INTEGER NOT NULL) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS refused_before (
-    origin BLOB NOT NULL, seq INTEGER NOT NULL, PRIMARY KEY (origin, seq)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS received_window (
+    id INTEGER PRIMARY KEY, key TEXT NOT NULL, origin BLOB NOT NULL, writer TEXT NOT NULL, highest INTEGER NOT NULL,
+    sha256 BLOB NOT NULL, digests INTEGER NOT NULL, used_ns INTEGER NOT NULL, UNIQUE (key, origin));
+CREATE TABLE IF NOT EXISTS received (
+    window INTEGER NOT NULL REFERENCES received_window (id) ON DELETE CASCADE, seq INTEGER NOT NULL,
+    sha256 BLOB NOT NULL, PRIMARY KEY (window, seq, sha256)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS partial (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, origin BLOB NOT NULL, seq INTEGER NOT NULL, size INTEGER NOT NULL,
-    sha256 BLOB NOT NULL, has INTEGER NOT NULL, touched_ns INTEGER NOT NULL, UNIQUE (origin, seq));
+    id INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT NOT NULL, origin BLOB NOT NULL, seq INTEGER NOT NULL,
+    sha256 BLOB NOT NULL, writer TEXT NOT NULL, has INTEGER NOT NULL, touched_ns INTEGER NOT NULL,
+    UNIQUE (key, origin, seq, sha256));
 CREATE TABLE IF NOT EXISTS partial_piece (
     partial INTEGER NOT NULL REFERENCES partial (id) ON DELETE CASCADE, start INTEGER NOT NULL, data BLOB NOT NULL,
     PRIMARY KEY (partial, start));
@@ -67,11 +71,26 @@ UPDATE outbox SET place = seq;
 DROP INDEX IF EXISTS outbox_order;
 UPDATE meta SET value = CAST('2' AS BLOB) WHERE name = 'version';
 """
+# Version 2 remembered received numbers without key and digest. Producers of that version can still repeat records that
+# were received: their numbers stay in `seen` and `seen_upto`, for reading only.
+# No producer has ever assigned numbers of 2^40 and above.
+_MIGRATE_FROM_VERSION_2 = """
+CREATE TABLE IF NOT EXISTS seen (origin BLOB NOT NULL, seq INTEGER NOT NULL, PRIMARY KEY (origin, seq)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS seen_upto (origin BLOB PRIMARY KEY, seq INTEGER NOT NULL) WITHOUT ROWID;
+ALTER TABLE outbox ADD COLUMN origin BLOB NOT NULL DEFAULT x'';
+ALTER TABLE outbox_next ADD COLUMN origin BLOB NOT NULL DEFAULT x'';
+DROP TABLE IF EXISTS partial_piece;
+DROP TABLE IF EXISTS partial;
+DROP TABLE IF EXISTS refused_before;
+DELETE FROM seen WHERE seq >= 1099511627776;
+DELETE FROM seen_upto WHERE seq >= 1099511627776;
+UPDATE meta SET value = CAST('3' AS BLOB) WHERE name = 'version';
+"""
 _INDEXES = """
 CREATE INDEX IF NOT EXISTS outbox_place ON outbox (consumer, priority, place, seq);
 CREATE INDEX IF NOT EXISTS outbox_topic ON outbox (consumer, topic, edition) WHERE topic <> '';
 """
-_ITEM = "consumer, seq, key, encoding, priority, payload, sha256, place"
+_ITEM = "consumer, seq, key, encoding, priority, payload, sha256, place, origin"
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +113,7 @@ class Store:
 
     Attributes:
         path: The SQLite file.
-        origin: Random identity of the store, 16 bytes.
+        origin: Random number of the store, 16 bytes; each queue has its own.
         inbox_changed: Set when a record was added to the inbox.
         lost: Report of lost commits that no operator has cleared; None if there is none.
 
@@ -110,6 +129,7 @@ class Store:
         self._in_flight: set[tuple[str, int]] = set()
         self._watermark = Watermark(path)
         self.lost: LostRecords | None = None
+        self._has_legacy_windows = False
         self.inbox_changed = threading.Event()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -131,15 +151,14 @@ class Store:
             # Some builds of SQLite overwrite deleted content, which writes every record to the disk a second time.
             self._db.execute("PRAGMA secure_delete=OFF")
             self._db.execute(f"PRAGMA cache_size={-CACHE_KB}")
+            self._migrate()
             self._db.executescript(_TABLES)
             with self.transaction():
                 self.origin = self._meta("origin", uuid.uuid4().bytes)
                 version = self._meta("version", str(SCHEMA_VERSION).encode())
-            if version == b"1":
-                self._db.executescript(f"BEGIN IMMEDIATE; {_MIGRATE_FROM_VERSION_1} COMMIT;")
-                version = str(SCHEMA_VERSION).encode()
             if version == str(SCHEMA_VERSION).encode():
                 self._db.executescript(_INDEXES)
+                self._has_legacy_windows = self._has_table("seen_upto")
             self._reader = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
             self._reader.execute("PRAGMA query_only=ON")
         except sqlite3.Error as error:
@@ -158,6 +177,33 @@ class Store:
         with self.transaction():
             self._watermark.start(self._db)
 
+    def _migrate(self) -> None:
+        if not self._has_table("meta"):
+            return
+        row = self._db.execute("SELECT value FROM meta WHERE name = 'version'").fetchone()
+        if row is not None and row[0] == b"1":
+            self._db.executescript(f"BEGIN IMMEDIATE; {_MIGRATE_FROM_VERSION_1} COMMIT;")
+        if row is not None and row[0] in (b"1", b"2"):
+            with self._db:
+                self._db.execute("BEGIN IMMEDIATE")
+                for statement in _MIGRATE_FROM_VERSION_2.split(";"):
+                    self._db.execute(statement)
+                self._assign_origins()
+
+    def _assign_origins(self) -> None:
+        """Give queued records the origin that version 2 used for their queue, and each queue a new one."""
+        (store_origin,) = self._db.execute("SELECT value FROM meta WHERE name = 'origin'").fetchone()
+        for (queue,) in self._db.execute("SELECT consumer FROM outbox_next").fetchall():
+            origin = bytes(store_origin)
+            if SITE_SEPARATOR in queue:
+                origin = hashlib.sha256(origin + queue.encode()).digest()[:16]
+            self._db.execute("UPDATE outbox SET origin = ? WHERE consumer = ?", (origin, queue))
+            self._db.execute("UPDATE outbox_next SET origin = ? WHERE consumer = ?", (uuid.uuid4().bytes, queue))
+
+    def _has_table(self, name: str) -> bool:
+        found = self._db.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,)).fetchone()
+        return found is not None
+
     def _meta(self, name: str, initial: bytes) -> bytes:
         self._db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?)", (name, initial))
         row = self._db.execute("SELECT value FROM meta WHERE name = ?", (name,)).fetchone()
@@ -171,7 +217,7 @@ class Store:
             DeliveryError: The database reported an error, for example a full disk; nothing was written.
         """
         with self._lock:
-            tx = Transaction(self._db, self._in_flight)
+            tx = Transaction(self._db, self._in_flight, has_legacy_windows=self._has_legacy_windows)
             try:
                 # The connection commits at the end of its block, and rolls back after an exception.
                 with self._db:
@@ -259,15 +305,22 @@ class Store:
             (queue,),
         )
 
-    def origin_of(self, queue: str) -> bytes:
-        """Return the identity of a queue, 16 bytes.
+    def is_older_than(self, queue: str, origin: bytes, highest: int, sha256: bytes) -> bool:
+        """Return whether this file is older than the last delivery of a queue: it was restored from a copy.
 
-        It is the store's own for a plain consumer name. Each `queue_of` has a different one: its numbers start at 1,
-        and its consumer can have received these numbers from another queue (a renamed site).
+        Args:
+            queue: Name of the queue.
+            origin: Origin to which the consumer's statement refers.
+            highest: Highest sequence number that the consumer has accepted.
+            sha256: Digest of the record with this number.
         """
-        if SITE_SEPARATOR not in queue:
-            return self.origin
-        return hashlib.sha256(self.origin + queue.encode()).digest()[:16]
+        found = self._query("SELECT seq, origin FROM outbox_next WHERE consumer = ?", (queue,))
+        if not found or bytes(found[0][1]) != origin:
+            return False
+        if highest > found[0][0]:
+            return True
+        items = self.queued_items(queue, [highest])
+        return bool(items) and items[0].origin == origin and items[0].sha256 != sha256
 
     def queue_depth(self, queue: str, max_priority: int = 7) -> QueueDepth:
         """Return the contents of one queue, counting priorities 1 to `max_priority`."""

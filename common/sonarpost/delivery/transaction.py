@@ -5,24 +5,25 @@ from __future__ import annotations
 import hashlib
 import sqlite3
 import time
+import uuid
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from functools import cache
 
 from sonarpost import wire
 from sonarpost.delivery.duplicate_window import DuplicateWindow
+from sonarpost.delivery.partial_records import PartialRecords
 from sonarpost.delivery.records import InboxItem, OutboxItem, ReceivedChunk, Topic
 from sonarpost.messages import Record
 
 # Limits on what a remote station can make a store keep; beyond them the oldest entries are deleted.
 MAX_QUARANTINED = 1000
 MAX_QUARANTINED_BYTES = 256 * 1024
-MAX_PARTIAL_RECORDS = 64
 
 # Each statement releases the interpreter lock and waits to get it back: multi-row statements are much faster.
 ROWS_PER_STATEMENT = 32
 
-_OUTBOX = "consumer, seq, key, encoding, priority, payload, sha256, created_utc_s, topic, edition, place"
+_OUTBOX = "consumer, seq, key, encoding, priority, payload, sha256, created_utc_s, topic, edition, place, origin"
 _INBOX = "key, payload, origin, seq, received_utc_s"
 
 
@@ -97,21 +98,33 @@ class Transaction:
         wrote_outbox: Whether a record was added to the outbox.
         wrote_inbox: Whether a record was added to the inbox.
         superseded: Number of queued records that newer editions replaced.
-        assigned: Highest number that was assigned in each queue with new records.
     """
 
-    def __init__(self, connection: sqlite3.Connection, in_flight: Set[tuple[str, int]] = frozenset()) -> None:
+    def __init__(
+        self,
+        connection: sqlite3.Connection,
+        in_flight: Set[tuple[str, int]] = frozenset(),
+        *,
+        has_legacy_windows: bool = False,
+    ) -> None:
         self._db = connection
         self._in_flight = in_flight
+        self._has_legacy_windows = has_legacy_windows
         self.wrote_outbox = False
         self.wrote_inbox = False
         self.superseded = 0
-        self._windows: dict[bytes, DuplicateWindow] = {}
-        self.assigned: dict[str, int] = {}
+        self._windows: dict[tuple[str, bytes], DuplicateWindow] = {}
+        self._numbers: dict[str, tuple[int, bytes]] = {}
         self._new_outbox: list[tuple[object, ...]] = []
         self._new_topics: set[tuple[str, str]] = set()
         self._new_inbox: list[tuple[object, ...]] = []
+        self._partial_records = PartialRecords(connection)
         self._handled: list[int] = []
+
+    @property
+    def assigned(self) -> dict[str, int]:
+        """Highest number of each queue in which numbers were assigned."""
+        return {queue: seq for queue, (seq, _) in self._numbers.items()}
 
     def flush(self) -> None:
         """Write the collected changes; `Store.transaction` calls it before the commit."""
@@ -128,9 +141,13 @@ class Transaction:
     def _flush_outbox(self) -> None:
         if self._new_outbox:
             _insert_rows(self._db, "outbox", _OUTBOX, self._new_outbox)
-            self._db.executemany("INSERT OR REPLACE INTO outbox_next VALUES (?, ?)", self.assigned.items())
+            self._write_numbers()
             self._new_outbox.clear()
             self._new_topics.clear()
+
+    def _write_numbers(self) -> None:
+        rows = [(queue, *number) for queue, number in self._numbers.items()]
+        self._db.executemany("INSERT OR REPLACE INTO outbox_next (consumer, seq, origin) VALUES (?, ?, ?)", rows)
 
     # Outbox
 
@@ -157,22 +174,35 @@ class Transaction:
             if any(row[1] > edition for row in editions):
                 return 0
             position, priority = self._supersede(queue, [row for row in editions if row[1] < edition], priority)
-        seq = self._next_seq(queue)
+        seq, origin = self._last_number(queue)
+        seq += 1
+        self._numbers[queue] = (seq, origin)
         digest = hashlib.sha256(payload).digest()
         self._new_outbox.append(
-            (queue, seq, key, encoding, priority, payload, digest, time.time(), name, edition, position or seq)
+            (queue, seq, key, encoding, priority, payload, digest, time.time(), name, edition, position or seq, origin)
         )
         if name:
             self._new_topics.add((queue, name))
         self.wrote_outbox = True
         return seq
 
-    def _next_seq(self, queue: str) -> int:
-        if queue not in self.assigned:
-            row = self._db.execute("SELECT seq FROM outbox_next WHERE consumer = ?", (queue,)).fetchone()
-            self.assigned[queue] = int(row[0]) if row else 0
-        self.assigned[queue] += 1
-        return self.assigned[queue]
+    def _last_number(self, queue: str) -> tuple[int, bytes]:
+        """Return the last sequence number of a queue and the queue's origin, which is random for a new queue."""
+        if queue not in self._numbers:
+            row = self._db.execute("SELECT seq, origin FROM outbox_next WHERE consumer = ?", (queue,)).fetchone()
+            self._numbers[queue] = (int(row[0]), bytes(row[1])) if row else (0, uuid.uuid4().bytes)
+        return self._numbers[queue]
+
+    def renew_origin(self, queue: str) -> None:
+        """Assign a new random origin to a queue; records that are already queued keep the present one.
+
+        For a store that was restored from an older copy: it assigns sequence numbers again that its consumer, and
+        watchers, have received with other content.
+        """
+        seq, _ = self._last_number(queue)
+        self._flush_outbox()
+        self._numbers[queue] = (seq, uuid.uuid4().bytes)
+        self._write_numbers()
 
     def _editions(self, queue: str, topic: str) -> list[tuple[int, int, int, int]]:
         """Return (seq, edition, position, priority) of a topic's records in a queue."""
@@ -244,13 +274,19 @@ class Transaction:
 
     # Inbox
 
-    def accept(self, key: str, payload: bytes, origin: bytes | None = None, seq: int | None = None) -> bool:
-        """Add a record to the inbox; return False if (origin, seq) was received before."""
-        if origin is not None and seq is not None and not self._add_seq(origin, seq):
-            return False
+    def accept(self, key: str, payload: bytes, chunk: ReceivedChunk | None = None) -> None:
+        """Add a record to the inbox.
+
+        Args:
+            key: Key expression of the record.
+            payload: The complete record.
+            chunk: The last chunk of the record, which identifies it; None for a plain publication.
+        """
+        origin, seq = (None, None) if chunk is None else (chunk.origin, chunk.seq)
+        if chunk is not None:
+            self._window(key, chunk.origin).add(chunk.seq, chunk.sha256, chunk.done_up_to)
         self._new_inbox.append((key, payload, origin, seq, time.time()))
         self.wrote_inbox = True
-        return True
 
     def remove_handled(self, item: InboxItem) -> None:
         """Remove a handled record from the inbox."""
@@ -264,90 +300,38 @@ class Transaction:
         ).fetchone()
         self._db.execute("DELETE FROM refused WHERE id <= ?", (int(row[0]) - MAX_QUARANTINED,))
 
-    def mark_refused(self, origin: bytes, seq: int) -> None:
-        """Store that (origin, seq) was refused, so that a repeated query gets the same reply."""
-        if self._add_seq(origin, seq):
-            self._window(origin).mark_refused(seq)
+    def was_received(self, key: str, chunk: ReceivedChunk) -> bool:
+        """Return whether the record of a chunk was accepted before: same key, origin, number and digest."""
+        if self._window(key, chunk.origin).contains(chunk.seq, chunk.sha256):
+            return True
+        return self._has_legacy_windows and self._was_received_before_migration(chunk)
 
-    def was_refused(self, origin: bytes, seq: int) -> bool:
-        """Return whether (origin, seq) was refused before."""
-        return self._window(origin).was_refused(seq)
+    def highest(self, key: str, origin: bytes) -> tuple[int, bytes]:
+        """Return the highest number accepted from a queue on a key, 0 for none, and the digest of its record."""
+        window = self._window(key, origin)
+        return window.highest, window.highest_sha256
 
-    def was_received(self, origin: bytes, seq: int) -> bool:
-        """Return whether (origin, seq) was accepted or refused before."""
-        return seq in self._window(origin)
-
-    def mark_done_up_to(self, origin: bytes, seq: int) -> None:
-        """Store that the producer no longer holds any number up to `seq`; dropped records leave gaps."""
-        self._window(origin).advance(seq)
-
-    def _window(self, origin: bytes) -> DuplicateWindow:
-        window = self._windows.get(origin)
+    def _window(self, key: str, origin: bytes) -> DuplicateWindow:
+        window = self._windows.get((key, origin))
         if window is None:
-            window = self._windows[origin] = DuplicateWindow(self._db, origin)
+            window = self._windows[key, origin] = DuplicateWindow(self._db, key, origin)
         return window
 
-    def _add_seq(self, origin: bytes, seq: int) -> bool:
-        window = self._window(origin)
-        if seq in window:
-            return False
-        window.add(seq)
-        self._delete_chunks(origin, seq)
-        return True
-
-    # Chunks of large records
-
-    def add_chunk(self, chunk: ReceivedChunk) -> bytes | int:
-        """Add a chunk of a record.
-
-        A chunk that does not follow the stored ones is not stored. A transfer therefore resumes after a restart of
-        either side. If the complete record does not match its digest, its chunks are deleted.
-
-        Returns:
-            The complete record, or the next offset to send. A record in a single chunk is returned unchecked.
-        """
-        if chunk.offset == 0 and len(chunk.data) == chunk.size:
-            self._delete_chunks(chunk.origin, chunk.seq)
-            return chunk.data
-        partial_id, received = self._partial(chunk)
-        if chunk.offset != received:
-            return received
-        received += len(chunk.data)
-        if received < chunk.size:
-            self._db.execute("INSERT INTO partial_piece VALUES (?, ?, ?)", (partial_id, chunk.offset, chunk.data))
-            self._db.execute("UPDATE partial SET has = ? WHERE id = ?", (received, partial_id))
-            return received
-        chunks = self._db.execute(
-            "SELECT data FROM partial_piece WHERE partial = ? ORDER BY start", (partial_id,)
-        ).fetchall()
-        self._delete_chunks(chunk.origin, chunk.seq)
-        payload = b"".join(bytes(row[0]) for row in chunks) + chunk.data
-        return payload if hashlib.sha256(payload).digest() == chunk.sha256 else 0
-
-    def _partial(self, chunk: ReceivedChunk) -> tuple[int, int]:
-        """Return (id, received bytes) of an incomplete record; one with other content is replaced."""
-        which = (chunk.origin, chunk.seq)
-        row = self._db.execute(
-            "SELECT id, has, size, sha256 FROM partial WHERE origin = ? AND seq = ?", which
+    def _was_received_before_migration(self, chunk: ReceivedChunk) -> bool:
+        found = self._db.execute(
+            "SELECT EXISTS (SELECT 1 FROM seen_upto WHERE origin = ?1 AND seq >= ?2)"
+            " OR EXISTS (SELECT 1 FROM seen WHERE origin = ?1 AND seq = ?2)",
+            (chunk.origin, chunk.seq),
         ).fetchone()
-        if row is not None and (row[2], row[3]) == (chunk.size, chunk.sha256):
-            self._db.execute("UPDATE partial SET touched_ns = ? WHERE id = ?", (time.time_ns(), row[0]))
-            return int(row[0]), int(row[1])
-        self._delete_chunks(*which)
-        self._window(chunk.origin).has_chunks = True
-        inserted = self._db.execute(
-            "INSERT INTO partial (origin, seq, size, sha256, has, touched_ns) VALUES (?, ?, ?, ?, 0, ?)",
-            (*which, chunk.size, chunk.sha256, time.time_ns()),
-        )
-        self._db.execute(
-            "DELETE FROM partial WHERE id NOT IN (SELECT id FROM partial ORDER BY touched_ns DESC, id DESC LIMIT ?)",
-            (MAX_PARTIAL_RECORDS,),
-        )
-        return int(inserted.lastrowid or 0), 0
+        return bool(found[0])
 
-    def _delete_chunks(self, origin: bytes, seq: int) -> None:
-        if self._window(origin).has_chunks:
-            self._db.execute("DELETE FROM partial WHERE origin = ? AND seq = ?", (origin, seq))
+    def add_chunk(self, key: str, chunk: ReceivedChunk) -> bytes | int:
+        """Add a chunk of a record; return the complete record, or the next offset to send."""
+        return self._partial_records.add(key, chunk)
+
+    def reclaim_partial_records(self) -> int:
+        """Delete the incomplete records of the writer that holds the most; return the number of bytes."""
+        return self._partial_records.reclaim()
 
     # State
 

@@ -15,6 +15,7 @@ import logging
 import os
 import sqlite3
 import time
+import uuid
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -208,7 +209,8 @@ class Watermark:
     def check(self, db: sqlite3.Connection) -> LostRecords | None:
         """Compare the store with its side-car, in an open transaction.
 
-        If commits were lost, the report is added to the store and logged, and numbers continue above the side-car's.
+        If commits were lost, the report is added to the store and logged. New records of a queue that is behind get a
+        new origin and numbers above the side-car's.
 
         Returns:
             The new report; None if the store is not older than the side-car, or if there is no readable side-car.
@@ -226,9 +228,8 @@ class Watermark:
             return None
         for queue in lost.queues:
             db.execute(
-                "INSERT INTO outbox_next (consumer, seq) VALUES (?, ?)"
-                " ON CONFLICT (consumer) DO UPDATE SET seq = excluded.seq",
-                (queue, side_car.queues[queue].last),
+                "INSERT OR REPLACE INTO outbox_next (consumer, seq, origin) VALUES (?, ?, ?)",
+                (queue, side_car.queues[queue].last, uuid.uuid4().bytes),
             )
         report = lost.plus(lost_records(db))
         db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (LOST, report.pack()))

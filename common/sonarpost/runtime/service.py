@@ -400,7 +400,8 @@ class Service(ABC, Generic[C]):
             or self._lost_records()
             or self._tls.degraded_reason(now_utc_s)
         )
-        warnings = (self.warning(), self._tls.warning(now_utc_s))
+        restored = "" if self._outbox is None else self._outbox.warning()
+        warnings = (self.warning(), restored, self._tls.warning(now_utc_s))
         with self._counter_lock:
             counters = dict(self._counters)
         gauges = {

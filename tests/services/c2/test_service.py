@@ -237,7 +237,7 @@ def test_record_committed_before_a_stop_is_handled_after_the_restart(begin, runn
     seen = watch(keys.shore_image("vessel-1"))
     idle = C2Service(platform("shore-1"), C2Config(out_dir=out))
     with idle.store.transaction() as tx:
-        tx.accept(keys.shore_inbox("vessel-1"), wire.encode(envelope(image())), b"o" * 16, 1)
+        tx.accept(keys.shore_inbox("vessel-1"), wire.encode(envelope(image())))
     idle.store.close()
     assert not out.exists()
     service = begin()

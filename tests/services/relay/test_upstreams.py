@@ -146,7 +146,7 @@ def test_newer_version_replaces_unsent_ones(begin, c2, source, runner):
     # The consumer stores nothing for the gaps in the numbers.
     source.send(IMAGES, "relay", image("CCCC", 1))
     eventually(lambda: len(shore.received) == 4)
-    assert shore.store._query("SELECT COUNT(*) FROM seen") == [(0,)]
+    assert shore.store._query("SELECT COUNT(*) FROM received") == [(4,)]
 
 
 def test_image_of_another_mission_is_not_a_version_of_the_first():

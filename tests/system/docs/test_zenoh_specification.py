@@ -308,20 +308,20 @@ def test_service_answers_the_example_query_with_the_example_reply(
         querier = client.declare_querier(selector)
         eventually(lambda: querier.matching_status.matching)
         assert ask(hex_block("decision"), hex_block("attachment")) == hex_block("reply")
-        assert ask(hex_block("decision"), hex_block("attachment")) == hex_block("reply")
+        again = AckReply.unpack(ask(hex_block("decision"), hex_block("attachment")), "k")
+        assert (again.status, again.highest) == ("stored", 1)
+        assert again.highest_sha256 == hashlib.sha256(hex_block("decision")).digest()
         eventually(lambda: len(consumer.received) == 1)
-        # Refused for its content: a repeated query does not refuse it a second time.
+        # Refused for its content: a repeated query is validated again.
         bad = msgpack.packb({"type": "decision", "v": 9})
         item = OutboxItem("relay", 2, "k", "", 4, bad, hashlib.sha256(bad).digest())
         first, again = (AckReply.unpack(ask(bad, attachment(bytes(range(16)), item)), "k") for _ in range(2))
-        assert first == AckReply("refused", reason=f"{DecisionConsumer.key}: v: got 9, expected 1")
-        assert again.status == "refused"
-        assert "refused before" in again.reason
-        assert consumer.store.refused_count() == 1
+        assert first == again == AckReply("refused", reason=f"{DecisionConsumer.key}: v: got 9, expected 1")
+        assert consumer.store.refused_count() == 2
         # Refused for its attachment: without origin and number it is not stored.
         refused = AckReply.unpack(ask(hex_block("decision"), None), "k")
         assert refused.status == "refused"
         assert f"{selector}: payload: got b''" in refused.reason
-        assert consumer.store.refused_count() == 1
+        assert consumer.store.refused_count() == 2
     finally:
         consumer.stop()
