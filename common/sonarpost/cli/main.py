@@ -18,6 +18,7 @@ COMMANDS = {
     "router": "run",
     "status": "status",
     "c2": "c2",
+    "store": "store",
     "console": "console",
     "metrics": "metrics",
     "simulate": "simulate",

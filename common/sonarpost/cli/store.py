@@ -1,0 +1,117 @@
+"""`sonarpost store check` and `salvage`: check the store of a stopped service, and recover a damaged one."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from contextlib import closing
+from pathlib import Path
+
+from sonarpost.cli.parsers import Subparsers, add_command, aligned
+from sonarpost.cli.shared import printable, time_text
+from sonarpost.delivery.inspection import StoreState, inspect
+from sonarpost.delivery.salvage import SalvageResult, TableResult, salvage
+from sonarpost.delivery.store import SCHEMA_VERSION, Store, lock_exclusively
+from sonarpost.errors import StoredFileError
+
+EXIT_UNSOUND = 1
+
+_CHECK = """Check the store of a stopped service: integrity, schema version, queues, and lost commits by the side-car
+STORE.watermark. Nothing is changed without --clear. Exit status: 0 if the store is sound, 1 if it is damaged, has
+another version or has lost commits, 2 if it cannot be checked, for example because the service is running."""
+_SALVAGE = """Copy every readable row of a damaged store into a new file, and print what was recovered. Queued records
+with a wrong digest are quarantined in the new store. Exit status: 0 if every row was copied, 1 if rows are missing, 2
+if nothing was written, for example because the service is running."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the command and its actions."""
+    actions = add_command(subparsers, "store", "check the store of a stopped service, and recover a damaged one")
+    check = actions.add_parser("check", help="check a store, and report lost commits", description=_CHECK)
+    check.add_argument("store", type=Path, metavar="STORE", help="store of a service, for example relay.db")
+    check.add_argument(
+        "--clear", action="store_true", help="clear the report of lost commits; the service is no longer degraded"
+    )
+    check.set_defaults(run=run_check)
+    copy = actions.add_parser("salvage", help="copy the readable rows of a damaged store", description=_SALVAGE)
+    copy.add_argument("store", type=Path, metavar="STORE", help="the damaged store")
+    copy.add_argument("--out", type=Path, required=True, metavar="NEW", help="new store; the file must not exist")
+    copy.set_defaults(run=run_salvage)
+
+
+def run_check(parsed: argparse.Namespace) -> int:
+    """Print the state of a store; return 0 if it is sound, otherwise 1."""
+    path: Path = parsed.store
+    if not path.is_file():
+        raise StoredFileError(str(path), "", "no such file", "the store of a service, for example relay.db")
+    if parsed.clear:
+        with closing(Store(path)) as store:
+            lost = store.clear_lost()
+        print("no report of lost commits" if lost is None else f"cleared: records possibly lost: {lost}")
+    with lock_exclusively(path):
+        state = inspect(path)
+    _print_state(path, state)
+    return 0 if state.is_sound else EXIT_UNSOUND
+
+
+def _print_state(path: Path, state: StoreState) -> None:
+    version = state.version or "unknown"
+    expected = "" if version == str(SCHEMA_VERSION) else f", expected {SCHEMA_VERSION}"
+    lines = [
+        ("store", str(path)),
+        ("integrity", "ok" if not state.problems else f"{len(state.problems)} problems"),
+        *(("", problem) for problem in state.problems),
+        ("schema version", version + expected),
+        ("side-car", state.side_car),
+    ]
+    if state.unreported is not None:
+        lines.append(("lost commits", f"records possibly lost: {state.unreported}; not yet reported by the service"))
+    if state.lost is not None:
+        found = time_text(state.lost.found_utc_s)
+        lines.append(
+            ("lost commits", f"records possibly lost: {state.lost}; found {found} UTC; --clear ends the report")
+        )
+    for line in aligned(lines):
+        print(printable(line))
+    print()
+    rows = [("queue", "records", "bytes", "oldest (UTC)", "age", "last number")]
+    now_utc_s = time.time()
+    for queue in state.queues:
+        age = "" if queue.oldest_utc_s is None else f"{max(0.0, now_utc_s - queue.oldest_utc_s):.0f} s"
+        counts = (str(queue.records), str(queue.size_bytes))
+        rows.append((queue.name, *counts, time_text(queue.oldest_utc_s), age, str(queue.last)))
+    for line in aligned(rows):
+        print(printable(line))
+    if state.problems:
+        print(f"\nRecover the readable records: sonarpost store salvage {path} --out NEW")
+
+
+def run_salvage(parsed: argparse.Namespace) -> int:
+    """Copy a store and print the result; return 0 if every row was copied, otherwise 1."""
+    path, out = parsed.store, parsed.out
+    result = salvage(path, out)
+    _print_result(result)
+    print(f"""
+Replace the damaged store while the service is stopped; leave {path}.watermark where it is:
+  mv {path} {path}.damaged
+  [ ! -e {path}-wal ] || mv {path}-wal {path}.damaged-wal
+  rm -f {path}-shm
+  mv {out} {path}""")
+    return 0 if result.is_complete else EXIT_UNSOUND
+
+
+def _print_result(result: SalvageResult) -> None:
+    rows = [("table", "recovered", "wrong digest", "unreadable")]
+    rows += [(t.name, str(t.recovered), str(t.wrong_digest), _unreadable(t)) for t in result.tables]
+    for line in aligned(rows):
+        print(printable(line))
+    if result.first_page:
+        part = "header of the first page" if result.first_page == "header" else "first page"
+        print(f"The {part} was unreadable and was replaced by that of a new store.")
+
+
+def _unreadable(table: TableResult) -> str:
+    if table.error:
+        return f"rows of unknown number: {table.error}"
+    ranges = [f"{first} to {'the end' if last is None else last}" for first, last in table.unreadable]
+    return "row " + ", ".join(ranges) if ranges else "-"

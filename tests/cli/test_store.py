@@ -1,0 +1,243 @@
+"""`sonarpost store`: check and salvage, on damaged stores."""
+
+from __future__ import annotations
+
+import os
+import re
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from builders.store_steps import queued_items, send
+
+from sonarpost.cli.main import main
+from sonarpost.delivery.store import Store
+from sonarpost.errors import DeliveryError
+
+PAGE = 4096
+RECORDS = 300
+
+
+def payload(number: int) -> bytes:
+    """Return 1 kB that no other record has."""
+    return (b"%06d" % number) * 170
+
+
+@pytest.fixture
+def relay(tmp_path: Path) -> Path:
+    """Make a closed store with records in all tables; one record has overflow pages."""
+    path = tmp_path / "relay.db"
+    store = Store(path)
+    for first in range(0, RECORDS, 50):
+        send(store, *(payload(number) for number in range(first, first + 50)), consumer="c2")
+    send(store, b"large" * 10_000, consumer="c2@north")
+    with store.transaction() as tx:
+        for number in range(40):
+            tx.accept("k/in", payload(number))
+        tx.put_state("name", b"value")
+        tx.quarantine("in", "k/bad", b"junk", "refused by a test")
+    store.close()
+    return path
+
+
+def pages_with(content: bytes, data: bytes) -> list[int]:
+    """Return the pages with `content`, numbered from 0."""
+    return [n for n in range(len(data) // PAGE) if content in data[n * PAGE : (n + 1) * PAGE]]
+
+
+def overwrite_page(path: Path, page: int, data: bytes = b"\xa5" * PAGE) -> None:
+    with path.open("r+b") as file:
+        file.seek(page * PAGE)
+        file.write(data)
+
+
+def run(*arguments: object) -> int:
+    return main(["store", *map(str, arguments)])
+
+
+def test_sound_store(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = relay.read_bytes()
+    assert run("check", relay) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"^integrity +ok$", text, re.MULTILINE)
+    assert re.search(r"^side-car +as the store$", text, re.MULTILINE)
+    assert re.search(rf"^c2 +{RECORDS} +{RECORDS * 1020} +20\S+ \S+ +\d+ s +{RECORDS}$", text, re.MULTILINE)
+    assert re.search(r"^c2@north +1 +50000 ", text, re.MULTILINE)
+    assert re.search(r"^\(inbox\) +40 +40800 .* 40$", text, re.MULTILINE)
+    assert re.search(r"^\(quarantine\) +1 +4 ", text, re.MULTILINE)
+    assert relay.read_bytes() == before
+
+
+def test_write_ahead_log_of_a_killed_service_is_read_and_stays(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    script = (
+        "import os; from pathlib import Path; from sonarpost.delivery.store import Store\n"
+        f"store = Store(Path({str(relay)!r}))\n"
+        "with store.transaction() as tx: tx.send('k', 'c2', b'in the log', encoding='e')\n"
+        "os._exit(0)"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
+    log = relay.with_name("relay.db-wal")
+    before = (relay.read_bytes(), log.read_bytes())
+    assert run("check", relay) == 0
+    assert re.search(rf"^c2 +{RECORDS + 1} ", capsys.readouterr().out, re.MULTILINE)
+    assert run("salvage", relay, "--out", relay.with_name("new.db")) == 0
+    assert (relay.read_bytes(), log.read_bytes()) == before
+    with closing(Store(relay.with_name("new.db"))) as new:
+        assert queued_items(new, "c2", 999)[-1].payload == b"in the log"
+
+
+def test_lost_commits_are_shown_and_cleared(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    relay.write_bytes(b"")
+    with closing(sqlite3.connect(relay)) as empty:
+        empty.execute("CREATE TABLE meta (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID")
+    assert run("check", relay) == 1
+    relay.unlink()
+    Store(relay).close()
+    assert run("check", relay) == 1
+    text = capsys.readouterr().out
+    assert f"records possibly lost: c2 {RECORDS}, c2@north 1, inbox 40; found 20" in text
+    assert run("check", relay, "--clear") == 0
+    assert f"cleared: records possibly lost: c2 {RECORDS}, c2@north 1, inbox 40" in capsys.readouterr().out
+    assert run("check", relay) == 0
+    with closing(Store(relay)) as store:
+        assert store.lost is None
+
+
+def test_loss_that_no_service_has_reported_yet(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    backup = relay.read_bytes()
+    with closing(Store(relay)) as store:
+        send(store, b"after the backup", consumer="c2")
+    relay.write_bytes(backup)
+    assert run("check", relay) == 1
+    text = capsys.readouterr().out
+    assert re.search(r"^side-car +newer than the store$", text, re.MULTILINE)
+    assert "records possibly lost: c2 1; not yet reported by the service" in text
+
+
+def test_store_in_use_is_refused(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with closing(Store(relay)):
+        for command in (["check", relay], ["check", relay, "--clear"], ["salvage", relay, "--out", f"{relay}.new"]):
+            assert run(*command) == 2
+            assert "relay.db: in use by another process" in capsys.readouterr().err
+    assert not Path(f"{relay}.new").exists()
+
+
+def test_missing_store_and_existing_output(relay: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (["check", tmp_path / "no.db"], ["salvage", tmp_path / "no.db", "--out", tmp_path / "new.db"]):
+        assert run(*command) == 2
+        assert "no.db: got 'no such file'" in capsys.readouterr().err
+    assert not (tmp_path / "no.db").exists()
+    assert run("salvage", relay, "--out", relay) == 2
+    assert "relay.db exists" in capsys.readouterr().err
+
+
+@pytest.fixture
+def salvaged(relay: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., Iterator[Store]]:
+    """Salvage a damaged store and open the new one; fails if the damaged one was changed."""
+    opened = []
+
+    def salvage(status: int = 1) -> tuple[Store, str]:
+        before = relay.read_bytes()
+        out = relay.with_name("new.db")
+        assert run("salvage", relay, "--out", out) == status
+        assert relay.read_bytes() == before
+        assert out.stat().st_mode & 0o777 == 0o600
+        opened.append(Store(out))
+        return opened[-1], capsys.readouterr().out
+
+    yield salvage
+    for store in opened:
+        store.close()
+
+
+def numbers(store: Store) -> set[int]:
+    items = queued_items(store, "c2", 9999)
+    assert all(item.payload == payload(item.seq - 1) for item in items)
+    return {item.seq for item in items}
+
+
+def test_salvage_of_a_sound_store_copies_everything(relay: Path, salvaged: Callable[..., tuple[Store, str]]) -> None:
+    with closing(Store(relay)) as old:
+        origin = old.origin
+    new, text = salvaged(0)
+    assert new.origin == origin
+    assert numbers(new) == set(range(1, RECORDS + 1))
+    assert [item.payload for item in new.inbox_items(99)] == [payload(number) for number in range(40)]
+    assert new.get_state("name") == b"value"
+    assert new.refused_count() == 1
+    assert send(new, b"next", consumer="c2") == [RECORDS + 1]
+    with new.transaction() as tx:
+        tx.accept("k", b"next")
+    assert new.inbox_items(99)[-1].id == 41
+    assert re.search(rf"^outbox +{RECORDS + 1} +0 +-$", text, re.MULTILINE)
+
+
+def test_salvage_around_damaged_pages(relay: Path, salvaged: Callable[..., tuple[Store, str]]) -> None:
+    lost: set[int] = set()
+    data = relay.read_bytes()
+    for number in (20, 100, 101, 102, 250):
+        page = next(p for p in pages_with(payload(number), data) if data[p * PAGE] == 13)
+        lost |= {n + 1 for n in range(RECORDS) if payload(n) in data[page * PAGE : (page + 1) * PAGE]}
+        overwrite_page(relay, page)
+    with pytest.raises(DeliveryError, match=r"recover the records: sonarpost store salvage \S*relay\.db --out NEW"):
+        Store(relay)
+    assert run("check", relay) == 1
+    new, text = salvaged()
+    assert 5 <= len(lost) <= 20
+    queued = numbers(new)
+    inbox = {item.payload for item in new.inbox_items(99)}
+    assert (set(range(1, RECORDS + 1)) - queued) | {n + 1 for n in range(40) if payload(n) not in inbox} == lost
+    assert queued_items(new, "c2@north", 9)[0].payload == b"large" * 10_000
+    assert new.get_state("name") == b"value"
+    assert re.search(r"^outbox +\d+ +0 +row \d+ to \d+, ", text, re.MULTILINE)
+
+
+def test_record_with_a_wrong_digest_is_quarantined(relay: Path, salvaged: Callable[..., tuple[Store, str]]) -> None:
+    page = pages_with(b"large" * 500, relay.read_bytes())[2]
+    overwrite_page(relay, page, relay.read_bytes()[page * PAGE :][:PAGE].replace(b"large", b"other"))
+    new, text = salvaged()
+    assert queued_items(new, "c2@north", 9) == ()
+    assert len(numbers(new)) == RECORDS
+    assert re.search(rf"^outbox +{RECORDS} +1 +-$", text, re.MULTILINE)
+    reasons = new._query("SELECT direction, reason FROM refused ORDER BY id")
+    assert reasons == [("in", "refused by a test"), ("out", "salvage: the digest of the record is wrong")]
+
+
+@pytest.mark.parametrize(("size", "part"), [(100, "header of the first page"), (PAGE, "first page")])
+def test_first_page_is_replaced(
+    size: int, part: str, relay: Path, salvaged: Callable[..., tuple[Store, str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    overwrite_page(relay, 0, os.urandom(size))
+    with pytest.raises(DeliveryError, match=r"file is not a database; .*sonarpost store salvage"):
+        Store(relay)
+    assert run("check", relay) == 1
+    assert "file is not a database" in capsys.readouterr().out
+    new, text = salvaged()
+    assert f"The {part} was unreadable and was replaced by that of a new store." in text
+    assert numbers(new) == set(range(1, RECORDS + 1))
+    assert new.inbox_depth() == 40
+
+
+def test_other_file_is_not_salvaged(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    relay.write_bytes(os.urandom(20 * PAGE))
+    out = relay.with_name("new.db")
+    status = run("salvage", relay, "--out", out)
+    assert status in (1, 2)
+    relay.write_text("text")
+    assert run("salvage", relay, "--out", relay.with_name("new2.db")) == 2
+    assert not relay.with_name("new2.db").exists()
+    assert "relay.db: got " in capsys.readouterr().err
+
+
+def test_old_records_have_an_age(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with closing(sqlite3.connect(relay)) as db, db:
+        db.execute("UPDATE outbox SET created_utc_s = ? WHERE consumer = 'c2'", (time.time() - 1000.0,))
+    assert run("check", relay) == 0
+    found = re.search(r"^c2 .* (\d+) s ", capsys.readouterr().out, re.MULTILINE)
+    assert found
+    assert 1000 <= int(found.group(1)) < 1100
