@@ -71,7 +71,8 @@ RUN groupadd --gid 10001 sonarpost \
     && install -d -o sonarpost -g sonarpost /var/lib/sonarpost /var/lib/sonarpost/state /var/lib/sonarpost/incoming \
         /var/lib/sonarpost/pictures \
     && install -d -m 0700 -o sonarpost -g sonarpost /var/lib/sonarpost/pki /var/lib/sonarpost/tls \
-        /var/lib/sonarpost/tls/shore /var/lib/sonarpost/tls/vessel
+        /var/lib/sonarpost/tls/shore /var/lib/sonarpost/tls/vessel \
+        /var/lib/sonarpost/acoustic /var/lib/sonarpost/acoustic/uuv /var/lib/sonarpost/acoustic/vessel
 COPY --from=dependencies /opt/sonarpost /opt/sonarpost
 COPY packaging/bin/ /usr/local/bin/
 COPY config/ /etc/sonarpost/

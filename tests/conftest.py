@@ -71,7 +71,11 @@ def platform(router: str, tmp_path: Path) -> Callable[[str], PlatformConfig]:
 
     def make(platform_id: str) -> PlatformConfig:
         return PlatformConfig(
-            id=platform_id, router=(router,), state_dir=tmp_path / "state" / platform_id, health_interval_s=0.1
+            id=platform_id,
+            router=(router,),
+            state_dir=tmp_path / "state" / platform_id,
+            health_interval_s=0.1,
+            acoustic_auth="none",
         )
 
     return make

@@ -89,7 +89,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "frame_count": [-1, 9],
         "data": [b"x" * 2049],
     },
-    SAMPLES["received-image-v1"].__class__: {
+    SAMPLES["received-image-v1-authenticated"].__class__: {
         "vessel_id": NO_NAME,
         "vehicle_id": NO_NAME,
         "image_id": NO_IMAGE,
@@ -106,7 +106,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "first_frame_utc_s": NO_TIME,
         "last_frame_utc_s": NO_TIME,
     },
-    SAMPLES["reconstructed-image-complete"].__class__: {
+    SAMPLES["reconstructed-image-authenticated"].__class__: {
         "vessel_id": NO_NAME,
         "vehicle_id": NO_NAME,
         "image_id": NO_IMAGE,
@@ -132,7 +132,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "created_utc_s": NO_TIME,
         "data": [b"", b"x" * 1025],
     },
-    SAMPLES["received-message"].__class__: {
+    SAMPLES["received-message-authenticated"].__class__: {
         "vessel_id": NO_NAME,
         "vehicle_id": NO_NAME,
         "received_utc_s": NO_TIME,
@@ -240,6 +240,9 @@ ANY_VALUE = {
     ("reconstructed_image", "contact"),
     ("reconstructed_image", "picture"),
     ("reconstructed_image", "complete"),
+    ("received_image", "authenticated"),
+    ("received_message", "authenticated"),
+    ("reconstructed_image", "authenticated"),
     ("relayed", "payload"),
 }
 

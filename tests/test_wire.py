@@ -268,7 +268,7 @@ def of(sample: str, **change: object) -> bytes:
         ("raster-8-bits", {"data": b"1"}, "data", "data: got b'1', expected 6 bytes for 3 x 2 px of 8 bits, not 1"),
         ("health", {"gauges": {"a": math.inf}}, "gauges.a", "gauges.a: got inf, expected a finite number"),
         (
-            "reconstructed-image-damaged",
+            "reconstructed-image-unauthenticated",
             {"missing_mask": b"12"},
             "missing_mask",
             "missing_mask: got b'12', expected 0 or 1 bytes, not 2",

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import to_json
@@ -119,8 +119,10 @@ class PlatformConfig(ServiceConfig):
         tls: The host's own certificate; required if `router` or `upstream` has a `tls/...` endpoint.
         upstream: Endpoints of the routers that the platform's router links to. Services do not connect to them; the
             relay probes them if the shore does not reply, to report the reason.
-        acoustic_key_file: Key shared by vehicles and vessel. With it, the `v1` acoustic link sends and accepts
-            authenticated frames only.
+        acoustic_auth: Authentication of the acoustic link. "key": uuv_modem and op_modem send and accept frames
+            authenticated with `acoustic_key_file` only, and do not start without it. "none": frames are not
+            authenticated, and every modem in range can forge them.
+        acoustic_key_file: Key shared by vehicles and vessel; `sonarpost pki acoustic` creates it. Not read with "none".
         health_interval_s: Interval of the health records.
         log_level: Least severity of log lines: debug, info, warning or error.
         log_format: Log lines as text or as JSON objects.
@@ -131,6 +133,7 @@ class PlatformConfig(ServiceConfig):
     tls: TlsConfig | None = None
     upstream: tuple[str, ...] = ()
     state_dir: Path = Path("state")
+    acoustic_auth: Literal["key", "none"] = "key"
     acoustic_key_file: Path | None = None
     health_interval_s: Annotated[float, Field(ge=0.05, le=3600)] = 5.0
     log_level: Annotated[str, Field(pattern="^(debug|info|warning|error)$")] = "info"

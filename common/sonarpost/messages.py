@@ -299,6 +299,8 @@ class ReceivedImage(Record):
         conflicts: Frames that contradict others of this image.
         first_frame_utc_s: Arrival of the first frame, by the vessel's clock.
         last_frame_utc_s: Arrival of the last frame that contributed.
+        authenticated: Whether all acoustic frames that contributed were authenticated with a key. None: not known, in
+            records of earlier versions.
     """
 
     TYPE: ClassVar[str] = "received_image"
@@ -320,6 +322,7 @@ class ReceivedImage(Record):
     conflicts: Count
     first_frame_utc_s: Time
     last_frame_utc_s: Time
+    authenticated: bool | None = None
 
     @field_validator("missing")
     @classmethod
@@ -359,6 +362,8 @@ class ReconstructedImage(Record):
         first_frame_utc_s: Arrival of the first frame, by the vessel's clock.
         last_frame_utc_s: Arrival of the last frame.
         notes: Remarks for the operator about this image.
+        authenticated: Whether all acoustic frames that contributed were authenticated with a key. None: not known, in
+            records of earlier versions.
     """
 
     TYPE: ClassVar[str] = "reconstructed_image"
@@ -382,6 +387,7 @@ class ReconstructedImage(Record):
     first_frame_utc_s: Time
     last_frame_utc_s: Time
     notes: tuple[Text, ...] = ()
+    authenticated: bool | None = None
 
     @field_validator("picture_sha256")
     @classmethod
@@ -493,6 +499,8 @@ class ReceivedMessage(Record):
         vehicle_id: Vehicle that sent it, identified by the address of its modem.
         received_utc_s: When it was received.
         data: Content, as its source on the vehicle gave it.
+        authenticated: Whether its acoustic frames were authenticated with a key. None: not known, in records of earlier
+            versions.
     """
 
     TYPE: ClassVar[str] = "received_message"
@@ -501,6 +509,7 @@ class ReceivedMessage(Record):
     vehicle_id: PlatformId
     received_utc_s: Time
     data: Annotated[bytes, Field(min_length=1, max_length=4096)]
+    authenticated: bool | None = None
 
 
 class DownlinkState(Record):

@@ -92,6 +92,7 @@ def _record(
         first_frame_utc_s=received.first_frame_utc_s,
         last_frame_utc_s=received.last_frame_utc_s,
         notes=tuple(notes),
+        authenticated=received.authenticated,
     )
 
 

@@ -12,7 +12,7 @@ from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import ReceivedImage, ReconstructedImage, Record
 from sonarpost.runtime.service import Service, UnitOfWork
-from sonarpost.security.acoustic_key import read_key
+from sonarpost.security.acoustic_key import link_key
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.decoder import Decoder
 from sonarpost.services.decompressor.migration import migrate_store
@@ -36,8 +36,7 @@ class DecompressorService(Service[DecompressorConfig]):
 
     def start(self) -> bool:
         """Convert the frames and the receiver state that version 0.1 left in the store, then start."""
-        key_file = self.platform.acoustic_key_file
-        migrate_store(self.store, self.platform.id, lambda: None if key_file is None else read_key(key_file))
+        migrate_store(self.store, self.platform.id, lambda: link_key(self.platform))
         return super().start()
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:

@@ -27,6 +27,10 @@ class OpModemConfig(ModemServiceConfig):
         wire_formats: Accepted wire formats; each frame identifies its own. With `acoustic_key_file`, "v1" only.
         pairing_timeout_s: "paper" format: wait for the rest of an image after its last frame.
         vehicles: Vehicle names by modem address; a vehicle that is not listed is named modem-{address}.
+        max_images_per_hour: New images that are decoded of each vehicle and hour; further ones wait. Vehicles that are
+            not in `vehicles` share one allowance.
+        max_image_bytes_per_hour: Pixels and coded bytes that are decoded of each vehicle and hour; further versions of
+            its images wait.
         image_consumers: Services on the vessel that receive the coded images.
         message_consumers: Services on the vessel that receive the vehicles' messages; without any, messages are
             published only.
@@ -55,6 +59,8 @@ class OpModemConfig(ModemServiceConfig):
     wire_formats: Annotated[tuple[WireFormat, ...], Field(min_length=1)] = ("v1", "paper")
     pairing_timeout_s: Seconds = 120.0
     vehicles: dict[Annotated[str, Field(pattern=r"^[0-9]{1,3}$")], PlatformId] = Field(default_factory=dict)
+    max_images_per_hour: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
+    max_image_bytes_per_hour: Annotated[int, Field(ge=1 << 20, le=1 << 40)] = 32 << 20
     image_consumers: tuple[ConsumerName, ...] = ("decompressor",)
     message_consumers: tuple[ConsumerName, ...] = ()
     downlink_rate: RateNumber = 0

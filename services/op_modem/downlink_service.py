@@ -24,7 +24,6 @@ from sonarpost.messages import Command, Decision, Record
 from sonarpost.modem.micromodem import RATES, FrameReceived, PacketFailed, PacketSent
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import UnitOfWork
-from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.packets import sent_frames
 from sonarpost.services.op_modem.transmit_gate import TransmitGate
@@ -36,6 +35,8 @@ _STATE_0_1 = "station"
 """The whole state in one value, as version 0.1 saved it."""
 _PARTS = "station/"
 _COUNTER_LIMIT = "seal-limit/"
+_AUTHENTICATED_SINCE = "authenticated-since"
+_UNFINISHED_BLOCKS = ("link/v1/block", "link/v1/rival")
 
 
 class DownlinkService(ModemService[OpModemConfig]):
@@ -45,15 +46,16 @@ class DownlinkService(ModemService[OpModemConfig]):
     ahead of the disk; the next step then begins with the last committed state.
 
     Raises:
-        ConfigError: The key file cannot be read or is not private to its owner, or no wire format remains with a key.
+        ConfigError: As `ModemService`, or no wire format remains that is authenticated.
     """
 
     def __init__(self, platform: PlatformConfig, config: OpModemConfig) -> None:
         # Before the store is opened, so that a configuration error leaves no open store.
-        self._key = None if platform.acoustic_key_file is None else read_key(platform.acoustic_key_file)
-        if self._key is not None and "v1" not in config.wire_formats:
-            raise ConfigError("[op_modem]", "wire_formats", config.wire_formats, '"v1" where acoustic_key_file is set')
+        if platform.acoustic_auth != "none" and "v1" not in config.wire_formats:
+            expected = '"v1", or acoustic_auth = "none" in [platform]: the paper format has no authentication'
+            raise ConfigError("[op_modem]", "wire_formats", config.wire_formats, expected)
         super().__init__(platform, config)
+        self._authenticated_since_s = self._begin_authentication()
         self._partial_packet: list[FrameReceived] = []
         self._gate = TransmitGate(config)
         self._link_lock = threading.RLock()
@@ -66,11 +68,35 @@ class DownlinkService(ModemService[OpModemConfig]):
 
     def _new_link(self) -> VesselLink:
         authenticator = None
-        if self._key is not None:
-            limit = int(self.store.get_state(_COUNTER_LIMIT + self._key.fingerprint) or b"0")
+        if self.key is not None:
+            limit = int(self.store.get_state(_COUNTER_LIMIT + self.key.fingerprint) or b"0")
             address = self.config.address
-            authenticator = FrameAuthenticator(self._key, address, Direction.TO_VEHICLE, first_counter=limit)
-        return VesselLink(self.platform.id, self.config, authenticator)
+            authenticator = FrameAuthenticator(self.key, address, Direction.TO_VEHICLE, first_counter=limit)
+        return VesselLink(self.platform.id, self.config, authenticator, self._authenticated_since_s)
+
+    def _begin_authentication(self) -> float:
+        """Return the time from which on the store holds content of authenticated frames only, UTC in seconds.
+
+        When authentication is switched on, the symbols of unfinished blocks are deleted: together with later frames
+        they would make images of which a part is not authenticated. Images that have begun are kept; their records say
+        that they are not authenticated.
+        """
+        saved = self.store.get_state(_AUTHENTICATED_SINCE)
+        if self.key is not None and saved is not None:
+            return float(saved)
+        with self.store.transaction() as tx:
+            if self.key is None:
+                tx.delete_state(_AUTHENTICATED_SINCE)
+                return 0.0
+            names = self.store.state_names(_PARTS)
+            was_on = any(name.startswith(_PARTS + "authentication/") for name in names)
+            is_new = not names and self.store.get_state(_STATE_0_1) is None
+            since_s = 0.0 if was_on or is_new else time.time()
+            for name in names if since_s else ():
+                if name.removeprefix(_PARTS).startswith(_UNFINISHED_BLOCKS):
+                    tx.delete_state(name)
+            tx.put_state(_AUTHENTICATED_SINCE, str(since_s).encode())
+        return since_s
 
     # Commands
 
@@ -218,10 +244,10 @@ class DownlinkService(ModemService[OpModemConfig]):
 
     def _reserve_counters(self, authenticator: FrameAuthenticator | None) -> None:
         """Store the limit of the authentication counters before they are used."""
-        if authenticator is None or self._key is None or (limit := authenticator.requested_limit) is None:
+        if authenticator is None or self.key is None or (limit := authenticator.requested_limit) is None:
             return
         with self.store.transaction() as tx:
-            tx.put_state(_COUNTER_LIMIT + self._key.fingerprint, str(limit).encode())
+            tx.put_state(_COUNTER_LIMIT + self.key.fingerprint, str(limit).encode())
         authenticator.grant(limit)
 
     def _poll_vehicle(self, now_s: float) -> None:
@@ -293,12 +319,19 @@ class DownlinkService(ModemService[OpModemConfig]):
                 "feedback_open": float(max(endpoint.feedback_open, feedback_in_flight)),
                 "images_incomplete": float(endpoint.incomplete_images),
                 "images_waiting": float(endpoint.next_deadline() is not None),
+                "images_held": float(self._link.limiter.held),
             }
             if authenticator is not None:
                 counts = authenticator.counts
                 gauges |= {"frames_forged": float(counts.forged), "frames_replayed": float(counts.replayed)}
                 gauges |= {"frames_genuine": float(counts.genuine), "key_frames_left": float(authenticator.frames_left)}
             return gauges
+
+    def warning(self) -> str:
+        """Return that the link is unauthenticated, and which vehicles exceed their limits."""
+        names = ", ".join(self._link.limiter.held_names)
+        limits = f"images wait, max_images_per_hour or max_image_bytes_per_hour is reached: {names}" if names else ""
+        return "; ".join(text for text in (super().warning(), limits) if text)
 
     def degraded_reason(self) -> str:
         """Return why the port, the modem or the transmission does not work."""

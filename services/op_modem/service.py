@@ -47,7 +47,7 @@ class OpModemService(DownlinkService):
     With `link = "v1"` the service also sends commands, decisions and feedback to the vehicles.
 
     Raises:
-        ConfigError: The key file cannot be read or is not private to its owner, or no wire format remains with a key.
+        ConfigError: As `DownlinkService`.
     """
 
     NAME = "op_modem"
@@ -60,6 +60,7 @@ class OpModemService(DownlinkService):
         self._storage_error = ""
         self._rejections = 0
         self._last_rejection = ""
+        self._limit_log = self.interval_log(log, logging.WARNING, "Image limit reached")
 
     def start(self) -> bool:
         """Process the frames that version 0.1 left in the outbox, then start."""
@@ -221,16 +222,19 @@ class OpModemService(DownlinkService):
             vehicle_id=self.config.name_of(frame.source),
             received_utc_s=frame.time_utc_s,
             data=data,
+            authenticated=self.key is not None,
         )
 
     def _send_due_images(self) -> None:
-        """Send the images whose wait for more frames has ended."""
+        """Send the images whose wait for more frames, or for the allowance of their vehicle, has ended."""
         with self._link_lock:
-            if self._link.endpoint.next_deadline() is None:
+            now = time.time()
+            releasable = self._link.limiter.can_release(now)
+            if self._link.endpoint.next_deadline() is None and not releasable:
                 return
             with self._link_step() as link:
-                images = link.endpoint.poll(time.time())
-                if images:
+                images = link.endpoint.poll(now)
+                if images or releasable:
                     effects = UnitOfWork()
                     self._send_images(images, effects)
                     self._save_state(effects)
@@ -239,11 +243,24 @@ class OpModemService(DownlinkService):
         self._log_images(images)
 
     def _send_images(self, images: Sequence[ImageUpdate], effects: UnitOfWork) -> None:
+        """Send images as far as the limits of their vehicles permit, and those that have waited for that."""
+        limiter, now = self._link.limiter, time.time()
+        effects.count("images_received", len(images))
+        self._send_payloads(limiter.release(now), effects)
         for image in images:
-            payload = wire.encode(self._link.image_record(image))
+            record = self._link.image_record(image)
+            accepted = limiter.add(record, wire.encode(record))
+            payloads = limiter.release(now)
+            self._send_payloads(payloads, effects)
+            if not (accepted and payloads):
+                effects.count("images_limited" if accepted else "images_dropped")
+                fields = {"action": "held" if accepted else "dropped", "waiting": limiter.held}
+                self._limit_log.log(vehicle=record.vehicle_id, image_id=record.image_id, **fields)
+
+    def _send_payloads(self, payloads: Sequence[bytes], effects: UnitOfWork) -> None:
+        for payload in payloads:
             for consumer in self.config.image_consumers:
                 effects.send_payload(keys.acoustic_image(self.platform.id), consumer, payload, ReceivedImage)
-            effects.count("images_received")
 
     def _log_images(self, images: Sequence[ImageUpdate]) -> None:
         for image in images:

@@ -14,8 +14,9 @@ from sonarpost.link.state import Parts, below, prefixed, unpack_plain
 from sonarpost.messages import Command, Contact, Decision, DownlinkState, ReceivedImage
 from sonarpost.modem.micromodem import RATES
 from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.image_limiter import ImageLimiter
 
-_LINK, _AUTHENTICATION = "link/", "authentication/"
+_LINK, _AUTHENTICATION, _LIMITS = "link/", "authentication/", "limits/"
 _MESSAGE_OVERHEAD_BYTES = 3  # kind, length and number of a message segment
 LATEST_UTC_S = 2**32 - 1
 
@@ -27,12 +28,23 @@ class VesselLink:
         vessel_id: Name of the vessel in records.
         config: Configuration of op_modem.
         authenticator: Authenticates frames; None without a key.
+        authenticated_since_s: UTC in seconds; an image whose first frame is older counts as unauthenticated.
     """
 
-    def __init__(self, vessel_id: str, config: OpModemConfig, authenticator: FrameAuthenticator | None = None) -> None:
+    def __init__(
+        self,
+        vessel_id: str,
+        config: OpModemConfig,
+        authenticator: FrameAuthenticator | None = None,
+        authenticated_since_s: float = 0.0,
+    ) -> None:
         self._vessel_id = vessel_id
         self._config = config
         self.authenticator = authenticator
+        self._authenticated_since_s = authenticated_since_s
+        self.limiter = ImageLimiter(
+            config.max_images_per_hour, config.max_image_bytes_per_hour, frozenset(config.vehicles.values())
+        )
         self.commands = CommandTracker(config.retry_s)
         self.endpoint = VesselEndpoint(
             self.commands,
@@ -103,11 +115,12 @@ class VesselLink:
 
     def image_record(self, update: ImageUpdate) -> ReceivedImage:
         """Return the record of an image's received content."""
-        return received_image(update, self._vessel_id, self._config.name_of(update.source))
+        authenticated = self.authenticator is not None and update.first_frame_s >= self._authenticated_since_s
+        return received_image(update, self._vessel_id, self._config.name_of(update.source), authenticated=authenticated)
 
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`."""
-        parts = prefixed(_LINK, self.endpoint.parts())
+        parts = {**prefixed(_LINK, self.endpoint.parts()), **prefixed(_LIMITS, self.limiter.parts())}
         if self.authenticator is None:
             return parts
         return {**parts, **prefixed(_AUTHENTICATION, self.authenticator.parts())}
@@ -115,6 +128,7 @@ class VesselLink:
     def restore(self, parts: Parts) -> dict[str, FrameError]:
         """Replace the state by saved parts; return why parts were skipped. The state of another key is ignored."""
         errors = {_LINK + name: error for name, error in self.endpoint.restore(below(_LINK, parts)).items()}
+        errors |= {_LIMITS + name: error for name, error in self.limiter.restore(below(_LIMITS, parts)).items()}
         if self.authenticator is not None:
             skipped = self.authenticator.restore(below(_AUTHENTICATION, parts))
             errors |= {_AUTHENTICATION + name: error for name, error in skipped.items()}
@@ -135,10 +149,18 @@ class VesselLink:
         self.restore(parts)
 
 
-def received_image(update: ImageUpdate, vessel_id: str, vehicle_id: str) -> ReceivedImage:
+def received_image(
+    update: ImageUpdate, vessel_id: str, vehicle_id: str, *, authenticated: bool | None = None
+) -> ReceivedImage:
     """Return the record of an image's received content.
 
     The link does not carry the detector's contact identifier: the record has vehicle and image identifier instead.
+
+    Args:
+        update: The content.
+        vessel_id: Name of the vessel.
+        vehicle_id: Name of the vehicle.
+        authenticated: Whether all frames of the image were authenticated; None if that is not known.
 
     Raises:
         ValidationError: A value does not fit the record.
@@ -182,6 +204,7 @@ def received_image(update: ImageUpdate, vessel_id: str, vehicle_id: str) -> Rece
         conflicts=update.conflicts,
         first_frame_utc_s=update.first_frame_s,
         last_frame_utc_s=update.last_frame_s,
+        authenticated=authenticated,
     )
 
 

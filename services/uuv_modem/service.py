@@ -14,7 +14,7 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem
-from sonarpost.errors import BadInputError, DeliveryError, RetryLaterError
+from sonarpost.errors import BadInputError, ConfigError, DeliveryError, RetryLaterError
 from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame, EncodedImage, OutgoingMessage, Record
 from sonarpost.modem.micromodem import (
@@ -52,17 +52,21 @@ class UuvModemService(ModemService[UuvModemConfig]):
     twice.
 
     Raises:
-        ConfigError: The port has an unsupported kind of URL, or the key file cannot be read.
+        ConfigError: As `ModemService`, or `link` is "paper" and frames are to be authenticated.
     """
 
     NAME = "uuv_modem"
     BATCH = 64
 
     def __init__(self, platform: PlatformConfig, config: UuvModemConfig) -> None:
+        if config.link == "paper" and platform.acoustic_auth != "none":
+            expected = '"v1", or acoustic_auth = "none" in [platform]: the paper format has no authentication'
+            raise ConfigError("[uuv_modem]", "link", config.link, expected)
         super().__init__(platform, config)
         try:
             self._migrate()
-            self._endpoint = VehicleEndpoint(platform, config, self.store)
+            rejection_log = self.interval_log(log, logging.WARNING, "Frame rejected")
+            self._endpoint = VehicleEndpoint(platform, config, self.store, self.key, rejection_log)
         except BaseException:
             self.store.close()
             raise

@@ -18,7 +18,7 @@ from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.errors import BadInputError, FrameError
 from sonarpost.link import migration
 from sonarpost.link.auth.authentication import FrameAuthenticator
-from sonarpost.link.auth.key import Direction
+from sonarpost.link.auth.key import AcousticKey, Direction
 from sonarpost.link.downlink.messages import (
     CommandOutcome,
     ConfirmationMessage,
@@ -39,9 +39,8 @@ from sonarpost.link.queue.transmit_queue import TransmitQueue
 from sonarpost.link.receiver import FeedbackReceived, FrameRejected, MessageReceived
 from sonarpost.link.sender import ImageSender, ImageToSend, OutgoingPacket
 from sonarpost.link.state import SavedParts, below, prefixed, unpack_plain
-from sonarpost.logs import kv
+from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import Contact, EncodedImage, OutgoingMessage, QueuedImage, QueueState
-from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.received_commands import ReceivedCommands
 from sonarpost.sonar.survey import Side
@@ -78,19 +77,25 @@ class VehicleEndpoint:
         platform: The vehicle.
         config: Configuration of the service.
         store: Holds the state.
-
-    Raises:
-        ConfigError: The key file cannot be read, or other users may read it.
+        key: Authenticates frames; None for none. The `paper` format has no authentication.
+        rejection_log: Logs rejected frames.
     """
 
-    def __init__(self, platform: PlatformConfig, config: UuvModemConfig, store: Store) -> None:
+    def __init__(
+        self,
+        platform: PlatformConfig,
+        config: UuvModemConfig,
+        store: Store,
+        key: AcousticKey | None = None,
+        rejection_log: IntervalLog | None = None,
+    ) -> None:
         self._platform_id = platform.id
         self._config = config
         self._store = store
         self._is_v1 = config.link == "v1"
         self._prefix = f"{config.link}/"
-        key_file = platform.acoustic_key_file if self._is_v1 else None
-        self._key = None if key_file is None else read_key(key_file)
+        self._key = key
+        self._rejection_log = rejection_log or IntervalLog(log, logging.WARNING, "Frame rejected")
         self._lock = threading.RLock()
         self._stale = True
         self._reset()
@@ -310,7 +315,7 @@ class VehicleEndpoint:
         forged = self.authenticator is not None and event.reason.field == "tag"
         replayed = self.authenticator is not None and event.reason.field == "counter"
         self._effects.count("frames_forged" if forged else "frames_replayed" if replayed else "frames_rejected")
-        log.warning("Frame rejected", extra=kv(source=event.source, reason=str(event.reason)))
+        self._rejection_log.log(source=event.source, reason=str(event.reason))
 
     def _confirm_commands(self, now: float) -> None:
         """Queue the outcomes of received commands, several in one message."""

@@ -89,11 +89,35 @@ def mission(out_dir: Path) -> Path:
     )
 
 
-def golden_files(contacts: ContactSet) -> dict[str, bytes]:
-    """Return all text exports by the name of their golden file."""
+def authenticated_mission(out_dir: Path) -> Path:
+    """Write an authenticated contact, and one whose frames had no authentication."""
+    return store(
+        out_dir,
+        image("0001", authenticated=True),
+        image("0002", {"lat_deg": 41.5261}, authenticated=False),
+    )
+
+
+MISSIONS = {"mission": mission, "authenticated": authenticated_mission}
+
+
+def golden_files(name: str, contacts: ContactSet) -> dict[str, bytes]:
+    """Return all text exports of a mission by the name of their golden file."""
     return {
-        "mission.geojson": geojson_bytes(contacts),
-        "mission.kml": kml_bytes(contacts),
-        "mission.csv": csv_bytes(contacts),
-        "mission.cot": b"\n".join(cot_events(contacts, FIRST_UTC_S + 3600)) + b"\n",
+        f"{name}.geojson": geojson_bytes(contacts),
+        f"{name}.kml": kml_bytes(contacts),
+        f"{name}.csv": csv_bytes(contacts),
+        f"{name}.cot": b"\n".join(cot_events(contacts, FIRST_UTC_S + 3600)) + b"\n",
     }
+
+
+def without_authenticated(name: str, data: bytes) -> bytes:
+    """Return an export without the property `authenticated`, as files of earlier versions are."""
+    if name.endswith(".geojson"):
+        document = json.loads(data)
+        for properties in [f["properties"] for f in document["features"]] + document["unlocated"]:
+            assert properties.pop("authenticated") is None
+        return (json.dumps(document, ensure_ascii=False, indent=1) + "\n").encode()
+    if name.endswith(".csv"):
+        return data.replace(b",authenticated\r\n", b"\r\n").replace(b",\r\n", b"\r\n")
+    return data

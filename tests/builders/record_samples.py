@@ -81,6 +81,7 @@ COMPLETE_IMAGE = ReconstructedImage(
     first_frame_utc_s=1476262801.0,
     last_frame_utc_s=1476262833.5,
     notes=(),
+    authenticated=True,
 )
 
 DAMAGED_IMAGE = ReconstructedImage(
@@ -99,6 +100,7 @@ DAMAGED_IMAGE = ReconstructedImage(
     bytes_total=232,
     frames_received=2,
     notes=("1 frames disagreed with others of this image",),
+    authenticated=False,
 )
 
 PREVIEW_GONE = QueuedImage(
@@ -117,8 +119,12 @@ SAMPLES: dict[str, Record] = {
         created_utc_s=1476262800.25,
         data=b"\x01\x02battery 80",
     ),
-    "received-message": ReceivedMessage(
-        vessel_id="vessel-1", vehicle_id="uuv-1", received_utc_s=1476262830.5, data=b"\x01\x02battery 80"
+    "received-message-authenticated": ReceivedMessage(
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        received_utc_s=1476262830.5,
+        data=b"\x01\x02battery 80",
+        authenticated=True,
     ),
     "downlink-state-asked": DownlinkState(
         vessel_id="vessel-1",
@@ -210,7 +216,7 @@ SAMPLES: dict[str, Record] = {
         frame_count=None,
         data=b"",
     ),
-    "received-image-v1": ReceivedImage(
+    "received-image-v1-authenticated": ReceivedImage(
         vessel_id="vessel-1",
         vehicle_id="uuv-1",
         image_id="00A7",
@@ -228,8 +234,9 @@ SAMPLES: dict[str, Record] = {
         conflicts=0,
         first_frame_utc_s=1476262801.0,
         last_frame_utc_s=1476262833.5,
+        authenticated=True,
     ),
-    "received-image-paper": ReceivedImage(
+    "received-image-paper-unauthenticated": ReceivedImage(
         vessel_id="vessel-1",
         vehicle_id="modem-3",
         image_id="00A7",
@@ -247,9 +254,10 @@ SAMPLES: dict[str, Record] = {
         conflicts=1,
         first_frame_utc_s=1476262801.0,
         last_frame_utc_s=1476262833.5,
+        authenticated=False,
     ),
-    "reconstructed-image-complete": COMPLETE_IMAGE,
-    "reconstructed-image-damaged": DAMAGED_IMAGE,
+    "reconstructed-image-authenticated": COMPLETE_IMAGE,
+    "reconstructed-image-unauthenticated": DAMAGED_IMAGE,
     "decision-full": Decision(
         decision_id="d-1",
         vessel_id="vessel-1",

@@ -131,6 +131,7 @@ def images(draw: st.DrawFn) -> ReconstructedImage:
         first_frame_utc_s=draw(_time),
         last_frame_utc_s=draw(_time),
         notes=tuple(draw(st.lists(_text(0, 2000), max_size=3))),
+        authenticated=draw(_maybe(st.booleans())),
     )
 
 
@@ -156,6 +157,7 @@ def received_images(draw: st.DrawFn) -> ReceivedImage:
         conflicts=draw(_count),
         first_frame_utc_s=draw(_time),
         last_frame_utc_s=draw(_time),
+        authenticated=draw(_maybe(st.booleans())),
     )
 
 

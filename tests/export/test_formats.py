@@ -14,7 +14,16 @@ import numpy as np
 import pytest
 import xmlschema
 from builders.common import GOLDEN_FOLDER
-from builders.exports import FIRST_UTC_S, decision, golden_files, image, mission, store
+from builders.exports import (
+    FIRST_UTC_S,
+    authenticated_mission,
+    decision,
+    golden_files,
+    image,
+    mission,
+    store,
+    without_authenticated,
+)
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -50,7 +59,30 @@ def single(record: object, *decisions: Decision) -> ContactSet:
 
 @pytest.mark.parametrize("name", ["mission.geojson", "mission.kml", "mission.csv", "mission.cot"])
 def test_output_equals_golden_file(contacts: ContactSet, name: str) -> None:
-    assert golden_files(contacts)[name] == (GOLDEN / name).read_bytes()
+    # The files are older than the property `authenticated`.
+    assert without_authenticated(name, golden_files("mission", contacts)[name]) == (GOLDEN / name).read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["geojson", "kml", "csv", "cot"])
+def test_every_export_marks_unauthenticated_contacts(tmp_path: Path, kind: str) -> None:
+    name = f"authenticated.{kind}"
+    output = golden_files("authenticated", load_contacts(authenticated_mission(tmp_path)))[name]
+    assert output == (GOLDEN / name).read_bytes()
+    marks = {
+        "geojson": b'"authenticated": false',
+        "kml": b"<name>uuv-1/0002 (unauthenticated)</name>",
+        "csv": b",false\r\n",
+        "cot": b"Unauthenticated: any modem in range",
+    }
+    assert output.count(marks[kind]) == 1
+
+
+def test_images_of_earlier_versions_have_no_statement_about_authentication(contacts: ContactSet) -> None:
+    assert {contact.image.authenticated for contact in contacts.contacts} == {None}
+    assert "authenticated" not in side_car(image())
+    assert side_car(image(authenticated=False))["authenticated"] is False
+    files = golden_files("mission", contacts)
+    assert not any(b"nauthenticated" in data for data in files.values())
 
 
 def test_written_files_equal_the_bytes(contacts: ContactSet, tmp_path: Path) -> None:

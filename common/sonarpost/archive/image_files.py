@@ -23,8 +23,12 @@ def image_file_name(image: ReconstructedImage) -> str:
 
 
 def side_car(image: ReconstructedImage) -> dict[str, object]:
-    """Return the content of the JSON file: all fields but the pixels, missing areas as a count and a range of rows."""
-    fields = image.model_dump(exclude={"picture", "missing_mask"})
+    """Return the content of the JSON file: all fields but the pixels, missing areas as a count and a range of rows.
+
+    `authenticated` is absent if it is not known, as in files of earlier versions.
+    """
+    unknown = {"authenticated"} if image.authenticated is None else set()
+    fields = image.model_dump(exclude={"picture", "missing_mask", *unknown})
     rows = np.flatnonzero(image.missing().any(axis=1))
     return {
         "type": image.TYPE,

@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from sonarpost.cli.parsers import Subparsers, add_command, aligned
 from sonarpost.files import PUBLIC_FILE, write_atomically, write_new
 from sonarpost.keys import SHORE
+from sonarpost.security.acoustic_key import KEY_NAME, create_key
 from sonarpost.security.fleet import (
     AUTHORITY_DAYS,
     CA_CERTIFICATE,
@@ -37,7 +38,9 @@ UPDATE_ROUTERS = "write the routers' configurations again (`sonarpost pki router
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add the command and its actions."""
-    actions = add_command(subparsers, "pki", "certificates of the fleet and access control of its routers")
+    actions = add_command(
+        subparsers, "pki", "certificates of the fleet, access control of its routers, key of its acoustic link"
+    )
 
     init = _add_action(actions, "init", run_init, "create the fleet's authority in a new folder")
     init.add_argument("--fleet", default="sonarpost", metavar="NAME", help="name of the fleet")
@@ -66,6 +69,12 @@ def add_parser(subparsers: Subparsers) -> None:
 
     router = _add_action(actions, "router-config", run_router_config, "write a router's configuration (JSON5)")
     _add_router_options(router)
+
+    acoustic = _add_action(actions, "acoustic", run_acoustic, "create the key of the acoustic link")
+    acoustic.add_argument("--out", type=Path, metavar="FILE", help=f"key file (default: DIR/{KEY_NAME})")
+    acoustic.add_argument(
+        "--replace", action="store_true", help="overwrite an existing key, which every vehicle and vessel must replace"
+    )
 
 
 def _add_action(
@@ -226,6 +235,21 @@ def run_router_config(args: argparse.Namespace) -> int:
             write_new(args.out, text.encode(), PUBLIC_FILE)
         except FileExistsError as error:
             raise PkiError(str(args.out), "", "an existing file", "a new file, or --replace") from error
+    return 0
+
+
+def run_acoustic(args: argparse.Namespace) -> int:
+    """Create the key that vehicles and vessels share; return 0."""
+    path = args.folder / KEY_NAME if args.out is None else args.out
+    if not path.parent.is_dir():
+        raise PkiError(str(path.parent), "", "no folder", "a fleet of `sonarpost pki init`, or --out FILE")
+    try:
+        key = create_key(path, replace=args.replace)
+    except FileExistsError as error:
+        raise PkiError(str(path), "", "an existing key", "a new file, or --replace") from error
+    print(f"key          {path}")
+    print(f"fingerprint  {key.fingerprint}")
+    print("Copy it to every vehicle and vessel, mode 0600, and name it as acoustic_key_file in [platform].")
     return 0
 
 

@@ -70,6 +70,7 @@ class SideCar(Record):
     first_frame_utc_s: Time
     last_frame_utc_s: Time
     notes: tuple[Text, ...] = ()
+    authenticated: bool | None = None
     height_px: Annotated[int, Field(ge=1, le=4096)]
     width_px: Annotated[int, Field(ge=1, le=4096)]
 

@@ -21,6 +21,8 @@ SEA_MINE: Final = "U-W-M"
 BOTTOM_RETURN: Final = "a-u-U-N-B"
 MEASURED_IN_IMAGE: Final = "m-i"
 """CoT "machine, mensurated": the position was measured in imagery."""
+UNAUTHENTICATED: Final = "Unauthenticated: any modem in range can have forged this contact."
+"""Remark about a contact whose acoustic frames were received without a key."""
 UNKNOWN: Final = "9999999.0"
 """CoT value of an unknown height or error."""
 
@@ -143,6 +145,8 @@ def _add_detail(event: ET.Element, contact: ExportContact) -> None:
     }
     if decision is not None:
         facts |= {"decision": decision.decision_id, "decided": utc_text(decision.decided_utc_s)}
+    if image.authenticated is not None:
+        facts["authenticated"] = "true" if image.authenticated else "false"
     ET.SubElement(detail, "sonarpost", {name: xml_text(value) for name, value in facts.items()})
     remarks = ET.SubElement(detail, "remarks", {"source": "sonarpost", "time": event.get("time", "")})
     remarks.text = xml_text(_remarks(contact))
@@ -152,6 +156,8 @@ def _remarks(contact: ExportContact) -> str:
     """Return the remarks for the operator of the receiving program, with the free text last."""
     image, record, decision = contact.image, contact.image.contact, contact.decision
     parts = [f"{_TITLES[contact.review]}."]
+    if image.authenticated is False:
+        parts.append(UNAUTHENTICATED)
     if record is not None:
         if record.time_utc_s is not None:
             parts.append(f"Seen {utc_text(record.time_utc_s)}.")

@@ -40,6 +40,8 @@ FOLDERS: Final[Mapping[ReviewState, str]] = {
     "unreviewed": "Not reviewed",
     "not_mine_like": "Not mine-like",
 }
+UNAUTHENTICATED: Final = " (unauthenticated)"
+"""End of the name of a contact whose acoustic frames were received without a key."""
 MAX_OVERLAY_M: Final = 1000.0
 ICON_PX: Final = 32
 _MAX_OVERLAY_LATITUDE_DEG: Final = 85.0
@@ -169,7 +171,7 @@ def _add_placemark(folder: ET.Element, contact: ExportContact, *, has_image: boo
     lat_deg, lon_deg = contact.position
     values = contact_properties(contact)
     placemark = _child(folder, "Placemark", id=contact.uid)
-    _child(placemark, "name", contact.name)
+    _child(placemark, "name", contact.name + (UNAUTHENTICATED if contact.image.authenticated is False else ""))
     _child(placemark, "description", _balloon_html(values, f"pictures/{contact.uid}.png" if has_image else None))
     _child(_child(placemark, "TimeStamp"), "when", str(values["seen_utc"] or values["first_frame_utc"]))
     _child(placemark, "styleUrl", f"#{contact.review}")

@@ -80,6 +80,7 @@ _PROPERTIES: Final[Mapping[str, Callable[[ExportContact], Value]]] = {
     "picture_sha256": lambda c: c.image.picture_sha256,
     "picture_file": lambda c: f"{c.image.vessel_id}/{c.image_path.name}" if c.image_path else None,
     "notes": lambda c: "; ".join(c.image.notes),
+    "authenticated": lambda c: c.image.authenticated,
 }
 
 COLUMNS: Final = tuple(_PROPERTIES)

@@ -16,6 +16,7 @@ from sonarpost.modem.micromodem import events as ev
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialPort
 from sonarpost.runtime.service import Service
+from sonarpost.security.acoustic_key import UNAUTHENTICATED, link_key
 
 log = logging.getLogger(__name__)
 
@@ -42,13 +43,18 @@ M = TypeVar("M", bound=ModemServiceConfig)
 class ModemService(Service[M]):
     """A service that drives a Micro-Modem. Subclasses handle events in `on_modem_event`.
 
+    Attributes:
+        key: Authenticates acoustic frames; None with `acoustic_auth = "none"`.
+
     Raises:
-        ConfigError: Unsupported kind of URL.
+        ConfigError: Unsupported kind of URL, no acoustic key is configured, or its file cannot be read or is not
+            private to its owner.
     """
 
     def __init__(self, platform: PlatformConfig, config: M) -> None:
         # Before the store is opened, so that a configuration error leaves no open store.
         self._port = SerialPort(config.port, config.baud)
+        self.key = link_key(platform)
         super().__init__(platform, config)
         driver = MicroModem(MicroModemConfig(config.address, reply_timeout_s=config.reply_timeout_s), config.port)
         self.modem = ModemRunner(driver, self._port, self._on_event)
@@ -59,7 +65,11 @@ class ModemService(Service[M]):
         """Handle an event of the driver; called in the modem's thread."""
 
     def on_start(self) -> None:
-        """Open the port."""
+        """Open the port, and log how acoustic frames are authenticated."""
+        if self.key is None:
+            log.warning("Acoustic link is unauthenticated", extra=kv(reason=UNAUTHENTICATED))
+        else:
+            log.info("Acoustic frames are authenticated", extra=kv(key_fingerprint=self.key.fingerprint))
         self.modem.start()
 
     def on_stop(self) -> None:
@@ -67,14 +77,18 @@ class ModemService(Service[M]):
         self.modem.stop()
 
     def gauges(self) -> Mapping[str, float]:
-        """Return whether the modem is ready."""
-        return {"modem_ready": float(self.modem.ready)}
+        """Return whether the modem is ready, and whether the link is unauthenticated."""
+        return {"modem_ready": float(self.modem.ready), "unauthenticated": float(self.key is None)}
 
     def degraded_reason(self) -> str:
         """Return why the port or the modem does not work."""
         if not self._port.is_open:
             return f"{self.config.port}: {self._port.error or 'not open yet'}"
         return "" if self.modem.ready else self._modem_error
+
+    def warning(self) -> str:
+        """Return that the link is unauthenticated, or nothing."""
+        return UNAUTHENTICATED if self.key is None else ""
 
     def _on_event(self, event: ModemEvent) -> None:
         match event:

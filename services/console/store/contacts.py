@@ -150,6 +150,7 @@ def _update_contact(db: sqlite3.Connection, contact_id: str, image: Reconstructe
         "has_picture": int(bool(image.codec)),
         "height_px": image.picture.height_px,
         "width_px": image.picture.width_px,
+        "authenticated": None if image.authenticated is None else int(image.authenticated),
     }
     columns = ", ".join((*constant, *variable))
     marks = ", ".join("?" * (len(constant) + len(variable)))

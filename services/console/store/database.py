@@ -48,7 +48,7 @@ CREATE TABLE IF NOT EXISTS contact (
     last_frame_utc_s REAL NOT NULL, arrived_utc_s REAL NOT NULL, updated_utc_s REAL NOT NULL,
     complete INTEGER NOT NULL, percent REAL NOT NULL, bytes_received INTEGER NOT NULL, bytes_total INTEGER NOT NULL,
     codec TEXT NOT NULL, has_picture INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL,
-    group_id TEXT
+    group_id TEXT, authenticated INTEGER
 ) WITHOUT ROWID;
 CREATE UNIQUE INDEX IF NOT EXISTS contact_image ON contact (vessel_id, vehicle_id, image_id, first_s);
 CREATE INDEX IF NOT EXISTS contact_updated ON contact (updated_utc_s, id);
@@ -176,6 +176,10 @@ class Database(SqliteFile):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, _SCHEMA, SCHEMA_VERSION)
+        with self.transaction() as db:
+            columns = {row["name"] for row in db.execute("PRAGMA table_info(contact)")}
+            if "authenticated" not in columns:  # a database of version 0.1
+                db.execute("ALTER TABLE contact ADD COLUMN authenticated INTEGER")
 
 
 def insert_row(db: sqlite3.Connection, table: str, values: Mapping[str, object]) -> int:

@@ -122,6 +122,13 @@ _LENGTHS: Final = (
 )
 
 
+_AUTHENTICATION: Final[Mapping[bool | None, str]] = {
+    True: "authenticated",
+    False: "UNAUTHENTICATED: any modem in range can have forged this contact",
+    None: "",
+}
+
+
 def report_html(detail: Json, image: ReconstructedImage, now_utc_s: float) -> str:
     """Return a page about a contact for printing on one or two sheets. Text of operators is escaped.
 
@@ -152,6 +159,7 @@ def report_html(detail: Json, image: ReconstructedImage, now_utc_s: float) -> st
         ("Received", f"{image.bytes_received} of {image.bytes_total} bytes, {contact['percent_received']} %"),
         ("Area not received", f"{100 * float(image.missing().mean()):.1f} % (black in the image)"),
         ("SHA-256 of the pixels", image.picture_sha256),
+        ("Acoustic frames", _AUTHENTICATION[image.authenticated]),
     ]
     return (
         "<!DOCTYPE html>\n<html lang='en'><head><meta charset='utf-8'>"

@@ -120,7 +120,7 @@ def test_authenticated_frames_of_an_old_store_are_converted(platform, tmp_path, 
     sender = V1Sender(SenderConfig(frame_bytes=64), protection=authenticator)
     sender.add_image(1, CONTACT, b"\x20" + bytes(60), 0.0)
     frames = [(3, sender.next_frame(0.0), 1e9), (3, preview_frame(2), 1e9)]
-    there = platform(VESSEL).model_copy(update={"acoustic_key_file": key_file})
+    there = platform(VESSEL).model_copy(update={"acoustic_auth": "key", "acoustic_key_file": key_file})
     service = DecompressorService(there, DecompressorConfig(out_dir=tmp_path / "out"))
     fill(service, {}, frames)
     found = []

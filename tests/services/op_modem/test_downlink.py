@@ -81,7 +81,8 @@ def begin(runner, platform, modem_pair):
             "retry_s": 0.5,
             "holdoff_s": 0.05,
         }
-        there = platform(VESSEL).model_copy(update={"acoustic_key_file": key_file})
+        auth = "none" if key_file is None else "key"
+        there = platform(VESSEL).model_copy(update={"acoustic_auth": auth, "acoustic_key_file": key_file})
         return runner.start(OpModemService(there, OpModemConfig(**(usual | options))))
 
     return start

@@ -319,7 +319,9 @@ def key(tmp_path) -> AcousticKey:
 def test_with_a_key_only_authentic_frames_are_accepted_and_no_counter_is_used_twice(
     vessel, start_service, compressor, runner, platform, key, tmp_path
 ):
-    configured = platform("uuv-1").model_copy(update={"acoustic_key_file": tmp_path / "acoustic.key"})
+    configured = platform("uuv-1").model_copy(
+        update={"acoustic_auth": "key", "acoustic_key_file": tmp_path / "acoustic.key"}
+    )
     service = start_service(configured)
     eventually(lambda: service.modem.ready)
     authenticator = FrameAuthenticator(key, 1, Direction.TO_VEHICLE)

@@ -67,6 +67,16 @@ def test_networks_of_platforms_lead_nowhere_and_only_routers_meet() -> None:
             assert not re.search("vessel|shore|link", joins(block)), name
 
 
+def test_modem_services_mount_the_acoustic_key_that_their_configuration_names() -> None:
+    for service, platform in (("uuv_modem", "uuv"), ("op_modem", "vessel"), ("decompressor", "vessel")):
+        assert f"- {platform}-acoustic:/var/lib/sonarpost/acoustic:ro" in blocks()[service]
+        assert f"- {platform}-acoustic:/var/lib/sonarpost/acoustic/{platform}\n" in blocks()["pki"]
+        written = tomllib.loads((REPOSITORY / "config" / f"{platform}.toml").read_text())["platform"]
+        assert written["acoustic_auth"] == "key"
+        assert written["acoustic_key_file"] == "/var/lib/sonarpost/acoustic/acoustic.key"
+    assert "/var/lib/sonarpost/acoustic/uuv" in (REPOSITORY / "Dockerfile").read_text()
+
+
 def test_every_variable_is_in_the_example_with_its_default() -> None:
     example = (REPOSITORY / ".env.example").read_text()
     known = dict(re.findall(r"^#?([A-Z_]+)=(.*?)(?:[ ]+#.*)?$", example, flags=re.MULTILINE))

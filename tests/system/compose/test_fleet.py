@@ -17,6 +17,7 @@ from builders.common import REPOSITORY
 
 from sonarpost.bus import router
 from sonarpost.errors import ConfigError
+from sonarpost.link.auth.key import parse_key
 from sonarpost.security.fleet import Fleet, FleetIndex, PkiError
 
 FILES = {"ca.pem": 0o644, "certificate.pem": 0o644, "key.pem": 0o600, "router.json5": 0o644}
@@ -37,7 +38,7 @@ def script() -> ModuleType:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    for name in ("pki", "tls/shore", "tls/vessel"):
+    for name in ("pki", "tls/shore", "tls/vessel", "acoustic/uuv", "acoustic/vessel"):
         (tmp_path / name).mkdir(parents=True)
     return tmp_path
 
@@ -100,10 +101,55 @@ def test_bundle_is_installed_on_another_host(
     assert {path.name: stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == FILES
     config = router.load(folder / "router.json5", [], [], [])
     assert json.loads(config.get_json("connect/endpoints")) == ["tls/c2.example:9448"]
+    assert key_of(aboard, "vessel") == (root / "pki" / "fleet" / "acoustic.key").read_text()
+    assert not (aboard / "acoustic" / "uuv").exists()
     index = FleetIndex.read(root / "pki" / "fleet")
     shore = index.current("shore-1")
     assert shore is not None
     assert shore.hosts == ("c2.example",)
+
+
+def key_of(root: Path, platform: str) -> str:
+    path = root / "acoustic" / platform / "acoustic.key"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    return path.read_text()
+
+
+def test_make_gives_vehicle_and_vessel_one_acoustic_key(script: ModuleType, root: Path) -> None:
+    script.run(["make"], {}, root)
+    key = key_of(root, "uuv")
+    assert key_of(root, "vessel") == key
+    parse_key(key, "acoustic.key")
+    script.run(["make"], {}, root)
+    assert key_of(root, "uuv") == key, "another run keeps the key"
+    assert not list((root / "tls" / "shore").glob("acoustic*"))
+    assert script.run(["pki", "acoustic", "--replace"], {}, root) == 0
+    script.run(["make"], {}, root)
+    assert key_of(root, "uuv") == key_of(root, "vessel") != key
+
+
+def test_make_without_folders_for_the_key_writes_none(script: ModuleType, tmp_path: Path) -> None:
+    for name in ("pki", "tls/shore", "tls/vessel"):
+        (tmp_path / name).mkdir(parents=True)
+    script.run(["make"], {}, tmp_path)
+    assert not (tmp_path / "acoustic").exists()
+
+
+def test_bundle_of_a_vehicle_holds_the_acoustic_key_only(
+    script: ModuleType, root: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment = {"FLEET_VEHICLES": "uuv-1 uuv-2"}
+    script.run(["make"], environment, root)
+    depot = script.Depot(root, script.Plan.from_environment(environment))
+    files = depot.files("uuv-2")
+    assert set(files) == {"acoustic.key"}
+    assert set(depot.files("vessel-1")) == {*FILES, "acoustic.key"}
+    assert "acoustic.key" not in depot.files("shore-1")
+    aboard = tmp_path_factory.mktemp("aboard")
+    monkeypatch.setattr(sys, "stdin", type("In", (), {"buffer": io.BytesIO(script.pack(files))}))
+    assert script.run(["install"], {}, aboard) == 0
+    assert key_of(aboard, "uuv") == key_of(root, "uuv")
+    assert not (aboard / "tls").exists()
 
 
 def tar_of(name: str, kind: bytes = tarfile.REGTYPE) -> bytes:
@@ -128,6 +174,8 @@ def test_error_names_the_environment_variable(script: ModuleType) -> None:
         script.Plan.from_environment({"SHORE_PORT": "x"})
     with pytest.raises(ConfigError, match="observer: got 'vessel-1', expected a name that no vessel has"):
         script.Plan.from_environment({"FLEET_OBSERVERS": "vessel-1"})
+    with pytest.raises(ConfigError, match="vehicle: got 'vessel-1', expected a name that no vessel has"):
+        script.Plan.from_environment({"FLEET_VEHICLES": "vessel-1"})
 
 
 def test_unknown_arguments_show_the_usage(script: ModuleType, root: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -146,6 +146,8 @@ def _platform_table(settings: ChainSettings, platform: str, port: int) -> str:
         f'[platform]\nid = "{platform}"\nrouter = ["tcp/127.0.0.1:{port}"]\n'
         f'state_dir = "{settings.folder / "state" / platform}"\n'
         f"health_interval_s = {HEALTH_INTERVAL_S}\n"
+        # The emulated channel has no other modems, and the paper's format has no authentication.
+        'acoustic_auth = "none"\n'
     )
 
 

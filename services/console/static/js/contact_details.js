@@ -3,7 +3,7 @@
 import { api } from "./api.js";
 import { decisionText } from "./decision_form.js";
 import { fill, h } from "./dom.js";
-import { DASH, duration, position, quantity, received, requestKind, time, verdict } from "./format.js";
+import { DASH, authentication, duration, position, quantity, received, requestKind, time, verdict } from "./format.js";
 import { measurementLine } from "./measurement.js";
 import { emit } from "./state.js";
 
@@ -59,7 +59,7 @@ function recordFacts(contact, record) {
     ["size (detector)", [quantity(r.length_m, "m"), quantity(r.width_m, "m")].join(" × ")], ["shadow, height (detector)", `${quantity(r.shadow_m, "m")}, ${quantity(r.height_m, "m")}`],
     ["slant, ground range", `${quantity(r.slant_range_m, "m")}, ${quantity(r.ground_range_m, "m")}`], ["altitude, depth", `${quantity(r.altitude_m, "m")}, ${quantity(r.depth_m, "m")}`],
     ["heading, speed", `${quantity(r.heading_deg, "°", 0)}, ${quantity(r.speed_mps, "m/s")}`], ["side", r.channel ?? DASH], ["pixel along × across", `${quantity(r.pixel_along_m, "m", 3)} × ${quantity(r.pixel_across_m, "m", 3)}`],
-    ["line, ping", `${r.line_name ?? DASH}, ${r.ping_number ?? DASH}`], ["sonar", r.sonar_id ?? DASH], ["identifier", contact.id],
+    ["line, ping", `${r.line_name ?? DASH}, ${r.ping_number ?? DASH}`], ["sonar", r.sonar_id ?? DASH], ["acoustic frames", authentication(contact) ?? DASH], ["identifier", contact.id],
   ];
   return h("dl", { class: "facts number" }, rows.map(([name, value]) => [h("dt", { text: name }), h("dd", { text: value })]));
 }

@@ -18,6 +18,12 @@ export function quantity(value, unit = "", digits = 1) {
 
 export const percent = (value, digits = 0) => (known(value) ? `${value.toFixed(digits)}\u202f%` : DASH);
 
+/** Statement about the authentication of a contact's acoustic frames; null where it is not known. */
+export function authentication(row) {
+  if (row.authenticated === null || row.authenticated === undefined) return null;
+  return row.authenticated ? "authenticated" : "unauthenticated: any modem in range can have forged this contact";
+}
+
 /** Percent received; below 100 until the image is complete. */
 export function received(row) {
   if (!known(row.percent_received)) return DASH;

@@ -1,7 +1,7 @@
 // The data integrity strip: codec, received and missing parts, and whether the displayed layer is measurable.
 
 import { h } from "./dom.js";
-import { bytes, duration, percent, received } from "./format.js";
+import { authentication, bytes, duration, percent, received } from "./format.js";
 
 function item(name, value, props = {}) {
   return h("div", props, h("dt", { text: name }), h("dd", { class: "number", text: value }));
@@ -14,6 +14,7 @@ export function integrityStrip(version, layer) {
   const missing = 100 * version.missing_fraction;
   const guessed = 100 * (version.guessed_fraction ?? 0);
   const facts = h("dl", {},
+    version.authenticated === false ? item("acoustic frames", "unauthenticated", { class: "missing", title: authentication(version) }) : null,
     item("codec", version.codec || "none", { title: version.model ? `model ${version.model}` : "no model" }),
     item("bytes", version.bytes_total ? `${version.bytes_received} of ${bytes(version.bytes_total)}` : bytes(version.bytes_received)),
     item("frames", String(version.frames_received)),

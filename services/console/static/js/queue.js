@@ -2,7 +2,7 @@
 
 import { api } from "./api.js";
 import { h } from "./dom.js";
-import { DASH, quantity, received, symbol, time, verdict } from "./format.js";
+import { DASH, authentication, quantity, received, symbol, time, verdict } from "./format.js";
 import { emit, listen, state } from "./state.js";
 
 const MARGIN_ROWS = 6; // rows drawn above and below the visible ones
@@ -105,11 +105,13 @@ function rowLabel(row) {
     row.name, verdict(row.review), row.atd_confidence === null ? "no detector confidence" : `detector ${row.atd_confidence.toFixed(2)} of 2`,
     row.complete ? "image complete" : `${received(row)} received`, `seen ${time(row.seen_utc_s ?? row.first_frame_utc_s)}`,
     row.looks > 1 ? `${row.looks} looks at one position` : "", row.advised ? "comment from the shore site" : "",
+    row.authenticated === false ? "unauthenticated" : "",
   ].filter(Boolean).join(", ");
 }
 
 function marks(row) {
   const list = [];
+  if (row.authenticated === false) list.push(h("span", { class: "mark bad unauthenticated", title: authentication(row) }, "⚠"));
   if (row.looks > 1) list.push(h("span", { class: "mark", title: `${row.looks} looks at one position` }, `×${row.looks}`));
   if (row.advised) list.push(h("span", { class: "mark", title: "Comment from the shore site" }, "✉"));
   if (row.open_requests > 0) list.push(h("span", { class: "mark", title: "Request in progress" }, "⟳"));
