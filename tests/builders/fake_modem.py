@@ -26,6 +26,9 @@ def drop_nth(kind: str, nth: int) -> DropRule:
 class FakeModem:
     """The modem and the simulated clock; `run` exchanges sentences with the driver until a given time.
 
+    `TXP`, `TXF` and `XST` switch the sentences on a transmission. The modem echoes a command for one of the
+    `fixed_settings` and does not store it. With `refuses_cycles` it answers every cycle command with `CAERR`.
+
     Args:
         driver: The driver under test.
         drops: Returns whether a sentence is lost, in either direction. Arguments: the sentence, and the number of its
@@ -33,12 +36,16 @@ class FakeModem:
     """
 
     data_timeout_s = 4.0
+    restart_s = 1.0
 
     def __init__(self, driver: MicroModem, drops: DropRule = drop_nothing) -> None:
         self.driver = driver
         self.drops = drops
         self.now = 0.0
-        self.settings = {"SRC": "0", "CST": "0", "RXP": "0"}
+        self.settings = {"SRC": "0", "CST": "0", "RXP": "0", "TXP": "0", "TXF": "0", "XST": "0"}
+        self.fixed_settings: set[str] = set()
+        self.refuses_cycles = False
+        self.restarts = 0
         self.events: list[ModemEvent] = []
         self.frames_decoded: list[FrameDecoded] = []
         self.received: list[nmea.Sentence] = []
@@ -76,6 +83,17 @@ class FakeModem:
 
     def schedule(self, delay_s: float, action: Callable[[], None]) -> None:
         heapq.heappush(self._due, (self.now + delay_s, next(self._order), action))
+
+    def _schedule_reply(self, delay_s: float, action: Callable[[], None]) -> None:
+        """Schedule what the modem itself does; a restart cancels it."""
+        restarts = self.restarts
+        self.schedule(delay_s, lambda: action() if self.restarts == restarts else None)
+
+    def restart(self) -> None:
+        """Restart the modem now; it keeps its settings."""
+        self._cycle = None
+        self.restarts += 1
+        self._schedule_reply(self.restart_s, lambda: self.send("CAREV", "000001", "INIT", "2.0.27087"))
 
     def run(self, until_s: float) -> None:
         """Advance the time from deadline to deadline."""
@@ -119,25 +137,30 @@ class FakeModem:
             answer(*sentence.fields)
 
     def _on_cccfg(self, name: str, value: str) -> None:
-        self.settings[name] = value
+        if name not in self.fixed_settings:
+            self.settings[name] = value
         if self.echo_settings:
-            self.schedule(0.05, lambda: self.send("CACFG", name, value))
+            self._schedule_reply(0.05, lambda: self.send("CACFG", name, value))
 
     def _on_cccfq(self, name: str) -> None:
-        self.schedule(0.05, lambda: self.send("CACFG", name, self.settings[name]))
+        self._schedule_reply(0.05, lambda: self.send("CACFG", name, self.settings[name]))
 
     def _on_ccclk(self, *fields: str) -> None:
-        self.schedule(0.05, lambda: self.send("CACLK", *fields))
+        self._schedule_reply(0.05, lambda: self.send("CACLK", *fields))
+
+    def _on_ccmsc(self, *fields: str) -> None:
+        assert fields == (self.settings["SRC"], self.settings["SRC"], "0")
+        self.restart()
 
     def _on_cccyc(self, *fields: str) -> None:
-        if self._cycle is not None:
-            self.schedule(0.05, lambda: self.send("CAERR", "000000", "CYC", 7, "busy"))
+        if self._cycle is not None or self.refuses_cycles:
+            self._schedule_reply(0.05, lambda: self.send("CAERR", "000000", "CYC", 7, "busy"))
             return
         self._cycle = Cycle.parse(nmea.Sentence("CCCYC", fields))
         self._frames = []
         self._cycle_number += 1
-        self.schedule(0.05, lambda: self.send("CACYC", *fields))
-        self.schedule(0.10, self._request_data)
+        self._schedule_reply(0.05, lambda: self.send("CACYC", *fields))
+        self._schedule_reply(0.10, self._request_data)
 
     def _request_data(self) -> None:
         cycle, number, wanted = self._cycle, self._cycle_number, len(self._frames) + 1
@@ -150,27 +173,31 @@ class FakeModem:
                 self.send("CAERR", "000000", "DATA_TIMEOUT", wanted)
                 self._cycle = None
 
-        self.schedule(self.data_timeout_s, give_up)
+        self._schedule_reply(self.data_timeout_s, give_up)
 
     def _on_cctxd(self, src: str, dest: str, ack: str, data: str) -> None:
         cycle = self._cycle
         if cycle is None or len(self._frames) >= cycle.nframes:
             return
         self._frames.append(bytes.fromhex(data))
-        self.schedule(0.05, lambda: self.send("CATXD", src, dest, ack, len(data) // 2))
-        self.schedule(0.10, self._request_data if len(self._frames) < cycle.nframes else self._transmit)
+        self._schedule_reply(0.05, lambda: self.send("CATXD", src, dest, ack, len(data) // 2))
+        self._schedule_reply(0.10, self._request_data if len(self._frames) < cycle.nframes else self._transmit)
 
     def _transmit(self) -> None:
         cycle, frames = self._cycle, tuple(self._frames)
         assert cycle is not None
         size = sum(map(len, frames))
-        self.send("CATXP", size)
+        self._report("TXP", "CATXP", size)
 
         def end() -> None:
             self.transmitted.append(frames)
             self._cycle = None
-            self.send("CATXF", size)
+            self._report("TXF", "CATXF", size)
             statistics = (7, "20250606", "230117.336548", 3, 0, 200, 5000, 25000, cycle.rate, cycle.src, cycle.dest)
-            self.send("CAXST", *statistics, int(cycle.ack), len(frames), len(frames), 3, size)
+            self._report("XST", "CAXST", *statistics, int(cycle.ack), len(frames), len(frames), 3, size)
 
-        self.schedule(RATES[cycle.rate].airtime_s, end)
+        self._schedule_reply(RATES[cycle.rate].airtime_s, end)
+
+    def _report(self, setting: str, kind: str, *fields: str | int) -> None:
+        if self.settings[setting] == "1":
+            self.send(kind, *fields)

@@ -22,6 +22,7 @@ from sonarpost.modem.micromodem import (
 from sonarpost.modem.micromodem.supervisor import Phase
 
 CONFIG = MicroModemConfig(address=3)
+SETTINGS = {"SRC": "3", "CST": "1", "RXP": "1", "TXP": "1", "TXF": "1", "XST": "1"}
 
 
 def started(config: MicroModemConfig = CONFIG, **options) -> FakeModem:
@@ -45,7 +46,7 @@ def test_configuration_sets_and_verifies_address_and_statistics() -> None:
     modem = started()
     modem.run(5.0)
     assert modem.events == [ModemReady(address=3, firmware=None)]
-    assert modem.settings == {"SRC": "3", "CST": "1", "RXP": "1"}
+    assert modem.settings == SETTINGS
     assert modem.commands("CCCFQ") == [("SRC",), ("CST",)]
     assert modem.driver.ready
 
@@ -184,7 +185,7 @@ def test_restarted_modem_is_reconfigured() -> None:
     assert len(modem.received) == sent, "nothing is sent during the pause after a restart"
     modem.run(20.0)
     assert modem.events[1:] == [ModemRebooted("0.93.0.09"), ModemReady(3, "0.93.0.09")]
-    assert modem.settings == {"SRC": "3", "CST": "1", "RXP": "1"}
+    assert modem.settings == SETTINGS
 
 
 def test_packet_fails_when_the_modem_is_not_ready_in_time() -> None:

@@ -7,6 +7,8 @@
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import (
+    CarrierSenseIgnored,
+    CarrierSenseRestored,
     ClockConfirmed,
     FailureReason,
     FlexibleDataReceived,
@@ -25,9 +27,12 @@ from sonarpost.modem.micromodem.events import (
     PollReceived,
     RequestDone,
     RequestFailed,
+    RestartRequested,
     SentenceRejected,
     SettingUnconfirmed,
     StatisticsReceived,
+    TransmissionFailing,
+    TransmissionRecovered,
     UnhandledSentence,
 )
 from sonarpost.modem.micromodem.rates import RATES, Rate
@@ -41,6 +46,8 @@ from sonarpost.modem.micromodem.statistics import LinkStatistics, TransmitStatis
 
 __all__ = [
     "RATES",
+    "CarrierSenseIgnored",
+    "CarrierSenseRestored",
     "ClockConfirmed",
     "FailureReason",
     "FlexibleDataReceived",
@@ -67,9 +74,12 @@ __all__ = [
     "Rate",
     "RequestDone",
     "RequestFailed",
+    "RestartRequested",
     "SentenceRejected",
     "SettingUnconfirmed",
     "StatisticsReceived",
+    "TransmissionFailing",
+    "TransmissionRecovered",
     "TransmitStatistics",
     "UnhandledSentence",
 ]

@@ -20,10 +20,12 @@ class MicroModemConfig:
         address: This modem's address (`SRC`), 0..127.
         settings: Optional settings, (name, integer value), sent after `SRC` and `CST`. The modem is used even if it
             does not confirm one of them; a `SettingUnconfirmed` reports it. With `RXP` the modem announces the start of
-            a reception, during which the driver does not transmit.
+            a reception, during which the driver does not transmit. With `TXP`, `TXF` and `XST` it reports start, end
+            and statistics of a transmission; without them a packet takes longer.
         airtimes_s: Air times by rate, where they differ from the nominal ones in `RATES`.
         airtime_margin: Longest transmission or reception, as a multiple of its air time.
         reply_timeout_s: Wait for the answer to a command; the default is that of Goby3's driver.
+        refused_wait_s: Wait before a command is sent again that the modem has rejected with `CAERR`.
         tries: How often a command or a cycle is sent before it has failed.
         retry_cap_s: Upper limit of the wait between tries, which doubles.
         init_pause_s: Pause after a restart of the modem.
@@ -33,17 +35,25 @@ class MicroModemConfig:
         statistics_timeout_s: Wait for the statistics at the end of a transmission or reception.
         poll_wait_s: Time for a polled modem's host to fill its packet.
         ack_wait_s: Wait for acknowledgements: two-way travel at the longest range and their own packet.
-        dump_quiet_s: During a configuration dump, the wait for an answer ends this long after its last line.
-        dump_limit_s: Upper limit of that wait.
+        dump_quiet_s: A configuration dump ends this long after its last line. Before, the driver starts no packet or
+            request, and it waits for an answer at least until then.
+        dump_limit_s: Upper limit of each of these waits.
+        max_carrier_sense_s: Longest time for which a busy channel delays a packet. If the modem reports a busy channel
+            for longer without a pause, the driver transmits.
+        failures_before_restart: Number of failed packets or polls in a row after which the driver restarts the modem.
+        restart_wait_s: Wait for the modem to report its restart; after it, the modem is configured anyway.
+        restart_backoff_s: Shortest time between two restarts; it doubles while the modem does not transmit.
+        restart_backoff_cap_s: Upper limit of that time.
         queued_packets: Capacity of the queue.
         max_defer_s: Longest time in the queue; a packet that is older has failed.
     """
 
     address: int
-    settings: tuple[tuple[str, int], ...] = (("RXP", 1),)
+    settings: tuple[tuple[str, int], ...] = (("RXP", 1), ("TXP", 1), ("TXF", 1), ("XST", 1))
     airtimes_s: Mapping[int, float] = field(default_factory=lambda: MappingProxyType({}))
     airtime_margin: float = 1.5
     reply_timeout_s: float = 5.0
+    refused_wait_s: float = 1.0
     tries: int = 3
     retry_cap_s: float = 60.0
     init_pause_s: float = 2.0
@@ -54,7 +64,12 @@ class MicroModemConfig:
     poll_wait_s: float = 20.0
     ack_wait_s: float = 20.0
     dump_quiet_s: float = 2.0
-    dump_limit_s: float = 30.0
+    dump_limit_s: float = 60.0
+    max_carrier_sense_s: float = 30.0
+    failures_before_restart: int = 3
+    restart_wait_s: float = 10.0
+    restart_backoff_s: float = 60.0
+    restart_backoff_cap_s: float = 3600.0
     queued_packets: int = 8
     max_defer_s: float = 120.0
 
@@ -67,7 +82,7 @@ class MicroModemConfig:
         where = "modem configuration"
         if not 0 <= self.address <= MAX_ADDRESS:
             raise ConfigError(where, "address", self.address, f"0..{MAX_ADDRESS}")
-        for name in ("tries", "queued_packets"):
+        for name in ("tries", "queued_packets", "failures_before_restart"):
             if getattr(self, name) < 1:
                 raise ConfigError(where, name, getattr(self, name), "at least 1")
         if not 1.0 <= self.airtime_margin < math.inf:

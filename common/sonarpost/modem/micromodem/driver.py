@@ -15,6 +15,7 @@ from datetime import datetime
 from typing import ClassVar
 
 from sonarpost.errors import SentenceError
+from sonarpost.modem.micromodem.carrier_sense import CarrierSense
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.events import (
     FailureReason,
@@ -43,6 +44,7 @@ from sonarpost.modem.micromodem.requests import (
 )
 from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
+    ConfigurationSetting,
     Cycle,
     DataRequest,
     ErrorReport,
@@ -61,6 +63,7 @@ from sonarpost.modem.micromodem.sentences import (
 from sonarpost.modem.micromodem.statistics import TransmitStatistics
 from sonarpost.modem.micromodem.supervisor import ModemSupervisor, Phase
 from sonarpost.modem.micromodem.transmit_cycle import QueuedPacket, TransmitCycle, check_packet
+from sonarpost.modem.micromodem.transmit_monitor import TransmitMonitor
 
 
 class MicroModem:
@@ -84,8 +87,8 @@ class MicroModem:
         self._out = bytearray()
         self._events: list[ModemEvent] = []
         self._events_since_s = 0.0
-        # End of a transmission that this driver did not start.
-        self._busy_until_s: float | None = None
+        self._carrier = CarrierSense(config)
+        self._monitor = TransmitMonitor(config)
 
     @property
     def phase(self) -> Phase:
@@ -115,7 +118,7 @@ class MicroModem:
     @property
     def receiving(self) -> bool:
         """Whether a packet is being received, as far as known."""
-        return self._reception.reception is not None
+        return self._reception.receiving
 
     @property
     def _exchange(self) -> TransmitCycle | RequestExchange | None:
@@ -140,7 +143,7 @@ class MicroModem:
     def port_lost(self, now: float) -> None:
         """Fail the exchange in progress and return received frames; queued packets wait for the next port."""
         self._supervisor.close()
-        self._abort(FailureReason.PORT_LOST)
+        self._abort(FailureReason.PORT_LOST, now)
         self._lines.reset()
         self._out.clear()
         self._events_since_s = now
@@ -257,7 +260,8 @@ class MicroModem:
             exchange_s = None if self._exchange is None else self._exchange.deadline_s
             # The modem is not queried during an exchange, which shows by itself whether the modem answers.
             check_s = None if not self._idle and self.phase is Phase.READY else self._supervisor.deadline_s
-            times_s += [exchange_s, check_s, self._reception.deadline_s, self._busy_until_s]
+            times_s += [exchange_s, check_s, self._reception.deadline_s, self._carrier.deadline_s]
+            times_s.append(self._supervisor.dump_ends_s)
         return min((time_s for time_s in times_s if time_s is not None), default=None)
 
     def bytes_to_send(self) -> bytes:
@@ -273,8 +277,7 @@ class MicroModem:
         if self.phase is Phase.CLOSED:
             return
         self._on_reception(self._reception.poll(now))
-        if self._busy_until_s is not None and now >= self._busy_until_s:
-            self._busy_until_s = None
+        self._events += self._carrier.update(now, receiving=self._reception.receiving)
         self._advance_exchanges(now)
         self._events += self._supervisor.poll(now, may_check=self._idle)
         self._start_next(now)
@@ -287,19 +290,21 @@ class MicroModem:
             result = exchange.result
             if result is None:
                 continue
-            self._events.append(result)
+            self._events += [result, *self._monitor.on_result(result, now)]
             if exchange is self._cycle:
                 self._cycle = None
             else:
                 self._request = None
             # A request that failed after its echo shows that the modem itself works.
             no_echo = isinstance(result, RequestFailed) and result.reason is FailureReason.NO_ECHO
-            if isinstance(result, PacketFailed) or no_echo:
+            if self._monitor.take_restart(now):
+                self._events += self._supervisor.restart(now)
+            elif isinstance(result, PacketFailed) or no_echo:
                 self._supervisor.check(now)
 
     def _start_next(self, now: float) -> None:
-        channel_free = self._reception.reception is None and self._busy_until_s is None
-        if not (self._queue and channel_free and self._idle and self.phase is Phase.READY):
+        modem_free = self._idle and self.phase is Phase.READY and self._supervisor.dump_ends_s is None
+        if not (self._queue and modem_free and self._carrier.channel_free):
             return
         item = self._queue.popleft()
         if isinstance(item, QueuedPacket):
@@ -327,12 +332,14 @@ class MicroModem:
                 if isinstance(event, PacketReceived):
                     self._request.on_answer(RequestKind.POLL, event.src)
 
-    def _abort(self, reason: FailureReason) -> None:
+    def _abort(self, reason: FailureReason, now: float) -> None:
         """Fail the exchange in progress and return the received frames: the modem has lost its state."""
-        self._events += [exchange.abort(reason) for exchange in (self._cycle, self._request) if exchange is not None]
+        for exchange in (self._cycle, self._request):
+            if exchange is not None:
+                result = exchange.abort(reason)
+                self._events += [result, *self._monitor.on_result(result, now)]
         self._cycle = self._request = None
-        self._events += self._reception.flush()
-        self._busy_until_s = None
+        self._events += [*self._reception.flush(), *self._carrier.reset(now)]
 
     def _send(self, sentence: Sentence) -> None:
         self._out += sentence.encode()
@@ -349,14 +356,16 @@ class MicroModem:
     def _on_revision(self, sentence: Sentence, now: float) -> None:
         revision = Revision.parse(sentence)
         if revision.rebooted:
-            self._abort(FailureReason.REBOOTED)
+            self._abort(FailureReason.REBOOTED, now)
         self._events += self._supervisor.on_revision(revision, now)
 
     def _on_setting(self, sentence: Sentence, now: float) -> None:
         was_ready = self.ready
+        if self._cycle is not None and self._cycle.on_setting(ConfigurationSetting.parse(sentence), now):
+            return
         self._events += self._supervisor.on_setting(sentence, now)
         if was_ready and not self.ready:
-            self._abort(FailureReason.REBOOTED)
+            self._abort(FailureReason.REBOOTED, now)
 
     def _on_clock(self, sentence: Sentence, now: float) -> None:
         self._events += self._supervisor.on_clock(sentence, now)
@@ -406,7 +415,7 @@ class MicroModem:
         if self._exchange is not None:
             self._exchange.on_transmission(mark, now)
         else:
-            self._busy_until_s = None if mark.ends else now + self.config.on_air_limit_s(None)
+            self._carrier.on_transmission(mark, now)
 
     def _on_transmit_statistics(self, sentence: Sentence, now: float) -> None:
         statistics: TransmitStatistics | None = None
@@ -468,6 +477,7 @@ class MicroModem:
     def _on_error(self, sentence: Sentence, now: float) -> None:
         report = ErrorReport.parse(sentence)
         self._events.append(ModemError(report))
+        self._supervisor.on_error(report, now)
         if self._exchange is not None:
             self._exchange.on_error(report, now)
 

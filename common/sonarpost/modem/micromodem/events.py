@@ -78,6 +78,59 @@ class ModemRebooted:
 
 
 @dataclass(frozen=True, slots=True)
+class TransmissionFailing:
+    """The modem answers, but several packets in a row have failed. Reported once until `TransmissionRecovered`.
+
+    Attributes:
+        failures: Number of failed packets and polls in a row.
+        reason: Why the last one failed.
+    """
+
+    failures: int
+    reason: FailureReason
+
+
+@dataclass(frozen=True, slots=True)
+class TransmissionRecovered:
+    """The modem transmits again.
+
+    Attributes:
+        failures: Number of packets and polls that failed before.
+        failing_s: Time since the first of them.
+    """
+
+    failures: int
+    failing_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class RestartRequested:
+    """The driver has sent the command to restart (`CCMSC`), because the modem does not transmit."""
+
+
+@dataclass(frozen=True, slots=True)
+class CarrierSenseIgnored:
+    """The modem has reported a busy channel for too long; the driver transmits in spite of it.
+
+    Attributes:
+        busy_s: How long the channel has been busy without a pause.
+    """
+
+    busy_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class CarrierSenseRestored:
+    """The modem reports a free channel again, and the driver defers to receptions.
+
+    Attributes:
+        busy_s: How long the channel was busy without a pause.
+    """
+
+    busy_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class SettingUnconfirmed:
     """The modem did not confirm an optional setting or the clock; the driver continues without."""
 
@@ -128,6 +181,8 @@ class PacketSent:
         started_s: Start of the cycle.
         finished_s: End of the cycle.
         statistics: Statistics of the transmission, or None.
+        end_reported: Whether the modem has reported the end of the transmission. If not, it has accepted the data, the
+            air time has passed, and the modem answers.
     """
 
     packet_id: int
@@ -138,6 +193,7 @@ class PacketSent:
     started_s: float
     finished_s: float
     statistics: TransmitStatistics | None
+    end_reported: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,6 +326,11 @@ ModemEvent = (
     ModemReady
     | ModemUnresponsive
     | ModemRebooted
+    | TransmissionFailing
+    | TransmissionRecovered
+    | RestartRequested
+    | CarrierSenseIgnored
+    | CarrierSenseRestored
     | SettingUnconfirmed
     | ClockConfirmed
     | ModemError

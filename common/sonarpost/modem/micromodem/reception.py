@@ -35,12 +35,14 @@ class _Reception:
         cycle: The far modem's announcement, if it has arrived.
         frames: The good frames, without statistics.
         bad_frames: Number of damaged frames.
+        timed_out: Whether the modem has stopped receiving; only the statistics may follow.
     """
 
     deadline_s: float
     cycle: Cycle | None = None
     frames: list[FrameReceived] = field(default_factory=list)
     bad_frames: int = 0
+    timed_out: bool = False
 
     @property
     def has_frames(self) -> bool:
@@ -94,11 +96,16 @@ class _Reception:
 
 
 class ReceptionTracker:
-    """Follows receptions. The channel is busy while `reception` is not None."""
+    """Follows receptions."""
 
     def __init__(self, config: MicroModemConfig) -> None:
         self._config = config
         self.reception: _Reception | None = None
+
+    @property
+    def receiving(self) -> bool:
+        """Whether a packet is being received, as far as known."""
+        return self.reception is not None and not self.reception.timed_out
 
     @property
     def deadline_s(self) -> float | None:
@@ -144,7 +151,7 @@ class ReceptionTracker:
             self._extend(reception, now)
             return []
         if message.text == "PACKET_TIMEOUT" and self.reception is not None:
-            # The modem has stopped waiting for the rest of the packet: only the statistics follow.
+            self.reception.timed_out = True
             self.reception.deadline_s = now + self._config.statistics_timeout_s
         return [ModemMessageReceived(message)]
 
@@ -188,10 +195,12 @@ class ReceptionTracker:
 
     def _restart(self, reception: _Reception, now: float) -> None:
         """Restart the time limit: the packet, or the data after a header, begins to arrive."""
+        reception.timed_out = False
         reception.deadline_s = now + self._config.on_air_limit_s(reception.cycle.rate if reception.cycle else None)
 
     def _extend(self, reception: _Reception, now: float) -> None:
         """Extend the time limit: the modem reports frames while later ones are still on the air."""
+        reception.timed_out = False
         reception.deadline_s = max(reception.deadline_s, now + self._config.statistics_timeout_s)
 
     def _close(self, statistics: LinkStatistics | None, *, ended: bool) -> list[ModemEvent]:

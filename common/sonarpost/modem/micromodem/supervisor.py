@@ -5,6 +5,7 @@ Configuration commands are sent one after the other. Each is repeated without an
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -18,11 +19,12 @@ from sonarpost.modem.micromodem.events import (
     ModemReady,
     ModemRebooted,
     ModemUnresponsive,
+    RestartRequested,
     SettingUnconfirmed,
     UnhandledSentence,
 )
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.sentences import ISO_SECONDS, ConfigurationSetting, Revision, parse_clock
+from sonarpost.modem.micromodem.sentences import ISO_SECONDS, ConfigurationSetting, ErrorReport, Revision, parse_clock
 
 _OPTIONAL_TRIES = 2
 
@@ -92,6 +94,7 @@ class ModemSupervisor:
     Attributes:
         phase: State towards the modem. While CONFIGURING or CHECKING, commands wait for their answers.
         firmware: Version reported by the modem, or None.
+        dump_ends_s: End of the configuration dump in progress, as far as known; None without a dump.
     """
 
     def __init__(self, config: MicroModemConfig, send: Callable[[Sentence], None]) -> None:
@@ -107,6 +110,8 @@ class ModemSupervisor:
         self._earlier_attempts = 0  # of the first command before the configuration began again
         self._failed_attempts = 0
         self._sent_s = self._due_s = 0.0
+        self._dump_started_s = self._dump_line_s = -math.inf
+        self.dump_ends_s: float | None = None
 
     @property
     def deadline_s(self) -> float:
@@ -129,10 +134,20 @@ class ModemSupervisor:
         """Stop: the port was closed."""
         self.phase = Phase.CLOSED
         self._commands.clear()
+        self.dump_ends_s = None
 
     def note_sentence(self, now: float) -> None:
-        """Record that a valid sentence was received."""
+        """Record that a valid sentence was received. A command whose wait has grown is sent again soon."""
         self._last_sentence_s = self._alive_s = now
+        if self._commands and self._attempts:
+            self._due_s = min(self._due_s, max(now, self._sent_s + self._config.reply_timeout_s))
+
+    def restart(self, now: float) -> list[ModemEvent]:
+        """Restart the modem, and configure it after its restart."""
+        address = str(self._config.address)
+        self._send(Sentence("CCMSC", (address, address, "0")))
+        self._configure(now + self._config.restart_wait_s)
+        return [RestartRequested()]
 
     def check(self, now: float, command: ModemCommand | None = None) -> None:
         """Require the answer to a command, by default the query of the address, before anything else is sent."""
@@ -158,7 +173,10 @@ class ModemSupervisor:
             SentenceError: A wrong field.
         """
         setting = ConfigurationSetting.parse(sentence)
-        if self._is_answered(sentence, now) or self.phase is Phase.CONFIGURING:
+        if self._is_answered(sentence, now):
+            return []
+        self._note_dump(now)
+        if self.phase is Phase.CONFIGURING:
             return []
         if setting.name == "SRC" and setting.number != self._config.address:
             # Another program has set it, or the sentence of a restart was lost.
@@ -174,6 +192,18 @@ class ModemSupervisor:
         """
         utc = parse_clock(sentence)
         return [ClockConfirmed(utc) if self._is_answered(sentence, now) else UnhandledSentence(sentence)]
+
+    def on_error(self, report: ErrorReport, now: float) -> None:
+        """Process an error of the modem: it may have rejected an optional command, which is sent again soon."""
+        if self._commands and self._attempts and not self._commands[0].required and not report.data_timeout:
+            self._due_s = min(self._due_s, now + self._config.refused_wait_s)
+
+    def _note_dump(self, now: float) -> None:
+        """Record a setting that this driver has not requested: a line of a dump."""
+        if now >= self._dump_line_s + self._config.dump_quiet_s:
+            self._dump_started_s = now
+        self._dump_line_s = now
+        self.dump_ends_s = min(now + self._config.dump_quiet_s, self._dump_started_s + self._config.dump_limit_s)
 
     def _is_answered(self, sentence: Sentence, now: float) -> bool:
         """Return whether a sentence is the answer to the first command, which is then removed."""
@@ -191,6 +221,8 @@ class ModemSupervisor:
         """Do what is due; query a silent modem only with `may_check` (no exchange is in progress)."""
         if self.phase is Phase.CLOSED:
             return []
+        if self.dump_ends_s is not None and now >= self.dump_ends_s:
+            self.dump_ends_s = None
         if self.phase is Phase.READY:
             if may_check and now >= self.deadline_s:
                 self.check(now)

@@ -14,6 +14,7 @@ from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.modem.micromodem.reception import FSK_MINI_PACKET
 from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
+    ConfigurationSetting,
     Cycle,
     DataRequest,
     ErrorReport,
@@ -66,9 +67,13 @@ class TransmitStage(Enum):
     REQUEST = auto()
     DATA_ECHO = auto()
     ON_AIR = auto()
+    QUERY = auto()
     STATISTICS = auto()
     ACKNOWLEDGEMENT = auto()
     OVER = auto()
+
+
+_AFTER_ECHO = frozenset({TransmitStage.REQUEST, TransmitStage.DATA_ECHO, TransmitStage.ON_AIR, TransmitStage.QUERY})
 
 
 class TransmitCycle:
@@ -77,6 +82,9 @@ class TransmitCycle:
     The host's own command starts it or, with `polled`, the command of another modem that requests data. A later
     sentence implies the earlier ones that were lost. A command without an answer is sent again, a frame is sent again
     when the modem requests it again, and every wait is limited.
+
+    A modem that reports no end of the transmission must not cause the same packet to be sent again and again. If it has
+    accepted all data and the air time has passed, it is queried. A packet counts as sent if the modem answers.
     """
 
     def __init__(
@@ -94,12 +102,14 @@ class TransmitCycle:
         self._config = config
         self._send = send
         self._cycle = polled or Cycle(config.address, packet.dest, packet.rate, packet.ack, len(packet.frames))
-        self._started_s = now
+        self._started_s = self._stage_s = now
         self._attempt = 0
+        self._refused = False  # the last attempt
         self._frame_number = 0
         self._frames_given: set[int] = set()
         self._acknowledged: set[int] = set()
         self._on_air = False
+        self._end_reported = False
         self._statistics: TransmitStatistics | None = None
         if polled is None:
             self.poll(now)
@@ -154,9 +164,10 @@ class TransmitCycle:
         if not self._frames_given:
             on_air_s = self._config.on_air_limit_s(self.packet.rate)
             self.deadline_s = max(self.deadline_s, now + self._config.request_timeout_s + on_air_s)
-        elif self.stage in {TransmitStage.REQUEST, TransmitStage.DATA_ECHO, TransmitStage.ON_AIR}:
+        elif self.stage in _AFTER_ECHO:
             self._on_air = True
             if mark.ends:
+                self._end_reported = True
                 self._wait(TransmitStage.STATISTICS, now, self._config.statistics_timeout_s)
             else:
                 self._wait(TransmitStage.ON_AIR, now, self._config.on_air_limit_s(self.packet.rate))
@@ -166,8 +177,8 @@ class TransmitCycle:
         header = statistics is not None and statistics.packet_type == FSK_MINI_PACKET
         if header or not self._frames_given:
             return
-        if self.stage in {TransmitStage.DATA_ECHO, TransmitStage.ON_AIR, TransmitStage.STATISTICS}:
-            self._on_air = True
+        if self.stage in _AFTER_ECHO - {TransmitStage.REQUEST} or self.stage is TransmitStage.STATISTICS:
+            self._on_air = self._end_reported = True
             self._statistics = statistics
             self._transmitted(now)
 
@@ -181,10 +192,28 @@ class TransmitCycle:
         if self.stage is TransmitStage.ACKNOWLEDGEMENT and len(self._acknowledged) == len(self.packet.frames):
             self._finish(now)
 
-    def on_error(self, report: ErrorReport, _now: float) -> None:
-        """Process a data timeout of the modem."""
-        if report.data_timeout and self.stage in {TransmitStage.REQUEST, TransmitStage.DATA_ECHO}:
-            self.abort(FailureReason.DATA_TIMEOUT)
+    def on_error(self, report: ErrorReport, now: float) -> None:
+        """Process a data timeout of the modem, or an error before the echo: the modem rejects the command."""
+        if report.data_timeout:
+            if self.stage in {TransmitStage.REQUEST, TransmitStage.DATA_ECHO}:
+                self.abort(FailureReason.DATA_TIMEOUT)
+        elif self.stage is TransmitStage.ECHO:
+            self._refused = True
+            self.deadline_s = min(self.deadline_s, now + self._config.refused_wait_s)
+
+    def on_setting(self, setting: ConfigurationSetting, now: float) -> bool:
+        """Process `CACFG`; return whether it is the answer to the query of this cycle.
+
+        During a configuration dump the modem answers late: a repeated command would be queued behind the dump.
+        """
+        if self.stage is TransmitStage.QUERY and (setting.name, setting.number) == ("SRC", self._config.address):
+            self._on_air = True
+            self._transmitted(now)
+            return True
+        if self.stage in _AFTER_ECHO or self.stage is TransmitStage.ECHO:
+            latest_s = self._stage_s + self._config.dump_limit_s
+            self.deadline_s = max(self.deadline_s, min(now + self._config.dump_quiet_s, latest_s))
+        return False
 
     def abort(self, reason: FailureReason) -> PacketFailed:
         """End the cycle as failed and return the event."""
@@ -201,16 +230,20 @@ class TransmitCycle:
         match self.stage:
             case TransmitStage.ECHO if self._attempt < self._config.tries:
                 self._attempt += 1
+                self._refused = False
                 self._send(self._cycle.sentence())
                 self._wait(TransmitStage.ECHO, now, self._config.reply_timeout_s)
             case TransmitStage.ECHO:
-                self.abort(FailureReason.NO_ECHO)
+                self.abort(FailureReason.REFUSED if self._refused else FailureReason.NO_ECHO)
             case TransmitStage.REQUEST:
                 self.abort(FailureReason.NO_DATA_REQUEST)
             case TransmitStage.DATA_ECHO:
                 # The data is not repeated: a modem whose echo is late would take it for the next frame.
                 self.abort(FailureReason.NO_DATA_ECHO)
             case TransmitStage.ON_AIR:
+                self._send(Sentence("CCCFQ", ("SRC",)))
+                self._wait(TransmitStage.QUERY, now, self._config.reply_timeout_s)
+            case TransmitStage.QUERY:
                 self.abort(FailureReason.NO_TRANSMIT_END if self._on_air else FailureReason.NO_TRANSMIT_START)
             case TransmitStage.STATISTICS:
                 self._transmitted(now)
@@ -230,12 +263,21 @@ class TransmitCycle:
         p = self.packet
         acknowledged = tuple(sorted(self._acknowledged))
         self.result = PacketSent(
-            p.packet_id, p.dest, p.rate, p.frames, acknowledged, self._started_s, now, self._statistics
+            p.packet_id,
+            p.dest,
+            p.rate,
+            p.frames,
+            acknowledged,
+            self._started_s,
+            now,
+            self._statistics,
+            self._end_reported,
         )
         self.stage = TransmitStage.OVER
 
     def _wait(self, stage: TransmitStage, now: float, wait_s: float) -> None:
         self.stage = stage
+        self._stage_s = now
         self.deadline_s = now + wait_s
 
     def _missing(self) -> bool:
