@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from builders.history import History
 from sonarpost import keys
 from sonarpost.cli.demo.chain import Chain
-from sonarpost.cli.demo.outcome import Outcome, evaluate
+from sonarpost.cli.demo.outcome import ImageFile, Outcome, evaluate, read_images
 from sonarpost.cli.demo.settings import VESSEL, ChainSettings, free_ports
 from sonarpost.cli.demo.watch import Watcher
 from sonarpost.link.frames.paper.frame import parse_frame
@@ -32,6 +33,16 @@ def snippet(number: int) -> npt.NDArray[np.uint8]:
     image[30:44, 50:60] += 120
     image[32:42, 60:100] *= 0.1
     return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def latest_versions(folder: Path) -> list[ImageFile]:
+    """Return the last version of each image of a folder, an image that has two sets of files twice."""
+    latest: dict[str, ImageFile] = {}
+    for name, image in read_images(folder).items():
+        base, _, version = name.rpartition("_v")
+        if base not in latest or int(version) > int(latest[base].name.rpartition("_v")[2]):
+            latest[base] = image
+    return list(latest.values())
 
 
 class VesselWatcher(Watcher):
@@ -72,6 +83,7 @@ class RunningChain:
         self.watcher = watcher
         self.settings = chain.settings
         self.deposited = 0
+        self.history = History(chain.settings.folder / "history.jsonl")
 
     def deposit(self, count: int = IMAGES) -> None:
         """Put snippets into the folder that the vehicle polls."""
@@ -80,6 +92,25 @@ class RunningChain:
             write_png(hidden, snippet(self.deposited))
             hidden.rename(hidden.with_name(hidden.name[1:]))
             self.deposited += 1
+
+    def kill(self, name: str) -> None:
+        """End a process at once (SIGKILL)."""
+        self.history.fault(name, "SIGKILL")
+        self.chain.kill(name)
+
+    def assert_delivered_once(self) -> None:
+        """Check that each encoded image is at the vessel and at the shore site, once and unchanged.
+
+        All versions of an image are one record; its digest is that of its last version's file.
+        """
+        for image_id in self.watcher.encoded:
+            self.history.add("queued", "compressor", image_id)
+        for process, folder in (("decompressor", self.settings.vessel_images), ("c2", self.settings.shore_images)):
+            self.history.add("consumer", process)
+            for image in latest_versions(folder):
+                self.history.add("handled", process, image.image_id, sha256=image.sha256)
+        verdict = self.history.verdict()
+        assert verdict.ok, f"{self.history.path}: {verdict}"
 
     def outcome(self) -> Outcome:
         """Return the outcome so far."""
@@ -132,6 +163,8 @@ def start_chain(tmp_path: Path) -> Iterator[Callable[..., RunningChain]]:
             chain = stack.enter_context(Chain(settings))
             watcher = stack.enter_context(VesselWatcher(settings))
             watcher.wait_until_started(chain.check)
-            return RunningChain(chain, watcher)
+            run = RunningChain(chain, watcher)
+            stack.callback(run.history.close)
+            return run
 
         yield start

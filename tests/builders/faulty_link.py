@@ -8,6 +8,7 @@ import socket
 import struct
 import threading
 import time
+from collections.abc import Callable
 
 CHUNK_BYTES = 4096
 POLL_S = 0.02
@@ -24,9 +25,16 @@ class FaultyLink:
     Args:
         target_port: Port of the target.
         bytes_per_s: Bandwidth of each direction; None for no limit.
+        on_fault: Called with the name of each fault, and of its end.
     """
 
-    def __init__(self, target_port: int, bytes_per_s: float | None = None) -> None:
+    def __init__(
+        self,
+        target_port: int,
+        bytes_per_s: float | None = None,
+        on_fault: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._on_fault = on_fault
         self._target_port = target_port
         self._bytes_per_s = bytes_per_s
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -41,22 +49,26 @@ class FaultyLink:
 
     def cut(self) -> None:
         """Reset every connection, and every new one at once."""
+        self._on_fault("cut")
         self._refusing.set()
         self._reset_all()
 
     def stall(self, *directions: str) -> None:
         """Stop the data in these directions, by default in both."""
+        self._on_fault(f"stall {' '.join(directions)}".strip())
         for direction in directions or ("up", "down"):
             self._stalled[direction].set()
 
     def mend(self) -> None:
         """Restore the link."""
+        self._on_fault("restored")
         for stalled in self._stalled.values():
             stalled.clear()
         self._refusing.clear()
 
     def reset(self) -> None:
         """Reset every connection, which loses the data in transit; new connections are accepted."""
+        self._on_fault("reset")
         self._reset_all()
 
     def close(self) -> None:

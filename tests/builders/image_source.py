@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from builders.records import reconstructed_image
-from sonarpost import keys
-from sonarpost.config import ServiceConfig
+from sonarpost import keys, wire
+from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.delivery.records import OutboxItem
+from sonarpost.delivery.transaction import Transaction
 from sonarpost.messages import Pixels, ReconstructedImage
 from sonarpost.runtime.service import Service, UnitOfWork
 
@@ -32,9 +34,21 @@ def make_image(
 
 
 class ImageSource(Service[ServiceConfig]):
-    """Outbox of a test in place of the decompressor."""
+    """Outbox of a test in place of the decompressor.
+
+    Args:
+        acknowledged: Called with each image that the relay has acknowledged.
+    """
 
     NAME = "source"
+
+    def __init__(self, platform: PlatformConfig, acknowledged: Callable[[ReconstructedImage], None]) -> None:
+        super().__init__(platform, ServiceConfig())
+        self._acknowledged = acknowledged
+
+    def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
+        if reason is None:
+            self._acknowledged(wire.decode(ReconstructedImage, item.payload, item.key))
 
     def handle(self, key: str, record: object, effects: UnitOfWork) -> None:
         raise AssertionError("the source consumes nothing")

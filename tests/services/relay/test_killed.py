@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import random
 import subprocess
@@ -11,9 +12,10 @@ import time
 import msgpack
 import pytest
 from builders.common import REPOSITORY, eventually
+from builders.history import History
 from builders.records import decision_record
 
-from sonarpost import keys
+from sonarpost import keys, wire
 from sonarpost.messages import Relayed
 
 RECORDS = 400
@@ -46,30 +48,32 @@ def relay_process(router, tmp_path):
         process.wait()
 
 
-def identifiers(site):
-    return [msgpack.unpackb(envelope.payload)["decision_id"] for envelope in site.received]
-
-
-def test_every_site_receives_every_record_once_if_the_relay_is_killed(runner, relay_process):
+def test_every_site_receives_every_record_once_if_the_relay_is_killed(runner, relay_process, tmp_path):
     first = runner.peer("shore-1", "c2", {keys.shore_inbox_all("shore"): Relayed})
     second = runner.peer("shore-2", "c2", {keys.shore_inbox_all("shore-2"): Relayed})
     console = runner.peer("vessel-1", "console")
-    wanted = [f"d{n}" for n in range(RECORDS)]
-    console.send(
-        keys.contact_decision("vessel-1"),
-        "relay",
-        *(decision_record(name) for name in wanted),
-    )
+    history = History(tmp_path / "history.jsonl")
+    decisions = [decision_record(f"d{n}") for n in range(RECORDS)]
+    console.send(keys.contact_decision("vessel-1"), "relay", *decisions)
+    for decision in decisions:
+        sha256 = hashlib.sha256(wire.encode(decision)).hexdigest()
+        history.add("queued", "console", decision.decision_id, sha256=sha256)
     rng = random.Random(7)
     for kill in range(1, KILLS + 1):
         process = relay_process()
         # A little later each time, at a random point of the next batches.
         eventually(lambda kill=kill: len(first.received) >= kill * RECORDS // (KILLS + 2), timeout_s=60)
         time.sleep(rng.uniform(0, 0.02))
+        history.fault("relay", "SIGKILL")
         process.kill()
         process.wait()
     relay_process()
-    for site in (first, second):
-        eventually(lambda site=site: len(site.received) >= RECORDS, timeout_s=60)
-        assert sorted(identifiers(site)) == sorted(wanted)
     eventually(lambda: console.store.outbox_depth() == 0)
+    for name, site in (("shore", first), ("shore-2", second)):
+        eventually(lambda site=site: len(site.received) >= RECORDS, timeout_s=60)
+        history.add("consumer", name)
+        for envelope in site.received:
+            sha256 = hashlib.sha256(envelope.payload).hexdigest()
+            history.add("handled", name, msgpack.unpackb(envelope.payload)["decision_id"], sha256=sha256)
+    history.close()
+    assert history.verdict().ok, history.verdict()

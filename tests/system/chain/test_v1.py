@@ -38,11 +38,12 @@ def test_every_image_is_complete_with_a_third_of_the_frames_lost(start_chain: St
     run.deposit(IMAGES)
     if killed is not None:
         run.until(lambda: len(run.watcher.shore) >= 1, 60, "first preview at the shore site")
-        run.chain.kill(killed)
+        run.kill(killed)
         run.chain.start(killed)
     run.until(lambda: len(run.watcher.shore) == IMAGES, 60, "every preview at the shore site")
     run.until(lambda: all_complete(run), 120, "every image at the shore site")
     run.until_idle()
+    run.assert_delivered_once()
     result = run.outcome()
     assert result.frames_lost > 0
     assert result.images_vessel == result.images_shore == result.images_complete == IMAGES

@@ -69,11 +69,13 @@ def test_sender_keeps_images_while_the_vessel_disk_is_full(
     system.send([make_image(n, LARGE) for n in range(20)])
     system.wait_until(lambda: system.shore_image_count() >= 5, 60, "first images at the shore")
     small.fill()
+    system.history.fault("disk", "full")
     system.send([make_image(n, LARGE) for n in range(20, COUNT)])
     system.wait_until(lambda: state_of(system, "relay") == "degraded", 60, "relay reports degraded")
     assert detail_of(system, "relay")
     assert system.source.store.outbox_depth() > 0
     small.empty()
+    system.history.fault("disk", "has space")
     system.assert_all_delivered_once()
     system.wait_until(lambda: state_of(system, "relay") == "ok", 30, "relay has recovered")
 
@@ -103,11 +105,13 @@ def test_images_stay_on_the_vessel_while_the_shore_store_disk_is_full(
     system.send([make_image(n, LARGE) for n in range(50)])
     system.assert_all_delivered_once()
     small.fill()
+    system.history.fault("disk", "full")
     system.send([make_image(n, LARGE) for n in range(50, COUNT)])
     system.wait_until(lambda: state_of(system, "c2") == "degraded", 60, "c2 reports degraded")
     assert detail_of(system, "c2")
     assert system.depths("relay")["outbox"] or system.depths("relay")["inbox"]
     small.empty()
+    system.history.fault("disk", "has space")
     system.assert_all_delivered_once()
     system.wait_until(lambda: state_of(system, "c2") == "ok", 30, "c2 has recovered")
 

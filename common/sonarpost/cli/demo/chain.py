@@ -61,7 +61,7 @@ class Chain:
         # If this process is killed, the child processes end too.
         environment = {**os.environ, EXIT_WITH_PARENT: str(os.getpid())}
         self._processes[name] = subprocess.Popen(  # noqa: S603 our own interpreter and modules
-            [sys.executable, "-m", *self._module(name)],
+            self.command(name),
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
@@ -69,6 +69,10 @@ class Chain:
             # Ctrl-C reaches this process only, which stops the services in order.
             process_group=0,
         )
+
+    def command(self, name: str) -> list[str]:
+        """Return the command of a process."""
+        return [sys.executable, "-m", *self.module(name)]
 
     def kill(self, name: str) -> None:
         """End a process at once (SIGKILL), as a power cut would."""
@@ -119,7 +123,8 @@ class Chain:
             log.close()
         self._logs.clear()
 
-    def _module(self, name: str) -> tuple[str, ...]:
+    def module(self, name: str) -> tuple[str, ...]:
+        """Return the module of a process and its arguments."""
         if name not in ROUTERS:
             return (f"sonarpost.services.{name}", "--config", str(self.settings.config_file(name)))
         uuv, vessel, shore = (f"tcp/127.0.0.1:{port}" for port in self.settings.router_ports)
