@@ -49,8 +49,10 @@ def test_record_is_a_duplicate_only_with_the_same_key_origin_number_and_digest(
     for key, origin, seq, payload, done_up_to in arrivals:
         chunk = record(seq, payload, origin, done_up_to)
         with store.transaction() as tx:
-            of_window = {n for k, o, n, _ in accepted if (k, o) == (key, origin)}
-            assert tx.highest(key, origin)[0] == max(of_window, default=0)
+            numbers = {n for k, o, n, _ in accepted if (k, o) == (key, origin)}
+            other = (key, origin, seq, b"y" if payload == b"x" else b"x")
+            expected = seq if other in accepted else max(numbers, default=0)
+            assert tx.accepted_number(key, chunk)[0] == expected
             assert tx.was_received(key, chunk) == ((key, origin, seq, payload) in accepted)
             if not tx.was_received(key, chunk):
                 tx.accept(key, payload, chunk)
@@ -94,6 +96,23 @@ def test_number_of_digests_is_limited(store: Store, monkeypatch: pytest.MonkeyPa
         receive(store, "k", *(record(seq, b"x") for seq in range(first, first + 10)))
         assert len(digests(store)) <= 40
     assert 100 in digests(store)
+
+
+def test_window_that_is_displaced_in_its_own_transaction_is_written_again(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Records of other peers in the transaction are not affected."""
+    monkeypatch.setattr(duplicate_window, "MAX_WINDOWS", 2)
+    for number in (1, 2):
+        receive(store, "k", record(1, b"x", bytes([number]) * 16))
+    with store.transaction() as tx:
+        for number in (3, 1):
+            chunk = record(2, b"y", bytes([number]) * 16)
+            assert not tx.was_received("k", chunk)
+            tx.accept("k", chunk.data, chunk)
+    with store.transaction() as tx:
+        assert tx.was_received("k", record(2, b"y", bytes([1]) * 16))
+        assert tx.was_received("k", record(2, b"y", bytes([3]) * 16))
 
 
 def test_least_recently_used_window_of_a_writer_is_deleted(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:

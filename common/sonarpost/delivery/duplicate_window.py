@@ -66,6 +66,15 @@ class DuplicateWindow:
         ).fetchone()
         return found is not None
 
+    def other_digest(self, seq: int, sha256: bytes) -> bytes | None:
+        """Return the digest of another accepted record with this number, or None."""
+        if self._id is None or seq > self._stored_highest:
+            return None
+        found = self._db.execute(
+            "SELECT sha256 FROM received WHERE window = ? AND seq = ? AND sha256 <> ?", (self._id, seq, sha256)
+        ).fetchone()
+        return None if found is None else bytes(found[0])
+
     def add(self, seq: int, sha256: bytes, done_up_to: int = 0) -> None:
         """Add an accepted record.
 
@@ -88,17 +97,20 @@ class DuplicateWindow:
         self._new.clear()
         before, self._digests = self._digests, self._digests + len(rows)
         values = (self.highest, self.highest_sha256, self._digests, time.time_ns())
-        if self._id is None:
+        if self._id is None or not self._update(values):
             self._id = self._create(values)
-        else:
-            self._db.execute(
-                "UPDATE received_window SET highest = ?, sha256 = ?, digests = ?, used_ns = ? WHERE id = ?",
-                (*values, self._id),
-            )
         self._db.executemany("INSERT INTO received VALUES (?, ?, ?)", [(self._id, *row) for row in rows])
         self._stored_highest = self.highest
         if before // PRUNE_EVERY != self._digests // PRUNE_EVERY:
             self._prune()
+
+    def _update(self, values: tuple[int, bytes, int, int]) -> bool:
+        """Update the row of the window; return False if a new window of the same transaction has displaced it."""
+        updated = self._db.execute(
+            "UPDATE received_window SET highest = ?, sha256 = ?, digests = ?, used_ns = ? WHERE id = ?",
+            (*values, self._id),
+        )
+        return updated.rowcount == 1
 
     def _create(self, values: tuple[int, bytes, int, int]) -> int:
         writer = writer_of(self._key)

@@ -189,7 +189,7 @@ class Inbox:
         return self._store_record(tx, message.key, message.payload, None)
 
     def _store_chunk(self, tx: Transaction, key: str, chunk: ReceivedChunk) -> AckReply:
-        highest, sha256 = tx.highest(key, chunk.origin)
+        highest, sha256 = tx.accepted_number(key, chunk)
         reply = AckReply("stored") if tx.was_received(key, chunk) else self._store_new_chunk(tx, key, chunk)
         return replace(reply, highest=highest, highest_sha256=sha256) if chunk.offset == 0 else reply
 

@@ -376,8 +376,9 @@ class QueueSender:
             if len(chunks) == 1:
                 reply = AckReply.unpack(payload, where)
                 self._max_batch = reply.max_batch
-                if reply.highest and self._scheduler.probing:
-                    self._check_age(chunks[0].transfer.item, reply)
+                item = chunks[0].transfer.item
+                if reply.highest and (self._scheduler.probing or reply.highest >= item.seq):
+                    self._check_age(item, reply)
                 return [reply]
             replies = protocol.unpack_replies(payload, len(chunks), where)
         except PayloadError as error:

@@ -87,9 +87,10 @@ class AckReply:
         next_offset: Next offset of the record that the consumer requires, in bytes.
         reason: Explanation, for people.
         max_batch: Number of records that the consumer accepts in one query; 0 for one.
-        highest: Highest sequence number that the consumer had accepted from this queue on this key before the query;
-            stated in replies to the first chunk of a record, otherwise 0. A producer that has not assigned this number
-            runs on an older copy of its store.
+        highest: Highest sequence number that the consumer had accepted from this queue on this key before the query, or
+            the number of the query if another record was accepted with it; only in replies to the first chunk of a
+            record, otherwise 0. A producer that has not assigned this number, or holds it with another digest, runs on
+            an older copy of its store.
         highest_sha256: Digest of the record with this number; empty if `highest` is 0.
     """
 

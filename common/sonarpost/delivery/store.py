@@ -322,7 +322,7 @@ class Store:
         Args:
             queue: Name of the queue.
             origin: Origin to which the consumer's statement refers.
-            highest: Highest sequence number that the consumer has accepted.
+            highest: Sequence number that the consumer has accepted.
             sha256: Digest of the record with this number.
         """
         found = self._query("SELECT seq, origin FROM outbox_next WHERE consumer = ?", (queue,))

@@ -306,10 +306,16 @@ class Transaction:
             return True
         return self._has_legacy_windows and self._was_received_before_migration(chunk)
 
-    def highest(self, key: str, origin: bytes) -> tuple[int, bytes]:
-        """Return the highest number accepted from a queue on a key, 0 for none, and the digest of its record."""
-        window = self._window(key, origin)
-        return window.highest, window.highest_sha256
+    def accepted_number(self, key: str, chunk: ReceivedChunk) -> tuple[int, bytes]:
+        """Return what shows a producer that its store is older than its last delivery.
+
+        Returns:
+            The number of the chunk and the digest of another record that was accepted with it; without such a record
+            the highest number accepted from this queue on this key, 0 for none, and the digest of its record.
+        """
+        window = self._window(key, chunk.origin)
+        other = window.other_digest(chunk.seq, chunk.sha256)
+        return (window.highest, window.highest_sha256) if other is None else (chunk.seq, other)
 
     def _window(self, key: str, origin: bytes) -> DuplicateWindow:
         window = self._windows.get((key, origin))
