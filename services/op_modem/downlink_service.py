@@ -24,6 +24,7 @@ from sonarpost.messages import Command, Decision, Record
 from sonarpost.modem.micromodem import RATES, FrameReceived, PacketFailed, PacketSent
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import UnitOfWork
+from sonarpost.security.acoustic_key import key_warning
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.packets import sent_frames
 from sonarpost.services.op_modem.transmit_gate import TransmitGate
@@ -328,10 +329,11 @@ class DownlinkService(ModemService[OpModemConfig]):
             return gauges
 
     def warning(self) -> str:
-        """Return that the link is unauthenticated, and which vehicles exceed their limits."""
+        """Return what concerns the key of the link, and which vehicles exceed their limits."""
         names = ", ".join(self._link.limiter.held_names)
         limits = f"images wait, max_images_per_hour or max_image_bytes_per_hour is reached: {names}" if names else ""
-        return "; ".join(text for text in (super().warning(), limits) if text)
+        parts = (super().warning(), key_warning(self._link.authenticator), limits)
+        return "; ".join(text for text in parts if text)
 
     def degraded_reason(self) -> str:
         """Return why the port, the modem or the transmission does not work."""

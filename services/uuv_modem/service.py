@@ -29,6 +29,7 @@ from sonarpost.modem.micromodem import (
 )
 from sonarpost.runtime.modem_service import ModemService
 from sonarpost.runtime.service import UnitOfWork
+from sonarpost.security.acoustic_key import key_warning
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.vehicle_endpoint import VehicleEndpoint
 
@@ -312,8 +313,14 @@ class UuvModemService(ModemService[UuvModemConfig]):
             log.warning("Record not published", extra=kv(key=key, error=str(error)))
 
     def gauges(self) -> Mapping[str, float]:
-        """Return the state of the modem and of the transmit queue."""
-        return {**super().gauges(), **self._endpoint.queue.gauges()}
+        """Return the state of the modem, of the transmit queue and of the key."""
+        authenticator = self._endpoint.authenticator
+        key = {} if authenticator is None else {"key_frames_left": float(authenticator.frames_left)}
+        return {**super().gauges(), **self._endpoint.queue.gauges(), **key}
+
+    def warning(self) -> str:
+        """Return that the link is unauthenticated, or that its key is nearly used up."""
+        return super().warning() or key_warning(self._endpoint.authenticator)
 
     def degraded_reason(self) -> str:
         """Return why the port, the modem or the link does not work."""

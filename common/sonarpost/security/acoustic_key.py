@@ -11,6 +11,7 @@ from typing import Final
 from sonarpost.config import PlatformConfig
 from sonarpost.errors import ConfigError
 from sonarpost.files import PRIVATE_FILE, write_atomically, write_new
+from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import KEY_BYTES, AcousticKey, parse_key
 
 KEY_NAME: Final = "acoustic.key"
@@ -35,6 +36,13 @@ def link_key(platform: PlatformConfig) -> AcousticKey | None:
             "[platform]", "acoustic_key_file", "nothing", f'a key file ({_CREATE}), or acoustic_auth = "none"'
         )
     return read_key(platform.acoustic_key_file)
+
+
+def key_warning(authenticator: FrameAuthenticator | None) -> str:
+    """Return a warning if an authenticator has used 15 of 16 counters of its key; empty otherwise."""
+    if authenticator is None or authenticator.frames_left > authenticator.settings.lifetime_frames // 16:
+        return ""
+    return f"the acoustic key is used up after {authenticator.frames_left} more frames; replace it"
 
 
 def create_key(path: Path, *, replace: bool = False) -> AcousticKey:

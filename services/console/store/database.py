@@ -178,7 +178,7 @@ class Database(SqliteFile):
         super().__init__(path, _SCHEMA, SCHEMA_VERSION)
         with self.transaction() as db:
             columns = {row["name"] for row in db.execute("PRAGMA table_info(contact)")}
-            if "authenticated" not in columns:  # a database of version 0.1
+            if "authenticated" not in columns:  # a database of version 0.1 or 0.2
                 db.execute("ALTER TABLE contact ADD COLUMN authenticated INTEGER")
 
 
