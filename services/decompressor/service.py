@@ -28,6 +28,7 @@ class DecompressorService(Service[DecompressorConfig]):
     """
 
     NAME = "decompressor"
+    PAGE_BYTES = 512
 
     def __init__(self, platform: PlatformConfig, config: DecompressorConfig) -> None:
         # Before the store is opened, so that a configuration error leaves no open store.

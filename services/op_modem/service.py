@@ -51,6 +51,7 @@ class OpModemService(DownlinkService):
     """
 
     NAME = "op_modem"
+    PAGE_BYTES = 512
 
     def __init__(self, platform: PlatformConfig, config: OpModemConfig) -> None:
         super().__init__(platform, config)

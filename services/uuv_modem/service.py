@@ -58,6 +58,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
 
     NAME = "uuv_modem"
     BATCH = 64
+    PAGE_BYTES = 512
 
     def __init__(self, platform: PlatformConfig, config: UuvModemConfig) -> None:
         if config.link == "paper" and platform.acoustic_auth != "none":

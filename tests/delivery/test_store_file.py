@@ -75,3 +75,42 @@ def test_read_from_a_closed_store_raises(tmp_path: Path) -> None:
 
 def test_deleted_records_are_not_overwritten_on_disk(store: Store) -> None:
     assert store._query("PRAGMA secure_delete") == [(0,)]
+
+
+def test_store_of_an_older_layout_is_converted_with_its_content(tmp_path: Path) -> None:
+    path = tmp_path / "s.db"
+    store = Store(path)
+    send(store, b"queued")
+    with store.transaction() as tx:
+        for number in range(100):
+            tx.put_state(f"part/{number}", b"%d" % number)
+    store.close()
+    with sqlite3.connect(path) as db:
+        db.executescript(
+            "CREATE TABLE old (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;"
+            "INSERT INTO old SELECT * FROM state; DROP TABLE state; ALTER TABLE old RENAME TO state;"
+        )
+    db.close()
+    store = Store(path, page_bytes=512)
+    assert store._query("PRAGMA page_size") == [(512,)]
+    assert store._query("PRAGMA journal_mode") == [("wal",)]
+    assert store._query("SELECT COUNT(rowid) FROM state") == [(100,)]
+    assert store.states("part/") == {str(number): b"%d" % number for number in range(100)}
+    assert [item.payload for item in queued_items(store, "c", 9)] == [b"queued"]
+    store.close()
+
+
+def test_store_without_space_for_a_conversion_keeps_its_page_size(tmp_path: Path, caplog) -> None:
+    path = tmp_path / "s.db"
+    store = Store(path)
+    send(store, b"queued")
+    store.close()
+    reader = sqlite3.connect(path)
+    reader.execute("BEGIN")
+    reader.execute("SELECT COUNT(*) FROM outbox").fetchone()  # the file cannot be replaced while it is read
+    store = Store(path, page_bytes=512)
+    reader.close()
+    assert store._query("PRAGMA page_size") == [(4096,)]
+    assert [item.payload for item in queued_items(store, "c", 9)] == [b"queued"]
+    assert "Store keeps its page size" in caplog.text
+    store.close()

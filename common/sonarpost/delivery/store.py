@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import logging
 import shutil
 import sqlite3
 import threading
@@ -24,9 +25,14 @@ from sonarpost.delivery.records import SITE_SEPARATOR, InboxItem, OutboxItem
 from sonarpost.delivery.transaction import Transaction, runs
 from sonarpost.delivery.watermark import LostRecords, Watermark, clear_lost_records, lost_records
 from sonarpost.errors import DeliveryError, RetryLaterError
+from sonarpost.logs import kv
+
+log = logging.getLogger(__name__)
 
 CACHE_KB = 8000
 """Page cache: records in flight are deleted without reading them from the disk."""
+CHECKPOINT_BYTES = 4_096_000
+"""Size of the write-ahead log at which its pages are copied into the file."""
 HANDLING_RESERVE_BYTES = 8_388_608
 """Free space for handling the accepted records: deleting rows writes to the write-ahead log."""
 MAX_CHECKED_BYTES = 268_435_456
@@ -61,7 +67,7 @@ CREATE TABLE IF NOT EXISTS partial_piece (
 CREATE TABLE IF NOT EXISTS refused (
     id INTEGER PRIMARY KEY AUTOINCREMENT, direction TEXT NOT NULL, key TEXT NOT NULL, payload BLOB NOT NULL,
     reason TEXT NOT NULL, at_utc_s REAL NOT NULL);
-CREATE TABLE IF NOT EXISTS state (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS state (name TEXT PRIMARY KEY, value BLOB NOT NULL);
 """
 
 # Version 1 had no editions; queued records keep their order.
@@ -119,12 +125,18 @@ class Store:
         inbox_changed: Set when a record was added to the inbox.
         lost: Report of lost commits that no operator has cleared; None if there is none.
 
+    Args:
+        path: The SQLite file.
+        page_bytes: Size of its pages, a power of two from 512 to 65536. A transaction writes whole pages: small ones
+            suit frequent small changes. An existing file is converted.
+
     Raises:
         DeliveryError: The file cannot be opened or is not a store of this version.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, page_bytes: int = 4096) -> None:
         self.path = path
+        self._page_bytes = page_bytes
         self._lock = threading.RLock()
         self._reader_lock = threading.Lock()
         self._outbox_listeners: list[threading.Event] = []
@@ -147,15 +159,19 @@ class Store:
     def _open(self) -> None:
         try:
             self._db = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
+            self._db.execute(f"PRAGMA page_size={self._page_bytes}")
             self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.execute(f"PRAGMA wal_autocheckpoint={CHECKPOINT_BYTES // self._page_bytes}")
             self._db.execute("PRAGMA synchronous=FULL")
             self._db.execute("PRAGMA foreign_keys=ON")
             # Some builds of SQLite overwrite deleted content, which writes every record to the disk a second time.
             self._db.execute("PRAGMA secure_delete=OFF")
             self._db.execute(f"PRAGMA cache_size={-CACHE_KB}")
             self._require_sound()
+            _convert_page_size(self._db, self._page_bytes)
             self._migrate()
             self._db.executescript(_TABLES)
+            _convert_state_table(self._db)
             with self.transaction():
                 self.origin = self._meta("origin", uuid.uuid4().bytes)
                 version = self._meta("version", str(SCHEMA_VERSION).encode())
@@ -464,6 +480,32 @@ def _reason(error: sqlite3.Error, path: Path) -> str:
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     damaged = code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
     return f"{error}; {_salvage_hint(path)}" if damaged else str(error)
+
+
+def _convert_page_size(db: sqlite3.Connection, page_bytes: int) -> None:
+    """Convert a file with another page size, which only works without a write-ahead log."""
+    if db.execute("PRAGMA page_size").fetchone()[0] == page_bytes:
+        return
+    try:
+        db.execute("PRAGMA journal_mode=DELETE")
+        db.execute(f"PRAGMA page_size={page_bytes}")
+        db.execute("VACUUM")
+    except sqlite3.OperationalError as error:
+        # A full disk: the file is still valid, and the next start tries again.
+        log.warning("Store keeps its page size", extra=kv(reason=str(error)))
+    db.execute("PRAGMA journal_mode=WAL")
+
+
+def _convert_state_table(db: sqlite3.Connection) -> None:
+    """Give the state table of an older store row numbers, with which a changed value keeps its place in the file."""
+    if not db.execute("SELECT 1 FROM sqlite_master WHERE name = 'state' AND sql LIKE '%WITHOUT ROWID%'").fetchall():
+        return
+    with db:
+        db.execute("BEGIN IMMEDIATE")
+        db.execute("CREATE TABLE state_rows (name TEXT PRIMARY KEY, value BLOB NOT NULL)")
+        db.execute("INSERT INTO state_rows SELECT name, value FROM state")
+        db.execute("DROP TABLE state")
+        db.execute("ALTER TABLE state_rows RENAME TO state")
 
 
 def lock_exclusively(path: Path) -> IO[bytes]:

@@ -343,7 +343,9 @@ class Transaction:
 
     def put_state(self, name: str, value: bytes) -> None:
         """Store `value` under `name`."""
-        self._db.execute("INSERT OR REPLACE INTO state VALUES (?, ?)", (name, value))
+        self._db.execute(
+            "INSERT INTO state VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET value = excluded.value", (name, value)
+        )
 
     def delete_state(self, name: str) -> None:
         """Delete the value under `name`."""

@@ -70,12 +70,14 @@ class Service(ABC, Generic[C]):
         BATCH: Maximum number of records that are committed in one transaction. Above 1, a power cut can repeat the
             side effects of `handle` outside the `UnitOfWork` for a whole batch.
         BATCH_BYTES: Maximum size of the records of one batch; it bounds the write-ahead log.
+        PAGE_BYTES: Page size of the store; small pages for a service whose transactions change few bytes.
     """
 
     NAME: ClassVar[str]
     PUBLISH: ClassVar[bool] = True
     BATCH: ClassVar[int] = 1
     BATCH_BYTES: ClassVar[int] = 2 * 1024 * 1024
+    PAGE_BYTES: ClassVar[int] = 4096
 
     def __init__(self, platform: PlatformConfig, config: C) -> None:
         self.platform = platform
@@ -85,7 +87,7 @@ class Service(ABC, Generic[C]):
         self._stopped = False
         self.started_utc_s = time.time()
         self._tls = TlsMonitor(platform.tls)
-        self.store = Store(platform.state_dir / f"{self.NAME}.db")
+        self.store = Store(platform.state_dir / f"{self.NAME}.db", page_bytes=self.PAGE_BYTES)
         self._disk_reserve = DiskReserve(self.store, HANDLING_RESERVE_BYTES, "senders keep their records")
         self._counters: Counter[str] = Counter()
         self._counter_lock = threading.Lock()
