@@ -53,18 +53,16 @@ COPY packaging/warm.py /src/packaging/
 COPY common/ /src/common/
 COPY services/ /src/services/
 # The codecs' machine code is made here, for any processor of this architecture, so that no service compiles at its start.
-# The compiler takes a source file's date for its identity: whole seconds survive the way into the next stage.
 RUN cd /src && /opt/build/bin/python -m build --wheel --no-isolation --outdir /dist . \
     && /opt/build/bin/pip --python /opt/sonarpost/bin/python install --no-deps --no-index --target /opt/app /dist/*.whl \
-    && find /opt/app -exec touch -h -d @1700000000 {} + \
     && python3 -m compileall -q --invalidation-mode unchecked-hash /opt/app \
-    && NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR=/opt/app/numba-cache /opt/sonarpost/bin/python -B packaging/warm.py
+    && NUMBA_CPU_NAME=generic /opt/sonarpost/bin/python -B packaging/warm.py
 
 FROM python AS runtime
 ENV PATH=/opt/app/bin:/opt/sonarpost/bin:$PATH \
     PYTHONDONTWRITEBYTECODE=1 \
     PYTHONUNBUFFERED=1 \
-    NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR=/tmp/numba-cache \
+    NUMBA_CPU_NAME=generic \
     SONARPOST_HEARTBEAT=/tmp/heartbeat.json
 RUN groupadd --gid 10001 sonarpost \
     && useradd --uid 10001 --gid 10001 --no-create-home --home-dir /var/lib/sonarpost --shell /usr/sbin/nologin sonarpost \

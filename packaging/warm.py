@@ -6,14 +6,13 @@ Fails if a module of sonarpost cannot be imported, a codec does not work, or not
 from __future__ import annotations
 
 import importlib
-import os
 import pkgutil
-from pathlib import Path
 
 import numpy as np
 
 import sonarpost
 from sonarpost.codec import codec_names, decode, encode
+from sonarpost.codec.jit import compilation_log
 from sonarpost.codec.machine_code import prepare_machine_code
 
 OPTIONAL = ("matplotlib", "pillow_jxl")
@@ -46,8 +45,8 @@ def main() -> None:
     import_everything()
     prepare_machine_code(print)
     try_every_codec()
-    files = [path for path in Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*") if path.is_file()]
-    assert any(path.suffix == ".nbc" for path in files), "nothing was compiled"
+    files = [path for folder in compilation_log.cache_folders for path in folder.glob("*.nb[ci]")]
+    assert any(path.suffix == ".nbc" for path in files), "no machine code was stored"
     print(f"{len(files)} files of machine code, {sum(path.stat().st_size for path in files)} B")
 
 

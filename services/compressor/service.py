@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from sonarpost import keys, wire
 from sonarpost.codec.interface import Codec
+from sonarpost.codec.jit import use_code_folder
 from sonarpost.codec.registry import CodecResources, default_registry, present_name
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.config import PlatformConfig
@@ -42,6 +43,7 @@ class CompressorService(Service[CompressorConfig]):
     NAME = "compressor"
 
     def __init__(self, platform: PlatformConfig, config: CompressorConfig) -> None:
+        use_code_folder(platform.state_dir / "machine-code")
         # Before the store is opened, so that a configuration error leaves no open store.
         tiles = open_codebook(config.codebook).tiles
         self._codec: Codec = default_registry().create(

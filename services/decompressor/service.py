@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from sonarpost import keys, wire
 from sonarpost.archive.image_files import write_image
+from sonarpost.codec.jit import use_code_folder
 from sonarpost.config import PlatformConfig
 from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.logs import kv
@@ -31,6 +32,7 @@ class DecompressorService(Service[DecompressorConfig]):
     PAGE_BYTES = 512
 
     def __init__(self, platform: PlatformConfig, config: DecompressorConfig) -> None:
+        use_code_folder(platform.state_dir / "machine-code")
         # Before the store is opened, so that a configuration error leaves no open store.
         self._decoder = Decoder(config.codebooks)
         super().__init__(platform, config)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import logging
+import sys
 import time
 
 from sonarpost.cli.parsers import Subparsers
-from sonarpost.codec.jit import compilation_log
+from sonarpost.codec.jit import NO_FOLDER, compilation_log
 from sonarpost.codec.machine_code import prepare_machine_code
 
 
@@ -23,13 +24,16 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(_: argparse.Namespace) -> int:
-    """Compile what the cache on disk does not hold; return 0."""
+    """Compile what the cache on disk does not hold; return 0, or 1 if the machine code cannot be stored."""
     started_s = time.monotonic()
     logging.getLogger("sonarpost.codec.jit").setLevel(logging.ERROR)  # the steps are printed here
     prepare_machine_code(lambda step: print(f"Preparing machine code: {step}", flush=True))
     if not compilation_log.compiled:
         print("Machine code is ready: the cache holds all functions")
         return 0
+    if not compilation_log.cache_folders:
+        print(f"Machine code is not stored: {NO_FOLDER}", file=sys.stderr)
+        return 1
     folders = ", ".join(sorted(str(folder) for folder in compilation_log.cache_folders))
     after_s = time.monotonic() - started_s
     print(f"Machine code is ready: compiled={compilation_log.compiled} after_s={after_s:.1f} in {folders}")

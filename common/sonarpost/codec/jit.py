@@ -1,4 +1,4 @@
-"""Compilation of codec functions to machine code with numba, cached on disk.
+"""Compilation of codec functions to machine code with numba, stored on disk (see `sonarpost.codec.code_cache`).
 
 Importing numba takes about a second. Import modules that use `jit` at definition only when an image is coded.
 """
@@ -19,7 +19,25 @@ R = TypeVar("R")
 COMPILE_S: Final = {"emb": 20, "vq": 2}
 """Approximate time to compile all functions of a codec."""
 
+NO_FOLDER: Final = "no folder for it is writable; set NUMBA_CACHE_DIR or run `sonarpost prepare` as the installing user"
+"""Why the machine code stays in memory."""
+
+service_folders: Final[list[Path]] = []
+"""Folders of `use_code_folder`."""
+
 log = logging.getLogger(__name__)
+
+
+def use_code_folder(folder: Path) -> None:
+    """Let this process store machine code in a folder if it cannot write beside the modules.
+
+    Call it before an image is coded. Other users must not be able to write there: the files are executed.
+
+    Args:
+        folder: Created when it is needed.
+    """
+    if folder not in service_folders:
+        service_folders.append(folder)
 
 
 def jit(function: Callable[P, R], *, reorder_sums: bool = False) -> Callable[P, R]:
@@ -29,7 +47,10 @@ def jit(function: Callable[P, R], *, reorder_sums: bool = False) -> Callable[P, 
     functions of their own module. With `reorder_sums`, the compiler may reorder sums of floating-point numbers.
     """
     flags = {"reassoc", "contract", "nnan", "nsz"} if reorder_sums else False
-    return cast(Callable[P, R], _numba().njit(cache=True, fastmath=flags)(function))
+    compiled = _numba().njit(fastmath=flags)(function)
+    # numba has no public way to choose the cache; the attribute has had this name since 2016.
+    compiled._cache = importlib.import_module("sonarpost.codec.code_cache").CodeCache(function)  # noqa: SLF001
+    return cast(Callable[P, R], compiled)
 
 
 class CompilationLog:
@@ -37,7 +58,7 @@ class CompilationLog:
 
     Attributes:
         compiled: Number of functions compiled in this process.
-        cache_folders: Folders with the machine code of the compiled functions.
+        cache_folders: Folders with the machine code of the compiled functions; empty without a writable folder.
     """
 
     def __init__(self) -> None:
@@ -53,14 +74,14 @@ class CompilationLog:
         if codec is None or not event.is_start:
             return
         self.compiled += 1
-        self.cache_folders.add(Path(dispatcher.stats.cache_path))
+        folder = dispatcher.stats.cache_path
+        if folder is not None:
+            self.cache_folders.add(Path(folder))
         if codec not in self._announced:
             self._announced.add(codec)
-            seconds = COMPILE_S[codec]
+            often = "once for each installation" if folder else f"in each process: {NO_FOLDER}"
             # A warning, so that it is visible in a program without a logging configuration.
-            log.warning(
-                "Preparing machine code for the %s codec: about %d s, once for each installation", codec, seconds
-            )
+            log.warning("Preparing machine code for the %s codec: about %d s, %s", codec, COMPILE_S[codec], often)
 
 
 compilation_log = CompilationLog()

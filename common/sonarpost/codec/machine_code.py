@@ -16,7 +16,7 @@ from sonarpost.codec.vq.tiles import cut_tiles
 def prepare_machine_code(progress: Callable[[str], None] | None = None) -> None:
     """Compile all functions of emb and vq that are not in the cache on disk; `jit.compilation_log` counts them.
 
-    numba stores the cache beside the modules or, if set, in the folder of the environment variable NUMBA_CACHE_DIR.
+    Folders: see `code_cache.code_folders`.
 
     Args:
         progress: Called with the name of each step before it starts.
