@@ -82,20 +82,22 @@ def test_a_full_disk_leaves_the_machine_code_in_memory(module, monkeypatch, capl
 
 
 def test_folders_are_tried_in_a_documented_order(monkeypatch, tmp_path) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "chosen"))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setattr(jit, "service_folders", [])
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
     jit.use_code_folder(tmp_path / "state" / "machine-code")
     source = tmp_path / "installed" / "codec" / "kernel.py"
-    chosen, beside, service, user = code_folders(source)
+    beside, service, user = code_folders(source)
     assert beside == source.parent / "__pycache__"
-    assert [folder.parent for folder in (chosen, service, user)] == [
-        tmp_path / "chosen",
-        tmp_path / "state" / "machine-code",
-        tmp_path / "user" / "sonarpost",
-    ]
-    other = code_folders(tmp_path / "other" / "codec" / "kernel.py")
-    assert chosen not in other
+    assert [service.parent, user.parent] == [tmp_path / "state" / "machine-code", tmp_path / "user" / "sonarpost"]
+
+
+def test_a_chosen_folder_replaces_all_others_and_holds_several_installations(monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "chosen"))
+    [one] = code_folders(tmp_path / "one" / "codec" / "kernel.py")
+    [other] = code_folders(tmp_path / "other" / "codec" / "kernel.py")
+    assert one != other
+    assert {one.parent, other.parent} == {tmp_path / "chosen"}
 
 
 def test_a_user_without_a_home_has_no_user_folder(monkeypatch) -> None:

@@ -26,16 +26,16 @@ log = logging.getLogger(__name__)
 def code_folders(source: Path) -> list[Path]:
     """Return the folders for the machine code of a module, in the order in which they are tried.
 
-    The folder of NUMBA_CACHE_DIR, `__pycache__` beside the module, the service's state folder and the user's cache
-    folder. They need not exist.
+    `__pycache__` beside the module, the service's state folder and the user's cache folder; only the folder of
+    NUMBA_CACHE_DIR if that is set. They need not exist.
     """
     # As in numba: a subfolder for each source folder, so that several installations can share a cache folder.
     name = f"{source.parent.name}_{hashlib.sha256(os.fsencode(source.parent)).hexdigest()[:16]}"
-    user = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111 Path raises without a home
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    shared = [Path(chosen)] if chosen else []
-    own = [*jit.service_folders, *([Path(user) / "sonarpost"] if Path(user).is_absolute() else [])]
-    return [*(folder / name for folder in shared), source.parent / "__pycache__", *(folder / name for folder in own)]
+    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
+        return [Path(chosen) / name]
+    user = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # noqa: PTH111 Path raises without a home
+    users = [user / "sonarpost"] if user.is_absolute() else []
+    return [source.parent / "__pycache__", *(folder / name for folder in (*jit.service_folders, *users))]
 
 
 class CodeCache:
