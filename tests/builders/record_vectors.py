@@ -50,6 +50,7 @@ def delivery_samples() -> dict[str, dict[str, bytes]]:
             "refused": AckReply("refused", reason="k: v: got 2, expected 1").pack(),
             "later": AckReply("later", reason="disk is full").pack(),
             "stored-takes-several": AckReply("stored").pack(max_batch=128),
+            "more-with-highest": AckReply("more", 32768, highest=41, highest_sha256=bytes.fromhex("33" * 32)).pack(),
         },
     }
 

@@ -171,6 +171,8 @@ class Inbox:
     def _store_message(self, tx: Transaction, message: _Message) -> Replies:
         if message.query is None:
             return self._store_publication(tx, message)
+        if "*" in message.key:
+            return self._refused(PayloadError(message.key, "key", message.key, "a key without wildcards"))
         try:
             received = parse_query(message.attachment, message.payload, message.key + self._key_suffix)
         except PayloadError as error:

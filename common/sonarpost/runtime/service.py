@@ -46,6 +46,8 @@ RETRY_AFTER_S = 1.0
 MAX_DETAIL = 2000
 TYPES_KEPT = 1000
 """Maximum number of keys in the cache of record types."""
+MAX_REFUSAL_LOGS = 64
+"""Maximum number of writers whose refused records are logged separately."""
 
 
 class ServiceStoppingError(Exception):
@@ -99,6 +101,7 @@ class Service(ABC, Generic[C]):
         self._token: zenoh.LivelinessToken | None = None
         self._threads: list[threading.Thread] = []
         self._interval_logs: list[IntervalLog] = []
+        self._refusal_logs: dict[str, IntervalLog] = {}
         self._heartbeat = Heartbeat.from_environment(os.environ, platform.state_dir, platform.health_interval_s)
 
     # Hooks of a subclass
@@ -264,7 +267,16 @@ class Service(ABC, Generic[C]):
 
     def _refused(self, error: BadInputError) -> None:
         self.count("records_refused")
-        log.error("Record refused", extra=kv(key=error.where, field=error.field, reason=str(error)))
+        self._refusal_log(error.where).log(key=error.where, field=error.field, reason=str(error))
+
+    def _refusal_log(self, key: str) -> IntervalLog:
+        """Return the log for refused records of one writer, so that one peer cannot hide the refusals of another."""
+        writer = keys.writer_of(key)
+        if writer not in self._refusal_logs and len(self._refusal_logs) >= MAX_REFUSAL_LOGS:
+            writer = ""
+        if writer not in self._refusal_logs:
+            self._refusal_logs[writer] = self.interval_log(log, logging.ERROR, "Record refused")
+        return self._refusal_logs[writer]
 
     def _work(self) -> None:
         while not self.stopping.is_set():
