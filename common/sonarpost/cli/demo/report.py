@@ -151,6 +151,7 @@ def _print_summary(outcome: Outcome, sheet: Path, console: Console) -> None:
         f"{'identical' if outcome.sha256_match else '[red]not identical[/red]'}; "
         f"{outcome.acoustic_s:.0f} s of airtime, {outcome.elapsed_s:.0f} s real time"
     )
+    console.print('acoustic link: unauthenticated (emulated channel, acoustic_auth = "none")')
     for text, names in (
         ("contacts without an encoded image", outcome.not_sent),
         ("images missing at the shore site", outcome.missing),
