@@ -363,3 +363,15 @@ def test_damaged_side_car_is_written_again(begin, runner, modem, relay, stream, 
     modem.send(IN, "decompressor", *records)
     eventually(lambda: len(relay.received) == 2)
     assert side.read_bytes() == whole
+
+
+@pytest.mark.parametrize("authenticated", [True, False, None])
+def test_record_and_side_car_state_the_authentication(begin, modem, relay, stream, out, authenticated):
+    begin()
+    [record] = updates(*frames_of("00A7", stream()))
+    modem.send(IN, "decompressor", record.model_copy(update={"authenticated": authenticated}))
+    eventually(lambda: len(relay.received) == 1)
+    assert relay.received[0].authenticated is authenticated
+    side_car = json.loads((out / f"{image_file_name(relay.received[0])}.json").read_text())
+    assert side_car.get("authenticated") is authenticated
+    assert ("authenticated" in side_car) == (authenticated is not None)
