@@ -9,16 +9,18 @@ import time
 from collections.abc import Sequence
 
 from sonarpost import keys
-from sonarpost.archive.image_files import add_image, image_file_name
+from sonarpost.archive.image_files import WrittenImage, add_image
 from sonarpost.archive.shore_files import (
-    decision_file_name,
+    decision_path,
     delete_image_files,
+    files_digest,
     image_row,
     index_missing_files,
     remove_temporary_files,
     select_for_removal,
+    verify_files,
 )
-from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, TaskingRow
+from sonarpost.archive.shore_index import DEFECTS, DecisionRow, ImageRow, ShoreIndex, TaskingRow
 from sonarpost.errors import PayloadError
 from sonarpost.files import AtomicFiles
 from sonarpost.logs import kv
@@ -41,7 +43,7 @@ class Archive:
         self._index: ShoreIndex | None = None
         self._lock = threading.RLock()
         self._files = AtomicFiles()
-        self._images: list[tuple[ReconstructedImage, float]] = []
+        self._images: list[tuple[str, ReconstructedImage, float]] = []
         self._decisions: list[Decision] = []
 
     def index(self) -> ShoreIndex:
@@ -60,23 +62,25 @@ class Archive:
                     log.info("Index completed from the files", extra=kv(file=index.path, rows=added))
             return self._index
 
-    def store_image(self, image: ReconstructedImage, relayed_utc_s: float) -> bool:
-        """Write and index the files of an image; return whether it is new."""
+    def store_image(self, image: ReconstructedImage, relayed_utc_s: float) -> WrittenImage:
+        """Write and index the files of an image; a different image with the same file name stays."""
         index = self.index()
         with self._lock:
-            path, new = add_image(self._files, self._out_dir / image.vessel_id, image)
-            if new or not index.has_image(image.vessel_id, image_file_name(image)):
-                self._images.append((image, relayed_utc_s))
-        log.info(
-            "Image stored" if new else "Image already stored",
-            extra=kv(
-                vessel=image.vessel_id,
-                version=image.version,
-                transit_s=round(time.time() - relayed_utc_s, 1),
-                file=path,
-            ),
+            written = add_image(self._files, self._out_dir / image.vessel_id, image)
+            name = written.tiff.stem
+            if written.is_new or not index.has_image(image.vessel_id, name):
+                self._images.append((name, image, relayed_utc_s))
+        fields = kv(
+            vessel=image.vessel_id,
+            version=image.version,
+            transit_s=round(time.time() - relayed_utc_s, 1),
+            file=written.tiff,
         )
-        return new
+        if written.is_new and written.is_conflict:
+            log.warning("Image conflicts with a stored one of the same name; both are kept", extra=fields)
+        else:
+            log.info("Image stored" if written.is_new else "Image already stored", extra=fields)
+        return written
 
     def store_decision(self, decision: Decision) -> bool:
         """Write and index the file of a decision; return whether it is new.
@@ -85,9 +89,8 @@ class Archive:
             PayloadError: A different decision has this identifier.
         """
         index = self.index()
-        folder = self._out_dir / decision.vessel_id / "decisions"
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / decision_file_name(decision.decision_id)
+        path = decision_path(self._out_dir, decision.vessel_id, decision.decision_id)
+        path.parent.mkdir(parents=True, exist_ok=True)
         text = (json.dumps(decision.model_dump(), indent=1) + "\n").encode()
         with self._lock:
             stored = self._files.text_of(path) or (path.read_bytes() if path.is_file() else None)
@@ -117,9 +120,11 @@ class Archive:
             files, self._files = self._files, AtomicFiles()
             files.commit()
             rows: list[ImageRow | DecisionRow] = [
-                image_row(self._out_dir, image_file_name(i), i, at, time.time()) for i, at in images
+                image_row(self._out_dir, name, image, at, time.time()) for name, image, at in images
             ]
-            rows += [DecisionRow.of(decision, time.time()) for decision in decisions]
+            for decision in decisions:
+                path = decision_path(self._out_dir, decision.vessel_id, decision.decision_id)
+                rows.append(DecisionRow.of(decision, time.time(), files_digest([path])))
             if rows:
                 self.index().put(rows)
 
@@ -151,6 +156,47 @@ class Archive:
                 ),
             )
         return rows
+
+    def verify(self, now_utc_s: float, interval_s: float) -> int:
+        """Compare some of the stored files with the index; log what is missing or changed.
+
+        Args:
+            now_utc_s: Time of this call.
+            interval_s: Interval of the calls; all files are compared once in `verify_days`.
+
+        Returns:
+            Number of compared images and decisions.
+        """
+        cycle_s = self._config.verify_days * 86400.0
+        if cycle_s == 0.0:
+            return 0
+        index = self.index()
+        results = []
+        for row in index.to_verify(now_utc_s - cycle_s, interval_s, cycle_s):
+            # Without retention and new files in between, for one row at a time.
+            with self._lock:
+                if isinstance(row, DecisionRow) or index.has_image(row.vessel_id, row.name):
+                    results.append(verify_files(self._out_dir, row))
+        if results:
+            index.mark_verified(results, now_utc_s)
+        new = [result for result in results if result.fault and result.fault != result.row.fault]
+        if new:
+            row = new[0].row
+            log.error(
+                "Stored files differ from the index",
+                extra=kv(
+                    records=len(new),
+                    vessel=row.vessel_id,
+                    first=row.name if isinstance(row, ImageRow) else row.decision_id,
+                    fault=new[0].fault,
+                ),
+            )
+        return len(results)
+
+    def defect_counts(self) -> dict[str, int]:
+        """Return the numbers of missing, changed, unreadable and conflicting records; 0 while the index is not open."""
+        with self._lock:
+            return dict.fromkeys(DEFECTS, 0) if self._index is None else self._index.defect_counts()
 
     def images_bytes(self) -> int:
         """Return the size of the stored images in bytes, 0 while the index is not open."""

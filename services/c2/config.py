@@ -19,9 +19,11 @@ class C2Config(ServiceConfig):
         retain_days: Age above which images are removed; None keeps them.
         max_bytes: Maximum size of the stored images; above it exported ones are removed first, then the oldest. None
             for no limit. Decisions are never removed.
+        verify_days: Time in which every stored file is compared with the index once; 0 disables the comparison.
     """
 
     site: PlatformId = SHORE
     out_dir: Path = Path("out")
     retain_days: Annotated[float, Field(gt=0, le=36500)] | None = None
     max_bytes: Annotated[int, Field(ge=0)] | None = None
+    verify_days: Annotated[float, Field(ge=0, le=36500)] = 1.0

@@ -30,6 +30,7 @@ COMMAND_PRIORITY = 1
 ADVICE_PRIORITY = 2
 CONSUMER = "relay"
 RETENTION_INTERVAL_S = 60.0
+VERIFICATION_INTERVAL_S = 60.0
 RETRY_S = 1.0
 
 
@@ -109,8 +110,10 @@ class C2Service(Service[C2Config]):
         return inner
 
     def _store_image(self, image: ReconstructedImage, relayed_utc_s: float, effects: UnitOfWork) -> None:
-        new = self._archive.store_image(image, relayed_utc_s)
-        effects.count("images_stored" if new else "images_repeated")
+        written = self._archive.store_image(image, relayed_utc_s)
+        effects.count("images_stored" if written.is_new else "images_repeated")
+        if written.is_new and written.is_conflict:
+            effects.count("images_conflicting")
         self._to_publish.append((keys.shore_image(image.vessel_id, self.config.site), image))
 
     def _store_decision(self, decision: Decision, effects: UnitOfWork) -> None:
@@ -220,6 +223,7 @@ class C2Service(Service[C2Config]):
     def on_start(self) -> None:
         """Start the retention and the publication of delivery states."""
         self.start_thread(self._run_retention, "retention")
+        self.start_thread(self._run_verification, "verification")
         self.start_thread(self._publish_states, "tasking")
         declare_presence(self.session, self.platform.id, self.NAME, self.config.site)
 
@@ -246,6 +250,20 @@ class C2Service(Service[C2Config]):
                 log.error("Retention failed", extra=kv(reason=str(error)))
             self._retention_due.wait(RETENTION_INTERVAL_S)
 
+    def _run_verification(self) -> None:
+        while not self.stopping.wait(VERIFICATION_INTERVAL_S):
+            try:
+                self._archive.verify(time.time(), VERIFICATION_INTERVAL_S)
+                self._background_faults.pop("verification", None)
+            except OSError as error:
+                self._background_faults["verification"] = f"stored files cannot be verified: {error}"
+                log.error("Verification of stored files failed", extra=kv(reason=str(error)))
+
+    def warning(self) -> str:
+        """Return how many records are missing, changed or conflicting in `out_dir`."""
+        counts = [f"{count} {defect}" for defect, count in self._archive.defect_counts().items() if count]
+        return f"{self.config.out_dir}: stored records {', '.join(counts)}" if counts else ""
+
     def degraded_reason(self) -> str:
         """Return the faults of the background threads."""
         return "; ".join(tuple(self._background_faults.values()))
@@ -256,6 +274,7 @@ class C2Service(Service[C2Config]):
         return {
             "pictures_bytes": float(self._archive.images_bytes()),
             "waiting_for_vessels": float(sum(self.store.queue_depth(queue).records for queue in waiting)),
+            **{f"records_{defect}": float(count) for defect, count in self._archive.defect_counts().items()},
         }
 
     def _publish(self, key: str, record: Record) -> None:

@@ -66,7 +66,12 @@ class DecompressorService(Service[DecompressorConfig]):
             log.exception("Image quarantined after an unexpected exception")
             self._quarantine_stream(record, f"{type(error).__name__}: {error}", effects)
             return
-        path, _ = write_image(self.config.out_dir, image)
+        written = write_image(self.config.out_dir, image)
+        if written.is_new and written.is_conflict:
+            log.warning(
+                "Image conflicts with a stored one of the same name; both are kept", extra=kv(file=written.tiff)
+            )
+            effects.count("images_conflicting")
         payload, out_key = wire.encode(image), keys.image_reconstructed(self.platform.id)
         for consumer in self.config.image_consumers:
             effects.send_payload(out_key, consumer, payload, ReconstructedImage, priority=5)
@@ -78,7 +83,7 @@ class DecompressorService(Service[DecompressorConfig]):
                 version=image.version,
                 missing_percent=round(100 * image.missing_fraction, 1),
                 missing_halves=",".join(image.missing_halves),
-                file=path,
+                file=written.tiff,
             ),
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -13,7 +14,8 @@ from builders.record_samples import COMPLETE_IMAGE, DAMAGED_IMAGE
 from builders.record_strategies import images
 from hypothesis import given, settings
 
-from sonarpost.archive.image_files import image_file_name, side_car, write_image
+from sonarpost.archive.image_files import add_image, image_file_name, side_car, write_image
+from sonarpost.files import AtomicFiles
 from sonarpost.messages import Pixels, ReconstructedImage
 from sonarpost.sonar.image_files import read_image
 
@@ -42,7 +44,7 @@ def test_name_holds_vehicle_time_image_and_version() -> None:
 
 
 def test_image_is_three_consistent_files(tmp_path: Path) -> None:
-    tiff, new = write_image(tmp_path / "a" / "b", COMPLETE_IMAGE)
+    tiff, new, _ = write_image(tmp_path / "a" / "b", COMPLETE_IMAGE)
     assert new
     assert tiff == tmp_path / "a" / "b" / f"{NAME}.tiff"
     assert sorted(contents(tiff.parent)) == [f"{NAME}.json", f"{NAME}.png", f"{NAME}.tiff"]
@@ -63,7 +65,7 @@ def test_image_is_three_consistent_files(tmp_path: Path) -> None:
 
 def test_tiff_and_png_hold_16_bits(tmp_path: Path) -> None:
     pixels = np.array([[0, 255, 256], [40_000, 65_535, 1]], np.uint16)
-    tiff, _ = write_image(tmp_path, with_pixels(pixels))
+    tiff, _, _ = write_image(tmp_path, with_pixels(pixels))
     for suffix in (".tiff", ".png"):
         back = read_image(tiff.with_suffix(suffix))
         assert back.dtype == np.uint16
@@ -92,13 +94,13 @@ def test_files_are_written_once_and_reproducible(
     tmp_path_factory: pytest.TempPathFactory, image: ReconstructedImage
 ) -> None:
     here, there = tmp_path_factory.mktemp("vessel"), tmp_path_factory.mktemp("shore")
-    tiff, new = write_image(here, image)
+    tiff, new, _ = write_image(here, image)
     assert new
     np.testing.assert_array_equal(read_image(tiff), image.picture.to_array())
     write_image(there, image)
     assert contents(here) == contents(there)
     before = {path.name: path.stat().st_mtime_ns for path in here.iterdir()}
-    assert write_image(here, image) == (tiff, False)
+    assert write_image(here, image) == (tiff, False, False)
     assert {path.name: path.stat().st_mtime_ns for path in here.iterdir()} == before
 
 
@@ -112,7 +114,7 @@ def test_versions_do_not_replace_each_other(tmp_path: Path) -> None:
 
 
 def test_damaged_files_are_written_again(tmp_path: Path) -> None:
-    tiff, _ = write_image(tmp_path, COMPLETE_IMAGE)
+    tiff, _, _ = write_image(tmp_path, COMPLETE_IMAGE)
     whole = contents(tmp_path)
     for damage in (
         lambda: tiff.with_suffix(".json").unlink(),
@@ -120,7 +122,7 @@ def test_damaged_files_are_written_again(tmp_path: Path) -> None:
         tiff.unlink,
     ):
         damage()
-        assert write_image(tmp_path, COMPLETE_IMAGE) == (tiff, True)
+        assert write_image(tmp_path, COMPLETE_IMAGE) == (tiff, True, False)
         assert contents(tmp_path) == whole
 
 
@@ -161,3 +163,48 @@ def test_side_car_is_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     write_image(tmp_path, COMPLETE_IMAGE)
     assert order[-1] == ".json"
     assert sorted(order) == [".json", ".png", ".tiff"]
+
+
+def shifted(seconds: float, value: int = 7) -> ReconstructedImage:
+    """Return another image whose first frame arrived within the same second."""
+    return with_pixels(np.full((2, 3), value, np.uint8), first_frame_utc_s=COMPLETE_IMAGE.first_frame_utc_s + seconds)
+
+
+def test_other_image_of_the_same_name_is_kept(tmp_path: Path) -> None:
+    first, second, third = COMPLETE_IMAGE, shifted(0.4), shifted(0.4, value=8)
+    assert image_file_name(first) == image_file_name(second)
+    assert write_image(tmp_path, first) == (tmp_path / f"{NAME}.tiff", True, False)
+    stored = contents(tmp_path)
+    written = [write_image(tmp_path, image) for image in (second, third)]
+    assert all(found.is_new and found.is_conflict for found in written)
+    assert len({found.tiff for found in written}) == 2
+    for found, image in zip(written, (second, third), strict=True):
+        digest = hashlib.sha256(found.tiff.with_suffix(".json").read_bytes()).hexdigest()[:16]
+        assert found.tiff.name == f"{NAME}_{digest}.tiff"
+        np.testing.assert_array_equal(read_image(found.tiff), image.picture.to_array())
+    now = contents(tmp_path)
+    assert len(now) == 9
+    assert stored.items() <= now.items()
+
+
+def test_repeated_images_of_one_name_change_no_file(tmp_path: Path) -> None:
+    images = [COMPLETE_IMAGE, shifted(0.4), shifted(0.1)]
+    written = [write_image(tmp_path, image) for image in images]
+    before = contents(tmp_path)
+    for image, found in zip(images, written, strict=True):
+        assert write_image(tmp_path, image) == (found.tiff, False, found.is_conflict)
+    assert contents(tmp_path) == before
+
+
+def test_conflicting_images_in_one_commit_are_kept(tmp_path: Path) -> None:
+    files = AtomicFiles()
+    images = [COMPLETE_IMAGE, shifted(0.4), COMPLETE_IMAGE, shifted(0.4)]
+    written = [add_image(files, tmp_path, image) for image in images]
+    files.commit()
+    assert [(found.is_new, found.is_conflict) for found in written] == [
+        (True, False),
+        (True, True),
+        (False, False),
+        (False, True),
+    ]
+    assert len(contents(tmp_path)) == 6

@@ -1,20 +1,44 @@
-"""Files of a reconstructed image: TIFF, JSON side-car and PNG, with the same bytes on every platform."""
+"""Files of a reconstructed image: TIFF, JSON side-car and PNG, with the same bytes on every platform.
+
+Different images can have the same file name: the time in it has whole seconds, and a producer can repeat identifiers.
+The first one keeps the plain name. Each further one has a digest of its side-car appended, so that none replaces
+another.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from sonarpost.export.contacts import SideCar
 from sonarpost.files import AtomicFiles
 from sonarpost.messages import ReconstructedImage
 from sonarpost.sonar.image_files import png_bytes, tiff_bytes
 
+DIGEST_CHARACTERS = 16
 
-def image_file_name(image: ReconstructedImage) -> str:
-    """Return the file name without suffix: vehicle, time of the first frame, image identifier, version.
+
+class WrittenImage(NamedTuple):
+    """Result of `write_image`.
+
+    Attributes:
+        tiff: Path of the TIFF file; the other two files differ in the suffix.
+        is_new: Whether the image was not stored before.
+        is_conflict: Whether another image has the plain file name.
+    """
+
+    tiff: Path
+    is_new: bool
+    is_conflict: bool
+
+
+def image_file_name(image: ReconstructedImage | SideCar) -> str:
+    """Return the plain file name without suffix: vehicle, time of the first frame, image identifier, version.
 
     The time distinguishes images of a later mission, if the vehicle has restarted its identifiers.
     """
@@ -42,39 +66,35 @@ def side_car(image: ReconstructedImage) -> dict[str, object]:
     }
 
 
-def write_image(folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
-    """Write the three files of an image; existing files of the same image are not changed.
+def write_image(folder: Path, image: ReconstructedImage) -> WrittenImage:
+    """Write the three files of an image; files of the same and of other images are not changed.
 
     The JSON file is written last: if it exists, the other two are complete.
-
-    Returns:
-        Path of the TIFF file, and whether the image is new.
 
     Raises:
         OSError: The folder cannot be written, for example because of a full disk.
     """
     files = AtomicFiles()
-    found = add_image(files, folder, image)
+    written = add_image(files, folder, image)
     files.commit()
-    return found
+    return written
 
 
-def add_image(files: AtomicFiles, folder: Path, image: ReconstructedImage) -> tuple[Path, bool]:
+def add_image(files: AtomicFiles, folder: Path, image: ReconstructedImage) -> WrittenImage:
     """Add the files of an image to others that are committed together; see `write_image`.
 
     Raises:
         OSError: The folder cannot be written; none of the three files is added.
     """
-    name = image_file_name(image)
-    tiff, sidecar = folder / f"{name}.tiff", folder / f"{name}.json"
     text = (json.dumps(side_car(image), indent=1) + "\n").encode()
-    png = folder / f"{name}.png"
-    if (added := files.text_of(sidecar)) is not None:
-        known = added == text
-    else:
-        known = sidecar.is_file() and sidecar.read_bytes() == text and tiff.is_file() and png.is_file()
-    if known:
-        return tiff, False
+    plain = folder / f"{image_file_name(image)}.json"
+    other = plain.with_name(f"{plain.stem}_{hashlib.sha256(text).hexdigest()[:DIGEST_CHARACTERS]}.json")
+    for path in (plain, other):
+        if _is_stored(files, path, text):
+            return WrittenImage(path.with_suffix(".tiff"), is_new=False, is_conflict=path == other)
+    is_conflict = other.exists() or _is_other_image(files.text_of(plain) or _content(plain), image, text)
+    sidecar = other if is_conflict else plain
+    tiff, png = sidecar.with_suffix(".tiff"), sidecar.with_suffix(".png")
     folder.mkdir(parents=True, exist_ok=True)
     pixels = image.picture.to_array()
     before = len(files)
@@ -85,4 +105,26 @@ def add_image(files: AtomicFiles, folder: Path, image: ReconstructedImage) -> tu
     except BaseException:
         files.drop_from(before)
         raise
-    return tiff, True
+    return WrittenImage(tiff, is_new=True, is_conflict=is_conflict)
+
+
+def _is_stored(files: AtomicFiles, sidecar: Path, text: bytes) -> bool:
+    if (added := files.text_of(sidecar)) is not None:
+        return added == text
+    complete = all(sidecar.with_suffix(suffix).is_file() for suffix in (".tiff", ".png"))
+    return _content(sidecar) == text and complete
+
+
+def _content(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None
+
+
+def _is_other_image(content: bytes | None, image: ReconstructedImage, text: bytes) -> bool:
+    """Return whether a side-car belongs to another image; an unreadable one is written again."""
+    if content is None or content == text:
+        return False
+    try:
+        fields = json.loads(content)
+    except ValueError:
+        return False
+    return isinstance(fields, dict) and fields.get("type") == image.TYPE

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from pydantic import ValidationError
 
-from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex
+from sonarpost.archive.image_files import image_file_name
+from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, Verified
 from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import DECISIONS, SideCar
 from sonarpost.logs import kv
@@ -23,6 +25,42 @@ SUFFIXES = (".json", ".tiff", ".png")
 def image_paths(out_dir: Path, row: ImageRow) -> tuple[Path, ...]:
     """Return the paths of an image's files."""
     return tuple(out_dir / row.vessel_id / f"{row.name}{suffix}" for suffix in SUFFIXES)
+
+
+def decision_path(out_dir: Path, vessel_id: str, decision_id: str) -> Path:
+    """Return the path of a decision's file."""
+    return out_dir / vessel_id / DECISIONS / decision_file_name(decision_id)
+
+
+def files_digest(paths: Iterable[Path]) -> str:
+    """Return the SHA-256 digests of files, separated by spaces.
+
+    Raises:
+        OSError: A file is missing or cannot be read.
+    """
+    return " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths)
+
+
+def verify_files(out_dir: Path, row: ImageRow | DecisionRow) -> Verified:
+    """Compare the files of a row with the index: existence, size, digests.
+
+    A row without digests (of an earlier version) gets those of the present files, if their size is right.
+    """
+    if isinstance(row, ImageRow):
+        paths, size_bytes = image_paths(out_dir, row), row.size_bytes
+    else:
+        paths, size_bytes = (decision_path(out_dir, row.vessel_id, row.decision_id),), None
+    try:
+        same_size = size_bytes in (None, sum(path.stat().st_size for path in paths))
+        found = files_digest(paths)
+    except FileNotFoundError:
+        return Verified(row, row.files_sha256, "missing")
+    except OSError as error:
+        log.debug("Stored file cannot be read", extra=kv(file=paths[0], error=str(error)))
+        return Verified(row, row.files_sha256, "unreadable")
+    if same_size and found == (row.files_sha256 or found):
+        return Verified(row, found, "")
+    return Verified(row, row.files_sha256, "changed")
 
 
 def decision_file_name(decision_id: str) -> str:
@@ -69,6 +107,8 @@ def image_row(
         atd_class=contact.atd_class if contact else None,
         atd_confidence=contact.atd_confidence if contact else None,
         size_bytes=sum((folder / f"{name}{suffix}").stat().st_size for suffix in SUFFIXES),
+        conflict=name != image_file_name(image),
+        files_sha256=files_digest(folder / f"{name}{suffix}" for suffix in SUFFIXES),
     )
 
 
@@ -116,7 +156,7 @@ def _missing_decisions(out_dir: Path, index: ShoreIndex) -> Iterator[DecisionRow
         try:
             decision = Decision.model_validate_json(path.read_bytes())
             if not index.has_decision(decision.vessel_id, decision.decision_id):
-                yield DecisionRow.of(decision, path.stat().st_mtime)
+                yield DecisionRow.of(decision, path.stat().st_mtime, files_digest([path]))
         except (ValidationError, OSError) as error:
             log.error("Stored decision cannot be read", extra=kv(file=path, reason=str(error)[:200]))
 

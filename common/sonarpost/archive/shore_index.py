@@ -6,6 +6,7 @@ it and mark exported images.
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import threading
 from collections.abc import Iterable, Iterator
@@ -18,7 +19,7 @@ from sonarpost.errors import StoredFileError
 from sonarpost.messages import Decision, DeliveryState, TaskingKind
 
 FILE_NAME = "index.db"
-INDEX_VERSION = 1
+INDEX_VERSION = 2
 BUSY_S = 10.0
 
 _SCHEMA = """
@@ -28,17 +29,36 @@ CREATE TABLE IF NOT EXISTS picture (
     relayed_utc_s REAL, accepted_utc_s REAL NOT NULL, complete INTEGER NOT NULL, missing_fraction REAL NOT NULL,
     height_px INTEGER NOT NULL, width_px INTEGER NOT NULL, codec TEXT NOT NULL, lat_deg REAL, lon_deg REAL,
     atd_class TEXT, atd_confidence REAL, size_bytes INTEGER NOT NULL, exported_utc_s REAL, removed_utc_s REAL,
+    conflict INTEGER NOT NULL DEFAULT 0, files_sha256 TEXT NOT NULL DEFAULT '', verified_utc_s REAL,
+    fault TEXT NOT NULL DEFAULT '',
     PRIMARY KEY (vessel_id, name)) WITHOUT ROWID;
 CREATE INDEX IF NOT EXISTS picture_age ON picture (accepted_utc_s) WHERE removed_utc_s IS NULL;
 CREATE TABLE IF NOT EXISTS decision (
     vessel_id TEXT NOT NULL, decision_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
     image_version INTEGER NOT NULL, verdict TEXT NOT NULL, confidence REAL, mlo_class TEXT, remark TEXT NOT NULL,
     operator TEXT NOT NULL, decided_utc_s REAL NOT NULL, accepted_utc_s REAL NOT NULL,
+    files_sha256 TEXT NOT NULL DEFAULT '', verified_utc_s REAL, fault TEXT NOT NULL DEFAULT '',
     PRIMARY KEY (vessel_id, decision_id)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS tasking (
     vessel_id TEXT NOT NULL, kind TEXT NOT NULL, record_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT,
     summary TEXT NOT NULL, author TEXT NOT NULL, issued_utc_s REAL NOT NULL, state TEXT NOT NULL, reason TEXT NOT NULL,
     changed_utc_s REAL NOT NULL, PRIMARY KEY (vessel_id, kind, record_id)) WITHOUT ROWID;
+"""
+_INDEXES = """
+CREATE INDEX IF NOT EXISTS picture_verified ON picture (verified_utc_s) WHERE removed_utc_s IS NULL;
+CREATE INDEX IF NOT EXISTS picture_fault ON picture (fault) WHERE fault <> '';
+CREATE INDEX IF NOT EXISTS picture_conflict ON picture (conflict) WHERE conflict <> 0;
+CREATE INDEX IF NOT EXISTS decision_verified ON decision (verified_utc_s);
+CREATE INDEX IF NOT EXISTS decision_fault ON decision (fault) WHERE fault <> '';
+"""
+_MIGRATE_FROM_VERSION_1 = """
+ALTER TABLE picture ADD COLUMN conflict INTEGER NOT NULL DEFAULT 0;
+ALTER TABLE picture ADD COLUMN files_sha256 TEXT NOT NULL DEFAULT '';
+ALTER TABLE picture ADD COLUMN verified_utc_s REAL;
+ALTER TABLE picture ADD COLUMN fault TEXT NOT NULL DEFAULT '';
+ALTER TABLE decision ADD COLUMN files_sha256 TEXT NOT NULL DEFAULT '';
+ALTER TABLE decision ADD COLUMN verified_utc_s REAL;
+ALTER TABLE decision ADD COLUMN fault TEXT NOT NULL DEFAULT '';
 """
 
 
@@ -53,6 +73,11 @@ class ImageRow:
         size_bytes: Size of its three files.
         exported_utc_s: When it was last exported; None for never.
         removed_utc_s: When retention deleted its files; None while they exist.
+        conflict: Whether another image has the plain file name, see `image_files`.
+        files_sha256: SHA-256 digests of its files in the order of `shore_files.SUFFIXES`, separated by spaces; empty
+            before the first verification of an image of an earlier version.
+        verified_utc_s: When its files were last compared with the index; None for never.
+        fault: `missing`, `changed` or `unreadable` if the last comparison failed, else empty.
     """
 
     vessel_id: str
@@ -76,11 +101,15 @@ class ImageRow:
     size_bytes: int
     exported_utc_s: float | None = None
     removed_utc_s: float | None = None
+    conflict: bool = False
+    files_sha256: str = ""
+    verified_utc_s: float | None = None
+    fault: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class DecisionRow:
-    """One decision."""
+    """One decision; `files_sha256`, `verified_utc_s` and `fault` as in `ImageRow`."""
 
     vessel_id: str
     decision_id: str
@@ -94,12 +123,16 @@ class DecisionRow:
     operator: str
     decided_utc_s: float
     accepted_utc_s: float
+    files_sha256: str = ""
+    verified_utc_s: float | None = None
+    fault: str = ""
 
     @classmethod
-    def of(cls, decision: Decision, accepted_utc_s: float) -> DecisionRow:
+    def of(cls, decision: Decision, accepted_utc_s: float, files_sha256: str = "") -> DecisionRow:
         """Return the row of a record."""
         values = decision.model_dump(exclude={"accepted_utc_s"})
-        return cls(**{f.name: values[f.name] for f in fields(cls) if f.name in values}, accepted_utc_s=accepted_utc_s)
+        named = {f.name: values[f.name] for f in fields(cls) if f.name in values}
+        return cls(**named, accepted_utc_s=accepted_utc_s, files_sha256=files_sha256)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +154,25 @@ class TaskingRow:
 
 Row = TypeVar("Row", ImageRow, DecisionRow, TaskingRow)
 _TABLES: dict[type, str] = {ImageRow: "picture", DecisionRow: "decision", TaskingRow: "tasking"}
+_NAMES: dict[type, str] = {ImageRow: "name", DecisionRow: "decision_id"}
 Mark = Literal["exported_utc_s", "removed_utc_s"]
+DEFECTS = ("missing", "changed", "unreadable", "conflicting")
+Fault = Literal["", "missing", "changed", "unreadable"]
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """Result of the comparison of a row with its files.
+
+    Attributes:
+        row: The row as it was compared.
+        files_sha256: Digests of the files, as in `ImageRow`.
+        fault: What differs, empty if nothing does.
+    """
+
+    row: ImageRow | DecisionRow
+    files_sha256: str
+    fault: Fault
 
 
 class ShoreIndex:
@@ -158,14 +209,17 @@ class ShoreIndex:
 
     def _open(self, *, writable: bool) -> None:
         version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
-        if version != INDEX_VERSION and not (writable and version == 0):
+        # Columns that version 1 does not have get their default values.
+        if version not in (1, INDEX_VERSION) and not (writable and version == 0):
             self._db.close()
             raise StoredFileError(str(self.path), "user_version", version, str(INDEX_VERSION))
         if writable:
             self._db.execute("PRAGMA journal_mode=WAL")
             # Rows that a power cut deletes are restored from the files at the next start.
             self._db.execute("PRAGMA synchronous=NORMAL")
-            self._db.executescript(f"{_SCHEMA} PRAGMA user_version = {INDEX_VERSION};")
+            migration = _MIGRATE_FROM_VERSION_1 if version == 1 else ""
+            end = f"PRAGMA user_version = {INDEX_VERSION}; COMMIT;"
+            self._db.executescript(f"BEGIN IMMEDIATE; {migration} {_SCHEMA} {_INDEXES} {end}")
 
     def close(self) -> None:
         """Close the file."""
@@ -214,7 +268,7 @@ class ShoreIndex:
         """
         where = "" if removed else "WHERE removed_utc_s IS NULL"
         rows = self._rows(ImageRow, f"{where} ORDER BY first_frame_utc_s, vessel_id, name")
-        return [replace(row, complete=bool(row.complete)) for row in rows]  # SQLite has no booleans
+        return [_with_booleans(row) for row in rows]
 
     def decisions(self) -> list[DecisionRow]:
         """Return all decisions, oldest first."""
@@ -233,6 +287,60 @@ class ShoreIndex:
         """Return whether a decision is indexed."""
         return bool(self._rows(DecisionRow, "WHERE vessel_id = ? AND decision_id = ?", (vessel_id, decision_id)))
 
+    def to_verify(self, before_utc_s: float, interval_s: float, cycle_s: float) -> list[ImageRow | DecisionRow]:
+        """Return rows whose files are to be compared with the index, those that wait longest first.
+
+        Args:
+            before_utc_s: Rows that were compared later are omitted.
+            interval_s: Interval of the calls.
+            cycle_s: Time in which every row is returned once; it limits the number of rows.
+
+        Raises:
+            OSError: The file cannot be read.
+        """
+        found: list[ImageRow | DecisionRow] = []
+        due = "(verified_utc_s IS NULL OR verified_utc_s < ?) ORDER BY verified_utc_s LIMIT ?"
+        with self._lock:
+            count = self._count("picture", "removed_utc_s IS NULL")
+            limit = math.ceil(count * interval_s / cycle_s)
+            images = self._rows(ImageRow, f"WHERE removed_utc_s IS NULL AND {due}", (before_utc_s, limit))
+            found += [_with_booleans(row) for row in images]
+            limit = math.ceil(self._count("decision") * interval_s / cycle_s)
+            found += self._rows(DecisionRow, f"WHERE {due}", (before_utc_s, limit))
+        return found
+
+    def mark_verified(self, results: Iterable[Verified], at_utc_s: float) -> None:
+        """Store the results of comparisons.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        with self._writing() as db:
+            for result in results:
+                table, name = _TABLES[type(result.row)], _NAMES[type(result.row)]
+                key = (result.row.vessel_id, getattr(result.row, name))
+                sql = f"UPDATE {table} SET files_sha256 = ?, verified_utc_s = ?, fault = ?"  # noqa: S608 literals
+                sql += f" WHERE vessel_id = ? AND {name} = ?"
+                db.execute(sql, (result.files_sha256, at_utc_s, result.fault, *key))
+
+    def defect_counts(self) -> dict[str, int]:
+        """Return the numbers of missing, changed, unreadable and conflicting images and decisions.
+
+        Raises:
+            OSError: The file cannot be read.
+        """
+        counts = dict.fromkeys(DEFECTS, 0)
+        with self._lock:
+            for table, where in (("picture", " AND removed_utc_s IS NULL"), ("decision", "")):
+                sql = f"SELECT fault, COUNT(*) FROM {table} WHERE fault <> ''{where} GROUP BY fault"  # noqa: S608
+                for fault, count in self._execute(sql):
+                    counts[fault] += count
+            counts["conflicting"] = self._count("picture", "conflict <> 0 AND removed_utc_s IS NULL")
+        return counts
+
+    def _count(self, table: str, where: str = "1") -> int:
+        return int(self._execute(f"SELECT COUNT(*) FROM {table} WHERE {where}").fetchone()[0])  # noqa: S608
+
     def size_bytes(self) -> int:
         """Return the size of all images that are not removed, in bytes."""
         with self._lock:
@@ -242,13 +350,20 @@ class ShoreIndex:
         return int(row[0])
 
     def _rows(self, row_type: type[Row], rest: str, values: tuple[object, ...] = ()) -> list[Row]:
-        names = ", ".join(f.name for f in fields(row_type))
+        table = _TABLES[row_type]
         with self._lock:
-            found = self._execute(f"SELECT {names} FROM {_TABLES[row_type]} {rest}", values).fetchall()  # noqa: S608
-        return [row_type(*row) for row in found]
+            columns = {row[1] for row in self._execute(f"PRAGMA table_info({table})")}
+            names = [f.name for f in fields(row_type) if f.name in columns]
+            found = self._execute(f"SELECT {', '.join(names)} FROM {table} {rest}", values).fetchall()  # noqa: S608
+        return [row_type(**dict(zip(names, row, strict=True))) for row in found]
 
     def _execute(self, sql: str, values: tuple[object, ...] = ()) -> sqlite3.Cursor:
         try:
             return self._db.execute(sql, values)
         except sqlite3.Error as error:
             raise OSError(f"{self.path}: {error}") from error
+
+
+def _with_booleans(row: ImageRow) -> ImageRow:
+    """Return the row with booleans, which SQLite does not have."""
+    return replace(row, complete=bool(row.complete), conflict=bool(row.conflict))

@@ -180,9 +180,14 @@ def load_contacts(out_dir: Path) -> ContactSet:
         StoredFileError: `out_dir` is not a readable folder.
     """
     stored = read_stored_records(out_dir)
+    problems = list(stored.problems)
     latest: dict[tuple[_Name, int], tuple[SideCar, Path]] = {}
     for image, path in stored.images:
         key = (_name(image), int(image.first_frame_utc_s))
+        if key in latest and latest[key][0].version == image.version:
+            expected = f"one image of this name and version; {latest[key][1].name} is exported"
+            problems.append(StoredFileError(str(path), "image_id", image.image_id, expected))
+            continue
         if key not in latest or latest[key][0].version < image.version:
             latest[key] = (image, path)
     start_times: defaultdict[_Name, list[int]] = defaultdict(list)
@@ -201,7 +206,7 @@ def load_contacts(out_dir: Path) -> ContactSet:
         ExportContact(image, tuple(decisions[key]), _png_path(image, path)) for key, (image, path) in latest.items()
     ]
     contacts.sort(key=lambda c: (c.image.first_frame_utc_s, c.uid))
-    return ContactSet(tuple(contacts), tuple(unmatched), stored.problems)
+    return ContactSet(tuple(contacts), tuple(unmatched), tuple(problems))
 
 
 def read_stored_records(out_dir: Path) -> StoredRecords:

@@ -151,13 +151,13 @@ def test_exported_image_is_removed_before_an_older_one(archive):
 
 def test_removed_image_that_arrives_again_is_stored(archive, tmp_path):
     kept = archive(max_bytes=0)
-    assert kept.store_image(image(), 5.0)
+    assert kept.store_image(image(), 5.0).is_new
     kept.flush()
     kept.apply_retention(1.0)
-    assert kept.store_image(image(), 5.0)
+    assert kept.store_image(image(), 5.0).is_new
     kept.flush()
     assert len(kept.index().images()) == 1
-    assert not kept.store_image(image(), 5.0)
+    assert not kept.store_image(image(), 5.0).is_new
     kept.flush()
 
 

@@ -193,7 +193,7 @@ def select_images(
         key = _image_key(row.image)
         if key not in newest or newest[key].image.version < row.image.version:
             newest[key] = row
-    return list(newest.values())
+    return [row for row in rows if row is newest[_image_key(row.image)] or row.image.conflict]
 
 
 def _print_images(rows: Sequence[ListedImage]) -> None:
@@ -207,7 +207,7 @@ def _print_images(rows: Sequence[ListedImage]) -> None:
             (
                 image.vessel_id,
                 f"{image.vehicle_id}/{image.image_id}",
-                str(image.version),
+                _version_text(image),
                 time_text(image.first_frame_utc_s),
                 f"{100 * image.missing_fraction:.0f} %",
                 f"{image.lat_deg:.5f} {image.lon_deg:.5f}" if located else "",
@@ -217,6 +217,11 @@ def _print_images(rows: Sequence[ListedImage]) -> None:
             )
         )
     _print_table(headings, cells, "images")
+
+
+def _version_text(image: ImageRow) -> str:
+    notes = [*(["conflict"] if image.conflict else []), *([image.fault] if image.fault else [])]
+    return f"{image.version} ({', '.join(notes)})" if notes else str(image.version)
 
 
 def _print_tasking(rows: Iterable[TaskingRow], record_filter: RecordFilter, *, as_json: bool) -> None:
