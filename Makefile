@@ -30,9 +30,10 @@ demo: $(RUN_TIME)
 test: setup
 	$(BIN)/python -m pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder $(ARGS)
 
-# Tests of several minutes each: long outages, processes killed at random for five minutes.
+# Tests of several minutes each: long outages, random faults in all processes for SONARPOST_CHAOS_S (1800) seconds,
+# SONARPOST_SOAK_CONTACTS (1200) contacts through all services.
 test-long: setup
-	$(BIN)/python -m pytest -m long -o faulthandler_timeout=1800 $(ARGS)
+	$(BIN)/python -m pytest -m long -o faulthandler_timeout=7200 $(ARGS)
 
 check: setup docs
 	$(BIN)/ruff format --check .

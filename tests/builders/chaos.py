@@ -22,8 +22,6 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import pytest
 import tifffile
 
@@ -33,6 +31,7 @@ from builders.faulty_link import FaultyLink
 from builders.history import History
 from builders.image_archive import ArchiveLog, name_of
 from builders.image_source import ImageSource, make_image
+from builders.numbered_snippet import number_of, numbered_snippet
 from builders.small_disk import SmallDisk
 from sonarpost import keys
 from sonarpost.cli.demo.chain import ROUTERS, Chain
@@ -106,33 +105,6 @@ def _draw(rng: random.Random, at_s: float) -> Fault:
     if kind == "step":
         return Fault(at_s, f"clock {rng.choice(CLOCKS)}", "step", 0.0, rng.choice(CLOCK_STEPS_S))
     return Fault(at_s, f"disk {rng.choice(DISKS)}", "full", rng.uniform(1.0, 8.0))
-
-
-# Numbered snippets
-
-_ROWS, _COLUMNS, _BLOCK_HEIGHT_PX, _BLOCK_WIDTH_PX = 4, 4, 20, 35
-_MODULUS = 13
-
-
-def numbered_snippet(number: int) -> npt.NDArray[np.uint8]:
-    """Return a snippet that shows a number of 12 bits and a checksum of 4, shape (80, 140)."""
-    if not 0 <= number < 4096:
-        raise ValueError(f"got {number}, expected 0 to 4095")
-    code = number << 4 | number % _MODULUS
-    bits = np.array([code >> (15 - n) & 1 for n in range(16)]).reshape(_ROWS, _COLUMNS)
-    blocks = np.kron(bits, np.ones((_BLOCK_HEIGHT_PX, _BLOCK_WIDTH_PX)))
-    noise = np.random.default_rng(number).normal(0.0, 12.0, blocks.shape)
-    return np.clip(60.0 + 130.0 * blocks + noise, 0, 255).astype(np.uint8)
-
-
-def number_of(pixels: npt.NDArray[np.uint8]) -> int | None:
-    """Return the number that a decoded snippet shows, None if the pattern is unreadable."""
-    if pixels.shape != (_ROWS * _BLOCK_HEIGHT_PX, _COLUMNS * _BLOCK_WIDTH_PX):
-        return None
-    blocks = pixels.reshape(_ROWS, _BLOCK_HEIGHT_PX, _COLUMNS, _BLOCK_WIDTH_PX).mean(axis=(1, 3))
-    code = sum(1 << (15 - n) for n, bright in enumerate((blocks > 125).ravel()) if bright)
-    number = code >> 4
-    return number if code & 15 == number % _MODULUS else None
 
 
 # The chain

@@ -1,0 +1,241 @@
+"""The contacts of a long mission through all services: memory, descriptors, threads, files, renewal of certificates.
+
+`SONARPOST_SOAK_CONTACTS` sets the number of contacts (1200: 40 a day for 30 days). Contacts follow each other as fast
+as the chain delivers them; the timers of the services run in real time. `SONARPOST_SOAK_OUT` names a folder for the table
+and the operation log.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import socket
+import ssl
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import tifffile
+from builders.common import REPOSITORY
+from builders.history import History
+from builders.image_archive import side_cars
+from builders.numbered_snippet import number_of, numbered_snippet
+from builders.process_samples import Samples
+
+from sonarpost.cli.demo.chain import ROUTERS, Chain
+from sonarpost.cli.demo.outcome import read_images
+from sonarpost.cli.demo.settings import PLATFORM_OF, ChainSettings, free_ports
+from sonarpost.sonar.image_files import write_png
+
+CONTACTS = int(os.environ.get("SONARPOST_SOAK_CONTACTS", "1200"))
+IN_FLIGHT = 48
+STALLED_S = 300.0
+SAMPLE_S = 5.0
+SHORE_LIMIT_BYTES = 3_000_000
+"""Limit of c2's images, about 180 contacts: retention removes older ones during the run."""
+MAX_GROWTH_MB = 40.0
+"""Growth of a process from a quarter of the contacts to the end."""
+LONG_S = 600.0 + 3.0 * CONTACTS
+
+
+class TlsChain(Chain):
+    """A chain whose vessel and shore routers are linked by TLS, with certificates made by `sonarpost pki`."""
+
+    def __init__(self, settings: ChainSettings) -> None:
+        super().__init__(settings)
+        self.tls_port = free_ports(1)[0]
+        self.fleet = settings.folder / "fleet"
+
+    def tls_folder(self, platform: str) -> Path:
+        """Folder of the certificate that the router of a platform uses."""
+        return self.settings.folder / "tls" / platform
+
+    def make_certificates(self) -> None:
+        """Make the fleet, as docs/how-to/certificates.md describes."""
+        self.settings.folder.mkdir(parents=True, exist_ok=True)
+        pki(self.fleet, "init", "--fleet", "north")
+        pki(self.fleet, "issue", "shore-1", "--role", "shore", "--host", "localhost")
+        pki(self.fleet, "issue", "vessel-1", "--role", "vessel")
+        _, vessel, shore = self.settings.router_ports
+        endpoint = f"tls/localhost:{self.tls_port}"
+        for platform, local, link in (("shore-1", shore, "--listen"), ("vessel-1", vessel, "--connect")):
+            files = self.tls_folder(platform)
+            shutil.copytree(self.fleet / "issued" / platform, files)
+            pki(
+                self.fleet,
+                *("router-config", "--platform", platform, "--local", f"tcp/127.0.0.1:{local}", link, endpoint),
+                *("--files", str(files), "--out", str(self.settings.folder / f"router-{platform}.json5")),
+            )
+
+    def renew_certificates(self) -> None:
+        """Renew both certificates, copy them, and restart the routers."""
+        for platform in ("shore-1", "vessel-1"):
+            pki(self.fleet, "renew", platform)
+            for file in (self.fleet / "issued" / f"{platform}.renewal-1").iterdir():
+                shutil.copy2(file, self.tls_folder(platform) / file.name)
+        for router in ("router-shore", "router-vessel"):
+            self.terminate(router)
+            self.start(router)
+
+    def command(self, name: str) -> list[str]:
+        platform = {"router-shore": "shore-1", "router-vessel": "vessel-1"}.get(name)
+        if platform is None:
+            return super().command(name)
+        config = self.settings.folder / f"router-{platform}.json5"
+        return [sys.executable, "-m", "sonarpost.bus.router", "--config", str(config)]
+
+    def served_certificate(self) -> bytes:
+        """Return the certificate with which the shore's router answers the vessel, DER."""
+        files = self.tls_folder("vessel-1")
+        context = ssl.create_default_context(cafile=str(files / "ca.pem"))
+        context.load_cert_chain(files / "certificate.pem", files / "key.pem")
+        with (
+            socket.create_connection(("localhost", self.tls_port), timeout=10) as plain,
+            context.wrap_socket(plain, server_hostname="localhost") as secured,
+        ):
+            der = secured.getpeercert(binary_form=True)
+        assert der is not None
+        return der
+
+
+def pki(fleet: Path, *arguments: str) -> None:
+    """Run `sonarpost pki`."""
+    command = [sys.executable, "-m", "sonarpost.cli.main", "pki", arguments[0], "--dir", str(fleet), *arguments[1:]]
+    subprocess.run(command, cwd=REPOSITORY, check=True, capture_output=True)
+
+
+class Mission:
+    """Feeds numbered snippets to the vehicle, and logs each complete image at the shore before retention removes it."""
+
+    def __init__(self, settings: ChainSettings, history: History) -> None:
+        self.settings = settings
+        self.history = history
+        self.queued = 0
+        self._found: dict[str, tuple[str, str]] = {}
+        for consumer in ("decompressor", "c2"):
+            history.add("consumer", consumer)
+
+    @property
+    def delivered(self) -> int:
+        """Number of complete images at the shore site."""
+        return len(self._found)
+
+    def feed(self) -> None:
+        """Put snippets into the vehicle's folder; at most `IN_FLIGHT` are not yet delivered."""
+        while self.queued < CONTACTS and self.queued - self.delivered < IN_FLIGHT:
+            name = f"snippet-{self.queued:05}.png"
+            hidden = self.settings.incoming / f".{name}"
+            write_png(hidden, numbered_snippet(self.queued))
+            hidden.rename(hidden.with_name(name))
+            self.history.add("queued", "survey folder", f"snippet-{self.queued:05}")
+            self.queued += 1
+
+    def look(self) -> None:
+        """Log the images that are complete at the shore and were not seen before."""
+        for path in side_cars(self.settings.shore_images):
+            base = path.stem.rpartition("_v")[0]
+            if base in self._found or '"complete": true' not in path.read_text(encoding="utf-8"):
+                continue
+            tiff = path.with_suffix(".tiff")
+            number = number_of(tifffile.imread(tiff))
+            record = f"unreadable {path.stem}" if number is None else f"snippet-{number:05}"
+            sha256 = hashlib.sha256(tiff.read_bytes()).hexdigest()
+            self.history.add("handled", "c2", record, sha256=sha256, detail=path.stem)
+            self._found[base] = record, path.stem
+
+    def log_vessel_images(self) -> None:
+        """Log the images of the vessel in the versions that were logged at the shore; others are unknown there."""
+        stored = read_images(self.settings.vessel_images)
+        for base in {name.rpartition("_v")[0] for name in stored}:
+            record, name = self._found.get(base, (f"not at the shore {base}", ""))
+            if name in stored:
+                self.history.add("handled", "decompressor", record, sha256=stored[name].sha256, detail=name)
+            elif not name:
+                self.history.add("handled", "decompressor", record, detail=base)
+
+
+def wait_until_started(chain: Chain, condition: Callable[[], bool]) -> None:
+    """Wait for a condition while all processes run."""
+    deadline = time.monotonic() + 60
+    while not condition():
+        chain.check()
+        assert time.monotonic() < deadline, "not started within 60 s"
+        time.sleep(0.2)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(LONG_S)
+def test_services_neither_grow_nor_lose_a_contact_over_a_long_mission(tmp_path: Path) -> None:
+    uuv, vessel, shore = free_ports(3)
+    settings = ChainSettings(
+        folder=tmp_path / "run",
+        mode="snippets",
+        rate=5,
+        loss=0.05,
+        time_scale=100.0,
+        router_ports=(uuv, vessel, shore),
+        extra=(
+            ("c2", f"max_bytes = {SHORE_LIMIT_BYTES}"),
+            ("op_modem", "max_images_per_hour = 1000000\nmax_image_bytes_per_hour = 1099511627776"),
+        ),
+    )
+    history = History(settings.folder / "history.jsonl")
+    chain = TlsChain(settings)
+    chain.make_certificates()
+    with chain:
+        folders: dict[str, list[Path]] = {}
+        for service, platform in PLATFORM_OF.items():
+            store = settings.folder / "state" / platform / f"{service}.db"
+            folders[f"store of {service}"] = [store, store.with_name(f"{store.name}-wal")]
+        folders["images of the vessel"] = [settings.vessel_images]
+        folders["images of the shore site"] = [settings.shore_images]
+        folders["index of the shore site"] = [settings.shore_images.parent / "index.db"]
+        folders["logs"] = [settings.folder / "logs"]
+        samples = Samples(chain, folders)
+        mission = Mission(settings, history)
+        wait_until_started(
+            chain, lambda: all(path[0].is_file() for path in folders.values() if path[0].suffix == ".db")
+        )
+        served = chain.served_certificate()
+        started_s = progress_s = time.monotonic()
+        sample_s, renewed = 0.0, False
+        while mission.delivered < CONTACTS:
+            chain.check()
+            mission.feed()
+            before = mission.delivered
+            mission.look()
+            now_s = time.monotonic()
+            progress_s = now_s if mission.delivered > before else progress_s
+            assert now_s - progress_s < STALLED_S, f"{mission.delivered} of {mission.queued} delivered, none for 5 min"
+            if now_s - sample_s > SAMPLE_S:
+                samples.take(mission.delivered)
+                sample_s = now_s
+            if not renewed and mission.delivered >= CONTACTS // 2:
+                history.fault("routers", "certificates renewed, restarted")
+                chain.renew_certificates()
+                renewed = True
+            time.sleep(0.2)
+        elapsed_s = time.monotonic() - started_s
+        samples.take(mission.delivered)
+        assert chain.served_certificate() != served, "the shore's router uses the renewed certificate"
+    mission.log_vessel_images()
+    history.close()
+    verdict = history.verdict()
+    text = f"{CONTACTS} contacts in {elapsed_s:.0f} s\n{verdict}\n\n{samples.table(CONTACTS)}\n"
+    print(text)
+    if (out := os.environ.get("SONARPOST_SOAK_OUT")) is not None:
+        Path(out).mkdir(parents=True, exist_ok=True)
+        (Path(out) / "soak.md").write_text(text)
+        shutil.copy(history.path, Path(out) / "soak-history.jsonl")
+    assert verdict.ok, verdict
+    assert samples.sizes["images of the shore site"][-1][1] < 1.5 * SHORE_LIMIT_BYTES, "retention limits the images"
+    for name, taken in samples.processes.items():
+        early, last = samples.nearest(taken, CONTACTS / 4), taken[-1]
+        assert last.rss_mb < early.rss_mb + MAX_GROWTH_MB, name
+        assert last.descriptors <= early.descriptors + 8, name
+        assert last.threads <= early.threads + 8, name
+    assert set(samples.processes) == {*ROUTERS, *PLATFORM_OF}
