@@ -1,8 +1,8 @@
 """The contacts of a long mission through all services: memory, descriptors, threads, files, renewal of certificates.
 
-`SONARPOST_SOAK_CONTACTS` sets the number of contacts (1200: 40 a day for 30 days). Contacts follow each other as fast
-as the chain delivers them; the timers of the services run in real time. `SONARPOST_SOAK_OUT` names a folder for the table
-and the operation log.
+`SONARPOST_SOAK_CONTACTS` sets the number of contacts (1200: 40 a day for 30 days). The chain is fed as fast as it
+delivers; the timers of the services run in real time. `SONARPOST_SOAK_OUT` names a folder for the table and the
+operation log.
 """
 
 from __future__ import annotations
