@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.files import AtomicFiles, write_atomically
+from sonarpost.files import PUBLIC_FILE, AtomicFiles, make_private, write_atomically
 
 
 def leftovers(folder: Path) -> list[str]:
@@ -31,9 +31,28 @@ def test_file_holds_the_last_version(tmp_path_factory: pytest.TempPathFactory, v
     assert [path.name for path in folder.iterdir()] == ["file.bin"]
 
 
-def test_file_is_readable_by_others(tmp_path: Path) -> None:
-    write_atomically(tmp_path / "f", b"x")
-    assert (tmp_path / "f").stat().st_mode & 0o777 == 0o644
+@pytest.mark.parametrize(("umask", "expected"), [(0o022, 0o644), (0o077, 0o600)])
+def test_umask_limits_the_permissions_unless_a_mode_is_given(umask: int, expected: int, tmp_path: Path) -> None:
+    files = AtomicFiles()
+    before = os.umask(umask)
+    try:
+        write_atomically(tmp_path / "by umask", b"x")
+        write_atomically(tmp_path / "given", b"x", PUBLIC_FILE)
+        files.add(tmp_path / "staged", b"x")
+        files.commit()
+    finally:
+        os.umask(before)
+    modes = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
+    assert modes == {"by umask": expected, "given": 0o644, "staged": expected}
+
+
+def test_existing_file_is_restricted_to_its_owner(tmp_path: Path) -> None:
+    (tmp_path / "old").write_text("x")
+    (tmp_path / "old").chmod(0o644)
+    for name in ("old", "new"):
+        make_private(tmp_path / name)
+        assert (tmp_path / name).stat().st_mode & 0o777 == 0o600
+    assert (tmp_path / "old").read_text() == "x"
 
 
 @pytest.mark.parametrize("call", ["fsync", "fchmod", "write", "replace"])
@@ -64,7 +83,7 @@ def test_failed_write_keeps_the_old_file_only(call: str, tmp_path: Path, monkeyp
     else:
         monkeypatch.setattr(os, call, fail)
     with pytest.raises(OSError, match="No space left"):
-        write_atomically(target, b"new")
+        write_atomically(target, b"new", PUBLIC_FILE)
     monkeypatch.undo()
     assert target.read_bytes() == b"old"
     assert leftovers(tmp_path) == []

@@ -1,8 +1,12 @@
-"""Atomic and durable writes: after a crash or power cut each file is complete or absent."""
+"""Atomic and durable writes: after a crash or power cut each file is complete or absent.
+
+Files get the permissions that the umask of the process allows, unless a mode is given. Services run with umask 077.
+"""
 
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -14,9 +18,10 @@ from typing import BinaryIO
 PRIVATE_FILE = 0o600
 PUBLIC_FILE = 0o644
 PRIVATE_FOLDER = 0o700
+PRIVATE_UMASK = 0o077
 
 
-def write_atomically(path: Path, data: bytes, mode: int = PUBLIC_FILE) -> None:
+def write_atomically(path: Path, data: bytes, mode: int | None = None) -> None:
     """Write a file with `atomic_file`.
 
     Raises:
@@ -27,30 +32,47 @@ def write_atomically(path: Path, data: bytes, mode: int = PUBLIC_FILE) -> None:
 
 
 @contextmanager
-def atomic_file(path: Path, mode: int = PUBLIC_FILE) -> Iterator[BinaryIO]:
+def atomic_file(path: Path, mode: int | None = None) -> Iterator[BinaryIO]:
     """Yield a temporary file; at the end of the block, flush it to the disk and rename it to `path`.
 
     Args:
         path: The file to create or replace; its folder must exist. It is unchanged if the block raises.
-        mode: Its permissions, independent of the umask.
+        mode: Its permissions, independent of the umask; None for those that the umask allows.
 
     Raises:
         OSError: It cannot be written (full disk, no permission); `path` is unchanged.
     """
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    temporary = Path(name)
+    descriptor, temporary = _create_temporary(path, 0o666 if mode is None else PRIVATE_FILE)
     try:
         with os.fdopen(descriptor, "wb") as file:
             yield file
             file.flush()
-            # mkstemp creates files that only their owner can read.
-            os.fchmod(file.fileno(), mode)
+            if mode is not None:
+                os.fchmod(file.fileno(), mode)
             os.fsync(file.fileno())
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+def _create_temporary(path: Path, mode: int) -> tuple[int, Path]:
+    """Create a temporary file for `path` with a mode that the umask limits; return its descriptor and path."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    return os.open(temporary, flags, mode), temporary
+
+
+def make_private(path: Path) -> None:
+    """Create a file that only its owner can read and write, or restrict an existing one to its owner.
+
+    Raises:
+        OSError: It cannot be created, or belongs to another user.
+    """
+    path.touch(PRIVATE_FILE)
+    if path.is_file() and path.stat().st_mode & 0o077:
+        path.chmod(PRIVATE_FILE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,11 +111,9 @@ class AtomicFiles:
         Raises:
             OSError: It cannot be written; the files added before are not affected.
         """
-        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-        self._staged.append(_Staged(descriptor, Path(name), path, last))
+        descriptor, temporary = _create_temporary(path, 0o666)
+        self._staged.append(_Staged(descriptor, temporary, path, last))
         try:
-            # mkstemp creates files that only their owner can read.
-            os.fchmod(descriptor, PUBLIC_FILE)
             with os.fdopen(descriptor, "wb", closefd=False) as file:
                 file.write(data)
         except BaseException:

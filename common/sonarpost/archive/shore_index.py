@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from sonarpost.errors import StoredFileError
+from sonarpost.files import make_private
 from sonarpost.messages import Decision, DeliveryState, TaskingKind
 
 FILE_NAME = "index.db"
@@ -190,6 +191,7 @@ class ShoreIndex:
         self._lock = threading.RLock()
         if writable:
             out_dir.mkdir(parents=True, exist_ok=True)
+            make_private(self.path)
         elif not self.path.is_file():
             raise StoredFileError(str(self.path), "", "no such file", "the index in the out_dir of c2")
         mode = "rwc" if writable else "ro"

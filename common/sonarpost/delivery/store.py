@@ -23,8 +23,10 @@ from typing import IO, Any
 
 from sonarpost.delivery.records import SITE_SEPARATOR, InboxItem, OutboxItem
 from sonarpost.delivery.transaction import Transaction, runs
+from sonarpost.delivery.watermark import SUFFIX as SIDE_CAR_SUFFIX
 from sonarpost.delivery.watermark import LostRecords, Watermark, clear_lost_records, lost_records
 from sonarpost.errors import DeliveryError, RetryLaterError
+from sonarpost.files import make_private
 from sonarpost.logs import kv
 
 log = logging.getLogger(__name__)
@@ -148,6 +150,8 @@ class Store:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._lock_file = lock_exclusively(path)
+            for existing in _files_of(path):
+                make_private(existing)
         except OSError as error:
             raise DeliveryError(f"{path}: cannot be opened as a sonarpost store: {error}") from error
         try:
@@ -469,6 +473,12 @@ class DiskReserve:
             return ""
         folder = self._store.path.parent
         return f"{folder}: {free_bytes} bytes free, below the reserve of {self._reserve_bytes}: {self._consequence}"
+
+
+def _files_of(path: Path) -> list[Path]:
+    """Return the files of a store: the database itself, which may be missing, and the present ones beside it."""
+    beside = [path.with_name(f"{path.name}{suffix}") for suffix in ("-wal", "-shm", ".lock", SIDE_CAR_SUFFIX)]
+    return [path, *(each for each in beside if each.is_file())]
 
 
 def _salvage_hint(path: Path) -> str:

@@ -14,6 +14,7 @@ from types import FrameType
 
 from sonarpost import config, logs
 from sonarpost.errors import ConfigError, SonarpostError
+from sonarpost.files import PRIVATE_UMASK
 from sonarpost.runtime.service import C, Service
 from sonarpost.stop_signals import exit_with_parent, wait_until_set
 
@@ -33,6 +34,8 @@ def main(service_type: type[Service[C]], config_type: type[C], arguments: Sequen
         config_type: Type of its configuration table.
         arguments: Command line; by default that of the process.
     """
+    # Stores, images and logs hold positions: only the user of the service can read what it creates.
+    os.umask(PRIVATE_UMASK)
     parser = argparse.ArgumentParser(
         prog=f"python -m sonarpost.services.{service_type.NAME}", description=service_type.__doc__
     )

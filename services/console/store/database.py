@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from sonarpost.errors import DeliveryError
+from sonarpost.files import make_private
 from sonarpost.messages import Advice, Command, Decision
 
 Role = Literal["observer", "operator", "expert"]
@@ -115,18 +116,17 @@ class SqliteFile:
         path: The file.
         schema: SQL that creates the tables if they do not exist.
         version: Schema version.
-        mode: Permissions of a new file.
 
     Raises:
         DeliveryError: The file cannot be opened, or has another schema version.
     """
 
-    def __init__(self, path: Path, schema: str, version: int = 0, mode: int = 0o666) -> None:
+    def __init__(self, path: Path, schema: str, version: int = 0) -> None:
         self.path = path
         self._lock = threading.RLock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.touch(mode)
+            make_private(path)
             self._db = sqlite3.connect(path, check_same_thread=False, isolation_level=None, timeout=10)
             self._db.row_factory = sqlite3.Row
             self._db.execute("PRAGMA journal_mode=WAL")

@@ -79,7 +79,7 @@ class Users(SqliteFile):
         session_max_s: float = 24 * 3600.0,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        super().__init__(path, _SCHEMA, mode=0o600)
+        super().__init__(path, _SCHEMA)
         self._session_s = session_s
         self._session_max_s = session_max_s
         self._clock = clock

@@ -1,0 +1,89 @@
+"""Files of a service process: readable by its user only, whatever umask it inherits."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from builders.common import eventually
+from builders.records import decision_record, reconstructed_image
+from builders.services import ServiceRunner
+
+from sonarpost import keys, wire
+from sonarpost.cli.main import main
+from sonarpost.config import PlatformConfig
+from sonarpost.delivery.store import Store
+from sonarpost.messages import Pixels, Relayed
+
+VESSEL = "vessel-1"
+
+
+def modes(folder: Path) -> dict[str, int]:
+    paths = [folder, *folder.rglob("*")]
+    return {str(path.relative_to(folder)): path.stat().st_mode & 0o777 for path in paths}
+
+
+def assert_private(folder: Path) -> set[str]:
+    """Require 0600 for every file and 0700 for every folder; return their names."""
+    found = modes(folder)
+    wrong = {name: oct(mode) for name, mode in found.items() if mode != (0o700 if (folder / name).is_dir() else 0o600)}
+    assert wrong == {}
+    return set(found)
+
+
+def test_files_of_c2_are_readable_by_its_user_only(
+    runner: ServiceRunner,
+    platform: Callable[[str], PlatformConfig],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    shore, out = platform("shore-1"), tmp_path / "deep" / "out"
+    config = tmp_path / "shore.toml"
+    config.write_text(
+        f'[platform]\nid = "shore-1"\nrouter = ["{shore.router[0]}"]\nstate_dir = "{tmp_path}/deep/state"\n'
+        f'[c2]\nout_dir = "{out}"\n'
+    )
+    command = [sys.executable, "-m", "sonarpost.services.c2", "--config", str(config)]
+    process = subprocess.Popen(command, umask=0o022)
+    try:
+        relay = runner.peer(VESSEL, "relay")
+        picture = Pixels(height_px=2, width_px=3, bits=8, data=bytes(6))
+        image = reconstructed_image(picture, vessel_id=VESSEL)
+        for key, record in (
+            (keys.image_reconstructed(VESSEL), image),
+            (keys.contact_decision(VESSEL), decision_record()),
+        ):
+            payload = wire.encode(record)
+            relay.send(
+                keys.shore_inbox(VESSEL), "c2", Relayed(vessel_id=VESSEL, key=key, payload=payload, relayed_utc_s=5.0)
+            )
+        eventually(lambda: len(list(out.glob("*/*.json"))) == 1 and len(list(out.glob("*/decisions/*.json"))) == 1)
+        eventually(lambda: relay.store.outbox_depth() == 0)
+        names = assert_private(tmp_path / "deep")
+        assert names >= {f"state/c2.db{suffix}" for suffix in ("", "-wal", "-shm", ".lock", ".watermark")}
+        assert names >= {"out/index.db", "out/index.db-wal", "out/vessel-1/decisions"}
+        assert main(["c2", "ls", "--out-dir", str(out)]) == 0
+        assert "1 images" in capsys.readouterr().out
+    finally:
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 0
+    assert_private(tmp_path / "deep")
+
+
+def test_store_of_an_earlier_version_is_restricted(tmp_path: Path) -> None:
+    path = tmp_path / "relay.db"
+    Store(path).close()
+    for each in tmp_path.iterdir():
+        each.chmod(0o644)
+    before = os.umask(0o022)
+    try:
+        store = Store(path)
+        assert {name: mode for name, mode in modes(tmp_path).items() if name != "." and mode != 0o600} == {}
+        store.close()
+    finally:
+        os.umask(before)
