@@ -73,6 +73,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
             self.store.close()
             raise
         self._mac = config.new_mac()
+        self._failed_packets = self.interval_log(log, logging.WARNING, "Packet not sent; retrying")
         self._events: queue.SimpleQueue[ModemEvent | None] = queue.SimpleQueue()
         self._unsaved: list[Callable[[], None]] = []  # changes of the endpoint that are not committed yet
         self._packet_id: int | None = None  # the packet that the modem is sending
@@ -205,7 +206,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
         self._packet_id = None
         self._retry_at_s = now + self.config.retry_s
         self.count("packets_failed")
-        log.warning("Packet not sent; retrying", extra=kv(reason=failed.reason, maybe_sent=failed.maybe_sent))
+        self._failed_packets.log(reason=failed.reason.value, maybe_sent=failed.maybe_sent)
 
     # The link's thread
 

@@ -29,12 +29,14 @@ class ModemServiceConfig(ServiceConfig):
         baud: Bit rate of the serial line.
         address: The modem's own address, set at start-up.
         reply_timeout_s: Time to wait for the modem's reply before a command is sent again.
+        max_carrier_sense_s: Longest time for which a busy channel delays a packet; some times the longest packet.
     """
 
     port: Annotated[str, Field(min_length=1)]
     baud: Annotated[int, Field(ge=300, le=4_000_000)] = 19200
     address: Annotated[int, Field(ge=0, le=127)]
     reply_timeout_s: Annotated[float, Field(gt=0, le=600)] = 5.0
+    max_carrier_sense_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
 
 
 M = TypeVar("M", bound=ModemServiceConfig)
@@ -56,9 +58,24 @@ class ModemService(Service[M]):
         self._port = SerialPort(config.port, config.baud)
         self.key = link_key(platform)
         super().__init__(platform, config)
-        driver = MicroModem(MicroModemConfig(config.address, reply_timeout_s=config.reply_timeout_s), config.port)
-        self.modem = ModemRunner(driver, self._port, self._on_event)
+        settings = MicroModemConfig(
+            config.address,
+            reply_timeout_s=config.reply_timeout_s,
+            max_carrier_sense_s=config.max_carrier_sense_s,
+        )
+        self.modem = ModemRunner(MicroModem(settings, config.port), self._port, self._on_event)
         self._modem_error = f"{config.port}: no reply from the modem yet"
+        self._transmit_failure = ""
+        self._carrier_warning = ""
+        self._report_warning = ""
+        self._rejected_lines = self.interval_log(log, logging.WARNING, "Line from the modem rejected")
+        self._modem_errors = self.interval_log(log, logging.WARNING, "Modem reports an error")
+        self._unreported_packets = self.interval_log(
+            log, logging.WARNING, "Modem does not report the end of a transmission; the air time is used"
+        )
+        self._ignored_receptions = self.interval_log(
+            log, logging.WARNING, "Modem reports a busy channel without a pause; transmitting"
+        )
 
     @abstractmethod
     def on_modem_event(self, event: ModemEvent) -> None:
@@ -84,11 +101,12 @@ class ModemService(Service[M]):
         """Return why the port or the modem does not work."""
         if not self._port.is_open:
             return f"{self.config.port}: {self._port.error or 'not open yet'}"
-        return "" if self.modem.ready else self._modem_error
+        return self._transmit_failure or ("" if self.modem.ready else self._modem_error)
 
     def warning(self) -> str:
-        """Return that the link is unauthenticated, or nothing."""
-        return UNAUTHENTICATED if self.key is None else ""
+        """Return that the link is unauthenticated, and what the modem reports wrongly."""
+        unauthenticated = UNAUTHENTICATED if self.key is None else ""
+        return "; ".join(text for text in (unauthenticated, self._carrier_warning, self._report_warning) if text)
 
     def _on_event(self, event: ModemEvent) -> None:
         match event:
@@ -105,10 +123,42 @@ class ModemService(Service[M]):
                 log.warning("Modem did not confirm a setting", extra=kv(command=event.command))
             case ev.ModemError():
                 self.count("modem_errors")
-                log.warning("Modem reports an error", extra=kv(error=event.report))
+                self._modem_errors.log(error=event.report)
             case ev.SentenceRejected():
                 self.count("sentences_rejected")
-                log.warning("Line from the modem rejected", extra=kv(reason=str(event.error)))
+                self._rejected_lines.log(reason=str(event.error))
+            case _:
+                self._on_transmit_event(event)
+        self.on_modem_event(event)
+
+    def _on_transmit_event(self, event: ModemEvent) -> None:
+        """Log, count and store for health whether the modem transmits."""
+        port = self.config.port
+        match event:
+            case ev.TransmissionFailing():
+                self._transmit_failure = f"{port}: the modem does not transmit: {event.reason}"
+                self.count("modem_transmit_failures")
+                log.error(
+                    "Modem does not transmit", extra=kv(port=port, failures=event.failures, reason=event.reason.value)
+                )
+            case ev.RestartRequested():
+                self.count("modem_restarts_requested")
+                log.warning("Restarting the modem", extra=kv(port=port))
+            case ev.TransmissionRecovered():
+                self._transmit_failure = ""
+                log.info("Modem transmits again", extra=kv(port=port, failures=event.failures, after_s=event.failing_s))
+            case ev.CarrierSenseIgnored():
+                self._carrier_warning = f"{port}: the modem reports a busy channel without a pause"
+                self.count("carrier_sense_ignored")
+                self._ignored_receptions.log(port=port, busy_s=event.busy_s)
+            case ev.CarrierSenseRestored():
+                self._carrier_warning = ""
+                log.info("Modem reports a free channel again", extra=kv(port=port, busy_s=event.busy_s))
+            case ev.PacketSent():
+                self._report_warning = ""
+                if not event.end_reported:
+                    self._report_warning = f"{port}: the modem does not report the end of transmissions"
+                    self.count("packets_unreported")
+                    self._unreported_packets.log(port=port)
             case _:
                 pass
-        self.on_modem_event(event)

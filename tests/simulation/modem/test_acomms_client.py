@@ -7,6 +7,7 @@ import queue
 import threading
 import warnings
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:setDaemon:DeprecationWarning")
 
 RANGE_M = 150.0
 SCALE = 20.0
+SET_UTC = datetime(2024, 2, 29, 23, 59, 50, tzinfo=UTC)
 
 
 class Client:
@@ -134,6 +136,12 @@ def test_ping_and_mini_packet(clients: tuple[Client, Client]):
     two.modem.send_minipacket(1, "1A2B")
     eventually(lambda: len(one.minis) == 1, what="mini-packet")
     assert (one.minis[0].src, one.minis[0].dest, bytes(one.minis[0].data)) == (2, 1, b"\x1a\x2b")
+
+
+def test_clock_is_set(clients: tuple[Client, Client]):
+    answer = clients[0].modem.set_time(SET_UTC)
+    assert answer is not None
+    assert answer.time == SET_UTC
 
 
 @pytest.mark.parametrize("rate", [0, 1])

@@ -121,6 +121,13 @@ def test_mini_packet(tester: Pair):
     tester.hosts[2].mini(1, bytes.fromhex("0123"))
     tester.run(10.0)
     assert tester.delivered(1) == [Delivery("mini", 2, 1, frames=[b"\x01\x23"], modes=[0])]
+    assert tester.delivered(2) == [], "Goby delivers an empty message for every CACST"
+    kinds = [line[1:6] for line in tester.hosts[2].raw]
+    first = kinds.index("CAMUC")
+    assert [kind for kind in kinds[first:] if kind != "CAREV"] == ["CAMUC", "CATXP", "CATXF", "CARXP", "CAMUR"]
+    kinds = [line[1:6] for line in tester.hosts[1].raw]
+    first = kinds.index("CARXP")
+    assert [k for k in kinds[first:] if k != "CAREV"] == ["CARXP", "CAMUA", "CACST", "CATXP", "CATXF"]
 
 
 @pytest.mark.parametrize(("rate", "frames"), [(0, 1), (2, 3), (5, 8)])

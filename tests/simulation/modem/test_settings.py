@@ -10,6 +10,14 @@ from sonarpost.simulation.modem.emulator import EmulatedMicroModem
 from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
 
+def test_second_z_of_the_clock_command_is_accepted():
+    bench = EmulatorBench()
+    bench.send(1, ("CCTMS", "2024-02-29T23:59:50ZZ", 0))
+    assert bench.sentences(1)[-1] == "CATMS,0,2024-02-29T23:59:50Z"
+    bench.send(1, ("CCTMS", "2024-02-29T23:59:50ZZZ", 0))
+    assert bench.sentences(1)[-1].endswith("CCTMS bad time")
+
+
 def test_clock_holds_the_set_second_until_the_pulse():
     bench = EmulatorBench()
     bench.advance(5.07)

@@ -118,8 +118,4 @@ def test_ping_and_mini_packet_with_replies():
     bench.send(1, ("CCMUC", 1, 2, "1a2b"))
     bench.advance(9.0)
     assert "CAMUA,1,2,1A2B" in bench.sentences(2)
-    assert [line for line in bench.sentences(1) if not line.startswith("CACST")] == [
-        "CAMUC,1,2,1A2B",
-        *sent,
-        "CAMUR,2,1",
-    ]
+    assert bench.sentences(1) == ["CAMUC,1,2,1A2B", *sent, "CAMUR,2,1"], "no CACST"

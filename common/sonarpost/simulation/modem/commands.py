@@ -146,9 +146,13 @@ def calendar_time(sentence: Sentence) -> datetime:
 
 
 def iso_time(sentence: Sentence) -> datetime:
-    """Read `CCTMS,2019-12-02T03:02:59Z,mode` (UTC); only mode 0 (immediately) is accepted."""
+    """Read `CCTMS,2019-12-02T03:02:59Z,mode` (UTC); only mode 0 (immediately) is accepted.
+
+    A second Z is accepted: WHOI's client sends one.
+    """
     read = FieldReader(sentence, strict=True)
     text = read.text(0, "time")
+    text = text[:-1] if text.endswith("ZZ") else text
     read.integer(1, "mode", 0, 0)
     try:
         return datetime.strptime(text, ISO_SECONDS).replace(tzinfo=UTC)

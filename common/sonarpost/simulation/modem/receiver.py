@@ -145,6 +145,9 @@ class Receiver:
             self._flexible(arrival, report)
         else:
             self._short(arrival, report)
+            if packet.kind is PacketKind.MINI_REPLY:
+                # A modem reports this reply without statistics, and Goby reads statistics as a received message.
+                return report
         return self._with_statistics(report, arrival)
 
     def _missed_reason(self, arrival: ArrivalEnded) -> str | None:
