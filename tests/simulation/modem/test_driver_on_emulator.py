@@ -57,6 +57,32 @@ def test_packets_between_two_drivers(rate: int, ack: bool):
     assert not [event for n in events for event in events[n] if isinstance(event, unwanted)]
 
 
+@pytest.mark.parametrize("off", [("TXF", "XST"), ("TXP", "TXF", "XST")])
+@pytest.mark.parametrize("before_start", [True, False])
+@pytest.mark.parametrize("rate", [0, 4])
+def test_packets_are_sent_once_by_a_modem_with_reports_off(off: tuple[str, ...], before_start: bool, rate: int):
+    """The settings are in the modem's memory at the start, or another program switches them off afterwards."""
+    bench = EmulatorBench()
+    drivers = {n: MicroModem(MicroModemConfig(n)) for n in (1, 2)}
+    switch_off = [("CCCFG", name, 0) for name in off]
+    if before_start:
+        bench.send(1, *switch_off)
+        bench.clear_output()
+    for driver in drivers.values():
+        driver.start(bench.now)
+    drive(bench, drivers, 10.0)
+    if not before_start:
+        bench.send(1, *switch_off)
+    packets = [[bytes([n]) * 20] for n in range(3)]
+    for frames in packets:
+        drivers[1].send_packet(2, rate, frames, now=bench.now)
+    events = drive(bench, drivers, 120.0)
+    assert [e.frames for e in events[1] if isinstance(e, PacketSent)] == [tuple(frames) for frames in packets]
+    assert [e for e in events[1] if isinstance(e, PacketFailed)] == []
+    got = [event for event in events[2] if isinstance(event, PacketReceived)]
+    assert [[frame.data for frame in packet.frames] for packet in got] == packets
+
+
 def test_driver_recovers_from_a_modem_reboot():
     bench = EmulatorBench()
     driver = MicroModem(MicroModemConfig(1))
