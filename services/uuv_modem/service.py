@@ -321,8 +321,8 @@ class UuvModemService(ModemService[UuvModemConfig]):
         return {**super().gauges(), **self._endpoint.queue.gauges(), **key}
 
     def warning(self) -> str:
-        """Return that the link is unauthenticated, or that its key is nearly used up."""
-        return super().warning() or key_warning(self._endpoint.authenticator)
+        """Return what concerns the key of the link, and what the modem reports wrongly."""
+        return "; ".join(text for text in (super().warning(), key_warning(self._endpoint.authenticator)) if text)
 
     def degraded_reason(self) -> str:
         """Return why the port, the modem or the link does not work."""
