@@ -14,12 +14,6 @@ RUN apt-get update -q \
     && apt-get clean \
     && rm -rf /var/lib/apt/lists/* /var/cache/debconf/*-old /var/log/apt /var/log/dpkg.log /var/log/alternatives.log
 
-# The run-time dependencies as a list of their own: only a change of these downloads anything again.
-FROM python AS requirements
-COPY pyproject.toml /src/
-RUN python3 -c "import tomllib; print(*tomllib.load(open('/src/pyproject.toml', 'rb'))['project']['dependencies'], sep='\n')" \
-    > /requirements.txt
-
 # Everything that is downloaded. A release of sonarpost that needs nothing new leaves this layer as it is.
 FROM python AS dependencies
 RUN apt-get update -q \
@@ -33,16 +27,14 @@ ENV PIP_CERT=/etc/ssl/certs/ca-certificates.crt PIP_FIND_LINKS=/src/packaging/wh
 COPY packaging/ca/ /usr/local/share/ca-certificates/
 COPY packaging/wheels/ /src/packaging/wheels/
 COPY packaging/trim.sh /src/packaging/
-COPY --from=requirements /requirements.txt /src/
-COPY requirements.lock /src/
+COPY requirements.lock requirements-build.lock /src/
 # Byte code is never checked against the source: the root file system may be read-only, and dates may change on the way
 # through layers.
 RUN update-ca-certificates \
     && python3 -m venv /opt/build \
-    && grep -E '^(build|hatchling|editables)==' /src/requirements.lock > /src/build-requirements.txt \
-    && /opt/build/bin/pip install -r /src/build-requirements.txt \
+    && /opt/build/bin/pip install --require-hashes -r /src/requirements-build.lock \
     && python3 -m venv /opt/sonarpost \
-    && /opt/sonarpost/bin/pip install --only-binary :all: -r /src/requirements.txt -c /src/requirements.lock \
+    && /opt/sonarpost/bin/pip install --only-binary :all: --require-hashes -r /src/requirements.lock \
     && sh /src/packaging/trim.sh /opt/sonarpost \
     && echo /opt/app > "$(echo /opt/sonarpost/lib/python3*/site-packages)/sonarpost-app.pth" \
     && python3 -m compileall -q --invalidation-mode unchecked-hash /opt/sonarpost/lib

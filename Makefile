@@ -6,21 +6,22 @@ RUN_TIME := $(VENV)/.run-time
 STAMP := $(VENV)/.ready
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: setup demo test test-long check docs docs-serve fmt lock clean images test-compose screenshots
+.PHONY: setup demo test test-long check docs docs-serve fmt lock sbom audit clean images test-compose screenshots
 
 setup: $(STAMP)
 
 # The locked run-time dependencies, sonarpost itself, editable, and the machine code of its codecs. Enough for `make demo`.
-$(RUN_TIME): requirements.lock pyproject.toml
+$(RUN_TIME): requirements.lock requirements-build.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) install -r requirements.lock
+	$(PIP) install --require-hashes -r requirements.lock
+	$(PIP) install --require-hashes -r requirements-build.lock
 	$(PIP) install --no-deps --no-build-isolation -e .
 	$(BIN)/sonarpost prepare
 	touch $@
 
 # The tools for tests, checks and documentation.
 $(STAMP): $(RUN_TIME) requirements-dev.lock
-	$(PIP) install -r requirements.lock -r requirements-dev.lock
+	$(PIP) install --require-hashes -r requirements-dev.lock
 	touch $@
 
 demo: $(RUN_TIME)
@@ -67,14 +68,28 @@ fmt: setup
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-# Resolve the dependencies of pyproject.toml and write the exact versions: requirements.lock for the run time and the
-# build tools of an editable installation, requirements-dev.lock for tests, checks and documentation.
+# Resolve the dependencies of pyproject.toml and write the newest versions with the hashes of all their files:
+# requirements.lock for the run time, requirements-build.lock to build and install sonarpost, requirements-dev.lock for
+# everything including tests, checks and documentation.
+COMPILE = build/lock/bin/uv pip compile --quiet --upgrade --generate-hashes --python-version 3.11.5 \
+	--custom-compile-command 'make lock'
 lock:
 	rm -rf build/lock && $(PYTHON) -m venv build/lock
-	build/lock/bin/python -m pip install --quiet --disable-pip-version-check . build editables hatchling
-	build/lock/bin/python -m pip freeze --exclude sonarpost > requirements.lock
-	build/lock/bin/python -m pip install --quiet --disable-pip-version-check -c requirements.lock '.[dev,docs]'
-	build/lock/bin/python -m pip freeze --exclude sonarpost | grep -vxFf requirements.lock > requirements-dev.lock
+	build/lock/bin/python -m pip install --quiet --disable-pip-version-check uv
+	$(COMPILE) pyproject.toml --output-file requirements.lock
+	$(COMPILE) --group build --constraint requirements.lock --output-file requirements-build.lock
+	$(COMPILE) pyproject.toml --group build --extra dev --extra docs \
+		--constraint requirements.lock --constraint requirements-build.lock --output-file requirements-dev.lock
+
+# The software bill of materials of the run time, in dist: from an environment that holds the locked packages only.
+sbom: setup
+	rm -rf build/sbom && $(PYTHON) -m venv --without-pip build/sbom
+	$(PIP) --python build/sbom install --require-hashes -r requirements.lock
+	$(BIN)/python packaging/sbom.py build/sbom requirements.lock dist/sonarpost.cdx.json
+
+# Known vulnerabilities of the locked packages. It needs PyPI's JSON interface, and prints which packages it has no data for.
+audit: setup
+	$(BIN)/python packaging/audit.py requirements.lock requirements-build.lock
 
 clean:
 	rm -rf $(VENV) build dist demo-out .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -39,15 +39,15 @@ CONF
 fi
 
 # What the tests of codecs import: the locked versions.
-names='numpy|scipy|numba|llvmlite|pillow|pillow-jxl-plugin|pydantic|pydantic_core|annotated-types|typing-inspection'
-names+='|typing_extensions|msgpack|tifffile|pytest|pytest-timeout|iniconfig|pluggy|packaging|pygments|hypothesis|sortedcontainers'
-if ! grep -ihE "^($names)==" requirements.lock requirements-dev.lock | cmp -s - "$work/site/.wanted"; then
+names='numpy|scipy|numba|llvmlite|pillow|pillow-jxl-plugin|pydantic|pydantic-core|annotated-types|typing-inspection'
+names+='|typing-extensions|msgpack|tifffile|pytest|pytest-timeout|iniconfig|pluggy|packaging|pygments|hypothesis|sortedcontainers'
+if ! grep -ioE "^($names)==[^ ]+" requirements-dev.lock | cmp -s - "$work/site/.wanted"; then
     rm -rf "$work/site"
     platforms=()
     for glibc in 2_36 2_34 2_31 2_28 2_27 2_26 2_24 2_17; do
         platforms+=(--platform "manylinux_${glibc}_aarch64")
     done
-    grep -ihE "^($names)==" requirements.lock requirements-dev.lock > "$work/wanted"
+    grep -ioE "^($names)==[^ ]+" requirements-dev.lock > "$work/wanted"
     "${pip[@]}" install --quiet --disable-pip-version-check --target "$work/site" --no-deps --only-binary=:all: \
         "${platforms[@]}" --platform manylinux2014_aarch64 --implementation cp --python-version "$version" -r "$work/wanted"
     mv "$work/wanted" "$work/site/.wanted"
