@@ -1,7 +1,7 @@
 """Write a software bill of materials (CycloneDX, JSON): python packaging/sbom.py ENVIRONMENT LOCK OUTPUT.
 
 ENVIRONMENT is a virtual environment with the packages of LOCK and nothing else. Exit status 1: the document does not
-list the packages of LOCK in the same versions. The product is the main component of the document, not one of its packages.
+list the packages of LOCK in the same versions. The product is the main component of the document, not a package.
 """
 
 from __future__ import annotations
