@@ -80,7 +80,7 @@ RENAMED_KEYS: Mapping[str, Mapping[str, str]] = {
         "vehicles": "op_modem.vehicles",
         "wire_formats": "op_modem.wire_formats",
     },
-    "console": {"session_most_s": "session_max_s", "side": "role"},
+    "console": {"behind_proxy": "trusted_proxies", "session_most_s": "session_max_s", "side": "role"},
 }
 
 

@@ -206,7 +206,7 @@ class StudyApp:
         # Report an invalid number of choices at the start.
         trials_for("", self._seed, tuple(folders.originals), folders.decoded, self._choices)
         self._static = static
-        access = AccessControl(None, "vessel", behind_proxy=False)
+        access = AccessControl(None, "vessel")
 
         def endpoint(handler: Handler) -> Endpoint:
             return access.endpoint(handler, needs_session=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ipaddress import IPv4Network, IPv6Network
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -26,7 +27,7 @@ class ConsoleConfig(ServiceConfig):
         names: Host names of the console in addition to `host` and the local host.
         tls: Serve HTTPS with the certificate of the platform.
         insecure: Permit other hosts without TLS, for a container whose port is published on the local host only.
-        behind_proxy: Read the browser's address from `X-Forwarded-For`.
+        trusted_proxies: Addresses and networks of reverse proxies, whose `X-Forwarded-For` has the browser's address.
         decision_consumers: On a vessel: services to which decisions are sent.
         command_consumers: On a vessel: services to which requests are sent.
         vehicles: Vehicle name for each modem address, as in `[op_modem]`.
@@ -51,7 +52,7 @@ class ConsoleConfig(ServiceConfig):
     names: tuple[HostName, ...] = ()
     tls: bool = False
     insecure: bool = False
-    behind_proxy: bool = False
+    trusted_proxies: tuple[IPv4Network | IPv6Network, ...] = ()
     decision_consumers: tuple[ConsumerName, ...] = ("relay", "op_modem")
     command_consumers: tuple[ConsumerName, ...] = ("op_modem",)
     vehicles: dict[Annotated[str, Field(pattern=r"^[0-9]{1,3}$")], PlatformId] = Field(default_factory=dict)

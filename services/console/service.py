@@ -39,6 +39,7 @@ from sonarpost.services.console.fleet import frame_event
 from sonarpost.services.console.state import ConsoleState, UnsentRecord
 from sonarpost.services.console.store.database import DATABASE_NAME, ID_COLUMN, RECORD_TYPES, Database, Table
 from sonarpost.services.console.store.users import FILE_NAME, Users
+from sonarpost.services.console.web.connections import ConnectionLimits, TrustedProxies
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 from sonarpost.sonar.image_files import read_image
 
@@ -186,7 +187,8 @@ class ConsoleService(Service[ConsoleConfig]):
             ConfigError: The certificate cannot be used.
         """
         tls = self.platform.tls if self.config.tls else None
-        self._server = WebServer(self._app.asgi, self.config.host, self.config.port, tls)
+        limits = ConnectionLimits(TrustedProxies(self.config.trusted_proxies))
+        self._server = WebServer(self._app.asgi, self.config.host, self.config.port, tls, limits)
         if not self._users.all():
             log.warning("No users: add one with `sonarpost console user add NAME --role operator --config FILE`")
         if self._on_vessel:

@@ -1,4 +1,4 @@
-"""Users and sessions of the console: password hashes, log-in limits. One SQLite file."""
+"""Users of the console with their password hashes, sessions and known browsers. One SQLite file."""
 
 from __future__ import annotations
 
@@ -6,21 +6,26 @@ import hashlib
 import hmac
 import re
 import secrets
+import sqlite3
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
-
 from sonarpost.errors import BadInputError
 from sonarpost.services.console.store.database import ROLES, Role, SqliteFile
 
 FILE_NAME = "console-users.db"
-SCRYPT_COST = 2**15
-"""Parameter n of scrypt with r = 8: 32 MiB for each attempt. Attempts run one at a time."""
+SCRYPT_COST, SCRYPT_PARALLEL = 2**15, 3
+"""Parameters n and p of scrypt with r = 8: 32 MiB for each check, and three times the time of p = 1. This is one of the
+minimum settings of OWASP's password storage cheat sheet. Checks run one at a time."""
+SCRYPT_MAX_BYTES = 2**26
 MIN_PASSWORD, MAX_PASSWORD = 10, 200
+MAX_SESSIONS_OF_USER = 10
+MAX_DEVICES_OF_USER = 20
+DEVICE_S = 90 * 86400.0
+"""A browser is known for this time after its last log-in."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}")
 _SCHEMA = """
@@ -30,7 +35,12 @@ CREATE TABLE IF NOT EXISTS user (
 CREATE TABLE IF NOT EXISTS session (
     token_sha256 BLOB PRIMARY KEY, name TEXT NOT NULL, csrf TEXT NOT NULL, begun_utc_s REAL NOT NULL,
     used_utc_s REAL NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS device (
+    token_sha256 BLOB NOT NULL, name TEXT NOT NULL, used_utc_s REAL NOT NULL,
+    PRIMARY KEY (token_sha256, name)) WITHOUT ROWID;
 """
+_PARALLEL_COLUMN = "ALTER TABLE user ADD COLUMN parallel INTEGER NOT NULL DEFAULT 1"
+"""Hashes of version 0.2.0 and before have p = 1; they are replaced at the next log-in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +94,9 @@ class Users(SqliteFile):
         self._session_max_s = session_max_s
         self._clock = clock
         self._hash_lock = threading.Lock()
+        with self.transaction() as db:
+            if "parallel" not in {row["name"] for row in db.execute("PRAGMA table_info(user)")}:
+                db.execute(_PARALLEL_COLUMN)
 
     # Users
 
@@ -114,19 +127,20 @@ class Users(SqliteFile):
         if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
             expected = f"{MIN_PASSWORD} to {MAX_PASSWORD} characters"
             raise BadInputError("user", "password", f"{len(password)} characters", expected)
-        salt = secrets.token_bytes(16)
-        hashed = self._hash(password, salt, SCRYPT_COST)
+        new = self._new_hash(password)
         with self.transaction() as db:
             db.execute(
-                "INSERT OR REPLACE INTO user VALUES (?, ?, ?, ?, ?, ?)",
-                (name, role, salt, hashed, SCRYPT_COST, self._clock()),
+                "INSERT OR REPLACE INTO user (name, role, changed_utc_s, salt, hash, cost, parallel)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (name, role, self._clock(), *new),
             )
             kept = b"" if keep is None else _token_hash(keep)
             db.execute("DELETE FROM session WHERE name = ? AND token_sha256 <> ?", (name, kept))
 
     def remove(self, name: str) -> bool:
-        """Remove a user and the user's sessions; return whether the user existed."""
+        """Remove a user with sessions and known browsers; return whether the user existed."""
         with self.transaction() as db:
+            db.execute("DELETE FROM device WHERE name = ?", (name,))
             db.execute("DELETE FROM session WHERE name = ?", (name,))
             return db.execute("DELETE FROM user WHERE name = ?", (name,)).rowcount > 0
 
@@ -140,24 +154,81 @@ class Users(SqliteFile):
             return [User(*row) for row in db.execute("SELECT name, role, changed_utc_s FROM user ORDER BY name")]
 
     def verify_password(self, name: str, password: str) -> bool:
-        """Return whether a password is correct. The duration is the same for an unknown user."""
-        with self.read() as db:
-            row = db.execute("SELECT salt, hash, cost FROM user WHERE name = ?", (name,)).fetchone()
-        salt, cost = (bytes(16), SCRYPT_COST) if row is None else (bytes(row["salt"]), int(row["cost"]))
-        hashed = self._hash(password[:MAX_PASSWORD], salt, cost)
-        return row is not None and hmac.compare_digest(hashed, bytes(row["hash"]))
+        """Return whether a password is correct. A correct one is hashed again if its hash has weaker parameters.
 
-    def _hash(self, password: str, salt: bytes, cost: int) -> bytes:
+        The duration is the same for an unknown user.
+        """
+        with self.read() as db:
+            row = db.execute("SELECT salt, hash, cost, parallel FROM user WHERE name = ?", (name,)).fetchone()
+        password = password[:MAX_PASSWORD]
+        if row is None:
+            self._hash(password, bytes(16), SCRYPT_COST, SCRYPT_PARALLEL)
+            return False
+        salt, expected, cost, parallel = row
+        if not hmac.compare_digest(self._hash(password, salt, cost, parallel), expected):
+            return False
+        if (cost, parallel) != (SCRYPT_COST, SCRYPT_PARALLEL):
+            new = self._new_hash(password)
+            with self.transaction() as db:
+                # The condition keeps a password that was changed in the meantime.
+                db.execute(
+                    "UPDATE user SET salt = ?, hash = ?, cost = ?, parallel = ? WHERE name = ? AND hash = ?",
+                    (*new, name, expected),
+                )
+        return True
+
+    def _new_hash(self, password: str) -> tuple[bytes, bytes, int, int]:
+        """Return salt, hash and the parameters n and p."""
+        salt = secrets.token_bytes(16)
+        return salt, self._hash(password, salt, SCRYPT_COST, SCRYPT_PARALLEL), SCRYPT_COST, SCRYPT_PARALLEL
+
+    def _hash(self, password: str, salt: bytes, cost: int, parallel: int) -> bytes:
         with self._hash_lock:
-            return Scrypt(salt=salt, length=32, n=cost, r=8, p=1).derive(password.encode("utf-8", "surrogatepass"))
+            return hashlib.scrypt(
+                password.encode("utf-8", "surrogatepass"),
+                salt=salt,
+                n=cost,
+                r=8,
+                p=parallel,
+                maxmem=SCRYPT_MAX_BYTES,
+                dklen=32,
+            )
+
+    # Known browsers
+
+    def is_known_device(self, name: str, token: str) -> bool:
+        """Return whether a user has logged in with this browser before."""
+        with self.read() as db:
+            found = db.execute(
+                "SELECT 1 FROM device WHERE token_sha256 = ? AND name = ? AND used_utc_s >= ?",
+                (_token_hash(token), name, self._clock() - DEVICE_S),
+            ).fetchone()
+        return found is not None
+
+    def add_device(self, name: str, token: str) -> str:
+        """Store that a user has logged in with a browser, and delete the oldest of too many; return its token.
+
+        Args:
+            name: Name of an existing user.
+            token: Token of the browser; replaced if it is not known for any user.
+        """
+        now = self._clock()
+        with self.transaction() as db:
+            db.execute("DELETE FROM device WHERE used_utc_s < ?", (now - DEVICE_S,))
+            if not db.execute("SELECT 1 FROM device WHERE token_sha256 = ?", (_token_hash(token),)).fetchone():
+                token = secrets.token_urlsafe(32)
+            db.execute("INSERT OR REPLACE INTO device VALUES (?, ?, ?)", (_token_hash(token), name, now))
+            _delete_oldest(db, "device", name, MAX_DEVICES_OF_USER)
+        return token
 
     # Sessions
 
     def start_session(self, name: str) -> Session:
-        """Start a session of an existing user."""
+        """Start a session of an existing user; it ends the user's least recently used session of too many."""
         token, csrf, now = secrets.token_urlsafe(32), secrets.token_urlsafe(24), self._clock()
         with self.transaction() as db:
             db.execute("DELETE FROM session WHERE used_utc_s < ? OR begun_utc_s < ?", self._limits(now))
+            _delete_oldest(db, "session", name, MAX_SESSIONS_OF_USER - 1)
             db.execute("INSERT INTO session VALUES (?, ?, ?, ?, ?)", (_token_hash(token), name, csrf, now, now))
         session = self.find_session(token)
         assert session is not None
@@ -197,6 +268,15 @@ class Users(SqliteFile):
         return now - self._session_s, now - self._session_max_s
 
 
+def _delete_oldest(db: sqlite3.Connection, table: str, name: str, kept: int) -> None:
+    """Delete a user's rows of a table except the most recently used ones."""
+    db.execute(
+        f"DELETE FROM {table} WHERE name = ? AND token_sha256 NOT IN ("  # noqa: S608  constants only
+        f"SELECT token_sha256 FROM {table} WHERE name = ? ORDER BY used_utc_s DESC LIMIT ?)",
+        (name, name, kept),
+    )
+
+
 def _token_hash(token: str) -> bytes:
     return hashlib.sha256(token.encode("utf-8", "surrogatepass")).digest()
 
@@ -204,46 +284,3 @@ def _token_hash(token: str) -> bytes:
 def is_equal_secret(given: str, expected: str) -> bool:
     """Compare two secrets in constant time."""
     return hmac.compare_digest(given.encode("utf-8", "surrogatepass"), expected.encode())
-
-
-class LoginLimiter:
-    """Limits failed log-in attempts of one user and from one address.
-
-    Args:
-        max_of_user: Failed attempts of one user in `window_s`.
-        max_from_address: Failed attempts from one address in `window_s`.
-        window_s: Duration of the window.
-    """
-
-    def __init__(self, max_of_user: int = 5, max_from_address: int = 20, window_s: float = 300.0) -> None:
-        self._max_of_user = max_of_user
-        self._max_from_address = max_from_address
-        self._window_s = window_s
-        self._lock = threading.Lock()
-        self._failures: dict[str, list[float]] = {}
-
-    def wait_s(self, user: str, address: str, now_s: float) -> float:
-        """Return the time until the next permitted attempt, 0 if one is permitted now; `now_s` is monotonic."""
-        with self._lock:
-            # Old entries are deleted for all names, so that invented names do not fill the memory.
-            recent = {
-                name: [at for at in times if now_s - at < self._window_s] for name, times in self._failures.items()
-            }
-            self._failures = {name: times for name, times in recent.items() if times}
-            waits = [0.0]
-            for name, limit in ((f"user {user}", self._max_of_user), (f"from {address}", self._max_from_address)):
-                times = self._failures.get(name, [])
-                if len(times) >= limit:
-                    waits.append(times[-limit] + self._window_s - now_s)
-            return max(waits)
-
-    def add_failure(self, user: str, address: str, now_s: float) -> None:
-        """Count a failed attempt."""
-        with self._lock:
-            for name in (f"user {user}", f"from {address}"):
-                self._failures.setdefault(name, []).append(now_s)
-
-    def clear(self, user: str) -> None:
-        """Delete a user's failed attempts after a successful one."""
-        with self._lock:
-            self._failures.pop(f"user {user}", None)

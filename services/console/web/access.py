@@ -22,6 +22,7 @@ from sonarpost.services.console.store.database import Actor, Permission, Side
 from sonarpost.services.console.store.decisions import ConflictError
 from sonarpost.services.console.store.serialisers import Json
 from sonarpost.services.console.store.users import Session, Users, is_equal_secret
+from sonarpost.services.console.web.connections import TrustedProxies
 from sonarpost.wire import first_error
 
 log = logging.getLogger(__name__)
@@ -110,13 +111,13 @@ class AccessControl:
     Args:
         users: Users and sessions; None for a server without log-in.
         side: Whether the console is on a vessel or at a shore site.
-        behind_proxy: Whether a proxy sets `X-Forwarded-For`.
+        proxies: Proxies whose `X-Forwarded-For` is used.
     """
 
-    def __init__(self, users: Users | None, side: Side, *, behind_proxy: bool) -> None:
+    def __init__(self, users: Users | None, side: Side, proxies: TrustedProxies | None = None) -> None:
         self._users = users
         self._side = side
-        self._behind_proxy = behind_proxy
+        self._proxies = TrustedProxies() if proxies is None else proxies
 
     def session_of(self, request: Request, *, is_use: bool = True) -> Session | None:
         """Return the session of a request; None if it has none. See `Users.find_session`."""
@@ -127,10 +128,8 @@ class AccessControl:
 
     def address_of(self, request: Request) -> str:
         """Return the network address of the browser."""
-        forwarded = request.headers.get("x-forwarded-for", "") if self._behind_proxy else ""
-        # The proxy appends the last entry. A client can forge the entries before it.
-        last = forwarded.rpartition(",")[2].strip()
-        return (last or (request.client.host if request.client else "?"))[:100]
+        host = request.client.host if request.client else "?"
+        return self._proxies.client_address(host, request.headers.get("x-forwarded-for", ""))
 
     def endpoint(
         self, handler: Handler, *, permission: Permission | None = None, needs_session: bool = True

@@ -17,7 +17,9 @@ from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.web.access import AccessControl, ApiError, error_response
 
 KEEP_ALIVE_S = 5.0
-MAX_STREAMS_OF_SESSION = 4
+MAX_STREAMS_OF_USER = 8
+MAX_STREAMS = 100
+RETRY_S = 10
 
 
 class EventStream:
@@ -36,11 +38,14 @@ class EventStream:
             session = await asyncio.to_thread(access.session_of, request)
             if session is None:
                 return error_response(ApiError(401, "no_session", "log in first"))
-            if self._open[session.csrf] >= MAX_STREAMS_OF_SESSION:
-                message = "too many pages of this session are open"
-                return error_response(ApiError(429, "too_many", message, headers={"Retry-After": "5"}))
+            headers = {"Retry-After": str(RETRY_S)}
+            if self._open[session.name] >= MAX_STREAMS_OF_USER:
+                message = f"{session.name} has {MAX_STREAMS_OF_USER} open pages, no more are permitted: close one"
+                return error_response(ApiError(429, "too_many", message, headers=headers))
+            if self._open.total() >= MAX_STREAMS:
+                return error_response(ApiError(503, "busy", "too many open pages", headers=headers))
             last_id = request.headers.get("last-event-id") or request.query_params.get("last", "")
-            events = self._events(request, access, session.csrf, last_id)
+            events = self._events(request, access, session.name, last_id)
             headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
             return StreamingResponse(events, media_type="text/event-stream", headers=headers)
 
@@ -51,16 +56,14 @@ class EventStream:
         self._stopped = True
         self._state.events.notify_all()
 
-    async def _events(
-        self, request: Request, access: AccessControl, session_key: str, last_id: str
-    ) -> AsyncIterator[str]:
+    async def _events(self, request: Request, access: AccessControl, user: str, last_id: str) -> AsyncIterator[str]:
         hub, loop, notified = self._state.events, asyncio.get_running_loop(), asyncio.Event()
 
         def notify() -> None:
             loop.call_soon_threadsafe(notified.set)
 
         hub.subscribe(notify)
-        self._open[session_key] += 1
+        self._open[user] += 1
         try:
             number = hub.parse_event_id(last_id) if last_id else hub.last
             hello = {"now_utc_s": self._state.clock(), "training": self._training}
@@ -88,9 +91,9 @@ class EventStream:
                     await asyncio.wait_for(notified.wait(), KEEP_ALIVE_S)
         finally:
             hub.unsubscribe(notify)
-            self._open[session_key] -= 1
-            if self._open[session_key] <= 0:
-                del self._open[session_key]
+            self._open[user] -= 1
+            if self._open[user] <= 0:
+                del self._open[user]
 
 
 def _event_text(name: str, data: str, event_id: str | None) -> str:

@@ -36,6 +36,13 @@ from sonarpost.services.console.web.access import (
     SecurityMiddleware,
     error_response,
 )
+from sonarpost.services.console.web.connections import (
+    CHECK_INTERVAL_S,
+    ConnectionDeadlines,
+    ConnectionLimits,
+    LimitedListener,
+    TrustedProxies,
+)
 from sonarpost.services.console.web.contact_routes import ContactRoutes
 from sonarpost.services.console.web.event_stream import EventStream
 from sonarpost.services.console.web.export_routes import ExportRoutes
@@ -47,7 +54,7 @@ log = logging.getLogger(__name__)
 STATIC: Final = Path(__file__).parents[1] / "static"
 CONTACT_STALE_S: Final = 600.0
 STOP_S: Final = 1.0
-MAX_CONNECTIONS: Final = 200
+BACKLOG: Final = 128
 
 
 class ConsoleApp:
@@ -60,7 +67,7 @@ class ConsoleApp:
         self._training = training
         self._map = MapRoutes(state)
         self._stream = EventStream(state, training=training)
-        access = AccessControl(users, config.role, behind_proxy=config.behind_proxy)
+        access = AccessControl(users, config.role, TrustedProxies(config.trusted_proxies))
         sessions = SessionRoutes(users, config.role, tls=config.tls, max_age_s=config.session_max_s)
         routes = [
             Route("/api/info", access.endpoint(self._info)),
@@ -145,22 +152,32 @@ class WebServer:
         host: Address to listen on.
         port: TCP port; 0 for any free port.
         tls: Certificate for HTTPS; None for HTTP.
+        limits: Limits of the connections; None for the default ones, without a proxy.
 
     Raises:
         PortError: The address cannot be bound.
         ConfigError: The certificate cannot be used.
     """
 
-    def __init__(self, app: ASGIApp, host: str, port: int, tls: TlsConfig | None = None) -> None:
+    def __init__(
+        self, app: ASGIApp, host: str, port: int, tls: TlsConfig | None = None, limits: ConnectionLimits | None = None
+    ) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        self._socket = socket.socket(family, socket.SOCK_STREAM)
+        self.limits = ConnectionLimits() if limits is None else limits
+        self._socket = LimitedListener(family, socket.SOCK_STREAM)
+        self._socket.limits = self.limits
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._socket.bind((host, port))
             # Connections are accepted after `start`; until then they wait in the backlog.
-            self._socket.listen(MAX_CONNECTIONS)
+            self._socket.listen(BACKLOG)
             config = uvicorn.Config(
-                app,
+                ConnectionDeadlines(app, self.limits),
+                # Other event loops do not use the socket's `accept`.
+                loop="asyncio",
+                backlog=BACKLOG,
+                callback_notify=self.limits.close_overdue,
+                timeout_notify=CHECK_INTERVAL_S,
                 log_config=None,
                 access_log=False,
                 ws="none",
@@ -168,7 +185,6 @@ class WebServer:
                 server_header=False,
                 proxy_headers=False,
                 timeout_graceful_shutdown=1,
-                limit_concurrency=MAX_CONNECTIONS,
                 ssl_certfile=None if tls is None else tls.certificate,
                 ssl_keyfile=None if tls is None else tls.key,
             )

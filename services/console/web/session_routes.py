@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-import math
-import time
+from typing import Final
 
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
@@ -12,10 +11,16 @@ from starlette.routing import Route
 from sonarpost.logs import kv
 from sonarpost.services.console.store.database import PERMISSIONS, Actor, Side
 from sonarpost.services.console.store.serialisers import Json
-from sonarpost.services.console.store.users import MAX_PASSWORD, MIN_PASSWORD, LoginLimiter, Session, Users
+from sonarpost.services.console.store.users import DEVICE_S, MAX_PASSWORD, MIN_PASSWORD, Session, Users
 from sonarpost.services.console.web.access import COOKIE, AccessControl, ApiError, Call, RequestBody
+from sonarpost.services.console.web.connections import address_group
+from sonarpost.services.console.web.login_limiter import LoginLimiter
 
 log = logging.getLogger(__name__)
+
+LOGIN: Final = "/api/login"
+DEVICE_COOKIE: Final = "sonarpost_device"
+"""Identifies a browser in which a user has logged in before; it grants nothing but an own limit of wrong passwords."""
 
 
 class _LoginBody(RequestBody):
@@ -46,7 +51,7 @@ class SessionRoutes:
     def routes(self, access: AccessControl) -> list[Route]:
         """Return the routes."""
         return [
-            Route("/api/login", access.endpoint(self._login, needs_session=False), methods=["POST"]),
+            Route(LOGIN, access.endpoint(self._login, needs_session=False), methods=["POST"]),
             Route("/api/session", access.endpoint(self._session)),
             Route("/api/logout", access.endpoint(self._logout), methods=["POST"]),
             Route("/api/password", access.endpoint(self._password), methods=["POST"]),
@@ -54,25 +59,25 @@ class SessionRoutes:
 
     def _login(self, call: Call) -> Response:
         body = call.parse_body(_LoginBody)
-        self._check_rate(body.user, call.address)
-        if not self._users.verify_password(body.user, body.password):
-            self._limiter.add_failure(body.user, call.address, time.monotonic())
-            log.warning("Log-in refused", extra=kv(user=body.user[:40], address=call.address))
-            raise ApiError(401, "wrong_login", "wrong user name or password")
-        self._limiter.clear(body.user)
+        device = call.request.cookies.get(DEVICE_COOKIE, "")[:200]
+        known = self._users.is_known_device(body.user, device)
+        buckets = self._limiter.buckets_of_login(body.user, address_group(call.address), device if known else None)
+        with self._limiter.attempt(buckets, known=known) as refund:
+            if not self._users.verify_password(body.user, body.password):
+                log.warning("Log-in refused", extra=kv(user=body.user[:40], address=call.address))
+                raise ApiError(401, "wrong_login", "wrong user name or password")
+            refund()
         session = self._users.start_session(body.user)
         log.info("User logged in", extra=kv(user=session.name, role=session.role, address=call.address))
         response = JSONResponse(self._session_json(session))
-        response.set_cookie(
-            COOKIE, session.token, max_age=int(self._max_age_s), httponly=True, samesite="strict", secure=self._tls
-        )
+        self._set_cookie(response, COOKIE, session.token, "/", self._max_age_s)
+        self._set_cookie(response, DEVICE_COOKIE, self._users.add_device(session.name, device), LOGIN, DEVICE_S)
         return response
 
-    def _check_rate(self, user: str, address: str) -> None:
-        wait_s = self._limiter.wait_s(user, address, time.monotonic())
-        if wait_s > 0:
-            headers = {"Retry-After": str(math.ceil(wait_s))}
-            raise ApiError(429, "too_many", "too many wrong passwords: wait some minutes", headers=headers)
+    def _set_cookie(self, response: Response, name: str, value: str, path: str, max_age_s: float) -> None:
+        response.set_cookie(
+            name, value, max_age=int(max_age_s), path=path, httponly=True, samesite="strict", secure=self._tls
+        )
 
     def _session_json(self, session: Session) -> Json:
         actor = Actor(session.name, session.role, "")
@@ -102,12 +107,11 @@ class SessionRoutes:
         if not MIN_PASSWORD <= len(body.new) <= MAX_PASSWORD:
             message = f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters; this one has {len(body.new)}"
             raise ApiError(400, "bad_request", message, "new")
-        self._check_rate(name, call.address)
-        if not self._users.verify_password(name, body.old):
-            # Limited like a log-in, because an unattended page could be used to guess the password.
-            self._limiter.add_failure(name, call.address, time.monotonic())
-            log.warning("Password change refused", extra=kv(user=name, address=call.address))
-            raise ApiError(403, "wrong_login", "this is not your present password", "old")
-        self._users.set_password(name, body.new, keep=call.session.token)
+        with self._limiter.attempt(self._limiter.buckets_of_session(call.session.token), known=False) as refund:
+            if not self._users.verify_password(name, body.old):
+                log.warning("Password change refused", extra=kv(user=name, address=call.address))
+                raise ApiError(403, "wrong_login", "this is not your present password", "old")
+            refund()
+            self._users.set_password(name, body.new, keep=call.session.token)
         log.info("Password changed", extra=kv(user=name, address=call.address))
         return Response(status_code=204)

@@ -11,6 +11,7 @@ from builders.common import eventually
 from builders.console import EventReader, image_record
 
 from sonarpost.services.console.events import EventHub, RateLimiter
+from sonarpost.services.console.web.event_stream import MAX_STREAMS_OF_USER
 from sonarpost.services.console.web.server import WebServer
 
 
@@ -77,12 +78,14 @@ def test_stream_ends_with_its_session(console, token, open_stream):
     eventually(lambda: console.state.events.subscriber_count == 0, what="no subscriber")
 
 
-def test_number_of_streams_of_a_session_is_limited(open_stream):
-    pages = [open_stream() for _ in range(4)]
-    eventually(lambda: all(page.names() for page in pages), what="four streams")
+def test_number_of_streams_of_a_user_is_limited_over_all_sessions(console, served, open_stream):
+    pages = [open_stream() for _ in range(MAX_STREAMS_OF_USER)]
+    eventually(lambda: all(page.names() for page in pages), what="streams")
     with pytest.raises(urllib.error.HTTPError) as caught:
-        open_stream()
+        EventReader(served.address, console.users.start_session("anna").token)
     assert caught.value.code == 429
+    assert int(caught.value.headers["retry-after"]) > 0
+    assert "close one" in json.load(caught.value)["error"]["message"]
     caught.value.close()
     pages[0].close()
 
@@ -95,6 +98,16 @@ def test_number_of_streams_of_a_session_is_limited(open_stream):
         return True
 
     eventually(is_accepted, what="another stream")
+
+
+def test_total_number_of_streams_is_limited(console, served, open_stream, monkeypatch):
+    monkeypatch.setattr("sonarpost.services.console.web.event_stream.MAX_STREAMS", 1)
+    page = open_stream()
+    eventually(lambda: page.names() != [], what="stream")
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        EventReader(served.address, console.users.start_session("bo").token)
+    assert (caught.value.code, json.load(caught.value)["error"]["code"]) == (503, "busy")
+    caught.value.close()
 
 
 def test_unhandled_exception_is_logged_and_answered(console, monkeypatch, caplog):

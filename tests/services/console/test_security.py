@@ -10,7 +10,7 @@ from starlette.testclient import TestClient
 
 from sonarpost.errors import BadInputError
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.store.users import LoginLimiter, Users
+from sonarpost.services.console.store.users import Users
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 ONE = f"/api/contacts/{ID}"
@@ -100,31 +100,6 @@ def test_session_cookie_attributes(console, make_console):
     secure = make_console(tls=True).browser().login("anna").headers
     assert "Secure" in secure["set-cookie"]
     assert "strict-transport-security" in secure
-
-
-def test_wrong_passwords_are_refused_and_limited(console):
-    browser = console.browser()
-    for _ in range(5):
-        assert browser.login("anna", "wrong password").status_code == 401
-    limited = browser.login("anna")
-    assert limited.status_code == 429
-    assert int(limited.headers["retry-after"]) > 200
-    assert browser.login("unknown").status_code == 401
-    assert browser.login("bo").status_code == 200
-
-
-def test_failed_log_ins_are_counted_by_user_and_by_address():
-    limiter = LoginLimiter(max_of_user=2, max_from_address=3, window_s=10)
-    limiter.add_failure("a", "x", 0)
-    limiter.add_failure("a", "y", 1)
-    assert limiter.wait_s("a", "z", 2) == 8
-    assert limiter.wait_s("b", "x", 2) == 0
-    limiter.add_failure("b", "x", 2)
-    limiter.add_failure("c", "x", 2)
-    assert limiter.wait_s("d", "x", 2) == 8
-    limiter.clear("a")
-    assert limiter.wait_s("a", "z", 2) == 0
-    assert limiter.wait_s("d", "x", 13) == 0
 
 
 def test_session_ends_by_log_out_idle_time_and_maximum_time(console, tmp_path):
