@@ -9,10 +9,10 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -50,21 +50,15 @@ _ZIP_TIME: Final = (1980, 1, 1, 0, 0, 0)
 """Earliest time of the ZIP format. A constant time makes equal contacts give equal bytes."""
 
 
+Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+
+
 @dataclass(frozen=True, slots=True)
 class _Overlay:
-    """Image on the map, top along the heading: a KML LatLonBox and its counter-clockwise rotation about its centre."""
+    """Place of an image on the map, top along the heading: a KML LatLonBox and its counter-clockwise rotation."""
 
-    png: bytes
     box_deg: Mapping[str, float]
     rotation_deg: float
-
-
-@dataclass(frozen=True, slots=True)
-class _ContactImage:
-    """Image of a contact as 8-bit PNG, and its map overlay if its orientation is known."""
-
-    png: bytes
-    overlay: _Overlay | None
 
 
 def kml_bytes(contacts: ContactSet) -> bytes:
@@ -72,33 +66,62 @@ def kml_bytes(contacts: ContactSet) -> bytes:
     return _document(contacts, {}, icons=False)
 
 
-def kmz_bytes(contacts: ContactSet) -> tuple[bytes, tuple[BadInputError, ...]]:
-    """Return a KMZ archive with `doc.kml`, images and icons. It references no network resource.
+def read_stored_pixels(contact: ExportContact) -> Pixels | None:
+    """Return the pixels in a contact's image file; None without a file.
+
+    Raises:
+        BadInputError: The file cannot be read.
+    """
+    return None if contact.image_path is None else read_image(contact.image_path)
+
+
+def add_kmz(
+    file: IO[bytes],
+    contacts: ContactSet,
+    read_pixels: Callable[[ExportContact], Pixels | None] = read_stored_pixels,
+) -> tuple[BadInputError, ...]:
+    """Write a KMZ archive with `doc.kml`, images and icons. It references no network resource.
+
+    One image at a time is in memory, and `doc.kml` is the last file of the archive.
+
+    Args:
+        file: Binary file, open for writing, at its start.
+        contacts: The contacts.
+        read_pixels: Returns the image of a contact with a position; None if it has no image.
 
     Returns:
-        The archive, and one error for each unreadable image. Its contact is exported without the image.
+        One error for each image for which `read_pixels` raised BadInputError. Its contact is exported without it.
+
+    Raises:
+        OSError: The file cannot be written.
     """
-    images: dict[str, _ContactImage] = {}
+    images: dict[str, _Overlay | None] = {}
     problems: list[BadInputError] = []
-    for contact in contacts.located:
-        if contact.image_path is None:
-            continue
-        try:
-            pixels = _eight_bits(read_image(contact.image_path))
-        except BadInputError as error:
-            problems.append(error)
-        else:
-            images[contact.uid] = _ContactImage(encode_png(Image.fromarray(pixels)), _overlay(contact, pixels))
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        _add_file(archive, "doc.kml", _document(contacts, images, icons=True))
+    with zipfile.ZipFile(file, "w") as archive:
+        for contact in contacts.located:
+            try:
+                found = read_pixels(contact)
+            except BadInputError as error:
+                problems.append(error)
+                continue
+            if found is None:
+                continue
+            pixels = _eight_bits(found)
+            _add_image(archive, f"pictures/{contact.uid}.png", pixels)
+            images[contact.uid] = overlay = _overlay(contact, pixels)
+            if overlay is not None:
+                _add_image(archive, f"overlays/{contact.uid}.png", _heading_up(contact, pixels))
         for review, colour in COLOURS.items():
             _add_file(archive, f"icons/{review}.png", _icon_png(review, colour))
-        for uid, image in images.items():
-            _add_file(archive, f"pictures/{uid}.png", image.png)
-            if image.overlay is not None:
-                _add_file(archive, f"overlays/{uid}.png", image.overlay.png)
-    return buffer.getvalue(), tuple(problems)
+        _add_file(archive, "doc.kml", _document(contacts, images, icons=True))
+    return tuple(problems)
+
+
+def kmz_bytes(contacts: ContactSet) -> tuple[bytes, tuple[BadInputError, ...]]:
+    """Return a KMZ archive and the errors of its images; see `add_kmz`."""
+    buffer = io.BytesIO()
+    problems = add_kmz(buffer, contacts)
+    return buffer.getvalue(), problems
 
 
 def write_kml(path: Path, contacts: ContactSet) -> None:
@@ -121,6 +144,10 @@ def write_kmz(path: Path, contacts: ContactSet) -> tuple[BadInputError, ...]:
     return problems
 
 
+def _add_image(archive: zipfile.ZipFile, name: str, pixels: npt.NDArray[np.uint8]) -> None:
+    _add_file(archive, name, encode_png(Image.fromarray(np.ascontiguousarray(pixels))))
+
+
 def _add_file(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
     entry = zipfile.ZipInfo(name, _ZIP_TIME)
     # PNG files are already compressed.
@@ -132,7 +159,7 @@ def _add_file(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
 # Document
 
 
-def _document(contacts: ContactSet, images: Mapping[str, _ContactImage], *, icons: bool) -> bytes:
+def _document(contacts: ContactSet, images: Mapping[str, _Overlay | None], *, icons: bool) -> bytes:
     root = ET.Element("kml", {"xmlns": NAMESPACE})
     document = _child(root, "Document")
     _child(document, "name", "sonarpost contacts")
@@ -192,8 +219,8 @@ def _balloon_html(values: Mapping[str, Value], image_name: str | None) -> str:
     return f"{image}<table>{rows}</table>"
 
 
-def _add_overlays(document: ET.Element, contacts: ContactSet, images: Mapping[str, _ContactImage]) -> None:
-    overlays = [(c, images[c.uid].overlay) for c in contacts.located if c.uid in images]
+def _add_overlays(document: ET.Element, contacts: ContactSet, images: Mapping[str, _Overlay | None]) -> None:
+    overlays = [(c, images[c.uid]) for c in contacts.located if c.uid in images]
     if not any(overlay for _, overlay in overlays):
         return
     folder = _child(document, "Folder")
@@ -227,7 +254,7 @@ def _child(parent: ET.Element, tag: str, text: str | None = None, /, **attribute
 # Images
 
 
-def _eight_bits(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
+def _eight_bits(pixels: Pixels) -> npt.NDArray[np.uint8]:
     """Scale 16-bit pixels to 8 bits by the brightest pixel; sonars rarely use the full range of 16 bits."""
     if pixels.dtype == np.uint8:
         return pixels.astype(np.uint8, copy=False)
@@ -236,11 +263,7 @@ def _eight_bits(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> npt.N
 
 
 def _overlay(contact: ExportContact, pixels: npt.NDArray[np.uint8]) -> _Overlay | None:
-    """Return the overlay of an image centred on the contact's position; None if its orientation is unknown.
-
-    Row 0 is the first ping and column 0 is nearest the track. With the heading at the top, a starboard image is
-    therefore mirrored top to bottom, and a port image is rotated by 180 degrees.
-    """
+    """Return the place of an image centred on the contact's position; None if its orientation is unknown."""
     record, position = contact.image.contact, contact.position
     if record is None or position is None or abs(position[0]) > _MAX_OVERLAY_LATITUDE_DEG:
         return None
@@ -250,7 +273,6 @@ def _overlay(contact: ExportContact, pixels: npt.NDArray[np.uint8]) -> _Overlay 
     height_m, width_m = along * pixels.shape[0], across * pixels.shape[1]
     if max(height_m, width_m) > MAX_OVERLAY_M:
         return None
-    rotated = pixels[::-1, :] if record.channel == "starboard" else pixels[::-1, ::-1]
     centre = Position(*position)
     north, south = (offset_position(centre, bearing, height_m / 2).lat_deg for bearing in (0.0, 180.0))
     east, west = (offset_position(centre, bearing, width_m / 2).lon_deg for bearing in (90.0, 270.0))
@@ -258,8 +280,18 @@ def _overlay(contact: ExportContact, pixels: npt.NDArray[np.uint8]) -> _Overlay 
         return None  # Readers disagree about boxes across the date line.
     # KML rotates counter-clockwise, and its range is -180 to 180 degrees.
     rotation_deg = math.remainder(-heading, 360.0)
-    png = encode_png(Image.fromarray(np.ascontiguousarray(rotated)))
-    return _Overlay(png, {"north": north, "south": south, "east": east, "west": west}, rotation_deg)
+    return _Overlay({"north": north, "south": south, "east": east, "west": west}, rotation_deg)
+
+
+def _heading_up(contact: ExportContact, pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return an image with the heading at the top.
+
+    Row 0 is the first ping and column 0 is nearest the track. A starboard image is therefore mirrored top to bottom,
+    and a port image is rotated by 180 degrees.
+    """
+    record = contact.image.contact
+    starboard = record is not None and record.channel == "starboard"
+    return pixels[::-1, :] if starboard else pixels[::-1, ::-1]
 
 
 def _icon_png(review: ReviewState, colour: str) -> bytes:

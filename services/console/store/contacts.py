@@ -203,6 +203,16 @@ def list_contacts(db: sqlite3.Connection, query: ContactFilter) -> Json:
     }
 
 
+def list_versions(db: sqlite3.Connection, query: ContactFilter, limit: int) -> list[tuple[str, int]]:
+    """Return identifier and newest version of the filtered contacts, by the time of their first frame."""
+    condition, values = query.where()
+    rows = db.execute(
+        f"SELECT c.id, c.version FROM contact c WHERE {condition} ORDER BY c.first_frame_utc_s, c.id LIMIT ?",  # noqa: S608
+        (*values, limit),
+    )
+    return [(str(row["id"]), int(row["version"])) for row in rows]
+
+
 def count_contacts(db: sqlite3.Connection) -> ContactCounts:
     """Count the contacts."""
     total = db.execute("SELECT COUNT(*) FROM contact").fetchone()[0]

@@ -14,8 +14,7 @@ from typing import Any, Final
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from sonarpost.logs import kv
-from sonarpost.services.console.events import RateLimiter
+from sonarpost.logs import IntervalLog, kv
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +26,6 @@ READ_S: Final = 30.0
 """Time in which a client has to read `CHUNK_BYTES` of a response."""
 CHUNK_BYTES: Final = 65536
 CHECK_INTERVAL_S: Final = 1
-LOG_INTERVAL_S: Final = 60.0
 
 IpNetwork = ipaddress.IPv4Network | ipaddress.IPv6Network
 Peer = tuple[str, int]
@@ -121,7 +119,7 @@ class ConnectionLimits:
         self.read_s = read_s
         self._clock = clock
         self._open: dict[Peer, _Open] = {}
-        self._log_limiter = RateLimiter(LOG_INTERVAL_S)
+        self._log = IntervalLog(log, logging.WARNING, "Connection limit reached")
 
     @property
     def count(self) -> int:
@@ -141,8 +139,7 @@ class ConnectionLimits:
         elif len(self._open) >= self._max_connections:
             full = self._open.values()
         if full:
-            if self._log_limiter.allows("limit"):
-                log.warning("Connection limit reached", extra=kv(address=peer[0], open=len(self._open)))
+            self._log.log(address=peer[0], open=len(self._open))
             oldest = min(full, key=lambda one: one.deadline_s)
             if oldest.deadline_s == math.inf:
                 return False

@@ -3,33 +3,44 @@
 from __future__ import annotations
 
 import base64
+import errno
 import html
+import os
+import shutil
 import sqlite3
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
-from starlette.responses import Response
+import numpy as np
+import numpy.typing as npt
+from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
+from starlette.types import Receive, Scope, Send
 
 from sonarpost import wire
 from sonarpost.archive.image_files import side_car
+from sonarpost.delivery.store import HANDLING_RESERVE_BYTES
 from sonarpost.export.contacts import ContactSet, ExportContact, SideCar
 from sonarpost.export.cot import cot_events
-from sonarpost.export.kml import kmz_bytes
+from sonarpost.export.kml import add_kmz
 from sonarpost.export.tables import csv_bytes, geojson_bytes
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review import rendering
 from sonarpost.services.console.state import ConsoleState
-from sonarpost.services.console.store.contacts import ContactFilter, find_version, list_contacts
+from sonarpost.services.console.store.contacts import ContactFilter, find_version, list_versions
 from sonarpost.services.console.store.serialisers import Json, decode_image
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call
 
-MAX_CONTACTS: Final = 10_000
-_PAGE: Final = 500
+MAX_CONTACTS: Final = 5000
+MAX_BYTES: Final = 268_435_456
+MAX_EXPORTS: Final = 4
+"""Exports at a time, of different users: one runs, the others wait or are downloaded."""
+RETRY_S: Final = 10
+CHUNK_BYTES: Final = 65536
 
 
 def _cot_bytes(contacts: ContactSet) -> bytes:
@@ -37,50 +48,145 @@ def _cot_bytes(contacts: ContactSet) -> bytes:
     return b'<?xml version="1.0" encoding="UTF-8"?>\n<events>\n' + events + b"\n</events>\n"
 
 
-_FORMATS: Final[Mapping[str, tuple[Callable[[ContactSet], bytes], str]]] = {
+KMZ: Final = "contacts.kmz"
+_FORMATS: Final[Mapping[str, tuple[Callable[[ContactSet], bytes] | None, str]]] = {
     "contacts.geojson": (geojson_bytes, "application/geo+json"),
     "contacts.csv": (csv_bytes, "text/csv; charset=utf-8"),
-    "contacts.kmz": (lambda contacts: kmz_bytes(contacts)[0], "application/vnd.google-earth.kmz"),
+    KMZ: (None, "application/vnd.google-earth.kmz"),
     "contacts.cot.xml": (_cot_bytes, "application/xml"),
 }
 
 
+class _ExportQueue:
+    """Limits exports: one runs at a time, and each user has at most one."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users: set[str] = set()
+        self.worker = threading.Lock()
+
+    def enter(self, user: str) -> None:
+        """Add an export of a user.
+
+        Raises:
+            ApiError: 429 if the user has one already; 503 if the queue is full.
+        """
+        headers = {"Retry-After": str(RETRY_S)}
+        with self._lock:
+            if user in self._users:
+                message = f"an export of {user} is not finished: try again in {RETRY_S} s"
+                raise ApiError(429, "too_many", message, headers=headers)
+            if len(self._users) >= MAX_EXPORTS:
+                message = f"{MAX_EXPORTS} exports are not finished: try again in {RETRY_S} s"
+                raise ApiError(503, "busy", message, headers=headers)
+            self._users.add(user)
+
+    def leave(self, user: str) -> None:
+        """Remove the export of a user."""
+        with self._lock:
+            self._users.discard(user)
+
+
+class _TemporaryFileResponse(StreamingResponse):
+    """Streams a temporary file and closes it, also if the client disconnects."""
+
+    def __init__(self, file: IO[bytes], on_close: Callable[[], None], headers: Mapping[str, str]) -> None:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        chunks = iter(lambda: file.read(CHUNK_BYTES), b"")
+        super().__init__(chunks, headers={**headers, "Content-Length": str(size)})
+        self._file = file
+        self._on_close = on_close
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._file.close()
+            self._on_close()
+
+
 class ExportRoutes:
-    """Routes of exports and reports."""
+    """Routes of exports and reports.
+
+    An export is written to a temporary file without a name in the folder of the database: the operating system
+    deletes it when the process ends, for whatever reason.
+    """
 
     def __init__(self, state: ConsoleState) -> None:
         self._state = state
+        self._queue = _ExportQueue()
+        self._stopped = False
 
     def routes(self, access: AccessControl) -> list[Route]:
         """Return the routes."""
         return [
-            Route("/api/export/{name}", access.endpoint(self._export)),
+            Route("/api/export/{name}", access.endpoint(self._export), methods=["GET"]),
             Route("/report/{id}", access.endpoint(self._report)),
         ]
+
+    def stop(self) -> None:
+        """End the running export, so that the process can stop."""
+        self._stopped = True
 
     def _export(self, call: Call) -> Response:
         name = str(call.request.path_params["name"])
         if name not in _FORMATS:
             raise ApiError(404, "not_found", "one of " + ", ".join(_FORMATS))
-        convert, media_type = _FORMATS[name]
-        # The KMZ export reads images from files.
-        with tempfile.TemporaryDirectory(prefix="sonarpost-export-") as folder:
-            image_folder = Path(folder) if name.endswith(".kmz") else None
-            data = convert(self._contacts(call.parse_query(ContactFilter), image_folder))
-        headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-        return Response(data, media_type=media_type, headers=headers)
+        query, user = call.parse_query(ContactFilter), call.actor.user
+        headers = {"Content-Disposition": f'attachment; filename="{name}"', "Content-Type": _FORMATS[name][1]}
+        self._queue.enter(user)
+        try:
+            with self._queue.worker:
+                file = self._write(name, query)
+        except BaseException:
+            self._queue.leave(user)
+            raise
+        return _TemporaryFileResponse(file, lambda: self._queue.leave(user), headers)
 
-    def _contacts(self, query: ContactFilter, image_folder: Path | None) -> ContactSet:
-        found: list[ExportContact] = []
+    def _write(self, name: str, query: ContactFilter) -> IO[bytes]:
+        """Write an export to a temporary file, and return the file."""
+        file: IO[bytes] = tempfile.TemporaryFile(dir=self._state.database.path.parent)  # noqa: SIM115  closed below
+        try:
+            contacts = self._contacts(query, file)
+            convert = _FORMATS[name][0]
+            if convert is None:
+                add_kmz(file, contacts, lambda contact: self._pixels(contact, file))
+            else:
+                file.write(convert(contacts))
+        except BaseException:
+            file.close()
+            raise
+        return file
+
+    def _contacts(self, query: ContactFilter, file: IO[bytes]) -> ContactSet:
         with self._state.database.read() as db:
-            for offset in range(0, MAX_CONTACTS, _PAGE):
-                items = list_contacts(db, query.model_copy(update={"offset": offset, "limit": _PAGE}))["items"]
-                assert isinstance(items, list)
-                found += [_export_contact(db, item, image_folder) for item in items]
-                if len(items) < _PAGE:
-                    break
-        found.sort(key=lambda contact: (contact.image.first_frame_utc_s, contact.uid))
+            versions = list_versions(db, query, MAX_CONTACTS + 1)
+        if len(versions) > MAX_CONTACTS:
+            raise ApiError(413, "too_large", f"more than {MAX_CONTACTS} contacts: select fewer in the queue")
+        found: list[ExportContact] = []
+        for contact_id, version in versions:
+            self._check(file)
+            # Other requests use the database between two contacts.
+            with self._state.database.read() as db:
+                found.append(_export_contact(db, contact_id, version))
         return ContactSet(tuple(found), (), ())
+
+    def _pixels(self, contact: ExportContact, file: IO[bytes]) -> npt.NDArray[np.uint8] | None:
+        self._check(file)
+        if not contact.image.codec:
+            return None
+        image = self._state.image(contact.uid, contact.image.version)
+        return rendering.eight_bits(image.picture.to_array())
+
+    def _check(self, file: IO[bytes]) -> None:
+        """Check the size of an export and the free space between two contacts."""
+        if self._stopped:
+            raise ApiError(503, "busy", "the console is stopping")
+        if file.tell() > MAX_BYTES:
+            raise ApiError(413, "too_large", f"more than {MAX_BYTES >> 20} MiB: select fewer contacts in the queue")
+        if shutil.disk_usage(self._state.database.path.parent).free < HANDLING_RESERVE_BYTES:
+            raise OSError(errno.ENOSPC, "the disk reserve is reached")
 
     def _report(self, call: Call) -> Response:
         contact_id = str(call.request.path_params["id"])
@@ -93,19 +199,14 @@ class ExportRoutes:
         return Response(text, media_type="text/html; charset=utf-8", headers=headers)
 
 
-def _export_contact(db: sqlite3.Connection, item: Json, image_folder: Path | None) -> ExportContact:
-    row = find_version(db, str(item["id"]), int(str(item["version"])))
+def _export_contact(db: sqlite3.Connection, contact_id: str, version: int) -> ExportContact:
+    row = find_version(db, contact_id, version)
     assert row is not None
-    image = decode_image(row)
     rows = db.execute(
-        "SELECT payload FROM decision WHERE contact_id = ? ORDER BY decided_utc_s, seq", (item["id"],)
+        "SELECT payload FROM decision WHERE contact_id = ? ORDER BY decided_utc_s, seq", (contact_id,)
     ).fetchall()
     decisions = tuple(wire.decode(Decision, bytes(row["payload"]), "decision") for row in rows)
-    path = None
-    if image_folder is not None and image.codec:
-        path = image_folder / f"{item['id']}.png"
-        path.write_bytes(rendering.encode_png(rendering.eight_bits(image.picture.to_array())))
-    return ExportContact(SideCar.model_validate(side_car(image)), decisions, path)
+    return ExportContact(SideCar.model_validate(side_car(decode_image(row))), decisions, None)
 
 
 # Report

@@ -66,6 +66,7 @@ class ConsoleApp:
         self._platform_id = platform_id
         self._training = training
         self._map = MapRoutes(state)
+        self._exports = ExportRoutes(state)
         self._stream = EventStream(state, training=training)
         access = AccessControl(users, config.role, TrustedProxies(config.trusted_proxies))
         sessions = SessionRoutes(users, config.role, tls=config.tls, max_age_s=config.session_max_s)
@@ -74,7 +75,7 @@ class ConsoleApp:
             *sessions.routes(access),
             *ContactRoutes(state).routes(access),
             *self._map.routes(access),
-            *ExportRoutes(state).routes(access),
+            *self._exports.routes(access),
             *self._stream.routes(access),
             Route("/", _page_endpoint(access, "index.html")),
             Route("/password", _page_endpoint(access, "password.html")),
@@ -85,7 +86,8 @@ class ConsoleApp:
         self.asgi: ASGIApp = SecurityMiddleware(app, (config.host, *config.names), tls=config.tls)
 
     def stop(self) -> None:
-        """End the event streams, so that the server can stop."""
+        """End the event streams and the running export, so that the server can stop."""
+        self._exports.stop()
         self._stream.stop()
 
     def _info(self, _call: Call) -> Response:

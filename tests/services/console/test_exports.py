@@ -1,13 +1,32 @@
-"""Exports and the printable report."""
+"""Exports with their limits, and the printable report."""
 
 from __future__ import annotations
 
 import csv
 import io
+import os
+import signal
+import subprocess
+import sys
+import threading
+import weakref
 import zipfile
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import suppress
+from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from builders.console import image_record
+import httpx2
+import pytest
+from builders.common import eventually
+from builders.console import PASSWORD, Browser, image_record
+
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.store.database import Database
+from sonarpost.services.console.web import export_routes
+from sonarpost.services.console.web.export_routes import ExportRoutes
+from sonarpost.services.console.web.server import WebServer
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 
@@ -42,3 +61,180 @@ def test_report_shows_known_and_unknown_values(console):
     assert '<dt>Altitude of the vehicle, m</dt><dd><span class="missing">unknown</span></dd>' in page
     assert "clean edge" in page
     assert "style=" not in page
+
+
+class Held:
+    """Exports wait between two contacts until `leave` is set."""
+
+    def __init__(self) -> None:
+        self.leave = threading.Event()
+        self.entered = threading.Semaphore(0)
+        self.running = self.most_running = 0
+
+    def wait(self, *_arguments: object) -> None:
+        self.running += 1
+        self.most_running = max(self.most_running, self.running)
+        self.entered.release()
+        assert self.leave.wait(60)
+        self.running -= 1
+
+
+@pytest.fixture
+def held(console, monkeypatch):
+    console.state.store_image(image_record())
+    held = Held()
+    monkeypatch.setattr(ExportRoutes, "_check", held.wait)
+    yield held
+    held.leave.set()
+
+
+@pytest.fixture
+def client_of(console):
+    """Clients of a real server, by user."""
+    server = WebServer(console.app.asgi, "127.0.0.1", 0)
+    server.start()
+    clients = []
+
+    def make(user: str) -> httpx2.Client:
+        cookies = {"sonarpost_session": console.users.start_session(user).token}
+        clients.append(httpx2.Client(base_url=server.address, cookies=cookies, timeout=60))
+        return clients[-1]
+
+    yield make
+    for client in clients:
+        client.close()
+    server.stop()
+
+
+def error_of(answer: httpx2.Response) -> tuple[int, str]:
+    return answer.status_code, answer.json()["error"]["code"]
+
+
+def test_exports_run_one_at_a_time_and_their_number_is_limited(console, client_of, held):
+    console.users.add("another", "observer", PASSWORD)
+    watch, probe = client_of("watch"), client_of("anna")
+    clients = [client_of(user) for user in ("anna", "bo", "eva", "another")]
+    with ThreadPoolExecutor(60) as pool:
+        first = pool.submit(watch.get, "/api/export/contacts.kmz")
+        assert held.entered.acquire(timeout=20)
+        repeated = list(pool.map(lambda _: watch.get("/api/export/contacts.kmz"), range(40)))
+        assert {error_of(answer) for answer in repeated} == {(429, "too_many")}
+        assert all(int(answer.headers["retry-after"]) > 0 for answer in repeated)
+        others = [pool.submit(client.get, "/api/export/contacts.csv") for client in clients]
+        [full] = wait(others, 30, FIRST_COMPLETED).done
+        assert error_of(full.result()) == (503, "busy")
+        assert int(full.result().headers["retry-after"]) > 0
+        # Other requests are answered while four exports are open.
+        assert probe.get("/api/contacts").json()["total"] == 1
+        assert not first.done()
+        held.leave.set()
+        done = [one.result().status_code for one in (first, *others) if one is not full]
+    assert done == [200] * 4
+    assert held.most_running == 1
+    assert watch.get("/api/export/contacts.csv").status_code == 200
+
+
+def test_aborted_download_ends_the_export(console, client_of):
+    console.state.store_image(image_record())
+    watch = client_of("watch")
+    for _ in range(3):
+        with watch.stream("GET", "/api/export/contacts.kmz") as answer:
+            codes = [answer.status_code]
+        eventually(lambda: console.app._exports._queue._users == set(), what="end of the export")
+        assert codes == [200]
+
+
+def test_failed_export_does_not_stay_in_the_queue(console, monkeypatch):
+    watch = console.browser("watch")
+    monkeypatch.setattr(export_routes, "HANDLING_RESERVE_BYTES", 2**62)
+    console.state.store_image(image_record())
+    for _ in range(2):
+        assert error_of(watch.get("/api/export/contacts.csv")) == (503, "not_now")
+    monkeypatch.undo()
+    assert watch.get("/api/export/contacts.csv").status_code == 200
+
+
+def test_size_of_exports_is_limited(console, monkeypatch):
+    for number in range(3):
+        console.state.store_image(image_record(f"000{number}", first_utc_s=1_700_000_000.0 + number))
+    watch = console.browser("watch")
+    monkeypatch.setattr(export_routes, "MAX_CONTACTS", 2)
+    answer = watch.get("/api/export/contacts.csv")
+    assert error_of(answer) == (413, "too_large")
+    assert "more than 2 contacts" in answer.json()["error"]["message"]
+    assert watch.get("/api/export/contacts.csv", q="0001").status_code == 200
+    monkeypatch.setattr(export_routes, "MAX_CONTACTS", 3)
+    assert watch.get("/api/export/contacts.kmz").status_code == 200
+    monkeypatch.setattr(export_routes, "MAX_BYTES", 1000)
+    assert error_of(watch.get("/api/export/contacts.kmz")) == (413, "too_large")
+
+
+def test_images_of_an_export_are_in_memory_one_at_a_time(console, monkeypatch):
+    for number in range(5):
+        console.state.store_image(image_record(f"000{number}", first_utc_s=1_700_000_000.0 + number))
+    made, alive = [], []
+    decode = export_routes.rendering.eight_bits
+
+    def eight_bits(pixels: object) -> object:
+        found = decode(pixels).copy()
+        made.append(weakref.ref(found))
+        alive.append(sum(image() is not None for image in made))
+        return found
+
+    monkeypatch.setattr(export_routes.rendering, "eight_bits", eight_bits)
+    assert console.browser("watch").get("/api/export/contacts.kmz").status_code == 200
+    assert len(alive) == 5
+    assert max(alive) <= 2
+
+
+def test_stop_ends_a_running_export(console):
+    console.state.store_image(image_record())
+    watch = console.browser("watch")
+    console.app.stop()
+    assert error_of(watch.get("/api/export/contacts.kmz")) == (503, "busy")
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+def test_no_file_remains_after_the_end_of_the_process(tmp_path, end):
+    state, temporary = tmp_path / "state", tmp_path / "tmp"
+    temporary.mkdir()
+    database = Database(state / "console-review.db")
+    records = [image_record(f"{number:04X}", first_utc_s=1_700_000_000.0 + number) for number in range(400)]
+    ConsoleState(ConsoleConfig(), database).store_images(records)
+    database.close()
+    words = ["console", "--training", "1", "--port", "0", "--state", str(state), "--password", PASSWORD]
+    code = f"import sys; from sonarpost.cli.main import main; sys.exit(main({words!r}))"
+    before = {path.name for path in state.iterdir()}
+    with subprocess.Popen(
+        [sys.executable, "-c", code], env={**os.environ, "TMPDIR": str(temporary)}, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        address = process.stdout.readline().split()[0]
+        with httpx2.Client(base_url=address, timeout=60) as client, ThreadPoolExecutor() as pool:
+            eventually(lambda: is_served(client), what="server")
+            assert Browser(client).login("watch", PASSWORD).status_code == 200
+            export = pool.submit(client.get, "/api/export/contacts.kmz")
+            eventually(lambda: is_exporting(process.pid, state) or export.done(), what="export")
+            assert not export.done()
+            process.send_signal(end)
+            process.wait(60)
+            assert export.exception() is not None or export.result().status_code != 200
+    left = {path.name for path in state.iterdir()} - before - {"console-users.db"}
+    assert {name for name in left if not name.endswith(("-wal", "-shm"))} == set()
+    assert [path for path in temporary.rglob("*") if "export" in path.name] == []
+
+
+def is_served(client: httpx2.Client) -> bool:
+    try:
+        return client.get("/login").status_code == 200
+    except httpx2.TransportError:
+        return False
+
+
+def is_exporting(pid: int, folder: Path) -> bool:
+    """Return whether a process has an unnamed file open in a folder."""
+    names = []
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(OSError):
+            names.append(str(link.readlink()))
+    return any(name.startswith(f"{folder}/") and name.endswith("(deleted)") for name in names)

@@ -116,6 +116,10 @@ def test_complete_review_with_the_keyboard(served):
     visit.press("Escape")
     visit.press("x")
     visit.wait("dialog .exports a")
+    with visit.page.expect_download() as download:
+        visit.page.locator("dialog [data-export=csv]").click()
+    assert download.value.suggested_filename == "contacts.csv"
+    visit.wait("dialog .progress >> text=contacts.csv is saved")
     visit.press("Escape")
     assert visit.page.evaluate("document.documentElement.dataset.theme") == "night"
 

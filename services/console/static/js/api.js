@@ -1,12 +1,24 @@
 // Requests to the server. Every failure becomes an ApiError whose message is shown to the operator.
 
 export class ApiError extends Error {
-  constructor(status, code, message, body = {}) {
+  constructor(status, code, message, body = {}, retry_after_s = 0) {
     super(message);
     this.status = status;
     this.code = code;
     this.body = body;
+    this.retry_after_s = retry_after_s;
   }
+}
+
+/** The error of a response. A response of a proxy has no message of the server. */
+async function errorOf(response) {
+  const body = await response.json().catch(() => ({}));
+  const retry_after_s = Number(response.headers.get("Retry-After")) || 0;
+  const busy = response.status === 429 || response.status === 503;
+  const again = retry_after_s ? `in ${retry_after_s} s` : "later";
+  const text = busy ? `The server is busy (status ${response.status}): try again ${again}.` : `The server returned status ${response.status}.`;
+  const { code = "error", message = text } = body.error ?? {};
+  return new ApiError(response.status, code, message, body, retry_after_s);
 }
 
 let csrf = "";
@@ -28,11 +40,35 @@ async function request(method, path, body) {
     throw new ApiError(0, "no_connection", "No response from the console's server.", { cause: String(error) });
   }
   if (response.status === 204) return null;
-  const result = await response.json().catch(() => ({}));
-  if (response.ok) return result;
+  if (response.ok) return response.json().catch(() => ({}));
   if (response.status === 401 && path !== "/api/login") location.assign("/login");
-  const { code = "error", message = `The server returned status ${response.status}.` } = result.error ?? {};
-  throw new ApiError(response.status, code, message, result);
+  throw await errorOf(response);
+}
+
+/** Download a file. The server prepares exports one at a time, so that the response may take minutes. */
+async function download(path) {
+  let response;
+  try {
+    response = await fetch(path, { credentials: "same-origin", cache: "no-store", redirect: "error" });
+    if (response.ok) return await response.blob();
+  } catch (error) {
+    throw new ApiError(0, "no_connection", "The export was interrupted.", { cause: String(error) });
+  }
+  if (response.status === 401) location.assign("/login");
+  throw await errorOf(response);
+}
+
+/** Return why the event stream is refused; null if it is accepted. */
+async function streamError(path) {
+  const ended = new AbortController();
+  try {
+    const response = await fetch(path, { credentials: "same-origin", cache: "no-store", signal: ended.signal });
+    return response.ok ? null : await errorOf(response);
+  } catch {
+    return null; // no connection: the stream reconnects
+  } finally {
+    ended.abort();
+  }
 }
 
 const contactPath = (id) => `/api/contacts/${encodeURIComponent(id)}`;
@@ -57,7 +93,8 @@ export const api = {
   advise: (id, body) => request("POST", `${contactPath(id)}/advice`, body),
   fleet: () => request("GET", "/api/fleet"),
   map: () => request("GET", "/api/map"),
-  exportUrl: (format, filter) => `/api/export/contacts.${format}?${queryString(filter)}`,
+  export: (format, filter) => download(`/api/export/contacts.${format}?${queryString(filter)}`),
+  streamError,
   reportUrl: (id) => `/report/${encodeURIComponent(id)}`,
   imageUrl: (id, version, layer) => `${contactPath(id)}/versions/${version}/picture.png?${queryString({ layer, map: "grey" })}`,
   maskUrl: (id, version, kind, layer) => `${contactPath(id)}/versions/${version}/mask.png?${queryString({ kind, layer })}`,

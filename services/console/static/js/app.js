@@ -156,9 +156,27 @@ class App {
 
   async exports() {
     const formats = [["geojson", "GeoJSON, for GIS"], ["kmz", "KMZ, for Google Earth, with images"], ["csv", "CSV, for spreadsheets"], ["cot.xml", "Cursor-on-Target, for TAK"]];
-    const links = formats.map(([format, text]) => h("a", { href: api.exportUrl(format, this.filters.query), download: "", text }));
+    const filter = this.filters.query;
+    const progress = h("p", { class: "progress", role: "status" });
+    const links = formats.map(([format, text]) => h("button", { type: "button", text, data: { export: format }, on: { click: (event) => saveExport(event.target, progress, format, filter) } }));
     const report = this.detail ? h("a", { href: api.reportUrl(this.detail.contact.id), target: "_blank", rel: "noopener", text: `Printable report of ${this.detail.contact.name}` }) : null;
-    await showDialog("Exports", [h("p", { text: `Contacts of the queue filter: ${this.queue.rows.matching}.` }), h("div", { class: "exports" }, links, report)], [{ label: "Close", value: null, primary: true }]);
+    await showDialog("Exports", [h("p", { text: `Contacts of the queue filter: ${this.queue.rows.matching}.` }), h("div", { class: "exports" }, links, report), progress], [{ label: "Close", value: null, primary: true }]);
+  }
+}
+
+/** Save an export as a file; the button is disabled until the server has prepared it. */
+async function saveExport(button, progress, format, filter) {
+  button.disabled = true;
+  progress.textContent = "The server prepares the file …";
+  try {
+    const url = URL.createObjectURL(await api.export(format, filter));
+    h("a", { href: url, download: `contacts.${format}` }).click();
+    setTimeout(() => URL.revokeObjectURL(url), 60000);
+    progress.textContent = `contacts.${format} is saved.`;
+  } catch (error) {
+    progress.textContent = `No export: ${error.message}`;
+  } finally {
+    button.disabled = false;
   }
 }
 

@@ -1,5 +1,7 @@
 // The event stream of the server, and the state of its connection.
 
+import { api } from "./api.js";
+import { toast } from "./dom.js";
 import { emit, setClock, state } from "./state.js";
 
 const NAMES = ["contact", "frame", "decision", "request", "advice", "fleet", "session", "clock"];
@@ -10,6 +12,8 @@ let source = null;
 let lastId = "";
 let opened_ms = 0;
 let reload = false;
+let checking = false;
+let retry_ms = RETRY_MS;
 
 function received(event) {
   state.last_event_ms = performance.now();
@@ -26,12 +30,15 @@ function lost() {
   emit("online");
 }
 
+const streamUrl = () => (lastId ? `/events?last=${encodeURIComponent(lastId)}` : "/events");
+
 function open() {
   source?.close();
   opened_ms = performance.now();
-  source = new EventSource(lastId ? `/events?last=${encodeURIComponent(lastId)}` : "/events");
+  source = new EventSource(streamUrl());
   source.addEventListener("hello", (event) => {
     received(event);
+    retry_ms = RETRY_MS;
     setClock(JSON.parse(event.data).now_utc_s);
     if (reload) emit("reload");
     reload = false;
@@ -52,16 +59,26 @@ function open() {
   });
 }
 
-/** Reopen a stream that is silent or closed. */
-function check() {
+/** Reopen a stream that is silent or closed. If the server refuses it, show the reason and wait as long as it says. */
+async function check() {
+  if (checking) return;
   const now_ms = performance.now();
-  const silent = now_ms - Math.max(state.last_event_ms, opened_ms) > SILENT_MS;
-  const closed = source.readyState === EventSource.CLOSED && now_ms - opened_ms > RETRY_MS;
+  const silent = now_ms - Math.max(state.last_event_ms, opened_ms) > Math.max(SILENT_MS, retry_ms);
+  const closed = source.readyState === EventSource.CLOSED && now_ms - opened_ms > retry_ms;
   if (silent) lost();
-  if (silent || closed) {
-    reload = true;
+  if (!silent && !closed) return;
+  reload = true;
+  checking = true;
+  const error = closed ? await api.streamError(streamUrl()) : null;
+  checking = false;
+  if (error === null) {
     open();
+    return;
   }
+  if (error.status === 401) emit("session");
+  else toast(`No live updates: ${error.message}`, { bad: true });
+  retry_ms = Math.max(RETRY_MS, 1000 * error.retry_after_s);
+  opened_ms = performance.now();
 }
 
 export function startEvents() {
