@@ -1,7 +1,7 @@
 # sonarpost: one image for every service, and one for the embedded router.
 #
 #   docker build -t sonarpost:dev .                       every service: command = a service's name
-#   docker build -t sonarpost-router:dev --target router .  stands in for eclipse/zenoh where no registry is reached
+#   docker build -t sonarpost-router:dev --target router .  instead of eclipse/zenoh where no registry is reached
 #
 # Works with BuildKit and with the builder before it. `make images` builds both, and the base too where no registry is
 # reached.

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Builds the images that docker-compose.yml names. Where no registry is reached, the base is made from Debian's packages
-# and the router's image from sonarpost's own router, under the name that the compose file asks for.
+# Builds the image of the services and gets that of the router. Where no registry is reached, the base is made from
+# Debian's packages, and the router's image is built from sonarpost's own router under a name of its own, sonarpost-router.
+# build/router-image holds the name of the router's image, for ROUTER_IMAGE in .env.
 #
 #   packaging/images.sh          SONARPOST_IMAGE, ROUTER_IMAGE and SONARPOST_BASE override the names
 set -euo pipefail
@@ -12,7 +13,7 @@ default() { sed -n "s/.*\${$1:-\([^}]*\)}.*/\1/p" docker-compose.yml | head -1; 
 image=${SONARPOST_IMAGE:-$(default SONARPOST_IMAGE)}
 router=${ROUTER_IMAGE:-$(default ROUTER_IMAGE)}
 base=${SONARPOST_BASE:-$(default SONARPOST_BASE)}
-stand_in=org.sonarpost.stand-in
+own_router=sonarpost-router:${image##*:}
 
 if ! docker info >/dev/null 2>&1; then
     echo "images: no container engine answers (docker info)" >&2
@@ -36,13 +37,17 @@ build --tag "$image"
 docker image inspect "$image" >/dev/null
 echo "images: $image, $(docker image inspect --format '{{.Size}}' "$image" | awk '{printf "%.0f MB", $1 / 1e6}'), ${SECONDS} s"
 
-ours() { [ "$(docker image inspect --format "{{index .Config.Labels \"$stand_in\"}}" "$router" 2>/dev/null)" = router ]; }
-if ! ours; then
+chosen() { mkdir -p build && echo "$1" > build/router-image; }
+if [ "${router%%:*}" != sonarpost-router ]; then
     if docker image inspect "$router" >/dev/null 2>&1 || timeout "${SONARPOST_PULL_S:-60}" docker pull --quiet "$router" 2>/dev/null; then
-        echo "images: $router as its makers built it"
+        chosen "$router"
+        echo "images: $router"
         exit 0
     fi
+    echo "images: no registry has $router: building $own_router. Add to .env: ROUTER_IMAGE=$own_router"
+    router=$own_router
 fi
-build --target router --label "$stand_in=router" --tag "$router"
-ours
-echo "images: $router is sonarpost's own router, as no registry gives the other"
+build --target router --tag "$router"
+docker image inspect "$router" >/dev/null
+chosen "$router"
+echo "images: $router"

@@ -9,6 +9,8 @@ python=${PYTHON:-.venv/bin/python}
 SECONDS=0
 export SONARPOST_IMAGE=${SONARPOST_IMAGE:-sonarpost:compose-test}
 packaging/images.sh
+ROUTER_IMAGE=$(cat build/router-image)
+export ROUTER_IMAGE
 echo "test-compose: images after ${SECONDS} s"
 
 export SONARPOST_COMPOSE_PROJECT=sonarpost-test-$$

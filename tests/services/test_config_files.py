@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 import re
 import tomllib
 
 import pytest
+import zenoh
 from builders.common import REPOSITORY
 
 from sonarpost.config import SERVICES, ServiceConfig, load
@@ -108,3 +110,11 @@ def test_both_ends_of_the_link_fit_together():
     assert uuv.destination == vessel.address != uuv.address
     assert compressor.codebook in decompressor.codebooks
     assert vessel.vehicles[str(uuv.address)] == load(path_of("uuv"), "atd_stub", table_of("atd_stub"), {})[0].id
+
+
+@pytest.mark.parametrize("path", sorted((REPOSITORY / "config").glob("router-*.json5")), ids=lambda path: path.stem)
+def test_a_router_without_authentication_listens_on_the_loopback_address_only(path):
+    endpoints = json.loads(zenoh.Config.from_file(str(path)).get_json("listen/endpoints"))
+    assert endpoints
+    for endpoint in endpoints:
+        assert re.fullmatch(r"tcp/127\.0\.0\.1:\d+", endpoint)

@@ -77,6 +77,27 @@ def test_modem_services_mount_the_acoustic_key_that_their_configuration_names() 
     assert "/var/lib/sonarpost/acoustic/uuv" in (REPOSITORY / "Dockerfile").read_text()
 
 
+def test_the_routers_of_the_files_in_config_get_endpoints_that_other_containers_reach() -> None:
+    """The files listen on the loopback address."""
+    with_file = {name: block for name, block in blocks().items() if "/etc/sonarpost/router-" in block}
+    assert set(with_file) == {"router-uuv", "router-sim"}
+    for block in with_file.values():
+        assert '"--listen", "tcp/router:7447"' in block
+    options = re.findall(r"^#(\w+)_ROUTER_OPTIONS=(.*)$", (REPOSITORY / ".env.example").read_text(), flags=re.MULTILINE)
+    assert {name for name, text in options if "--listen tcp/router:7447" in text} == {"SHORE", "VESSEL"}
+
+
+def test_the_own_router_has_a_name_of_its_own() -> None:
+    text = (REPOSITORY / "packaging" / "images.sh").read_text()
+    [built] = re.findall(r"^build --target router --tag \"(\S+)\"$", text, flags=re.MULTILINE)
+    assert built == "$router"
+    assert (
+        text.index("own_router=sonarpost-router:")
+        < text.index("router=$own_router")
+        < text.index("build --target router")
+    )
+
+
 def test_every_variable_is_in_the_example_with_its_default() -> None:
     example = (REPOSITORY / ".env.example").read_text()
     known = dict(re.findall(r"^#?([A-Z_]+)=(.*?)(?:[ ]+#.*)?$", example, flags=re.MULTILINE))

@@ -189,3 +189,32 @@ def test_authority_is_created_once(script: ModuleType, root: Path) -> None:
     script.run(["make"], {}, root)
     assert (root / "pki" / "fleet" / "ca.key").read_bytes() == key
     assert Fleet(root / "pki" / "fleet", lambda: b"").authority_days_left() > 3000
+
+
+def test_make_at_a_terminal_encrypts_the_key_of_the_authority(
+    script: ModuleType, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    prompts: list[str] = []
+    monkeypatch.setattr(script, "ask_at_terminal", lambda prompt: prompts.append(prompt) or b"correct horse battery")
+    assert script.run(["make"], {}, root) == 0
+    assert b"ENCRYPTED" in (root / "pki" / "fleet" / "ca.key").read_bytes()
+    assert prompts == [
+        "Passphrase for the new authority's key, empty for none: ",
+        "Repeat: ",
+        "Passphrase of the authority's key: ",
+    ]
+    # Without missing certificates the key is not needed.
+    prompts.clear()
+    assert script.run(["make"], {}, root) == 0
+    assert prompts == []
+    assert "no passphrase" not in capsys.readouterr().out
+    with pytest.raises(script.SonarpostError):
+        script.Depot(root, script.Plan.from_environment({"FLEET_CONSOLES": "c-1"}), lambda _: b"wrong").make()
+
+
+def test_make_without_a_terminal_reports_the_key_without_passphrase(
+    script: ModuleType, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert script.run(["make"], {}, root) == 0
+    assert b"ENCRYPTED" not in (root / "pki" / "fleet" / "ca.key").read_bytes()
+    assert "its key has no passphrase: keep the volume pki off the hosts that run services" in capsys.readouterr().out
