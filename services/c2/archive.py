@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 from sonarpost import keys
 from sonarpost.archive.image_files import WrittenImage, add_image
+from sonarpost.archive.retention import DAY_S
 from sonarpost.archive.shore_files import (
     decision_path,
     delete_image_files,
@@ -17,7 +18,7 @@ from sonarpost.archive.shore_files import (
     image_row,
     index_missing_files,
     remove_temporary_files,
-    select_for_removal,
+    select_images,
     verify_files,
 )
 from sonarpost.archive.shore_index import DEFECTS, DecisionRow, ImageRow, ShoreIndex, TaskingRow
@@ -134,11 +135,16 @@ class Archive:
 
     def apply_retention(self, now_utc_s: float) -> list[ImageRow]:
         """Remove images by age and total size; return them."""
-        if self._config.retain_days is None and self._config.max_bytes is None:
-            return []
+        config = self._config
         with self._lock:
             index = self.index()
-            rows = select_for_removal(index.images(), now_utc_s, self._config.retain_days, self._config.max_bytes)
+            oldest_utc_s = index.oldest_utc_s()
+            too_large = index.size_bytes() > config.max_bytes
+            if oldest_utc_s is None or (now_utc_s - oldest_utc_s <= config.retain_days * DAY_S and not too_large):
+                return []
+            # The decisions only matter above the maximum size.
+            decisions = index.decisions() if too_large else []
+            rows = select_images(index.images(), decisions, now_utc_s, config.retain_days, config.max_bytes)
             for row in rows:
                 delete_image_files(self._out_dir, row)
             if rows:

@@ -5,25 +5,23 @@ from typing import Annotated
 
 from pydantic import Field
 
-from sonarpost.config import ServiceConfig
 from sonarpost.keys import SHORE
 from sonarpost.messages import PlatformId
+from sonarpost.runtime.retention import MaxBytes, RetentionConfig
 
 
-class C2Config(ServiceConfig):
+class C2Config(RetentionConfig):
     """The `[c2]` table.
 
     Attributes:
         site: Name of this site in keys; relays name it in their upstreams.
         out_dir: Folder of the stored records, with a folder for each vessel and an index.
-        retain_days: Age above which images are removed; None keeps them.
-        max_bytes: Maximum size of the stored images; above it exported ones are removed first, then the oldest. None
-            for no limit. Decisions are never removed.
+        max_bytes: Maximum size of the stored images; above it exported images are removed first, then those with a
+            decision, then the others, each the oldest first. Decisions are never removed.
         verify_days: Time in which every stored file is compared with the index once; 0 disables the comparison.
     """
 
     site: PlatformId = SHORE
     out_dir: Path = Path("out")
-    retain_days: Annotated[float, Field(gt=0, le=36500)] | None = None
-    max_bytes: Annotated[int, Field(ge=0)] | None = None
+    max_bytes: MaxBytes = 50_000_000_000
     verify_days: Annotated[float, Field(ge=0, le=36500)] = 1.0

@@ -8,8 +8,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import zenoh
-
 from sonarpost import keys, wire
 from sonarpost.bus.connectivity import declare_presence
 from sonarpost.config import PlatformConfig
@@ -18,6 +16,7 @@ from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import DeliveryError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
+from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, ServiceStoppingError, UnitOfWork
 from sonarpost.services.c2 import tasking
 from sonarpost.services.c2.archive import Archive
@@ -29,7 +28,6 @@ log = logging.getLogger(__name__)
 COMMAND_PRIORITY = 1
 ADVICE_PRIORITY = 2
 CONSUMER = "relay"
-RETENTION_INTERVAL_S = 60.0
 VERIFICATION_INTERVAL_S = 60.0
 RETRY_S = 1.0
 
@@ -49,7 +47,7 @@ class C2Service(Service[C2Config]):
     def __init__(self, platform: PlatformConfig, config: C2Config) -> None:
         super().__init__(platform, config)
         self._archive = Archive(config)
-        self._retention_due = threading.Event()
+        self._retention = Retention(self._apply_retention, self.stopping)
         self._changed = threading.Event()
         self._changed_names: set[str] = set()
         self._changed_lock = threading.Lock()
@@ -130,13 +128,13 @@ class C2Service(Service[C2Config]):
         try:
             self._archive.flush()
             for key, record in self._to_publish:
-                self._publish(key, record)
+                self._publish_stored(key, record)
             superseded = super().commit_batch(handled)
         finally:
             self._to_publish.clear()
             self._uncommitted.clear()
-        if self.config.max_bytes is not None and any(effects.counts.get("images_stored") for effects, _ in handled):
-            self._retention_due.set()
+        if any(effects.counts.get("images_stored") for effects, _ in handled):
+            self._retention.wake()
         return superseded
 
     # Records for vessels
@@ -212,7 +210,7 @@ class C2Service(Service[C2Config]):
                     continue  # not committed yet
                 item = Tasking.unpack(packed)
                 self._archive.store_tasking([item.row()])
-                self._publish(keys.tasking_state(item.vessel_id, self.config.site), item.state_record())
+                self._publish_stored(keys.tasking_state(item.vessel_id, self.config.site), item.state_record())
                 names.discard(name)
         finally:
             with self._changed_lock:
@@ -222,14 +220,14 @@ class C2Service(Service[C2Config]):
 
     def on_start(self) -> None:
         """Start the retention and the publication of delivery states."""
-        self.start_thread(self._run_retention, "retention")
+        self.start_thread(self._retention.run, "retention")
         self.start_thread(self._run_verification, "verification")
         self.start_thread(self._publish_states, "tasking")
         declare_presence(self.session, self.platform.id, self.NAME, self.config.site)
 
     def on_stop(self) -> None:
         """Wake the background threads."""
-        self._retention_due.set()
+        self._retention.wake()
         self._changed.set()
 
     def stop(self) -> None:
@@ -237,18 +235,10 @@ class C2Service(Service[C2Config]):
         super().stop()
         self._archive.close()
 
-    def _run_retention(self) -> None:
-        while not self.stopping.is_set():
-            self._retention_due.clear()
-            try:
-                removed = self._archive.apply_retention(time.time())
-                if removed:
-                    self.count("images_removed", len(removed))
-                self._background_faults.pop("retention", None)
-            except OSError as error:
-                self._background_faults["retention"] = f"images cannot be removed: {error}"
-                log.error("Retention failed", extra=kv(reason=str(error)))
-            self._retention_due.wait(RETENTION_INTERVAL_S)
+    def _apply_retention(self, now_utc_s: float) -> None:
+        removed = self._archive.apply_retention(now_utc_s)
+        if removed:
+            self.count("images_removed", len(removed))
 
     def _run_verification(self) -> None:
         while not self.stopping.wait(VERIFICATION_INTERVAL_S):
@@ -266,7 +256,7 @@ class C2Service(Service[C2Config]):
 
     def degraded_reason(self) -> str:
         """Return the faults of the background threads."""
-        return "; ".join(tuple(self._background_faults.values()))
+        return "; ".join(fault for fault in (*self._background_faults.values(), self._retention.error) if fault)
 
     def gauges(self) -> Mapping[str, float]:
         """Return the size of the stored images and the number of records queued for vessels."""
@@ -277,11 +267,11 @@ class C2Service(Service[C2Config]):
             **{f"records_{defect}": float(count) for defect, count in self._archive.defect_counts().items()},
         }
 
-    def _publish(self, key: str, record: Record) -> None:
-        try:
-            self.session.put(key, wire.encode(record), encoding=wire.encoding_of(type(record)))
-        except zenoh.ZError as error:
-            if self.stopping.is_set():
-                # The session was closed: the record is published after the next start.
-                raise ServiceStoppingError from error
-            log.warning("Record not published", extra=kv(key=key, error=str(error)))
+    def _publish_stored(self, key: str, record: Record) -> None:
+        """Publish a record.
+
+        Raises:
+            ServiceStoppingError: The session was closed: the record is published after the next start.
+        """
+        if not self.publish(key, record) and self.stopping.is_set():
+            raise ServiceStoppingError

@@ -5,18 +5,22 @@ from typing import Annotated
 
 from pydantic import Field
 
-from sonarpost.config import ConsumerName, ServiceConfig
+from sonarpost.config import ConsumerName
+from sonarpost.runtime.retention import MaxBytes, RetentionConfig
 
 
-class DecompressorConfig(ServiceConfig):
+class DecompressorConfig(RetentionConfig):
     """Configuration of the decoder and of its outputs.
 
     Attributes:
         out_dir: Folder of the image files.
+        max_bytes: Maximum size of the image files; above it versions that a later one has replaced are removed first,
+            then the others, each the oldest first. Records that wait for delivery are in the store and stay.
         codebooks: Tile codebooks that vehicles may use: nominal-10, nominal-20 or files.
         image_consumers: Services on the vessel that receive the decoded images; name only services that run.
     """
 
     out_dir: Path = Path("out")
+    max_bytes: MaxBytes = 20_000_000_000
     codebooks: Annotated[tuple[str, ...], Field(min_length=1)] = ("nominal-10", "nominal-20")
     image_consumers: tuple[ConsumerName, ...] = ("relay",)

@@ -6,12 +6,13 @@ import logging
 from collections.abc import Mapping
 
 from sonarpost import keys, wire
-from sonarpost.archive.image_files import write_image
+from sonarpost.archive.image_files import remove_old_images, write_image
 from sonarpost.codec.jit import use_code_folder
 from sonarpost.config import PlatformConfig
 from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import ReceivedImage, ReconstructedImage, Record
+from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.security.acoustic_key import link_key
 from sonarpost.services.decompressor.config import DecompressorConfig
@@ -36,11 +37,31 @@ class DecompressorService(Service[DecompressorConfig]):
         # Before the store is opened, so that a configuration error leaves no open store.
         self._decoder = Decoder(config.codebooks)
         super().__init__(platform, config)
+        self._retention = Retention(self._apply_retention, self.stopping)
 
     def start(self) -> bool:
         """Convert the frames and the receiver state that version 0.1 left in the store, then start."""
         migrate_store(self.store, self.platform.id, lambda: link_key(self.platform))
         return super().start()
+
+    def on_start(self) -> None:
+        """Start the retention."""
+        self.start_thread(self._retention.run, "retention")
+
+    def on_stop(self) -> None:
+        """End the retention."""
+        self._retention.wake()
+
+    def degraded_reason(self) -> str:
+        """Return why old files cannot be removed."""
+        return self._retention.error
+
+    def _apply_retention(self, now_utc_s: float) -> None:
+        config = self.config
+        removed = remove_old_images(config.out_dir, now_utc_s, config.retain_days, config.max_bytes)
+        if removed:
+            self.count("images_removed", len(removed))
+            log.warning("Image files removed by retention", extra=kv(images=len(removed), first=removed[0]))
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Return the coded images of this vessel."""

@@ -8,9 +8,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
-import zenoh
-
-from sonarpost import keys, wire
+from sonarpost import keys
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import ConfigError, DeliveryError, FrameError, PayloadError
@@ -22,11 +20,10 @@ from sonarpost.link.state import SavedParts
 from sonarpost.logs import kv
 from sonarpost.messages import Command, Decision, Record
 from sonarpost.modem.micromodem import RATES, FrameReceived, PacketFailed, PacketSent
-from sonarpost.runtime.modem_service import ModemService
+from sonarpost.runtime.modem_service import ModemService, sent_frames
 from sonarpost.runtime.service import UnitOfWork
 from sonarpost.security.acoustic_key import key_warning
 from sonarpost.services.op_modem.config import OpModemConfig
-from sonarpost.services.op_modem.packets import sent_frames
 from sonarpost.services.op_modem.transmit_gate import TransmitGate
 from sonarpost.services.op_modem.vessel_endpoint import VesselLink
 
@@ -272,7 +269,7 @@ class DownlinkService(ModemService[OpModemConfig]):
                 log.warning("Packet not sent", extra=kv(destination=packet.address, reason=event.reason))
                 return
             changed = self._commit_sent(packet, now)
-        for record in sent_frames(self.platform.id, self.config.address, event, now):
+        for record in sent_frames(self.platform.id, self.config.address, event, event.packet_id, now):
             self.publish(keys.acoustic_tx(self.platform.id), record)
         self._publish_states(changed)
 
@@ -302,13 +299,6 @@ class DownlinkService(ModemService[OpModemConfig]):
                     vehicle=command.vehicle, kind=command.kind, record_id=command.record_id, state=str(command.state)
                 ),
             )
-
-    def publish(self, key: str, record: Record) -> None:
-        """Publish a record for subscribers, without durable delivery."""
-        try:
-            self.session.put(key, wire.encode(record), encoding=wire.encoding_of(type(record)))
-        except zenoh.ZError as error:
-            log.warning("Record not published", extra=kv(key=key, error=str(error)))
 
     def link_gauges(self) -> Mapping[str, float]:
         """Return the state of commands, images, feedback and authentication."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import msgpack
 
 from sonarpost.messages import AcousticFrame, LinkQuality
-from sonarpost.modem.micromodem import RATES, FrameReceived, LinkStatistics, PacketReceived, PacketSent
+from sonarpost.modem.micromodem import RATES, FrameReceived, LinkStatistics, PacketReceived
 
 _MAX_FRAMES = 8
 
@@ -60,25 +60,6 @@ def received_frame(
         data=frame.data,
         quality=quality_of(packet.statistics),
     )
-
-
-def sent_frames(vessel_id: str, source: int, packet: PacketSent, sent_utc_s: float) -> list[AcousticFrame]:
-    """Return the records of the frames of a packet that was sent."""
-    return [
-        AcousticFrame(
-            direction="tx",
-            platform_id=vessel_id,
-            time_utc_s=sent_utc_s,
-            source=source,
-            destination=packet.dest,
-            rate=packet.rate,
-            packet=packet.packet_id,
-            frame_number=number,
-            frame_count=len(packet.frames),
-            data=data,
-        )
-        for number, data in enumerate(packet.frames, start=1)
-    ]
 
 
 def quality_of(statistics: LinkStatistics | None) -> LinkQuality | None:

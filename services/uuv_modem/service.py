@@ -9,14 +9,12 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Final
 
-import zenoh
-
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError, RetryLaterError
 from sonarpost.logs import kv
-from sonarpost.messages import AcousticFrame, EncodedImage, OutgoingMessage, Record
+from sonarpost.messages import EncodedImage, OutgoingMessage, Record
 from sonarpost.modem.micromodem import (
     RATES,
     FrameDecoded,
@@ -27,7 +25,7 @@ from sonarpost.modem.micromodem import (
     PacketSent,
     PollReceived,
 )
-from sonarpost.runtime.modem_service import ModemService
+from sonarpost.runtime.modem_service import ModemService, sent_frames
 from sonarpost.runtime.service import UnitOfWork
 from sonarpost.security.acoustic_key import key_warning
 from sonarpost.services.uuv_modem.config import UuvModemConfig
@@ -279,20 +277,8 @@ class UuvModemService(ModemService[UuvModemConfig]):
         self._packets += 1
         self.count("packets_sent")
         self.count("frames_sent", len(sent.frames))
-        for number, data in enumerate(sent.frames, start=1):
-            frame = AcousticFrame(
-                direction="tx",
-                platform_id=self.platform.id,
-                time_utc_s=now,
-                source=self.config.address,
-                destination=sent.dest,
-                rate=sent.rate,
-                packet=self._packets,
-                frame_number=number,
-                frame_count=len(sent.frames),
-                data=data,
-            )
-            self._publish(keys.acoustic_tx(self.platform.id), frame)
+        for frame in sent_frames(self.platform.id, self.config.address, sent, self._packets, now):
+            self.publish(keys.acoustic_tx(self.platform.id), frame)
 
     def _publish_queue_state(self, now: float) -> None:
         """Publish the state of the queue if it is due.
@@ -306,13 +292,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
             interval_s = min(interval_s, _STATE_INTERVAL_S)
         if self._published_at_s is None or not 0 <= now - self._published_at_s < interval_s:
             self._published_at_s, self._published_images = now, images
-            self._publish(keys.acoustic_queue(self.platform.id), self._endpoint.queue_state(now))
-
-    def _publish(self, key: str, record: Record) -> None:
-        try:
-            self.session.put(key, wire.encode(record), encoding=wire.encoding_of(type(record)))
-        except zenoh.ZError as error:
-            log.warning("Record not published", extra=kv(key=key, error=str(error)))
+            self.publish(keys.acoustic_queue(self.platform.id), self._endpoint.queue_state(now))
 
     def gauges(self) -> Mapping[str, float]:
         """Return the state of the modem, of the transmit queue and of the key."""

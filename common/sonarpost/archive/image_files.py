@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Set
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from sonarpost.archive.retention import remove_files
 from sonarpost.export.contacts import SideCar
 from sonarpost.files import AtomicFiles
 from sonarpost.messages import ReconstructedImage
@@ -37,6 +39,10 @@ class WrittenImage(NamedTuple):
     is_conflict: bool
 
 
+# The side-car first: if it exists, the others are complete.
+SUFFIXES = (".json", ".tiff", ".png")
+
+
 def image_file_name(image: ReconstructedImage | SideCar) -> str:
     """Return the plain file name without suffix: vehicle, time of the first frame, image identifier, version.
 
@@ -44,6 +50,23 @@ def image_file_name(image: ReconstructedImage | SideCar) -> str:
     """
     first = datetime.fromtimestamp(image.first_frame_utc_s, UTC).strftime("%Y%m%dT%H%M%SZ")
     return f"{image.vehicle_id}_{first}_{image.image_id}_v{image.version}"
+
+
+def is_superseded(name: str, names: Set[str]) -> bool:
+    """Return whether a later version is among the file names without suffix."""
+    base, _, version = name.rpartition("_v")
+    return version.isdecimal() and f"{base}_v{int(version) + 1}" in names
+
+
+def remove_old_images(folder: Path, now_utc_s: float, retain_days: float, max_bytes: int) -> list[str]:
+    """Remove the files of images by age and total size, superseded versions first; return their names without suffix.
+
+    Raises:
+        OSError: The folder cannot be read, or a file cannot be deleted.
+    """
+    return remove_files(
+        folder, SUFFIXES, now_utc_s, retain_days, max_bytes, lambda name, names: 0 if is_superseded(name, names) else 1
+    )
 
 
 def side_car(image: ReconstructedImage) -> dict[str, object]:

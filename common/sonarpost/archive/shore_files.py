@@ -9,7 +9,8 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from sonarpost.archive.image_files import image_file_name
+from sonarpost.archive.image_files import SUFFIXES, image_file_name
+from sonarpost.archive.retention import Stored, select_for_removal
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, Verified
 from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import DECISIONS, SideCar
@@ -17,9 +18,6 @@ from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage
 
 log = logging.getLogger(__name__)
-
-# The side-car first: if it exists, the others are complete.
-SUFFIXES = (".json", ".tiff", ".png")
 
 
 def image_paths(out_dir: Path, row: ImageRow) -> tuple[Path, ...]:
@@ -161,28 +159,28 @@ def _missing_decisions(out_dir: Path, index: ShoreIndex) -> Iterator[DecisionRow
             log.error("Stored decision cannot be read", extra=kv(file=path, reason=str(error)[:200]))
 
 
-def select_for_removal(
-    images: Sequence[ImageRow], now_utc_s: float, retain_days: float | None, max_bytes: int | None
+def select_images(
+    images: Sequence[ImageRow],
+    decisions: Iterable[DecisionRow],
+    now_utc_s: float,
+    retain_days: float | None,
+    max_bytes: int | None,
 ) -> list[ImageRow]:
-    """Select the images that retention removes.
+    """Select the images that retention removes; see `select_for_removal`.
 
-    Images accepted longer than `retain_days` ago are removed. Of the others, exported ones are removed first, oldest
-    first, then the rest, oldest first, until at most `max_bytes` remain.
+    Because of the total size, exported images are removed first, then those with a decision, then those without, in
+    each group the one that was accepted first.
     """
-    old: list[ImageRow] = []
-    kept: list[ImageRow] = []
-    for row in images:
-        too_old = retain_days is not None and now_utc_s - row.accepted_utc_s > retain_days * 86400.0
-        (old if too_old else kept).append(row)
-    if max_bytes is None:
-        return old
-    total = sum(row.size_bytes for row in kept)
-    for row in sorted(kept, key=lambda r: (r.exported_utc_s is None, r.accepted_utc_s, r.vessel_id, r.name)):
-        if total <= max_bytes:
-            break
-        total -= row.size_bytes
-        old.append(row)
-    return old
+    decided = {(d.vessel_id, d.vehicle_id, d.image_id) for d in decisions}
+
+    def order(row: ImageRow) -> int:
+        if row.exported_utc_s is not None:
+            return 0
+        return 1 if (row.vessel_id, row.vehicle_id, row.image_id) in decided else 2
+
+    rows = sorted(images, key=lambda row: (row.vessel_id, row.name))
+    stored = [Stored(row, row.accepted_utc_s, row.size_bytes, order(row)) for row in rows]
+    return select_for_removal(stored, now_utc_s, retain_days, max_bytes)
 
 
 def delete_image_files(out_dir: Path, row: ImageRow) -> None:

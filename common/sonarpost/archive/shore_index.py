@@ -351,6 +351,12 @@ class ShoreIndex:
             ).fetchone()
         return int(row[0])
 
+    def oldest_utc_s(self) -> float | None:
+        """Return when the oldest image that is not removed was accepted; None if there is none."""
+        with self._lock:
+            row = self._execute("SELECT MIN(accepted_utc_s) FROM picture WHERE removed_utc_s IS NULL").fetchone()
+        return None if row[0] is None else float(row[0])
+
     def _rows(self, row_type: type[Row], rest: str, values: tuple[object, ...] = ()) -> list[Row]:
         table = _TABLES[row_type]
         with self._lock:

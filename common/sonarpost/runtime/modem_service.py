@@ -11,7 +11,8 @@ from pydantic import Field
 
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.logs import kv
-from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, ModemEvent
+from sonarpost.messages import AcousticFrame
+from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, ModemEvent, PacketSent
 from sonarpost.modem.micromodem import events as ev
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialPort
@@ -162,3 +163,32 @@ class ModemService(Service[M]):
                     self._unreported_packets.log(port=port)
             case _:
                 pass
+
+
+def sent_frames(
+    platform_id: str, source: int, packet: PacketSent, number: int, sent_utc_s: float
+) -> list[AcousticFrame]:
+    """Return the records of the frames of a packet that was sent.
+
+    Args:
+        platform_id: Name of the platform.
+        source: Its modem address.
+        packet: The packet.
+        number: Number of the packet on this platform.
+        sent_utc_s: End of the packet.
+    """
+    return [
+        AcousticFrame(
+            direction="tx",
+            platform_id=platform_id,
+            time_utc_s=sent_utc_s,
+            source=source,
+            destination=packet.dest,
+            rate=packet.rate,
+            packet=number,
+            frame_number=frame_number,
+            frame_count=len(packet.frames),
+            data=data,
+        )
+        for frame_number, data in enumerate(packet.frames, start=1)
+    ]

@@ -366,6 +366,16 @@ class Service(ABC, Generic[C]):
                     self._counters[name] += by
         return tx.superseded
 
+    def publish(self, key: str, record: Record) -> bool:
+        """Publish a record for subscribers, without durable delivery; return whether Zenoh has taken it."""
+        try:
+            self.session.put(key, wire.encode(record), encoding=wire.encoding_of(type(record)))
+        except zenoh.ZError as error:
+            if not self.stopping.is_set():
+                log.warning("Record not published", extra=kv(key=key, error=str(error)))
+            return False
+        return True
+
     def is_responding(self, queue: str) -> bool:
         """Return whether the consumer of a queue replied to the last request."""
         return self._outbox is not None and self._outbox.is_responding(queue)
@@ -455,7 +465,6 @@ class Service(ABC, Generic[C]):
             record = self.health(state)
             # Before the publication, which can block: a router that hangs must not make this service unhealthy.
             self._heartbeat.beat(record, time.monotonic())
-            key = keys.health(self.platform.id, self.NAME)
-            self.session.put(key, wire.encode(record), encoding=wire.encoding_of(Health))
-        except (DeliveryError, zenoh.ZError) as error:
+            self.publish(keys.health(self.platform.id, self.NAME), record)
+        except DeliveryError as error:
             log.warning("Health not published", extra=kv(error=str(error)))

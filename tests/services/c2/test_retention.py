@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import pytest
@@ -10,8 +11,8 @@ from builders.records import decision_record, reconstructed_image
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.archive.shore_files import find_image, select_for_removal
-from sonarpost.archive.shore_index import FILE_NAME, ImageRow, ShoreIndex
+from sonarpost.archive.shore_files import find_image, select_images
+from sonarpost.archive.shore_index import FILE_NAME, DecisionRow, ImageRow, ShoreIndex
 from sonarpost.errors import StoredFileError
 from sonarpost.messages import Pixels
 from sonarpost.services.c2.archive import Archive
@@ -77,15 +78,32 @@ def images_in(folder):
 
 def test_retention_removes_exported_images_first_then_the_oldest():
     rows = [row("a", 1), row("b", 2), row("c", 3, exported_utc_s=9.0), row("d", 4, exported_utc_s=9.0)]
-    assert [r.name for r in select_for_removal(rows, 10.0, None, 250)] == ["c", "d"]
-    assert [r.name for r in select_for_removal(rows, 10.0, None, 100)] == ["c", "d", "a"]
-    assert select_for_removal(rows, 10.0, None, 400) == []
+    assert [r.name for r in select_images(rows, (), 10.0, None, 250)] == ["c", "d"]
+    assert [r.name for r in select_images(rows, (), 10.0, None, 100)] == ["c", "d", "a"]
+    assert select_images(rows, (), 10.0, None, 400) == []
+
+
+def test_images_without_a_decision_are_removed_last():
+    decision = DecisionRow.of(decision_record(vehicle_id="uuv-1", image_id="BBBB"), 5.0)
+    rows = [row("a", 1), row("b", 2, image_id="BBBB"), row("c", 3, exported_utc_s=9.0)]
+    assert [r.name for r in select_images(rows, [decision], 10.0, None, 100)] == ["c", "b"]
+    assert [r.name for r in select_images(rows, [decision], 10.0, None, 0)] == ["c", "b", "a"]
+
+
+def test_retention_is_on_by_default(archive, tmp_path):
+    stored = archive()
+    stored.store_image(image("AAAA"), 5.0)
+    stored.flush()
+    assert stored.apply_retention(time.time() + 364 * DAY_S) == []
+    assert [r.image_id for r in stored.apply_retention(time.time() + 366 * DAY_S)] == ["AAAA"]
+    assert images_in(tmp_path / "out") == []
+    assert C2Config().max_bytes == 50_000_000_000
 
 
 def test_retention_removes_old_images_below_the_size_limit():
     rows = [row("old", 0.0), row("new", 5 * DAY_S)]
-    assert [r.name for r in select_for_removal(rows, 6 * DAY_S, 3.0, None)] == ["old"]
-    assert [r.name for r in select_for_removal(rows, 6 * DAY_S, 3.0, 10)] == ["old", "new"]
+    assert [r.name for r in select_images(rows, (), 6 * DAY_S, 3.0, None)] == ["old"]
+    assert [r.name for r in select_images(rows, (), 6 * DAY_S, 3.0, 10)] == ["old", "new"]
 
 
 @given(
@@ -95,7 +113,7 @@ def test_retention_removes_old_images_below_the_size_limit():
 )
 def test_retention_keeps_the_limits_and_removes_no_more_than_needed(pictures, days, limit):
     rows = [row(str(n), at, size, 1.0 if done else None) for n, (at, size, done) in enumerate(pictures)]
-    removed = select_for_removal(rows, 1e6, days, limit)
+    removed = select_images(rows, (), 1e6, days, limit)
     kept = [r for r in rows if r not in removed]
     assert len(removed) == len(set(removed))
     if days is not None:
@@ -128,14 +146,6 @@ def test_retention_deletes_files_and_keeps_decisions(archive, tmp_path):
     assert kept.apply_retention(2e9) == []
 
 
-def test_retention_without_limits_removes_nothing(archive, tmp_path):
-    kept = archive()
-    kept.store_image(image(), 5.0)
-    kept.flush()
-    assert kept.apply_retention(1e12) == []
-    assert len(images_in(tmp_path / "out")) == 1
-
-
 def test_exported_image_is_removed_before_an_older_one(archive):
     kept = archive()
     kept.store_image(image("AAAA"), 5.0)
@@ -146,7 +156,7 @@ def test_exported_image_is_removed_before_an_older_one(archive):
     size = index.size_bytes()
     index.mark("exported_utc_s", [r for r in index.images() if r.image_id == "BBBB"], 7.0)
     limited = archive(max_bytes=size - 1)
-    assert [r.image_id for r in limited.apply_retention(1e10)] == ["BBBB"]
+    assert [r.image_id for r in limited.apply_retention(time.time())] == ["BBBB"]
 
 
 def test_removed_image_that_arrives_again_is_stored(archive, tmp_path):

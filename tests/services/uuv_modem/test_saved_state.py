@@ -64,7 +64,7 @@ def test_failed_commit_leaves_records_in_the_inbox_and_the_state_is_reloaded(lin
     eventually(lambda: service._endpoint.images_accepted == 4 and service.store.inbox_depth() == 0)
     assert [e.image_id for e in service._endpoint.queue.expected(0.0)] == ["0001", "0002", "0003", "0004"]
     eventually(lambda: "readonly" not in service.health().detail)
-    eventually(lambda: decoded(published)[-1].images_waiting == 4)
+    eventually(lambda: [state.images_waiting for state in decoded(published)[-1:]] == [4])
     counts = [state.images_accepted for state in decoded(published)]
     assert counts == sorted(counts)
     assert set(counts) <= {0, 1, 4}

@@ -1,0 +1,107 @@
+"""Retention: which stored items are removed because of their age or of the total size, and files in folders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Generic, TypeVar
+
+DAY_S = 86400.0
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Stored(Generic[T]):
+    """An item that retention can remove.
+
+    Attributes:
+        item: The item.
+        stored_utc_s: When it was stored.
+        size_bytes: Its size.
+        order: Items of a lower order are removed first because of the total size.
+    """
+
+    item: T
+    stored_utc_s: float
+    size_bytes: int
+    order: int = 0
+
+
+def select_for_removal(
+    stored: Iterable[Stored[T]], now_utc_s: float, retain_days: float | None, max_bytes: int | None
+) -> list[T]:
+    """Select the items that retention removes.
+
+    Items stored longer than `retain_days` ago are removed. Of the others, those of the lowest order are removed first,
+    oldest first, until at most `max_bytes` remain. None stands for no limit.
+    """
+    old: list[T] = []
+    kept: list[Stored[T]] = []
+    for each in stored:
+        if retain_days is not None and now_utc_s - each.stored_utc_s > retain_days * DAY_S:
+            old.append(each.item)
+        else:
+            kept.append(each)
+    total = sum(each.size_bytes for each in kept)
+    for each in sorted(kept, key=lambda e: (e.order, e.stored_utc_s)):  # stable: items of one time stay in order
+        if max_bytes is None or total <= max_bytes:
+            break
+        total -= each.size_bytes
+        old.append(each.item)
+    return old
+
+
+def stored_files(folder: Path, suffixes: tuple[str, ...]) -> list[Stored[str]]:
+    """Return the files of a folder by their names without suffix: files of one name are one item.
+
+    An item is as old as its newest file. Names that begin with a dot are skipped (a file being written). A folder that
+    does not exist has no items.
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
+    found: dict[str, Stored[str]] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if path.suffix.lower() not in suffixes or path.name.startswith(".") or not path.is_file():
+            continue
+        status = path.stat()
+        before = found.get(path.stem, Stored(path.stem, 0.0, 0))
+        found[path.stem] = replace(
+            before,
+            stored_utc_s=max(before.stored_utc_s, status.st_mtime),
+            size_bytes=before.size_bytes + status.st_size,
+        )
+    return list(found.values())
+
+
+def remove_files(
+    folder: Path,
+    suffixes: tuple[str, ...],
+    now_utc_s: float,
+    retain_days: float | None,
+    max_bytes: int | None,
+    order: Callable[[str, frozenset[str]], int] = lambda _name, _names: 0,
+) -> list[str]:
+    """Remove files of a folder by age and total size; return their names without suffix.
+
+    Args:
+        folder: The folder; its subfolders are not searched.
+        suffixes: Suffixes of the files, lower case, in the order of their removal.
+        now_utc_s: Current time.
+        retain_days: See `select_for_removal`.
+        max_bytes: See `select_for_removal`.
+        order: Returns `Stored.order` of a name among all names.
+
+    Raises:
+        OSError: The folder cannot be read, or a file cannot be deleted.
+    """
+    stored = stored_files(folder, suffixes)
+    names = frozenset(each.item for each in stored)
+    ordered = [replace(each, order=order(each.item, names)) for each in stored]
+    selected = select_for_removal(ordered, now_utc_s, retain_days, max_bytes)
+    for name in selected:
+        for suffix in suffixes:
+            (folder / f"{name}{suffix}").unlink(missing_ok=True)
+    return selected

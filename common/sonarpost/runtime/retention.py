@@ -1,0 +1,66 @@
+"""Retention of a service: its configuration, and the thread that applies it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Annotated
+
+from pydantic import Field
+
+from sonarpost.config import ServiceConfig
+from sonarpost.errors import DeliveryError
+from sonarpost.logs import kv
+
+log = logging.getLogger(__name__)
+
+INTERVAL_S = 60.0
+
+RetainDays = Annotated[float, Field(gt=0, le=36500)]
+MaxBytes = Annotated[int, Field(ge=0)]
+
+
+class RetentionConfig(ServiceConfig):
+    """Base class of the tables of services that store files or images.
+
+    Attributes:
+        retain_days: Age in days above which files or images are removed.
+        max_bytes: Maximum size of the files or images in bytes; above it the oldest are removed.
+    """
+
+    retain_days: RetainDays = 365.0
+    max_bytes: MaxBytes = 20_000_000_000
+
+
+class Retention:
+    """Removes what is too old or too much, every minute and after `wake`.
+
+    Args:
+        remove: Removes what the limits exceed, and counts it. Receives the current UTC in seconds.
+        stopping: Ends `run`.
+    """
+
+    def __init__(self, remove: Callable[[float], None], stopping: threading.Event) -> None:
+        self._remove = remove
+        self._stopping = stopping
+        self._due = threading.Event()
+        self.error = ""
+        """Why the last removal failed; empty if it did not."""
+
+    def wake(self) -> None:
+        """Apply the limits now, or end if the service stops."""
+        self._due.set()
+
+    def run(self) -> None:
+        """Apply the limits until the service stops."""
+        while not self._stopping.is_set():
+            self._due.clear()
+            try:
+                self._remove(time.time())
+                self.error = ""
+            except (OSError, DeliveryError) as error:
+                self.error = f"stored files cannot be removed: {error}"
+                log.error("Retention failed", extra=kv(reason=str(error)))
+            self._due.wait(INTERVAL_S)
