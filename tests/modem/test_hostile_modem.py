@@ -123,6 +123,15 @@ def test_unreported_transmission_fails_if_the_modem_does_not_answer_afterwards(l
     assert (failed.reason, failed.maybe_sent) == (reason, True)
 
 
+def test_packet_fails_if_the_modem_reports_an_error_and_no_transmission() -> None:
+    modem = ready(drops=lambda sentence, _: sentence.kind in MARKS.values())
+    modem.driver.send_packet(1, 4, [b"x"], now=modem.now)
+    modem.schedule(0.5, lambda: modem.send("CAERR", "000000", "AMP", 1, "battery low"))
+    modem.run(30.0)
+    (failed,) = modem.events_of(PacketFailed)
+    assert (failed.reason, failed.maybe_sent) == (FailureReason.NO_TRANSMIT_START, True)
+
+
 def test_late_end_of_a_transmission_is_accepted_after_the_query() -> None:
     modem = ready(drops=lambda sentence, _: sentence.kind in {"CATXF", "CAXST"})
     modem.driver.send_packet(1, 4, [b"x"], now=modem.now)
@@ -344,7 +353,9 @@ def test_rejected_polls_restart_the_modem() -> None:
     modem.refuses_cycles = True
     for _ in range(3):
         modem.driver.request_packet(1, 1, now=modem.now)
-        modem.run(modem.now + 20.0)
+        modem.run(modem.now + 4.0)
+    assert len(modem.commands("CCCYC")) == 3 * CONFIG.tries
+    assert [event.reason for event in modem.events_of(RequestFailed)] == [FailureReason.REFUSED] * 3
     assert modem.restarts == 1
 
 
@@ -386,6 +397,14 @@ def test_commands_are_not_repeated_when_a_dump_delays_their_answers(delay_s: flo
     assert [data for *_, data in modem.commands("CCTXD")] == ["78"]
     assert len(modem.events_of(PacketSent)) == 1
     assert modem.transmitted == [((b"x"),)]
+
+
+def test_poll_is_not_repeated_when_a_dump_delays_its_echo() -> None:
+    modem = ready()
+    modem.driver.request_packet(1, 1, now=modem.now)
+    modem.schedule(0.01, lambda: dump(modem, 600))
+    modem.run(5.0 + 36.0 + 1.0)
+    assert len(modem.commands("CCCYC")) == 1
 
 
 def test_endless_dump_delays_a_packet_by_a_limited_time() -> None:

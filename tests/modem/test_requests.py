@@ -104,9 +104,11 @@ def test_unknown_command_fails_after_its_tries() -> None:
     assert driver.generation == 1
     driver.send_flexible(2, 1, b"x", 1.0)
     events: list[object] = []
-    for _ in range(3):
+    for second in range(1, 4):
         assert driver.bytes_to_send().startswith(b"$CCTDP")
-        events += receive(driver, "CAERR,120000,NMEA,2,unknown CCTDP")
+        events += receive(driver, "CAERR,120000,NMEA,2,unknown CCTDP", now=float(second))
+        assert driver.bytes_to_send() == b"", "the command is sent again after a pause"
+        events += driver.poll(second + 1.0)
     assert RequestFailed(1, "flexible data", 2, FailureReason.REFUSED) in events
     assert driver.queued == 0
 

@@ -363,6 +363,8 @@ class MicroModem:
         was_ready = self.ready
         if self._cycle is not None and self._cycle.on_setting(ConfigurationSetting.parse(sentence), now):
             return
+        if self._request is not None:
+            self._request.on_setting(now)
         self._events += self._supervisor.on_setting(sentence, now)
         if was_ready and not self.ready:
             self._abort(FailureReason.REBOOTED, now)

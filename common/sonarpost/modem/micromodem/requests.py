@@ -114,6 +114,8 @@ class RequestExchange:
         self._send = send
         self._stage = _Stage.ECHO
         self._attempt = 0
+        self._sent_s = now
+        self._refused = False  # the last attempt
         self.poll(now)
 
     def owns(self, cycle: Cycle) -> bool:
@@ -149,11 +151,17 @@ class RequestExchange:
             self.abort(FailureReason.NO_ANSWER)
 
     def on_error(self, report: ErrorReport, now: float) -> None:
-        """Process an NMEA error before the echo: the modem rejects the command."""
-        if report.module == "NMEA" and self._stage is _Stage.ECHO:
-            self.deadline_s = now
-            if self._attempt >= self._config.tries:
-                self.abort(FailureReason.REFUSED)
+        """Process an error before the echo: the modem rejects the command."""
+        is_poll = self.request.kind is RequestKind.POLL
+        if self._stage is _Stage.ECHO and (report.module == "NMEA" or is_poll):
+            self._refused = True
+            self.deadline_s = min(self.deadline_s, now + self._config.refused_wait_s)
+
+    def on_setting(self, now: float) -> None:
+        """Process `CACFG`: during a configuration dump the modem answers late."""
+        if self._stage is _Stage.ECHO:
+            latest_s = self._sent_s + self._config.dump_limit_s
+            self.deadline_s = max(self.deadline_s, min(now + self._config.dump_quiet_s, latest_s))
 
     def abort(self, reason: FailureReason) -> RequestFailed:
         """End the exchange as failed and return the event."""
@@ -168,10 +176,12 @@ class RequestExchange:
             return
         if self._stage is _Stage.ECHO and self._attempt < self._config.tries:
             self._attempt += 1
+            self._refused = False
+            self._sent_s = now
             self.deadline_s = now + self._config.reply_timeout_s
             self._send(self.request.command)
         elif self._stage is _Stage.ECHO:
-            self.abort(FailureReason.NO_ECHO)
+            self.abort(FailureReason.REFUSED if self._refused else FailureReason.NO_ECHO)
         elif self._stage is _Stage.ON_AIR:
             # CATXF may have been lost, or this modem sends none for short packets.
             self._transmitted(now)

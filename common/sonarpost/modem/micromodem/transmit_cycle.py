@@ -84,7 +84,8 @@ class TransmitCycle:
     when the modem requests it again, and every wait is limited.
 
     A modem that reports no end of the transmission must not cause the same packet to be sent again and again. If it has
-    accepted all data and the air time has passed, it is queried. A packet counts as sent if the modem answers.
+    accepted all data without an error and the air time has passed, it is queried. If it answers, the packet counts as
+    sent.
     """
 
     def __init__(
@@ -110,6 +111,7 @@ class TransmitCycle:
         self._acknowledged: set[int] = set()
         self._on_air = False
         self._end_reported = False
+        self._error_reported = False  # after the data, before the transmission
         self._statistics: TransmitStatistics | None = None
         if polled is None:
             self.poll(now)
@@ -193,13 +195,15 @@ class TransmitCycle:
             self._finish(now)
 
     def on_error(self, report: ErrorReport, now: float) -> None:
-        """Process a data timeout of the modem, or an error before the echo: the modem rejects the command."""
+        """Process a data timeout, a rejection of the command, or an error before the start of the transmission."""
         if report.data_timeout:
             if self.stage in {TransmitStage.REQUEST, TransmitStage.DATA_ECHO}:
                 self.abort(FailureReason.DATA_TIMEOUT)
         elif self.stage is TransmitStage.ECHO:
             self._refused = True
             self.deadline_s = min(self.deadline_s, now + self._config.refused_wait_s)
+        elif self.stage is TransmitStage.ON_AIR and not self._on_air:
+            self._error_reported = True
 
     def on_setting(self, setting: ConfigurationSetting, now: float) -> bool:
         """Process `CACFG`; return whether it is the answer to the query of this cycle.
@@ -240,6 +244,8 @@ class TransmitCycle:
             case TransmitStage.DATA_ECHO:
                 # The data is not repeated: a modem whose echo is late would take it for the next frame.
                 self.abort(FailureReason.NO_DATA_ECHO)
+            case TransmitStage.ON_AIR if self._error_reported and not self._on_air:
+                self.abort(FailureReason.NO_TRANSMIT_START)
             case TransmitStage.ON_AIR:
                 self._send(Sentence("CCCFQ", ("SRC",)))
                 self._wait(TransmitStage.QUERY, now, self._config.reply_timeout_s)
