@@ -320,7 +320,8 @@ class DownlinkService(ModemService[OpModemConfig]):
 
     def warning(self) -> str:
         """Return what concerns the key of the link, and which vehicles exceed their limits."""
-        names = ", ".join(self._link.limiter.held_names)
+        with self._link_lock:
+            names = ", ".join(self._link.limiter.held_names)
         limits = f"images wait, max_images_per_hour or max_image_bytes_per_hour is reached: {names}" if names else ""
         parts = (super().warning(), key_warning(self._link.authenticator), limits)
         return "; ".join(text for text in parts if text)
