@@ -10,7 +10,9 @@ import pytest
 from sonarpost.cli.main import main
 from sonarpost.config import PlatformConfig
 from sonarpost.errors import ConfigError
-from sonarpost.security.acoustic_key import link_key, read_key
+from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.auth.key import AcousticKey, Direction
+from sonarpost.security.acoustic_key import key_warning, link_key, read_key
 
 
 def test_command_creates_a_private_key_and_prints_its_fingerprint_only(
@@ -57,3 +59,11 @@ def test_authentication_is_on_unless_it_is_switched_off(tmp_path: Path) -> None:
     assert link_key(PlatformConfig(id="uuv-1", acoustic_auth="none", acoustic_key_file=tmp_path / "absent")) is None
     with pytest.raises(ValueError, match="acoustic_auth"):
         PlatformConfig.model_validate({"id": "uuv-1", "acoustic_auth": "off"})
+
+
+def test_warning_when_the_last_sixteenth_of_the_key_is_in_use() -> None:
+    key = AcousticKey(bytes(range(32)))
+    fresh = FrameAuthenticator(key, 3, Direction.FROM_VEHICLE, first_counter=1_000_000 - 20_000)
+    assert key_warning(fresh) == key_warning(None) == ""
+    used = FrameAuthenticator(key, 3, Direction.FROM_VEHICLE, first_counter=(1 << 20) - 500)
+    assert "500 more frames" in key_warning(used)
