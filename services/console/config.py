@@ -8,15 +8,16 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sonarpost.config import ConsumerName, ServiceConfig
+from sonarpost.config import ConsumerName
 from sonarpost.keys import SHORE
 from sonarpost.messages import Latitude, Longitude, PlatformId
+from sonarpost.runtime.retention import MaxBytes, RetentionConfig
 
 HostName = Annotated[str, Field(pattern=r"^[A-Za-z0-9.:\[\]_-]{1,253}$")]
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 
 
-class ConsoleConfig(ServiceConfig):
+class ConsoleConfig(RetentionConfig):
     """The `[console]` table.
 
     Attributes:
@@ -43,6 +44,9 @@ class ConsoleConfig(ServiceConfig):
         vessel_lon_deg: Longitude of the vessel.
         ring_m: Radii of the range rings on the map.
         tiles_dir: Folder of map tiles, `{z}/{x}/{y}.png`.
+        max_bytes: Maximum size of the images in the console's database; above it images of contacts with a decision are
+            removed first, superseded versions before the newest, each the oldest first. Contacts, decisions and the
+            audit are never removed.
     """
 
     role: Literal["vessel", "shore"] = "vessel"
@@ -68,6 +72,7 @@ class ConsoleConfig(ServiceConfig):
     vessel_lon_deg: Longitude | None = None
     ring_m: tuple[Annotated[float, Field(gt=0, le=100000)], ...] = (100.0, 200.0, 500.0)
     tiles_dir: Path | None = None
+    max_bytes: MaxBytes = 20_000_000_000
 
     @model_validator(mode="after")
     def _is_consistent(self) -> ConsoleConfig:

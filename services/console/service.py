@@ -32,6 +32,7 @@ from sonarpost.messages import (
     Record,
     TaskingState,
 )
+from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.events import RateLimiter
@@ -86,6 +87,7 @@ class ConsoleService(Service[ConsoleConfig]):
         self.state.on_unsent = self._wake.set
         self._frame_events = RateLimiter(FRAME_EVENT_INTERVAL_S)
         self._send_error = ""
+        self._retention = Retention(self._apply_retention, self.stopping)
 
     @property
     def address(self) -> str:
@@ -125,6 +127,12 @@ class ConsoleService(Service[ConsoleConfig]):
             assert isinstance(record, Advice)
             self.state.store_advice(record)
             effects.count("advice_taken")
+
+    def _apply_retention(self, now_utc_s: float) -> None:
+        removed = self.state.remove_images(now_utc_s)
+        if removed:
+            self.count("images_removed", removed)
+            log.warning("Images removed by retention", extra=kv(images=removed))
 
     # Sending
 
@@ -205,6 +213,7 @@ class ConsoleService(Service[ConsoleConfig]):
         self._server.start()
         self.start_thread(self._send_loop, "send")
         self.start_thread(self._update_loop, "update")
+        self.start_thread(self._retention.run, "retention")
         if not self._on_vessel and self.config.out_dir is not None:
             self.start_thread(self._catch_up, "catch-up")
 
@@ -281,6 +290,7 @@ class ConsoleService(Service[ConsoleConfig]):
     def on_stop(self) -> None:
         """Stop the web server."""
         self._wake.set()
+        self._retention.wake()
         self._app.stop()
         if self._server is not None:
             self._server.stop()
@@ -292,8 +302,8 @@ class ConsoleService(Service[ConsoleConfig]):
         self._users.close()
 
     def degraded_reason(self) -> str:
-        """Return why records cannot be queued; empty if they can."""
-        return self._send_error
+        """Return why records cannot be queued, or old images not be removed; empty if they can."""
+        return self._send_error or self._retention.error
 
     def warning(self) -> str:
         """Return a warning if there are no users."""

@@ -28,6 +28,7 @@ from sonarpost.services.console.store.database import (
     insert_row,
 )
 from sonarpost.services.console.store.decisions import DecisionInput, DeliveryStates
+from sonarpost.services.console.store.retention import remove_images
 from sonarpost.services.console.store.serialisers import (
     RECORD_JSON,
     Json,
@@ -192,6 +193,11 @@ class ConsoleState:
         return self._publish(table, record_id)
 
     # Queries
+
+    def remove_images(self, now_utc_s: float) -> int:
+        """Apply the retention to stored images; return the number of removed versions."""
+        with self.database.transaction() as db:
+            return remove_images(db, now_utc_s, self.config.retain_days, self.config.max_bytes)
 
     def counts(self) -> ContactCounts:
         """Count the contacts."""

@@ -109,7 +109,7 @@ def store_image(
     """
     contact_id = contact_uid(image)
     added = db.execute(
-        "INSERT OR IGNORE INTO version VALUES (?, ?, ?, ?, ?)",
+        "INSERT OR IGNORE INTO version (contact_id, version, received_utc_s, rate, payload) VALUES (?, ?, ?, ?, ?)",
         (contact_id, image.version, now_utc_s, rate, wire.encode(image)),
     )
     if added.rowcount == 0:

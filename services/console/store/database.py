@@ -67,7 +67,7 @@ CREATE TABLE IF NOT EXISTS look_group (
 CREATE INDEX IF NOT EXISTS look_group_place ON look_group (lat_deg, lon_deg);
 CREATE TABLE IF NOT EXISTS version (
     contact_id TEXT NOT NULL, version INTEGER NOT NULL, received_utc_s REAL NOT NULL, rate INTEGER,
-    payload BLOB NOT NULL, PRIMARY KEY (contact_id, version)) WITHOUT ROWID;
+    payload BLOB NOT NULL, removed INTEGER NOT NULL DEFAULT 0, PRIMARY KEY (contact_id, version)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS decision (
     seq INTEGER PRIMARY KEY AUTOINCREMENT, decision_id TEXT NOT NULL UNIQUE, contact_id TEXT NOT NULL DEFAULT '',
     vessel_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL, version INTEGER NOT NULL,
@@ -180,6 +180,8 @@ class Database(SqliteFile):
             columns = {row["name"] for row in db.execute("PRAGMA table_info(contact)")}
             if "authenticated" not in columns:  # a database of version 0.1 or 0.2
                 db.execute("ALTER TABLE contact ADD COLUMN authenticated INTEGER")
+            if "removed" not in {row["name"] for row in db.execute("PRAGMA table_info(version)")}:
+                db.execute("ALTER TABLE version ADD COLUMN removed INTEGER NOT NULL DEFAULT 0")
 
 
 def insert_row(db: sqlite3.Connection, table: str, values: Mapping[str, object]) -> int:
