@@ -14,11 +14,11 @@ from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import AcousticKey, Direction
 from sonarpost.link.downlink.commands import CommandTracker
 from sonarpost.link.downlink.vessel_endpoint import VesselEndpoint
+from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.link.state import below, prefixed
 from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame
-from sonarpost.services.op_modem.vessel_endpoint import received_image
 
 log = logging.getLogger(__name__)
 

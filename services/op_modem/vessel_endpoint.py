@@ -9,9 +9,10 @@ from sonarpost.link.downlink import messages as dl
 from sonarpost.link.downlink.commands import MAX_PENDING, CommandTracker, PendingCommand
 from sonarpost.link.downlink.vessel_endpoint import VesselEndpoint
 from sonarpost.link.frames.v1.frame import segments_room
+from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.link.state import Parts, below, prefixed, unpack_plain
-from sonarpost.messages import Command, Contact, Decision, DownlinkState, ReceivedImage
+from sonarpost.messages import Command, Decision, DownlinkState, ReceivedImage
 from sonarpost.modem.micromodem import RATES
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.image_limiter import ImageLimiter
@@ -147,65 +148,6 @@ class VesselLink:
         if isinstance(state.get("seal"), dict):
             parts |= prefixed(_AUTHENTICATION, migration.authentication_parts(state["seal"]))
         self.restore(parts)
-
-
-def received_image(
-    update: ImageUpdate, vessel_id: str, vehicle_id: str, *, authenticated: bool | None = None
-) -> ReceivedImage:
-    """Return the record of an image's received content.
-
-    The link does not carry the detector's contact identifier: the record has vehicle and image identifier instead.
-
-    Args:
-        update: The content.
-        vessel_id: Name of the vessel.
-        vehicle_id: Name of the vehicle.
-        authenticated: Whether all frames of the image were authenticated; None if that is not known.
-
-    Raises:
-        ValidationError: A value does not fit the record.
-    """
-    summary = update.contact
-    contact = (
-        None
-        if summary is None
-        else Contact(
-            contact_id=f"{vehicle_id}/{update.image_id}",
-            vehicle_id=vehicle_id,
-            channel=summary.side.value if summary.side else None,
-            time_utc_s=summary.time_utc_s,
-            lat_deg=summary.lat_deg,
-            lon_deg=summary.lon_deg,
-            position_sigma_m=summary.position_sigma_m,
-            depth_m=summary.depth_m,
-            altitude_m=summary.altitude_m,
-            heading_deg=summary.heading_deg,
-            ground_range_m=summary.ground_range_m,
-            atd_confidence=summary.confidence,
-            pixel_along_m=summary.pixel_along_m,
-            pixel_across_m=summary.pixel_across_m,
-        )
-    )
-    return ReceivedImage(
-        vessel_id=vessel_id,
-        vehicle_id=vehicle_id,
-        image_id=update.image_id,
-        version=update.version,
-        contact=contact,
-        height_px=None if summary is None else summary.height_px,
-        width_px=None if summary is None else summary.width_px,
-        stream=update.stream,
-        missing=update.missing,
-        missing_halves=update.missing_halves,
-        complete=update.complete,
-        bytes_received=update.received_bytes,
-        bytes_total=update.total_bytes,
-        frames_received=update.frames,
-        conflicts=update.conflicts,
-        first_frame_utc_s=update.first_frame_s,
-        last_frame_utc_s=update.last_frame_s,
-        authenticated=authenticated,
-    )
 
 
 def message_of(record: Command | Decision, token: int) -> dl.DownlinkCommand:

@@ -25,11 +25,11 @@ from sonarpost.errors import CodebookError
 from sonarpost.link.frames.paper.frame import ContactFrame, parse_frame
 from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import plan_packets
+from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.messages import ReconstructedImage
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.service import DecompressorService
-from sonarpost.services.op_modem.vessel_endpoint import received_image
 from sonarpost.sonar.image_files import read_image
 
 VESSEL = "vessel-1"

@@ -9,11 +9,11 @@ from builders.written_bytes import written_bytes
 
 from sonarpost import keys, wire
 from sonarpost.link.downlink.messages import image_of_number
+from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.messages import ReceivedImage, ReconstructedImage
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.service import DecompressorService
-from sonarpost.services.op_modem.vessel_endpoint import received_image
 
 VESSEL = "vessel-1"
 IN, OUT = keys.acoustic_image(VESSEL), keys.image_reconstructed(VESSEL)

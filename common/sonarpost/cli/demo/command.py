@@ -90,8 +90,8 @@ def run(parsed: argparse.Namespace) -> int:
     logging.getLogger("sonarpost.bus.session").setLevel(logging.ERROR)
     started = time.monotonic()
     inputs = _inputs(parsed)
-    simulated = _simulate(parsed.seed, console) if inputs is None else None
     folder = _fresh_folder(parsed.out)
+    simulated = _simulate(parsed.seed, console) if inputs is None else None
     ports = free_ports(4)
     settings = ChainSettings(
         folder=folder,

@@ -81,8 +81,10 @@ def _paper_cell(original: Image | None, budget_bytes: int) -> SheetCell:
     """Return what the paper's codec makes of at most as many bytes: 10-pixel tiles, else 20-pixel tiles."""
     if original is None:
         return SheetCell()
-    streams = [get_codec("vq", codebook=name).encode(original) for name in _PAPER_CODEBOOKS]
-    stream = next((one for one in streams if len(one) <= budget_bytes), streams[-1])
+    for name in _PAPER_CODEBOOKS:
+        stream = get_codec("vq", codebook=name).encode(original)
+        if len(stream) <= budget_bytes:
+            break
     image = decode_image(stream).image
     return SheetCell(f"vq, {len(stream)} B{_psnr(original, image)}", image)
 

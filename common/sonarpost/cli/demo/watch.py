@@ -175,7 +175,7 @@ class Watcher:
         """
         with self._lock:
             health = dict(self.health)
-            contacts, encoded, queue = len(self.snippets), len(self.encoded), self.queue
+            contacts, encoded = len(self.snippets), len(self.encoded)
         for service, gauges in IDLE_GAUGES.items():
             report = health.get(service)
             if report is None or report.time_utc_s < since_utc_s:
@@ -191,16 +191,8 @@ class Watcher:
             return f"compressor: {encoded} of {contacts} contacts"
         if self.settings.link == "paper" or self.all_complete:
             return ""
-        feedback_open = health["op_modem"].gauges.get("feedback_open", 1.0)
-        return self._queue_busy(queue, feedback_open, since_utc_s)
-
-    @staticmethod
-    def _queue_busy(queue: QueueState | None, feedback_open: float, since_utc_s: float) -> str:
-        if queue is None or queue.time_utc_s < since_utc_s:
-            return "no recent state of the vehicle's queue"
-        if queue.images_waiting or queue.messages_waiting:
-            return f"uuv_modem: {queue.images_waiting} images, {queue.messages_waiting} messages"
         # The vessel repeats its feedback until the vehicle has sent what is missing.
+        feedback_open = health["op_modem"].gauges.get("feedback_open", 1.0)
         return f"op_modem: feedback_open {feedback_open:g}" if feedback_open else ""
 
     def wait_until_started(self, check: Callable[[], None]) -> None:
