@@ -369,6 +369,37 @@ def test_memory_is_bounded() -> None:
     assert receiver.counts.evicted_sources == 4
 
 
+def test_full_table_keeps_an_image_whose_detail_precedes_its_preview() -> None:
+    sender = V1Sender(SenderConfig(channels=(LossChannel(0.0),), feedback=True))
+    receiver = V1Receiver(ReceiverConfig(max_contacts=8))
+    complete: set[str] = set()
+
+    def frames_of(numbers: range, now: float) -> list[bytes]:
+        for number in numbers:
+            sender.add_image(number, contact(number), stream(number, 200), now)
+        frames = []
+        while (frame := sender.next_frame(now + 60.0)) is not None and len(frames) < 100:
+            frames.append(frame)
+        return frames
+
+    def deliver(frames: list[bytes], now: float) -> None:
+        for frame in frames:
+            for event in receiver.accept(VEHICLE, frame, now):
+                if isinstance(event, ImageUpdate) and event.complete:
+                    complete.add(event.image_id)
+        feedback = receiver.feedback(VEHICLE, now)
+        assert feedback is not None
+        sender.on_feedback(feedback, now)
+
+    deliver(frames_of(range(1, 9), 0.0), 0.0)
+    assert len(complete) == 8
+    # The preview of 9 was lost and is sent again after the one of 10.
+    ninth, tenth = frames_of(range(9, 10), 100.0), frames_of(range(10, 11), 200.0)
+    deliver([*ninth[1:], *tenth, ninth[0]], 300.0)
+    assert len(complete) == 10
+    assert receiver.incomplete_images == 0
+
+
 def test_state_to_save_for_a_frame_does_not_grow_with_the_contacts() -> None:
     channel = LossChannel(0.2)
     sender = V1Sender(SenderConfig(frame_bytes=60, channels=(channel,), kept_images=725))

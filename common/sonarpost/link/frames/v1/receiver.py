@@ -250,12 +250,13 @@ class PeerState:
 
     def _new_image(self, number: int, now: float, config: ReceiverConfig) -> AssembledImage:
         self.images.pop(number, None)
-        # Images without a record are deleted first: an operator cannot use them without a position.
         without_record = [n for n, i in self.images.items() if i.contact is None]
         if len(without_record) >= _MAX_WITHOUT_RECORD:
-            del self.images[without_record.pop(0)]
+            del self.images[without_record[0]]
         while len(self.images) >= config.max_contacts:
-            del self.images[without_record.pop(0) if without_record else next(iter(self.images))]
+            # Complete ones first: the others hold bytes of complete blocks, which the sender does not repeat.
+            complete = next((n for n, i in self.images.items() if i.contact is not None and i.complete), None)
+            del self.images[next(iter(self.images)) if complete is None else complete]
         image = self.images[number] = AssembledImage(self.address, number, now, now)
         return image
 
