@@ -6,13 +6,13 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX
-from sonarpost.config import ServiceConfig
+from sonarpost.runtime.retention import MaxBytes, RetentionConfig
 from sonarpost.sonar.options import ErrorBudget, Mounting, SurveyOptions
 
 SidePx = Annotated[int, Field(ge=MIN_SIDE_PX, le=MAX_SIDE_PX)]
 
 
-class AtdStubConfig(ServiceConfig):
+class AtdStubConfig(RetentionConfig):
     """Input files, detection, snippets and release.
 
     Attributes:
@@ -40,6 +40,10 @@ class AtdStubConfig(ServiceConfig):
         port_order: Order of the port samples in survey files.
         mounting: Position of the sonar relative to the position in the file: offsets, layback, heading.
         errors: Standard deviations of positions, headings and altitudes.
+        retain_days: Time after which a processed input file and a stored snippet are removed, and the entry of a
+            processed file is deleted.
+        max_bytes: Maximum size of the processed input files, and of the files in `snippet_dir`; above it the oldest are
+            removed. Input files that are not processed and those in quarantine are never removed.
     """
 
     mode: Literal["survey", "snippets"] = "survey"
@@ -62,6 +66,7 @@ class AtdStubConfig(ServiceConfig):
     port_order: Literal["farthest_first", "nearest_first"] = "farthest_first"
     mounting: Mounting = Mounting()
     errors: ErrorBudget = ErrorBudget()
+    max_bytes: MaxBytes = 100_000_000_000
 
     def survey_options(self) -> SurveyOptions:
         """Return the options of the survey readers."""

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import msgpack
 
+from sonarpost.archive.retention import DAY_S, Stored, remove_files, select_for_removal
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
@@ -17,10 +18,12 @@ from sonarpost.errors import DeliveryError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.logs import kv
 from sonarpost.messages import Record, Snippet
+from sonarpost.runtime.retention import INTERVAL_S
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import FileEndStore
 from sonarpost.services.atd_stub.input_folder import (
+    DONE_SUFFIX,
     InputFile,
     StableFiles,
     content_sha256,
@@ -28,13 +31,14 @@ from sonarpost.services.atd_stub.input_folder import (
     printable,
 )
 from sonarpost.services.atd_stub.release import ContactRelease
-from sonarpost.services.atd_stub.snippet_files import read_snippet, write_snippet
+from sonarpost.services.atd_stub.snippet_files import SNIPPET_SUFFIXES, read_snippet, write_snippet
 from sonarpost.services.atd_stub.survey_detection import DetectionResult, detect_in_survey
 from sonarpost.sonar.readers import SUPPORTED_SUFFIXES
 
 log = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = (".tif", ".tiff", ".png")
+_FILE = "file:"
 
 
 class AtdStubService(Service[AtdStubConfig]):
@@ -51,7 +55,8 @@ class AtdStubService(Service[AtdStubConfig]):
         super().__init__(platform, config)
         self._suffixes = SUPPORTED_SUFFIXES if config.mode == "survey" else IMAGE_SUFFIXES
         self._stable_files = StableFiles(config.settle_s, require_done_marker=config.require_done_marker)
-        self._processed: set[InputFile] = set()
+        self._processed: dict[InputFile, str] = {}  # with the digest of the content
+        self._retention_due_s = 0.0
         self._files_waiting = -1
         self._release = ContactRelease(platform, self.store, config.max_in_flight, self.commit)
         self._file_ends = FileEndStore(self.store)
@@ -95,16 +100,59 @@ class AtdStubService(Service[AtdStubConfig]):
             try:
                 self._release_expired_contacts()
                 self._process_folder()
+                self._apply_retention(time.time())
             except (OSError, DeliveryError) as error:
                 self.set_degraded(f"{type(error).__name__}: {error}")
             else:
                 self.set_degraded("")
             self.stopping.wait(self.config.poll_s)
 
+    def _apply_retention(self, now_utc_s: float) -> None:
+        """Remove processed input files and stored snippets by age and total size, and the entries of old files.
+
+        Raises:
+            OSError: A file cannot be deleted.
+            DeliveryError: The store cannot be read or written.
+        """
+        if time.monotonic() < self._retention_due_s:
+            return
+        self._retention_due_s = time.monotonic() + INTERVAL_S
+        config = self.config
+        entries = {name: msgpack.unpackb(packed) for name, packed in self.store.states(_FILE).items()}
+        effects = UnitOfWork()
+        for name, entry in entries.items():
+            if "processed_utc_s" not in entry:  # stored by version 0.2 or earlier
+                entry["processed_utc_s"] = now_utc_s
+                effects.put_state(_state_name(name), msgpack.packb(entry))
+        stored = [
+            Stored(file, max(entries[content]["processed_utc_s"], file.modified_ns * 1e-9), file.size_bytes)
+            for file, content in self._processed.items()
+            if content in entries and "refused" not in entries[content]
+        ]
+        removed = select_for_removal(stored, now_utc_s, config.retain_days, config.max_bytes)
+        for file in removed:
+            for path in (file.path, file.path.with_suffix(".txt"), file.path.with_name(file.path.name + DONE_SUFFIX)):
+                path.unlink(missing_ok=True)
+            log.warning("Input file removed by retention", extra=kv(file=printable(file.path.name)))
+        present = {content for file, content in self._processed.items() if file not in removed}
+        for name, entry in entries.items():
+            if name not in present and now_utc_s - entry["processed_utc_s"] > config.retain_days * DAY_S:
+                effects.delete_state(_state_name(name))
+        if removed:
+            effects.count("files_removed", len(removed))
+        if config.snippet_dir is not None:
+            snippets = remove_files(
+                config.snippet_dir, SNIPPET_SUFFIXES, now_utc_s, config.retain_days, config.max_bytes
+            )
+            if snippets:
+                effects.count("snippets_removed", len(snippets))
+        self.commit(effects)
+
     def _process_folder(self) -> None:
         self.config.input_dir.mkdir(parents=True, exist_ok=True)
         files = list_input_files(self.config.input_dir, self._suffixes)
-        self._processed &= set(files)
+        present = set(files)
+        self._processed = {file: content for file, content in self._processed.items() if file in present}
         new = tuple(file for file in files if file not in self._processed)
         complete = self._stable_files.update(new, time.monotonic())
         self._files_waiting = len(new)
@@ -113,27 +161,27 @@ class AtdStubService(Service[AtdStubConfig]):
             if self.stopping.is_set():
                 return
             try:
-                is_finished = self._process(file)
+                content = self._process(file)
             except OSError as error:
                 # The files after it are processed first; it is tried again with the next poll.
                 first_error = first_error or error
                 continue
-            if is_finished:
-                self._processed.add(file)
+            if content:
+                self._processed[file] = content
                 self._files_waiting -= 1
         if first_error is not None:
             raise first_error
 
-    def _process(self, file: InputFile) -> bool:
-        """Process a file; return False if it was removed or changed and has to be tried again."""
+    def _process(self, file: InputFile) -> str:
+        """Process a file; return its digest, empty if it was removed or changed and has to be tried again."""
         try:
             content = content_sha256(file.path)
         except FileNotFoundError:
-            return False
+            return ""
         if (entry := self.store.get_state(_state_name(content))) is not None:
             self._skip_known(file.path, content, entry)
-            return True
-        return self._detect(file.path, content)
+            return content
+        return content if self._detect(file.path, content) else ""
 
     def _detect(self, path: Path, content: str) -> bool:
         started = time.perf_counter()
@@ -166,7 +214,7 @@ class AtdStubService(Service[AtdStubConfig]):
 
     def _commit_result(self, path: Path, content: str, result: DetectionResult, duration_s: float) -> None:
         effects = UnitOfWork()
-        entry = {"file": printable(path.name), "contacts": result.contact_count}
+        entry = {"file": printable(path.name), "contacts": result.contact_count, "processed_utc_s": time.time()}
         effects.put_state(_state_name(content), msgpack.packb(entry))
         effects.count("files_processed")
         effects.count("contacts_detected", result.contact_count)
@@ -222,7 +270,8 @@ class AtdStubService(Service[AtdStubConfig]):
         reason = printable(reason)
         log.error("File quarantined", extra=kv(file=path.name, reason=reason))
         effects = UnitOfWork()
-        effects.put_state(_state_name(content), msgpack.packb({"file": printable(path.name), "refused": reason}))
+        entry = {"file": printable(path.name), "refused": reason, "processed_utc_s": time.time()}
+        effects.put_state(_state_name(content), msgpack.packb(entry))
         effects.count("files_quarantined")
         self.commit(effects)
         self._move_to_quarantine(path, content, reason)
@@ -256,4 +305,4 @@ def _is_unchanged(path: Path, content: str) -> bool:
 
 
 def _state_name(content: str) -> str:
-    return f"file:{content}"
+    return _FILE + content

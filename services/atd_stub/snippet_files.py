@@ -21,6 +21,8 @@ from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.input_folder import printable
 from sonarpost.sonar.image_files import read_image, tiff_bytes
 
+SNIPPET_SUFFIXES: Final = (".txt", ".tiff")
+"""Suffixes of the files of a snippet."""
 _TIME: Final = "time_utc"
 _MAX_TEXT_BYTES: Final = 1 << 16
 _UNSAFE_CHARACTER: Final = re.compile(r"[^A-Za-z0-9._-]")
