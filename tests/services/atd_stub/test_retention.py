@@ -69,7 +69,7 @@ def test_old_processed_files_are_removed_by_default_and_unprocessed_ones_stay(st
     assert (folder / "quarantine" / "bad.tiff").exists()
     assert list((tmp_path / "snippets").iterdir()) == []
     assert service.store.state_names("file:") == ()
-    assert service.store.outbox_depth() == 1
+    assert service.gauges()["contacts_waiting"] == 1
     counters = service.health().counters
     assert (counters["files_removed"], counters["snippets_removed"]) == (1, 1)
 
