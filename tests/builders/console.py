@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import ssl
 import threading
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -128,14 +129,17 @@ class EventReader:
         address: URL of the server.
         token: Token of a session.
         query: Query string of the request.
+        context: TLS context; None for HTTP.
         headers: Additional HTTP headers.
     """
 
-    def __init__(self, address: str, token: str, query: str = "", **headers: str) -> None:
+    def __init__(
+        self, address: str, token: str, query: str = "", context: ssl.SSLContext | None = None, **headers: str
+    ) -> None:
         request = urllib.request.Request(
             f"{address}events{query}", None, {"Cookie": f"sonarpost_session={token}", **headers}
         )
-        self._stream: HTTPResponse = urllib.request.urlopen(request, timeout=60)
+        self._stream: HTTPResponse = urllib.request.urlopen(request, timeout=60, context=context)
         self.events: list[tuple[str, str, Any]] = []
         self.ended = False
         threading.Thread(target=self._read, daemon=True).start()
