@@ -97,9 +97,4 @@ def test_other_rules_protect_when_a_rule_is_missing(rule: str, scenario: Scenari
 
 def test_each_rule_is_removed_in_a_test() -> None:
     removed = {name for removal in REMOVALS for name in removal.changes}
-    assert removed | set(DEPTH_RULES) | {"state_reused"} == {field.name for field in fields(Rules)}
-
-
-def test_stating_a_reused_number_would_make_the_detection_of_a_restore_complete() -> None:
-    complete = explore(restore(replace(NEW, state_reused=True)), "I5")
-    assert not complete.violation, str(complete)
+    assert removed | set(DEPTH_RULES) == {field.name for field in fields(Rules)}

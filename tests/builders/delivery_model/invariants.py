@@ -31,7 +31,7 @@ def violations_in(world: World, state: State) -> list[str]:
 def violations_by(world: World, before: State, step: Step) -> list[str]:
     """Return which invariants a transition violates, and why."""
     found = []
-    if step.reused is not None and world.rules.state_reused:
+    if step.reused is not None:
         which, origin = step.reused
         if step.after.producers[which].origin == origin:
             found.append(f"I5: producer-{which + 1} has reused a number of {origin} and still uses this origin")

@@ -335,9 +335,10 @@ def _deliver(world: World, state: State, query: Query) -> Step:
     consumer, status = react(world, state.consumer, query)
     after = state._replace(consumer=consumer)
     if status in {"stored", "refused"}:
-        highest, digest = _highest(world.rules, state.consumer, consumer, query)
+        # Only the reply to the first chunk states a number; "more" changes nothing else and is not modelled.
+        highest, digest = _highest(world.rules, state.consumer, query) if query.chunk == 0 else (0, "")
         numbers = _window(world.rules, state.consumer, query).seen
-        reused = any(seq == query.seq and name != query.name for seq, name in numbers)
+        reused = query.chunk == 0 and any(seq == query.seq and name != query.name for seq, name in numbers)
         reply = Reply(query.origin, query.seq, query.name, status, highest, digest, reused)
         for which, producer in enumerate(after.producers):
             if query in producer.asked or not (world.rules.bind_replies or query.data[0] not in _names(world, which)):
@@ -456,13 +457,12 @@ def _extended(window: Window) -> Window:
     return Window(seen, edge, window.refused)
 
 
-def _highest(rules: Rules, before: Consumer, after: Consumer, query: Query) -> tuple[int, str]:
-    """Return the highest number accepted before a query, and its digest."""
-    if rules.state_reused:
-        others = sorted(name for seq, name in _window(rules, after, query).seen if seq == query.seq)
-        if others and others != [query.name]:
-            return query.seq, next(name for name in others if name != query.name)
+def _highest(rules: Rules, before: Consumer, query: Query) -> tuple[int, str]:
+    """Return the highest number accepted before a query, or its own if it was used before, and the digest."""
     seen = _window(rules, before, query).seen
+    others = sorted(name for seq, name in seen if seq == query.seq and name != query.name)
+    if others and rules.state_reused:
+        return query.seq, others[0]
     if not seen:
         return 0, ""
     highest = max(seen)[0]

@@ -19,7 +19,7 @@ class Rules:
         secret_origin: Watchers do not receive the origin.
         detect_restore: A reply states the highest number; a producer that finds itself older uses a new origin.
         state_reused: A reply to a record whose number was used before states this number and the other digest in place
-            of the highest number. It makes I5 complete; the product does without it.
+            of the highest number.
         current_origin_only: The producer compares the highest number only in replies for its current origin.
         origin_of_row: A queued record keeps the origin under which it was queued.
         chunks_of_digest: Chunks belong to a key, an origin, a number and a digest; otherwise another digest replaces
@@ -41,7 +41,7 @@ class Rules:
     forget_refused: bool = True
     secret_origin: bool = True
     detect_restore: bool = True
-    state_reused: bool = False
+    state_reused: bool = True
     current_origin_only: bool = True
     origin_of_row: bool = True
     chunks_of_digest: bool = True

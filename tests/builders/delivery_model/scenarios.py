@@ -179,6 +179,8 @@ REMOVALS = (
     Removal("origin visible to watchers", {"secret_origin": False}, shared_key, "I6"),
     Removal("queued records get the new origin", {"origin_of_row": False}, restore, "I2"),
     Removal("age compared for earlier origins", {"current_origin_only": False}, restore, "I6"),
+    Removal("age of a store not compared", {"detect_restore": False}, restore, "I5"),
+    Removal("reused number not stated", {"state_reused": False}, restore, "I5"),
     Removal("oldest chunks deleted first", {"fair_chunks": False}, hostile_large, "I4"),
     Removal("each key counts as a writer", {"writer_of_prefix": False}, hostile_large, "I4"),
     Removal("assembled digest not checked", {"check_assembled": False}, shared_key_with_origin, "I1"),
@@ -214,7 +216,6 @@ DEPTH_RULES: Mapping[str, str] = {
     "window_of_key": "a record is valid only on its own key, and its identity has the digest",
     "settled_after_acceptance": "`settled` only permits to delete digests, and the newest ones stay",
     "forget_refused": "the refused identity has the digest of a record that stays invalid",
-    "detect_restore": "the digest tells records with a reused number apart; without it, only the warning is missing",
     "chunks_of_digest": "the digest of the assembled record is checked",
     "validate_key": "a window belongs to a key",
 }

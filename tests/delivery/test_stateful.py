@@ -1,0 +1,241 @@
+"""Random sequences of faults with the real store, outbox and inbox: invariants of `docs/specifications/delivery.md`."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import tempfile
+from pathlib import Path
+from unittest import mock
+
+import msgpack
+import pytest
+from builders.delivery_machine import Delivery, SentQuery, query_of
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+
+from sonarpost.delivery import duplicate_window, outbox, partial_records
+
+DECISION = "sonarpost/v1/vessel-1/contact/decision"
+IMAGE = "sonarpost/v1/vessel-1/image/reconstructed"
+OTHER_IMAGE = "sonarpost/v1/vessel-2/image/reconstructed"
+PRODUCER_KEYS = ((DECISION, IMAGE), (IMAGE, OTHER_IMAGE))
+HOSTILE_KEYS = ("sonarpost/v1/other/tasking/a/advice", "sonarpost/v1/other/tasking/b/advice", "sonarpost/v1/other/x")
+MAX_RESTORES = 2
+SMALL_LIMITS = {
+    (outbox, "BACK_OFF_S"): (0.0,),
+    # Two producers with three origins each share a key; all others have fewer windows.
+    (duplicate_window, "MAX_WINDOWS"): 2 * (1 + MAX_RESTORES),
+    (partial_records, "MAX_WRITER_RECORDS"): 2,
+    (partial_records, "MAX_RECORDS"): 10,
+}
+WHICH = st.integers(0, 1)
+ANY = st.integers(0, 10**6)
+
+
+class DeliveryFaults(RuleBasedStateMachine):
+    """Faults of producers, consumer, network and a peer that may write to other keys and has all origins."""
+
+    @initialize()
+    def start(self) -> None:
+        self.folder = Path(tempfile.mkdtemp(prefix="delivery-"))
+        self.delivery = Delivery(self.folder, PRODUCER_KEYS, HOSTILE_KEYS)
+        self.restores = [0, 0]
+        self.hostile_serial = 100
+
+    def teardown(self) -> None:
+        if not hasattr(self, "delivery"):
+            return
+        try:
+            self.delivery.deliver_everything()
+            self.delivery.handle(10**6)
+            self.delivery.check()
+        finally:
+            self.delivery.close()
+            shutil.rmtree(self.folder)
+
+    @property
+    def sent(self) -> list[SentQuery]:
+        return self.delivery.network.sent
+
+    # Producers
+
+    @rule(which=WHICH, second=st.booleans(), count=st.integers(1, 4), valid=st.integers(0, 9))
+    def queue(self, which: int, second: bool, count: int, valid: int) -> None:
+        for _ in range(count):
+            self.delivery.queue(which, PRODUCER_KEYS[which][second], 100, valid=valid > 0)
+
+    @rule(which=WHICH, second=st.booleans(), size_bytes=st.sampled_from([32768, 32769, 70_000]))
+    def queue_large(self, which: int, second: bool, size_bytes: int) -> None:
+        self.delivery.queue(which, PRODUCER_KEYS[which][second], size_bytes)
+
+    @rule(which=WHICH, topic=st.sampled_from(["t1", "t2"]))
+    def queue_edition(self, which: int, topic: str) -> None:
+        self.delivery.queue(which, PRODUCER_KEYS[which][0], 100, topic=topic)
+
+    @rule(which=WHICH)
+    def send(self, which: int) -> None:
+        self.delivery.producers[which].send()
+
+    @rule(which=WHICH)
+    def use_replies(self, which: int) -> None:
+        self.delivery.producers[which].use_replies()
+
+    @rule(which=WHICH)
+    def remove_acknowledged(self, which: int) -> None:
+        self.delivery.producers[which].sender._remove_acknowledged()
+
+    @rule(which=WHICH)
+    def kill_producer(self, which: int) -> None:
+        self.delivery.kill_producer(which)
+
+    @rule(which=WHICH)
+    def back_up(self, which: int) -> None:
+        self.delivery.back_up(which)
+
+    @precondition(lambda self: any(producer.backup for producer in self.delivery.producers))
+    @rule(which=WHICH)
+    def restore(self, which: int) -> None:
+        if self.delivery.producers[which].backup is not None and self.restores[which] < MAX_RESTORES:
+            self.restores[which] += 1
+            self.delivery.restore(which)
+
+    # Network: any query arrives at any time and any number of times; replies arrive late or are lost.
+
+    @precondition(lambda self: self.sent)
+    @rule(chosen=st.lists(ANY, min_size=1, max_size=6))
+    def deliver_any(self, chosen: list[int]) -> None:
+        self.delivery.receive([self.sent[number % len(self.sent)] for number in chosen])
+
+    @precondition(lambda self: self.sent)
+    @rule(count=st.integers(1, 8))
+    def deliver_latest(self, count: int) -> None:
+        self.delivery.receive(self.sent[-count:])
+
+    @precondition(lambda self: self.sent)
+    @rule(count=st.integers(1, 12))
+    def reply_in_order(self, count: int) -> None:
+        open_queries = [q for q in self.sent if q.handler.reply is None and not q.handler.timed_out]
+        for query in [q for q in open_queries if q.replies][:count]:
+            query.handler.reply = query.replies[0]
+
+    @precondition(lambda self: self.sent)
+    @rule(number=ANY)
+    def lose_reply(self, number: int) -> None:
+        query = self.sent[number % len(self.sent)]
+        query.handler.timed_out = query.handler.reply is None
+
+    # Consumer
+
+    @rule()
+    def kill_consumer(self) -> None:
+        self.delivery.kill_consumer()
+
+    @rule(limit=st.integers(1, 5))
+    def handle(self, limit: int) -> None:
+        self.delivery.handle(limit)
+
+    # A peer that may write to its own keys only. It has the origins, which watchers do not receive.
+
+    @rule(
+        key=st.sampled_from(HOSTILE_KEYS),
+        number=ANY,
+        seq_from=st.sampled_from(["same", "next", "small", "far"]),
+        settled_below_seq=st.booleans(),
+        content=st.sampled_from(["junk", "own", "same", "wrong digest", "first chunk", "batch"]),
+        own_origin=st.one_of(st.none(), st.integers(0, 9)),
+        with_producer=st.booleans(),
+    )
+    def attack(
+        self,
+        key: str,
+        number: int,
+        seq_from: str,
+        settled_below_seq: bool,
+        content: str,
+        own_origin: int | None,
+        with_producer: bool,
+    ) -> None:
+        origin, seq, payload = bytes([number % 5]) * 16, 1, b"x"
+        companions: list[SentQuery] = []
+        if self.sent:
+            seen = self.sent[number % len(self.sent)]
+            fields = msgpack.unpackb(seen.attached)
+            origin = fields["origin"]
+            seq = fields["seq"] if fields["v"] == 1 else fields["records"][0][0]
+            payload = seen.content
+            companions = [seen] if with_producer else []
+        if own_origin is not None:
+            origin = bytes([own_origin]) * 16
+        seq = {"same": seq, "next": seq + 1, "small": 1 + number % 9, "far": 2**62}[seq_from]
+        settled = seq - 1 if settled_below_seq else 0
+        own = f"{key} valid own {number % 7}".encode()
+        records = {
+            "junk": [(seq, b"junk")],
+            "own": [(seq, own)],
+            "same": [(seq, payload)],
+            "wrong digest": [(seq, own)],
+            "first chunk": [(seq, own)],
+            "batch": [(seq, own), (seq + 1, b"junk"), (seq + 2, own + b"+")],
+        }[content]
+        with_digest = [(n, data, hashlib.sha256(data).digest()) for n, data in records]
+        if content == "wrong digest":
+            with_digest = [(seq, own, hashlib.sha256(payload).digest())]
+        whole_bytes = 40_000 if content == "first chunk" else 0
+        query = query_of(key, origin, with_digest, settled, whole_bytes=whole_bytes)
+        if not companions:
+            before = self.delivery.consumer_state_of_producers()
+            self.delivery.receive([query])
+            assert self.delivery.consumer_state_of_producers() == before, "I4: another writer's state has changed"
+        else:
+            # In one transaction with a query of a producer.
+            self.delivery.receive([query, *companions])
+
+    @rule(origins=st.lists(st.integers(0, 19), min_size=2, max_size=10), key=st.sampled_from(HOSTILE_KEYS))
+    def send_from_many_origins(self, origins: list[int], key: str) -> None:
+        queries = []
+        for number in origins:
+            self.hostile_serial += 1
+            data = f"{key} valid own {self.hostile_serial}".encode()
+            records = [(self.hostile_serial, data, hashlib.sha256(data).digest())]
+            queries.append(query_of(key, bytes([number]) * 16, records, 0))
+        self.delivery.receive(queries)
+
+    @invariant()
+    def invariants_hold(self) -> None:
+        if hasattr(self, "delivery"):
+            self.delivery.check()
+
+
+def run(max_examples: int, steps: int) -> None:
+    profile = settings(
+        max_examples=max_examples,
+        stateful_step_count=steps,
+        deadline=None,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
+    )
+    patches = [mock.patch.object(module, name, value) for (module, name), value in SMALL_LIMITS.items()]
+    for patch in patches:
+        patch.start()
+    try:
+        run_state_machine_as_test(DeliveryFaults, settings=profile)  # type: ignore[no-untyped-call]
+    finally:
+        for patch in patches:
+            patch.stop()
+
+
+def test_random_faults_keep_the_invariants() -> None:
+    run(max_examples=40, steps=40)
+
+
+@pytest.mark.long
+def test_many_random_faults_keep_the_invariants() -> None:
+    run(max_examples=1500, steps=80)
