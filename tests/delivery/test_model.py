@@ -34,6 +34,7 @@ def test_all_states_satisfy_the_invariants(scenario: Scenario) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("scenario", LARGE_SCENARIOS, ids=lambda scenario: scenario.__name__)
 def test_all_states_of_larger_configurations_satisfy_the_invariants(scenario: Scenario) -> None:
     result = explore(scenario(NEW))
