@@ -169,7 +169,9 @@ class ExportRoutes:
             self._check(file)
             # Other requests use the database between two contacts.
             with self._state.database.read() as db:
-                found.append(_export_contact(db, contact_id, version))
+                contact = _export_contact(db, contact_id, version)
+            if contact is not None:
+                found.append(contact)
         return ContactSet(tuple(found), (), ())
 
     def _pixels(self, contact: ExportContact, file: IO[bytes]) -> npt.NDArray[np.uint8] | None:
@@ -199,9 +201,11 @@ class ExportRoutes:
         return Response(text, media_type="text/html; charset=utf-8", headers=headers)
 
 
-def _export_contact(db: sqlite3.Connection, contact_id: str, version: int) -> ExportContact:
+def _export_contact(db: sqlite3.Connection, contact_id: str, version: int) -> ExportContact | None:
+    """Return a contact; None if the version was deleted in the meantime."""
     row = find_version(db, contact_id, version)
-    assert row is not None
+    if row is None:
+        return None
     rows = db.execute(
         "SELECT payload FROM decision WHERE contact_id = ? ORDER BY decided_utc_s, seq", (contact_id,)
     ).fetchall()
