@@ -44,7 +44,7 @@ PROCESSES = (*ROUTERS, *PLATFORM_OF)
 CLOCKS = (UUV, VESSEL, SHORE, WATER)
 DISKS = (UUV, VESSEL, SHORE, "shore images")
 DISK_KB = {UUV: 96_000, VESSEL: 128_000, SHORE: 128_000, "shore images": 512_000}
-CLOCK_STEPS_S = (-21600.0, -3600.0, -30.0, 30.0, 3600.0, 21600.0)
+CLOCK_STEPS_S = (-7200.0, -3600.0, -30.0, 30.0, 3600.0, 7200.0)
 """The difference of two is less than the time for which op_modem keeps a contact: see its limits."""
 SOURCE_VEHICLE = "uuv-9"
 SNIPPET_KEY = "snippet"

@@ -400,6 +400,21 @@ def test_full_table_keeps_an_image_whose_detail_precedes_its_preview() -> None:
     assert receiver.incomplete_images == 0
 
 
+def test_clock_set_back_by_a_day_delays_neither_a_group_nor_a_reminder() -> None:
+    config = SenderConfig(channels=(LossChannel(0.0),), feedback=True, group_delay_s=20.0)
+    sender, day_s = V1Sender(config), 86400.0
+    sender.add_image(1, contact(1), stream(1, 200), day_s)
+    assert sender.next_frame(0.0) is None, "the group waits for others"
+    assert sender.next_frame(config.group_delay_s) is not None
+    while sender.next_frame(config.group_delay_s) is not None:
+        pass
+    # The receiver does not answer.
+    assert sender.next_frame(day_s + config.max_defer_s) is not None, "a reminder by the old clock"
+    while sender.next_frame(0.0) is not None:
+        pass
+    assert sender.next_frame(config.max_defer_s) is not None, "a reminder"
+
+
 def test_state_to_save_for_a_frame_does_not_grow_with_the_contacts() -> None:
     channel = LossChannel(0.2)
     sender = V1Sender(SenderConfig(frame_bytes=60, channels=(channel,), kept_images=725))

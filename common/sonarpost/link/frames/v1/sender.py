@@ -269,6 +269,8 @@ class V1Sender:
 
     def _begin_groups(self, now: float) -> None:
         symbol_bytes = self.symbol_bytes
+        for image in self.waiting:
+            image.added_s = min(image.added_s, now)  # later only after the clock was set back
         while self.waiting:
             limit = group_limit(self.config, symbol_bytes)
             due = len(self.waiting) >= limit or now - self.waiting[0].added_s >= self.config.group_delay_s
@@ -405,6 +407,8 @@ class V1Sender:
             block.planned += max(1, block.source_symbols // 16)
 
     def _overdue_blocks(self, now: float) -> list[SendBlock]:
+        for block in self.blocks:
+            block.last_activity_s = min(block.last_activity_s, now)  # later only after the clock was set back
         return [b for b in self.blocks if b.left <= 0 and now - b.last_activity_s >= self.config.max_defer_s]
 
     def images_are_due(self, now: float) -> bool:
