@@ -88,6 +88,18 @@ def test_other_record_with_the_same_number_does_not_disturb_the_transfer(store: 
     assert add(store, first[1], OTHER_KEY) == b"old record"
 
 
+def test_complete_record_deletes_its_chunks_only_with_the_right_digest(store: Store) -> None:
+    first, second = chunks(b"0123456789", 5)
+    assert add(store, first) == 5
+    forged = ReceivedChunk(ORIGIN, 1, first.size, first.sha256, 0, b"x" * first.size)
+    assert add(store, forged) == forged.data
+    assert partials(store) == 1
+    assert add(store, second) == b"0123456789"
+    assert add(store, first) == 5
+    assert add(store, ReceivedChunk(ORIGIN, 1, first.size, first.sha256, 0, b"0123456789")) == b"0123456789"
+    assert partials(store) == 0
+
+
 def test_damaged_record_restarts_the_transfer(store: Store) -> None:
     first, second = chunks(b"0123456789", 5)
     bad = ReceivedChunk(ORIGIN, 1, first.size, first.sha256, 0, b"0x234")

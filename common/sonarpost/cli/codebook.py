@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from sonarpost.cli.parsers import Subparsers, add_command
 from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.cli.shared import Subparsers, add_command
 from sonarpost.codec.interface import Image, to_uint8
 from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split
 from sonarpost.codec.vq.builder import MAX_TILES, Round, TrainingImage, build, rms_distance

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 
-from sonarpost.cli.parsers import Subparsers
+from sonarpost.cli.shared import Subparsers
 
 
 def add_parser(subparsers: Subparsers) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from sonarpost.cli.parsers import Subparsers
+from sonarpost.cli.shared import Subparsers
 from sonarpost.detection.detector import MINE_LIKE, Detection
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.snippets import cut_snippet, ground_projected_image, to_grey

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.cli.parsers import Subparsers
+from sonarpost.cli.shared import Subparsers
 from sonarpost.codec import Codec, StreamHeader, codec_names, decode_image, get_codec
 from sonarpost.codec.api import CodecOptions
 from sonarpost.codec.registry import RETIRED_NAMES, CodecResources, default_registry

@@ -8,8 +8,7 @@ import logging
 from prometheus_client import start_http_server
 
 from sonarpost import logs
-from sonarpost.cli.parsers import Subparsers
-from sonarpost.cli.shared import add_router_options, router_of
+from sonarpost.cli.shared import Subparsers, add_router_options, router_of
 from sonarpost.errors import PortError
 from sonarpost.monitoring.fleet import FleetTracker, FleetWatcher
 from sonarpost.monitoring.metrics import FleetCollector, registry_of

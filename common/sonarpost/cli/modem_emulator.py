@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from sonarpost.cli.parsers import Subparsers
+from sonarpost.cli.shared import Subparsers
 from sonarpost.errors import ConfigError
 from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.channel.config import EmulatorConfig

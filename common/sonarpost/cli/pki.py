@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
-from sonarpost.cli.parsers import Subparsers, add_command, aligned
+from sonarpost.cli.shared import Subparsers, add_command, aligned
 from sonarpost.files import PUBLIC_FILE, write_atomically, write_new
 from sonarpost.keys import SHORE
 from sonarpost.security.acoustic_key import KEY_NAME, create_key

@@ -7,7 +7,7 @@ import logging
 import sys
 import time
 
-from sonarpost.cli.parsers import Subparsers
+from sonarpost.cli.shared import Subparsers
 from sonarpost.codec.jit import NO_FOLDER, compilation_log
 from sonarpost.codec.machine_code import prepare_machine_code
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sonarpost import logs
 from sonarpost.bus import router
-from sonarpost.cli.parsers import Subparsers
+from sonarpost.cli.shared import Subparsers
 from sonarpost.config import SERVICES
 
 

@@ -7,7 +7,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from sonarpost.cli.parsers import Subparsers
+from sonarpost.cli.shared import Subparsers
 from sonarpost.files import write_atomically
 from sonarpost.simulation.seabed.survey import SimulatedSurvey, SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind

@@ -19,8 +19,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sonarpost.cli.parsers import Subparsers, aligned
-from sonarpost.cli.shared import add_router_options, printable, router_of
+from sonarpost.cli.shared import Subparsers, add_router_options, aligned, printable, router_of
 from sonarpost.errors import ConfigError
 from sonarpost.monitoring.fleet import FleetState, FleetWatcher, ServiceStatus
 from sonarpost.stop_signals import stop_on_signals

@@ -7,11 +7,11 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-from sonarpost.cli.parsers import Subparsers, add_command, aligned
-from sonarpost.cli.shared import printable, time_text
+from sonarpost.cli.shared import Subparsers, add_command, aligned, printable, time_text
 from sonarpost.delivery.inspection import StoreState, inspect
 from sonarpost.delivery.salvage import SalvageResult, TableResult, salvage
-from sonarpost.delivery.store import SCHEMA_VERSION, Store, lock_exclusively
+from sonarpost.delivery.schema import VERSION
+from sonarpost.delivery.store import Store, lock_exclusively
 from sonarpost.errors import StoredFileError
 
 EXIT_UNSOUND = 1
@@ -56,7 +56,7 @@ def run_check(parsed: argparse.Namespace) -> int:
 
 def _print_state(path: Path, state: StoreState) -> None:
     version = state.version or "unknown"
-    expected = "" if version == str(SCHEMA_VERSION) else f", expected {SCHEMA_VERSION}"
+    expected = "" if version == str(VERSION) else f", expected {VERSION}"
     lines = [
         ("store", str(path)),
         ("integrity", "ok" if not state.problems else f"{len(state.problems)} problems"),

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from sonarpost.delivery import watermark
-from sonarpost.delivery.store import SCHEMA_VERSION
+from sonarpost.delivery.schema import VERSION
 from sonarpost.delivery.watermark import LostRecords, Marks
 from sonarpost.errors import StoredFileError
 
@@ -62,7 +62,7 @@ class StoreState:
     @property
     def is_sound(self) -> bool:
         """Whether the file is undamaged, has the expected version and no lost commits."""
-        version = str(SCHEMA_VERSION)
+        version = str(VERSION)
         return not self.problems and self.version == version and self.unreported is None and self.lost is None
 
 

@@ -50,7 +50,7 @@ class PartialRecords:
             The complete record, or the next offset to send. A record in a single chunk is returned unchecked.
         """
         if chunk.offset == 0 and len(chunk.data) == chunk.size:
-            if self._has_rows():
+            if self._has_rows() and hashlib.sha256(chunk.data).digest() == chunk.sha256:
                 self._db.execute(
                     "DELETE FROM partial WHERE key = ? AND origin = ? AND seq = ? AND sha256 = ?",
                     (key, chunk.origin, chunk.seq, chunk.sha256),

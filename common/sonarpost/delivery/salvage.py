@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from sonarpost.delivery.inspection import open_unchanged
-from sonarpost.delivery.store import SCHEMA_VERSION, Store, lock_exclusively
+from sonarpost.delivery.schema import VERSION
+from sonarpost.delivery.store import Store, lock_exclusively
 from sonarpost.errors import StoredFileError
 from sonarpost.files import PRIVATE_FILE, sync_folder
 
@@ -151,7 +152,7 @@ def _copy(source: sqlite3.Connection, target: sqlite3.Connection) -> list[TableR
     with target:
         target.execute("BEGIN")
         results = [_copy_table(source, target, name) for name in (*names, "sqlite_sequence")]
-        version = str(SCHEMA_VERSION).encode()
+        version = str(VERSION).encode()
         target.execute("INSERT OR IGNORE INTO meta VALUES ('version', ?)", (version,))
     return results
 

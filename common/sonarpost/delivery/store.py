@@ -8,12 +8,10 @@ that is killed at any moment therefore neither loses nor duplicates a record.
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import logging
 import shutil
 import sqlite3
 import threading
-import uuid
 from collections.abc import Iterator, Sequence, Set
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -21,13 +19,13 @@ from itertools import accumulate
 from pathlib import Path
 from typing import IO, Any
 
-from sonarpost.delivery.records import SITE_SEPARATOR, InboxItem, OutboxItem
+from sonarpost.delivery import schema
+from sonarpost.delivery.records import InboxItem, OutboxItem
 from sonarpost.delivery.transaction import Transaction, runs
 from sonarpost.delivery.watermark import SUFFIX as SIDE_CAR_SUFFIX
 from sonarpost.delivery.watermark import LostRecords, Watermark, clear_lost_records, lost_records
 from sonarpost.errors import DeliveryError, RetryLaterError
 from sonarpost.files import make_private
-from sonarpost.logs import kv
 
 log = logging.getLogger(__name__)
 
@@ -39,67 +37,7 @@ HANDLING_RESERVE_BYTES = 8_388_608
 """Free space for handling the accepted records: deleting rows writes to the write-ahead log."""
 MAX_CHECKED_BYTES = 268_435_456
 """Maximum size of a file whose pages are checked at the start: 256 MiB take about 0.3 s on a fast disk."""
-SCHEMA_VERSION = 3
 
-_TABLES = """
-CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS outbox (
-    consumer TEXT NOT NULL, seq INTEGER NOT NULL, key TEXT NOT NULL, encoding TEXT NOT NULL, priority INTEGER NOT NULL,
-    payload BLOB NOT NULL, sha256 BLOB NOT NULL, created_utc_s REAL NOT NULL,
-    topic TEXT NOT NULL DEFAULT '', edition INTEGER NOT NULL DEFAULT 0, place INTEGER NOT NULL DEFAULT 0,
-    origin BLOB NOT NULL DEFAULT x'', PRIMARY KEY (consumer, seq));
-CREATE TABLE IF NOT EXISTS outbox_next (
-    consumer TEXT PRIMARY KEY, seq INTEGER NOT NULL, origin BLOB NOT NULL DEFAULT x'') WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS inbox (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT NOT NULL, payload BLOB NOT NULL, origin BLOB, seq INTEGER,
-    received_utc_s REAL NOT NULL);
-CREATE TABLE IF NOT EXISTS received_window (
-    id INTEGER PRIMARY KEY, key TEXT NOT NULL, origin BLOB NOT NULL, writer TEXT NOT NULL, highest INTEGER NOT NULL,
-    sha256 BLOB NOT NULL, digests INTEGER NOT NULL, used_ns INTEGER NOT NULL, UNIQUE (key, origin));
-CREATE TABLE IF NOT EXISTS received (
-    window INTEGER NOT NULL REFERENCES received_window (id) ON DELETE CASCADE, seq INTEGER NOT NULL,
-    sha256 BLOB NOT NULL, PRIMARY KEY (window, seq, sha256)) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS partial (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, key TEXT NOT NULL, origin BLOB NOT NULL, seq INTEGER NOT NULL,
-    sha256 BLOB NOT NULL, writer TEXT NOT NULL, has INTEGER NOT NULL, touched_ns INTEGER NOT NULL,
-    UNIQUE (key, origin, seq, sha256));
-CREATE TABLE IF NOT EXISTS partial_piece (
-    partial INTEGER NOT NULL REFERENCES partial (id) ON DELETE CASCADE, start INTEGER NOT NULL, data BLOB NOT NULL,
-    PRIMARY KEY (partial, start));
-CREATE TABLE IF NOT EXISTS refused (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, direction TEXT NOT NULL, key TEXT NOT NULL, payload BLOB NOT NULL,
-    reason TEXT NOT NULL, at_utc_s REAL NOT NULL);
-CREATE TABLE IF NOT EXISTS state (name TEXT PRIMARY KEY, value BLOB NOT NULL);
-"""
-
-# Version 1 had no editions; queued records keep their order.
-_MIGRATE_FROM_VERSION_1 = """
-ALTER TABLE outbox ADD COLUMN topic TEXT NOT NULL DEFAULT '';
-ALTER TABLE outbox ADD COLUMN edition INTEGER NOT NULL DEFAULT 0;
-ALTER TABLE outbox ADD COLUMN place INTEGER NOT NULL DEFAULT 0;
-UPDATE outbox SET place = seq;
-DROP INDEX IF EXISTS outbox_order;
-UPDATE meta SET value = CAST('2' AS BLOB) WHERE name = 'version';
-"""
-# Version 2 remembered received numbers without key and digest. Producers of that version can still repeat records that
-# were received: their numbers stay in `seen` and `seen_upto`, for reading only.
-# No producer has ever assigned numbers of 2^40 and above.
-_MIGRATE_FROM_VERSION_2 = """
-CREATE TABLE IF NOT EXISTS seen (origin BLOB NOT NULL, seq INTEGER NOT NULL, PRIMARY KEY (origin, seq)) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS seen_upto (origin BLOB PRIMARY KEY, seq INTEGER NOT NULL) WITHOUT ROWID;
-ALTER TABLE outbox ADD COLUMN origin BLOB NOT NULL DEFAULT x'';
-ALTER TABLE outbox_next ADD COLUMN origin BLOB NOT NULL DEFAULT x'';
-DROP TABLE IF EXISTS partial_piece;
-DROP TABLE IF EXISTS partial;
-DROP TABLE IF EXISTS refused_before;
-DELETE FROM seen WHERE seq >= 1099511627776;
-DELETE FROM seen_upto WHERE seq >= 1099511627776;
-UPDATE meta SET value = CAST('3' AS BLOB) WHERE name = 'version';
-"""
-_INDEXES = """
-CREATE INDEX IF NOT EXISTS outbox_place ON outbox (consumer, priority, place, seq);
-CREATE INDEX IF NOT EXISTS outbox_topic ON outbox (consumer, topic, edition) WHERE topic <> '';
-"""
 _ITEM = "consumer, seq, key, encoding, priority, payload, sha256, place, origin"
 
 
@@ -172,25 +110,17 @@ class Store:
             self._db.execute("PRAGMA secure_delete=OFF")
             self._db.execute(f"PRAGMA cache_size={-CACHE_KB}")
             self._require_sound()
-            _convert_page_size(self._db, self._page_bytes)
-            self._migrate()
-            self._db.executescript(_TABLES)
-            _convert_state_table(self._db)
-            with self.transaction():
-                self.origin = self._meta("origin", uuid.uuid4().bytes)
-                version = self._meta("version", str(SCHEMA_VERSION).encode())
-            if version == str(SCHEMA_VERSION).encode():
-                self._db.executescript(_INDEXES)
-                self._has_legacy_windows = self._has_table("seen_upto")
+            version, self.origin = schema.prepare(self._db, self._page_bytes)
+            self._has_legacy_windows = schema.has_legacy_windows(self._db)
             self._reader = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
             self._reader.execute("PRAGMA query_only=ON")
         except sqlite3.Error as error:
             reason = f"cannot be opened as a sonarpost store: {_reason(error, self.path)}"
             raise DeliveryError(f"{self.path}: {reason}") from error
-        if version != str(SCHEMA_VERSION).encode():
+        if version != str(schema.VERSION).encode():
             self._reader.close()
             self._db.close()
-            raise DeliveryError(f"{self.path}: store version {version!r}, expected {SCHEMA_VERSION}")
+            raise DeliveryError(f"{self.path}: store version {version!r}, expected {schema.VERSION}")
         self._check_watermark()
 
     def _require_sound(self) -> None:
@@ -207,38 +137,6 @@ class Store:
             self.lost = lost_records(self._db)
         with self.transaction():
             self._watermark.start(self._db)
-
-    def _migrate(self) -> None:
-        if not self._has_table("meta"):
-            return
-        row = self._db.execute("SELECT value FROM meta WHERE name = 'version'").fetchone()
-        if row is not None and row[0] == b"1":
-            self._db.executescript(f"BEGIN IMMEDIATE; {_MIGRATE_FROM_VERSION_1} COMMIT;")
-        if row is not None and row[0] in (b"1", b"2"):
-            with self._db:
-                self._db.execute("BEGIN IMMEDIATE")
-                for statement in _MIGRATE_FROM_VERSION_2.split(";"):
-                    self._db.execute(statement)
-                self._assign_origins()
-
-    def _assign_origins(self) -> None:
-        """Give queued records the origin that version 2 used for their queue, and each queue a new one."""
-        (store_origin,) = self._db.execute("SELECT value FROM meta WHERE name = 'origin'").fetchone()
-        for (queue,) in self._db.execute("SELECT consumer FROM outbox_next").fetchall():
-            origin = bytes(store_origin)
-            if SITE_SEPARATOR in queue:
-                origin = hashlib.sha256(origin + queue.encode()).digest()[:16]
-            self._db.execute("UPDATE outbox SET origin = ? WHERE consumer = ?", (origin, queue))
-            self._db.execute("UPDATE outbox_next SET origin = ? WHERE consumer = ?", (uuid.uuid4().bytes, queue))
-
-    def _has_table(self, name: str) -> bool:
-        found = self._db.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,)).fetchone()
-        return found is not None
-
-    def _meta(self, name: str, initial: bytes) -> bytes:
-        self._db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?)", (name, initial))
-        row = self._db.execute("SELECT value FROM meta WHERE name = ?", (name,)).fetchone()
-        return bytes(row[0])
 
     @contextmanager
     def transaction(self) -> Iterator[Transaction]:
@@ -490,32 +388,6 @@ def _reason(error: sqlite3.Error, path: Path) -> str:
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     damaged = code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
     return f"{error}; {_salvage_hint(path)}" if damaged else str(error)
-
-
-def _convert_page_size(db: sqlite3.Connection, page_bytes: int) -> None:
-    """Convert a file with another page size, which only works without a write-ahead log."""
-    if db.execute("PRAGMA page_size").fetchone()[0] == page_bytes:
-        return
-    try:
-        db.execute("PRAGMA journal_mode=DELETE")
-        db.execute(f"PRAGMA page_size={page_bytes}")
-        db.execute("VACUUM")
-    except sqlite3.OperationalError as error:
-        # A full disk: the file is still valid, and the next start tries again.
-        log.warning("Store keeps its page size", extra=kv(reason=str(error)))
-    db.execute("PRAGMA journal_mode=WAL")
-
-
-def _convert_state_table(db: sqlite3.Connection) -> None:
-    """Give the state table of an older store row numbers, with which a changed value keeps its place in the file."""
-    if not db.execute("SELECT 1 FROM sqlite_master WHERE name = 'state' AND sql LIKE '%WITHOUT ROWID%'").fetchall():
-        return
-    with db:
-        db.execute("BEGIN IMMEDIATE")
-        db.execute("CREATE TABLE state_rows (name TEXT PRIMARY KEY, value BLOB NOT NULL)")
-        db.execute("INSERT INTO state_rows SELECT name, value FROM state")
-        db.execute("DROP TABLE state")
-        db.execute("ALTER TABLE state_rows RENAME TO state")
 
 
 def lock_exclusively(path: Path) -> IO[bytes]:

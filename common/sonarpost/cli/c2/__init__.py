@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sonarpost.cli.c2 import stored, tasking, watch
-from sonarpost.cli.parsers import Subparsers, add_command
+from sonarpost.cli.shared import Subparsers, add_command
 
 __all__ = ["add_parser"]
 

@@ -20,8 +20,7 @@ from rich.text import Text
 
 from sonarpost.archive.shore_files import find_image, image_paths
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, TaskingRow
-from sonarpost.cli.parsers import Subparsers
-from sonarpost.cli.shared import printable, time_text
+from sonarpost.cli.shared import Subparsers, printable, time_text
 from sonarpost.errors import BadInputError, ConfigError, StoredFileError
 from sonarpost.export.contacts import ExportContact, load_contacts, match_start_time
 from sonarpost.export.cot import cot_events

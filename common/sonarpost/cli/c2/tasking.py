@@ -14,8 +14,7 @@ from pydantic import ValidationError
 
 from sonarpost import keys
 from sonarpost.bus.session import open_with_retry
-from sonarpost.cli.parsers import Subparsers
-from sonarpost.cli.shared import add_router_options, add_site_option, router_of
+from sonarpost.cli.shared import Subparsers, add_router_options, add_site_option, router_of
 from sonarpost.delivery.client import deliver
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import Advice, Command, Record, Verdict

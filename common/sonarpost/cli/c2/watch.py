@@ -14,8 +14,7 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
-from sonarpost.cli.parsers import Subparsers
-from sonarpost.cli.shared import add_router_options, add_site_option, printable, router_of, time_text
+from sonarpost.cli.shared import Subparsers, add_router_options, add_site_option, printable, router_of, time_text
 from sonarpost.errors import PayloadError
 from sonarpost.messages import Decision, ReconstructedImage, Record, TaskingState
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sonarpost.cli.parsers import Subparsers, add_command
+from sonarpost.cli.shared import Subparsers, add_command
 from sonarpost.cli.survey import export, info, plot
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
-from sonarpost.cli.parsers import Subparsers
+from sonarpost.cli.shared import Subparsers
 from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
 from sonarpost.files import atomic_file
 from sonarpost.sonar.readers import open_survey

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sonarpost.cli.parsers import Subparsers
+from sonarpost.cli.shared import Subparsers
 from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.readers import open_survey

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
-from sonarpost.cli.parsers import Subparsers
+from sonarpost.cli.shared import Subparsers
 from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
