@@ -83,8 +83,8 @@ def prepare(db: sqlite3.Connection, page_bytes: int) -> tuple[bytes, bytes]:
         page_bytes: Size of the pages.
 
     Returns:
-        Version of the schema as text, which is another one than `VERSION` for a store of a newer version; and the store's
-        random number, 16 bytes.
+        Version of the schema as text, which differs from `VERSION` for a store of a newer version; and the random
+        number of the store, 16 bytes.
 
     Raises:
         sqlite3.Error: The file cannot be read or written.
