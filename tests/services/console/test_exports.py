@@ -208,17 +208,20 @@ def test_no_file_remains_after_the_end_of_the_process(tmp_path, end):
     with subprocess.Popen(
         [sys.executable, "-c", code], env={**os.environ, "TMPDIR": str(temporary)}, stdout=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout is not None
-        address = process.stdout.readline().split()[0]
-        with httpx2.Client(base_url=address, timeout=60) as client, ThreadPoolExecutor() as pool:
-            eventually(lambda: is_served(client), what="server")
-            assert Browser(client).login("watch", PASSWORD).status_code == 200
-            export = pool.submit(client.get, "/api/export/contacts.kmz")
-            eventually(lambda: is_exporting(process.pid, state) or export.done(), what="export")
-            assert not export.done()
-            process.send_signal(end)
-            process.wait(60)
-            assert export.exception() is not None or export.result().status_code != 200
+        try:
+            assert process.stdout is not None
+            address = process.stdout.readline().split()[0]
+            with httpx2.Client(base_url=address, timeout=60) as client, ThreadPoolExecutor() as pool:
+                eventually(lambda: is_served(client), what="server")
+                assert Browser(client).login("watch", PASSWORD).status_code == 200
+                export = pool.submit(client.get, "/api/export/contacts.kmz")
+                eventually(lambda: is_exporting(process.pid, state) or export.done(), what="export")
+                assert not export.done()
+                process.send_signal(end)
+                process.wait(60)
+                assert export.exception() is not None or export.result().status_code != 200
+        finally:
+            process.kill()
     left = {path.name for path in state.iterdir()} - before - {"console-users.db"}
     assert {name for name in left if not name.endswith(("-wal", "-shm"))} == set()
     assert [path for path in temporary.rglob("*") if "export" in path.name] == []
