@@ -219,7 +219,8 @@ def test_no_file_remains_after_the_end_of_the_process(tmp_path, end):
                 assert not export.done()
                 process.send_signal(end)
                 process.wait(60)
-                assert export.exception() is not None or export.result().status_code != 200
+                # A terminated console may complete a running response; a killed one cannot.
+            assert export.exception() is not None or end == signal.SIGTERM
         finally:
             process.kill()
     left = {path.name for path in state.iterdir()} - before - {"console-users.db"}
