@@ -39,6 +39,13 @@ def test_files_of_one_name_are_removed_together_by_age(tmp_path):
     assert names(tmp_path) == ["new.tiff", "new.txt", "other.dat"]
 
 
+def test_files_stored_while_the_clock_was_not_set_are_not_removed_by_age(tmp_path):
+    (tmp_path / "unset.tiff").write_bytes(b"12345")
+    os.utime(tmp_path / "unset.tiff", (100.0, 100.0))
+    assert remove_files(tmp_path, (".tiff",), NOW_UTC_S, 10.0, None) == []
+    assert remove_files(tmp_path, (".tiff",), NOW_UTC_S, 10.0, 4) == ["unset"]
+
+
 def test_oldest_files_are_removed_above_the_maximum_size(tmp_path):
     for number in range(4):
         (tmp_path / f"{number}.tiff").write_bytes(b"x" * 100)

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 DAY_S = 86400.0
+EARLIEST_UTC_S = 1_577_836_800.0
+"""2020-01-01: an earlier time of storage shows that the clock was not set; the age of the item is unknown."""
 
 T = TypeVar("T")
 
@@ -34,13 +36,14 @@ def select_for_removal(
 ) -> list[T]:
     """Select the items that retention removes.
 
-    Items stored longer than `retain_days` ago are removed. Of the others, those of the lowest order are removed first,
-    oldest first, until at most `max_bytes` remain. None stands for no limit.
+    Items stored longer than `retain_days` ago are removed, except those of unknown age. Of the others, those of the
+    lowest order are removed first, oldest first, until at most `max_bytes` remain. None stands for no limit.
     """
     old: list[T] = []
     kept: list[Stored[T]] = []
     for each in stored:
-        if retain_days is not None and now_utc_s - each.stored_utc_s > retain_days * DAY_S:
+        age_s = now_utc_s - each.stored_utc_s if each.stored_utc_s >= EARLIEST_UTC_S else 0.0
+        if retain_days is not None and age_s > retain_days * DAY_S:
             old.append(each.item)
         else:
             kept.append(each)

@@ -17,6 +17,8 @@ from sonarpost.logs import kv
 log = logging.getLogger(__name__)
 
 INTERVAL_S = 60.0
+STEP_S = 3600.0
+FOLLOW_AFTER_S = 86400.0
 
 RetainDays = Annotated[float, Field(gt=0, le=36500)]
 MaxBytes = Annotated[int, Field(ge=0)]
@@ -34,6 +36,28 @@ class RetentionConfig(ServiceConfig):
     max_bytes: MaxBytes = 20_000_000_000
 
 
+class SteadyTime:
+    """Wall clock that follows a step only after a day, so that a wrong clock does not make all files old at once."""
+
+    def __init__(self) -> None:
+        self._offset_s = time.time() - time.monotonic()
+        self._stepped_s: float | None = None
+
+    def now_utc_s(self) -> float:
+        """Return the wall clock; for a day after a step of more than an hour, the earlier of new and previous time."""
+        wall_s, steady_s = time.time(), time.monotonic()
+        step_s = wall_s - steady_s - self._offset_s
+        if abs(step_s) > STEP_S:
+            if self._stepped_s is None:
+                self._stepped_s = steady_s
+                log.warning("Clock was set; retention follows it after a day", extra=kv(step_s=round(step_s)))
+            if steady_s - self._stepped_s < FOLLOW_AFTER_S:
+                return min(wall_s, steady_s + self._offset_s)
+        self._offset_s = wall_s - steady_s
+        self._stepped_s = None
+        return wall_s
+
+
 class Retention:
     """Removes what is too old or too much, every minute and after `wake`.
 
@@ -46,6 +70,7 @@ class Retention:
         self._remove = remove
         self._stopping = stopping
         self._due = threading.Event()
+        self._time = SteadyTime()
         self.error = ""
         """Why the last removal failed; empty if it did not."""
 
@@ -58,7 +83,7 @@ class Retention:
         while not self._stopping.is_set():
             self._due.clear()
             try:
-                self._remove(time.time())
+                self._remove(self._time.now_utc_s())
                 self.error = ""
             except (OSError, DeliveryError) as error:
                 self.error = f"stored files cannot be removed: {error}"

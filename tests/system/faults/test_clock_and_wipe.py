@@ -14,8 +14,6 @@ from builders.vessel_and_shore import PROCESSES, VesselAndShore
 
 COUNT = 200
 DAY_S = 86400.0
-KEEP_ALL = "retain_days = 36500\n"
-"""The corrected clock of the shore makes images a year old, which the default of retain_days would remove."""
 
 
 class Clock:
@@ -55,7 +53,7 @@ def system_with_clocks(
             "relay": (sys.executable, script, str(clocks["vessel"])),
             "c2": (sys.executable, script, str(clocks["shore"])),
         }
-        return start_system(launcher=launcher, c2=KEEP_ALL), made
+        return start_system(launcher=launcher), made
     library = libfaketime()
     made = {side: Clock(file, lambda offset_s: f"{offset_s:+.0f}s") for side, file in clocks.items()}
     environment = {
@@ -68,7 +66,7 @@ def system_with_clocks(
         }
         for name in PROCESSES
     }
-    return start_system(environment=environment, c2=KEEP_ALL), made
+    return start_system(environment=environment), made
 
 
 def test_clock_jumps_lose_and_duplicate_nothing(system_with_clocks: tuple[VesselAndShore, dict[str, Clock]]) -> None:
