@@ -19,6 +19,7 @@ from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 
 DAY_S = 86400.0
+START_UTC_S = 1_700_000_000.0
 
 
 def image(image_id="AAAA", version=1, vessel="vessel-1", first_frame_utc_s=1_700_000_000.0):
@@ -101,9 +102,10 @@ def test_retention_is_on_by_default(archive, tmp_path):
 
 
 def test_retention_removes_old_images_below_the_size_limit():
-    rows = [row("old", 0.0), row("new", 5 * DAY_S)]
-    assert [r.name for r in select_images(rows, (), 6 * DAY_S, 3.0, None)] == ["old"]
-    assert [r.name for r in select_images(rows, (), 6 * DAY_S, 3.0, 10)] == ["old", "new"]
+    rows = [row("old", START_UTC_S), row("new", START_UTC_S + 5 * DAY_S)]
+    now_utc_s = START_UTC_S + 6 * DAY_S
+    assert [r.name for r in select_images(rows, (), now_utc_s, 3.0, None)] == ["old"]
+    assert [r.name for r in select_images(rows, (), now_utc_s, 3.0, 10)] == ["old", "new"]
 
 
 @given(
@@ -112,15 +114,16 @@ def test_retention_removes_old_images_below_the_size_limit():
     st.none() | st.integers(0, 5000),
 )
 def test_retention_keeps_the_limits_and_removes_no_more_than_needed(pictures, days, limit):
-    rows = [row(str(n), at, size, 1.0 if done else None) for n, (at, size, done) in enumerate(pictures)]
-    removed = select_images(rows, (), 1e6, days, limit)
+    rows = [row(str(n), START_UTC_S + at, size, 1.0 if done else None) for n, (at, size, done) in enumerate(pictures)]
+    now_utc_s = START_UTC_S + 1e6
+    removed = select_images(rows, (), now_utc_s, days, limit)
     kept = [r for r in rows if r not in removed]
     assert len(removed) == len(set(removed))
     if days is not None:
-        assert all(1e6 - r.accepted_utc_s <= days * DAY_S for r in kept)
+        assert all(now_utc_s - r.accepted_utc_s <= days * DAY_S for r in kept)
     if limit is not None:
         assert sum(r.size_bytes for r in kept) <= limit
-    if removed and limit is not None and (days is None or 1e6 - removed[-1].accepted_utc_s <= days * DAY_S):
+    if removed and limit is not None and (days is None or now_utc_s - removed[-1].accepted_utc_s <= days * DAY_S):
         assert sum(r.size_bytes for r in kept) + removed[-1].size_bytes > limit
     if days is None and limit is None:
         assert removed == []
