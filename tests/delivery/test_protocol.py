@@ -151,13 +151,16 @@ def test_restarted_consumer_discards_a_repeated_record(
         )
         return AckReply.unpack(replies.recv().ok.payload.to_bytes(), KEY)
 
-    eventually(lambda: bool(consumer.session.info.routers_zid()))
+    querier = client.declare_querier(keys.delivery_query(KEY, "consumer"))
+    eventually(lambda: bool(querier.matching_status.matching))
     assert ask().status == "stored"
     eventually(lambda: consumer.got == ["d1"])
     consumer.stop()
+    eventually(lambda: not querier.matching_status.matching)
     consumer = Consumer(platform("vessel-1"), ServiceConfig())
     consumer.start()
     try:
+        eventually(lambda: bool(querier.matching_status.matching))
         # As if the acknowledgement was lost: the producer repeats the query.
         assert ask().status == "stored"
         producer.start()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import threading
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,6 @@ from builders.records import decision_record
 
 from sonarpost import keys, wire
 from sonarpost.bus.connectivity import ConnectivityState, diagnose_no_reply, probe_endpoint, query_presence
-from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Advice, Command, Record
 from sonarpost.runtime.service import Service, UnitOfWork
@@ -215,15 +215,26 @@ class _Unrevoked:
         return self._index
 
 
-def test_service_logs_that_its_certificate_is_refused(world, caplog):
-    stop = threading.Event()
-    waiting = threading.Thread(target=lambda: open_with_retry([world.shore_tls], stop, world.tls("expired")))
-    waiting.start()
-    eventually(lambda: "Zenoh router not reached" in caplog.text, what="the warning")
-    stop.set()
-    waiting.join()
-    [record] = [r for r in caplog.records if r.message.startswith("Zenoh router not reached")]
-    assert "certificate expired" in vars(record)["fields"]["error"]
+OPEN = """
+import sys, threading
+from pathlib import Path
+from sonarpost.bus.session import open_with_retry
+from sonarpost.config import TlsConfig
+from sonarpost.logs import configure_logging
+configure_logging("service")
+folder = Path(sys.argv[2])
+files = {name: folder / f"{name}.pem" for name in ("ca", "certificate", "key")}
+open_with_retry([sys.argv[1]], threading.Event(), TlsConfig(**files))
+"""
+
+
+def test_service_logs_that_its_certificate_is_refused(world):
+    arguments = [sys.executable, "-c", OPEN, world.shore_tls, str(world.folders["expired"])]
+    with subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        line = next(line for line in process.stderr if "Zenoh router not reached" in line)
+        process.kill()
+    assert "certificate expired" in line
 
 
 def test_no_part_of_a_key_appears_in_logs_health_or_process_list(world, start_service, caplog):
