@@ -47,8 +47,9 @@ def test_every_codec_is_encoded_and_decoded_by_name(name: str) -> None:
 
 def test_options_select_model_codebook_and_packing(codebook: Path) -> None:
     image = snippet(48, 64)
-    assert [c.get_codec(model=model).codec_id for model in ("standard", "structure")] == [0x20, 0x21]
-    assert c.encode(image, model="structure")[0] == 0x21
+    assert [c.get_codec(model=model, strength=0.0).codec_id for model in ("standard", "structure")] == [0x20, 0x21]
+    assert [c.get_codec(model=model).codec_id for model in ("standard", "structure")] == [0x22, 0x23]
+    assert c.encode(image, model="structure", strength=0.0)[0] == 0x21
     assert c.get_codec("vq", codebook="nominal-20", packing="2byte").codec_id == 0x11
     assert c.decode(c.encode(image, "vq", codebook=codebook), codebooks=[codebook]).shape == image.shape
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from numba.core import caching
 
-from sonarpost.codec import jit
+from sonarpost.codec import code_cache, jit
 from sonarpost.codec.code_cache import code_folders
 
 SOURCE = """
@@ -58,6 +58,16 @@ def test_machine_code_is_stored_beside_the_module_and_loaded_again(module, tmp_p
     assert (second(1), hits(second)) == (2, 1)
 
 
+@pytest.mark.parametrize(("imports", "loaded"), [("from sonarpost.codec.jit import jit", 0), ("", 1)])
+def test_a_change_of_another_compiled_module_of_the_folder_compiles_again(imports, loaded, module, tmp_path) -> None:
+    other = tmp_path / "source" / "other.py"
+    module()(1)
+    other.write_text(imports)
+    code_cache._digest.cache_clear()  # a new process reads the sources again
+    changed = module()
+    assert (changed(1), hits(changed)) == (2, loaded)
+
+
 @pytest.mark.parametrize("damaged", ["*.nbi", "*.nbc"])
 @pytest.mark.parametrize("content", [b"", b"\x80\x04junk"])
 def test_a_damaged_file_is_replaced(damaged, content, module, tmp_path, caplog) -> None:
@@ -85,11 +95,19 @@ def test_folders_are_tried_in_a_documented_order(monkeypatch, tmp_path) -> None:
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setattr(jit, "service_folders", [])
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
-    jit.use_code_folder(tmp_path / "state" / "machine-code")
+    monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
+    jit.use_code_folder(tmp_path / "state")
     source = tmp_path / "installed" / "codec" / "kernel.py"
     beside, service, user = code_folders(source)
     assert beside == source.parent / "__pycache__"
     assert [service.parent, user.parent] == [tmp_path / "state" / "machine-code", tmp_path / "user" / "sonarpost"]
+
+
+def test_the_cache_folder_of_systemd_replaces_the_state_folder(monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr(jit, "service_folders", [])
+    monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path / "cache"))
+    jit.use_code_folder(tmp_path / "state")
+    assert jit.service_folders == [tmp_path / "cache" / "machine-code"]
 
 
 def test_a_chosen_folder_replaces_all_others_and_holds_several_installations(monkeypatch, tmp_path) -> None:

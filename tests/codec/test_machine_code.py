@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -53,7 +54,7 @@ def run(cache: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True, check=True)
 
 
-@pytest.mark.timeout(900)  # compiles everything: 30 s on an idle machine
+@pytest.mark.timeout(900)  # compiles everything: 15 s on an idle machine
 def test_first_use_prints_the_message_once_and_prepare_completes_the_cache(tmp_path: Path) -> None:
     cache, images = tmp_path / "cache", tmp_path / "images"
     images.mkdir()
@@ -61,18 +62,24 @@ def test_first_use_prints_the_message_once_and_prepare_completes_the_cache(tmp_p
         write_png(images / f"{name}.png", snippet(32, 48))
     encode = ("-m", "sonarpost.cli.main", "encode", str(images))
     first = run(cache, *encode)
-    assert first.stderr.splitlines() == [MESSAGE.format(codec="emb", seconds=20)]
+    # Progress, on a slow host, is not of interest here.
+    lines = [line for line in first.stderr.splitlines() if not line.startswith("encoding: ")]
+    assert lines == [MESSAGE.format(codec="emb", seconds=10)]
     assert "2 of 2 files done" in first.stdout
     assert run(cache, *encode).stderr == ""
     assert run(cache, "-c", DECODE_TWICE).stdout.splitlines()[-1:] == [
         "WARNING sonarpost.codec.jit " + MESSAGE.format(codec="vq", seconds=2)
     ]
-    prepared = run(cache, "-m", "sonarpost.cli.main", "prepare").stdout.splitlines()
-    assert prepared[0] == "Preparing machine code: emb, model standard"
-    assert prepared[-1].startswith("Machine code is ready: compiled=")
-    assert str(cache) in prepared[-1]
-    assert list(cache.rglob("*.nbc"))
-    again = run(cache, "-m", "sonarpost.cli.main", "prepare").stdout.splitlines()
-    assert again[-1] == "Machine code is ready: the cache holds all functions"
+    preparing = run(cache, "-m", "sonarpost.cli.main", "prepare")
+    assert preparing.stderr.splitlines()[0] == "Preparing machine code: emb, model standard"
+    prepared = preparing.stdout
+    assert prepared.startswith("Machine code is ready: compiled=")
+    assert str(cache) in prepared
+    # One specialisation of each function: more of them multiply the compile time.
+    specialisations = Counter(path.name.rsplit(".", 2)[0] for path in cache.glob("emb_*/*.nbc"))
+    assert [name for name, count in specialisations.items() if count > 1] == []
+    assert len(specialisations) in range(15, 21)
+    again = run(cache, "-m", "sonarpost.cli.main", "prepare", "-q")
+    assert (again.stdout, again.stderr) == ("Machine code is ready: the cache holds all functions\n", "")
     # Encoding and decoding in another process, with all options, compiles nothing and logs nothing.
     assert run(cache, "-c", ENCODE_AND_DECODE).stdout.splitlines() == ["compiled 0"]

@@ -18,11 +18,13 @@ class CodecOptions(TypedDict, total=False):
 
     Attributes:
         model: Model of emb: "standard" (least squared error, the default) or "structure" (structural similarity).
+        strength: Strength of despeckling of emb, 0 (code the image as it is) to 1 (the default), in steps of 1/16.
         codebook: Codebook of vq: "nominal-10" (the default), "nominal-20" or a file.
         packing: Index format of vq: "14bit" (the default), "2byte", "3byte" or "ascii5".
     """
 
     model: str
+    strength: float
     codebook: str | Path
     packing: str
 
@@ -37,7 +39,7 @@ def get_codec(name: str = "emb", **options: Unpack[CodecOptions]) -> Codec:
 
     Args:
         name: One of `codec_names()`.
-        **options: `model` of emb; `codebook` and `packing` of vq, as for `sonarpost encode`.
+        **options: `model` and `strength` of emb; `codebook` and `packing` of vq, as for `sonarpost encode`.
 
     Raises:
         ConfigError: No codec has this name, or it does not have this option or value.
@@ -45,7 +47,7 @@ def get_codec(name: str = "emb", **options: Unpack[CodecOptions]) -> Codec:
     """
     registry = default_registry()
     spec = registry.spec(name)
-    allowed = ["model"] * spec.has_models + ["codebook", "packing"] * spec.needs_tiles
+    allowed = ["model", "strength"] * spec.has_models + ["codebook", "packing"] * spec.needs_tiles
     for option in options:
         if option not in allowed:
             raise ConfigError(f"codec {name}", "option", option, " or ".join(allowed) or "no options")
@@ -54,7 +56,9 @@ def get_codec(name: str = "emb", **options: Unpack[CodecOptions]) -> Codec:
     packings = {one.value: one for one in IndexPacking}
     if packing not in packings:
         raise ConfigError(f"codec {name}", "packing", packing, " or ".join(packings))
-    return registry.create(name, CodecResources(tiles, packings[packing], options.get("model")))
+    return registry.create(
+        name, CodecResources(tiles, packings[packing], options.get("model"), options.get("strength"))
+    )
 
 
 def encode(
@@ -66,7 +70,7 @@ def encode(
         image: Shape (16..512, 16..512), uint8 or uint16; uint16 is mapped to 8 bits over its own range.
         codec: One of `codec_names()`.
         budget: Maximum length of the stream in bytes; None: the codec's default size or quality.
-        **options: `model` of emb; `codebook` and `packing` of vq, as for `sonarpost encode`.
+        **options: `model` and `strength` of emb; `codebook` and `packing` of vq, as for `sonarpost encode`.
 
     Returns:
         The stream, header included.

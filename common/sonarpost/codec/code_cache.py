@@ -100,7 +100,7 @@ def _open(function: Callable[..., object], folder: Path) -> Any:  # noqa: ANN401
         from_function = staticmethod(lambda _function, _source: Locator())
         ensure_cache_path = staticmethod(lambda: None)
         get_cache_path = staticmethod(lambda: str(folder))
-        get_source_stamp = staticmethod(lambda: _digest(inspect.getfile(function)))
+        get_source_stamp = staticmethod(lambda: _digest(Path(inspect.getfile(function)).parent))
         get_disambiguator = staticmethod(lambda: str(function.__code__.co_firstlineno))
 
     implementation = type("Implementation", (caching.CompileResultCacheImpl,), {"_locator_classes": [Locator]})
@@ -108,8 +108,11 @@ def _open(function: Callable[..., object], folder: Path) -> Any:  # noqa: ANN401
 
 
 @cache
-def _digest(source: str) -> bytes:
-    return hashlib.sha256(Path(source).read_bytes()).digest()
+def _digest(folder: Path) -> bytes:
+    """Return the digest of all modules of the folder with compiled functions, which call one another."""
+    sources = [path.read_bytes() for path in sorted(folder.glob("*.py"))]
+    compiled = [source for source in sources if b"from sonarpost.codec.jit import" in source]
+    return hashlib.sha256(b"".join(hashlib.sha256(source).digest() for source in compiled)).digest()
 
 
 @cache

@@ -116,16 +116,20 @@ class DecodedImage:
         image: Shape (height_px, width_px), uint8.
         missing: Same shape, True where no valid data arrived. Missing pixels are black.
         notes: Remarks of the decoder, one line each, for operators and the side-car file.
+        despeckle_strength: Strength of the encoder's despeckling, 0..1; None if the stream does not contain it.
     """
 
     image: Image
     missing: Mask
     notes: tuple[str, ...] = ()
+    despeckle_strength: float | None = None
 
     @classmethod
-    def without_gaps(cls, image: Image, notes: Sequence[str] = ()) -> DecodedImage:
+    def without_gaps(
+        cls, image: Image, notes: Sequence[str] = (), despeckle_strength: float | None = None
+    ) -> DecodedImage:
         """Return an image in which no pixel is missing."""
-        return cls(image, np.zeros(image.shape, np.bool_), tuple(notes))
+        return cls(image, np.zeros(image.shape, np.bool_), tuple(notes), despeckle_strength)
 
     @classmethod
     def all_missing(cls, header: StreamHeader, notes: Sequence[str]) -> DecodedImage:

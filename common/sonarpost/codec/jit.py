@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any, Final, ParamSpec, TypeVar, cast
 P = ParamSpec("P")
 R = TypeVar("R")
 
-COMPILE_S: Final = {"emb": 20, "vq": 2}
+COMPILE_S: Final = {"emb": 10, "vq": 2}
 """Approximate time to compile all functions of a codec."""
 
 NO_FOLDER: Final = "no folder for it is writable; set NUMBA_CACHE_DIR or run `sonarpost prepare` as the installing user"
@@ -28,14 +29,15 @@ service_folders: Final[list[Path]] = []
 log = logging.getLogger(__name__)
 
 
-def use_code_folder(folder: Path) -> None:
-    """Let this process store machine code in a folder if it cannot write beside the modules.
+def use_code_folder(state_dir: Path) -> None:
+    """Let this process store machine code in `machine-code` of a folder if it cannot write beside the modules.
 
     Call it before an image is coded. Other users must not be able to write there: the files are executed.
 
     Args:
-        folder: Created when it is needed.
+        state_dir: The folder, created when it is needed. `CACHE_DIRECTORY`, which systemd sets, replaces it.
     """
+    folder = Path(os.environ.get("CACHE_DIRECTORY") or state_dir) / "machine-code"
     if folder not in service_folders:
         service_folders.append(folder)
 
@@ -43,14 +45,24 @@ def use_code_folder(folder: Path) -> None:
 def jit(function: Callable[P, R], *, reorder_sums: bool = False) -> Callable[P, R]:
     """Return `function`, compiled on its first call.
 
-    numba recompiles a cached function only when its own source file changes. Compiled functions therefore call only
-    functions of their own module. With `reorder_sums`, the compiler may reorder sums of floating-point numbers.
+    Each combination of argument types is compiled separately, and each function again within its callers. Literal
+    arguments and mixed integer types in compiled code therefore multiply the compile time. A division by zero does not
+    raise an exception.
+
+    A cached function is compiled again when a module with compiled functions in the same folder changes. Compiled
+    functions therefore use only functions and constants of such modules. With `reorder_sums`, the compiler may reorder
+    sums of floating-point numbers.
     """
     flags = {"reassoc", "contract", "nnan", "nsz"} if reorder_sums else False
-    compiled = _numba().njit(fastmath=flags)(function)
+    compiled = _numba().njit(fastmath=flags, error_model="numpy", no_cfunc_wrapper=True)(function)
     # numba has no public way to choose the cache; the attribute has had this name since 2016.
     compiled._cache = importlib.import_module("sonarpost.codec.code_cache").CodeCache(function)  # noqa: SLF001
     return cast(Callable[P, R], compiled)
+
+
+def inlined(function: Callable[P, R]) -> Callable[P, R]:
+    """Return `function`, compiled as a part of each function that calls it; for small ones or single calls."""
+    return cast(Callable[P, R], _numba().njit(error_model="numpy", inline="always")(function))
 
 
 class CompilationLog:

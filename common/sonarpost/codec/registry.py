@@ -3,8 +3,8 @@
 `BUILTINS` lists the codecs of this package. Another distribution adds codecs through the entry-point group
 `sonarpost.codecs`: the entry point loads a `CodecSpec` with the name of the entry point.
 
-Codec ids are never reused. 0x01..0x0F have no model, 0x10..0x13 belong to vq (one for each packing), 0x20 and 0x21 to
-emb (one for each kind of model). 0x80 and above are for other distributions.
+Codec ids are never reused. 0x01..0x0F have no model, 0x10..0x13 belong to vq (one for each packing), 0x20 to 0x23 to
+emb (one for each kind of model, with and without despeckling). 0x80 and above are for other distributions.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ class CodecResources:
         tiles: The tile database, for codecs with a codebook.
         packing: Format of the indices of vq.
         model: Name of the model of emb; None: the default model.
+        strength: Strength of despeckling of emb, 0..1; None: the default strength.
         codec_id: Codec id of the stream to decode; None for encoding.
         model_tag: Model tag of the stream to decode; None for encoding.
     """
@@ -48,6 +49,7 @@ class CodecResources:
     tiles: TileDatabase | None = None
     packing: IndexPacking = IndexPacking.BITS14
     model: str | None = None
+    strength: float | None = None
     codec_id: int | None = None
     model_tag: int | None = None
 
@@ -63,7 +65,7 @@ class CodecSpec:
         summary: One line for people.
         needs_tiles: Whether `create` requires a tile database. A receiver finds it by the two bytes of its identity in
             the stream, so all codec ids must have a tag of two bytes (`interface.tag_length`).
-        has_models: Whether the option `model` selects a trained model.
+        has_models: Whether the option `model` selects a trained model, and `strength` the strength of despeckling.
         is_embedded: Whether every prefix of a stream is an image, and longer streams can start with shorter ones.
     """
 
@@ -90,13 +92,15 @@ def _create_emb(resources: CodecResources) -> Codec:
     from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415
     from sonarpost.codec.emb.model import shipped_models  # noqa: PLC0415
 
-    for name, codec_id in emb.CODEC_IDS.items():
-        if codec_id == resources.codec_id:
-            models = shipped_models(name)
-            # For an unknown tag, the current model: its `decode` raises the error.
-            known = (one for one in models if model_tag(codec_id, one.identity) == resources.model_tag)
-            return EmbCodec(next(known, models[0]))
-    return EmbCodec(resources.model or emb.DEFAULT_MODEL)
+    for despeckled, codec_ids in ((False, emb.CODEC_IDS), (True, emb.DESPECKLED_CODEC_IDS)):
+        for name, codec_id in codec_ids.items():
+            if codec_id == resources.codec_id:
+                models = shipped_models(name, despeckled=despeckled)
+                # For an unknown tag, the current model: its `decode` raises the error.
+                known = (one for one in models if model_tag(codec_id, one.identity) == resources.model_tag)
+                return EmbCodec(next(known, models[0]), emb.DEFAULT_STRENGTH if despeckled else 0.0)
+    strength = emb.DEFAULT_STRENGTH if resources.strength is None else resources.strength
+    return EmbCodec(resources.model or emb.DEFAULT_MODEL, strength)
 
 
 def _still_image_spec(image_format: StillImageFormat) -> CodecSpec:
@@ -108,7 +112,7 @@ def _still_image_spec(image_format: StillImageFormat) -> CodecSpec:
 BUILTINS = (
     CodecSpec(
         emb.NAME,
-        tuple(emb.CODEC_IDS.values()),
+        (*emb.CODEC_IDS.values(), *emb.DESPECKLED_CODEC_IDS.values()),
         _create_emb,
         "embedded wavelet codec with learned contexts: an image at every length from 20 bytes",
         has_models=True,

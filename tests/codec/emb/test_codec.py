@@ -150,7 +150,7 @@ def test_bytes_after_a_lost_byte_are_not_used() -> None:
 def test_unknown_models_and_small_budgets_are_rejected() -> None:
     stream = bytearray(CODEC.encode(contact(), 40))
     with pytest.raises(StreamError, match="codec_id"):
-        CODEC.decode(bytes([0x22]) + bytes(stream[1:]))
+        CODEC.decode(bytes([0x2F]) + bytes(stream[1:]))
     with pytest.raises(StreamError, match="does not have"):
         CODEC.decode(bytes([stream[0], stream[1] ^ 1]) + bytes(stream[2:]))
     for budget in (-1, 0, 3, 5):

@@ -94,7 +94,7 @@ def test_sign_network_matches_unbounded_integers_and_is_odd(orient: int, reach: 
     for _ in range(40):
         f = rng.integers(-reach, reach + 1, kernel.SIGN_FEATURES).astype(np.int32)
         f[kernel.SIGN_ODD :] = rng.integers(0, 25, kernel.SIGN_FEATURES - kernel.SIGN_ODD)
-        nets = (MODEL.sign_b1[orient], MODEL.sign_w1, MODEL.sign_w2, orient)
+        nets = (MODEL.sign_b1, MODEL.sign_w1, MODEL.sign_w2, orient, np.zeros(2 * kernel.SIGN_HIDDEN, np.int32))
         logits.append(kernel._sign_logit(f, *nets))
         assert logits[-1] == plain_sign_logit(f.tolist(), orient)
         f[: kernel.SIGN_ODD] *= -1

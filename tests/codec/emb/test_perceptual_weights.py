@@ -173,16 +173,22 @@ def test_structure_model_supports_region_and_texture() -> None:
     assert STRUCTURE.speckle_layer(stream).any()
 
 
-def test_each_model_has_its_codec_id() -> None:
+def test_each_model_has_its_codec_ids() -> None:
     registry, image = default_registry(), seabed()
-    for model, codec_id in (("standard", 0x20), ("structure", 0x21)):
-        codec = registry.create("emb", CodecResources(model=model))
+    for model, strength, codec_id in (
+        ("standard", 0.0, 0x20),
+        ("structure", 0.0, 0x21),
+        ("standard", 0.5, 0x22),
+        ("structure", 1.0, 0x23),
+    ):
+        codec = registry.create("emb", CodecResources(model=model, strength=strength))
         assert (codec.name, codec.codec_id) == ("emb", codec_id)
-        assert codec.model_hash == shipped_models(model)[0].identity
+        assert codec.model_hash == shipped_models(model, despeckled=strength > 0)[0].identity
         stream = codec.encode(image, 64)
         assert stream[0] == codec_id
         reader = registry.create_for_stream(stream)
         assert (reader.name, reader.codec_id, reader.model_hash) == ("emb", codec_id, codec.model_hash)
+        assert reader.decode(stream).despeckle_strength == strength
         assert np.array_equal(reader.decode(stream).image, codec.decode(stream).image)
 
 

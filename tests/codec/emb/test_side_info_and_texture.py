@@ -29,8 +29,9 @@ from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import StreamError
 
 GOLDEN = GOLDEN_FOLDER / "emb"
-FIRST, OPTIMISED, SECOND, STRUCTURE = (
-    GOLDEN / name for name in ("streams.json", "streams_fitted.json", "streams_second.json", "streams_structure.json")
+FIRST, OPTIMISED, SECOND, STRUCTURE, DESPECKLED, HALF = (
+    GOLDEN / f"streams{name}.json"
+    for name in ("", "_fitted", "_second", "_structure", "_despeckled", "_half_despeckled")
 )
 """Streams of the first encoder, of the encoder with optimised targets, of the second model, of the structure model."""
 CODEC = EmbCodec()
@@ -165,8 +166,8 @@ def test_extreme_bodies_decode(byte: int) -> None:
         assert CODEC.decode(header + bytes([byte]) * length).image.shape == (32, 48)
 
 
-def golden_cases(model: str = "standard") -> dict[str, tuple[np.ndarray, int, EmbCodec]]:
-    plain, with_texture = (EmbCodec(model, send_texture=texture) for texture in (False, True))
+def golden_cases(model: str = "standard", strength: float = 0.0) -> dict[str, tuple[np.ndarray, int, EmbCodec]]:
+    plain, with_texture = (EmbCodec(model, strength, send_texture=texture) for texture in (False, True))
     return {
         "80x80 at 64 B": (speckled(), 64, plain),
         "140x80 at 256 B": (speckled(140, 80), 256, plain),
@@ -185,22 +186,25 @@ def hashes(stream: bytes, codec: EmbCodec) -> dict[str, str]:
     return out
 
 
-def model_of_file(file: Path) -> str:
-    return "structure" if file == STRUCTURE else "standard"
+def options_of_file(file: Path) -> tuple[str, float]:
+    """Return model and strength of the golden streams of a file."""
+    return {STRUCTURE: ("structure", 0.0), DESPECKLED: ("standard", 1.0), HALF: ("structure", 0.5)}.get(
+        file, ("standard", 0.0)
+    )
 
 
-@pytest.mark.parametrize("file", [FIRST, OPTIMISED, SECOND, STRUCTURE], ids=lambda path: path.stem)
+@pytest.mark.parametrize("file", [FIRST, OPTIMISED, SECOND, STRUCTURE, DESPECKLED, HALF], ids=lambda path: path.stem)
 @pytest.mark.parametrize("name", golden_cases())
 def test_golden_streams_of_every_encoder_and_model_are_decoded(name: str, file: Path) -> None:
     """The pixels are the same on every machine and in every release that has the model."""
     golden = json.loads(file.read_text())[name]
     stream = bytes.fromhex(golden.pop("stream"))
-    assert hashes(stream, golden_cases(model_of_file(file))[name][2]) == golden
+    assert hashes(stream, golden_cases(*options_of_file(file))[name][2]) == golden
 
 
-@pytest.mark.parametrize("file", [SECOND, STRUCTURE], ids=lambda path: path.stem)
+@pytest.mark.parametrize("file", [SECOND, STRUCTURE, DESPECKLED, HALF], ids=lambda path: path.stem)
 @pytest.mark.parametrize("name", golden_cases())
 def test_golden_streams_are_reproduced(name: str, file: Path) -> None:
     """The bytes are the same on every machine."""
-    image, budget, codec = golden_cases(model_of_file(file))[name]
+    image, budget, codec = golden_cases(*options_of_file(file))[name]
     assert codec.encode(image, budget).hex() == json.loads(file.read_text())[name]["stream"]

@@ -83,7 +83,7 @@ def packets_of(stream: bytes, height_px: int, width_px: int) -> tuple[int, bytes
         packets = stream[start : -len(_EOC)]
         if stream == codestream(height_px, width_px, decompositions, packets):
             return decompositions, packets
-    expected = f"a complete codestream of one tile, {width_px} x {height_px} px, 9/7, 64 x 64 blocks"
+    expected = f"a complete codestream of one tile, {width_px} × {height_px} px, 9/7, 64 × 64 blocks"
     raise StreamError("jpeg2000 body", "codestream", stream, expected)
 
 

@@ -274,7 +274,7 @@ def check_av1_frame(frame: bytes, shape: tuple[int, ...]) -> None:
     Raises:
         StreamError: The body is something else.
     """
-    expected = f"an AV1 sequence header and frame of a still picture of {shape[0]} x {shape[1]} px"
+    expected = f"an AV1 sequence header and frame of a still picture of {shape[1]} × {shape[0]} px"
     length = frame[1] if len(frame) > 1 else 0
     header, rest = frame[2 : 2 + length], frame[2 + length :]
     # The length of the frame: 7 bits a byte, least significant first, at most 3 bytes.

@@ -52,7 +52,6 @@ def code_planes(
     layout, mean, weights = state.layout, side.mean, model.perceptual
     bands, widths = layout.bands.tolist(), layout.sides[:, 1].tolist()  # Python numbers are ten times faster here
     features = np.zeros(kernel.FEATURES, np.int32)
-    base = np.zeros((2, kernel.HIDDEN_1), np.int32)
     insignificant = np.zeros(layout.cells, np.int32)
     originals = targets if originals is None else originals
     scaled = targets if weights is None else perceptual_weights.apply_initial_scales(weights, state, targets)
@@ -60,11 +59,11 @@ def code_planes(
         state.lower, state.widths, state.signs, state.sizes, state.signed, state.planes, state.logits, insignificant,
         state.scale,
     )  # fmt: skip
-    nets = (model.w1, model.w2, model.b2, _last_layer(model))
+    nets = (model.w1, model.b1, model.w2, model.b2, _last_layer(model))
     sign_nets = (model.sign_w1, model.sign_b1, model.sign_w2)
     tables = (model.probabilities, model.costs, model.centres)
     stream = (coder.words, coder.data, coder.best, coder.curve, originals)
-    examples = (coder.decisions, coder.sign_decisions)
+    examples, scratch = (coder.decisions, coder.sign_decisions), kernel.scratch_arrays()
     first_plane = _FIRST_PLANE if weights is None else _FIRST_PLANE_PERCEPTUAL
     for plane in range(-side.extra_planes, planes):
         number = plane + side.extra_planes
@@ -84,12 +83,10 @@ def code_planes(
                 if row == 1 and kind != kernel.REFINE:
                     lows = low_pass_images(state, model, side, finest)
                 _set_band_features(features, band, threshold, mean, _density(state, band))
-                for net in (0, 1):
-                    kernel.band_base(features, model.w1[net], model.b1[net], base[net])
                 low_width = widths[band[LEVEL]]
                 end = kernel.code_band(
                     coder.mode, kind, number + 1, threshold, row, low_width, price, min_logit, layout.bands, scaled,
-                    lows, features, base, arrays, nets, sign_nets, tables, stream, examples,
+                    lows, features, arrays, nets, sign_nets, tables, stream, examples, scratch,
                 )  # fmt: skip
                 if end < 0:
                     return

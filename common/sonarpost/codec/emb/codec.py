@@ -6,7 +6,8 @@ decodes to the image that its bytes determine.
 The encoder tries several start steps and sends the body with the smallest squared error of the image. A perceptual
 model uses structural similarity instead: Wang, Simoncelli, Bovik, "Multiscale structural similarity for image quality
 assessment" (2003), at a half and a quarter of the size, which have nearly all of the weight, with a binomial window in
-place of the Gaussian one. Integer arithmetic only, so that all machines write the same stream.
+place of the Gaussian one. Before, the encoder estimates the scene without speckle (`despeckle`); all of this is then
+against the estimate. Only integers are added up, so that all machines write the same stream.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import ClassVar, Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb import CODEC_IDS, DEFAULT_MODEL, NAME, transform
+from sonarpost.codec.emb import CODEC_IDS, DEFAULT_MODEL, DESPECKLED_CODEC_IDS, NAME, transform
 from sonarpost.codec.emb.bitplanes import (
     START_THRESHOLDS,
     code_planes,
@@ -36,6 +37,7 @@ from sonarpost.codec.emb.decode import (
     read_body,
     synthesise_speckle,
 )
+from sonarpost.codec.emb.despeckle import STRENGTH_STEPS, check_strength, despeckled
 from sonarpost.codec.emb.kernel import I64
 from sonarpost.codec.emb.model import Model, shipped_models
 from sonarpost.codec.emb.rate_distortion_opt import TargetCoefficients, target_coefficients
@@ -126,14 +128,13 @@ class TrialEncoder:
     def best(
         self,
         targets: TargetCoefficients,
-        mean_index: int,
-        region: RegionOfInterest | None,
-        texture: tuple[int, ...] | None,
+        sent: SideInfo,
         start_steps: tuple[int, ...] = (),
     ) -> EncodedTrial:
         """Write bodies with several start steps and return the one with the smallest error.
 
-        Without `start_steps`, those of `SEARCHES` are tried.
+        `sent` is the side information but for the start step and the extra planes. Without `start_steps`, those of
+        `SEARCHES` are tried.
         """
         pixels = targets.plane.size
         searches = SEARCHES if self.model.perceptual is None else PERCEPTUAL_SEARCHES
@@ -147,7 +148,7 @@ class TrialEncoder:
         trials: dict[int, EncodedTrial] = {}
         for i in range(len(first) + further):
             step = first[i] if i < len(first) else next_step({tried: trial.error for tried, trial in trials.items()})
-            side = SideInfo(mean_index, step, region, texture, extra_planes(targets.targets, step))
+            side = replace(sent, start_step=step, extra_planes=extra_planes(targets.targets, step))
             trials[step] = self.write(targets, side)
         return min(trials.values(), key=lambda trial: trial.error)
 
@@ -241,7 +242,8 @@ class Encoded:
         stream: Header and body.
         mean_square_error: Shape (len(stream) + 1,), float64: estimated mean squared error, in grey levels squared, of
             the image that the first n bytes decode to; infinite for prefixes without an image. It is computed from the
-            coefficients: clipping and the enhancer reduce the true error by some per cent. With a region of interest,
+            coefficients: clipping and the enhancer reduce the true error by some per cent. Against the despeckled image
+            if the codec despeckles. With a region of interest,
             the error in it weighs 9/4.
     """
 
@@ -256,25 +258,30 @@ class EmbCodec:
     Attributes:
         model: Model that encodes: "standard" (least squared error), "structure" (structural similarity), or a trained
             model.
+        strength: Strength of despeckling, 0..1, rounded to 1/16; 0 codes the image as it is (see `despeckle`).
         send_texture: Whether streams carry the strength of the image's texture (4 bytes); see `speckle_layer`.
         start_steps: Start steps to try; empty: see `SEARCHES`.
 
     Raises:
-        ConfigError: No model has this name.
+        ConfigError: No model has this name, or the strength is outside 0..1.
     """
 
     model: str | Model = DEFAULT_MODEL
+    strength: float = 0.0
     send_texture: bool = False
     start_steps: tuple[int, ...] = ()
     name: ClassVar[str] = NAME
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "strength", check_strength(self.strength))
         _ = self.network  # rejects an unknown name at once
 
     @cached_property
     def network(self) -> Model:
         """The model that encodes."""
-        return shipped_models(self.model)[0] if isinstance(self.model, str) else self.model
+        if isinstance(self.model, str):
+            return shipped_models(self.model, despeckled=self.strength > 0)[0]
+        return replace(self.model, sends_strength=self.strength > 0)
 
     @property
     def codec_id(self) -> int:
@@ -303,16 +310,18 @@ class EmbCodec:
         Raises:
             StreamError: As for `encode`.
         """
-        grey, header = encoder_input(self, image)
+        original, header = encoder_input(self, image)
+        grey = despeckled(original, self.strength)
         budget = max(64, grey.size // 25) if budget_bytes is None else budget_bytes
         limit = min(budget - header.size, MAX_BODY_BYTES)
         if limit < MIN_BODY_BYTES:
             raise StreamError("codec emb", "budget_bytes", budget, f"at least {header.size + MIN_BODY_BYTES} B")
         mean_index = min((int(grey.astype(np.int64).sum()) // grey.size + MEAN_STEP // 2) // MEAN_STEP, 63)
         targets = _targets(grey, mean_index * MEAN_STEP, region, limit, self.network)
-        texture = measure_speckle(grey, targets.layout) if self.send_texture else None
+        texture = measure_speckle(original, targets.layout) if self.send_texture else None
         encoder = TrialEncoder(self.network, limit, _PRICE)
-        best = encoder.best(targets, mean_index, region, texture, self.start_steps)
+        sent = SideInfo(mean_index, 0, region, texture, strength=round(self.strength * STRENGTH_STEPS))
+        best = encoder.best(targets, sent, self.start_steps)
         estimate = error_by_length(best.curve, len(best.body), header.size, grey.size)
         return Encoded(header.pack() + best.body, estimate)
 
@@ -326,6 +335,7 @@ class EmbCodec:
         limit = min(budget_bytes - header.size, MAX_BODY_BYTES)
         if side.start_step < 0 or limit < len(stream) - header.size:
             return stream
+        grey = despeckled(grey, side.strength / STRENGTH_STEPS)
         targets = _targets(grey, side.mean, side.region, limit, model)
         targets = replace(targets, targets=constrained_targets(targets.targets, state, side))
         encoder = TrialEncoder(model, limit, price=0, prefix=stream[header.size : -1])
@@ -342,7 +352,9 @@ class EmbCodec:
         state, side = read_body(body, layout_of(header.height_px, header.width_px), model)
         if side.mean_index < 0:
             return DecodedImage.all_missing(header, [*notes, "too few bytes arrived for an image"])
-        return DecodedImage.without_gaps(decoded_image(state, side, model), notes)
+        known = side.start_step >= 0 or not model.sends_strength
+        strength = side.strength / STRENGTH_STEPS if known else None
+        return DecodedImage.without_gaps(decoded_image(state, side, model), notes, strength)
 
     def speckle_layer(self, stream: bytes) -> npt.NDArray[np.int16]:
         """Return the synthetic speckle that the decoded image lacks, as grey levels to add, shape of the image, int16.
@@ -374,7 +386,8 @@ class EmbCodec:
 
 
 def _codec_id_of(model: Model) -> int:
-    return CODEC_IDS["standard" if model.perceptual is None else "structure"]
+    codec_ids = DESPECKLED_CODEC_IDS if model.sends_strength else CODEC_IDS
+    return codec_ids["standard" if model.perceptual is None else "structure"]
 
 
 def _targets(grey: Image, mean: int, region: RegionOfInterest | None, limit: int, model: Model) -> TargetCoefficients:
@@ -390,11 +403,14 @@ def _model_of(stream: bytes, own: Model) -> tuple[Model, StreamHeader]:
         StreamError: The header is invalid, or the stream belongs to another codec or an unknown model.
     """
     header = StreamHeader.unpack(stream)
-    name = next((name for name, codec_id in CODEC_IDS.items() if codec_id == header.codec_id), None)
+    despeckled_stream = header.codec_id in DESPECKLED_CODEC_IDS.values()
+    codec_ids = DESPECKLED_CODEC_IDS if despeckled_stream else CODEC_IDS
+    name = next((name for name, codec_id in codec_ids.items() if codec_id == header.codec_id), None)
     if name is None:
-        expected = " or ".join(f"{codec_id:#04x}" for codec_id in CODEC_IDS.values())
+        known = (*CODEC_IDS.values(), *DESPECKLED_CODEC_IDS.values())
+        expected = " or ".join(f"{codec_id:#04x}" for codec_id in known)
         raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", f"{expected} ({NAME})")
-    models = shipped_models(name)
+    models = shipped_models(name, despeckled=despeckled_stream)
     if header.codec_id == _codec_id_of(own):
         models = (own, *models)
     for model in models:

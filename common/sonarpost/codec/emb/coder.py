@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from sonarpost.codec.emb import kernel
+from sonarpost.codec.emb import kernel, range_coder
 from sonarpost.codec.emb.kernel import I16, I32, I64, U8
 from sonarpost.codec.emb.transform import Layout
 
@@ -58,9 +58,9 @@ class Coder:
     """The range coder with its input or output.
 
     Attributes:
-        mode: `kernel.WRITE`, `READ` or `COLLECT`.
+        mode: `range_coder.WRITE`, `READ` or `COLLECT`.
         data: Bytes to read, or written so far.
-        words: State of the coder; see `kernel`.
+        words: State of the coder; see `range_coder`.
         best: The best complete stream so far (WRITE).
         curve: Squared error by number of bytes (WRITE); `curve[0]` is the current error.
         decisions: Training examples of decisions (COLLECT).
@@ -69,7 +69,7 @@ class Coder:
 
     mode: int
     data: U8
-    words: I64 = field(default_factory=lambda: np.zeros(kernel.CODER_WORDS, np.int64))
+    words: I64 = field(default_factory=lambda: np.zeros(range_coder.CODER_WORDS, np.int64))
     best: U8 = field(default_factory=lambda: np.zeros(0, np.uint8))
     curve: I64 = field(default_factory=lambda: np.zeros(1, np.int64))
     decisions: I16 = field(default_factory=lambda: np.zeros((0, kernel.FEATURES + 3), np.int16))
@@ -78,8 +78,8 @@ class Coder:
     @classmethod
     def reader(cls, body: bytes) -> Coder:
         """Return a coder that reads a body."""
-        coder = cls(kernel.READ, np.frombuffer(body, np.uint8).copy())
-        kernel.start_reading(coder.words, coder.data)
+        coder = cls(range_coder.READ, np.frombuffer(body, np.uint8).copy())
+        range_coder.start_reading(coder.words, coder.data)
         return coder
 
     @classmethod
@@ -88,30 +88,30 @@ class Coder:
 
         The first bits written must be those of `prefix`. Later bits are inverted if they would change the prefix.
         """
-        coder = cls(kernel.WRITE, np.zeros(limit_bytes + 8, np.uint8))
+        coder = cls(range_coder.WRITE, np.zeros(limit_bytes + 8, np.uint8))
         coder.best = np.zeros(limit_bytes, np.uint8)
         coder.curve = np.full(limit_bytes + 2, -1, np.int64)
-        coder.words[kernel.CODER_RANGE] = (1 << 32) - 1
-        coder.words[kernel.CODER_LIMIT] = limit_bytes
-        coder.words[kernel.CODER_PREFIX] = len(prefix)
+        coder.words[range_coder.CODER_RANGE] = (1 << 32) - 1
+        coder.words[range_coder.CODER_LIMIT] = limit_bytes
+        coder.words[range_coder.CODER_PREFIX] = len(prefix)
         coder.best[: len(prefix)] = np.frombuffer(prefix, np.uint8)
         return coder
 
     def record_error(self) -> None:
         """Store the current squared error as that of the bytes so far."""
-        position = 1 + (int(self.words[kernel.CODER_COST]) >> 11)
+        position = 1 + (int(self.words[range_coder.CODER_COST]) >> 11)
         self.curve[min(position, len(self.curve) - 1)] = self.curve[0]
 
     def finish(self) -> bytes:
         """Return the shortest body within the budget that determines all bits written."""
-        kernel.finish_writing(self.words, self.data, self.best)
-        return self.best[: int(self.words[kernel.CODER_BEST_LENGTH])].tobytes()
+        range_coder.finish_writing(self.words, self.data, self.best)
+        return self.best[: int(self.words[range_coder.CODER_BEST_LENGTH])].tobytes()
 
     def code_bit(self, bit: int, probability: int = 32768) -> int:
         """Write or read one bit with `probability` / 65536 of 1; return it, or -1 at the end."""
-        if self.mode == kernel.COLLECT:
+        if self.mode == range_coder.COLLECT:
             return bit
-        if self.mode == kernel.WRITE:
+        if self.mode == range_coder.WRITE:
             own = probability if bit else 65536 - probability
-            self.words[kernel.CODER_COST] += round(256 * (16 - np.log2(own)))
-        return int(kernel.code_bit(self.words, self.data, self.best, bit, probability, self.mode))
+            self.words[range_coder.CODER_COST] += round(256 * (16 - np.log2(own)))
+        return int(range_coder.code_bit(self.words, self.data, self.best, bit, probability, self.mode))

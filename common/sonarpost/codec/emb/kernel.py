@@ -1,16 +1,25 @@
-"""The coding loop: contexts, networks, range coder. The same code encodes, decodes and collects training examples.
+"""The coding loop: contexts and networks. The same code encodes, decodes and collects training examples.
 
-All arithmetic is on int32 and int64. docs/explanation/codecs.md describes the format. This is one long module because
-numba recompiles cached machine code only when its own module changes (see `sonarpost.codec.jit`).
+All arithmetic is on int32 and int64. docs/explanation/codecs.md describes the format.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
 
+from sonarpost.codec.emb.range_coder import (
+    CODER_CODE,
+    CODER_COST,
+    CODER_ROWS,
+    CODER_SIGN_ROWS,
+    COLLECT,
+    WRITE,
+    code_bit,
+)
 from sonarpost.codec.emb.transform import (
     CHILD,
     COUSIN_1,
@@ -27,14 +36,13 @@ from sonarpost.codec.emb.transform import (
     STRIDE,
     WIDTH,
 )
-from sonarpost.codec.jit import jit
+from sonarpost.codec.jit import inlined, jit
 
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 I16 = npt.NDArray[np.int16]
 U8 = npt.NDArray[np.uint8]
 
-WRITE, READ, COLLECT = 0, 1, 2
 NEAR, REFINE, ALL = 0, 1, 2
 """Kinds of pass: insignificant coefficients with significant neighbours; significant ones; all insignificant ones."""
 
@@ -61,166 +69,18 @@ _INVERSE_BITS: Final = 54
 _SKIP_NEAR: Final = 384
 _SKIP_FAR: Final = 896
 
-_NEIGHBOURS: Final = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+_int64: Final = cast(Callable[[Any], int], np.int64)
+"""Conversion to int64. Compiled functions call one another with int64 only, so that each has one specialisation."""
 
-# Words of the coder state.
-CODER_LOW, CODER_RANGE, CODER_LENGTH, CODER_CODE, CODER_UNKNOWN, CODER_POSITION, CODER_STOP, CODER_EVENTS = range(8)
-CODER_BEST_EVENTS, CODER_BEST_LENGTH, CODER_COST, CODER_ROWS, CODER_SIGN_ROWS, CODER_LIMIT, CODER_PREFIX = range(8, 15)
-CODER_WORDS: Final = 15
-_TOP: Final = 1 << 32
-_BOTTOM: Final = 1 << 24
-
-
-@jit
-def start_reading(coder: I64, data: U8) -> None:
-    """Load the first four bytes. Missing bytes are unknown."""
-    coder[CODER_RANGE] = _TOP - 1
-    for _ in range(4):
-        _next_byte(coder, data)
-    # Only a damaged stream has a code that is not below the range.
-    coder[CODER_CODE] = min(coder[CODER_CODE], coder[CODER_RANGE] - 1)
+# Neighbours of a coefficient: steps down and to the right.
+_CROSS: Final = np.array([(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)], np.int64)
+_SIDES: Final = np.array([(0, -1), (0, 1), (-1, 0), (1, 0)], np.int64)
+_CORNERS: Final = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)], np.int64)
+_DISTANT: Final = np.array([(0, -2), (0, 2), (-2, 0), (2, 0)], np.int64)
+_AROUND: Final = np.array([(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)], np.int64)
 
 
-@jit
-def _next_byte(coder: I64, data: U8) -> None:
-    position = coder[CODER_POSITION]
-    if position < data.shape[0]:
-        coder[CODER_CODE] = (coder[CODER_CODE] << 8) | data[position]
-        coder[CODER_UNKNOWN] <<= 8
-    else:
-        coder[CODER_CODE] <<= 8
-        coder[CODER_UNKNOWN] = (coder[CODER_UNKNOWN] << 8) | 255
-    coder[CODER_POSITION] = position + 1
-
-
-@jit
-def _read_bit(coder: I64, data: U8, probability: int) -> int:
-    """Read a bit with probability `probability` / 65536 of 1; -1 if the available bytes do not determine it."""
-    bound = (coder[CODER_RANGE] >> 16) * probability
-    code = coder[CODER_CODE]
-    if code >= bound:
-        bit = 0
-        coder[CODER_CODE] = code - bound
-        coder[CODER_RANGE] -= bound
-    elif code + coder[CODER_UNKNOWN] < bound:
-        bit = 1
-        coder[CODER_RANGE] = bound
-    else:
-        coder[CODER_STOP] = 1
-        return -1
-    while coder[CODER_RANGE] < _BOTTOM:
-        _next_byte(coder, data)
-        coder[CODER_RANGE] <<= 8
-    return bit
-
-
-@jit
-def _bit_with_prefix(coder: I64, data: U8, best: U8, bit: int, bound: int) -> int:
-    """Return `bit`, or its opposite if only that gives a stream with the first CODER_PREFIX bytes of `best`.
-
-    The final code value lies in [low, low + range). It must also lie in [first, first + size).
-    """
-    length, prefix = coder[CODER_LENGTH], coder[CODER_PREFIX]
-    first, size = np.int64(0), np.int64(_TOP)
-    for i in range(prefix, length):
-        if data[i] != 255:  # no carry passes this byte
-            return bit
-    for i in range(min(length, prefix)):
-        if data[i] != best[i]:
-            first = np.int64(_TOP)  # only a carry makes them equal
-    for i in range(min(prefix - length, 4)):
-        size >>= 8
-        first += np.int64(best[length + i]) * size
-    low, split, end = coder[CODER_LOW], coder[CODER_LOW] + bound, coder[CODER_LOW] + coder[CODER_RANGE]
-    if bit == 1 and split <= first:
-        return 0
-    if bit == 0 and split >= first + size and low < first + size and end > first:
-        return 1
-    return bit
-
-
-@jit
-def _write_bit(coder: I64, data: U8, best: U8, bit: int, probability: int) -> int:
-    """Write a bit and return the bit written (see `_bit_with_prefix`).
-
-    Stops when a stream of CODER_LIMIT bytes cannot distinguish it from its opposite.
-    """
-    bound = (coder[CODER_RANGE] >> 16) * probability
-    if coder[CODER_PREFIX] > 0:
-        bit = _bit_with_prefix(coder, data, best, bit, bound)
-    if bit:
-        coder[CODER_RANGE] = bound
-    else:
-        coder[CODER_LOW] += bound
-        coder[CODER_RANGE] -= bound
-    while coder[CODER_RANGE] < _BOTTOM:
-        length = coder[CODER_LENGTH]
-        if length >= coder[CODER_LIMIT]:
-            coder[CODER_STOP] = 1
-            return bit
-        if coder[CODER_LOW] >> 32:
-            _carry(data, length)
-        data[length] = (coder[CODER_LOW] >> 24) & 255
-        coder[CODER_LENGTH] = length + 1
-        coder[CODER_LOW] = (coder[CODER_LOW] & 0xFFFFFF) << 8
-        coder[CODER_RANGE] <<= 8
-    coder[CODER_EVENTS] += 1
-    _save_if_complete(coder, data, best)
-    return bit
-
-
-@jit
-def _carry(data: U8, length: int) -> None:
-    position = length - 1
-    while data[position] == 255:
-        data[position] = 0
-        position -= 1
-    data[position] += 1
-
-
-@jit
-def _save_if_complete(coder: I64, data: U8, best: U8) -> None:
-    """Store a stream of CODER_LIMIT bytes that determines all bits so far in `best`, if there is one."""
-    length = coder[CODER_LENGTH]
-    left = coder[CODER_LIMIT] - length
-    if left > 4:
-        return
-    cell = 1 << (32 - 8 * left)
-    value = (coder[CODER_LOW] + cell - 1) // cell * cell
-    if value + cell > coder[CODER_LOW] + coder[CODER_RANGE]:
-        return
-    best[:length] = data[:length]
-    if value >> 32:
-        _carry(best, length)
-    for i in range(left):
-        best[length + i] = (value >> (24 - 8 * i)) & 255
-    coder[CODER_BEST_EVENTS] = coder[CODER_EVENTS]
-    coder[CODER_BEST_LENGTH] = length + left
-
-
-@jit
-def finish_writing(coder: I64, data: U8, best: U8) -> None:
-    """Store the shortest stream that determines all bits in `best`, unless the budget is used up."""
-    if coder[CODER_STOP]:
-        return
-    limit = coder[CODER_LIMIT]
-    coder[CODER_BEST_EVENTS] = -1
-    for left in range(5):
-        coder[CODER_LIMIT] = min(coder[CODER_LENGTH] + left, limit)
-        if coder[CODER_BEST_EVENTS] < coder[CODER_EVENTS]:
-            _save_if_complete(coder, data, best)
-
-
-@jit
-def code_bit(coder: I64, data: U8, best: U8, bit: int, probability: int, mode: int) -> int:
-    """Write or read one bit of known probability; return it, or -1 at the end."""
-    if mode == READ:
-        return _read_bit(coder, data, probability)
-    bit = _write_bit(coder, data, best, bit, probability)
-    return -1 if coder[CODER_STOP] else bit
-
-
-@jit
+@inlined
 def _clip(value: int, limit: int) -> int:
     return min(max(value, -limit), limit)
 
@@ -253,32 +113,42 @@ def _sum_around(plane: I32, at: int, stride: int) -> int:
 
 
 @jit
+def _gather(f: I32, first: int, plane: I32, at: int, stride: int, places: I64) -> None:
+    """Store neighbours of a cell in `f` from index `first`. `places` has shape (neighbours, 2): steps down and right.
+
+    `first` is an int64, because a literal number gives a specialisation of its own.
+    """
+    for i in range(places.shape[0]):
+        f[first + i] = plane[at + places[i, 0] * stride + places[i, 1]]
+
+
+@jit
 def _cell_index(bands: I32, row: int, y: int, x: int) -> int:
     """Return the flat index of a cell, clipped to the band; -1 for an empty band."""
-    height, width = bands[row, HEIGHT], bands[row, WIDTH]
+    height, width = _int64(bands[row, HEIGHT]), _int64(bands[row, WIDTH])
     if height == 0 or width == 0:
         return -1
     return int(bands[row, OFFSET] + min(y, height - 1) * bands[row, STRIDE] + min(x, width - 1))
 
 
-@jit
+@inlined
 def _has_significant_neighbour(sizes: I32, bands: I32, row: int, y: int, x: int, at: int) -> bool:
     """Return whether a neighbour, the parent or a sibling is significant, or the band has no parent."""
     if bands[row, PARENT] < 0:
         return True
-    if _sum_around(sizes, at, bands[row, STRIDE]) > 0:
+    if _sum_around(sizes, at, _int64(bands[row, STRIDE])) > 0:
         return True
-    parent = _cell_index(bands, bands[row, PARENT], y >> 1, x >> 1)
+    parent = _cell_index(bands, _int64(bands[row, PARENT]), y >> 1, x >> 1)
     if parent >= 0 and sizes[parent] > 0:
         return True
-    for column in (SIBLING_1, SIBLING_2):
+    for column in range(SIBLING_1, SIBLING_2 + 1):
         sibling = bands[row, column]
         if sibling >= 0 and sizes[bands[sibling, OFFSET] + y * bands[sibling, STRIDE] + x] > 0:
             return True
     return False
 
 
-@jit
+@inlined
 def _quotient(size: int, threshold: int, inverse: int) -> int:
     """Return min(size // threshold, MAX_EIGHTHS) without a division; `inverse` is 2^54 // threshold + 1.
 
@@ -304,7 +174,7 @@ def _context(  # noqa: C901, PLR0912, PLR0915  44 features, one after the other
     at: int,
 ) -> None:
     """Compute the features of one coefficient. The band features at the end of `f` are set already."""
-    stride = bands[row, STRIDE]
+    stride = _int64(bands[row, STRIDE])
     f[0], f[1] = sizes[at - 1], sizes[at - stride]
     f[2], f[3] = sizes[at - stride - 1], sizes[at - stride + 1]
     f[4], f[5] = sizes[at + 1], sizes[at + stride]
@@ -312,7 +182,7 @@ def _context(  # noqa: C901, PLR0912, PLR0915  44 features, one after the other
     f[8], f[9] = sizes[at - 2], sizes[at - 2 * stride]
     f[10], f[11] = sizes[at + 2], sizes[at + 2 * stride]
     f[12] = sizes[at]
-    window = 0
+    window = _int64(0)
     for dy in range(-2, 3):
         line = at + dy * stride
         window += sizes[line - 2] + sizes[line - 1] + sizes[line] + sizes[line + 1] + sizes[line + 2]
@@ -326,38 +196,40 @@ def _context(  # noqa: C901, PLR0912, PLR0915  44 features, one after the other
         f[31], f[32] = min(y, 8) * 4, min(x, 8) * 4
         f[33] = 32 if y == 0 and x == 0 else 0
         return
-    parent = bands[row, PARENT]
+    parent = _int64(bands[row, PARENT])
     if parent >= 0:
         cell = _cell_index(bands, parent, y >> 1, x >> 1)
         if cell >= 0:
-            width = bands[parent, STRIDE]
+            width = _int64(bands[parent, STRIDE])
             f[14], f[15] = sizes[cell], _sum_around(sizes, cell, width) >> 1
             f[43] += insignificant[cell] * 16
             f[16], f[17] = sizes[cell - 1] + sizes[cell + 1], sizes[cell - width] + sizes[cell + width]
             # The parent's neighbour on the side of this coefficient.
             f[18] = sizes[cell + (1 if x & 1 else -1)]
             f[19] = sizes[cell + (width if y & 1 else -width)]
-        grand = bands[parent, PARENT]
+        grand = _int64(bands[parent, PARENT])
         if grand >= 0:
             cell = _cell_index(bands, grand, y >> 2, x >> 2)
             if cell >= 0:
-                f[20], f[21] = sizes[cell], _sum_around(sizes, cell, bands[grand, STRIDE]) >> 1
+                f[20], f[21] = sizes[cell], _sum_around(sizes, cell, _int64(bands[grand, STRIDE])) >> 1
     for k in range(2):
-        sibling = bands[row, SIBLING_1 + k]
+        sibling = _int64(bands[row, SIBLING_1 + k])
         if sibling >= 0:
-            cell = bands[sibling, OFFSET] + y * bands[sibling, STRIDE] + x
-            f[22 + 2 * k], f[23 + 2 * k] = sizes[cell], _sum_around(sizes, cell, bands[sibling, STRIDE]) >> 1
+            width = _int64(bands[sibling, STRIDE])
+            cell = bands[sibling, OFFSET] + y * width + x
+            f[22 + 2 * k], f[23 + 2 * k] = sizes[cell], _sum_around(sizes, cell, width) >> 1
             f[43] += insignificant[cell] * 16
-        following = bands[row, NEXT_1 + k]
+        following = _int64(bands[row, NEXT_1 + k])
         if following >= 0:
             cell = _cell_index(bands, following, y, x)
             if cell >= 0:
-                f[34 + 2 * k], f[35 + 2 * k] = sizes[cell], _sum_around(sizes, cell, bands[following, STRIDE]) >> 1
-        cousin = bands[row, COUSIN_1 + k]
+                width = _int64(bands[following, STRIDE])
+                f[34 + 2 * k], f[35 + 2 * k] = sizes[cell], _sum_around(sizes, cell, width) >> 1
+        cousin = _int64(bands[row, COUSIN_1 + k])
         if cousin >= 0:
             cell = _cell_index(bands, cousin, y >> 1, x >> 1)
             if cell >= 0:
-                f[38 + k] = (sizes[cell] + _sum_around(sizes, cell, bands[cousin, STRIDE])) >> 1
+                f[38 + k] = (sizes[cell] + _sum_around(sizes, cell, _int64(bands[cousin, STRIDE]))) >> 1
     child = bands[row, CHILD]
     if child >= 0:
         cell = bands[child, OFFSET] + 2 * y * bands[child, STRIDE] + 2 * x
@@ -365,18 +237,21 @@ def _context(  # noqa: C901, PLR0912, PLR0915  44 features, one after the other
         f[26] = (sizes[cell] + sizes[cell + 1] + sizes[below] + sizes[below + 1]) >> 1
     low_stride = low_width + 2
     here = bands[row, LOW] + (y + 1) * low_stride + x + 1
-    level = bands[row, LEVEL]
-    grey = max(lows[here] >> level, 256)  # 1/64 grey, at least 4 grey
-    f[27] = min(log2_eighths(grey), 120) - 80
-    across = abs(lows[here + 1] - lows[here - 1])
-    along = abs(lows[here + low_stride] - lows[here - low_stride])
-    f[28], f[29] = _quotient(across * 4, threshold, inverse), _quotient(along * 4, threshold, inverse)
-    curvature = abs(
-        4 * lows[here] - lows[here + 1] - lows[here - 1] - lows[here + low_stride] - lows[here - low_stride]
-    )
-    f[30] = _quotient(curvature * 2, threshold, inverse)
-    neighbours = lows[here + 1] + lows[here - 1] + lows[here + low_stride] + lows[here - low_stride]
-    f[31] = min(log2_eighths(max(neighbours >> (level + 2), 256)), 120) - 80
+    level = _int64(bands[row, LEVEL])
+    middle, left, right = _int64(lows[here]), _int64(lows[here - 1]), _int64(lows[here + 1])
+    above, below = _int64(lows[here - low_stride]), _int64(lows[here + low_stride])
+    total = left + right + above + below
+    f[27] = min(log2_eighths(max(middle >> level, 256)), 120) - 80  # 1/64 grey, at least 4 grey
+    f[28] = _quotient(abs(right - left) * 4, threshold, inverse)
+    f[29] = _quotient(abs(below - above) * 4, threshold, inverse)
+    f[30] = _quotient(abs(4 * middle - total) * 2, threshold, inverse)
+    f[31] = min(log2_eighths(max(total >> (level + 2), 256)), 120) - 80
+
+
+@inlined
+def _active(total: int, shift: int) -> int:
+    """Return the activation of a hidden unit: 1/256, never negative."""
+    return min(max(total >> shift, 0), 4095)
 
 
 @jit
@@ -392,7 +267,7 @@ def _logit(f: I32, base: I32, w1: I32, w2: I32, b2: I32, last_layer: I64, h1: I3
     for j in range(HIDDEN_2):
         h2[j] = b2[j]
     for j in range(HIDDEN_1):
-        h1[j] = min(max(h1[j] >> 6, 0), 4095)
+        h1[j] = _active(_int64(h1[j]), 6)
     for i in range(0, HIDDEN_1, 8):
         p, q, r, s = h1[i], h1[i + 1], h1[i + 2], h1[i + 3]
         t, u, v, w = h1[i + 4], h1[i + 5], h1[i + 6], h1[i + 7]
@@ -401,26 +276,26 @@ def _logit(f: I32, base: I32, w1: I32, w2: I32, b2: I32, last_layer: I64, h1: I3
                 p * w2[i, j] + q * w2[i + 1, j] + r * w2[i + 2, j] + s * w2[i + 3, j]
                 + t * w2[i + 4, j] + u * w2[i + 5, j] + v * w2[i + 6, j] + w * w2[i + 7, j]
             )  # fmt: skip
-    total = np.int64(last_layer[HIDDEN_2]) * 256
+    total = _int64(last_layer[HIDDEN_2]) * 256
     for i in range(h2.shape[0]):
-        h2[i] = min(max(h2[i] >> 12, 0), 4095)
-        total += np.int64(h2[i]) * last_layer[i]
-    return _clip(int(total >> 28), LOGIT_LIMIT)
+        h2[i] = _active(_int64(h2[i]), 12)
+        total += _int64(h2[i]) * last_layer[i]
+    return _clip(total >> 28, LOGIT_LIMIT)
 
 
-@jit
+@inlined
 def _adapt(last_layer: I64, h2: I32, bit: int, probability: int) -> None:
     """Update the weights of the last layer by gradient descent on the code length of the bit, at a rate of 1/256.
 
     Units: error 1/2^16, hidden units 1/2^8, weights 1/2^28.
     """
-    error = np.int64((bit << 16) - probability)
+    error = _int64((bit << 16) - probability)
     for i in range(h2.shape[0]):
         last_layer[i] = min(max(last_layer[i] + ((error * h2[i]) >> 4), -_LIVE_LIMIT), _LIVE_LIMIT)
     last_layer[HIDDEN_2] = min(max(last_layer[HIDDEN_2] + (error << 4), -_LIVE_LIMIT), _LIVE_LIMIT)
 
 
-@jit
+@inlined
 def band_base(f: I32, w1: I32, b1: I32, base: I32) -> None:
     """Compute the contribution of the band features to the first layer."""
     for j in range(base.shape[0]):
@@ -431,55 +306,40 @@ def band_base(f: I32, w1: I32, b1: I32, base: I32) -> None:
 
 
 @jit
-def _cross(f: I32, first: int, signed: I32, at: int, stride: int) -> None:
-    """Store a signed coefficient and its neighbours left, right, above, below."""
-    f[first] = signed[at]
-    f[first + 1], f[first + 2] = signed[at - 1], signed[at + 1]
-    f[first + 3], f[first + 4] = signed[at - stride], signed[at + stride]
-
-
-@jit
-def _corners(f: I32, first: int, signed: I32, at: int, stride: int) -> None:
-    """Store the four diagonal neighbours of a signed coefficient."""
-    f[first], f[first + 1] = signed[at - stride - 1], signed[at - stride + 1]
-    f[first + 2], f[first + 3] = signed[at + stride - 1], signed[at + stride + 1]
-
-
-@jit
-def _sign_context(  # noqa: C901, PLR0912  61 features, one after the other
+def _sign_context(  # noqa: C901, PLR0912, PLR0915  61 features, one after the other
     f: I32, signed: I32, lows: I32, bands: I32, low_width: int, threshold: int, row: int, y: int, x: int, at: int
 ) -> None:
     """Compute the sign features of a coefficient: signed neighbours (odd features) and its position (even features)."""
-    stride, level = bands[row, STRIDE], bands[row, LEVEL]
+    stride, level = _int64(bands[row, STRIDE]), _int64(bands[row, LEVEL])
     for i in range(SIGN_FEATURES):
         f[i] = 0
-    f[0], f[1] = signed[at - 1], signed[at + 1]
-    f[2], f[3] = signed[at - stride], signed[at + stride]
-    _corners(f, 11, signed, at, stride)
+    _gather(f, _int64(0), signed, at, stride, _SIDES)
+    _gather(f, _int64(11), signed, at, stride, _CORNERS)
     f[4], f[5] = f[11] - f[12], f[14] - f[13]
-    f[15], f[16], f[17], f[18] = signed[at - 2], signed[at + 2], signed[at - 2 * stride], signed[at + 2 * stride]
+    _gather(f, _int64(15), signed, at, stride, _DISTANT)
     f[SIGN_ODD], f[SIGN_ODD + 1] = (x & 1) * 16, (y & 1) * 16
     f[SIGN_ODD + 2], f[SIGN_ODD + 3] = min(y, 8) * 2, min(x, 8) * 2
     f[SIGN_ODD + 3 + min(level, 5)] = 16
     if bands[row, ORIENT] != LL:
-        parent = bands[row, PARENT]
+        parent = _int64(bands[row, PARENT])
         if parent >= 0:
             cell = _cell_index(bands, parent, y >> 1, x >> 1)
             if cell >= 0:
-                width = bands[parent, STRIDE]
+                width = _int64(bands[parent, STRIDE])
                 f[6] = signed[cell]
-                f[19], f[20] = signed[cell - 1], signed[cell + 1]
-                f[21], f[22] = signed[cell - width], signed[cell + width]
-                _corners(f, 23, signed, cell, width)
+                _gather(f, _int64(19), signed, cell, width, _SIDES)
+                _gather(f, _int64(23), signed, cell, width, _CORNERS)
         for k in range(2):
-            sibling, following, cousin = bands[row, SIBLING_1 + k], bands[row, NEXT_1 + k], bands[row, COUSIN_1 + k]
-            if sibling >= 0:
-                width = bands[sibling, STRIDE]
-                _cross(f, 27 + 5 * k, signed, bands[sibling, OFFSET] + y * width + x, width)
-            if following >= 0:
-                cell = _cell_index(bands, following, y, x)
-                if cell >= 0:
-                    _cross(f, 27 + 5 * k, signed, cell, bands[following, STRIDE])
+            # A band has either sibling k or following band k.
+            beside, cell = _int64(bands[row, SIBLING_1 + k]), _int64(-1)
+            if beside >= 0:
+                cell = bands[beside, OFFSET] + y * bands[beside, STRIDE] + x
+            if bands[row, NEXT_1 + k] >= 0:
+                beside = _int64(bands[row, NEXT_1 + k])
+                cell = _cell_index(bands, beside, y, x)
+            if cell >= 0:
+                _gather(f, 27 + 5 * k, signed, cell, _int64(bands[beside, STRIDE]), _CROSS)
+            cousin = _int64(bands[row, COUSIN_1 + k])
             if cousin >= 0:
                 cell = _cell_index(bands, cousin, y >> 1, x >> 1)
                 if cell >= 0:
@@ -491,15 +351,16 @@ def _sign_context(  # noqa: C901, PLR0912  61 features, one after the other
             f[39], f[40], f[41], f[42] = signed[cell], signed[cell + 1], signed[below], signed[below + 1]
         low_stride = low_width + 2
         here = bands[row, LOW] + (y + 1) * low_stride + x + 1
+        middle = _int64(lows[here])
         for i in range(8):
-            beside = here + _NEIGHBOURS[i][0] * low_stride + _NEIGHBOURS[i][1]
-            f[43 + i] = _clip((lows[beside] - lows[here]) * 4 // threshold, MAX_EIGHTHS)
-        f[7] = _clip((lows[here + 1] - lows[here - 1]) * 4 // threshold, MAX_EIGHTHS)
-        f[8] = _clip((lows[here + low_stride] - lows[here - low_stride]) * 4 // threshold, MAX_EIGHTHS)
-        f[9] = _clip((lows[here + 1] + lows[here - 1] - 2 * lows[here]) * 4 // threshold, MAX_EIGHTHS)
-        f[10] = _clip(
-            (lows[here + low_stride] + lows[here - low_stride] - 2 * lows[here]) * 4 // threshold, MAX_EIGHTHS
-        )
+            change = _int64(lows[here + _AROUND[i, 0] * low_stride + _AROUND[i, 1]]) - middle
+            f[43 + i] = _clip(change * 4 // threshold, MAX_EIGHTHS)
+        right, left = _int64(lows[here + 1]), _int64(lows[here - 1])
+        below, above = _int64(lows[here + low_stride]), _int64(lows[here - low_stride])
+        f[7] = _clip((right - left) * 4 // threshold, MAX_EIGHTHS)
+        f[8] = _clip((below - above) * 4 // threshold, MAX_EIGHTHS)
+        f[9] = _clip((right + left - 2 * middle) * 4 // threshold, MAX_EIGHTHS)
+        f[10] = _clip((below + above - 2 * middle) * 4 // threshold, MAX_EIGHTHS)
     nonzero = 0
     for i in range(6):
         if f[i] != 0:
@@ -508,27 +369,26 @@ def _sign_context(  # noqa: C901, PLR0912  61 features, one after the other
 
 
 @jit
-def _active(total: int) -> int:
-    """Return the activation of a hidden unit of the sign network: 1/256, never negative."""
-    return min(max(total >> 6, 0), 4095)
+def _sign_logit(f: I32, b1: I32, w1: I32, w2: I32, orient: int, sums: I32) -> int:
+    """Return the logit of a positive sign, an odd function of the odd features. One network for each orientation.
 
-
-@jit
-def _sign_logit(f: I32, base: I32, w1: I32, w2: I32, orient: int) -> int:
-    """Return the logit of a positive sign, an odd function of the odd features. One network for each orientation."""
-    odd, even = np.zeros(SIGN_HIDDEN, np.int32), base.copy()
+    `sums` has 2 * SIGN_HIDDEN cells and is overwritten: sums over the odd features, sums over the others.
+    """
+    for j in range(SIGN_HIDDEN):
+        sums[j], sums[SIGN_HIDDEN + j] = 0, b1[orient, j]
     for i in range(SIGN_FEATURES):
         if f[i] != 0:
-            target = odd if i < SIGN_ODD else even
+            start = 0 if i < SIGN_ODD else SIGN_HIDDEN
             for j in range(SIGN_HIDDEN):
-                target[j] += f[i] * w1[orient, i, j]
-    total = np.int64(0)
+                sums[start + j] += f[i] * w1[orient, i, j]
+    total = _int64(0)
     for j in range(SIGN_HIDDEN):
-        total += np.int64(_active(even[j] + odd[j]) - _active(even[j] - odd[j])) * w2[orient, j]
-    return _clip(int(total >> 12), LOGIT_LIMIT)
+        odd, even = _int64(sums[j]), _int64(sums[SIGN_HIDDEN + j])
+        total += (_active(even + odd, 6) - _active(even - odd, 6)) * w2[orient, j]
+    return _clip(total >> 12, LOGIT_LIMIT)
 
 
-@jit
+@inlined
 def _reconstruct(lower: int, width: int, logit: int, centres: I32) -> int:
     """Return the mean magnitude of coefficients in this interval with this logit. Unlikely ones are smaller."""
     size = min(lower // width, 4) - 1
@@ -540,7 +400,10 @@ def _reconstruct(lower: int, width: int, logit: int, centres: I32) -> int:
 def reconstruct(lower: I32, widths: I32, signs: I32, logits: I32, centres: I32, out: I32) -> None:
     """Write the reconstruction value of every coefficient to `out`."""
     for at in range(lower.shape[0]):
-        out[at] = signs[at] * _reconstruct(lower[at], widths[at], logits[at], centres) if lower[at] > 0 else 0
+        value = _int64(0)
+        if lower[at] > 0:
+            value = _reconstruct(_int64(lower[at]), _int64(widths[at]), _int64(logits[at]), centres)
+        out[at] = signs[at] * value
 
 
 @jit
@@ -552,7 +415,7 @@ def update_sizes(lower: I32, widths: I32, signs: I32, sizes: I32, signed: I32, t
             signed[at] = sizes[at] * signs[at]
 
 
-@jit
+@inlined
 def _collect_decision(rows: I16, coder: I64, f: I32, bit: int, net: int, interval: int) -> None:
     """Store a training example, one of `interval` on average, chosen by a reproducible random number."""
     coder[CODER_CODE] = (coder[CODER_CODE] * 1103515245 + 12345) & 0x7FFFFFFF
@@ -565,7 +428,7 @@ def _collect_decision(rows: I16, coder: I64, f: I32, bit: int, net: int, interva
     coder[CODER_ROWS] = n + 1
 
 
-@jit
+@inlined
 def _collect_sign(rows: I16, coder: I64, f: I32, orient: int, sign: int) -> None:
     n = coder[CODER_SIGN_ROWS]
     if n >= rows.shape[0]:
@@ -576,22 +439,26 @@ def _collect_sign(rows: I16, coder: I64, f: I32, orient: int, sign: int) -> None
     coder[CODER_SIGN_ROWS] = n + 1
 
 
-@jit
+@inlined
 def _transfer(mode: int, bit: int, logit: int, probabilities: I32, costs: I32, coder: I64, data: U8, best: U8) -> int:
     """Write `bit`, or read one; return it, or -1 at the end."""
-    probability = probabilities[logit + LOGIT_LIMIT]
-    if mode == READ:
-        return _read_bit(coder, data, probability)
-    bit = _write_bit(coder, data, best, bit, probability)
-    coder[CODER_COST] += costs[(logit if bit else -logit) + LOGIT_LIMIT]
-    return -1 if coder[CODER_STOP] else bit
+    coded = code_bit(coder, data, best, bit, _int64(probabilities[logit + LOGIT_LIMIT]), mode)
+    if mode == WRITE and coded >= 0:
+        coder[CODER_COST] += costs[(logit if coded else -logit) + LOGIT_LIMIT]
+    return coded
 
 
-@jit
+@inlined
 def _is_worthwhile(magnitude: int, threshold: int, reconstruction: int, cost: int, price: int) -> bool:
     """Return whether a significant coefficient removes enough squared error for its bits and its sign bit."""
     size, decoded = magnitude * 16 // threshold, reconstruction * 16 // threshold
     return bool(decoded * (2 * size - decoded) >= (price * (cost + 256)) >> 8)
+
+
+def scratch_arrays() -> tuple[I32, I32, I32, I32, I32]:
+    """Return arrays for `code_band`: base, h1 and h2 of `_logit`, sign features, sums of `_sign_logit`."""
+    base, h1, h2 = (np.zeros(size, np.int32) for size in (HIDDEN_1, HIDDEN_1, HIDDEN_2))
+    return base, h1, h2, np.zeros(SIGN_FEATURES, np.int32), np.zeros(2 * SIGN_HIDDEN, np.int32)
 
 
 @jit
@@ -608,13 +475,13 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  one loop keeps modes and passes 
     targets: I32,
     lows: I32,
     f: I32,
-    bases: I32,
     state: tuple[I32, I32, I32, I32, I32, I32, I32, I32, I32],
-    nets: tuple[I32, I32, I32, I64],
+    nets: tuple[I32, I32, I32, I32, I64],
     sign_nets: tuple[I32, I32, I32],
     tables: tuple[I32, I32, I32],
     stream: tuple[I64, U8, U8, I64, I32],
     examples: tuple[I16, I16],
+    scratch: tuple[I32, I32, I32, I32, I32],
 ) -> int:
     """Code one pass over one band. Returns 0, or -1 at the end of the stream or of the budget.
 
@@ -632,33 +499,33 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  one loop keeps modes and passes 
         targets: The coefficients to code (WRITE, COLLECT), flat, scaled.
         lows: Low-pass images reconstructed so far.
         f: Features. The band features, from BAND_FEATURES, are set.
-        bases: Shape (2, HIDDEN_1): contribution of the band features to the first layer; first axis as in `nets`.
         state: Arrays of `CoefficientState`: lower bound of the magnitude, 0 if not significant; width of the interval;
             sign; magnitude in eighths of the threshold, at most MAX_EIGHTHS; the same with sign; plane that decided
             last, or minus the plane that evaluated last; logit of the last decision or evaluation; 1 if this plane
             decided that the coefficient stays insignificant; scale, 1/256.
-        nets: Weights w1, w2, b2, and the adapted weights w3 and b3, 1/2^28 (see `_adapt`). First axis: 0 significance,
-            1 refinement.
+        nets: Weights w1, b1, w2, b2, and the adapted weights w3 and b3, 1/2^28 (see `_adapt`). First axis: 0
+            significance, 1 refinement.
         sign_nets: Weights w1, b1, w2; first axis: orientation of the band.
         tables: Probability of 1 in 1/65536 and cost of a 1 in 1/256 bit, by logit + LOGIT_LIMIT; reconstruction points
             in 1/256 of the interval, see `_reconstruct`.
         stream: State of the range coder; bytes; the best complete stream so far (WRITE); squared error by number of
             bytes; the original coefficients, flat, to which the error refers.
         examples: Training examples of decisions and of signs (COLLECT).
+        scratch: Arrays for intermediate results; see `scratch_arrays`.
     """
     lower, widths, signs, sizes, signed, planes, logits, insignificant, scale = state
-    w1, w2, b2, last_layer = nets
     sign_w1, sign_b1, sign_w2 = sign_nets
     probabilities, costs, centres = tables
     coder, data, best, curve, originals = stream
-    stride, orient, level = bands[row, STRIDE], bands[row, ORIENT], bands[row, LEVEL]
-    h1, h2 = np.zeros(HIDDEN_1, np.int32), np.zeros(HIDDEN_2, np.int32)
-    sign_features = np.zeros(SIGN_FEATURES, np.int32)
-    inverse = int((1 << _INVERSE_BITS) // np.int64(threshold) + 1)
+    base, h1, h2, sign_features, sums = scratch
+    stride, orient, level = _int64(bands[row, STRIDE]), _int64(bands[row, ORIENT]), _int64(bands[row, LEVEL])
+    inverse = int((1 << _INVERSE_BITS) // _int64(threshold) + 1)
     interval = 12 if level == 1 else 4 if level == 2 else 1
     net = 1 if kind == REFINE else 0
-    for y in range(bands[row, HEIGHT]):
-        for x in range(bands[row, WIDTH]):
+    w1, b1, w2, b2, last_layer = nets[0][net], nets[1][net], nets[2][net], nets[3][net], nets[4][net]
+    band_base(f, w1, b1, base)
+    for y in range(_int64(bands[row, HEIGHT])):
+        for x in range(_int64(bands[row, WIDTH])):
             at = bands[row, OFFSET] + y * stride + x
             if planes[at] == plane or (lower[at] > 0) != (kind == REFINE):
                 continue
@@ -667,10 +534,10 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  one loop keeps modes and passes 
                 continue
             if kind == ALL and logits[at] < min_logit - (_SKIP_NEAR if planes[at] == -plane else _SKIP_FAR):
                 continue
-            magnitude = abs(targets[at])
+            magnitude = abs(_int64(targets[at]))
             bit = 1 if magnitude >= lower[at] + threshold else 0
             _context(f, sizes, insignificant, lows, bands, low_width, threshold, inverse, row, y, x, at)
-            logit = _logit(f, bases[net], w1[net], w2[net], b2[net], last_layer[net], h1, h2)
+            logit = _logit(f, base, w1, w2, b2, last_layer, h1, h2)
             if logit < min_logit:
                 planes[at], logits[at] = -plane, logit
                 continue
@@ -685,8 +552,10 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  one loop keeps modes and passes 
                 if bit < 0:
                     planes[at] = -plane
                     return -1
-                _adapt(last_layer[net], h2, bit, probabilities[logit + LOGIT_LIMIT])
-            before = _reconstruct(lower[at], widths[at], logits[at], centres) if lower[at] > 0 else 0
+                _adapt(last_layer, h2, bit, probabilities[logit + LOGIT_LIMIT])
+            before = 0
+            if lower[at] > 0:
+                before = _reconstruct(_int64(lower[at]), _int64(widths[at]), _int64(logits[at]), centres)
             logits[at] = logit
             if kind == REFINE:
                 # A plane halves the interval, unless its bounds were rescaled.
@@ -698,7 +567,7 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  one loop keeps modes and passes 
                 if mode == COLLECT:
                     _collect_sign(examples[1], coder, sign_features, orient, sign)
                 else:
-                    sign_logit = _sign_logit(sign_features, sign_b1[orient], sign_w1, sign_w2, orient)
+                    sign_logit = _sign_logit(sign_features, sign_b1, sign_w1, sign_w2, orient, sums)
                     sign = _transfer(mode, sign, sign_logit, probabilities, costs, coder, data, best)
                     if sign < 0:
                         planes[at] = -plane
@@ -707,8 +576,8 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  one loop keeps modes and passes 
             if lower[at] > 0:
                 sizes[at] = min((lower[at] + (widths[at] >> 1)) * 8 // threshold, MAX_EIGHTHS)
                 signed[at] = sizes[at] * signs[at]
-                after = _reconstruct(lower[at], widths[at], logits[at], centres)
-                original, own_scale = np.int64(originals[at] * signs[at]), np.int64(scale[at])
+                after = _reconstruct(_int64(lower[at]), _int64(widths[at]), _int64(logits[at]), centres)
+                original, own_scale = _int64(originals[at] * signs[at]), _int64(scale[at])
                 error_after, error_before = original - after * 256 // own_scale, original - before * 256 // own_scale
                 curve[0] += error_after**2 - error_before**2
             else:

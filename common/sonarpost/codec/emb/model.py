@@ -8,7 +8,7 @@ so that their streams always decode; the weights that their networks do not have
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from itertools import pairwise
@@ -102,6 +102,7 @@ class Model:
         image_weights: Shape (IMAGE_FEATURES, CHANNELS): the enhancer's weights of the features of the whole image.
         layers: Taps (9, in, out) and bias (out,) of the enhancer's layers.
         perceptual: Scales of the coefficients; None for a model trained for the least squared error.
+        sends_strength: Whether the side information has the strength of despeckling.
     """
 
     identity: str
@@ -121,6 +122,7 @@ class Model:
     image_weights: I32
     layers: tuple[tuple[I32, I32], ...]
     perceptual: PerceptualWeights | None = None
+    sends_strength: bool = False
 
 
 def read_arrays(raw: bytes, where: str = "emb model") -> dict[str, I32]:
@@ -158,7 +160,7 @@ def model_of(arrays: dict[str, I32], identity: str = "") -> Model:
     for name in ("sign_w1", "sign_b1", "sign_w2"):
         missing = k.SIGN_HIDDEN - own[name].shape[-1]
         own[name] = np.pad(own[name], [(0, 0)] * (own[name].ndim - 1) + [(0, missing)])
-    return Model(identity=identity, layers=layers, perceptual=perceptual, **own)
+    return Model(identity=identity, layers=layers, perceptual=perceptual, sends_strength=False, **own)
 
 
 def _with_zero_rows(weights: I32, at: int, rows: int) -> I32:
@@ -177,8 +179,12 @@ def parse(raw: bytes, where: str = "emb model") -> Model:
 
 
 @cache
-def shipped_models(name: str = DEFAULT_MODEL) -> tuple[Model, ...]:
+def shipped_models(name: str = DEFAULT_MODEL, *, despeckled: bool = False) -> tuple[Model, ...]:
     """Return the shipped models of a name: the current one, then those of earlier releases.
+
+    Args:
+        name: A name in `MODEL_FILES`.
+        despeckled: Whether their streams have the strength of despeckling.
 
     Raises:
         ConfigError: No model has this name.
@@ -186,4 +192,5 @@ def shipped_models(name: str = DEFAULT_MODEL) -> tuple[Model, ...]:
     if name not in MODEL_FILES:
         raise ConfigError("codec emb", "model", name, " or ".join(MODEL_FILES))
     data = files("sonarpost.codec.emb").joinpath("data")
-    return tuple(parse(data.joinpath(file).read_bytes(), file) for file in MODEL_FILES[name])
+    models = (parse(data.joinpath(file).read_bytes(), file) for file in MODEL_FILES[name])
+    return tuple(replace(model, sends_strength=despeckled) for model in models)

@@ -88,39 +88,52 @@ def local_variance(lows: I32, layout: Layout, finest: int, level: int) -> I64:
     """Return the local variance of the low-pass image of level `finest`, in grey squared, for scales of `level`."""
     height, width = (int(n) for n in layout.sides[finest])
     radius, rounds = _WINDOWS[min(level - finest, len(_WINDOWS) - 1)]
-    return np.asarray(_variance(lows, int(layout.low_offsets[finest]), height, width, finest + 3, radius, rounds))
+    moments = np.zeros((2, height, width), np.int64)
+    _variance(lows, int(layout.low_offsets[finest]), finest + 3, radius, rounds, moments, np.zeros_like(moments[0]))
+    return np.asarray(moments[0], np.int64)
 
 
 @jit
-def _box_sum(plane: I64, radius: int) -> I64:
-    """Return the sum over a square around each cell. Outside the image its edge repeats."""
-    height, width = plane.shape
-    across, out = np.zeros_like(plane), np.zeros_like(plane)
-    for y in range(height):
-        for x in range(width):
-            for k in range(-radius, radius + 1):
-                across[y, x] += plane[y, min(max(x + k, 0), width - 1)]
-    for y in range(height):
-        for k in range(-radius, radius + 1):
-            line = min(max(y + k, 0), height - 1)
-            for x in range(width):
-                out[y, x] += across[line, x]
-    return out
+def _variance(  # noqa: C901, PLR0912  one function compiles faster than several
+    lows: I32, start: int, shift: int, radius: int, rounds: int, moments: I64, across: I64
+) -> None:
+    """Compute the local variance in grey squared.
 
-
-@jit
-def _variance(lows: I32, start: int, height: int, width: int, shift: int, radius: int, rounds: int) -> I64:
-    """Return the local variance in grey squared. `shift` converts the values to 1/8 grey."""
-    sums, squares = np.zeros((height, width), np.int64), np.zeros((height, width), np.int64)
+    Args:
+        lows: Low-pass images.
+        start: Index of the image in `lows`.
+        shift: Converts its values to 1/8 grey.
+        radius: Radius of the box filter. Outside the image its edge repeats.
+        rounds: Number of times that the filter is applied.
+        moments: Shape (2, height, width); `moments[0]` receives the result.
+        across: Shape (height, width), overwritten.
+    """
+    _, height, width = moments.shape
     for y in range(height):
         for x in range(width):
             value = np.int64(lows[start + (y + 1) * (width + 2) + x + 1]) >> shift
-            sums[y, x], squares[y, x] = value, value * value
-    count = np.int64(1)
+            moments[0, y, x], moments[1, y, x] = value, value * value
+    count = 1
     for _ in range(rounds):
-        sums, squares = _box_sum(sums, radius), _box_sum(squares, radius)
         count *= (2 * radius + 1) ** 2
-    return (squares * count - sums * sums) // (count * count * 64)
+        for m in range(2):
+            for y in range(height):
+                for x in range(width):
+                    total = 0
+                    for k in range(x - radius, x + radius + 1):
+                        total += moments[m, y, min(max(k, 0), width - 1)]
+                    across[y, x] = total
+            for y in range(height):
+                for x in range(width):
+                    moments[m, y, x] = 0
+                for k in range(y - radius, y + radius + 1):
+                    line = min(max(k, 0), height - 1)
+                    for x in range(width):
+                        moments[m, y, x] += across[line, x]
+    for y in range(height):
+        for x in range(width):
+            total = moments[0, y, x]
+            moments[0, y, x] = (moments[1, y, x] * count - total * total) // (count * count * 64)
 
 
 @jit

@@ -141,12 +141,10 @@ def _squared_norms(side: int, levels: int) -> tuple[tuple[Plane, ...], ...]:
         sides.append((sides[-1] + 1) // 2)
     synthesis = np.eye(side, dtype=np.int64) << transform.FRACTION_BITS  # response of each value of the previous level
     out: list[tuple[Plane, ...]] = []
-    scratch = np.zeros(side, np.int64)
     for level in range(1, levels + 1):
         n, low = sides[level - 1], sides[level]
         single = np.eye(n, dtype=np.int64) << transform.FRACTION_BITS
-        for line in single:
-            transform.synthesise_line(line, n, scratch)
+        transform.synthesise_rows(single)
         synthesis = (single @ synthesis + _HALF) >> transform.FRACTION_BITS
         norms = (synthesis**2).sum(1)
         out.append((norms[:low], norms[low:]))

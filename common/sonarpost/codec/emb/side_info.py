@@ -1,4 +1,4 @@
-"""Side information at the start of a body: mean level, start step, region of interest and texture levels."""
+"""Side information at the start of a body: mean level, start step, region of interest, texture and strength."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from sonarpost.codec.emb.coder import Coder
+from sonarpost.codec.emb.despeckle import STRENGTH_STEPS
 from sonarpost.codec.emb.kernel import I64
 from sonarpost.codec.emb.model import Model
 from sonarpost.codec.emb.transform import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, Layout
@@ -82,6 +83,7 @@ class SideInfo:
         region: Region of interest.
         texture: Strength of the image's texture in each band, 0..15; see `decode`.
         extra_planes: Planes above the usual first one, 0..6, for images that are half black and half white.
+        strength: Strength of despeckling in sixteenths: 0 for models that do not send it, else 1..16.
     """
 
     mean_index: int
@@ -89,6 +91,7 @@ class SideInfo:
     region: RegionOfInterest | None = None
     texture: tuple[int, ...] | None = None
     extra_planes: int = 0
+    strength: int = 0
 
     @property
     def mean(self) -> int:
@@ -122,7 +125,10 @@ def code_side_info(coder: Coder, model: Model, side: SideInfo) -> SideInfo:
         texture = None
         if _code_bit(coder, int(side.texture is not None), _RARE):
             texture = tuple(_code_number(coder, 4, n) for n in side.texture or (0,) * TEXTURE_BANDS)
-        return SideInfo(mean_index, start_step, region, texture, extra)
+        strength = STRENGTH_STEPS if model.sends_strength else 0
+        if model.sends_strength and _code_bit(coder, int(side.strength < STRENGTH_STEPS), _RARE):
+            strength = max(_code_number(coder, 4, side.strength), 1)
+        return SideInfo(mean_index, start_step, region, texture, extra, strength)
     except _EndOfStreamError:
         return SideInfo(mean_index, -1)
 

@@ -132,105 +132,89 @@ def layout_of(height_px: int, width_px: int) -> Layout:
     return Layout(height_px, width_px, levels, bands, cells, position, sides_array, low_offsets, low_cells)
 
 
-@jit
-def _lift(line: Plane, n: int, first: int, constant: int) -> None:
-    """Add to every second value, from `first`, its two neighbours times a constant; mirrored at the ends."""
-    for i in range(first, n, 2):
-        left = line[i - 1] if i > 0 else line[i + 1]
-        right = line[i + 1] if i + 1 < n else line[i - 1]
-        line[i] += ((left + right) * constant + _ROUND) >> FRACTION_BITS
+ANALYSIS, CORRELATION, SYNTHESIS = 0, 1, 2
+"""Filters: one level of the wavelet, the transpose of its inverse, its inverse."""
+_LIFTING: Final = np.array(
+    [
+        [[1, ALPHA], [0, BETA], [1, GAMMA], [0, DELTA]],
+        [[1, -ALPHA], [0, -BETA], [1, -GAMMA], [0, -DELTA]],
+        [[0, -DELTA], [1, -GAMMA], [0, -BETA], [1, -ALPHA]],
+    ],
+    np.int64,
+)
+"""Lifting steps of each filter: the first of every second value, and the constant."""
 
 
 @jit
-def _lift_transposed(line: Plane, n: int, first: int, constant: int) -> None:
-    """Transpose of `_lift`: every second value adds its share to its two neighbours."""
-    for i in range(first, n, 2):
-        share = (line[i] * constant + _ROUND) >> FRACTION_BITS
-        line[i - 1 if i > 0 else i + 1] += share
-        line[i + 1 if i + 1 < n else i - 1] += share
+def _filter_lines(  # noqa: C901, PLR0912  one function compiles faster than several
+    flat: Plane, count: int, pitch: int, n: int, step: int, kind: int, line: Plane
+) -> None:
+    """Filter `count` lines of `n` values in place.
 
-
-@jit
-def _decompose_line(line: Plane, n: int, scratch: Plane, transposed: int) -> None:
-    """Apply one level of the wavelet; `transposed`: the transpose of `synthesise_line` instead."""
-    if n == 1:
-        return
-    if transposed:
-        _lift_transposed(line, n, 1, -ALPHA)
-        _lift_transposed(line, n, 0, -BETA)
-        _lift_transposed(line, n, 1, -GAMMA)
-        _lift_transposed(line, n, 0, -DELTA)
-        even_gain, odd_gain = GAIN_INVERSE, GAIN
-    else:
-        _lift(line, n, 1, ALPHA)
-        _lift(line, n, 0, BETA)
-        _lift(line, n, 1, GAMMA)
-        _lift(line, n, 0, DELTA)
-        even_gain, odd_gain = GAIN, GAIN_INVERSE
-    low = (n + 1) // 2
-    for i in range(n):
-        place, gain = (i // 2, even_gain) if i % 2 == 0 else (low + i // 2, odd_gain)
-        scratch[place] = (line[i] * gain + _ROUND) >> FRACTION_BITS
-    line[:n] = scratch[:n]
-
-
-@jit
-def synthesise_line(line: Plane, n: int, scratch: Plane) -> None:
-    """Invert one level of the wavelet on the first `n` values of a line, in place. `scratch` is at least as long."""
-    if n == 1:
-        return
-    low = (n + 1) // 2
-    for i in range(n):
-        if i % 2 == 0:
-            scratch[i] = (line[i // 2] * GAIN_INVERSE + _ROUND) >> FRACTION_BITS
+    Value i of line k is `flat[k * pitch + i * step]`. `line` has at least n + 2 cells and is overwritten: the values
+    from cell 1, and the mirrored values beyond both ends.
+    """
+    low, high = (n + 1) // 2, n // 2
+    for k in range(count):
+        start = k * pitch
+        if kind == SYNTHESIS:
+            for i in range(low):
+                line[2 * i + 1] = (flat[start + i * step] * GAIN_INVERSE + _ROUND) >> FRACTION_BITS
+            for i in range(high):
+                line[2 * i + 2] = (flat[start + (low + i) * step] * GAIN + _ROUND) >> FRACTION_BITS
         else:
-            scratch[i] = (line[low + i // 2] * GAIN + _ROUND) >> FRACTION_BITS
-    _lift(scratch, n, 0, -DELTA)
-    _lift(scratch, n, 1, -GAMMA)
-    _lift(scratch, n, 0, -BETA)
-    _lift(scratch, n, 1, -ALPHA)
-    line[:n] = scratch[:n]
+            for i in range(n):
+                line[i + 1] = flat[start + i * step]
+        for number in range(4):
+            first, constant = _LIFTING[kind, number, 0] + 1, _LIFTING[kind, number, 1]
+            if kind == CORRELATION:  # each second value adds its share to its two neighbours
+                line[0], line[n + 1] = 0, 0
+                for i in range(first, n + 1, 2):
+                    share = (line[i] * constant + _ROUND) >> FRACTION_BITS
+                    line[i - 1] += share
+                    line[i + 1] += share
+                line[2] += line[0]
+                line[n - 1] += line[n + 1]
+            else:  # the two neighbours of each second value are added to it
+                line[0], line[n + 1] = line[2], line[n - 1]
+                for i in range(first, n + 1, 2):
+                    line[i] += ((line[i - 1] + line[i + 1]) * constant + _ROUND) >> FRACTION_BITS
+        if kind == SYNTHESIS:
+            for i in range(n):
+                flat[start + i * step] = line[i + 1]
+        else:
+            even_gain, odd_gain = (GAIN, GAIN_INVERSE) if kind == ANALYSIS else (GAIN_INVERSE, GAIN)
+            for i in range(low):
+                flat[start + i * step] = (line[2 * i + 1] * even_gain + _ROUND) >> FRACTION_BITS
+            for i in range(high):
+                flat[start + (low + i) * step] = (line[2 * i + 2] * odd_gain + _ROUND) >> FRACTION_BITS
+
+
+def _filter_rows(plane: Plane, height: int, width: int, kind: int) -> None:
+    if width > 1:
+        _filter_lines(plane.reshape(-1), height, plane.shape[1], width, 1, kind, np.empty(width + 2, np.int64))
+
+
+def _filter_columns(plane: Plane, height: int, width: int, kind: int) -> None:
+    if height > 1:
+        _filter_lines(plane.reshape(-1), width, 1, height, plane.shape[1], kind, np.empty(height + 2, np.int64))
+
+
+def synthesise_rows(plane: Plane) -> None:
+    """Invert one level of the wavelet on each row, in place. The plane is C-contiguous."""
+    _filter_rows(plane, plane.shape[0], plane.shape[1], SYNTHESIS)
 
 
 @jit
-def _decompose(plane: Plane, sides: I32, transposed: int) -> None:
-    """Apply `_decompose_line` to the rows and then the columns of each level."""
-    line = np.zeros(max(plane.shape), np.int64)
-    scratch = np.zeros(max(plane.shape), np.int64)
-    for level in range(sides.shape[0] - 1):
-        height, width = sides[level, 0], sides[level, 1]
-        for y in range(height):
-            line[:width] = plane[y, :width]
-            _decompose_line(line, width, scratch, transposed)
-            plane[y, :width] = line[:width]
+def _store_low_pass(plane: Plane, height: int, width: int, lows: I32, start: int) -> None:
+    """Store the low-pass image at the top left of the plane, with repeated border."""
+    for y in range(-1, height + 1):
+        from_y = min(max(y, 0), height - 1)
+        at = start + (y + 1) * (width + 2)
+        lows[at] = plane[from_y, 0]
         for x in range(width):
-            line[:height] = plane[:height, x]
-            _decompose_line(line, height, scratch, transposed)
-            plane[:height, x] = line[:height]
-
-
-@jit
-def _inverse(plane: Plane, sides: I32, down_to: int, lows: I32, offsets: Plane) -> None:
-    """Invert the levels above `down_to`; store the low-pass image of each level, with repeated border."""
-    line = np.zeros(max(plane.shape), np.int64)
-    scratch = np.zeros(max(plane.shape), np.int64)
-    for level in range(sides.shape[0] - 1, down_to - 1, -1):
-        height, width = sides[level, 0], sides[level, 1]
-        if level < sides.shape[0] - 1:
-            for x in range(width):
-                line[:height] = plane[:height, x]
-                synthesise_line(line, height, scratch)
-                plane[:height, x] = line[:height]
-            for y in range(height):
-                line[:width] = plane[y, :width]
-                synthesise_line(line, width, scratch)
-                plane[y, :width] = line[:width]
-        if level > 0:
-            for y in range(-1, height + 1):
-                from_y = min(max(y, 0), height - 1)
-                at = offsets[level] + (y + 1) * (width + 2)
-                for x in range(-1, width + 1):
-                    lows[at + x + 1] = plane[from_y, min(max(x, 0), width - 1)]
+            lows[at + x + 1] = plane[from_y, x]
+        lows[at + width + 1] = plane[from_y, width - 1]
 
 
 @lru_cache(maxsize=64)
@@ -281,7 +265,9 @@ def forward(image: Plane, layout: Layout) -> Plane:
         layout: Layout of the image.
     """
     plane = np.array(image, np.int64, order="C")
-    _decompose(plane, layout.sides, 0)
+    for height, width in layout.sides[:-1].tolist():
+        _filter_rows(plane, height, width, ANALYSIS)
+        _filter_columns(plane, height, width, ANALYSIS)
     return _with_cosines(plane, layout)
 
 
@@ -290,9 +276,11 @@ def correlate(image: Plane, layout: Layout) -> Plane:
 
     This is the transpose of `inverse`: each level takes the columns first.
     """
-    turned = np.array(image.T, np.int64, order="C")
-    _decompose(turned, np.ascontiguousarray(layout.sides[:, ::-1]), 1)
-    return _with_cosines(turned.T, layout)
+    plane = np.array(image, np.int64, order="C")
+    for height, width in layout.sides[:-1].tolist():
+        _filter_columns(plane, height, width, CORRELATION)
+        _filter_rows(plane, height, width, CORRELATION)
+    return _with_cosines(plane, layout)
 
 
 def _with_cosines(plane: Plane, layout: Layout) -> Plane:
@@ -315,12 +303,18 @@ def inverse(coefficients: Plane, layout: Layout, down_to: int = 0) -> tuple[Plan
         The plane, with the low-pass image of level `down_to` at its top left; and all low-pass images from that level
         up, at `layout.low_offsets`, each with a border of one cell, int32.
     """
-    plane = coefficients.astype(np.int64, copy=True)
+    plane = np.array(coefficients, np.int64, order="C")
     height, width = (int(n) for n in layout.sides[layout.levels])
     low = _matrix_step(cosine_matrix(width).T, plane[:height, :width].T).T
     plane[:height, :width] = _matrix_step(cosine_matrix(height).T, low)
     lows = np.zeros(layout.low_cells, np.int32)
-    _inverse(plane, layout.sides, down_to, lows, layout.low_offsets)
+    for level in range(layout.levels, down_to - 1, -1):
+        height, width = layout.sides[level].tolist()
+        if level < layout.levels:
+            _filter_columns(plane, height, width, SYNTHESIS)
+            _filter_rows(plane, height, width, SYNTHESIS)
+        if level > 0:
+            _store_low_pass(plane, height, width, lows, int(layout.low_offsets[level]))
     return plane, lows
 
 

@@ -125,7 +125,7 @@ class VqCodec:
         length = self._body_length(header.height_px, header.width_px)
         limit = MAX_BODY_BYTES if budget_bytes is None else min(budget_bytes - header.size, MAX_BODY_BYTES)
         if length > limit:
-            needed = f"at least {length + header.size} B for {header.width_px} x {header.height_px} px"
+            needed = f"at least {length + header.size} B for {header.width_px} × {header.height_px} px"
             raise StreamError("codec vq", "budget_bytes", limit + header.size, needed)
         indices, _ = self.tiles.nearest(cut_tiles(grey, self.tiles.tile_px))
         return header.pack() + pack_indices(indices + 1, self.packing)
