@@ -12,8 +12,12 @@ from PIL import Image
 
 from sonarpost.cli import detect as command
 from sonarpost.cli.detect import annotated_waterfall
+from sonarpost.detection.detector import detect
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.messages import Contact
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.sonar.side_car import read_side_car
 from sonarpost.sonar.survey import Side
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -36,7 +40,8 @@ def test_table_lists_each_contact(file, capsys):
     assert run(file) == 0
     title, columns, line = capsys.readouterr().out.splitlines()
     assert title == f"{file}: 200 pings, 1 contacts"
-    assert len(columns.split()) == len(line.split()) - 1  # the position is two numbers
+    assert len(columns.split()) == len(line.split())
+    assert {"lat_deg", "lon_deg", "sigma_m"} < set(columns.split())
     assert line.split()[2:4] == ["mine-like", "starboard"]
 
 
@@ -61,10 +66,21 @@ def test_json_is_one_object_with_contacts_of_every_file(file, capsys):
     assert missing <= {"type", "v", "schema_version", "time_utc_s"}, missing
 
 
-def test_snippets_are_written_at_both_scales(file, tmp_path):
+def test_snippets_are_written_at_both_scales_with_side_cars(file, tmp_path, capsys):
     (tmp_path / "out").mkdir()
-    assert run(file, "--snippets", tmp_path / "out") == 0
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["line7-001-ground.png", "line7-001.png"]
+    assert run(file, "--snippets", tmp_path / "out", "--json") == 0
+    names = ["line7-001-ground.png", "line7-001-ground.txt", "line7-001.png", "line7-001.txt"]
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == names
+    (found,) = json.loads(capsys.readouterr().out)["files"][0]["contacts"]
+    native, ground = (
+        read_side_car(tmp_path / "out" / name, "", "uuv").contact for name in ("line7-001.txt", "line7-001-ground.txt")
+    )
+    for name, value in native.model_dump(exclude={"time_utc_s"}).items():
+        assert value == found[name], name
+    assert native.time_utc_s == pytest.approx(1_000_000_000, abs=20)
+    assert (ground.pixel_along_m, ground.pixel_across_m) == (0.1, 0.1)
+    assert ground.contact_id != native.contact_id
+    assert (ground.lat_deg, ground.lon_deg) == (native.lat_deg, native.lon_deg)
     with Image.open(tmp_path / "out" / "line7-001-ground.png") as image:
         assert image.size == (100, 100)
 
@@ -83,14 +99,27 @@ def test_consecutive_files_are_one_line(make_survey, tmp_path, capsys):
     assert run(*paths, "--plot", tmp_path / "out.png") == 0
 
 
-def test_plot_marks_contact_on_its_side(file, tmp_path):
-    assert run(file, "--plot", tmp_path / "out.png") == 0
-    with Image.open(tmp_path / "out.png") as image:
+def test_plot_marks_contact_on_its_side_and_has_scales(file, tmp_path):
+    assert run(file, "--plot", tmp_path / "absent" / "out.png") == 0
+    with Image.open(tmp_path / "absent" / "out.png") as image:
         pixels = np.asarray(image).astype(int)
-    assert pixels.shape == (200, 1024, 3)
+    assert pixels.shape == (22 + 200 + 34, 150 + 2 * 512 + 30, 3)
     rows, columns = np.nonzero((pixels[..., 0] == 255) & (pixels[..., 1] == 80) & (pixels[..., 2] == 60))
-    assert columns.min() > 512 + 230
-    assert abs(rows.min() - 110) < 5
+    assert columns.min() > 150 + 512 + 230
+    assert abs(rows.min() - 22 - 110) < 5
+    ink = pixels.max(axis=2) == 20
+    assert ink[:, 144:150].any(), "times and ping numbers"
+    assert ink[-34:, 150:-30].any(), "ranges"
+
+
+def test_long_recording_is_reduced_in_the_plot(make_survey):
+    survey = make_survey({"ping": 120})
+    long = replace(survey, pings=survey.pings * 20)
+    found = detect(survey)
+    image = np.asarray(annotated_waterfall(long, found)).astype(int)
+    assert image.shape[0] == 22 + 1334 + 34  # 4000 pings, 3 in a row
+    rows, _ = np.nonzero((image[..., 0] == 255) & (image[..., 1] == 80) & (image[..., 2] == 60))
+    assert rows.min() == pytest.approx(22 + 120 / 3 - 6, abs=4)
 
 
 def test_several_files_give_one_plot_each(file, tmp_path):
@@ -99,11 +128,55 @@ def test_several_files_give_one_plot_each(file, tmp_path):
 
 
 def test_options_limit_number_of_contacts(file, capsys):
-    assert run(file, "--threshold", "2") == 0
-    assert capsys.readouterr().out.splitlines() == [f"{file}: 200 pings, 0 contacts"]
     assert run(file, "--threshold", "0.001", "--max-contacts", "3", "--json") == 0
     (found,) = json.loads(capsys.readouterr().out)["files"]
     assert len(found["contacts"]) == 3
+
+
+def test_nothing_found_says_what_lower_thresholds_give(tmp_path, capsys):
+    file = tmp_path / "rock.xtf"
+    spec = SurveySpec(seed=2, seabed=SeabedKind.ROCK, pings=300, samples=400, targets=2, clutter=4)
+    write_xtf(simulate_survey(spec).survey, file)
+    assert run(file, "--threshold", "2", "--json") == 0
+    (found,) = json.loads(capsys.readouterr().out)["files"]
+    assert found["contacts"] == []
+    counts = found["contacts_above"]
+    assert list(counts) == ["2.0", "1.0", "0.5", "0.3", "0.1"]
+    assert counts["2.0"] == 0
+    assert counts["0.1"] > counts["0.3"] > counts["1.0"] >= 1
+    for confidence, count in counts.items():
+        assert run(file, "--threshold", confidence, "--json") == 0
+        (listed,) = json.loads(capsys.readouterr().out)["files"]
+        assert len(listed["contacts"]) == count, confidence
+        assert listed["contacts_above"] == {c: n for c, n in counts.items() if float(c) <= float(confidence)}
+    assert run(file, "--threshold", "2") == 0
+    title, message = capsys.readouterr().out.splitlines()
+    assert title == f"{file}: 300 pings, 0 contacts"
+    lower = ", ".join(f"{counts[c]} above {c}" for c in ("1.0", "0.5", "0.3", "0.1"))
+    assert message == f"0 contacts above 2.0; {lower}; see --threshold"
+
+
+def test_counts_of_consecutive_files_are_those_of_each_file(make_survey, tmp_path, capsys):
+    survey = make_survey({"ping": 40, "sample": 300}, {"ping": 160, "sample": 350})
+    paths = [tmp_path / "a.xtf", tmp_path / "b.xtf"]
+    for path, pings in zip(paths, (survey.pings[:100], survey.pings[100:]), strict=True):
+        write_xtf(replace(survey, pings=pings), path)
+    assert run(*paths, "--json", "--threshold", "2") == 0
+    counts = [f["contacts_above"]["1.0"] for f in json.loads(capsys.readouterr().out)["files"]]
+    assert run(*paths, "--json") == 0
+    files = json.loads(capsys.readouterr().out)["files"]
+    assert counts == [len(f["contacts"]) for f in files] == [1, 1]
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", ["scotsman-iver2", "000_1236"])
+def test_counts_of_recordings_are_those_of_the_thresholds(data_dir, name, capsys):
+    path = data_dir / "surveys" / f"{name}.xtf"
+    assert run(path, "--json", "--threshold", "2") == 0
+    counts = json.loads(capsys.readouterr().out)["files"][0]["contacts_above"]
+    for confidence, count in counts.items():
+        assert run(path, "--json", "--threshold", confidence) == 0
+        assert len(json.loads(capsys.readouterr().out)["files"][0]["contacts"]) == count
 
 
 @pytest.mark.parametrize("options", [("--threshold", "3"), ("--threshold", "nan"), ("--max-contacts", "0")])
@@ -112,14 +185,25 @@ def test_error_names_option_out_of_range(file, options):
         run(file, *options)
 
 
-def test_invalid_file_and_missing_folder_raise(file, tmp_path):
+def test_invalid_file_and_output_are_reported_before_the_work(file, tmp_path, monkeypatch):
     (tmp_path / "bad.xtf").write_bytes(b"not a survey")
     with pytest.raises(SurveyFileError):
         run(tmp_path / "bad.xtf")
-    with pytest.raises(FileNotFoundError):
-        run(file, "--plot", tmp_path / "absent" / "out.png")
+    monkeypatch.setattr(command, "_detect_files", lambda *_: pytest.fail("the work has begun"))
+    for option in ("--plot", "--snippets"):
+        with pytest.raises(ConfigError, match=r"output folder: got .*bad\.xtf"):
+            run(file, option, tmp_path / "bad.xtf" / "out.png")
 
 
-def test_waterfall_with_one_side_or_none(make_survey):
-    assert annotated_waterfall(make_survey(sides=(Side.STARBOARD,)), ()).size == (512, 200)
-    assert annotated_waterfall(make_survey(sides=()), ()).size == (1, 1)
+def test_file_cut_by_a_power_failure_has_a_note(file, tmp_path, capsys):
+    (tmp_path / "cut.xtf").write_bytes(file.read_bytes()[:-658])
+    assert run(tmp_path / "cut.xtf") == 0
+    assert "note: the file ends inside its last packet" in capsys.readouterr().out
+    assert run(tmp_path / "cut.xtf", "--json") == 0
+    (found,) = json.loads(capsys.readouterr().out)["files"]
+    assert found["pings"] == 199
+    assert "the file ends inside its last packet" in found["warnings"][0]
+
+
+def test_waterfall_of_one_side(make_survey):
+    assert annotated_waterfall(make_survey(sides=(Side.STARBOARD,)), ()).size == (150 + 2 * 512 + 30, 22 + 200 + 34)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from builders.surveys import MAKERS, make_xtf
 from PIL import Image
+from pyproj import Transformer
 
 from sonarpost.cli.main import main
 from sonarpost.cli.survey.plot import SIDE_PX, angle_normalised, nice_step, reduce_survey, thinned_track
@@ -19,6 +20,7 @@ from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import ChannelPing, Side
+from sonarpost.sonar.xtf_writer import write_xtf
 
 
 @pytest.mark.parametrize("kind", sorted(MAKERS))
@@ -78,20 +80,120 @@ def test_export_geojson_splits_track_at_gaps_and_antimeridian(small_survey, tmp_
     assert features[1]["properties"]["first_ping"] == 2
 
 
-def test_track_without_fixes_is_empty_collection(small_survey, tmp_path, capsys):
+@pytest.mark.parametrize("kind", ["csv", "geojson"])
+def test_export_without_positions_is_an_error_and_writes_no_file(kind, small_survey, tmp_path, capsys):
     pings = tuple(dataclasses.replace(p, lat_deg=None, lon_deg=None) for p in small_survey())
-    path = make_xtf(dataclasses.replace(small_survey(), pings=pings), tmp_path)
-    assert main(["survey", "export", "--format", "geojson", str(path)]) == 0
-    assert json.loads(capsys.readouterr().out) == {"type": "FeatureCollection", "features": []}
-    assert main(["survey", "plot", "--out", str(tmp_path), str(path)]) == 0
+    without = make_xtf(dataclasses.replace(small_survey(), pings=pings), tmp_path)
+    write_xtf(small_survey(), tmp_path / "metres.xtf", "EPSG:32619")
+    out = tmp_path / "absent" / "track"
+    for path, crs, message in (
+        (without, [], "positions: got 'none in 5 pings', expected a recording with positions"),
+        (tmp_path / "metres.xtf", [], "positions: got 'metres', expected their projection, --crs EPSG:N"),
+    ):
+        assert main(["survey", "export", "--format", kind, "--out", str(out), str(path), *crs]) == 2
+        printed = capsys.readouterr()
+        [line] = printed.err.splitlines()
+        assert message in line
+        assert not out.parent.exists()
+        assert main(["survey", "export", "--format", kind, str(path), *crs]) == 2
+        assert capsys.readouterr().out == ""
+    metres = str(tmp_path / "metres.xtf")
+    assert main(["survey", "export", "--format", kind, "--out", str(out), metres, "--crs", "EPSG:32619"]) == 0
+    assert "48.4454" in out.read_text()
+    assert main(["survey", "plot", "--out", str(tmp_path / "plots" / "new"), str(without)]) == 0
+    assert len(list((tmp_path / "plots" / "new").iterdir())) == 2
+
+
+def info_of(path, capsys, *options):
+    assert main(["survey", "info", "--json", str(path), *options]) == 0
+    info = json.loads(capsys.readouterr().out)
+    assert main(["survey", "info", str(path), *options]) == 0
+    text = capsys.readouterr().out
+    assert all(f"  hint: {hint}" in text for hint in info["hints"])
+    return info, text
+
+
+def test_info_shows_coordinates_in_metres_and_how_to_name_the_projection(small_survey, tmp_path, capsys):
+    survey = small_survey(pings=30)
+    write_xtf(survey, tmp_path / "m.xtf", "EPSG:32619")
+    to_utm = Transformer.from_crs(4326, 32619, always_xy=True)
+    points = [to_utm.transform(p.lon_deg, p.lat_deg) for p in survey]
+    info, text = info_of(tmp_path / "m.xtf", capsys)
+    eastings, northings = zip(*points, strict=True)
+    for axis, values in (("easting", eastings), ("northing", northings)):
+        assert info[f"{axis}_m"] == pytest.approx([min(values), max(values)], abs=0.001)
+        assert [info[end][axis] for end in ("first_m", "last_m")] == pytest.approx([values[0], values[-1]], abs=0.001)
+    assert f"  first_m              easting {points[0][0]:.1f}, northing {points[0][1]:.1f}" in text
+    [projection, missing] = info["hints"]
+    assert missing == "no positions: contacts have no position"
+    assert "name their projection with --crs EPSG:N" in projection
+    assert "EPSG:326ZZ at latitude 48.4 N or EPSG:327ZZ at latitude 41.9 S" in projection
+    info, _ = info_of(tmp_path / "m.xtf", capsys, "--crs", "EPSG:32619")
+    assert info["hints"] == []
+    assert info["lat_deg"] == pytest.approx([48.44545, 48.44545 + 29e-6], abs=1e-7)
+    assert info["easting_m"] == pytest.approx([min(eastings), max(eastings)], abs=0.001)
+
+
+@pytest.mark.parametrize(
+    ("crs", "options", "hint"),
+    [
+        ("EPSG:3395", [], "they are not UTM coordinates"),
+        ("EPSG:3395", ["--crs", "EPSG:32619"], "EPSG:32619 has no position for these eastings and northings"),
+    ],
+)
+def test_info_says_when_a_projection_does_not_fit(crs, options, hint, small_survey, tmp_path, capsys):
+    pings = [dataclasses.replace(p, lat_deg=85.0, lon_deg=179.0) for p in small_survey()]
+    write_xtf(dataclasses.replace(small_survey(), pings=tuple(pings)), tmp_path / "m.xtf", crs)
+    info, _ = info_of(tmp_path / "m.xtf", capsys, *options)
+    assert hint in info["hints"][0]
+
+
+def test_info_says_what_is_missing(small_survey, tmp_path, capsys):
+    def with_values(**values):
+        pings = tuple(dataclasses.replace(p, **values) for p in small_survey())
+        return info_of(make_xtf(dataclasses.replace(small_survey(), pings=pings), tmp_path), capsys)[0]
+
+    assert info_of(make_xtf(small_survey(), tmp_path), capsys)[0]["hints"] == []
+    assert with_values(altitude_m=None, heading_deg=None)["hints"] == [
+        "heading_deg in none of 5 pings: contacts without a heading have no position",
+        "altitude_m in none of 5 pings: it is taken from the first bottom return",
+    ]
+    assert with_values(lat_deg=48.0, lon_deg=-68.0)["hints"] == ["the position is the same in every ping"]
+    info = with_values(lat_deg=None, lon_deg=None)
+    assert info["hints"] == ["no positions: contacts have no position"]
+    assert (info["easting_m"], info["first_m"]) == (None, None)
+
+
+def test_info_says_that_degrees_are_marked_as_metres(small_survey, tmp_path, capsys):
+    path = make_xtf(small_survey(), tmp_path)
+    raw = bytearray(path.read_bytes())
+    raw[164:166] = bytes(2)
+    path.write_bytes(raw)
+    assert "look like degrees, but NavUnits" in info_of(path, capsys)[0]["hints"][0]
+    raw[164] = 3
+    path.write_bytes(raw)
+    assert info_of(path, capsys)[0]["hints"] == []
 
 
 def test_failed_export_leaves_no_file(small_survey, tmp_path, capsys):
     path = make_xtf(small_survey(), tmp_path)
-    path.write_bytes(path.read_bytes()[:-7])
+    path.write_bytes(path.read_bytes()[:-512] + bytes(512))
     assert main(["survey", "export", "--out", str(tmp_path / "t.csv"), str(path)]) == 2
-    assert "truncated" in capsys.readouterr().err
+    assert "MagicNumber" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["line.xtf"]
+
+
+def test_file_cut_by_a_power_failure_is_read_by_every_command(small_survey, tmp_path, capsys):
+    path = make_xtf(small_survey(pings=30, samples=300), tmp_path)
+    path.write_bytes(path.read_bytes()[:-658])
+    for command in (["survey", "info", "--json"], ["survey", "export"], ["survey", "plot", "--out", str(tmp_path)]):
+        assert main([*command, str(path)]) == 0
+        printed = capsys.readouterr()
+        if "export" in command:
+            assert printed.out.count("\n") == 30
+        elif "info" in command:
+            assert json.loads(printed.out)["pings"] == 29
+        assert "the file ends inside its last packet" in printed.out + printed.err
 
 
 def test_plot_writes_waterfall_and_track(small_survey, tmp_path, capsys):

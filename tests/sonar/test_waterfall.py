@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from builders.surveys import make_waterfall
+from pyproj import Transformer
 
 from sonarpost.errors import SurveyFileError
+from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import open_survey, read_survey
 from sonarpost.sonar.survey import Side
 
@@ -112,3 +114,25 @@ def test_derived_images_match_recordings(data_dir, tmp_path, name):
         assert (got.lat_deg, got.lon_deg) == (want.lat_deg, want.lon_deg)
         assert got.time_utc_s == pytest.approx(want.time_utc_s, abs=0.001)
         assert (got.speed_mps or 0) == pytest.approx(want.speed_mps or 0, abs=0.006)
+
+
+def test_table_in_metres_has_positions_and_its_extent(small_survey, tmp_path):
+    path = make_waterfall(small_survey(), tmp_path)
+    to_utm = Transformer.from_crs(4326, 32619, always_xy=True)
+    points = [to_utm.transform(p.lon_deg, p.lat_deg) for p in small_survey()]
+    header, *lines = (tmp_path / "line.csv").read_text().splitlines()
+    rows = [header.replace("lat_deg,lon_deg", "northing_m,easting_m")]
+    for line, (easting_m, northing_m) in zip(lines, points, strict=True):
+        number, time_utc, _, _, rest = line.split(",", 4)
+        rows.append(f"{number},{time_utc},{northing_m!r},{easting_m!r},{rest}")
+    (tmp_path / "line.csv").write_text("\n".join(rows))
+    path.write_text(path.read_text().replace('positions = "degrees"', 'positions = "metres"'))
+    with pytest.raises(SurveyFileError, match=r"projected_crs: got None, expected .* \(--crs\)"):
+        open_survey(path)
+    with open_survey(path, SurveyOptions(projected_crs="EPSG:32619")) as source:
+        for ping, want in zip(source.pings(), small_survey(), strict=True):
+            assert (ping.lat_deg, ping.lon_deg) == pytest.approx((want.lat_deg, want.lon_deg), abs=1e-8)
+        grid = source.info.grid
+    assert (grid.first_m, grid.last_m) == (points[0], points[-1])
+    eastings, northings = zip(*points, strict=True)
+    assert (grid.min_m, grid.max_m) == ((min(eastings), min(northings)), (max(eastings), max(northings)))

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from pydantic import ValidationError
 from pyproj import Transformer
 from pyxtf import XTFPingHeader
 
@@ -30,6 +31,7 @@ CHAN_INFO = 256
 CHANNEL = HEADER + 256
 CHANNEL_BYTES = 64 + 40
 WEIGHT, TIME_DELAY = 58, 12
+CUT = "the file ends inside its last packet, as after a power failure: {} bytes are left out"
 
 
 @pytest.fixture
@@ -59,12 +61,47 @@ def test_file_shorter_than_header_is_rejected(tmp_path, raw, length):
         read(tmp_path, raw[:length])
 
 
-def test_truncation_inside_packet_is_an_error(tmp_path, raw):
-    for length in range(HEADER, len(raw), 29):
-        if (length - HEADER) % PACKET:
-            with pytest.raises(SurveyFileError, match="truncated"):
-                read(tmp_path, raw[:length])
-    assert len(read(tmp_path, raw[: HEADER + 2 * PACKET]).pings) == 2
+def test_cut_at_any_byte_after_the_first_packet_leaves_the_complete_pings(tmp_path, raw):
+    complete = read(tmp_path, raw)
+    assert complete.warnings == ()
+    for length in range(HEADER + PACKET, len(raw)):
+        count, left_bytes = divmod(length - HEADER, PACKET)
+        survey = read(tmp_path, raw[:length])
+        assert [p.number for p in survey] == [p.number for p in complete][:count]
+        assert survey.warnings == ((CUT.format(left_bytes),) if left_bytes else ())
+
+
+def test_cut_in_the_only_packet_is_an_error(tmp_path, raw):
+    for length in range(HEADER + 1, HEADER + PACKET):
+        with pytest.raises(SurveyFileError, match="truncated"):
+            read(tmp_path, raw[:length])
+
+
+def test_damaged_length_is_not_taken_for_a_cut_file(tmp_path, raw):
+    """A packet longer than all before it is damage: what follows it would be lost without an error."""
+    for row in range(1, 5):
+        longer = put(bytearray(raw), HEADER + row * PACKET + 10, "I", max(PACKET + 1, len(raw)))
+        with pytest.raises(SurveyFileError, match=f"packet at byte {HEADER + row * PACKET}: got .* truncated"):
+            read(tmp_path, longer)
+    for tail in (b"\x00", b"\xce\xfb", bytes(PACKET // 2)):
+        with pytest.raises(SurveyFileError, match="MagicNumber"):
+            read(tmp_path, raw + tail)
+
+
+def test_cut_of_other_packets_and_of_longer_ones(tmp_path, raw):
+    packet = attitude((2013, 9, 10, 21, 13, 8, 100), 1.5, -2.5, 123.0)
+    for length in range(1, len(packet)):
+        survey = read(tmp_path, raw + packet[:length])
+        assert (len(survey.pings), survey.warnings) == (5, (CUT.format(length),))
+    body = bytes(raw[: HEADER + PACKET]) + packet + bytes(raw[HEADER + PACKET :])
+    assert len(read(tmp_path, body[: HEADER + PACKET + 100]).pings) == 1
+    assert len(read(tmp_path, body[:-1]).pings) == 4
+
+
+@pytest.mark.realdata
+def test_recording_without_its_last_658_bytes(data_dir, tmp_path):
+    content = (data_dir / "surveys" / "scotsman-iver2.xtf").read_bytes()
+    assert len(read(tmp_path, content[:-658]).pings) == 460
 
 
 def test_file_without_pings_is_rejected(tmp_path, raw):
@@ -313,7 +350,7 @@ def test_projected_coordinates_require_crs(raw, tmp_path):
         assert np.hypot(*off_m) < 0.001
     assert survey.warnings == ()
     for wrong in ("EPSG:4326", "EPSG:999999", "nonsense", "EPSG:2225"):  # degrees, unknown, invalid, US feet
-        with pytest.raises(SurveyFileError, match="projected_crs"):
+        with pytest.raises(ValidationError, match="projected_crs"):
             read(tmp_path, raw, projected_crs=wrong)
 
 
@@ -342,6 +379,18 @@ def test_position_source_ship(raw, tmp_path):
     assert read(tmp_path, raw).pings[0].lat_deg == 48.44545
     ship = read(tmp_path, raw, position_source="ship").pings[0]
     assert (ship.lat_deg, ship.lon_deg) == (10.0, 20.0)
+
+
+@pytest.mark.parametrize(("source", "other", "offset"), [("sensor", "ship", 160), ("ship", "sensor", 128)])
+def test_position_in_the_other_field_is_reported(raw, tmp_path, source, other, offset):
+    assert (XTFPingHeader.ShipYcoordinate.offset, XTFPingHeader.SensorYcoordinate.offset) == (128, 160)
+    assert not read(tmp_path, raw, position_source=source).warnings
+    in_every_ping(raw, offset, "dd", 0.0, 0.0)
+    assert read(tmp_path, raw, position_source=source).warnings == (
+        f'the file has the position of the {other}, not of the {source}: position_source = "{other}"',
+        "no position fix in 5 of 5 pings, the first in row 0",
+    )
+    assert not read(tmp_path, raw, position_source=other).warnings
 
 
 def test_port_order_nearest_first(raw, tmp_path):

@@ -13,6 +13,7 @@ edge along half of its length, and it increases with both.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -208,6 +209,34 @@ class Detection:
     position_sigma_m: float | None = None
 
 
+LISTED_CONFIDENCES: Final = (1.0, 0.5, 0.3, 0.1)
+"""Confidences below the threshold at which a search counts contacts."""
+
+
+@dataclass(frozen=True, slots=True)
+class SearchResult:
+    """Result of one search.
+
+    Attributes:
+        detections: Contacts of both sides at or above the confidence threshold, most confident first.
+        weaker: What lower thresholds would give: for each of `LISTED_CONFIDENCES` below the threshold, the ping index
+            of each contact at or above that confidence.
+    """
+
+    detections: tuple[Detection, ...]
+    weaker: Mapping[float, tuple[int, ...]]
+
+
+def counts_text(threshold: float, count: int, weaker: Mapping[float, int]) -> str:
+    """Return the number of contacts at the threshold and at lower ones as text.
+
+    >>> counts_text(1.0, 0, {0.5: 2, 0.3: 7})
+    '0 contacts above 1.0; 2 above 0.5, 7 above 0.3'
+    """
+    lower = ", ".join(f"{number} above {confidence}" for confidence, number in weaker.items())
+    return f"{count} contacts above {threshold}" + (f"; {lower}" if lower else "")
+
+
 def detect(
     survey: Survey | SurveySource, settings: DetectorSettings | None = None, options: SurveyOptions | None = None
 ) -> tuple[Detection, ...]:
@@ -229,31 +258,60 @@ def detect(
     if isinstance(survey, SurveySource):
         options = options if options is not None else survey.options
         survey = load_survey(survey)
+    return search(survey, settings, options).detections
+
+
+def search(
+    survey: Survey, settings: DetectorSettings | None = None, options: SurveyOptions | None = None
+) -> SearchResult:
+    """Detect the contacts of a survey in memory, and count those that lower thresholds would give.
+
+    Args:
+        survey: The recording.
+        settings: None for the defaults. `weaker` is not limited to the maximum number of contacts.
+        options: As for `detect`.
+    """
     settings = settings if settings is not None else DetectorSettings()
     options = options if options is not None else SurveyOptions()
     altitude_m = altitudes_m(survey)
-    found = [d for side in survey.sides() for d in _detect_side(survey, side, settings, options, altitude_m)]
+    found: list[Detection] = []
+    weaker: dict[float, list[int]] = {c: [] for c in LISTED_CONFIDENCES if c < settings.confidence_threshold}
+    for side in survey.sides():
+        grid = normalise_side(survey, side, settings, altitude_m)
+        if grid is None:
+            continue
+        contacts = _SideContacts(grid, settings, min((settings.confidence_threshold, *weaker)))
+        for confidence, rows in weaker.items():
+            candidates = (candidate for _, candidate in contacts.at(confidence))
+            rows += [c.measurement.row for c in candidates if survey.pings[c.measurement.row].channel(side) is not None]
+        for confidence, candidate in contacts.at(settings.confidence_threshold):
+            detection = _detection(survey, grid, confidence, candidate, settings, options, altitude_m)
+            found += [detection] if detection is not None else []
     found.sort(key=lambda d: (-d.confidence, d.ping_index, d.side.value, d.sample))
-    return tuple(found[: settings.max_contacts])
+    return SearchResult(tuple(found[: settings.max_contacts]), {c: tuple(rows) for c, rows in weaker.items()})
 
 
-def _detect_side(
-    survey: Survey, side: Side, settings: DetectorSettings, options: SurveyOptions, altitude_m: FloatVector
-) -> list[Detection]:
-    grid = normalise_side(survey, side, settings, altitude_m)
-    if grid is None:
-        return []
-    candidates = find_candidates(grid, settings)
-    scored = zip(fused_confidences(candidates, grid, settings), candidates, strict=True)
-    kept = suppress_duplicates([c for c in scored if c[0] >= settings.confidence_threshold], grid, settings)
-    # A structure that contains a contact or a more confident structure is not reported again.
-    for structure in find_structures(grid):
-        if structure.confidence < settings.confidence_threshold:
-            break
-        if not any(is_part_of_structure(other, structure.candidate, grid) for _, other in kept):
-            kept.append((structure.confidence, structure.candidate))
-    described = [_detection(survey, grid, confidence, c, settings, options, altitude_m) for confidence, c in kept]
-    return [d for d in described if d is not None]
+class _SideContacts:
+    """The contacts of one side at any threshold down to `lowest`."""
+
+    def __init__(self, grid: LevelGrid, settings: DetectorSettings, lowest: float) -> None:
+        candidates = find_candidates(grid, settings)
+        scored = zip(fused_confidences(candidates, grid, settings), candidates, strict=True)
+        # Only more confident candidates suppress one: those at a higher threshold are the first of this list.
+        self._kept = suppress_duplicates([c for c in scored if c[0] >= lowest], grid, settings)
+        self._structures = find_structures(grid)
+        self._grid = grid
+
+    def at(self, threshold: float) -> list[tuple[float, Candidate]]:
+        """Return confidence and candidate of each contact at or above a threshold."""
+        kept = [c for c in self._kept if c[0] >= threshold]
+        # A structure that contains a contact or a more confident structure is not reported again.
+        for structure in self._structures:
+            if structure.confidence < threshold:
+                break
+            if not any(is_part_of_structure(other, structure.candidate, self._grid) for _, other in kept):
+                kept.append((structure.confidence, structure.candidate))
+        return kept
 
 
 def _detection(

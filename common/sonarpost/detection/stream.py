@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from sonarpost.detection.association import DetectionPosition
-from sonarpost.detection.detector import Detection, detect
+from sonarpost.detection.detector import Detection, search
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.geometry import ping_spacing_m
 from sonarpost.sonar.options import SurveyOptions
@@ -90,6 +90,8 @@ class StreamDetector:
         self._options = options if options is not None else SurveyOptions()
         self._end: _FileEnd | None = None
         self._files = 0
+        self.weaker: list[dict[float, int]] = []
+        """For each file, the number of contacts at the confidences of `LISTED_CONFIDENCES` below the threshold."""
 
     def add_file(self, survey: Survey) -> tuple[StreamContact, ...]:
         """Process the next file.
@@ -103,17 +105,20 @@ class StreamDetector:
         self._files += 1
         released: tuple[StreamContact, ...] = ()
         reported: tuple[DetectionPosition, ...] = ()
-        first_row = 0
+        first_row = new_row = 0
         if before is not None and is_continuation(before.survey, survey):
             first_row = max(0, len(before.survey.pings) - self._pings(before.survey, HELD_BACK_M))
             reported = before.reported
             survey = replace(survey, pings=before.survey.pings + survey.pings)
             origins = before.origins + origins
+            new_row = len(before.survey.pings)
         elif before is not None:
             released = before.held
+        result = search(survey, self._settings, self._options)
+        self.weaker.append({c: sum(row >= new_row for row in rows) for c, rows in result.weaker.items()})
         found = [
             StreamContact(*origins[d.ping_index], d, survey)
-            for d in detect(survey, self._settings, self._options)
+            for d in result.detections
             if d.ping_index >= first_row and not self._is_reported(d, reported)
         ]
         end = len(survey.pings) - self._pings(survey, HELD_BACK_M)

@@ -1,64 +1,125 @@
-"""Grey image files: TIFF as the record, PNG for display.
-
-Only grey of 8 or 16 bits is accepted. The declared size is checked before decoding, so that a small file cannot
-allocate gigabytes.
-"""
+"""Image files: JPEG, PNG and TIFF are read as grey; TIFF is written as the record, PNG for display."""
 
 from __future__ import annotations
 
 import io
-import struct
-import warnings
+import os
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import tifffile
 from PIL import Image
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.files import write_atomically
+from sonarpost.sonar.image_decoding import EXPECTED, DecodedFile, GreyImage, decode_file
 
-GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
-
-MAX_PIXELS: Final = 1 << 26
-"""Enough for a survey of 30,000 pings of 2,000 samples; snippets are much smaller."""
-MAX_FILE_BYTES: Final = 1 << 28
-
-_PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
-_PNG_END: Final = b"IEND\xaeB`\x82"
-_TIFF_SIGNATURES: Final = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
-_DEPTH_EXPECTED: Final = "grey of 8 or 16 bits"
-_PNG_COLOURS: Final = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGB with alpha"}
+IMAGE_SUFFIXES: Final = (".tif", ".tiff", ".png", ".jpg", ".jpeg")
+SIDE_CAR_SUFFIX: Final = ".txt"
+MAX_UNUSED_LINES: Final = 10
+MAX_IMAGES: Final = 100_000
 
 
 def read_image(path: Path) -> GreyImage:
-    """Read a grey image, TIFF or PNG by its content (the suffix is ignored).
+    """Read an image that is grey of 8 or 16 bits already; `read_any_image` converts others.
 
-    RGB of 8 or 16 bits with three equal channels is read as grey. A TIFF of several pages, an alpha channel, a
-    palette, float, 1-bit or 32-bit samples are rejected.
+    RGB with three equal channels is grey.
 
     Returns:
         Shape (rows, columns), uint8 or uint16 as in the file; 0 is black (a white-is-zero TIFF is inverted).
 
     Raises:
-        SurveyFileError: Not a readable grey image.
+        SurveyFileError: Not a readable image, or one that has to be converted.
     """
-    try:
-        if not path.is_file():
-            raise SurveyFileError(str(path), "", "not a regular file or absent", "a TIFF or PNG image")
-        size_bytes = path.stat().st_size
-        if size_bytes > MAX_FILE_BYTES:
-            raise SurveyFileError(str(path), "file size", size_bytes, f"at most {MAX_FILE_BYTES} bytes")
-        raw = path.read_bytes()
-    except OSError as error:
-        raise SurveyFileError(str(path), "", error.strerror or str(error), "a readable image") from error
-    if raw.startswith(_PNG_SIGNATURE):
-        return _grey(_read_png(raw, path), path)
-    if raw.startswith(_TIFF_SIGNATURES):
-        return _grey(_read_tiff(raw, path), path)
-    raise SurveyFileError(str(path), "signature", raw[:8], "a TIFF or PNG image")
+    decoded = decode_file(path)
+    if decoded.notes:
+        raise SurveyFileError(str(path), "pixels", "; ".join(decoded.notes), "grey of 8 or 16 bits without conversion")
+    return decoded.pixels
+
+
+def read_any_image(path: Path) -> DecodedFile:
+    """Read a JPEG, PNG or TIFF of any depth and colour as grey; `notes` states what was converted.
+
+    Raises:
+        SurveyFileError: Not such a file, damaged, truncated or too large.
+    """
+    return decode_file(path)
+
+
+@dataclass(frozen=True)
+class ImageFolder:
+    """The images of a folder.
+
+    Attributes:
+        images: Files with a suffix of `IMAGE_SUFFIXES`, sorted; at least one.
+        side_cars: Text files `NAME.txt` beside an image of that name.
+        unused: A line with the reason for each other file; above `MAX_UNUSED_LINES` one for each suffix.
+    """
+
+    images: tuple[Path, ...]
+    side_cars: tuple[Path, ...]
+    unused: tuple[str, ...]
+
+
+def list_images(folder: Path, *, recursive: bool = False, ignore: Collection[Path] = ()) -> ImageFolder:
+    """List the images of a folder and what else is in it. Links to folders are not followed.
+
+    Args:
+        folder: The folder.
+        recursive: Whether subfolders are searched.
+        ignore: Subfolders that are not mentioned: output folders.
+
+    Raises:
+        SurveyFileError: Not a readable folder, without an image, or with more than `MAX_IMAGES`.
+    """
+    images: list[Path] = []
+    others: list[tuple[Path, str]] = []
+
+    def fail(error: OSError) -> None:
+        raise SurveyFileError(str(folder), "", error.strerror or str(error), "readable folders") from error
+
+    if not folder.is_dir():
+        raise SurveyFileError(str(folder), "", "no such folder", "a folder of JPEG, PNG or TIFF images")
+    for place, subfolders, names in os.walk(folder, onerror=fail):
+        for path in (Path(place) / name for name in names):
+            reason = _unused_reason(path)
+            if reason:
+                others.append((path, reason))
+            else:
+                images.append(path)
+        if not recursive:
+            found = (path for path in (Path(place) / name for name in subfolders) if path not in ignore)
+            others += ((path, "a folder, not searched") for path in found)
+            subfolders.clear()
+    stems = {path.with_suffix("") for path in images}
+    is_side_car = [path.suffix == SIDE_CAR_SUFFIX and path.with_suffix("") in stems for path, _ in others]
+    side_cars = [path for (path, _), taken in zip(others, is_side_car, strict=True) if taken]
+    unused = unused_lines(folder, [other for other, taken in zip(others, is_side_car, strict=True) if not taken])
+    if not 1 <= len(images) <= MAX_IMAGES:
+        expected = f"1 to {MAX_IMAGES} files ending in {', '.join(IMAGE_SUFFIXES)}"
+        only = ", ".join(path.name for path, _ in sorted(others)[:MAX_UNUSED_LINES])
+        raise SurveyFileError(str(folder), "images", len(images), expected + (f" (only {only})" if only else ""))
+    return ImageFolder(tuple(sorted(images)), tuple(sorted(side_cars)), unused)
+
+
+def unused_lines(folder: Path, unused: Sequence[tuple[Path, str]]) -> tuple[str, ...]:
+    """Return a line for each file and its reason; above `MAX_UNUSED_LINES` one for each suffix and reason."""
+    if len(unused) <= MAX_UNUSED_LINES:
+        return tuple(f"{path}: not used: {reason}" for path, reason in sorted(unused))
+    counts = Counter((path.suffix.lower() or "no suffix", reason) for path, reason in unused)
+    return tuple(f"{folder}: {count} not used ({suffix}): {why}" for (suffix, why), count in sorted(counts.items()))
+
+
+def _unused_reason(path: Path) -> str:
+    if path.name.startswith("."):
+        return "hidden"
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
+        return "not " + EXPECTED
+    return "" if path.is_file() else "not a regular file"
 
 
 def write_tiff(path: Path, image: GreyImage, description: str | None = None) -> None:
@@ -131,83 +192,3 @@ def _check_writable(path: Path, image: GreyImage) -> None:
         raise SurveyFileError(str(path), "depth", str(image.dtype), "uint8 or uint16")
     if image.ndim != 2 or 0 in image.shape:
         raise SurveyFileError(str(path), "shape", image.shape, "rows and columns, both at least 1")
-
-
-def _read_png(raw: bytes, path: Path) -> npt.NDArray[np.generic]:
-    """Check the IHDR chunk, then decode: Pillow converts 1, 2 and 4 bits silently."""
-    if len(raw) < 33 or raw[12:16] != b"IHDR":
-        raise SurveyFileError(str(path), "IHDR", raw[8:16], "a PNG header")
-    columns, rows, depth, colour = struct.unpack(">IIBB", raw[16:26])
-    if depth not in (8, 16) or colour not in (0, 2):
-        found = f"{_PNG_COLOURS.get(colour, f'colour type {colour}')} of {depth} bits"
-        raise SurveyFileError(str(path), "depth", found, _DEPTH_EXPECTED)
-    if colour == 2 and depth == 16:
-        # Pillow would silently drop the low byte.
-        raise SurveyFileError(str(path), "depth", "RGB of 16 bits", _DEPTH_EXPECTED)
-    _check_size(path, rows, columns)
-    if _PNG_END not in raw:
-        # Pillow accepts a file that ends after the last pixel, before the checksum.
-        raise SurveyFileError(str(path), "IEND", "absent", "an end chunk: the file is truncated")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(io.BytesIO(raw), formats=["PNG"]) as image:
-                image.load()
-                pixels = np.asarray(image)
-    except Exception as error:  # Pillow raises OSError, SyntaxError, ValueError, struct.error, ...
-        raise SurveyFileError(str(path), "PNG data", str(error), "an undamaged PNG") from error
-    return pixels if depth == 8 else pixels.astype(np.uint16)
-
-
-def _read_tiff(raw: bytes, path: Path) -> npt.NDArray[np.generic]:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with tifffile.TiffFile(io.BytesIO(raw)) as file:
-                return _tiff_page(file, path)
-    except SurveyFileError:
-        raise
-    except Exception as error:  # a damaged TIFF makes tifffile raise nearly anything
-        raise SurveyFileError(str(path), "TIFF data", str(error), "an undamaged TIFF") from error
-
-
-def _tiff_page(file: tifffile.TiffFile, path: Path) -> npt.NDArray[np.generic]:
-    page = file.pages.first
-    bits, kind, channels = int(page.bitspersample), int(page.sampleformat), int(page.samplesperpixel)
-    if bits not in (8, 16) or kind != 1 or channels not in (1, 3):
-        names = {1: "unsigned integer", 2: "signed integer", 3: "float"}
-        found = f"{channels} x {names.get(kind, f'sample format {kind}')} of {bits} bits"
-        raise SurveyFileError(str(path), "depth", found, _DEPTH_EXPECTED)
-    photometric = int(page.photometric)
-    # Accepted: white is zero, black is zero, RGB; rejected: palettes, masks and print colours.
-    if photometric not in ((0, 1) if channels == 1 else (2,)):
-        raise SurveyFileError(str(path), "PhotometricInterpretation", photometric, _DEPTH_EXPECTED)
-    rows, columns = int(page.imagelength), int(page.imagewidth)
-    _check_size(path, rows, columns)
-    if int(page.imagedepth) != 1 or (page.is_tiled and int(page.tilewidth) * int(page.tilelength) > MAX_PIXELS):
-        raise SurveyFileError(str(path), "layout", "a volume or a giant tile", "a two-dimensional image")
-    if len(file.pages) != 1:
-        raise SurveyFileError(str(path), "pages", len(file.pages), "one")
-    pixels = np.asarray(page.asarray(maxworkers=1))
-    if channels == 3 and pixels.shape == (3, rows, columns):
-        pixels = np.moveaxis(pixels, 0, -1)
-    if photometric == 0:
-        pixels = np.iinfo(pixels.dtype).max - pixels
-    return pixels
-
-
-def _check_size(path: Path, rows: int, columns: int) -> None:
-    if not (rows and columns and rows * columns <= MAX_PIXELS):
-        raise SurveyFileError(str(path), "size", f"{columns} x {rows}", f"1 to {MAX_PIXELS} pixels")
-
-
-def _grey(pixels: npt.NDArray[np.generic], path: Path) -> GreyImage:
-    if pixels.ndim == 3 and pixels.shape[2] == 3:
-        if not ((pixels[..., 0] == pixels[..., 1]).all() and (pixels[..., 0] == pixels[..., 2]).all()):
-            raise SurveyFileError(str(path), "colour", "RGB with unequal channels", _DEPTH_EXPECTED)
-        pixels = pixels[..., 0]
-    if pixels.ndim != 2:
-        raise SurveyFileError(str(path), "shape", pixels.shape, "rows and columns")
-    if pixels.dtype.itemsize == 1:
-        return np.ascontiguousarray(pixels, dtype=np.uint8)
-    return np.ascontiguousarray(pixels, dtype=np.uint16)

@@ -1,16 +1,11 @@
-"""Navigation checks of all formats: limits, jumps, time, mounting of the sonar, projected coordinates."""
+"""Navigation checks of all formats: limits, jumps, time, mounting of the sonar."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Final
 
-from pyproj import Transformer
-from pyproj.exceptions import ProjError
-
-from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
 from sonarpost.sonar.options import Mounting
 from sonarpost.sonar.survey import Ping
@@ -32,7 +27,6 @@ _MAX_CORRECTION_M: Final = 100.0
 """Maximum correction of the dead reckoning at once, when a vehicle surfaces."""
 _NEW_PLACE_PINGS: Final = 5
 """Number of consecutive fixes that agree with each other and are then accepted at any distance."""
-_WGS84: Final = "EPSG:4326"
 
 
 def is_plausible(name: str, value: float) -> bool:
@@ -151,38 +145,3 @@ class NavigationChecks:
             (self._without_heading, "position left out, no heading to apply the mounting with, in"),
         )
         return [f"{text} {counter.summary(total)}" for counter, text in texts if counter.count]
-
-
-class Projection:
-    """Conversion of projected coordinates in metres to degrees.
-
-    Args:
-        crs: Coordinate system as pyproj accepts it: `EPSG:32619`, a PROJ string, WKT.
-        path: The survey file, for error messages.
-
-    Raises:
-        SurveyFileError: Not a projected coordinate system in metres.
-    """
-
-    def __init__(self, crs: str, path: Path) -> None:
-        try:
-            self._transformer = Transformer.from_crs(crs, _WGS84, always_xy=True)
-            source = self._transformer.source_crs
-        except ProjError as error:
-            raise SurveyFileError(str(path), "projected_crs", crs, "a coordinate system of pyproj") from error
-        if source is None or not source.is_projected:
-            raise SurveyFileError(str(path), "projected_crs", crs, "a projected coordinate system")
-        if any(axis.unit_conversion_factor != 1 for axis in source.axis_info):
-            raise SurveyFileError(str(path), "projected_crs", crs, "a coordinate system in metres")
-
-    def position(self, easting_m: float, northing_m: float) -> Position | None:
-        """Return the position; None if it is not finite, 0/0 or outside the projection."""
-        if not (math.isfinite(easting_m) and math.isfinite(northing_m)) or (easting_m, northing_m) == (0.0, 0.0):
-            return None
-        try:
-            lon_deg, lat_deg = self._transformer.transform(easting_m, northing_m, errcheck=True)
-        except ProjError:
-            return None
-        if not (math.isfinite(lon_deg) and math.isfinite(lat_deg) and abs(lat_deg) <= 90):
-            return None
-        return Position(float(lat_deg), (float(lon_deg) + 180) % 360 - 180)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from sonarpost.errors import ConfigError
 from sonarpost.wire import first_error
@@ -14,6 +15,18 @@ from sonarpost.wire import first_error
 _MAX_BYTES = 1 << 16
 _Offset = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]
 _Sigma = Annotated[float, Field(ge=0, le=10_000, allow_inf_nan=False)]
+
+
+def _check_projected_crs(crs: str) -> str:
+    # Imported here: pyproj takes 0.1 s, and most commands and services use no projection.
+    from sonarpost.sonar.projection import Projection  # noqa: PLC0415
+
+    Projection(crs)
+    return crs
+
+
+ProjectedCrs = Annotated[str, AfterValidator(_check_projected_crs)]
+"""Projected coordinate system in metres, as pyproj accepts it."""
 
 
 class _Section(BaseModel):
@@ -87,7 +100,7 @@ class SurveyOptions(_Section):
         errors: Accuracy of positions, headings and altitudes.
     """
 
-    projected_crs: str | None = None
+    projected_crs: ProjectedCrs | None = None
     position_source: Literal["sensor", "ship"] = "sensor"
     port_order: Literal["farthest_first", "nearest_first"] = "farthest_first"
     humminbird_sample_spacing_m: Annotated[float, Field(gt=0, le=1)] | None = None
@@ -110,7 +123,16 @@ def load_options(path: Path) -> SurveyOptions:
         raise ConfigError(str(path), "", error.strerror or str(error), "a readable TOML file") from error
     except ValueError as error:  # not UTF-8, or not TOML
         raise ConfigError(str(path), "", str(error), "TOML") from error
+    return checked_options(table, str(path))
+
+
+def checked_options(table: Mapping[str, object], where: str) -> SurveyOptions:
+    """Return options from their names and values.
+
+    Raises:
+        ConfigError: A name or value is invalid; names `where`.
+    """
     try:
         return SurveyOptions.model_validate(table)
     except ValidationError as error:
-        raise ConfigError(str(path), *first_error(error)) from error
+        raise ConfigError(where, *first_error(error)) from error

@@ -11,6 +11,7 @@ from typing import Final, Self
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.navigation import NavigationChecks, PositionJumpFilter, apply_mounting
 from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.projection import GridExtent
 from sonarpost.sonar.survey import Ping, Side, Survey
 
 MAX_HELD_BYTES: Final = 1 << 30
@@ -30,6 +31,7 @@ class SurveyInfo:
         ping_count: Number of pings.
         sides: Sides of all pings together, port first.
         warnings: Irregularities of the file, one line each.
+        grid: Extent of the coordinates of a file in metres, as stored; None for a file in degrees.
     """
 
     path: Path
@@ -38,6 +40,7 @@ class SurveyInfo:
     ping_count: int
     sides: tuple[Side, ...]
     warnings: tuple[str, ...]
+    grid: GridExtent | None = None
 
 
 class SurveySource(ABC):
@@ -88,6 +91,10 @@ class StreamedSource(SurveySource):
         """Return the warnings specific to the format, after the first pass."""
         return []
 
+    def _grid(self) -> GridExtent | None:
+        """Return the extent of the coordinates of a file in metres, after the first pass."""
+        return None
+
     def _validate(self, sonar_id: str, line_name: str) -> None:
         """Read the whole file and set `info`.
 
@@ -105,7 +112,7 @@ class StreamedSource(SurveySource):
             raise SurveyFileError(str(self.path), "pings", count, "at least one ping with a port or starboard channel")
         warnings = (*self._format_warnings(), *checks.warnings(count))
         ordered = tuple(side for side in Side if side in sides)
-        self.info = SurveyInfo(self.path, sonar_id, line_name, count, ordered, warnings)
+        self.info = SurveyInfo(self.path, sonar_id, line_name, count, ordered, warnings, self._grid())
 
     def pings(self) -> Iterator[Ping]:
         """Yield the pings without implausible fixes and with the mounting applied."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections import Counter
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final
@@ -14,8 +15,10 @@ from pyxtf import XTFFileHeader, XTFPingChanHeader, XTFPingHeader
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.files import write_atomically
+from sonarpost.sonar.geometry import Position
 from sonarpost.sonar.navigation import KNOT_MPS
-from sonarpost.sonar.readers.xtf import NAV_UNITS_DEGREES
+from sonarpost.sonar.projection import Projection
+from sonarpost.sonar.readers.xtf import NAV_UNITS_DEGREES, NAV_UNITS_METRES
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
@@ -30,7 +33,7 @@ _Slot = tuple[Side, int]
 """A channel of the file: a side, and the number of the channel on that side of a ping."""
 
 
-def write_xtf(survey: Survey, path: Path) -> None:
+def write_xtf(survey: Survey, path: Path, projected_crs: str | None = None) -> None:
     """Write a survey as XTF, atomically.
 
     Samples keep their size (8, 16 or 32 bits). Time is rounded to 10 ms, the resolution of the format; altitude,
@@ -38,16 +41,36 @@ def write_xtf(survey: Survey, path: Path) -> None:
     which the reader takes as None for a position, an altitude, or a field that is zero in every ping. For the same
     reason a heading of exactly 0 degrees is written as 360. The same survey gives the same bytes.
 
+    Args:
+        survey: The survey.
+        path: The file to create or replace.
+        projected_crs: Write positions in metres of this coordinate system, which the file does not name. None for
+            degrees.
+
     Raises:
+        ValueError: Not a projected coordinate system in metres.
         SurveyFileError: The format cannot represent the survey (more than six channels, a channel whose sample
             size changes, a sonar name over 15 ASCII characters, or a value out of range).
         OSError: The file cannot be written.
     """
     slots = _slots(survey, path)
-    chunks = [bytes(_file_header(survey, slots, path))]
+    header = _file_header(survey, slots, path)
+    if projected_crs is not None:
+        header.NavUnits = NAV_UNITS_METRES
+        projection = Projection(projected_crs)
+        survey = replace(survey, pings=tuple(_in_metres(ping, projection) for ping in survey.pings))
+    chunks = [bytes(header)]
     for row, ping in enumerate(survey.pings):
         chunks.append(_packet(ping, row, slots, path))
     write_atomically(path, b"".join(chunks))
+
+
+def _in_metres(ping: Ping, projection: Projection) -> Ping:
+    """Return the ping with northing and easting in the fields of latitude and longitude."""
+    if ping.lat_deg is None or ping.lon_deg is None:
+        return ping
+    easting_m, northing_m = projection.coordinates(Position(ping.lat_deg, ping.lon_deg))
+    return replace(ping, lat_deg=northing_m, lon_deg=easting_m)
 
 
 def _slots(survey: Survey, path: Path) -> dict[_Slot, ChannelPing]:

@@ -11,6 +11,7 @@ from scipy.ndimage import uniform_filter
 
 from sonarpost.cli.simulate import add_parser
 from sonarpost.errors import ConfigError
+from sonarpost.simulation.seabed import survey as simulator
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.targets import MINE_LIKE_KINDS
 from sonarpost.simulation.seabed.terrain import SeabedKind
@@ -49,6 +50,25 @@ def test_survey_depends_only_on_the_seed(small):
         np.testing.assert_array_equal(again.survey.waterfall(side), small.survey.waterfall(side))
     other = simulate_survey(dataclasses.replace(SMALL, seed=6))
     assert not np.array_equal(other.survey.waterfall(Side.PORT), small.survey.waterfall(Side.PORT))
+
+
+def test_survey_without_speckle_has_the_same_other_draws(monkeypatch):
+    spec = SurveySpec(seed=5, pings=40, targets=1, clutter=0, seabed=SeabedKind.SAND, bits=16)
+    noisy, clean = simulate_survey(spec), simulate_survey(spec, speckle=False)
+    drawn = simulator._speckle
+
+    def ones(shape, rng):
+        return np.ones_like(drawn(shape, rng))
+
+    monkeypatch.setattr(simulator, "_speckle", ones)
+    expected = simulate_survey(spec)
+    assert noisy.truth == clean.truth
+    for side in noisy.survey.sides():
+        one, other = noisy.survey.waterfall(side), clean.survey.waterfall(side)
+        assert np.array_equal(other, expected.survey.waterfall(side))
+        assert not np.array_equal(one, other)
+        middle = slice(400, 800)
+        assert (one[:, middle] ** 2).mean() == pytest.approx((other[:, middle] ** 2).mean(), rel=0.1)
 
 
 def test_objects_do_not_change_the_seabed():
@@ -161,14 +181,45 @@ def test_command_writes_survey_and_truth(tmp_path, capsys):
     for got, want in zip(document["objects"], made.truth, strict=True):
         assert got == {**dataclasses.asdict(want), "kind": want.kind.value, "side": want.side.value}
     first = out.read_bytes()
-    assert run(*words) == 0
+    assert run(*words, "--force") == 0
     assert out.read_bytes() == first
+
+
+def test_command_replaces_files_only_with_force(tmp_path):
+    words = ["--pings", "2", "--samples", "64", "--targets", "0", "--clutter", "0"]
+    out, truth = tmp_path / "new" / "a.xtf", tmp_path / "truth.json"
+    truth.write_text("older")
+    with pytest.raises(ConfigError, match=r"truth\.json: got 'an existing file', expected .* --force"):
+        run(str(out), *words, "--truth", str(truth))
+    assert (out.exists(), truth.read_text()) == (False, "older")
+    assert run(str(out), *words) == 0
+    first = out.read_bytes()
+    with pytest.raises(ConfigError, match=r"a\.xtf: got 'an existing file', expected .* --force"):
+        run(str(out), *words, "--seed", "2")
+    assert out.read_bytes() == first
+    assert run(str(out), *words, "--seed", "2", "--truth", str(truth), "--force") == 0
+    assert out.read_bytes() != first
+    assert json.loads(truth.read_text())["survey"] == "a.xtf"
+
+
+def test_command_writes_positions_in_metres(tmp_path):
+    words = ["--pings", "5", "--samples", "64", "--targets", "0", "--clutter", "0"]
+    assert (
+        run(str(tmp_path / "degrees.xtf"), *words) == run(str(tmp_path / "m.xtf"), *words, "--crs", "EPSG:32620") == 0
+    )
+    assert all(ping.lat_deg is None for ping in read_survey(tmp_path / "m.xtf"))
+    read = read_survey(tmp_path / "m.xtf", SurveyOptions(projected_crs="EPSG:32620"))
+    for got, want in zip(read, read_survey(tmp_path / "degrees.xtf"), strict=True):
+        assert (got.lat_deg, got.lon_deg) == pytest.approx((want.lat_deg, want.lon_deg), abs=1e-8)
+    with pytest.raises(ConfigError, match="--crs"):
+        run(str(tmp_path / "b.xtf"), *words, "--crs", "EPSG:4326")
 
 
 def test_command_rejects_invalid_options(tmp_path):
     with pytest.raises(ConfigError, match="pings"):
         run(str(tmp_path / "a.xtf"), "--pings", "0")
-    with pytest.raises(FileNotFoundError):
-        run(str(tmp_path / "absent" / "a.xtf"), "--pings", "2", "--samples", "64", "--targets", "0", "--clutter", "0")
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"output folder: got .*file"):
+        run(str(tmp_path / "file" / "a.xtf"), "--pings", "2", "--samples", "64", "--targets", "0", "--clutter", "0")
     with pytest.raises(SystemExit):
         run(str(tmp_path / "a.xtf"), "--seabed", "cheese")

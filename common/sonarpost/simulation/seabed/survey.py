@@ -185,8 +185,12 @@ class SimulatedSurvey:
     truth: tuple[TruthObject, ...]
 
 
-def simulate_survey(spec: SurveySpec) -> SimulatedSurvey:
+def simulate_survey(spec: SurveySpec, *, speckle: bool = True) -> SimulatedSurvey:
     """Simulate a survey line.
+
+    Args:
+        spec: Specification of the survey.
+        speckle: False for the same survey without speckle. All other random draws are the same.
 
     Returns:
         The survey, whose path contains the seed as there is no file, and the truth in order of pings.
@@ -212,7 +216,7 @@ def simulate_survey(spec: SurveySpec) -> SimulatedSurvey:
     track, altitude_m = _simulate_track(spec, seabed, track_rng)
     sides = {
         side: _quantised(
-            received_amplitude(echo_intensity(seabed, track, spec, sign), altitude_m, spec, noise_rng),
+            received_amplitude(echo_intensity(seabed, track, spec, sign), altitude_m, spec, noise_rng, speckle=speckle),
             spec.bits,
         )
         for side, sign in _SIGN.items()
@@ -443,7 +447,12 @@ def _spread_beam(image: FloatImage, spec: SurveySpec) -> FloatImage:
 
 
 def received_amplitude(
-    intensity: FloatImage, altitude_m: FloatArray, spec: SurveySpec, rng: np.random.Generator
+    intensity: FloatImage,
+    altitude_m: FloatArray,
+    spec: SurveySpec,
+    rng: np.random.Generator,
+    *,
+    speckle: bool = True,
 ) -> FloatImage:
     """Return the received amplitude for a mean intensity, with speckle, noise, ringing and gain variation.
 
@@ -452,6 +461,7 @@ def received_amplitude(
         altitude_m: Shape (pings,); scattering in the water ends at the bottom.
         spec: Range and sampling.
         rng: Random generator.
+        speckle: False for a speckle factor of 1. The other random draws are the same.
 
     Returns:
         Same shape, float32, at least 0; 1 is approximately flat sand at half range.
@@ -463,7 +473,8 @@ def received_amplitude(
     # Faint clouds of plankton and bubbles in the water column.
     cloud = gaussian_filter1d(gaussian_filter1d(rng.standard_normal(intensity.shape), 30.0, axis=0), 12.0, axis=1)
     water = 0.0004 * np.exp(14.0 * cloud) * (centres * spec.range_m < altitude_m[:, None])
-    power = gain * (intensity + water) * _speckle(intensity.shape, rng)
+    drawn_speckle = _speckle(intensity.shape, rng)  # drawn in any case: the draws after it stay the same
+    power = gain * (intensity + water) * (drawn_speckle if speckle else np.float32(1.0))
     power += noise * rng.standard_exponential(intensity.shape, dtype=np.float32)
     amplitude = np.sqrt(power)
     amplitude += 6.0 * np.exp(-centres * spec.range_m / 0.05)

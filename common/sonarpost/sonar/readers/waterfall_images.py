@@ -29,16 +29,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position
-from sonarpost.sonar.image_files import GreyImage, read_image
+from sonarpost.sonar.image_decoding import GreyImage
+from sonarpost.sonar.image_files import read_image
 from sonarpost.sonar.navigation import (
     KNOT_MPS,
     NAVIGATION_LIMITS,
     PingCounter,
-    Projection,
     is_plausible,
     position_in_degrees,
 )
-from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.options import ProjectedCrs, SurveyOptions
+from sonarpost.sonar.projection import GridExtent, Projection, extended
 from sonarpost.sonar.readers.open_file import CheckedFile
 from sonarpost.sonar.source import StreamedSource
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Ping, Side
@@ -60,7 +61,7 @@ class WaterfallDescription(BaseModel):
     port_order: Literal["farthest_first", "nearest_first"] | None = None
     navigation: _Name
     positions: Literal["degrees", "metres"]
-    projected_crs: str | None = None
+    projected_crs: ProjectedCrs | None = None
     frequency_hz: Annotated[float, Field(gt=0)] | None = None
     knots: bool = False
     zero_is_unknown: bool = False
@@ -81,13 +82,16 @@ class WaterfallSource(StreamedSource):
             raise SurveyFileError(str(path), "port_order", None, "farthest_first or nearest_first")
         crs = self._config.projected_crs or options.projected_crs
         if self._config.positions == "metres" and crs is None:
-            raise SurveyFileError(str(path), "projected_crs", None, "the coordinate system of positions in metres")
-        self._projection = Projection(crs, path) if crs is not None and self._config.positions == "metres" else None
+            raise SurveyFileError(
+                str(path), "projected_crs", None, "the coordinate system of positions in metres (--crs)"
+            )
+        self._projection = Projection(crs) if crs is not None and self._config.positions == "metres" else None
         self._images = self._read_images()
         self._table = CheckedFile(path.parent / self._config.navigation)
         self._without_fix = PingCounter()
         self._implausible: dict[str, PingCounter] = {}
         self._pings = 0
+        self._extent: GridExtent | None = None
         try:
             self._validate(self._config.sonar_id, path.name.removesuffix(".toml").removesuffix(".waterfall"))
         except BaseException:
@@ -106,6 +110,9 @@ class WaterfallSource(StreamedSource):
         if self._config.port_order == "farthest_first" and Side.PORT in images:
             images[Side.PORT] = images[Side.PORT][:, ::-1]
         return images
+
+    def _grid(self) -> GridExtent | None:
+        return self._extent
 
     def _format_warnings(self) -> list[str]:
         fixes = [f"no position fix in {self._without_fix.summary(self._pings)}"] if self._without_fix.count else []
@@ -210,6 +217,7 @@ class WaterfallSource(StreamedSource):
         if north is None or east is None or (north, east) == (0.0, 0.0):
             return None
         if self._projection is not None:
+            self._extent = extended(self._extent, east, north)
             return self._projection.position(east, north)
         return position_in_degrees(north, east)
 

@@ -31,17 +31,18 @@ from sonarpost.sonar.navigation import (
     KNOT_MPS,
     NAVIGATION_LIMITS,
     PingCounter,
-    Projection,
     is_plausible,
     position_in_degrees,
 )
 from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.projection import GridExtent, Projection, extended
 from sonarpost.sonar.readers.open_file import CheckedFile, SequentialReader
 from sonarpost.sonar.source import StreamedSource
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Ping, Samples, Side
 
 FILE_MAGIC: Final = 0x7B
 PACKET_MAGIC: Final = 0xFACE
+_MAGIC_BYTES: Final = PACKET_MAGIC.to_bytes(2, "little")
 SONAR_PACKET: Final = 0
 ATTITUDE_PACKET: Final = 3
 NAV_UNITS_METRES: Final = 0
@@ -278,12 +279,14 @@ def _frequency_hz(value_khz: float) -> float | None:
 class XtfSource(StreamedSource):
     """An open XTF recording.
 
-    The file must be complete: a file that ends inside a packet is rejected. A field that is zero in every ping is
-    unknown. HSeconds of 100 (rounding of a recorder) is read as the next second. Pitch, roll and heading that no ping
-    contains are taken from attitude packets up to one second before the ping.
+    A file that ends inside its last packet, as after a power failure, is read up to there with a warning. The cut
+    packet may not be longer than the longest one before it: a damaged length in the middle of a file is an error.
+
+    A field that is zero in every ping is unknown. HSeconds of 100 (rounding of a recorder) is read as the next second.
+    Pitch, roll and heading that no ping contains are taken from attitude packets up to one second before the ping.
 
     Raises:
-        SurveyFileError: Not an XTF file, truncated, inconsistent, without sonar pings, or unreadable.
+        SurveyFileError: Not an XTF file, damaged, inconsistent, without a complete sonar ping, or unreadable.
     """
 
     def __init__(self, path: Path, options: SurveyOptions) -> None:
@@ -303,7 +306,7 @@ class XtfSource(StreamedSource):
         self._first_packet = reader.offset
         crs = self.options.projected_crs
         nav_units = int(header.NavUnits)
-        projection = Projection(crs, self.path) if crs is not None and nav_units == NAV_UNITS_METRES else None
+        projection = Projection(crs) if crs is not None and nav_units == NAV_UNITS_METRES else None
         self._cleaner = NavigationCleaner(nav_units, projection)
         farthest_first = self.options.port_order == "farthest_first"
         self._parser = PingParser(self._file, channels, port_farthest_first=farthest_first)
@@ -311,6 +314,8 @@ class XtfSource(StreamedSource):
         self._attitudes = 0
         self._attitude_fields: set[str] = set()
         self._pings = 0
+        self._cut = ""
+        self._only_other_position = 0
         self._validate(decode_text(header.SonarName) or "unknown", self.path.stem)
 
     def close(self) -> None:
@@ -322,7 +327,14 @@ class XtfSource(StreamedSource):
         if self._attitudes and self._from_attitude():
             names = ", ".join(self._from_attitude())
             warnings.append(f"{names} from attitude packets ({self._attitudes} of them)")
-        return [*warnings, *self._cleaner.warnings(self._pings), *self._port_order.warnings()]
+        if self._only_other_position > self._pings / 2:
+            used, other = ("ship", "sensor") if self.options.position_source == "ship" else ("sensor", "ship")
+            warnings.append(f'the file has the position of the {other}, not of the {used}: position_source = "{other}"')
+        cut = [self._cut] if self._cut else []
+        return [*cut, *warnings, *self._cleaner.warnings(self._pings), *self._port_order.warnings()]
+
+    def _grid(self) -> GridExtent | None:
+        return self._cleaner.grid
 
     def _from_attitude(self) -> tuple[str, ...]:
         """Return the fields taken from attitude packets: zero in every ping, and set in a packet."""
@@ -346,30 +358,40 @@ class XtfSource(StreamedSource):
         self._file.check_unchanged()
 
     def _packets(self) -> Iterator[tuple[int, str, bytes]]:
-        """Yield (type, place in the file, bytes of the whole record) of each packet."""
+        """Yield (type, place in the file, bytes of the whole record) of each complete packet."""
         reader = SequentialReader(self._file, self._first_packet)
-        while reader.remaining:
+        longest = 0
+        while remaining := reader.remaining:
             place = f"packet at byte {reader.offset}"
-            raw = reader.read(_START_BYTES, place)
-            start = XTFPacketStart.from_buffer_copy(raw)
-            if start.MagicNumber != PACKET_MAGIC:
-                raise self._file.error(f"{place}, MagicNumber", hex(start.MagicNumber), hex(PACKET_MAGIC))
-            length = int(start.NumBytesThisRecord)
+            raw = reader.read(min(_START_BYTES, remaining), place)
+            if raw[:2] != _MAGIC_BYTES[: len(raw)]:
+                found = hex(int.from_bytes(raw[:2], "little"))
+                raise self._file.error(f"{place}, MagicNumber", found, hex(PACKET_MAGIC))
+            start = XTFPacketStart.from_buffer_copy(raw.ljust(_START_BYTES, b"\0"))
+            length = int(start.NumBytesThisRecord) if remaining >= _START_BYTES else _START_BYTES
             if not _START_BYTES <= length <= MAX_PACKET_BYTES:
                 expected = f"{_START_BYTES} to {MAX_PACKET_BYTES} bytes"
                 raise self._file.error(f"{place}, NumBytesThisRecord", length, expected)
-            yield int(start.HeaderType), place, raw + reader.read(length - _START_BYTES, place)
+            if remaining < length <= longest:
+                self._cut = (
+                    f"the file ends inside its last packet, as after a power failure: {remaining} bytes are left out"
+                )
+                return
+            longest = max(longest, length)
+            yield int(start.HeaderType), place, raw + reader.read(length - len(raw), place)
 
     def _ping(self, raw: bytes, place: str, attitude: Attitude | None, row: int | None) -> Ping:
         """Return a ping; `row` is its row in the first pass, else None."""
         header, time_utc_s = self._parser.header(raw, place)
-        of_ship = self.options.position_source == "ship"
+        sensor = (float(header.SensorXcoordinate), float(header.SensorYcoordinate))
+        ship = (float(header.ShipXcoordinate), float(header.ShipYcoordinate))
+        used, other = (ship, sensor) if self.options.position_source == "ship" else (sensor, ship)
         stored = Ping(
             number=int(header.PingNumber),
             time_utc_s=time_utc_s,
             channels=tuple(self._parser.channels(raw, header, place)),
-            lat_deg=float(header.ShipYcoordinate if of_ship else header.SensorYcoordinate),
-            lon_deg=float(header.ShipXcoordinate if of_ship else header.SensorXcoordinate),
+            lat_deg=used[1],
+            lon_deg=used[0],
             heading_deg=float(header.SensorHeading),
             altitude_m=float(header.SensorPrimaryAltitude),
             depth_m=float(header.SensorDepth),
@@ -380,6 +402,7 @@ class XtfSource(StreamedSource):
         if row is not None:
             self._cleaner.observe(row, stored)
             self._port_order.observe(stored.channels)
+            self._only_other_position += used == (0.0, 0.0) != other
         ping = self._cleaner.clean(stored)
         if attitude is not None and 0 <= time_utc_s - attitude.time_utc_s <= _ATTITUDE_VALID_S:
             ping = replace(ping, **{name: getattr(attitude, name) for name in self._from_attitude()})
@@ -417,7 +440,7 @@ class _PortOrderCheck:
         scale = float(np.linalg.norm(port) * np.linalg.norm(starboard))
         if scale == 0 or float(port[::-1] @ starboard) < 0.5 * scale or float(port @ starboard) > 0:
             return []
-        return ["port looks stored nearest sample first, against the format: port may be mirrored"]
+        return ['port looks stored nearest sample first, against the format: port_order = "nearest_first" mirrors it']
 
     def _profile(self, side: Side) -> npt.NDArray[np.float64]:
         profile: npt.NDArray[np.float64] = np.log1p(self._sums[side] / self._counts[side])
@@ -445,6 +468,8 @@ class NavigationCleaner:
         self._projection = projection
         self.recorded: set[str] = set()
         """Fields that are not zero in a ping observed so far."""
+        self.grid: GridExtent | None = None
+        """Extent of the coordinates, if they are in metres."""
         self._without_fix = PingCounter()
         self._implausible: dict[str, PingCounter] = {}
 
@@ -452,6 +477,8 @@ class NavigationCleaner:
         """Count irregularities of a ping in the first pass through the file."""
         if self._position(stored) is None:
             self._without_fix.add(row)
+        if self._nav_units == NAV_UNITS_METRES and stored.lat_deg is not None and stored.lon_deg is not None:
+            self.grid = extended(self.grid, stored.lon_deg, stored.lat_deg)
         for name in NAVIGATION_LIMITS:
             value = getattr(stored, name)
             if value:
@@ -479,7 +506,7 @@ class NavigationCleaner:
         if self._nav_units == NAV_UNITS_METRES and self._projection is None:
             warnings.append(
                 "no positions: NavUnits is 0 (projected metres) and the file does not contain the projection; "
-                "set the option projected_crs"
+                "set the option projected_crs (--crs)"
             )
         elif self._nav_units not in (NAV_UNITS_DEGREES, NAV_UNITS_METRES):
             expected = f"{NAV_UNITS_DEGREES} (degrees) or {NAV_UNITS_METRES} (projected metres)"

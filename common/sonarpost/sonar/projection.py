@@ -1,0 +1,89 @@
+"""Projected coordinates in metres: their extent in a file, and their conversion to degrees."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from pyproj import Transformer
+from pyproj.exceptions import ProjError
+
+from sonarpost.sonar.geometry import Position
+
+_WGS84: Final = "EPSG:4326"
+_EXPECTED: Final = "a projected coordinate system in metres, for example EPSG:32616"
+
+
+@dataclass(frozen=True, slots=True)
+class GridExtent:
+    """Extent of the coordinates in metres that a file holds; each is (easting, northing).
+
+    Attributes:
+        first_m: First coordinates of the recording.
+        last_m: Last coordinates.
+        min_m: Least easting and northing.
+        max_m: Greatest easting and northing.
+    """
+
+    first_m: tuple[float, float]
+    last_m: tuple[float, float]
+    min_m: tuple[float, float]
+    max_m: tuple[float, float]
+
+
+def extended(extent: GridExtent | None, easting_m: float, northing_m: float) -> GridExtent | None:
+    """Return an extent that includes further coordinates; unchanged if these are 0/0 or not finite."""
+    here = (easting_m, northing_m)
+    if here == (0.0, 0.0) or not all(map(math.isfinite, here)):
+        return extent
+    if extent is None:
+        return GridExtent(here, here, here, here)
+    low, high = extent.min_m, extent.max_m
+    return GridExtent(
+        first_m=extent.first_m,
+        last_m=here,
+        min_m=(min(low[0], easting_m), min(low[1], northing_m)),
+        max_m=(max(high[0], easting_m), max(high[1], northing_m)),
+    )
+
+
+class Projection:
+    """A projected coordinate system.
+
+    Args:
+        crs: Coordinate system as pyproj accepts it: `EPSG:32619`, a PROJ string, WKT.
+
+    Raises:
+        ValueError: Not a projected coordinate system in metres.
+    """
+
+    def __init__(self, crs: str) -> None:
+        try:
+            self._transformer = Transformer.from_crs(crs, _WGS84, always_xy=True)
+        except ProjError as error:
+            raise ValueError(_EXPECTED) from error
+        source = self._transformer.source_crs
+        if (
+            source is None
+            or not source.is_projected
+            or any(axis.unit_conversion_factor != 1 for axis in source.axis_info)
+        ):
+            raise ValueError(_EXPECTED)
+
+    def position(self, easting_m: float, northing_m: float) -> Position | None:
+        """Return the position; None if it is not finite, 0/0 or outside the projection."""
+        if not (math.isfinite(easting_m) and math.isfinite(northing_m)) or (easting_m, northing_m) == (0.0, 0.0):
+            return None
+        try:
+            lon_deg, lat_deg = self._transformer.transform(easting_m, northing_m, errcheck=True)
+        except ProjError:
+            return None
+        if not (math.isfinite(lon_deg) and math.isfinite(lat_deg) and abs(lat_deg) <= 90):
+            return None
+        return Position(float(lat_deg), (float(lon_deg) + 180) % 360 - 180)
+
+    def coordinates(self, position: Position) -> tuple[float, float]:
+        """Return easting and northing in metres, infinite outside the projection."""
+        easting_m, northing_m = self._transformer.transform(position.lon_deg, position.lat_deg, direction="INVERSE")
+        return float(easting_m), float(northing_m)
