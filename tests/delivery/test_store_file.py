@@ -43,8 +43,10 @@ def test_other_file_is_rejected_and_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "s.db"
     path.write_bytes(b"not a database, but another file" * 100)
     before = path.read_bytes()
-    with pytest.raises(DeliveryError, match=r"s\.db: cannot be opened as a sonarpost store"):
+    with pytest.raises(DeliveryError, match=r"s\.db: cannot be opened as a sonarpost store") as error:
         Store(path)
+    assert error.tb is not None  # keeps the store alive: nothing was closed by the garbage collector
+    assert path not in [link.readlink() for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
     assert path.read_bytes() == before
 
 

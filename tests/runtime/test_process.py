@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import textwrap
@@ -146,6 +147,28 @@ def test_signal_stops_a_service_that_waits_for_its_router(number: signal.Signals
     status, seconds, log = end(process, number)
     assert (status, "Traceback" in log) == (0, False)
     assert seconds < 3
+
+
+def test_overridden_keys_are_logged_at_the_start(start: Start, tmp_path: Path, router: str) -> None:
+    variables = {"SONARPOST_PLATFORM__HEALTH_INTERVAL_S": "9.0", "SONARPOST_PLATFORM__LOG_LEVEL": ""}
+    process = start(configuration(tmp_path, router), **variables)
+    read_until(process, "Configuration overridden by environment keys=platform.health_interval_s")
+    end(process, signal.SIGTERM)
+
+
+def test_a_service_notifies_systemd(start: Start, tmp_path: Path, router: str) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
+        bound.bind(str(tmp_path / "notify"))
+        bound.settimeout(30)
+        process = start(configuration(tmp_path, router), NOTIFY_SOCKET=str(tmp_path / "notify"), WATCHDOG_USEC="200000")
+        assert bound.recv(4096).decode() == f"STATUS=waiting for the router {router}"
+        assert bound.recv(4096) == b"READY=1\nSTATUS=started\nWATCHDOG_USEC=300000"
+        assert {bound.recv(4096) for _ in range(5)} == {b"WATCHDOG=1\nSTATUS=ok"}
+        process.send_signal(signal.SIGTERM)
+        messages: list[bytes] = []
+        while b"STOPPING=1\nSTATUS=stopping" not in messages:
+            messages.append(bound.recv(4096))
+    assert process.wait(timeout=20) == 0
 
 
 def test_signal_stops_a_service_whose_consumer_does_not_reply(start: Start, tmp_path: Path, router: str) -> None:

@@ -27,6 +27,7 @@ from sonarpost.bus.session import router_config
 from sonarpost.config import TlsConfig
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError, SonarpostError
 from sonarpost.messages import Health, ServiceState
+from sonarpost.monitoring.service_manager import ServiceManager
 from sonarpost.security.tls_files import TlsMonitor
 from sonarpost.stop_signals import exit_with_parent, stop_on_signals, wait_until_set
 
@@ -59,22 +60,24 @@ class RouterMonitor:
         self._peers: dict[str, str] = {}
         self._denied: dict[str, str] = {}
         self._stop = threading.Event()
+        self._manager = ServiceManager.from_environment(os.environ, HEALTH_INTERVAL_S)
         self._declared: list[object] = []
         self._thread: threading.Thread | None = None
 
     def start(self, session: zenoh.Session) -> None:
-        """Start to log links and, if the platform is known, to publish health and presence."""
+        """Start to log links, to notify systemd and, if the platform is known, to publish health and presence."""
         self._declared.append(session.info.declare_link_events_listener(self._on_link, history=True))
         platform = self._platform
-        if platform is None:
-            return
-        self._declared.append(session.liveliness().declare_token(keys.alive(platform, NAME)))
-        self._declared += [declare_presence(session, platform, NAME, site) for site in self._sites]
+        if platform is not None:
+            self._declared.append(session.liveliness().declare_token(keys.alive(platform, NAME)))
+            self._declared += [declare_presence(session, platform, NAME, site) for site in self._sites]
         self._thread = threading.Thread(target=self._run, args=(session, platform), name="router-health", daemon=True)
         self._thread.start()
+        self._manager.ready("started")
 
     def close(self) -> None:
         """Publish a last health record and stop; the session stays open."""
+        self._manager.stopping()
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
@@ -116,10 +119,15 @@ class RouterMonitor:
             gauges={"links": links, **self._tls.gauges(now_utc_s)},
         )
 
-    def _run(self, session: zenoh.Session, platform: str) -> None:
+    def _run(self, session: zenoh.Session, platform: str | None) -> None:
         stopping = False
         while not stopping:
             stopping = self._stop.wait(HEALTH_INTERVAL_S)
+            with self._lock:
+                links = len(self._peers)
+            self._manager.alive(f"ok: {links} links")
+            if platform is None:
+                continue
             try:
                 record = self.health(platform, "stopping" if stopping else None)
                 session.put(keys.health(platform, NAME), wire.encode(record), encoding=wire.encoding_of(Health))

@@ -120,9 +120,9 @@ class DuplicateWindow:
             (self._key, self._origin, writer, *values),
         )
         self._db.execute(
-            "DELETE FROM received_window WHERE writer = ?1 AND id NOT IN"
-            " (SELECT id FROM received_window WHERE writer = ?1 ORDER BY used_ns DESC, id DESC LIMIT ?2)",
-            (writer, MAX_WINDOWS),
+            "DELETE FROM received_window WHERE writer = ? AND id NOT IN"
+            " (SELECT id FROM received_window WHERE writer = ? ORDER BY used_ns DESC, id DESC LIMIT ?)",
+            (writer, writer, MAX_WINDOWS),
         )
         return int(inserted.lastrowid or 0)
 

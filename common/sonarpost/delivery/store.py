@@ -95,7 +95,9 @@ class Store:
         try:
             self._open()
         except BaseException:
-            self._lock_file.close()
+            for opened in (vars(self).get("_reader"), vars(self).get("_db"), self._lock_file):
+                if opened is not None:
+                    opened.close()
             raise
 
     def _open(self) -> None:
@@ -118,8 +120,6 @@ class Store:
             reason = f"cannot be opened as a sonarpost store: {_reason(error, self.path)}"
             raise DeliveryError(f"{self.path}: {reason}") from error
         if version != str(schema.VERSION).encode():
-            self._reader.close()
-            self._db.close()
             raise DeliveryError(f"{self.path}: store version {version!r}, expected {schema.VERSION}")
         self._check_watermark()
 
@@ -229,9 +229,9 @@ class Store:
         """Return the highest number for which this and all lower numbers have left the queue."""
         # One statement: a record queued between two statements would be reported to its consumer as done.
         return self._read_int(
-            "SELECT COALESCE((SELECT MIN(seq) - 1 FROM outbox WHERE consumer = ?1),"
-            " (SELECT seq FROM outbox_next WHERE consumer = ?1), 0)",
-            (queue,),
+            "SELECT COALESCE((SELECT MIN(seq) - 1 FROM outbox WHERE consumer = ?),"
+            " (SELECT seq FROM outbox_next WHERE consumer = ?), 0)",
+            (queue, queue),
         )
 
     def is_older_than(self, queue: str, origin: bytes, highest: int, sha256: bytes) -> bool:

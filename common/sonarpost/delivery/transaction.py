@@ -325,9 +325,9 @@ class Transaction:
 
     def _was_received_before_migration(self, chunk: ReceivedChunk) -> bool:
         found = self._db.execute(
-            "SELECT EXISTS (SELECT 1 FROM seen_upto WHERE origin = ?1 AND seq >= ?2)"
-            " OR EXISTS (SELECT 1 FROM seen WHERE origin = ?1 AND seq = ?2)",
-            (chunk.origin, chunk.seq),
+            "SELECT EXISTS (SELECT 1 FROM seen_upto WHERE origin = ? AND seq >= ?)"
+            " OR EXISTS (SELECT 1 FROM seen WHERE origin = ? AND seq = ?)",
+            (chunk.origin, chunk.seq, chunk.origin, chunk.seq),
         ).fetchone()
         return bool(found[0])
 

@@ -39,6 +39,15 @@ class ModemServiceConfig(ServiceConfig):
     reply_timeout_s: Annotated[float, Field(gt=0, le=600)] = 5.0
     max_carrier_sense_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
 
+    def check_with(self, platform: PlatformConfig) -> None:
+        """Check the kind of the port and the acoustic key.
+
+        Raises:
+            ConfigError: As `ModemService`.
+        """
+        SerialPort(self.port, self.baud)
+        link_key(platform)
+
 
 M = TypeVar("M", bound=ModemServiceConfig)
 

@@ -48,6 +48,8 @@ def main(service_type: type[Service[C]], config_type: type[C], arguments: Sequen
         return EXIT_CONFIG
     exit_with_parent()
     logs.configure_logging(service_type.NAME, platform.log_level, platform.log_format)
+    if overridden := config.overridden_keys(service_type.NAME, os.environ):
+        log.info("Configuration overridden by environment", extra=logs.kv(keys=", ".join(overridden)))
     try:
         service = service_type(platform, own)
     except SonarpostError as error:

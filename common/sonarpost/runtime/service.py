@@ -34,6 +34,7 @@ from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.logs import IntervalLog, kv, log_context
 from sonarpost.messages import Health, Record, ServiceState
 from sonarpost.monitoring.heartbeat import Heartbeat
+from sonarpost.monitoring.service_manager import ServiceManager
 from sonarpost.security.tls_files import TlsMonitor
 
 __all__ = ["Service", "ServiceStoppingError", "UnitOfWork"]
@@ -103,6 +104,7 @@ class Service(ABC, Generic[C]):
         self._interval_logs: list[IntervalLog] = []
         self._refusal_logs: dict[str, IntervalLog] = {}
         self._heartbeat = Heartbeat.from_environment(os.environ, platform.state_dir, platform.health_interval_s)
+        self._manager = ServiceManager.from_environment(os.environ, platform.health_interval_s)
 
     # Hooks of a subclass
 
@@ -194,6 +196,7 @@ class Service(ABC, Generic[C]):
             False if the service was stopped before it reached a router.
         """
         endpoints = self.platform.router
+        self._manager.starting(f"waiting for the router {', '.join(endpoints)}")
         self._session = open_with_retry(endpoints, self.stopping, self.platform.tls)
         if self._session is None:
             return False
@@ -216,6 +219,7 @@ class Service(ABC, Generic[C]):
             self.start_thread(self._work, "work")
         self.on_start()
         self.start_thread(self._report, "health")
+        self._manager.ready("started")
         log.info("Service started", extra=kv(platform=self.platform.id, router=", ".join(endpoints)))
         return True
 
@@ -224,6 +228,7 @@ class Service(ABC, Generic[C]):
         if self._stopped:
             return
         self._stopped = True
+        self._manager.stopping()
         self.stopping.set()
         self.store.inbox_changed.set()
         if self._session is not None:
@@ -465,6 +470,8 @@ class Service(ABC, Generic[C]):
             record = self.health(state)
             # Before the publication, which can block: a router that hangs must not make this service unhealthy.
             self._heartbeat.beat(record, time.monotonic())
+            self._manager.alive(f"{record.state}: {record.detail}" if record.detail else record.state)
             self.publish(keys.health(self.platform.id, self.NAME), record)
         except DeliveryError as error:
+            self._manager.alive(f"health unknown: {error}")  # the process does not hang
             log.warning("Health not published", extra=kv(error=str(error)))
