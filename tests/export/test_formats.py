@@ -77,10 +77,14 @@ def test_every_export_marks_unauthenticated_contacts(tmp_path: Path, kind: str) 
     assert output.count(marks[kind]) == 1
 
 
-def test_images_of_earlier_versions_have_no_statement_about_authentication(contacts: ContactSet) -> None:
+def test_images_of_earlier_versions_have_no_statement_about_authentication_and_despeckling(
+    contacts: ContactSet,
+) -> None:
     assert {contact.image.authenticated for contact in contacts.contacts} == {None}
     assert "authenticated" not in side_car(image())
     assert side_car(image(authenticated=False))["authenticated"] is False
+    assert "despeckle_strength" not in side_car(image())
+    assert side_car(image(despeckle_strength=0.0))["despeckle_strength"] == 0.0
     files = golden_files("mission", contacts)
     assert not any(b"nauthenticated" in data for data in files.values())
 

@@ -107,6 +107,7 @@ def image_row(
         size_bytes=sum((folder / f"{name}{suffix}").stat().st_size for suffix in SUFFIXES),
         conflict=name != image_file_name(image),
         files_sha256=files_digest(folder / f"{name}{suffix}" for suffix in SUFFIXES),
+        despeckle_strength=image.despeckle_strength,
     )
 
 

@@ -20,7 +20,7 @@ from sonarpost.files import make_private
 from sonarpost.messages import Decision, DeliveryState, TaskingKind
 
 FILE_NAME = "index.db"
-INDEX_VERSION = 2
+INDEX_VERSION = 3
 BUSY_S = 10.0
 
 _SCHEMA = """
@@ -31,7 +31,7 @@ CREATE TABLE IF NOT EXISTS picture (
     height_px INTEGER NOT NULL, width_px INTEGER NOT NULL, codec TEXT NOT NULL, lat_deg REAL, lon_deg REAL,
     atd_class TEXT, atd_confidence REAL, size_bytes INTEGER NOT NULL, exported_utc_s REAL, removed_utc_s REAL,
     conflict INTEGER NOT NULL DEFAULT 0, files_sha256 TEXT NOT NULL DEFAULT '', verified_utc_s REAL,
-    fault TEXT NOT NULL DEFAULT '',
+    fault TEXT NOT NULL DEFAULT '', despeckle_strength REAL,
     PRIMARY KEY (vessel_id, name)) WITHOUT ROWID;
 CREATE INDEX IF NOT EXISTS picture_age ON picture (accepted_utc_s) WHERE removed_utc_s IS NULL;
 CREATE TABLE IF NOT EXISTS decision (
@@ -61,6 +61,8 @@ ALTER TABLE decision ADD COLUMN files_sha256 TEXT NOT NULL DEFAULT '';
 ALTER TABLE decision ADD COLUMN verified_utc_s REAL;
 ALTER TABLE decision ADD COLUMN fault TEXT NOT NULL DEFAULT '';
 """
+_MIGRATE_FROM_VERSION_2 = "ALTER TABLE picture ADD COLUMN despeckle_strength REAL;"
+_MIGRATIONS = {1: _MIGRATE_FROM_VERSION_1 + _MIGRATE_FROM_VERSION_2, 2: _MIGRATE_FROM_VERSION_2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +81,7 @@ class ImageRow:
             before the first verification of an image of an earlier version.
         verified_utc_s: When its files were last compared with the index; None for never.
         fault: `missing`, `changed` or `unreadable` if the last comparison failed, else empty.
+        despeckle_strength: As in `ReconstructedImage`; None in an index of an earlier version.
     """
 
     vessel_id: str
@@ -106,6 +109,7 @@ class ImageRow:
     files_sha256: str = ""
     verified_utc_s: float | None = None
     fault: str = ""
+    despeckle_strength: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,15 +215,15 @@ class ShoreIndex:
 
     def _open(self, *, writable: bool) -> None:
         version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
-        # Columns that version 1 does not have get their default values.
-        if version not in (1, INDEX_VERSION) and not (writable and version == 0):
+        # Columns that an earlier version does not have get their default values.
+        if version not in (*_MIGRATIONS, INDEX_VERSION) and not (writable and version == 0):
             self._db.close()
             raise StoredFileError(str(self.path), "user_version", version, str(INDEX_VERSION))
         if writable:
             self._db.execute("PRAGMA journal_mode=WAL")
             # Rows that a power cut deletes are restored from the files at the next start.
             self._db.execute("PRAGMA synchronous=NORMAL")
-            migration = _MIGRATE_FROM_VERSION_1 if version == 1 else ""
+            migration = _MIGRATIONS.get(version, "")
             end = f"PRAGMA user_version = {INDEX_VERSION}; COMMIT;"
             self._db.executescript(f"BEGIN IMMEDIATE; {migration} {_SCHEMA} {_INDEXES} {end}")
 

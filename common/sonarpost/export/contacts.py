@@ -71,6 +71,7 @@ class SideCar(Record):
     last_frame_utc_s: Time
     notes: tuple[Text, ...] = ()
     authenticated: bool | None = None
+    despeckle_strength: Fraction | None = None
     height_px: Annotated[int, Field(ge=1, le=4096)]
     width_px: Annotated[int, Field(ge=1, le=4096)]
 

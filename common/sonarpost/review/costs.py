@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 from sonarpost.modem.micromodem.rates import RATES
+
+NEW_IMAGE_KINDS: Final = ("wider", "original")
+"""Kinds of requests that are answered with an image of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,16 +59,16 @@ def request_cost(
 ) -> RequestCost:
     """Estimate the cost of a request.
 
-    `refine` doubles the length of the stream, `resend` completes the present stream, and `wider` (expand) requests a
-    new image. A `revisit` costs only its request packet, because its result is a new contact. Lost frames are sent
-    again, so that the uplink takes 1 / (1 - loss) times as long.
+    `refine` doubles the length of the stream, and `resend` completes the present stream. `wider` (expand) and
+    `original` request a new image. A `revisit` costs only its request packet, because its result is a new contact. Lost
+    frames are sent again, so that the uplink takes 1 / (1 - loss) times as long.
 
     Args:
         kind: Kind of the request.
         downlink_rate: Micro-Modem rate of the vessel.
         uplink_rate: Latest rate of the vehicle; None if unknown.
-        bytes_received: Received bytes of the stream; 0 for `wider`.
-        bytes_total: Announced length of the stream; for `wider` the expected length of the new stream.
+        bytes_received: Received bytes of the stream; 0 for `NEW_IMAGE_KINDS`.
+        bytes_total: Announced length of the stream; for `NEW_IMAGE_KINDS` the expected length of the new stream.
         loss: Fraction of recently lost frames; None if unknown.
         overhead_bytes: Header bytes in each frame.
     """
@@ -82,7 +86,9 @@ def request_cost(
     loss = min(0.9, loss or 0.0)
     packets = packets_for(math.ceil(wanted_bytes / (1 - loss)), uplink_rate, overhead_bytes)
     size = (
-        f"a new image of {total_bytes} bytes" if kind == "wider" else f"{wanted_bytes} of {total_bytes} bytes missing"
+        f"a new image of {total_bytes} bytes"
+        if kind in NEW_IMAGE_KINDS
+        else f"{wanted_bytes} of {total_bytes} bytes missing"
     )
     basis = f"latest rate {uplink_rate}, {size}"
     if loss:

@@ -138,7 +138,7 @@ def measure_length(contact: Contact | None, missing: npt.NDArray[np.bool_], star
     height_px, width_px = missing.shape
     for name, (row, column) in (("from", start), ("to", end)):
         if not (0 <= row <= height_px and 0 <= column <= width_px):
-            raise NotMeasurableError("image", name, (row, column), f"a point within {width_px} x {height_px} px")
+            raise NotMeasurableError("image", name, (row, column), f"a point within {width_px} × {height_px} px")
     if start == end:
         raise NotMeasurableError("image", "to", end, "a point different from `from`")
     missing_fraction = _fraction_on(missing, start, end)

@@ -26,6 +26,7 @@ SAMPLES: dict[str, dl.Content] = {
         ((1, dl.CommandOutcome.ACCEPTED), (2**32 - 1, dl.CommandOutcome.UNKNOWN_IMAGE))
     ),
     "wider": dl.ExpandMessage(0x0A0B0C0D, 1_790_000_004, 7),
+    "original": dl.OriginalMessage(0x0A0B0C0E, 1_790_000_005, 7),
     "data": dl.DataMessage(b"\x00status"),
 }
 
@@ -45,6 +46,7 @@ commands = st.one_of(
     st.builds(dl.RefineMessage, **heads, number=numbers, stream_bytes=st.integers(0, 65535)),
     st.builds(dl.ResendMessage, **heads, number=numbers),
     st.builds(dl.ExpandMessage, **heads, number=numbers),
+    st.builds(dl.OriginalMessage, **heads, number=numbers),
     st.builds(
         dl.RevisitMessage,
         **heads,
@@ -109,6 +111,8 @@ def test_hostile_bytes_parse_or_raise_frame_error(data: bytes) -> None:
         (b"\x04" + bytes(8) + b"\0\1\1\0\xff\xc3", "mlo_class"),
         (b"\x05" + bytes(8) + b"\0\1\0", "length"),
         (b"\x05" + bytes(10), "number"),
+        (b"\x06" + bytes(8) + b"\0\1\0", "length"),
+        (b"\x06" + bytes(10), "number"),
         (b"\x08" + bytes(4), "length"),
         (b"\x08" + bytes(4) + b"\x09", "outcome"),
         (b"\x10", "data"),

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated, Final, Literal
@@ -51,6 +51,7 @@ class MessageKind(IntEnum):
     REVISIT = 0x03
     DECISION = 0x04
     EXPAND = 0x05
+    ORIGINAL = 0x06
     CONFIRMATION = 0x08
     DATA = 0x10
 
@@ -61,6 +62,7 @@ _COMMANDS: Final = (
     MessageKind.REVISIT,
     MessageKind.DECISION,
     MessageKind.EXPAND,
+    MessageKind.ORIGINAL,
 )
 
 
@@ -124,6 +126,11 @@ class ExpandMessage(ImageCommandMessage):
 
 
 @dataclass(frozen=True, slots=True)
+class OriginalMessage(ImageCommandMessage):
+    """Send the contact without despeckling, as a new image."""
+
+
+@dataclass(frozen=True, slots=True)
 class RevisitMessage(CommandMessage):
     """Survey a position again.
 
@@ -180,7 +187,14 @@ class DataMessage:
         _check("data", len(self.data), 1, 4095)
 
 
-DownlinkCommand = RefineMessage | ResendMessage | RevisitMessage | DecisionMessage | ExpandMessage
+_NUMBER_KINDS: Final[Mapping[type[ImageCommandMessage], MessageKind]] = {
+    ResendMessage: MessageKind.RESEND,
+    ExpandMessage: MessageKind.EXPAND,
+    OriginalMessage: MessageKind.ORIGINAL,
+}
+"""Kinds of the messages that have only the number of the contact."""
+
+DownlinkCommand = RefineMessage | ResendMessage | RevisitMessage | DecisionMessage | ExpandMessage | OriginalMessage
 Content = DownlinkCommand | ConfirmationMessage | DataMessage
 
 
@@ -208,9 +222,8 @@ def _packed(content: Content, room_bytes: int) -> bytes:
             return bytes([MessageKind.CONFIRMATION]) + b"".join(_OUTCOME.pack(*each) for each in content.outcomes)
         case RefineMessage():
             return _head(MessageKind.REFINE, content) + _REFINE.pack(content.number, content.stream_bytes)
-        case ResendMessage() | ExpandMessage():
-            kind = MessageKind.RESEND if isinstance(content, ResendMessage) else MessageKind.EXPAND
-            return _head(kind, content) + _NUMBER.pack(content.number)
+        case ResendMessage() | ExpandMessage() | OriginalMessage():
+            return _head(_NUMBER_KINDS[type(content)], content) + _NUMBER.pack(content.number)
         case RevisitMessage():
             degrees = (round(value * _DEGREE_STEPS) for value in (content.lat_deg, content.lon_deg))
             return _head(MessageKind.REVISIT, content) + _REVISIT.pack(*degrees)
@@ -265,6 +278,8 @@ def _command(kind: MessageKind, token: int, issued: int, body: bytes) -> Downlin
             return ResendMessage(token, issued, *_fields(_NUMBER, body))
         case MessageKind.EXPAND:
             return ExpandMessage(token, issued, *_fields(_NUMBER, body))
+        case MessageKind.ORIGINAL:
+            return OriginalMessage(token, issued, *_fields(_NUMBER, body))
         case MessageKind.REVISIT:
             lat, lon = _fields(_REVISIT, body)
             return RevisitMessage(token, issued, lat / _DEGREE_STEPS, lon / _DEGREE_STEPS)
