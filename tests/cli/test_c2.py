@@ -69,7 +69,7 @@ def out(tmp_path):
 
 
 def ls(capsys, out, *options):
-    assert main(["c2", "ls", "--out-dir", str(out), "--json", *options]) == 0
+    assert main(["c2", "ls", "--archive", str(out), "--json", *options]) == 0
     return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
 
@@ -99,7 +99,7 @@ def test_ls_filters(options, expected, capsys, out):
 
 
 def test_ls_prints_a_table(capsys, out):
-    assert main(["c2", "ls", "--out-dir", str(out)]) == 0
+    assert main(["c2", "ls", "--archive", str(out)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "image" in lines[0]
     [line] = [line for line in lines if "uuv-1/AAAA" in line]
@@ -109,7 +109,7 @@ def test_ls_prints_a_table(capsys, out):
 
 
 def test_ls_without_an_index_names_the_missing_file(capsys, tmp_path):
-    assert main(["c2", "ls", "--out-dir", str(tmp_path)]) == 2
+    assert main(["c2", "ls", "--archive", str(tmp_path)]) == 2
     assert f"{tmp_path / 'index.db'}: got 'no such file', expected the index" in capsys.readouterr().err
 
 
@@ -133,31 +133,49 @@ def test_decision_matches_the_image_received_before_it(tmp_path):
 
 
 def test_get_copies_the_newest_version(capsys, out, tmp_path):
-    assert main(["c2", "get", "uuv-1/AAAA", "--out-dir", str(out), "--to", str(tmp_path / "here")]) == 0
+    assert main(["c2", "get", "uuv-1/AAAA", "--archive", str(out), "--out", str(tmp_path / "here")]) == 0
     names = sorted(p.name for p in (tmp_path / "here").iterdir())
     assert names == [f"uuv-1_20231114T221320Z_AAAA_v2.{kind}" for kind in ("json", "png", "tiff")]
     for name in names:
         assert (tmp_path / "here" / name).read_bytes() == (out / "vessel-1" / name).read_bytes()
-    assert main(["c2", "get", "uuv-1/ZZZZ", "--out-dir", str(out)]) == 2
+    assert main(["c2", "get", "uuv-1/ZZZZ", "--archive", str(out)]) == 2
     assert "an image that `sonarpost c2 ls` shows" in capsys.readouterr().err
 
 
 def test_get_copies_nothing_if_a_file_is_unreadable(capsys, out, tmp_path):
     next(out.glob("vessel-1/*AAAA_v2.png")).unlink()
-    assert main(["c2", "get", "uuv-1/AAAA", "--out-dir", str(out), "--to", str(tmp_path / "here")]) == 2
+    assert main(["c2", "get", "uuv-1/AAAA", "--archive", str(out), "--out", str(tmp_path / "here")]) == 2
     assert "a readable file of c2" in capsys.readouterr().err
     assert not (tmp_path / "here").exists()
 
 
 def test_export_writes_all_formats_and_marks_images_as_exported(capsys, out, tmp_path):
-    files = {name: tmp_path / f"contacts.{name}" for name in ("geojson", "kml", "kmz", "csv")}
-    options = [part for name, path in files.items() for part in (f"--{name}", str(path))]
-    assert main(["c2", "export", "--out-dir", str(out), "--vessel", "vessel-1", *options]) == 0
+    files = {name: tmp_path / "new" / f"contacts.{name}" for name in ("geojson", "kml", "kmz", "csv")}
+    options = [part for path in files.values() for part in ("--out", str(path))]
+    assert main(["c2", "export", "--archive", str(out), "--vessel", "vessel-1", *options]) == 0
     assert len(json.loads(files["geojson"].read_text())["features"]) == 2
     assert files["kmz"].read_bytes().startswith(b"PK")
     assert "2 contacts, 0 of them without a position" in capsys.readouterr().out
     exported = {r["image_id"]: r["exported_utc_s"] is not None for r in ls(capsys, out, "--all-versions")}
     assert exported == {"AAAA": True, "BBBB": True, "CCCC": False}
+
+
+def test_former_spellings_of_archive_and_out_are_accepted(capsys, out, tmp_path):
+    assert main(["c2", "get", "uuv-1/AAAA", "--out-dir", str(out), "--to", str(tmp_path / "here")]) == 0
+    assert len(list((tmp_path / "here").iterdir())) == 3
+    assert main(["c2", "export", "--out-dir", str(out), "--kml", str(tmp_path / "contacts.xml")]) == 0
+    assert "<kml" in (tmp_path / "contacts.xml").read_text()
+    with pytest.raises(SystemExit):
+        main(["c2", "export", "--help"])
+    printed = capsys.readouterr().out
+    assert "--archive" in printed
+    assert "--out-dir" not in printed
+
+
+def test_export_to_a_file_of_unknown_format_is_an_error(capsys, out, tmp_path):
+    assert main(["c2", "export", "--archive", str(out), "--out", str(tmp_path / "contacts.shp")]) == 2
+    expected = "expected a name that ends in .geojson, .kml, .kmz, .csv"
+    assert expected in capsys.readouterr().err
 
 
 def test_export_sends_cursor_on_target_events(capsys, out):
@@ -175,7 +193,7 @@ def test_export_sends_cursor_on_target_events(capsys, out):
         listener = threading.Thread(target=receive)
         listener.start()
         assert (
-            main(["c2", "export", "--out-dir", str(out), "--vessel", "vessel-1", "--cot", f"tcp://127.0.0.1:{port}"])
+            main(["c2", "export", "--archive", str(out), "--vessel", "vessel-1", "--cot", f"tcp://127.0.0.1:{port}"])
             == 0
         )
         listener.join(20)
@@ -187,15 +205,15 @@ def test_export_sends_cursor_on_target_events(capsys, out):
 
 def test_export_to_an_unreachable_endpoint_is_an_error(capsys, out):
     endpoint = f"tcp://127.0.0.1:{free_port()}"
-    assert main(["c2", "export", "--out-dir", str(out), "--cot", endpoint, "--cot-wait", "0.5"]) == 2
+    assert main(["c2", "export", "--archive", str(out), "--cot", endpoint, "--cot-wait", "0.5"]) == 2
     assert "tcp://127.0.0.1" in capsys.readouterr().err
 
 
 def test_export_needs_an_output_and_reports_rejected_files(capsys, out, tmp_path):
-    assert main(["c2", "export", "--out-dir", str(out)]) == 2
-    assert "at least one of --geojson" in capsys.readouterr().err
+    assert main(["c2", "export", "--archive", str(out)]) == 2
+    assert "expected --out FILE or --cot URL" in capsys.readouterr().err
     (out / "vessel-1" / "broken.json").write_text("{")
-    assert main(["c2", "export", "--out-dir", str(out), "--csv", str(tmp_path / "c.csv")]) == 1
+    assert main(["c2", "export", "--archive", str(out), "--out", str(tmp_path / "c.csv")]) == 1
     assert "rejected: " in capsys.readouterr().err
 
 
@@ -217,7 +235,7 @@ def test_comment_is_stored_by_c2_when_the_command_ends(capsys, c2, router, tmp_p
     advice = wire.decode(Advice, item.payload, item.key)
     assert item.key == keys.advice("vessel-1")
     assert (advice.image_id, advice.image_version, advice.verdict, advice.author) == ("AAAA", 2, "mine_like", "ann")
-    listing = ["c2", "ls", "--tasking", "--json", "--out-dir", str(tmp_path / "live")]
+    listing = ["c2", "ls", "--tasking", "--json", "--archive", str(tmp_path / "live")]
     eventually(lambda: main(listing) == 0 and '"state": "waiting"' in capsys.readouterr().out)
     # Another record with the same identifier is rejected.
     assert main([*arguments[:-4], "--author", "ann", "--remark", "other", "--id", "a-1", "--router", router]) == 2
@@ -303,7 +321,7 @@ def test_watch_prints_lines_across_router_restarts_until_ctrl_c(watching):
         )
         publish(hub, state, keys.tasking_state("vessel-1"))
         eventually(lambda: len(printed) == 3)
-        assert "vessel-1  image     uuv-1/AAAA v1  30 x 20 px, complete, at 56.40000 -5.60000" in "".join(printed)
+        assert "vessel-1  image     uuv-1/AAAA v1  30 × 20 px, complete, at 56.40000 -5.60000" in "".join(printed)
         assert "decision  uuv-1/AAAA v1  mine_like two?lines ?[31m (op)\n" in "".join(printed)
         assert "comment   a  refused: no\n" in "".join(printed)
         hub.close()
@@ -349,3 +367,51 @@ def test_expand_and_its_former_name_send_the_same_record(kind, capsys, c2, route
     assert main(arguments) == 0
     eventually(lambda: c2.gauges()["waiting_for_vessels"] == 1)
     assert [item.key for item in queued_items(c2.store, "relay@vessel-1", 9)] == [keys.command("vessel-1", "wider")]
+
+
+# The folder without --archive
+
+
+@pytest.fixture
+def elsewhere(out, tmp_path, monkeypatch):
+    """An empty current folder, on a host whose /etc/sonarpost/shore.toml names the fixture's folder."""
+    folder = tmp_path / "cwd"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    config = tmp_path / "shore.toml"
+    config.write_text(f'[platform]\nid = "shore-1"\n[c2]\nout_dir = "{out}"\n')
+    monkeypatch.setattr("sonarpost.cli.c2.stored.SHORE_CONFIG", config)
+    return folder
+
+
+def test_folder_comes_from_the_configuration_of_the_host(elsewhere, out, tmp_path, capsys):
+    for options in ([], ["--config", str(tmp_path / "shore.toml")]):
+        assert main(["c2", "ls", *options]) == 0
+        printed = capsys.readouterr()
+        assert printed.out.endswith("3 images\n")
+        assert printed.err == f"sonarpost c2: folder {out}\n"
+    assert main(["c2", "get", "uuv-1/AAAA", "--out", "here"]) == 0
+    assert main(["c2", "export", "--out", "c.csv", "--vessel", "vessel-1"]) == 0
+    assert len(list(elsewhere.glob("here/*"))) == 3
+    assert (elsewhere / "c.csv").is_file()
+
+
+def test_folder_of_a_demo_in_the_current_folder_comes_first(elsewhere, tmp_path, capsys):
+    archive = Archive(C2Config(out_dir=elsewhere / "demo-out" / "shore" / "images"))
+    archive.store_image(image("CCCC"), 5.0)
+    archive.flush()
+    archive.close()
+    assert main(["c2", "ls"]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.endswith("1 images\n")
+    assert printed.err == "sonarpost c2: folder demo-out/shore/images\n"
+    assert main(["c2", "ls", "--config", str(tmp_path / "shore.toml")]) == 0
+    assert capsys.readouterr().out.endswith("3 images\n")
+
+
+def test_folder_is_out_if_nothing_names_one(elsewhere, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("sonarpost.cli.c2.stored.SHORE_CONFIG", tmp_path / "absent.toml")
+    assert main(["c2", "ls"]) == 2
+    assert "out/index.db" in capsys.readouterr().err
+    assert main(["c2", "ls", "--config", str(tmp_path / "absent.toml")]) == 2
+    assert "absent.toml" in capsys.readouterr().err

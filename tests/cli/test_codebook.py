@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import io
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
+from rich.console import Console
 
 from sonarpost.cli import codebook, encode
 from sonarpost.cli.codebook import parse_rounds
@@ -59,7 +62,7 @@ def folder(tmp_path: Path) -> Path:
 def test_folder_is_encoded_and_decoded(run: Run, folder: Path, text: bool, packing: str) -> None:
     assert run("encode", folder, "--codec", "vq", "--packing", packing, *(["--text"] if text else [])) == 0
     suffix = ".txt" if text else ".vq"
-    streams = sorted(folder.glob(f"*{suffix}"))
+    streams = sorted((folder / "streams").glob(f"*{suffix}"))
     assert [stream.stem for stream in streams] == ["a", "b", "c"]
     if text:
         assert set(streams[0].read_text()) <= set("0123456789abcdef\n")
@@ -95,20 +98,111 @@ def test_invalid_files_of_a_folder_are_reported_and_the_others_processed(
     assert "3 of 6 files done" in output.out
     for name in ("0bad.png", "small.png", "a.tiff"):
         assert name in output.err
-    assert sorted(path.name for path in folder.glob("*.vq")) == ["a.vq", "b.vq", "c.vq"]
+    assert "notes.md: not used" in output.err
+    assert not list(folder.glob("*.vq")), "streams do not lie among the images"
+    folder /= "streams"
+    assert sorted(path.name for path in folder.iterdir()) == ["a.vq", "b.vq", "c.vq"]
     (folder / "a.vq").write_bytes(b"\x10\0")
     (folder / "d.txt").write_text("xyz")
+    (folder / "e.md").write_text("xyz")
     assert run("decode", folder) == 1
     output = capsys.readouterr()
     assert "2 of 4 files done" in output.out
     assert "a.vq" in output.err
+    assert "e.md: not used: not a stream" in output.err
     assert "hexadecimal" in output.err
+
+
+@pytest.fixture
+def own_images(tmp_path: Path) -> Path:
+    """Make a folder as a person has it: a large JPEG of a phone, a colour PNG, a small TIFF, a side-car, a note."""
+    images = tmp_path / "own"
+    images.mkdir()
+    large = Image.fromarray(np.kron(snippet(3, 90, 120), np.ones((8, 8), np.uint8))).convert("RGB")
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    large.save(images / "phone.jpg", exif=exif)
+    Image.fromarray(np.dstack([snippet(4), snippet(5), snippet(6)])).save(images / "colour.png")
+    write_tiff(images / "small.tiff", snippet(7, 12, 20))
+    (images / "phone.txt").write_text("lat_deg: 56.45\nlon_deg: -5.6\n")
+    (images / "heron.heic").write_text("not an image")
+    return images
+
+
+def test_own_images_are_refused_with_the_way_out(
+    run: Run, own_images: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("encode", own_images, "--codec", "vq") == 1
+    output = capsys.readouterr()
+    assert "1 of 3 files done" in output.out
+    assert "phone.jpg: size: got '720 × 960 px', expected 16 to 512 px a side; --fit crop or --fit resize" in output.err
+    with pytest.raises(SonarpostError, match="--fit resize"):
+        run("encode", own_images / "phone.jpg", "--codec", "vq")
+
+
+def test_own_images_are_encoded_with_a_note_for_each_change(
+    run: Run, own_images: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("encode", own_images, "--codec", "vq", "--fit", "resize") == 0
+    output = capsys.readouterr()
+    lines = {Path(line.split(" ->")[0]).name: line for line in output.out.splitlines() if " -> " in line}
+    assert lines["phone.jpg"].endswith("turned by its orientation tag (6); 720 × 960 px resized to 384 × 512 px")
+    assert "colour converted to grey (0.299 R + 0.587 G + 0.114 B)" in lines["colour.png"]
+    assert "20 × 12 px resized to 27 × 16 px" in lines["small.tiff"]
+    assert "heron.heic: not used" in output.err
+    assert "not used: 1 *.txt beside images" in output.err
+    assert f"sonarpost decode {own_images}\n" in output.out
+    assert sorted(path.name for path in (own_images / "streams").iterdir()) == ["colour.vq", "phone.vq", "small.vq"]
+    assert run("decode", own_images) == 0
+    assert "384 × 512 px" in capsys.readouterr().out
+    assert read_image(own_images / "out" / "phone.tiff").shape == (512, 384)
+    assert run("encode", own_images, "--codec", "vq", "--fit", "resize") == 0
+    assert "a folder, not searched" not in capsys.readouterr().err
+
+
+def test_input_that_cannot_be_read_leaves_no_folder(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "empty.png").touch()
+    for name in ("absent.png", "empty.png"):
+        with pytest.raises(SonarpostError):
+            run("encode", tmp_path / name)
+    (tmp_path / "empty.vq").touch()
+    with pytest.raises(SonarpostError):
+        run("decode", tmp_path / "empty.vq")
+    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
+
+
+def test_crop_encodes_the_centre(run: Run, own_images: Path) -> None:
+    assert run("encode", own_images / "phone.jpg", "--codec", "vq", "--fit", "crop", "--out", own_images / "s") == 0
+    assert run("decode", own_images / "s" / "phone.vq") == 0
+    assert read_image(own_images / "s" / "out" / "phone.tiff").shape == (512, 512)
+
+
+def test_codebook_is_built_from_own_images(
+    run: Run, own_images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "own.tiles"
+    assert run("codebook", "build", "--images", own_images, "--tile", 8, "--out", out, "--rounds", "90:40") == 0
+    assert load(out).notes["images"] == "3"
+    said = capsys.readouterr().err
+    for text in ("heron.heic: not used", "colour.png: colour converted", "phone.jpg: turned"):
+        assert text in said
+
+
+def test_redirected_output_does_not_go_to_the_progress_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal, output = io.StringIO(), io.StringIO()
+    monkeypatch.setattr("sys.stdout", output)
+    with ProgressDisplay(Console(file=terminal, force_terminal=True)) as display:
+        display.show("encoding", 1, 2)
+        print("a line of the result")
+    assert output.getvalue() == "a line of the result\n"
+    assert "encoding" in terminal.getvalue()
 
 
 def test_missing_pixels_are_written_as_a_mask_and_reported(
     run: Run, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run("encode", folder / "a.tiff", "--codec", "vq")
+    folder /= "streams"
     stream = folder / "a.vq"
     stream.write_bytes(stream.read_bytes()[:-20])
     capsys.readouterr()
@@ -144,22 +238,17 @@ def test_invalid_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Pa
     assert not (tmp_path / "x.tiles").exists()
 
 
-def test_codecs_are_listed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("encode", "unused", "--codec", "help") == 0
-    assert "vector quantisation" in capsys.readouterr().out
-
-
 def test_info_prints_a_shipped_codebook(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("codebook", "info", "nominal-10") == 0
     output = capsys.readouterr().out
     assert load_default(10).tiles.identity in output
-    assert "10 x 10 px" in output
+    assert "10 × 10 px" in output
     assert run("codebook") == 0
     assert "build" in capsys.readouterr().out
 
 
 def test_codebook_is_built_from_a_folder_and_used(run: Run, folder: Path, tmp_path: Path) -> None:
-    out = tmp_path / "mine.tiles"
+    out = tmp_path / "new" / "mine.tiles"
     (folder / "broken.tif").write_bytes(b"II*\0")
     assert run("codebook", "build", "--images", folder, "--tile", 8, "--out", out, "--rounds", "90:8,99:1:2") == 1
     built = load(out)
@@ -168,10 +257,10 @@ def test_codebook_is_built_from_a_folder_and_used(run: Run, folder: Path, tmp_pa
     assert not out.with_name("mine.tiles.journal").exists()
     assert run("encode", folder / "a.tiff", "--codec", "vq", "--codebook", out) == 0
     with pytest.raises(CodebookError, match="SONARPOST_CODEBOOKS"):
-        run("decode", folder / "a.vq")
-    assert run("decode", folder / "a.vq", "--codebook", out) == 0
+        run("decode", folder / "streams" / "a.vq")
+    assert run("decode", folder / "streams" / "a.vq", "--codebook", out) == 0
     # The codebook holds all tiles of the first image, so it is reconstructed exactly.
-    assert np.array_equal(read_image(folder / "out" / "a.tiff"), snippet(0))
+    assert np.array_equal(read_image(folder / "streams" / "out" / "a.tiff"), snippet(0))
     more = tmp_path / "more.tiles"
     assert run("codebook", "build", "--images", folder / "b.png", "--tile", 8, "--out", more, "--core", out) == 0
     assert np.array_equal(load(more).tiles.tiles[: len(built.tiles)], built.tiles.tiles)

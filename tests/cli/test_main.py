@@ -4,42 +4,108 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import logging
+import os
+import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import pytest
 
-from sonarpost.cli.main import COMMANDS, RENAMED_COMMANDS, main, parser
+from sonarpost.cli.main import COMMANDS, LOG_LEVEL_VARIABLE, RENAMED_COMMANDS, exit_status, main, parser
+from sonarpost.cli.parsing.commands import EXAMPLES, EXTRAS
+from sonarpost.cli.parsing.parser import actions_of, all_parsers
+
+LIGHT = "numpy scipy rich pydantic numba zenoh PIL cryptography"
 
 
-def commands_of(whole: argparse.ArgumentParser) -> set[str]:
-    return {name for action in whole._subparsers._group_actions for name in action.choices}  # type: ignore[union-attr]
+def summaries_of(whole: argparse.ArgumentParser) -> dict[str, str | None]:
+    [group] = whole._subparsers._group_actions  # type: ignore[union-attr]
+    return {each.dest: each.help for each in group._choices_actions}  # type: ignore[attr-defined]
 
 
-def test_every_command_is_where_the_table_says() -> None:
-    for command in COMMANDS:
-        assert command in commands_of(parser(command))
+@pytest.fixture(scope="module")
+def whole() -> argparse.ArgumentParser:
+    return parser()
 
 
-def test_the_table_has_every_command() -> None:
-    assert commands_of(parser()) == set(COMMANDS)
+@pytest.fixture
+def verbosity(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Restore what -v and -q change."""
+    monkeypatch.setenv(LOG_LEVEL_VARIABLE, "info")
+    root = logging.getLogger()
+    before = root.level, root.handlers[:]
+    yield
+    root.setLevel(before[0])
+    root.handlers[:] = before[1]
 
 
-def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([]) == 0
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_is_where_the_table_says(command: str) -> None:
+    alone = actions_of(parser(command))[command]
+    assert len(alone._actions) > 2 or command == "prepare"
+
+
+def test_the_table_has_the_summary_of_every_command(whole: argparse.ArgumentParser) -> None:
+    assert summaries_of(whole) == {name: summary for name, (_, summary) in COMMANDS.items()}
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["help"]])
+def test_help_lists_every_command(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        sys.exit(main(arguments))
     listed = capsys.readouterr().out
     assert {line.split()[0] for line in listed.splitlines() if line.startswith("    ") and line[4] != " "} >= set(
         COMMANDS
     )
 
 
-def test_an_unknown_command_is_refused_with_all_names(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_of_a_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main(["help", "store", "salvage"])
+    printed = capsys.readouterr().out
+    assert printed.startswith("usage: sonarpost store salvage")
+    assert printed.endswith(f"\nexample: sonarpost {EXAMPLES['store salvage']}\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "usage", "expected"),
+    [
+        (["sned"], "sonarpost", "invalid choice: 'sned'"),
+        (["pkii"], "sonarpost", "did you mean pki?"),
+        (["--verison"], "sonarpost", "did you mean --version?"),
+        (
+            ["simulate", "a.xtf", "--sed", "3"],
+            "sonarpost simulate",
+            "unrecognized arguments: --sed 3; did you mean --seed?",
+        ),
+        (["store", "chekc", "x"], "sonarpost store", "did you mean check?"),
+        (["store", "check", "x", "y"], "sonarpost store check", "unrecognized arguments: y"),
+        (["simulate", "a.xtf", "--seabed", "sandy"], "sonarpost simulate", "did you mean sand?"),
+    ],
+)
+def test_a_usage_error_has_the_usage_of_the_command_and_a_suggestion(
+    arguments: list[str], usage: str, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as caught:
-        main(["sned"])
+        main(arguments)
     assert caught.value.code == 2
     message = capsys.readouterr().err
-    assert "sned" in message
-    assert "modem-emulator" in message
+    assert message.startswith(f"usage: {usage} [-h]")
+    assert message.splitlines()[-1].startswith(f"{usage}: error: ")
+    assert expected in message
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["help"], ["sned"], []])
+def test_no_library_is_loaded_without_a_command(arguments: list[str]) -> None:
+    code = (
+        f"import sys\nfrom sonarpost.cli.main import main\n"
+        f"try: main({arguments})\nexcept SystemExit: pass\n"
+        f"loaded = set('{LIGHT}'.split()) & sys.modules.keys()\n"
+        "assert not loaded, loaded"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
 def test_a_command_does_not_load_the_others() -> None:
@@ -48,6 +114,63 @@ def test_a_command_does_not_load_the_others() -> None:
         "assert not {'scipy', 'numba', 'sonarpost.cli.demo'} & sys.modules.keys(), 'loaded what pki does not need'"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_every_command_has_an_example_that_parses(whole: argparse.ArgumentParser) -> None:
+    parsers = all_parsers(whole)
+    assert {name for name, each in parsers.items() if not actions_of(each)} <= set(EXAMPLES)
+    for name in EXAMPLES:
+        words = shlex.split(EXAMPLES[name].partition(" > ")[0])
+        assert words[: len(name.split())] == name.split()
+        assert hasattr(whole.parse_args(words), "run")
+        assert parsers[name].format_help().endswith(f"\nexample: sonarpost {EXAMPLES[name]}\n")
+
+
+def test_every_command_accepts_verbose_and_quiet_before_and_after_it(whole: argparse.ArgumentParser) -> None:
+    for name in EXAMPLES:
+        words = shlex.split(EXAMPLES[name].partition(" > ")[0])
+        assert not hasattr(whole.parse_args(words), "verbosity")
+        assert whole.parse_args(["-v", *words]).verbosity == "verbose"
+        assert whole.parse_args([*words, "--quiet"]).verbosity == "quiet"
+    assert all("--verbose" in each.format_help() for each in all_parsers(whole).values())
+
+
+@pytest.mark.usefixtures("verbosity")
+def test_verbose_logs_the_traceback_of_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["store", "check", "absent.db"]) == 2
+    assert "Traceback" not in capsys.readouterr().err
+    assert main(["-v", "store", "check", "absent.db"]) == 2
+    printed = capsys.readouterr().err
+    assert "DEBUG sonarpost: Command failed" in printed
+    assert "Traceback" in printed
+    assert os.environ[LOG_LEVEL_VARIABLE] == "debug"
+
+
+@pytest.mark.usefixtures("verbosity")
+def test_quiet_leaves_the_error_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["store", "check", "absent.db", "-q"]) == 2
+    assert capsys.readouterr().err.startswith("sonarpost: absent.db")
+    assert not logging.getLogger().isEnabledFor(logging.WARNING)
+    assert os.environ[LOG_LEVEL_VARIABLE] == "error"
+
+
+@pytest.mark.parametrize("package", EXTRAS)
+def test_a_missing_extra_is_named(package: str, capsys: pytest.CaptureFixture[str]) -> None:
+    def run() -> int:
+        raise ModuleNotFoundError(f"No module named '{package}'", name=f"{package}.part")
+
+    assert exit_status(run, needed_by="sonarpost console") == 2
+    extra = EXTRAS[package]
+    expected = f"sonarpost console: needs the extra {extra}: pip install 'sonarpost[{extra}]'\n"
+    assert capsys.readouterr().err == expected
+
+
+def test_another_missing_module_is_a_defect() -> None:
+    def run() -> int:
+        raise ModuleNotFoundError("No module named 'numpy'", name="numpy")
+
+    with pytest.raises(ModuleNotFoundError):
+        exit_status(run)
 
 
 @pytest.mark.parametrize("command", RENAMED_COMMANDS)
@@ -65,3 +188,35 @@ def test_a_renamed_command_names_its_new_name(command: str, capsys: pytest.Captu
 )
 def test_the_new_name_of_a_renamed_command_exists(command: str) -> None:
     assert importlib.util.find_spec(command) is not None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "first", "another"),
+    [
+        ("encode --codec help", "avif", "vector quantisation with a shared tile codebook (the paper's codec)"),
+        ("encode --codec=help", "avif", "vector quantisation"),
+        ("encode --codebook help", "nominal-10", "of 20 × 20 px"),
+        ("codebook build --core help", "nominal-10", "of 20 × 20 px"),
+        ("decode --codebook help", "nominal-10", "FILE"),
+        ("encode --model help", "standard (default)", "structure"),
+        ("encode --packing help", "14bit", "ascii5"),
+        ("demo --rate help", "0  1 x  32 B =   32 B in", "5  8 x 256 B = 2048 B in"),
+        ("simulate --seabed help", "sand", "ripples"),
+        ("modem-emulator --preset help", "still", ""),
+        ("pki issue --role help", "uuv", "vessel"),
+    ],
+)
+def test_help_as_a_value_lists_the_values(
+    arguments: str, first: str, another: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments.split())
+    assert caught.value.code == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith(first)
+    assert another in printed.out
+    assert printed.err == ""
+
+
+def test_help_is_a_value_where_there_is_no_list(whole: argparse.ArgumentParser) -> None:
+    assert whole.parse_args(["pki", "revoke", "help", "--reason", "help"]).reason == "help"

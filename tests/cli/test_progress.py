@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import io
+import logging
+from pathlib import Path
 
+import pytest
+from builders.common import eventually
 from rich.console import Console
 
-from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.cli import progress as module
+from sonarpost.cli.main import LOG_LEVEL_VARIABLE, main
+from sonarpost.cli.progress import ProgressDisplay, progress_console
 from sonarpost.codec.vq.builder import BuildProgress, RefinementProgress
 
 
@@ -14,34 +20,92 @@ def progress(done: int, total: int = 100, round_number: int = 0) -> BuildProgres
     return BuildProgress(round_number, 2, done, done, total, 10 * done)
 
 
-def test_log_gets_a_line_every_ten_seconds() -> None:
+def test_state_has_step_amount_and_time() -> None:
     out = io.StringIO()
     now = [0.0]
-    with ProgressDisplay(Console(file=out, width=200), clock=lambda: now[0]) as display:
-        for done in range(1, 101):
-            display.build(progress(done))
-            now[0] += 1.0
-        display.build(progress(1, round_number=1))
-        display.build(RefinementProgress(1, 3, 50, 100, float("nan")))
-        display.build(RefinementProgress(1, 3, 100, 100, 12.345))
-    lines = out.getvalue().splitlines()
-    assert lines[:2] == ["round 1 of 2: 1 of 100, 10 tiles", "round 1 of 2: 11 of 100, 110 tiles"]
-    assert lines[10:] == [
-        "round 1 of 2: 100 of 100, 1000 tiles",
-        "round 2 of 2: 1 of 100, 10 tiles",
-        "refining 1 of 3: 50 of 100",
-        "refining 1 of 3: the error was 12.35 grey levels RMS before",
-    ]
+    display = ProgressDisplay(Console(file=out, width=200), "reading", clock=lambda: now[0])
+    now[0] = 3.0
+    assert display.state() == "reading: 3 s"
+    display.build(progress(11))
+    assert display.state() == "round 1 of 2: 11 of 100, 110 tiles, 0 s"
+    now[0] = 15.0
+    display.build(progress(20))
+    assert display.state() == "round 1 of 2: 20 of 100, 200 tiles, 12 s"
+    display.build(RefinementProgress(1, 3, 50, 100, float("nan")))
+    assert display.state() == "refining 1 of 3: 50 of 100, 0 s"
+    display.build(RefinementProgress(1, 3, 100, 100, 12.345))
+    assert out.getvalue() == "refining 1 of 3: the error was 12.35 grey levels RMS before\n"
+    assert ProgressDisplay(Console(file=out)).state() == ""
+
+
+def test_log_gets_lines_until_the_command_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert module.LINE_EVERY_S == 10.0
+    monkeypatch.setattr(module, "LINE_EVERY_S", 0.01)
+    out = io.StringIO()
+    with ProgressDisplay(Console(file=out, width=200), "drawing") as display:
+        eventually(lambda: out.getvalue().count("drawing: 0 s\n") >= 2)
+    display._lines.join(timeout=10)
+    assert not display._lines.is_alive()
+
+
+def test_short_command_prints_nothing_in_a_log() -> None:
+    out = io.StringIO()
+    with ProgressDisplay(Console(file=out), "drawing") as display:
+        display.show("drawing", 100, 100)
+    assert out.getvalue() == ""
+
+
+def test_quiet_prints_no_progress(capsys: pytest.CaptureFixture[str]) -> None:
+    progress_console().print("shown")
+    root = logging.getLogger()
+    level = root.level
+    root.setLevel(logging.ERROR)
+    try:
+        progress_console().print("hidden")
+    finally:
+        root.setLevel(level)
+    printed = capsys.readouterr()
+    assert (printed.out, printed.err) == ("", "shown\n")
 
 
 def test_terminal_gets_a_bar_and_lines() -> None:
     out = io.StringIO()
-    console = Console(file=out, force_terminal=True, width=100)
-    with ProgressDisplay(console) as display:
+    with ProgressDisplay(Console(file=out, force_terminal=True, width=100)) as display:
         display.build(progress(50))
         display._bar.refresh()
-        assert "50/100" in out.getvalue()
-        assert "round 1 of 2 500 tiles" in out.getvalue()
+        assert "round 1 of 2" in out.getvalue()
+        assert "50 of 100, 500 tiles" in out.getvalue()
         display.build(RefinementProgress(1, 1, 100, 100, 1.0))
     assert "the error was 1.00" in out.getvalue()
-    assert "\n50 of 100" not in out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("detect {line} --json", "detecting in {line}: 0 of 1, "),
+        ("survey info {line} --json", "reading {line}: "),
+        ("survey plot {line} --out {folder}", "drawing {line}: "),
+        ("survey export {line} --out {folder}/track.csv", "reading {line}: "),
+        ("simulate {folder}/other.xtf --pings 300 --force", "simulating 300 pings: "),
+    ],
+)
+def test_long_commands_have_progress_and_quiet_removes_it(
+    words: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = tmp_path / "line.xtf"
+    assert main(["simulate", str(line), "--pings", "300"]) == 0
+    monkeypatch.setattr(module, "LINE_EVERY_S", 0.002)
+    monkeypatch.setenv(LOG_LEVEL_VARIABLE, "info")
+    capsys.readouterr()
+    arguments = [word.format(line=line, folder=tmp_path) for word in words.split()]
+    assert main(arguments) == 0
+    printed = capsys.readouterr()
+    assert any(shown.startswith(expected.format(line=line)) for shown in printed.err.splitlines())
+    level = logging.getLogger().level
+    try:
+        assert main([*arguments, "-q"]) == 0
+    finally:
+        logging.getLogger().setLevel(level)
+    quiet = capsys.readouterr()
+    assert quiet.err == ""
+    assert (quiet.out == "") == (printed.out == "")

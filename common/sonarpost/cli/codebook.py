@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers, add_command
+from sonarpost.cli.shared import Subparsers, add_command, in_new_folder
 from sonarpost.codec.interface import Image, to_uint8
 from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split
 from sonarpost.codec.vq.builder import MAX_TILES, Round, TrainingImage, build, rms_distance
@@ -20,12 +20,11 @@ from sonarpost.codec.vq.codec import codebook_tag
 from sonarpost.codec.vq.comparison import UnmatchedTiles, compare
 from sonarpost.codec.vq.tiles import MAX_DIMS
 from sonarpost.errors import CodebookError, ConfigError, SurveyFileError
-from sonarpost.sonar.image_files import read_image
+from sonarpost.sonar.image_files import list_images, read_any_image
 
 DEFAULT_ROUNDS = "39:16"
 EXIT_SOME_FAILED = 1
 EXIT_DIFFERENT = 1
-IMAGE_SUFFIXES = (".tiff", ".tif", ".png")
 _ROUND = re.compile(r"(?P<fom>\d{1,6}(\.\d{1,6})?):(?P<rms>\d{1,6}(\.\d{1,6})?)(:(?P<images>\d{1,9}))?", re.ASCII)
 
 
@@ -92,7 +91,12 @@ def _add_adapt(actions: Subparsers) -> None:
 
 def _add_images_and_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--images", type=Path, nargs="+", required=True, metavar="DIR", help="folders of TIFF or PNG images, or files"
+        "--images",
+        type=Path,
+        nargs="+",
+        required=True,
+        metavar="DIR",
+        help="folders of JPEG, PNG or TIFF images, or files",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the codebook to write")
     parser.add_argument(
@@ -105,13 +109,13 @@ def run_build(args: argparse.Namespace) -> int:
     rounds = parse_rounds(args.rounds, args.tile)
     if args.refine < 0:
         raise ConfigError("--refine", "", args.refine, "zero or more passes")
-    journal = args.out.with_name(args.out.name + ".journal")
+    journal = in_new_folder(args.out).with_name(args.out.name + ".journal")
     if journal.exists() and not args.resume:
         raise CodebookError(str(journal), "", "an interrupted build", "--resume to continue, or remove the journal")
     console = Console(stderr=True)
     images, skipped = _training_images(args.images, console)
     core = open_codebook(args.core).tiles if args.core is not None else None
-    with ProgressDisplay(console) as display:
+    with ProgressDisplay() as display:
         database = build(
             images,
             args.tile,
@@ -190,10 +194,11 @@ def _variance_text(tiles: UnmatchedTiles, own: str, other: str) -> str:
 def run_adapt(args: argparse.Namespace) -> int:
     """Adapt a codebook and measure the gain; return 0, or 1 if an image was skipped."""
     console = Console(stderr=True)
+    in_new_folder(args.out)
     base = open_codebook(args.base).tiles
     images, skipped = _training_images(args.images, console)
     training, held_out = split(images)
-    with ProgressDisplay(console) as display:
+    with ProgressDisplay() as display:
         adapted = adapt(base, training, max_tiles=args.max_tiles, keep=args.keep, progress=display.show)
         before, after = measure(base, held_out), measure(adapted.tiles, held_out)
     notes = {
@@ -227,7 +232,7 @@ def _print_codebook(codebook: Codebook) -> None:
     tiles = codebook.tiles
     _print_table(
         {
-            "tiles": f"{len(tiles)} of {tiles.tile_px} x {tiles.tile_px} px",
+            "tiles": f"{len(tiles)} of {tiles.tile_px} × {tiles.tile_px} px",
             "dimensions": f"{tiles.dims} of {tiles.tile_px**2}",
             "identity": tiles.identity,
             "tag in streams": f"{codebook_tag(tiles):#06x}",
@@ -250,19 +255,25 @@ def _training_images(sources: list[Path], console: Console) -> tuple[list[Traini
     """
     images, skipped = [], 0
     for source in sources:
-        paths = [source]
+        paths: tuple[Path, ...] = (source,)
         if source.is_dir():
-            paths = sorted(p for p in source.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+            found = list_images(source)
+            paths = found.images
+            for line in found.unused:
+                console.print(line, markup=False, soft_wrap=True)
         for path in paths:
             try:
-                pixels = read_image(path)
+                image = read_any_image(path)
             except SurveyFileError as error:
                 skipped += 1
-                console.print(f"skipped: {error}", markup=False)
+                console.print(f"skipped: {error}", markup=False, soft_wrap=True)
                 continue
+            for note in image.notes:
+                console.print(f"{path}: {note}", markup=False, soft_wrap=True)
+            pixels = image.pixels
             images.append(TrainingImage(f"{path} {pixels.shape} {pixels.dtype}", _loader(path)))
     return images, skipped
 
 
 def _loader(path: Path) -> Callable[[], Image]:
-    return lambda: to_uint8(read_image(path))
+    return lambda: to_uint8(read_any_image(path).pixels)

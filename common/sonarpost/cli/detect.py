@@ -8,29 +8,39 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 from PIL import Image, ImageDraw
 
-from sonarpost.cli.shared import Subparsers
-from sonarpost.detection.detector import MINE_LIKE, Detection
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.cli.shared import (
+    Subparsers,
+    add_survey_options,
+    in_new_folder,
+    make_output_folder,
+    survey_options_of,
+)
+from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
+from sonarpost.detection.detector import MINE_LIKE, Detection, counts_text
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.snippets import cut_snippet, ground_projected_image, to_grey
+from sonarpost.detection.snippets import cut_snippet, ground_projected_image
 from sonarpost.detection.stream import StreamContact, StreamDetector
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
+from sonarpost.messages import Contact
 from sonarpost.sonar.image_files import encode_png, write_png
-from sonarpost.sonar.options import SurveyOptions, load_options
+from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import read_survey
-from sonarpost.sonar.survey import Side, Survey
+from sonarpost.sonar.side_car import write_side_car
+from sonarpost.sonar.source import InMemorySource
+from sonarpost.sonar.survey import Survey
 
 _HEADER = (
-    "  n  conf  class      side       ping  sample  range_m  length_m  width_m  shadow_m  height_m  position"
-    "                sigma_m"
+    "  n  conf  class      side       ping  sample  range_m  length_m  width_m  shadow_m  height_m"
+    "     lat_deg      lon_deg  sigma_m"
 )
 
 # Size of the snippets that are projected to the bottom: 10 m x 10 m.
@@ -67,9 +77,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--max-contacts", type=int, metavar="N", help="list at most the N most confident contacts of a file"
     )
-    parser.add_argument(
-        "--options", type=Path, metavar="FILE.toml", help="mounting, errors, projection (see the page Surveys)"
-    )
+    add_survey_options(parser)
     parser.add_argument("--vehicle", default="uuv", metavar="ID", help="vehicle_id of the records (default: uuv)")
     parser.set_defaults(run=run)
 
@@ -81,36 +89,47 @@ def run(parsed: argparse.Namespace) -> int:
     except ValueError as error:
         value = (parsed.threshold, parsed.max_contacts)
         raise ConfigError("detect", "--threshold, --max-contacts", value, str(error)) from error
-    options = SurveyOptions() if parsed.options is None else load_options(parsed.options)
+    options = survey_options_of(parsed)
     files: list[Path] = parsed.files
-    results = _detect_files(files, settings, options)
+    if parsed.plot is not None:
+        in_new_folder(parsed.plot)
+    if parsed.snippets is not None:
+        make_output_folder(parsed.snippets)
+    with ProgressDisplay() as display:
+        results = _detect_files(files, settings, options, display)
     for result in results:
         if not parsed.json:
-            _print_table(result)
+            _print_table(result, settings.confidence_threshold)
         if parsed.plot is not None:
             path = _plot_path(parsed.plot, result.survey.path, several=len(files) > 1)
             image = annotated_waterfall(result.survey, [contact.in_file() for contact in result.contacts])
             write_atomically(path, encode_png(image))
         if parsed.snippets is not None:
-            _write_snippets(parsed.snippets, result)
+            _write_snippets(parsed.snippets, result, parsed.vehicle)
     if parsed.json:
-        print(json.dumps({"files": [_file_json(r, parsed.vehicle) for r in results]}, allow_nan=False))
+        found = [_file_json(r, parsed.vehicle, settings.confidence_threshold) for r in results]
+        print(json.dumps({"files": found}, allow_nan=False))
     return 0
 
 
-def _detect_files(files: Sequence[Path], settings: DetectorSettings, options: SurveyOptions) -> list[FileResult]:
+def _detect_files(
+    files: Sequence[Path], settings: DetectorSettings, options: SurveyOptions, display: ProgressDisplay
+) -> list[FileResult]:
     """Detect in the files in their order; a contact belongs to the file that contains its ping."""
     detector = StreamDetector(settings, options)
     results: list[FileResult] = []
-    for path in files:
+    for number, path in enumerate(files):
+        display.show(f"reading {path}", number, len(files))
         survey = read_survey(path, options)
+        display.show(f"detecting in {path}", number, len(files))
         started_s = time.perf_counter()
         contacts = detector.add_file(survey)
         results.append(FileResult(survey, []))
         results[-1].seconds += time.perf_counter() - started_s
         _assign(contacts, results)
     _assign(detector.finish(), results)
-    for result in results:
+    for result, weaker in zip(results, detector.weaker, strict=True):
+        result.count, result.weaker = len(result.contacts), weaker
         result.contacts.sort(key=lambda c: -c.detection.confidence)
         del result.contacts[settings.max_contacts or len(result.contacts) :]
     return results
@@ -121,20 +140,19 @@ def _assign(contacts: Sequence[StreamContact], results: Sequence[FileResult]) ->
         results[contact.file].contacts.append(contact)
 
 
-def _print_table(result: FileResult) -> None:
+def _print_table(result: FileResult, threshold: float) -> None:
     survey = result.survey
     print(f"{survey.path}: {len(survey.pings)} pings, {len(result.contacts)} contacts")
     for warning in survey.warnings:
         print(f"  note: {warning}")
-    if result.contacts:
-        print(_HEADER)
+    print(_HEADER if result.contacts else f"{counts_text(threshold, 0, result.weaker)}; see --threshold")
     for number, contact in enumerate(result.contacts, start=1):
         d = contact.detection
-        place = f"{d.position.lat_deg:.6f} {d.position.lon_deg:.6f}" if d.position is not None else "-"
+        lat, lon = ("-", "-") if d.position is None else (f"{d.position.lat_deg:.6f}", f"{d.position.lon_deg:.6f}")
         print(
             f"{number:3d}  {d.confidence:4.2f}  {d.atd_class:9}  {d.side.value:9}  {d.ping_number:5d}  {d.sample:6d}"
             f"  {d.slant_range_m:7.1f}  {_metres(d.length_m):>8}  {d.width_m:7.2f}  {d.shadow_m:8.2f}"
-            f"  {_metres(d.height_m):>8}  {place}  {_metres(d.position_sigma_m):>6}"
+            f"  {_metres(d.height_m):>8}  {lat:>10}  {lon:>11}  {_metres(d.position_sigma_m):>7}"
         )
 
 
@@ -142,11 +160,13 @@ def _metres(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _file_json(result: FileResult, vehicle_id: str) -> dict[str, object]:
+def _file_json(result: FileResult, vehicle_id: str, threshold: float) -> dict[str, object]:
     return {
         "file": str(result.survey.path),
         "pings": len(result.survey.pings),
+        "warnings": list(result.survey.warnings),
         "seconds": round(result.seconds, 3),
+        "contacts_above": {str(confidence): n for confidence, n in ((threshold, result.count), *result.weaker.items())},
         "contacts": [contact_json(result.survey, contact, vehicle_id) for contact in result.contacts],
     }
 
@@ -155,24 +175,37 @@ def _plot_path(plot: Path, survey_path: Path, *, several: bool) -> Path:
     return plot.with_name(f"{plot.stem}-{survey_path.stem}{plot.suffix}") if several else plot
 
 
-def _write_snippets(folder: Path, result: FileResult) -> None:
-    """Write the snippet of each contact at the resolution of the recording and, if possible, at 10 cm a pixel."""
-    folder.mkdir(parents=True, exist_ok=True)
+def _write_snippets(folder: Path, result: FileResult, vehicle_id: str) -> None:
+    """Write the snippet of each contact at the resolution of the recording and, if possible, at 10 cm a pixel.
+
+    Each has a side-car with the fields of the contact.
+    """
     for number, contact in enumerate(result.contacts, start=1):
         name = f"{result.survey.path.stem}-{number:03d}"
+        fields = contact_json(result.survey, contact, vehicle_id) | {"time_utc_s": contact.detection.time_utc_s}
+        record = Contact.model_validate({key: value for key, value in fields.items() if key in Contact.model_fields})
         write_png(folder / f"{name}.png", cut_snippet(contact.survey, contact.detection).image)
+        write_side_car(folder / f"{name}.txt", record)
         ground = ground_projected_image(contact.survey, contact.detection, _GROUND_PX, _GROUND_PX, _GROUND_PIXEL_M)
         if ground is not None:
             write_png(folder / f"{name}-ground.png", ground)
+            changes = {
+                "contact_id": f"{record.contact_id}-ground",
+                "pixel_along_m": _GROUND_PIXEL_M,
+                "pixel_across_m": _GROUND_PIXEL_M,
+            }
+            write_side_car(folder / f"{name}-ground.txt", record.model_copy(update=changes))
 
 
 @dataclass
 class FileResult:
-    """A file, its contacts, and the time of the detection."""
+    """A file, its contacts, their number at the threshold and at lower ones, and the time of the detection."""
 
     survey: Survey
     contacts: list[StreamContact]
     seconds: float = 0.0
+    count: int = 0
+    weaker: dict[float, int] = field(default_factory=dict)
 
 
 def contact_json(survey: Survey, contact: StreamContact, vehicle_id: str) -> dict[str, object]:
@@ -226,36 +259,29 @@ def _content_hash(path: Path) -> str:
 _COLOURS = {MINE_LIKE: (255, 80, 60)}
 _OTHER_COLOUR = (255, 210, 60)
 _MARGIN_PX = 6
+_MAX_SIDE_PX = 1000
 
 
 def annotated_waterfall(survey: Survey, detections: Sequence[Detection]) -> Image.Image:
-    """Draw a survey with port on the left, the track of the vehicle in the middle, and the first ping at the top.
+    """Draw the waterfall of `sonarpost survey plot` with a frame around highlight and shadow of each contact.
 
-    A frame encloses highlight and shadow of each contact, red if mine-like, else yellow. Its text is the number in
-    `detections` (from 1) and the confidence.
+    A frame is red if the contact is mine-like, else yellow. Its text is the number in `detections` (from 1) and the
+    confidence.
 
     Returns:
-        RGB image, one row a ping, one column a sample; 1 x 1 for a survey without samples.
+        RGB image with scales of slant range, time and ping number.
     """
-    halves = {side: _grey(survey, side) for side in survey.sides()}
-    if not halves or not survey.pings:
-        return Image.new("RGB", (1, 1))
-    track = halves[Side.PORT].shape[1] if Side.PORT in halves else 0
-    columns = [image[:, ::-1] if side is Side.PORT else image for side, image in halves.items()]
-    waterfall = Image.fromarray(np.hstack(columns)).convert("RGB")
-    draw = ImageDraw.Draw(waterfall)
+    side_px = min(max(survey.sample_count(side) for side in survey.sides()), _MAX_SIDE_PX)
+    reduced = reduce_survey(InMemorySource(survey, SurveyOptions()), over_ground=False, side_px=side_px)
+    image = draw_waterfall(reduced, f"{survey.line_name}   {len(detections)} contacts", over_ground=False)
+    draw = ImageDraw.Draw(image)
     for number, detection in enumerate(detections, start=1):
-        near = detection.highlight_samples[0] - _MARGIN_PX
-        far = detection.highlight_samples[1] + detection.shadow_samples + _MARGIN_PX
-        left, right = (track - far, track - near) if detection.side is Side.PORT else (track + near, track + far)
-        top, bottom = detection.highlight_pings[0] - _MARGIN_PX, detection.highlight_pings[1] + _MARGIN_PX
+        far_sample = detection.highlight_samples[1] + detection.shadow_samples
+        near_m, far_m = (sample * detection.pixel_across_m for sample in (detection.highlight_samples[0], far_sample))
+        left, right = sorted(reduced.x(detection.side, range_m) for range_m in (near_m, far_m))
+        top, bottom = map(reduced.y, detection.highlight_pings)
+        frame = (left - _MARGIN_PX, top - _MARGIN_PX, right + _MARGIN_PX, bottom + _MARGIN_PX)
         colour = _COLOURS.get(detection.atd_class, _OTHER_COLOUR)
-        draw.rectangle((left, top, right, bottom), outline=colour)
-        draw.text((left, bottom + 1), f"{number}: {detection.confidence:.2f}", fill=colour)
-    return waterfall
-
-
-def _grey(survey: Survey, side: Side) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    image = survey.waterfall(side)
-    known = np.isfinite(image)
-    return to_grey(np.where(known, image, 0.0).astype(np.uint32), known)
+        draw.rectangle(frame, outline=colour)
+        draw.text((frame[0], frame[3] + 1), f"{number}: {detection.confidence:.2f}", fill=colour)
+    return image

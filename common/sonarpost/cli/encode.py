@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from sonarpost.cli.shared import Subparsers
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.cli.shared import Subparsers, add_fit_option, in_new_folder, printable
 from sonarpost.codec import Codec, StreamHeader, codec_names, decode_image, get_codec
 from sonarpost.codec.api import CodecOptions
+from sonarpost.codec.fitting import fit_image
 from sonarpost.codec.registry import RETIRED_NAMES, CodecResources, default_registry
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import SonarpostError, StreamError
 from sonarpost.files import write_atomically
-from sonarpost.sonar.image_files import read_image, write_png, write_tiff
+from sonarpost.sonar.image_files import list_images, read_any_image, unused_lines, write_png, write_tiff
 
-IMAGE_SUFFIXES = (".tiff", ".tif", ".png")
+STREAM_FOLDER = "streams"
+DECODED_FOLDER = "out"
 TEXT_SUFFIX = ".txt"
 MAX_STREAM_FILE_BYTES = 1 << 18  # header and the longest body, twice for hexadecimal text, and line ends
 EXIT_SOME_FAILED = 1
@@ -29,7 +33,7 @@ EXIT_SOME_FAILED = 1
 def add_parser(subparsers: Subparsers) -> None:
     """Add both commands."""
     encode = subparsers.add_parser("encode", help="encode an image or a folder of images")
-    encode.add_argument("input", type=Path, metavar="IMAGE_OR_DIR", help="TIFF or PNG, grey, 8 or 16 bits")
+    encode.add_argument("input", type=Path, metavar="IMAGE_OR_DIR", help="JPEG, PNG or TIFF of any depth and colour")
     encode.add_argument(
         "--codec", default="emb", help="name of a codec; `--codec help` lists them (default: %(default)s)"
     )
@@ -50,10 +54,15 @@ def add_parser(subparsers: Subparsers) -> None:
         "--budget", type=int, metavar="BYTES", help="maximum length of a stream, header included (default: the codec's)"
     )
     encode.add_argument("--text", action="store_true", help="write hexadecimal text (.txt), as the paper does")
-    encode.add_argument("--out", type=Path, metavar="DIR", help="folder for the streams (default: that of the image)")
+    add_fit_option(encode)
+    encode.add_argument(
+        "--out", type=Path, metavar="DIR", help=f"folder for the streams (default: {STREAM_FOLDER}/ beside the image)"
+    )
     encode.set_defaults(run=run_encode)
     decode = subparsers.add_parser("decode", help="decode a stream or a folder of streams to TIFF and PNG")
-    decode.add_argument("input", type=Path, metavar="FILE_OR_DIR", help="output of `sonarpost encode`")
+    decode.add_argument(
+        "input", type=Path, metavar="FILE_OR_DIR", help="a stream, or a folder of streams or of encoded images"
+    )
     decode.add_argument(
         "--codebook",
         metavar="NAME_OR_FILE",
@@ -61,7 +70,10 @@ def add_parser(subparsers: Subparsers) -> None:
         "files and folders in the environment variable SONARPOST_CODEBOOKS)",
     )
     decode.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the images (default: out/ beside the stream)"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help=f"folder for the images (default: {DECODED_FOLDER}/ in that folder)",
     )
     decode.set_defaults(run=run_decode)
 
@@ -69,20 +81,30 @@ def add_parser(subparsers: Subparsers) -> None:
 def run_encode(args: argparse.Namespace) -> int:
     """Encode; return 0, or 1 if any file of the folder could not be encoded."""
     registry = default_registry()
-    if args.codec == "help":
-        for name in registry.names():
-            print(f"{name:16} {registry.spec(name).summary}")
-        return 0
     options: CodecOptions = {} if args.model is None else {"model": args.model}
     if registry.spec(args.codec).needs_tiles:
         options |= {"codebook": args.codebook, "packing": args.packing}
     codec = get_codec(args.codec, **options)
     suffix = TEXT_SUFFIX if args.text else f".{codec.name}"
+    folder = args.out if args.out is not None else _folder_of(args.input) / STREAM_FOLDER
 
     def encode_one(path: Path) -> str:
-        return _encode_file(codec, path, _output_folder(args.out, path.parent) / (path.stem + suffix), args)
+        return _encode_file(codec, path, folder / (path.stem + suffix), args)
 
-    return _process_files(args.input, IMAGE_SUFFIXES, encode_one)
+    if not args.input.is_dir():
+        print(encode_one(args.input))
+        return 0
+    found = list_images(args.input, ignore=(folder, args.input / DECODED_FOLDER))
+    for line in found.unused:
+        print(line, file=sys.stderr)
+    if found.side_cars:
+        print(
+            f"{args.input}: not used: {len(found.side_cars)} *.txt beside images: streams hold no position",
+            file=sys.stderr,
+        )
+    status = _process_files("encoding", found.images, encode_one)
+    print(f"decode them with: sonarpost decode {shlex.quote(str(args.input if args.out is None else folder))}")
+    return status
 
 
 def run_decode(args: argparse.Namespace) -> int:
@@ -91,45 +113,68 @@ def run_decode(args: argparse.Namespace) -> int:
     # Opened before the loop: an unreadable codebook is one error, not one for each file.
     tiles = open_codebook(args.codebook).tiles if args.codebook is not None else None
 
+    folder = args.out if args.out is not None else _folder_of(args.input) / DECODED_FOLDER
+
     def decode_one(path: Path) -> str:
-        return _decode_file(path, _output_folder(args.out, path.parent / "out"), tiles)
+        return _decode_file(path, folder, tiles)
 
-    return _process_files(args.input, suffixes, decode_one)
-
-
-def _process_files(source: Path, suffixes: tuple[str, ...], process: Callable[[Path], str]) -> int:
-    """Process one file, or the files of a folder. In a folder, an invalid file is reported and the loop continues."""
-    if not source.is_dir():
-        print(process(source))
+    if not args.input.is_dir():
+        print(decode_one(args.input))
         return 0
-    paths = sorted(path for path in source.iterdir() if path.suffix.lower() in suffixes and path.is_file())
-    if not paths:
-        raise StreamError(str(source), "", "no such file", "a folder with files ending in " + ", ".join(suffixes))
+    source = args.input / STREAM_FOLDER
+    source = source if source.is_dir() else args.input
+    return _process_files("decoding", _list_streams(source, suffixes, folder), decode_one)
+
+
+def _folder_of(source: Path) -> Path:
+    return source if source.is_dir() else source.parent
+
+
+def _list_streams(folder: Path, suffixes: tuple[str, ...], out: Path) -> list[Path]:
+    """Return the streams of a folder; print what else is in it."""
+    entries = sorted(path for path in folder.iterdir() if path != out)
+    streams = [path for path in entries if path.suffix.lower() in suffixes and path.is_file()]
+    if not streams:
+        raise StreamError(str(folder), "", "no such file", "a folder with files ending in " + ", ".join(suffixes))
+    for line in unused_lines(folder, [(path, "not a stream") for path in entries if path not in streams]):
+        print(line, file=sys.stderr)
+    return streams
+
+
+def _process_files(step: str, paths: Sequence[Path], process: Callable[[Path], str]) -> int:
+    """Process the files of a folder. An invalid file is reported and the loop continues."""
     failed = 0
     path_by_stem: dict[str, Path] = {}
-    for path in paths:
-        try:
-            if path.stem in path_by_stem:
-                # The output has the stem of the input, as in the paper: a second file would overwrite the first.
-                other = path_by_stem[path.stem].name
-                raise StreamError(str(path), "name", path.stem, f"another stem than that of {other}")
-            path_by_stem[path.stem] = path
-            print(process(path))
-        except SonarpostError as error:
-            failed += 1
-            print(f"{path.name}: {error}", file=sys.stderr)
+    with ProgressDisplay() as display:
+        for number, path in enumerate(paths):
+            display.show(step, number, len(paths), printable(path.name))
+            try:
+                if path.stem in path_by_stem:
+                    # The output has the stem of the input, as in the paper: a second file would overwrite the first.
+                    other = path_by_stem[path.stem].name
+                    raise StreamError(str(path), "name", path.stem, f"another stem than that of {other}")
+                path_by_stem[path.stem] = path
+                print(process(path), flush=True)
+            except SonarpostError as error:
+                failed += 1
+                where = "" if str(path) in str(error) else f"{path}: "
+                print(f"{where}{error}", file=sys.stderr)
     print(f"{len(paths) - failed} of {len(paths)} files done")
     return EXIT_SOME_FAILED if failed else 0
 
 
 def _encode_file(codec: Codec, path: Path, target: Path, args: argparse.Namespace) -> str:
-    image = read_image(path)
+    read = read_any_image(path)
+    fitted = fit_image(read.pixels, args.fit, str(path))
+    image = fitted.pixels
     stream = codec.encode(image, args.budget)
     try:
-        write_atomically(target, (stream.hex() + "\n").encode() if args.text else stream)
+        write_atomically(in_new_folder(target), (stream.hex() + "\n").encode() if args.text else stream)
     except OSError as error:
         raise StreamError(str(target), "", error.strerror or str(error), "a writable file") from error
-    return f"{path} -> {target}: {image.nbytes} B -> {len(stream)} B ({image.nbytes / len(stream):.1f}:1)"
+    size = f"{image.shape[1]} × {image.shape[0]} px"
+    done = f"{path} -> {target}: {size}, {image.nbytes} B -> {len(stream)} B ({image.nbytes / len(stream):.1f}:1)"
+    return "; ".join((done, *read.notes, *fitted.notes))
 
 
 def _decode_file(path: Path, folder: Path, tiles: TileDatabase | None) -> str:
@@ -139,7 +184,7 @@ def _decode_file(path: Path, folder: Path, tiles: TileDatabase | None) -> str:
         decoded = decode_image(stream)
     else:
         decoded = default_registry().create_for_stream(stream, CodecResources(tiles)).decode(stream)
-    target = folder / f"{path.stem}.tiff"
+    target = in_new_folder(folder / f"{path.stem}.tiff")
     write_tiff(target, decoded.image)
     write_png(target.with_suffix(".png"), decoded.image)
     missing = ""
@@ -147,7 +192,7 @@ def _decode_file(path: Path, folder: Path, tiles: TileDatabase | None) -> str:
         mask = folder / f"{path.stem}.missing.png"
         write_png(mask, decoded.missing.astype(np.uint8) * np.uint8(255))
         missing = f", {100 * decoded.missing.mean():.1f} % missing (white in {mask.name}): {'; '.join(decoded.notes)}"
-    return f"{path} -> {target}: {header.width_px} x {header.height_px} px{missing}"
+    return f"{path} -> {target}: {header.width_px} × {header.height_px} px{missing}"
 
 
 def _read_stream(path: Path) -> bytes:
@@ -165,12 +210,3 @@ def _read_stream(path: Path) -> bytes:
         return bytes.fromhex(data.decode("ascii"))
     except ValueError as error:  # includes UnicodeDecodeError
         raise StreamError(str(path), "text", data[:40], "hexadecimal digits") from error
-
-
-def _output_folder(chosen: Path | None, default: Path) -> Path:
-    folder = chosen if chosen is not None else default
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StreamError(str(folder), "", error.strerror or str(error), "a folder that can be created") from error
-    return folder

@@ -1,103 +1,121 @@
-"""The `sonarpost` command: one subcommand a module."""
+"""The `sonarpost` command. Its help, and the report of a misspelt command, import the module of no command."""
 
 from __future__ import annotations
 
 import argparse
 import importlib
+import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
 
 from sonarpost import __version__
+from sonarpost.cli.parsing.commands import COMMANDS, EXTRAS, RENAMED_COMMANDS
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.errors import SonarpostError
 
-# Module of each command. Only the module of the given command is imported: all of them together take seconds.
-COMMANDS = {
-    "demo": "demo",
-    "run": "run",
-    "router": "run",
-    "status": "status",
-    "c2": "c2",
-    "store": "store",
-    "console": "console",
-    "metrics": "metrics",
-    "simulate": "simulate",
-    "survey": "survey",
-    "detect": "detect",
-    "encode": "encode",
-    "decode": "encode",
-    "codebook": "codebook",
-    "prepare": "prepare",
-    "pki": "pki",
-    "modem-emulator": "modem_emulator",
-}
-# Commands of version 0.1 that have another name now.
-RENAMED_COMMANDS = {
-    "catalogue": "sonarpost codebook",
-    "survey-panel": "python -m research.user_study",
-    "codebook nominal": "python -m research.default_codebooks",
-    "bench": "python -m research.codecs (research/README.md lists the others)",
-    "bench codecs": "python -m research.codecs",
-    "bench link": "python -m research.link",
-    "bench detect": "python -m research.detection",
-    "bench recognition": "python -m research.recognition",
-    "bench paper": "python -m research.paper",
-    "bench sea-trial": "python -m research.sea_trial",
-    "bench mission": "python -m research.mission",
-    "bench busy": "python -m research.utilisation",
-}
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
+LOG_LEVEL_VARIABLE = "SONARPOST_PLATFORM__LOG_LEVEL"
+"""Environment variable that overrides the configured log level of a service and of the services it starts."""
+_STATUS = (
+    "Exit status: 0 success; 1 done, with a result that needs attention (the help of the command says which); "
+    "2 invalid input, one line on standard error; 130 interrupted by Ctrl-C."
+)
 
 
-def parser(command: str = "") -> argparse.ArgumentParser:
-    """Return the parser of one command, or of all commands for any other name."""
-    whole = argparse.ArgumentParser(
+def parser(command: str | None = None) -> CommandParser:
+    """Return the parser with the options of one command, or of all commands for None.
+
+    All other commands, and every command for another name, have a summary but no options.
+    """
+    whole = CommandParser(
         prog="sonarpost",
         description="Send images of sonar contacts from an underwater vehicle to a vessel and a shore site.",
+        epilog=_STATUS,
     )
     whole.add_argument("--version", action="version", version=f"sonarpost {__version__}")
     subparsers = whole.add_subparsers(metavar="COMMAND", required=False)
-    modules = [COMMANDS[command]] if command in COMMANDS else dict.fromkeys(COMMANDS.values())
-    for module in modules:
-        importlib.import_module(f"sonarpost.cli.{module}").add_parser(subparsers)
+    wanted = dict.fromkeys(module for name, (module, _) in COMMANDS.items() if command in (None, name))
+    added = set[str]()
+    for name, (module, summary) in COMMANDS.items():
+        if module not in wanted:
+            subparsers.add_parser(name, help=summary)
+        elif module not in added:  # a module adds all its commands
+            importlib.import_module(f"sonarpost.{module}").add_parser(subparsers)
+            added.add(module)
     return whole
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the exit status (2: invalid input, reported in one line)."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    new_name = RENAMED_COMMANDS.get(" ".join(given[:2])) or RENAMED_COMMANDS.get(" ".join(given[:1]))
+    words = [word for word in given if not word.startswith("-")]
+    if words[:1] == ["help"]:
+        given = [*words[1:], "--help"]
+        words = words[1:]
+    new_name = RENAMED_COMMANDS.get(" ".join(words[:2])) or RENAMED_COMMANDS.get(" ".join(words[:1]))
     if new_name is not None:
-        print(f"sonarpost: {' '.join(given[:2])}: this command is now: {new_name}", file=sys.stderr)
+        print(f"sonarpost: {' '.join(words[:2])}: this command is now: {new_name}", file=sys.stderr)
         return EXIT_ERROR
-    whole = parser(given[0] if given else "")
-    parsed = whole.parse_args(given)
-    if not hasattr(parsed, "run"):
-        whole.print_help()
-        return 0
-    return exit_status(lambda: parsed.run(parsed))
+    command = words[0] if words else ""
+
+    def run() -> int:
+        whole = parser(command)
+        parsed = whole.parse_args(given)
+        apply_verbosity(parsed)
+        if not hasattr(parsed, "run"):
+            whole.print_help()
+            return 0
+        status: int = parsed.run(parsed)
+        return status
+
+    return exit_status(run, needed_by=f"sonarpost {command}".strip())
 
 
-def exit_status(run: Callable[[], int], prog: str = "sonarpost") -> int:
+def apply_verbosity(parsed: argparse.Namespace) -> None:
+    """Set the log level of this process and of the services that it starts, if -v or -q was given."""
+    verbosity = getattr(parsed, "verbosity", None)
+    if verbosity == "verbose":
+        # Imported lazily: it loads the records.
+        from sonarpost.logs import configure_logging  # noqa: PLC0415
+
+        configure_logging("sonarpost", "debug")
+        os.environ[LOG_LEVEL_VARIABLE] = "debug"
+    elif verbosity == "quiet":
+        logging.getLogger().setLevel(logging.ERROR)
+        os.environ[LOG_LEVEL_VARIABLE] = "error"
+
+
+def exit_status(run: Callable[[], int], prog: str = "sonarpost", needed_by: str = "") -> int:
     """Run a command; return its exit status.
 
-    A SonarpostError or OSError is printed as one line and gives status 2, an interrupt gives status 130.
+    A SonarpostError, an OSError or a missing extra is printed as one line and gives status 2, an interrupt gives
+    status 130. At log level debug the traceback is logged as well.
     """
     try:
         return run()
     except SonarpostError as error:
-        print(f"{prog}: {error}", file=sys.stderr)
-        return EXIT_ERROR
+        return _failed(prog, error)
     except OSError as error:
         if isinstance(error, BrokenPipeError):
             # The reader has closed the output (`| head`): not an error.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
-        print(f"{prog}: {error}", file=sys.stderr)
-        return EXIT_ERROR
+        return _failed(prog, error)
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        return _failed(needed_by or prog, error, f"needs the extra {extra}: pip install 'sonarpost[{extra}]'")
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+
+
+def _failed(prog: str, error: Exception, text: str = "") -> int:
+    logging.getLogger(__name__).debug("Command failed", exc_info=error)
+    print(f"{prog}: {text or error}", file=sys.stderr)
+    return EXIT_ERROR
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import logging
 from prometheus_client import start_http_server
 
 from sonarpost import logs
-from sonarpost.cli.shared import Subparsers, add_router_options, router_of
+from sonarpost.cli.shared import Subparsers, add_router_options, log_level, router_of
 from sonarpost.errors import PortError
 from sonarpost.monitoring.fleet import FleetTracker, FleetWatcher
 from sonarpost.monitoring.metrics import FleetCollector, registry_of
@@ -50,7 +50,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(parsed: argparse.Namespace) -> int:
     """Serve until SIGTERM or SIGINT."""
     endpoints, tls = router_of(parsed)
-    logs.configure_logging("metrics", log_format=parsed.log_format)
+    logs.configure_logging("metrics", log_level(parsed), log_format=parsed.log_format)
     with stop_on_signals() as stop:
         watcher = FleetWatcher(endpoints, tls, FleetTracker(parsed.forget_after))
         registry = registry_of(FleetCollector(watcher.state, parsed.stale_after))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from sonarpost.cli.shared import Subparsers
+from sonarpost.cli.shared import Subparsers, in_new_folder
 from sonarpost.errors import ConfigError
 from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.channel.config import EmulatorConfig
@@ -154,7 +154,7 @@ def _config(parsed: argparse.Namespace) -> EmulatorConfig:
                 "tcp_ports": (parsed.tcp or (0,) * parsed.modems) if parsed.tcp is not None else (),
                 "time_scale": parsed.time_scale,
                 "serial_baud": parsed.baud or 0.0,
-                "log": parsed.log,
+                "log": None if parsed.log is None else in_new_folder(parsed.log),
                 "transponder": [_transponder(text) for text in parsed.transponder],
             }
         )

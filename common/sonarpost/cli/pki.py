@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
-from sonarpost.cli.shared import Subparsers, add_command, aligned
+from sonarpost.cli.shared import Subparsers, add_command, aligned, in_new_folder
 from sonarpost.files import PUBLIC_FILE, write_atomically, write_new
 from sonarpost.keys import SHORE
 from sonarpost.security.acoustic_key import KEY_NAME, create_key
@@ -229,10 +229,10 @@ def run_router_config(args: argparse.Namespace) -> int:
     if args.out is None:
         sys.stdout.write(text)
     elif args.replace:
-        write_atomically(args.out, text.encode())
+        write_atomically(in_new_folder(args.out), text.encode())
     else:
         try:
-            write_new(args.out, text.encode(), PUBLIC_FILE)
+            write_new(in_new_folder(args.out), text.encode(), PUBLIC_FILE)
         except FileExistsError as error:
             raise PkiError(str(args.out), "", "an existing file", "a new file, or --replace") from error
     return 0

@@ -7,6 +7,7 @@ import logging
 import sys
 import time
 
+from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers
 from sonarpost.codec.jit import NO_FOLDER, compilation_log
 from sonarpost.codec.machine_code import prepare_machine_code
@@ -27,7 +28,13 @@ def run(_: argparse.Namespace) -> int:
     """Compile what the cache on disk does not hold; return 0, or 1 if the machine code cannot be stored."""
     started_s = time.monotonic()
     logging.getLogger("sonarpost.codec.jit").setLevel(logging.ERROR)  # the steps are printed here
-    prepare_machine_code(lambda step: print(f"Preparing machine code: {step}", flush=True))
+    with ProgressDisplay() as display:
+
+        def show(step: str) -> None:
+            display.show(step)
+            display.line(f"Preparing machine code: {step}")
+
+        prepare_machine_code(show)
     if not compilation_log.compiled:
         print("Machine code is ready: the cache holds all functions")
         return 0

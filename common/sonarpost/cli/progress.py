@@ -1,46 +1,96 @@
-"""Progress of a long command: a bar on a terminal, else a line every ten seconds."""
+"""Progress of a long command on standard error: a bar on a terminal, else a line every ten seconds."""
 
 from __future__ import annotations
 
+import logging
 import math
+import sys
+import threading
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from sonarpost.codec.vq.builder import BuildProgress, RefinementProgress
+if TYPE_CHECKING:
+    from sonarpost.codec.vq.builder import BuildProgress, RefinementProgress
 
 LINE_EVERY_S = 10.0
 
 
+def progress_console() -> Console:
+    """Return the console for progress, on standard error. With --quiet it prints nothing."""
+    return Console(stderr=True, quiet=not logging.getLogger().isEnabledFor(logging.WARNING))
+
+
 class ProgressDisplay:
-    """Context manager that shows the progress of steps.
+    """Context manager that shows what a command does. A command shorter than ten seconds prints nothing in a log.
 
     Args:
-        console: Output; shows a bar if it is a terminal.
+        console: Output (default: `progress_console`); shows a bar if it is a terminal.
+        step: Name of the first step.
         clock: Monotonic clock in seconds.
     """
 
-    def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
-        self._console = console
+    def __init__(
+        self, console: Console | None = None, step: str = "", clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._console = progress_console() if console is None else console
         self._clock = clock
-        self._last_line_s = -math.inf
-        self._step = ""
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        self._bar = Bar(*columns, console=console, transient=True, disable=not console.is_terminal)
-        self._task = self._bar.add_task("", total=None)
+        self._step, self._count, self._since_s = step, "", clock()
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[count]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
+        self._bar = Bar(
+            *columns,
+            console=self._console,
+            transient=True,
+            disable=not self._console.is_terminal,
+            redirect_stdout=sys.stdout.isatty(),  # results that go to a file stay there
+        )
+        self._task = self._bar.add_task(step, total=None, count="")
+        self._stop = threading.Event()
+        self._lines = threading.Thread(target=self._print_lines, daemon=True)
 
     def __enter__(self) -> ProgressDisplay:
-        self._bar.start()
+        if self._console.is_terminal:
+            self._bar.start()
+        else:
+            self._lines.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._stop.set()
         self._bar.stop()
+        if self._lines.is_alive():
+            self._lines.join()  # no line follows the results
+
+    def show(self, step: str, done: int = 0, total: int | None = None, detail: str = "") -> None:
+        """Set the progress of a step.
+
+        Args:
+            step: Name of the step.
+            done: Amount done.
+            total: Total amount; None if it is unknown.
+            detail: Further text.
+        """
+        if step != self._step:
+            self._since_s = self._clock()
+        count = ", ".join(part for part in ("" if total is None else f"{done} of {total}", detail) if part)
+        self._step, self._count = step, count
+        self._bar.update(self._task, description=step, completed=done, total=total, count=count)
 
     def build(self, progress: BuildProgress | RefinementProgress) -> None:
-        """Show the progress of a codebook build."""
+        """Set the progress of a codebook build."""
+        # Imported lazily: most commands do not need it.
+        from sonarpost.codec.vq.builder import BuildProgress  # noqa: PLC0415
+
         if isinstance(progress, BuildProgress):
             step = f"round {progress.round_number + 1} of {progress.rounds}"
             self.show(step, progress.done_in_round, progress.images_in_round, f"{progress.tiles} tiles")
@@ -51,23 +101,16 @@ class ProgressDisplay:
         else:
             self.line(f"{step}: the error was {progress.rms:.2f} grey levels RMS before")
 
-    def show(self, step: str, done: int, total: int, detail: str = "") -> None:
-        """Show the progress of a step.
-
-        Args:
-            step: Name of the step.
-            done: Amount done.
-            total: Total amount.
-            detail: Further text.
-        """
-        if self._console.is_terminal:
-            self._bar.update(self._task, description=f"{step} {detail}".rstrip(), completed=done, total=total)
-            return
-        now = self._clock()
-        if done >= total or step != self._step or now - self._last_line_s >= LINE_EVERY_S:
-            self.line(f"{step}: {done} of {total}" + (f", {detail}" if detail else ""))
-            self._step, self._last_line_s = step, now
-
     def line(self, text: str) -> None:
         """Print a line, above the bar if there is one."""
-        self._bar.console.print(text, markup=False, highlight=False)
+        self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def state(self) -> str:
+        """Return the line of a log: step, amount, time since the step began; empty without a step."""
+        count = f"{self._count}, " if self._count else ""
+        return f"{self._step}: {count}{self._clock() - self._since_s:.0f} s" if self._step else ""
+
+    def _print_lines(self) -> None:
+        while not self._stop.wait(LINE_EVERY_S):
+            if text := self.state():
+                self.line(text)

@@ -1,23 +1,37 @@
-"""`sonarpost run SERVICE --config FILE` and `sonarpost router`."""
+"""`sonarpost run SERVICE --config FILE`, `sonarpost run all --config FILE` and `sonarpost router`."""
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import runpy
 import sys
 from pathlib import Path
 
 from sonarpost import logs
 from sonarpost.bus import router
-from sonarpost.cli.shared import Subparsers
-from sonarpost.config import SERVICES
+from sonarpost.cli.deployment import run_all
+from sonarpost.cli.shared import Subparsers, add_survey_options, log_level, survey_options_of
+from sonarpost.config import ENVIRONMENT_PREFIX, SERVICES
+from sonarpost.errors import ConfigError
+
+_DESCRIPTION = """Run one service until Ctrl-C, or all services that have a table in the file: a test on a bench needs
+one terminal for each platform. With all, an embedded router is started as well if `router` names an endpoint of this
+host on which no router listens. Each line of the output begins with the name of its process. A process that ends is
+restarted after 1, 2, 4, ... 60 s; one that ends with status 2, an invalid configuration, stops all. For operation use
+systemd (`sonarpost install-units`)."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add the subcommands."""
-    run = subparsers.add_parser("run", help="run one service of the chain", description="Run one service.")
-    run.add_argument("service", choices=SERVICES, help="name of the service")
+    run = subparsers.add_parser(
+        "run", help="run one service of the chain, or all services of a platform", description=_DESCRIPTION
+    )
+    run.add_argument("service", choices=("all", *SERVICES), help="name of the service, or all")
     run.add_argument("--config", type=Path, required=True, help="TOML file of the platform")
+    add_survey_options(run)
+    run_all.add_options(run)
     run.set_defaults(run=run_service)
     route = subparsers.add_parser("router", help="run an embedded Zenoh router", description=router.__doc__)
     router.add_arguments(route)
@@ -25,13 +39,38 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run_service(parsed: argparse.Namespace) -> int:
-    """Run the service's own module, as `python -m sonarpost.services.NAME` does."""
+    """Run the service's own module, as `python -m sonarpost.services.NAME` does, or all services.
+
+    Raises:
+        ConfigError: Invalid survey options, or options for another service than the given one.
+    """
+    os.environ.update(_survey_overrides(parsed))
+    if parsed.service == "all":
+        return run_all.run(parsed)
+    if parsed.router_config is not None or parsed.listen:
+        raise ConfigError("command line", "--router-config or --listen", parsed.service, "the service all")
     sys.argv[1:] = ["--config", str(parsed.config)]
     runpy.run_module(f"sonarpost.services.{parsed.service}", run_name="__main__", alter_sys=True)
     return 0
 
 
+def _survey_overrides(parsed: argparse.Namespace) -> dict[str, str]:
+    """Return --options and --crs as environment variables, which override the configuration file."""
+    given = parsed.options or parsed.crs
+    if given is None:
+        return {}
+    if parsed.service not in ("atd_stub", "all"):
+        raise ConfigError(f"run {parsed.service}", "--options, --crs", given, "survey options for atd_stub only")
+    crs = survey_options_of(parsed).projected_crs
+    values = {"SURVEY_OPTIONS": parsed.options, "PROJECTED_CRS": crs}
+    return {
+        f"{ENVIRONMENT_PREFIX}ATD_STUB__{name}": json.dumps(str(v), ensure_ascii=False)
+        for name, v in values.items()
+        if v is not None
+    }
+
+
 def run_router(parsed: argparse.Namespace) -> int:
     """Run an embedded router."""
-    logs.configure_logging("router")
+    logs.configure_logging("router", log_level(parsed))
     return router.run_parsed(parsed)

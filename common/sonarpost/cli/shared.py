@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
+import tempfile
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
-from sonarpost.config import PlatformConfig, TlsConfig, load
 from sonarpost.errors import ConfigError
 from sonarpost.keys import SHORE
+
+if TYPE_CHECKING:
+    from sonarpost.config import TlsConfig
+    from sonarpost.sonar.options import SurveyOptions
+    from sonarpost.sonar.source import SurveyInfo
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # noqa: SLF001  argparse names it so
 """Group of the parsers of commands or actions."""
@@ -35,6 +41,12 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     """Return the rows as lines with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def in_new_folder(path: Path) -> Path:
+    """Return the path of an output file after creating its folder, as `make_output_folder` does."""
+    make_output_folder(path.parent)
+    return path
 
 
 def add_router_options(parser: argparse.ArgumentParser) -> None:
@@ -62,6 +74,9 @@ def router_of(parsed: argparse.Namespace) -> tuple[tuple[str, ...], TlsConfig | 
     Raises:
         ConfigError: The file is invalid, or only some of the TLS options are given.
     """
+    # Imported lazily: the help of a command does not need it, and it loads the records.
+    from sonarpost.config import PlatformConfig, TlsConfig, load  # noqa: PLC0415
+
     endpoints: tuple[str, ...] = (DEFAULT_ROUTER,)
     tls: TlsConfig | None = None
     if parsed.config is not None:
@@ -78,9 +93,86 @@ def router_of(parsed: argparse.Namespace) -> tuple[tuple[str, ...], TlsConfig | 
     return endpoints, tls
 
 
+def log_level(parsed: argparse.Namespace) -> str:
+    """Return the log level of a server: info unless -v or -q was given."""
+    return {"verbose": "debug", "quiet": "error"}.get(getattr(parsed, "verbosity", ""), "info")
+
+
 def add_site_option(parser: argparse.ArgumentParser) -> None:
     """Add --site, the name of the shore site."""
     parser.add_argument("--site", default=SHORE, metavar="NAME", help=f"name of the shore site (default: {SHORE})")
+
+
+def add_survey_options(parser: argparse.ArgumentParser) -> None:
+    """Add --options and --crs: what survey files do not contain."""
+    parser.add_argument(
+        "--options", type=Path, metavar="FILE.toml", help="survey options: projection, mounting of the sonar, errors"
+    )
+    parser.add_argument(
+        "--crs", metavar="EPSG:N", help="coordinate system of positions in metres; replaces the one in --options"
+    )
+
+
+def survey_options_of(parsed: argparse.Namespace) -> SurveyOptions:
+    """Return the survey options of the command line.
+
+    Raises:
+        ConfigError: The options file is invalid, or --crs is not a projected coordinate system in metres.
+    """
+    from sonarpost.sonar.options import SurveyOptions, load_options  # noqa: PLC0415  as in `router_of`
+
+    options = load_options(parsed.options) if parsed.options is not None else SurveyOptions()
+    crs = projected_crs_of(parsed)
+    return options if crs is None else options.model_copy(update={"projected_crs": crs})
+
+
+def projected_crs_of(parsed: argparse.Namespace) -> str | None:
+    """Return --crs, or None if it is not given.
+
+    Raises:
+        ConfigError: Not a projected coordinate system in metres.
+    """
+    from sonarpost.sonar.options import checked_options  # noqa: PLC0415  as in `router_of`
+
+    return checked_options({"projected_crs": parsed.crs}, "--crs").projected_crs
+
+
+def print_notes(info: SurveyInfo) -> None:
+    """Print the irregularities of a survey file on standard error."""
+    for warning in info.warnings:
+        print(f"note: {info.path.name}: {warning}", file=sys.stderr)
+
+
+def make_output_folder(folder: Path) -> None:
+    """Create a folder for output, and check before the work that files can be created in it.
+
+    Raises:
+        ConfigError: It cannot be created or written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ConfigError("command line", "output folder", str(folder), f"a folder to write into ({reason})") from error
+
+
+def utc_text(time_utc_s: float) -> str:
+    """Return a time as ISO 8601 to the millisecond."""
+    when = datetime.fromtimestamp(round(time_utc_s, 3), tz=UTC)
+    return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def add_fit_option(parser: argparse.ArgumentParser) -> None:
+    """Add --fit, for images of a size that codecs do not accept."""
+    parser.add_argument(
+        "--fit",
+        choices=("refuse", "crop", "resize"),
+        default="refuse",
+        help="images outside 16 to 512 px a side: cut the centre (crop), change the resolution (resize), or report an "
+        "error (default: %(default)s)",
+    )
 
 
 def time_text(utc_s: float | None) -> str:

@@ -7,7 +7,9 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from sonarpost.cli.shared import Subparsers
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.cli.shared import Subparsers, in_new_folder, projected_crs_of
+from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
 from sonarpost.simulation.seabed.survey import SimulatedSurvey, SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
@@ -24,7 +26,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="write a simulated side-scan survey as XTF",
         description="Write a simulated side-scan survey as XTF. The same options give the same file.",
     )
-    parser.add_argument("out", type=Path, metavar="OUT.xtf", help="the file to create or replace")
+    parser.add_argument("out", type=Path, metavar="OUT.xtf", help="the file to create")
     for name, text in (
         ("seed", "seed of every random draw"),
         ("pings", "number of pings"),
@@ -45,11 +47,24 @@ def add_parser(subparsers: Subparsers) -> None:
         "--bits", type=int, choices=(8, 16), default=default.bits, help="bits per sample (default: %(default)s)"
     )
     parser.add_argument("--truth", type=Path, metavar="FILE.json", help="write the ground truth as JSON")
+    parser.add_argument(
+        "--crs", metavar="EPSG:N", help="write positions in metres of this coordinate system, in place of degrees"
+    )
+    parser.add_argument("--force", action="store_true", help="replace existing files")
     parser.set_defaults(run=run_simulate)
 
 
 def run_simulate(args: argparse.Namespace) -> int:
-    """Simulate and write a survey; print its summary."""
+    """Simulate and write a survey; print its summary.
+
+    Raises:
+        ConfigError: A file exists and --force is not given, its folder cannot be written, or --crs is invalid.
+    """
+    for path in filter(None, (args.out, args.truth)):
+        if path.exists() and not args.force:
+            raise ConfigError(str(path), "", "an existing file", "a new file, or --force to replace it")
+        in_new_folder(path)
+    crs = projected_crs_of(args)
     spec = SurveySpec(
         seed=args.seed,
         seabed=SeabedKind(args.seabed),
@@ -61,8 +76,9 @@ def run_simulate(args: argparse.Namespace) -> int:
         targets=args.targets,
         clutter=args.clutter,
     )
-    simulated = simulate_survey(spec)
-    write_xtf(simulated.survey, args.out)
+    with ProgressDisplay(step=f"simulating {spec.pings} pings"):
+        simulated = simulate_survey(spec)
+    write_xtf(simulated.survey, args.out, crs)
     if args.truth is not None:
         write_atomically(args.truth, truth_json(simulated, args.out.name).encode())
     mines = sum(item.is_mine_like for item in simulated.truth)

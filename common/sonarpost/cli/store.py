@@ -7,7 +7,7 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-from sonarpost.cli.shared import Subparsers, add_command, aligned, printable, time_text
+from sonarpost.cli.shared import Subparsers, add_command, aligned, in_new_folder, printable, time_text
 from sonarpost.delivery.inspection import StoreState, inspect
 from sonarpost.delivery.salvage import SalvageResult, TableResult, salvage
 from sonarpost.delivery.schema import VERSION
@@ -88,7 +88,7 @@ def _print_state(path: Path, state: StoreState) -> None:
 
 def run_salvage(parsed: argparse.Namespace) -> int:
     """Copy a store and print the result; return 0 if every row was copied, otherwise 1."""
-    path, out = parsed.store, parsed.out
+    path, out = parsed.store, in_new_folder(parsed.out)
     result = salvage(path, out)
     _print_result(result)
     print(f"""

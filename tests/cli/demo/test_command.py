@@ -20,3 +20,32 @@ def test_a_foreign_output_folder_is_refused_before_the_survey_is_simulated(
     assert "expected a folder that is new, empty or of an earlier demo" in capsys.readouterr().err
     assert simulated == []
     assert (tmp_path / "notes.txt").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("line.jsf", "line.jsf: suffix: got '.jsf', expected one of .xtf"),
+        ("line.DAT", "line.DAT: suffix: got '.DAT', expected one of .xtf"),
+        ("line.xtf", "line.xtf: FileFormat: got '0x74', expected 0x7b"),
+        ("absent.xtf", "absent.xtf: got 'no such file or folder'"),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_refused_before_anything_is_started(
+    name: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if name != "absent.xtf":
+        (tmp_path / name).write_bytes(b"this is no survey\n" * 200)
+    assert main(["demo", "--survey", str(tmp_path / name), "--out", str(tmp_path / "out")]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert message in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("threshold", ["2.1", "-0.1", "nan"])
+def test_a_threshold_out_of_range_is_refused(
+    threshold: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["demo", f"--threshold={threshold}", "--out", str(tmp_path / "out")]) == 2
+    assert "--threshold: got" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

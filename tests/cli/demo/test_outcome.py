@@ -17,9 +17,12 @@ from sonarpost.link.frames.paper.sender import plan_packets
 ENCODED = {"0001": "contact-1", "0002": "contact-2"}
 
 
-def store_image(folder: Path, image_id: str, *, complete: bool = True, pixels: bytes = b"pixels") -> None:
+def store_image(
+    folder: Path, image_id: str, *, complete: bool = True, missing_fraction: float = 0.0, pixels: bytes = b"pixels"
+) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{image_id}.json").write_text(json.dumps({"image_id": image_id, "complete": complete}))
+    fields = {"image_id": image_id, "complete": complete, "missing_fraction": missing_fraction}
+    (folder / f"{image_id}.json").write_text(json.dumps(fields))
     (folder / f"{image_id}.tiff").write_bytes(pixels)
 
 
@@ -99,3 +102,13 @@ def test_different_pixels_at_the_shore_site_are_a_failure(tmp_path: Path) -> Non
         store_image(settings.vessel_images, image_id)
         store_image(settings.shore_images, image_id, pixels=b"other")
     assert not outcome_of(settings).sha256_match
+
+
+def test_image_without_a_pixel_does_not_count_as_received(tmp_path: Path) -> None:
+    settings = ChainSettings(tmp_path, link="paper", loss=0.3)
+    store_at_both(settings, "0001")
+    for folder in (settings.vessel_images, settings.shore_images):
+        store_image(folder, "0002", complete=False, missing_fraction=1.0)
+    outcome = outcome_of(settings)
+    assert (outcome.images_vessel, outcome.images_shore, outcome.images_complete) == (1, 1, 1)
+    assert outcome.succeeded

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
+import os
 import re
 import sys
 import time
@@ -20,7 +22,9 @@ from rich.text import Text
 
 from sonarpost.archive.shore_files import find_image, image_paths
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, TaskingRow
-from sonarpost.cli.shared import Subparsers, printable, time_text
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.cli.shared import Subparsers, in_new_folder, make_output_folder, printable, time_text
+from sonarpost.config import load
 from sonarpost.errors import BadInputError, ConfigError, StoredFileError
 from sonarpost.export.contacts import ExportContact, load_contacts, match_start_time
 from sonarpost.export.cot import cot_events
@@ -29,9 +33,10 @@ from sonarpost.export.kml import write_kml, write_kmz
 from sonarpost.export.tables import write_csv, write_geojson
 from sonarpost.files import write_atomically
 
+DEMO_IMAGES = Path("demo-out/shore/images")
+SHORE_CONFIG = Path("/etc/sonarpost/shore.toml")
 PIPED_WIDTH = 160
-FORMATS = ("geojson", "kml", "kmz", "csv")
-LABELS = {"geojson": "GeoJSON", "kml": "KML", "kmz": "KMZ", "csv": "CSV"}
+WRITERS = {"geojson": write_geojson, "kml": write_kml, "kmz": write_kmz, "csv": write_csv}
 EXIT_INCOMPLETE = 1
 
 _AGO = re.compile(r"(\d+(?:\.\d+)?)([smhd])")
@@ -83,14 +88,23 @@ def add_actions(actions: Subparsers) -> None:
     get.add_argument("picture", metavar="VEHICLE/IMAGE", help="name from `ls`, or the name of the files")
     get.add_argument("--vessel", metavar="NAME", help="vessel, if two vessels have an image of this name")
     get.add_argument("--version", type=int, metavar="N", help="version (default: the newest)")
-    get.add_argument("--to", type=Path, default=Path(), metavar="DIR", help="destination (default: current folder)")
-    _add_out_dir(get)
+    get.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="destination (default: current folder)")
+    get.add_argument("--to", dest="out", type=Path, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
+    _add_archive(get)
     get.set_defaults(run=run_get)
 
     export = actions.add_parser("export", help="write GeoJSON, KML, KMZ or CSV, or send Cursor-on-Target events")
     _add_filters(export)
-    for name in FORMATS:
-        export.add_argument(f"--{name}", type=Path, metavar="FILE", help=f"write {LABELS[name]} to FILE")
+    export.add_argument(
+        "--out",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="file to write, named *.geojson, *.kml, *.kmz or *.csv; can be repeated",
+    )
+    for name in WRITERS:
+        export.add_argument(f"--{name}", type=Path, help=argparse.SUPPRESS)  # former spellings of --out
     export.add_argument("--cot", metavar="URL", help="send events to tcp://host:port, tls://… or udp://…")
     for name in ("ca", "certificate", "key"):
         export.add_argument(f"--cot-{name}", type=Path, metavar="PEM", help=f"{name} for --cot tls://…")
@@ -100,12 +114,41 @@ def add_actions(actions: Subparsers) -> None:
     export.set_defaults(run=run_export)
 
 
-def _add_out_dir(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out-dir", type=Path, default=Path("out"), metavar="DIR", help="out_dir of c2 (default: out)")
+def _add_archive(parser: argparse.ArgumentParser) -> None:
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
+        "--archive",
+        type=Path,
+        metavar="DIR",
+        help=f"folder of c2 (default: {DEMO_IMAGES} if there is one, else that of {SHORE_CONFIG}, else out)",
+    )
+    where.add_argument("--out-dir", dest="archive", type=Path, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
+    where.add_argument("--config", type=Path, metavar="FILE", help="TOML file of the shore site; its out_dir is used")
+
+
+def folder_of(parsed: argparse.Namespace) -> Path:
+    """Return the folder of c2 that the options select; one that they do not name is printed on standard error.
+
+    Raises:
+        ConfigError: The configuration file is invalid.
+    """
+    if parsed.archive is not None:
+        return Path(parsed.archive)
+    path: Path | None = parsed.config
+    folder = DEMO_IMAGES
+    if path is None and not DEMO_IMAGES.is_dir():
+        path = SHORE_CONFIG if SHORE_CONFIG.is_file() else None
+        folder = Path("out")
+    if path is not None:
+        # The import contract does not allow a static import of a service here.
+        model = importlib.import_module("sonarpost.services.c2.config").C2Config
+        folder = load(path, "c2", model, os.environ)[1].out_dir
+    print(f"sonarpost c2: folder {folder}", file=sys.stderr)
+    return folder
 
 
 def _add_filters(parser: argparse.ArgumentParser) -> None:
-    _add_out_dir(parser)
+    _add_archive(parser)
     parser.add_argument("--vessel", metavar="NAME", help="only this vessel")
     parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle")
     parser.add_argument("--since", metavar="TIME", help="first received since 90m, 2h or 3d ago, or since a UTC time")
@@ -135,7 +178,7 @@ def since_of(text: str | None, now_utc_s: float | None = None) -> float:
 def run_ls(parsed: argparse.Namespace) -> int:
     """Print the table of images, or of commands and comments; return 0."""
     record_filter = RecordFilter.of(parsed)
-    with closing(ShoreIndex(parsed.out_dir, writable=False)) as index:
+    with closing(ShoreIndex(folder_of(parsed), writable=False)) as index:
         if parsed.tasking:
             _print_tasking(index.tasking(), record_filter, as_json=parsed.json)
             return 0
@@ -259,15 +302,16 @@ def _print_table(headings: Sequence[str], rows: Sequence[Sequence[str]], noun: s
 
 def run_get(parsed: argparse.Namespace) -> int:
     """Copy the files of an image and print their paths; return 0."""
-    with closing(ShoreIndex(parsed.out_dir, writable=False)) as index:
+    folder = folder_of(parsed)
+    with closing(ShoreIndex(folder, writable=False)) as index:
         row = find_image(index.images(), parsed.picture, parsed.vessel, parsed.version)
     copies = []
-    for path in image_paths(parsed.out_dir, row):
+    for path in image_paths(folder, row):
         try:
-            copies.append((parsed.to / path.name, path.read_bytes()))
+            copies.append((parsed.out / path.name, path.read_bytes()))
         except OSError as error:
             raise StoredFileError(str(path), "", error.strerror or str(error), "a readable file of c2") from error
-    parsed.to.mkdir(parents=True, exist_ok=True)
+    make_output_folder(parsed.out)
     for path, data in copies:
         write_atomically(path, data)
         print(path)
@@ -279,11 +323,13 @@ def run_get(parsed: argparse.Namespace) -> int:
 
 def run_export(parsed: argparse.Namespace) -> int:
     """Export contacts; return 0, or 1 if a stored file was rejected."""
-    if not any(getattr(parsed, name) for name in (*FORMATS, "cot")):
-        options = ", ".join(f"--{name}" for name in (*FORMATS, "cot"))
-        raise ConfigError("c2 export", "", "no output", f"at least one of {options}")
+    outputs = _export_files(parsed)
+    if not outputs and parsed.cot is None:
+        raise ConfigError("c2 export", "", "no output", "--out FILE or --cot URL")
     record_filter = RecordFilter.of(parsed)
-    contacts = load_contacts(parsed.out_dir)
+    folder = folder_of(parsed)
+    with ProgressDisplay(step=f"reading {folder}"):
+        contacts = load_contacts(folder)
     chosen = tuple(
         contact
         for contact in contacts.contacts
@@ -291,20 +337,28 @@ def run_export(parsed: argparse.Namespace) -> int:
     )
     contacts = replace(contacts, contacts=chosen)
     problems = list(contacts.problems)
-    for name, write in (("geojson", write_geojson), ("kml", write_kml), ("csv", write_csv), ("kmz", write_kmz)):
-        path: Path | None = getattr(parsed, name)
-        if path is not None:
-            problems += write(path, contacts) or ()
-            print(f"{path}: {len(contacts.contacts)} contacts, {len(contacts.unlocated)} of them without a position")
+    for name, path in outputs:
+        with ProgressDisplay(step=f"writing {path}"):
+            problems += WRITERS[name](in_new_folder(path), contacts) or ()
+        print(f"{path}: {len(contacts.contacts)} contacts, {len(contacts.unlocated)} of them without a position")
     if parsed.cot is not None:
         events = cot_events(contacts, time.time())
         with CotSender(parsed.cot, TlsFiles(parsed.cot_ca, parsed.cot_certificate, parsed.cot_key)) as sender:
             sender.send(events, parsed.cot_wait)
         print(f"{parsed.cot}: {len(events)} events, {len(contacts.unlocated)} contacts without a position omitted")
-    _mark_exported(parsed.out_dir, contacts.contacts)
+    _mark_exported(folder, contacts.contacts)
     for problem in problems:
         print(f"rejected: {problem}", file=sys.stderr)
     return EXIT_INCOMPLETE if problems else 0
+
+
+def _export_files(parsed: argparse.Namespace) -> list[tuple[str, Path]]:
+    """Return format and path of every file to write."""
+    files = [(path.suffix.lower().removeprefix("."), path) for path in parsed.out]
+    for name, path in files:
+        if name not in WRITERS:
+            raise ConfigError("c2 export", "--out", str(path), "a name that ends in ." + ", .".join(WRITERS))
+    return files + [(name, path) for name in WRITERS if (path := getattr(parsed, name)) is not None]
 
 
 def _mark_exported(out_dir: Path, contacts: Sequence[ExportContact]) -> None:

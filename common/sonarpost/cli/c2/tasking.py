@@ -21,21 +21,31 @@ from sonarpost.messages import Advice, Command, Record, Verdict
 from sonarpost.wire import first_error
 
 CONSUMER = "c2"
-KINDS = {"refine": "refine", "resend": "resend", "expand": "wider", "revisit": "revisit", "wider": "wider"}
+KINDS = {
+    "refine": "refine",
+    "resend": "resend",
+    "expand": "wider",
+    "original": "original",
+    "revisit": "revisit",
+    "wider": "wider",
+}
 """Kind on the command line (`wider` is the former name of `expand`) -> kind in the record."""
 RENAMED_ACTIONS = {"task": "command", "advise": "comment"}
 
 
 def add_actions(actions: Subparsers) -> None:
     """Add the actions `command` and `comment`."""
-    command = actions.add_parser("command", help="request more detail, a lost image part, more seabed or a revisit")
+    command = actions.add_parser(
+        "command", help="request more detail, a lost image part, more seabed, the unfiltered image or a revisit"
+    )
     _add_common_options(command)
     command.add_argument(
         "--kind",
         required=True,
         choices=KINDS,
         metavar="KIND",
-        help="refine (more detail), resend (lost parts), expand (more seabed around the contact) or revisit",
+        help="refine (more detail), resend (lost parts), expand (more seabed around the contact), original (the image"
+        " without despeckling) or revisit",
     )
     command.add_argument("--lat", type=float, metavar="DEG", help="latitude to revisit")
     command.add_argument("--lon", type=float, metavar="DEG", help="longitude to revisit")

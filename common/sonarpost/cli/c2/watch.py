@@ -130,7 +130,7 @@ def line_of(record: Record) -> str:
     """Return a record as one line of text."""
     if isinstance(record, ReconstructedImage):
         contact = record.contact
-        parts = [f"{record.picture.width_px} x {record.picture.height_px} px"]
+        parts = [f"{record.picture.width_px} × {record.picture.height_px} px"]
         parts.append("complete" if record.complete else f"{100 * record.missing_fraction:.0f} % missing")
         if contact is not None and contact.lat_deg is not None and contact.lon_deg is not None:
             parts.append(f"at {contact.lat_deg:.5f} {contact.lon_deg:.5f}")

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
 import sys
-import time
 from typing import IO
 
 from sonarpost.cli.demo.settings import PLATFORM_OF, ChainSettings, write_config
+from sonarpost.cli.deployment.processes import Processes
 from sonarpost.errors import SonarpostError
-from sonarpost.stop_signals import EXIT_WITH_PARENT
 
-STOP_S = 5.0
 ROUTERS = ("router-uuv", "router-vessel", "router-shore")
 
 
@@ -21,12 +16,12 @@ class ChainError(SonarpostError):
     """A process of the chain has ended unexpectedly."""
 
 
-class Chain:
+class Chain(Processes):
     """The three routers and all services, each a process; a context manager that stops all of them at its end."""
 
     def __init__(self, settings: ChainSettings) -> None:
+        super().__init__()
         self.settings = settings
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._logs: list[IO[bytes]] = []
 
     def __enter__(self) -> Chain:
@@ -45,50 +40,15 @@ class Chain:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of all processes that were started."""
-        return tuple(self._processes)
-
-    def pid(self, name: str) -> int:
-        """Process identifier of a process."""
-        return self._processes[name].pid
-
     def start(self, name: str) -> None:
         """Start a router or a service; its output goes to logs/NAME.log."""
         log = (self.settings.folder / "logs" / f"{name}.log").open("ab")
         self._logs.append(log)
-        # If this process is killed, the child processes end too.
-        environment = {**os.environ, EXIT_WITH_PARENT: str(os.getpid())}
-        self._processes[name] = subprocess.Popen(  # noqa: S603 our own interpreter and modules
-            self.command(name),
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            env=environment,
-            # Ctrl-C reaches this process only, which stops the services in order.
-            process_group=0,
-        )
+        self.spawn(name, self.command(name), log)
 
     def command(self, name: str) -> list[str]:
         """Return the command of a process."""
         return [sys.executable, "-m", *self.module(name)]
-
-    def kill(self, name: str) -> None:
-        """End a process at once (SIGKILL), as a power cut would."""
-        self._processes[name].kill()
-        self._processes[name].wait()
-
-    def terminate(self, name: str) -> float:
-        """Stop a process (SIGTERM); return the seconds it took."""
-        started = time.monotonic()
-        self._processes[name].send_signal(signal.SIGTERM)
-        self._processes[name].wait(timeout=STOP_S)
-        return time.monotonic() - started
-
-    def status(self, name: str) -> int | None:
-        """Return the exit status of a process, None while it runs."""
-        return self._processes[name].poll()
 
     def check(self) -> None:
         """Check that all processes run.
@@ -96,9 +56,9 @@ class Chain:
         Raises:
             ChainError: One has ended.
         """
-        for name, process in self._processes.items():
-            if process.poll() is not None:
-                raise ChainError(f"{name} ended with status {process.returncode}; its log: {self.log_tail(name)}")
+        for name in self.names:
+            if (status := self.status(name)) is not None:
+                raise ChainError(f"{name} ended with status {status}; its log: {self.log_tail(name)}")
 
     def log_tail(self, name: str, lines: int = 5) -> str:
         """Return the last lines of the log of a process."""
@@ -108,17 +68,7 @@ class Chain:
 
     def stop(self) -> None:
         """Stop all processes: services first, then routers; one that does not stop within 5 s is killed."""
-        for group in (tuple(n for n in self._processes if n not in ROUTERS), ROUTERS):
-            running = [self._processes[n] for n in group if n in self._processes and self._processes[n].poll() is None]
-            for process in running:
-                process.terminate()
-            deadline = time.monotonic() + STOP_S
-            for process in running:
-                try:
-                    process.wait(timeout=max(0.0, deadline - time.monotonic()))
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+        self.stop_in_order(last=ROUTERS)
         for log in self._logs:
             log.close()
         self._logs.clear()

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import importlib
+import json
 import logging
+import re
 import shutil
 import time
 from pathlib import Path
@@ -12,16 +15,21 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from sonarpost.cli.demo.chain import Chain
+from sonarpost.cli.demo.next_steps import commands, folder_lines, routers_line
 from sonarpost.cli.demo.operator_page import OperatorPage
 from sonarpost.cli.demo.outcome import evaluate
+from sonarpost.cli.demo.own_images import usable_images
 from sonarpost.cli.demo.report import show
-from sonarpost.cli.demo.settings import ChainSettings, free_ports
+from sonarpost.cli.demo.settings import CONSOLE_PORT, ROUTER_PORTS, ChainSettings, reserved_ports
 from sonarpost.cli.demo.watch import Watcher
+from sonarpost.cli.progress import progress_console
+from sonarpost.cli.shared import add_fit_option, add_survey_options, print_notes, survey_options_of
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
-from sonarpost.sonar.readers import SUPPORTED_SUFFIXES
+from sonarpost.sonar.image_files import SIDE_CAR_SUFFIX
+from sonarpost.sonar.readers import SUPPORTED_SUFFIXES, open_survey
 from sonarpost.sonar.survey import Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -32,7 +40,6 @@ STALLED_S = 60.0
 """Real time without a change after which the demo ends although the chain is busy."""
 MAX_FEEDBACK_INTERVALS = 60
 """Feedback intervals without a change, on top of `STALLED_S`, while the vessel still repeats feedback."""
-IMAGE_SUFFIXES = (".tif", ".tiff", ".png")
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -42,11 +49,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="run the whole chain on this host, from a survey file to the shore",
         description="Run every service as a process, with emulated acoustic modems on pseudo-terminals, three Zenoh "
         "routers, and a simulated or given survey. Ends with a table and a contact sheet. The exit status is 1 if an "
-        "image that the channel can deliver is missing or incomplete at the shore site.",
+        "image that the channel can deliver is missing or incomplete at the shore site, or if there is no contact.",
     )
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--survey", type=Path, metavar="FILE_OR_DIR", help="survey file, or a folder of them")
-    source.add_argument("--images", type=Path, metavar="DIR", help="send the TIFF and PNG snippets of a folder instead")
+    source.add_argument("--images", type=Path, metavar="DIR", help="send your own images instead: a file or a folder")
+    add_fit_option(parser)
     parser.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="output (default: demo-out)")
     link = parser.add_mutually_exclusive_group()
     link.add_argument(
@@ -56,15 +64,26 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="wire format: v1 with the codec emb, or the paper's with its tile codec (default: %(default)s)",
     )
     link.add_argument("--paper", action="store_const", const="paper", dest="link", help="short for --link paper")
-    parser.add_argument("--rate", type=int, default=1, choices=sorted(RATES), help="Micro-Modem rate (default: 1)")
+    parser.add_argument(
+        "--rate",
+        type=int,
+        default=1,
+        choices=sorted(RATES),
+        help="Micro-Modem rate (default: 1, packets of 192 B in 6.1 s); table: docs/reference/modem-rates.md",
+    )
     parser.add_argument("--loss", type=_probability, default=0.0, metavar="P", help="probability that a frame is lost")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the survey and channel simulators")
     parser.add_argument(
         "--time-scale", type=_positive, default=20.0, metavar="X", help="simulated seconds per second (default: 20)"
     )
+    parser.add_argument("--keep", action="store_true", help="keep services and routers running until Ctrl-C")
     parser.add_argument(
-        "--console", action="store_true", help="serve the operator's page and keep it open at the end until Ctrl-C"
+        "--console", action="store_true", help="like --keep, and serve the operator's page: user and password are shown"
     )
+    parser.add_argument(
+        "--threshold", type=float, metavar="CONFIDENCE", help="minimum confidence of a contact, 0 to 2 (default: 1.0)"
+    )
+    add_survey_options(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     parser.set_defaults(run=run)
 
@@ -85,62 +104,140 @@ def _positive(text: str) -> float:
 
 def run(parsed: argparse.Namespace) -> int:
     """Run the demo; return 0 if everything that the channel can deliver is at the shore site, unchanged."""
-    console = Console(stderr=True)
+    console = progress_console()
+    if parsed.console:
+        importlib.import_module("uvicorn")  # a missing extra is reported before the services start
     # Routers and services start together: failed first attempts to connect are expected.
     logging.getLogger("sonarpost.bus.session").setLevel(logging.ERROR)
     started = time.monotonic()
-    inputs = _inputs(parsed)
+    detection_settings, inputs = _detection_settings(parsed), _inputs(parsed, console)
+    if inputs is not None and inputs[0] == parsed.survey:
+        # A single file that cannot be read is reported before the services start.
+        with open_survey(parsed.survey, survey_options_of(parsed)) as source:
+            print_notes(source.info)
     folder = _fresh_folder(parsed.out)
     simulated = _simulate(parsed.seed, console) if inputs is None else None
-    ports = free_ports(4)
-    settings = ChainSettings(
-        folder=folder,
-        mode="snippets" if parsed.images else "survey",
-        link=parsed.link,
-        rate=parsed.rate,
-        loss=parsed.loss,
-        seed=parsed.seed,
-        time_scale=parsed.time_scale,
-        router_ports=(ports[0], ports[1], ports[2]),
-        console_port=ports[3] if parsed.console else None,
-    )
+    with reserved_ports(*ROUTER_PORTS, *((CONSOLE_PORT,) if parsed.console else ())) as ports:
+        settings = ChainSettings(
+            folder=folder,
+            mode="snippets" if parsed.images else "survey",
+            link=parsed.link,
+            rate=parsed.rate,
+            loss=parsed.loss,
+            seed=parsed.seed,
+            time_scale=parsed.time_scale,
+            router_ports=(ports[0], ports[1], ports[2]),
+            console_port=ports[3] if parsed.console else None,
+            extra=(*detection_settings, ("atd_stub", f'fit = "{parsed.fit}"')),
+        )
+        return _run_chain(parsed, settings, (inputs, simulated), started, console)
+
+
+def _run_chain(
+    parsed: argparse.Namespace,
+    settings: ChainSettings,
+    sources: tuple[tuple[Path, ...] | None, Survey | None],
+    started_s: float,
+    console: Console,
+) -> int:
+    """Run the chain with the given files or the simulated survey; return the exit status."""
     page = OperatorPage(settings) if parsed.console else None
     with Chain(settings) as chain, Watcher(settings) as watcher:
         # During the start of the services: the vehicle processes files when it is ready.
-        files = _deposit(inputs, simulated, settings, console)
+        files = _deposit(*sources, settings, console)
         with console.status("starting three routers and eight services"):
             watcher.wait_until_started(chain.check)
+        console.print(routers_line(settings), highlight=False, soft_wrap=True)
         if page is not None:
             page.show(console)
         _follow(chain, watcher, files, console)
-        if page is not None:
-            page.keep_open(chain, console)
-    outcome = evaluate(settings, watcher.snippets, watcher.contact_of_image, time.monotonic() - started)
-    show(watcher, settings, outcome, console)
-    if parsed.json:
-        print(outcome.as_json(), flush=True)
-    refused = _print_refused(settings, console)
+        outcome = evaluate(settings, watcher.snippets, watcher.contact_of_image, time.monotonic() - started_s)
+        results = Console(stderr=True)  # printed with --quiet as well
+        refused = _print_refused(settings, results)
+        if not watcher.snippets:
+            _print_no_contacts(settings, results)
+            if parsed.json:
+                print(outcome.as_json(), flush=True)
+            return 1
+        show(watcher, settings, outcome, results)
+        keep = parsed.keep or parsed.console
+        _print_next_steps(settings, console, running=keep)
+        if parsed.json:
+            print(outcome.as_json(), flush=True)
+        if keep:
+            if page is not None:
+                page.show(console)
+            _keep_running(chain)
     return 0 if outcome.succeeded and refused < files else 1
 
 
-def _inputs(parsed: argparse.Namespace) -> tuple[Path, ...] | None:
+def _print_next_steps(settings: ChainSettings, console: Console, *, running: bool) -> None:
+    """Print where the images are, and commands to paste."""
+    state = "services and routers run until Ctrl-C" if running else "stopped; `--keep` leaves them running"
+    for line in (*folder_lines(settings), f"{routers_line(settings)} ({state})"):
+        console.print(line, highlight=False, soft_wrap=True)
+    console.print("\nNext, in this folder" + (" in another terminal:" if running else ":"), highlight=False)
+    for command, purpose in commands(settings, running=running):
+        # Lines to paste: never wrapped.
+        console.print(f"  {command}", style="bold", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"      {purpose}", highlight=False)
+
+
+def _keep_running(chain: Chain) -> None:
+    """Wait for Ctrl-C.
+
+    Raises:
+        ChainError: A process of the chain has ended.
+    """
+    try:
+        while True:
+            chain.check()
+            time.sleep(0.5)
+    except KeyboardInterrupt:
+        return
+
+
+def _inputs(parsed: argparse.Namespace, console: Console) -> tuple[Path, ...] | None:
     """Return the files to process, None for a simulated survey.
 
     Raises:
         SurveyFileError: There is no such file or folder, or no suitable file in it.
     """
-    given: Path | None = parsed.survey or parsed.images
+    if parsed.images is not None:
+        return usable_images(parsed.images, parsed.fit, console)
+    given: Path | None = parsed.survey
     if given is None:
         return None
-    suffixes = IMAGE_SUFFIXES if parsed.images else SUPPORTED_SUFFIXES
-    if given.is_file() and not parsed.images:
+    if given.is_file():
+        if not given.name.lower().endswith(SUPPORTED_SUFFIXES):
+            raise SurveyFileError(str(given), "suffix", given.suffix, "one of " + ", ".join(SUPPORTED_SUFFIXES))
         return (given,)
     if not given.is_dir():
         raise SurveyFileError(str(given), "", "no such file or folder", "a file or folder that exists")
-    found = tuple(sorted(p for p in given.iterdir() if p.suffix.lower() in suffixes and p.is_file()))
+    found = tuple(sorted(p for p in given.iterdir() if p.suffix.lower() in SUPPORTED_SUFFIXES and p.is_file()))
     if not found:
-        raise SurveyFileError(str(given), "", "no such file in it", "files named *" + ", *".join(suffixes))
+        raise SurveyFileError(str(given), "", "no such file in it", "files named *" + ", *".join(SUPPORTED_SUFFIXES))
     return found
+
+
+def _detection_settings(parsed: argparse.Namespace) -> tuple[tuple[str, str], ...]:
+    """Return --threshold and the survey options as lines of [atd_stub].
+
+    Raises:
+        ConfigError: They are invalid, or given with --images.
+    """
+    survey_options_of(parsed)
+    if parsed.threshold is not None and not 0 <= parsed.threshold <= 2:
+        raise ConfigError("demo", "--threshold", parsed.threshold, "0 to 2")
+    given = {
+        "survey_options": parsed.options and str(parsed.options.absolute()),
+        "projected_crs": parsed.crs,
+        "confidence_threshold": parsed.threshold,
+    }
+    lines = [(key, json.dumps(value, ensure_ascii=False)) for key, value in given.items() if value is not None]
+    if lines and parsed.images:
+        raise ConfigError("demo", "--images", str(parsed.images), "--survey with --options, --crs or --threshold")
+    return tuple(("atd_stub", f"{key} = {text}") for key, text in lines)
 
 
 def _fresh_folder(folder: Path) -> Path:
@@ -157,6 +254,14 @@ def _fresh_folder(folder: Path) -> Path:
     folder.mkdir(parents=True)
     (folder / MARKER).touch()
     return folder
+
+
+def _print_no_contacts(settings: ChainSettings, console: Console) -> None:
+    """Print how many contacts each file has at lower thresholds, as atd_stub has logged it."""
+    log = (settings.folder / "logs" / "atd_stub.log").read_text(encoding="utf-8", errors="replace")
+    for name, counts in re.findall(r' File processed .*?file=("[^"]*"|\S+) .*counts="([^"]*)"', log):
+        console.print(f"{name}: {counts}", markup=False, highlight=False, soft_wrap=True)
+    console.print("[red]no contacts to send[/red]; see --threshold and `sonarpost detect --plot`")
 
 
 def _print_refused(settings: ChainSettings, console: Console) -> int:
@@ -187,10 +292,17 @@ def _deposit(
         write_xtf(simulated, settings.incoming / f"simulated-{settings.seed}.xtf")
         return 1
     assert inputs is not None
+    side_cars = 0
     for path in inputs:
+        side_car = path.with_suffix(SIDE_CAR_SUFFIX)
+        if settings.mode == "snippets" and side_car.is_file():
+            shutil.copyfile(side_car, settings.incoming / side_car.name)
+            side_cars += 1
         partial = settings.incoming / f".{path.name}"
         shutil.copyfile(path, partial)
         partial.rename(settings.incoming / path.name)
+    if settings.mode == "snippets":
+        console.print(f"{side_cars} of {len(inputs)} images have a side-car with their position")
     console.print(f"{len(inputs)} input file{'s' if len(inputs) != 1 else ''}")
     return len(inputs)
 
@@ -207,25 +319,27 @@ def _follow(chain: Chain, watcher: Watcher, files: int, console: Console) -> Non
         TextColumn("{task.fields[unit]}"),
     )
     with Progress(*columns, TimeElapsedColumn(), console=console) as progress:
-        air = progress.add_task("acoustic airtime", total=None, unit="s")
+        air = progress.add_task("acoustic air time", total=None, unit="s")
         shore = progress.add_task("images at the shore site", total=None, unit="")
-        changes, changed_at, idle_since = -1, time.monotonic(), None
+        changes, changed_at, idle_since_utc_s = -1, time.monotonic(), 0.0
         while True:
             chain.check()
             now = time.monotonic()
             planned, sent = watcher.packets_planned, watcher.packets_sent
             progress.update(air, total=round(planned * airtime_s) or None, completed=round(sent * airtime_s))
-            progress.update(shore, total=len(watcher.encoded) or None, completed=len(watcher.shore))
+            progress.update(shore, total=len(watcher.encoded) or None, completed=watcher.images_at_shore)
             busy = watcher.busy(files, time.time() - 5.0)
             if watcher.changes != changes:
-                changes, changed_at, idle_since = watcher.changes, now, None
+                changes, changed_at, idle_since_utc_s = watcher.changes, now, 0.0
             if busy:
-                idle_since = None
+                idle_since_utc_s = 0.0
                 if now - changed_at > stalled_s:
                     console.print(f"[red]no change for {stalled_s:.0f} s; still busy: {busy}")
                     return
-            elif idle_since is None:
-                idle_since = now
-            elif now - idle_since > QUIET_S + settings.packet_s:
+            elif not idle_since_utc_s:
+                idle_since_utc_s = time.time()
+            quiet = idle_since_utc_s and time.time() - idle_since_utc_s > QUIET_S + settings.packet_s
+            # A report may be older than the last work of its service: decide by newer ones.
+            if quiet and not watcher.busy(files, idle_since_utc_s):
                 return
             time.sleep(0.1)

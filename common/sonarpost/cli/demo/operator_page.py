@@ -1,14 +1,12 @@
-"""The operator's page of a demo: its address, its user, and waiting until it is closed."""
+"""The operator's page of a demo: its address and its user."""
 
 from __future__ import annotations
 
 import importlib
 import secrets
-import time
 
 from rich.console import Console
 
-from sonarpost.cli.demo.chain import Chain
 from sonarpost.cli.demo.settings import VESSEL, ChainSettings
 
 USER = "op"
@@ -34,19 +32,4 @@ class OperatorPage:
 
     def show(self, console: Console) -> None:
         """Print the address, the user and the password."""
-        console.print(f"operator's page: {self.address}  user {USER}  password {self._password}", highlight=False)
-
-    def keep_open(self, chain: Chain, console: Console) -> None:
-        """Wait for Ctrl-C.
-
-        Raises:
-            ChainError: A process of the chain has ended.
-        """
-        self.show(console)
-        console.print("open until Ctrl-C; the contact sheet follows")
-        try:
-            while True:
-                chain.check()
-                time.sleep(0.5)
-        except KeyboardInterrupt:
-            return
+        console.print(f"operator's page: {self.address}  user: {USER}  password: {self._password}", highlight=False)

@@ -86,11 +86,12 @@ def read_channel_log(path: Path) -> ChannelDelivery:
 
 @dataclass(frozen=True)
 class ImageFile:
-    """An image on the disk of one platform."""
+    """An image on the disk of one platform; `has_pixels` is false if only its contact record was received."""
 
     name: str
     image_id: str
     complete: bool
+    has_pixels: bool
     sha256: str
 
 
@@ -99,8 +100,9 @@ def read_images(folder: Path) -> dict[str, ImageFile]:
     images = {}
     for sidecar in sorted(folder.glob("*.json")):
         fields = json.loads(sidecar.read_text(encoding="utf-8"))
+        has_pixels = fields["missing_fraction"] < 1
         digest = hashlib.sha256(sidecar.with_suffix(".tiff").read_bytes()).hexdigest()
-        images[sidecar.stem] = ImageFile(sidecar.stem, fields["image_id"], fields["complete"], digest)
+        images[sidecar.stem] = ImageFile(sidecar.stem, fields["image_id"], fields["complete"], has_pixels, digest)
     return images
 
 
@@ -109,6 +111,8 @@ class Outcome:
     """Figures of a run; the fields up to `out` are the JSON object that `--json` prints.
 
     Attributes:
+        images_vessel: Images at the vessel of which at least one pixel was received.
+        images_shore: The same at the shore site.
         missing: Images that the channel delivered, at least in part, and that are not at the shore site.
         incomplete: Images at the shore site that v1 should have completed.
         not_sent: Contacts of which no image was encoded.
@@ -163,8 +167,8 @@ def evaluate(
         contacts=len(contacts),
         frames_sent=channel.frames_sent,
         frames_lost=channel.frames_lost,
-        images_vessel=len({image.image_id for image in vessel.values()}),
-        images_shore=len(at_shore),
+        images_vessel=len({image.image_id for image in vessel.values() if image.has_pixels}),
+        images_shore=len({image.image_id for image in shore.values() if image.has_pixels}),
         images_complete=len(complete),
         sha256_match={n: i.sha256 for n, i in vessel.items()} == {n: i.sha256 for n, i in shore.items()},
         acoustic_s=round(channel.acoustic_s, 1),

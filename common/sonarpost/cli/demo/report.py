@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
 from rich.table import Table
 
+from sonarpost.cli.demo.next_steps import shown
 from sonarpost.cli.demo.outcome import Outcome
 from sonarpost.cli.demo.settings import ChainSettings
 from sonarpost.cli.demo.sheet import SheetCell, SheetContact, write_sheet
@@ -48,7 +48,7 @@ def _sheet_contacts(watcher: Watcher, settings: ChainSettings) -> list[SheetCont
     for image_id, encoded in by_confidence:
         snippet, received = watcher.snippets.get(encoded.contact.contact_id), watcher.shore.get(image_id)
         original = None if snippet is None else to_uint8(snippet.picture.to_array())
-        size = f"{encoded.width_px} x {encoded.height_px} px"
+        size = f"{encoded.width_px} x {encoded.height_px} px"  # the font of the sheet has no multiplication sign
         raw = f"{size}, {encoded.height_px * encoded.width_px} B"
         place = f"{_position(watcher, image_id, encoded)}   confidence {_confidence(encoded)}"
         contacts.append(
@@ -69,7 +69,11 @@ def _received_cell(received: ReconstructedImage | None, original: Image | None) 
     if received is None or not received.codec:
         return SheetCell()
     image = received.picture.to_array()
-    label = f"{received.codec}, {received.bytes_received} B{_psnr(original, to_uint8(image))}"
+    label = f"{received.codec}, {received.bytes_received} B"
+    if received.despeckle_strength:
+        label += f", despeckled, strength {received.despeckle_strength:.2f}"
+    else:
+        label += _psnr(original, to_uint8(image))
     return SheetCell(label, image, received.missing())
 
 
@@ -86,10 +90,11 @@ def _paper_cell(original: Image | None, budget_bytes: int) -> SheetCell:
         if len(stream) <= budget_bytes:
             break
     image = decode_image(stream).image
-    return SheetCell(f"vq, {len(stream)} B{_psnr(original, image)}", image)
+    return SheetCell(f"vq, {len(stream)} B", image)
 
 
 def _psnr(original: Image | None, image: Image) -> str:
+    """Return the PSNR; it says nothing about a despeckled image, as the original has the speckle."""
     return "" if original is None or original.shape != image.shape else f", PSNR {psnr_db(original, image):.1f} dB"
 
 
@@ -113,7 +118,9 @@ def _state(received: ReconstructedImage | None) -> str:
         return "not received"
     if received.complete:
         return "complete"
-    if received.codec and not received.missing_fraction:
+    if not received.codec:
+        return "contact record only"
+    if not received.missing_fraction:
         return f"{received.bytes_received} of {received.bytes_total} B"
     return f"{100 * received.missing_fraction:.0f} % missing"
 
@@ -146,14 +153,16 @@ def _print_table(watcher: Watcher, settings: ChainSettings, console: Console) ->
 
 
 def _print_summary(outcome: Outcome, sheet: Path, console: Console) -> None:
-    console.print(
-        f"{outcome.contacts} contacts; {outcome.frames_sent} frames sent, {outcome.frames_lost} lost; "
-        f"{outcome.images_vessel} images at the vessel, {outcome.images_shore} at the shore site "
-        f"({outcome.images_complete} complete), "
-        f"{'identical' if outcome.sha256_match else '[red]not identical[/red]'}; "
-        f"{outcome.acoustic_s:.0f} s of airtime, {outcome.elapsed_s:.0f} s real time"
-    )
-    console.print('acoustic link: unauthenticated (emulated channel, acoustic_auth = "none")')
+    same = "identical at both" if outcome.sha256_match else "[red]not identical[/red]"
+    for line in (
+        f"{outcome.contacts} contacts",
+        f"images received: {outcome.images_vessel} at the vessel, {outcome.images_shore} at the shore site",
+        f"{outcome.images_complete} images complete at the shore site; files {same}",
+        f"{outcome.frames_sent} acoustic frames sent, {outcome.frames_lost} lost",
+        f"{outcome.acoustic_s:.0f} s of air time, {outcome.elapsed_s:.0f} s in real time",
+        'acoustic link: unauthenticated (emulated channel, acoustic_auth = "none")',
+    ):
+        console.print(line, highlight=False, soft_wrap=True)
     for text, names in (
         ("contacts without an encoded image", outcome.not_sent),
         ("images missing at the shore site", outcome.missing),
@@ -161,4 +170,4 @@ def _print_summary(outcome: Outcome, sheet: Path, console: Console) -> None:
     ):
         if names:
             console.print(f"[red]FAILED: {len(names)} {text}: {', '.join(names)}")
-    print(f"contact sheet: {sheet}", file=sys.stderr)
+    console.print(f"contact sheet: {shown(sheet)}", highlight=False, markup=False, soft_wrap=True)

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from sonarpost.errors import PortError
 from sonarpost.modem.micromodem import RATES
 
+ROUTER_PORTS = (7467, 7457, 7447)
+"""Ports of the routers of a demo's vehicle, vessel and shore site, if they are free. 7447 is Zenoh's usual port."""
+CONSOLE_PORT = 8470
 UUV, VESSEL, SHORE, WATER = "uuv-1", "vessel-1", "shore-1", "water"
 UUV_ADDRESS, VESSEL_ADDRESS = 3, 1
 PLATFORM_OF = {
@@ -127,6 +133,36 @@ def free_ports(count: int) -> tuple[int, ...]:
             probe.close()
 
 
+@contextmanager
+def reserved_ports(*preferred: int) -> Iterator[tuple[int, ...]]:
+    """Reserve a TCP port for each preferred one: itself, or else the next one that is free.
+
+    The reservation excludes other demos on this host.
+
+    Raises:
+        PortError: No port is free.
+    """
+    with ExitStack() as stack:
+        yield tuple(_reserve(port, stack) for port in preferred)
+
+
+def _reserve(preferred: int, stack: ExitStack) -> int:
+    for port in range(preferred, 65536):
+        # The probe of the port itself is closed again: a router must be able to listen. This name stays reserved.
+        reservation = socket.socket(socket.AF_UNIX)
+        try:
+            reservation.bind(f"\0sonarpost-demo-{port}")
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(("127.0.0.1", port))
+        except OSError:
+            reservation.close()
+            continue
+        stack.enter_context(reservation)
+        return port
+    raise PortError(f"no free TCP port from {preferred} on")
+
+
 def write_config(settings: ChainSettings) -> None:
     """Write one TOML file for each platform."""
     folder = settings.folder / "config"
@@ -199,6 +235,7 @@ def _vehicle_link(settings: ChainSettings) -> str:
         f'link = "v1"\nexpected_loss = {min(settings.loss, 0.9)}\nstream_bytes = {STREAM_BYTES}\n'
         f"tx_burst_s = {60 / scale:.3f}\nrx_window_s = {10 / scale + 0.5:.3f}\nholdoff_s = {5 / scale + 0.1:.3f}\n"
         f"queue_interval_s = 0.2\ngroup_delay_s = {20 / scale:.3f}\nretry_s = 0.2\n"
+        f"max_defer_s = {120 / scale + 1:.3f}\n"
         f"reply_timeout_s = {settings.reply_timeout_s:.3f}\n"
     )
 

@@ -13,7 +13,8 @@ from PIL import Image, ImageDraw, ImageFont
 from sonarpost.codec.interface import to_uint8
 
 BACKGROUND, INK, FAINT, MISSING = (16, 20, 26), (232, 236, 240), (140, 150, 160), (200, 70, 60)
-SCALE = 2
+SCALE, MAX_SCALED_PX = 2, 256
+"""Images of at most 256 px are drawn at twice their size; larger ones would make the sheet unreadable on a screen."""
 MARGIN, GAP, GROUP_GAP, LABEL, CAPTION, HEADER = 24, 12, 40, 24, 56, 104
 MAX_CONTACTS, CONTACTS_A_LINE = 12, 2
 
@@ -54,8 +55,8 @@ def write_sheet(path: Path, title: str, subtitle: str, stages: Sequence[str], co
     """
     shown = contacts[:MAX_CONTACTS]
     images = [[cell.image for cell in contact.cells if cell.image is not None] for contact in shown]
-    width_px = max((image.shape[1] for group in images for image in group), default=140) * SCALE
-    heights_px = [max((image.shape[0] for image in group), default=80) * SCALE for group in images]
+    width_px = max((_drawn_px(image)[0] for group in images for image in group), default=140 * SCALE)
+    heights_px = [max((_drawn_px(image)[1] for image in group), default=80 * SCALE) for group in images]
     group_px = len(stages) * (width_px + GAP) - GAP + GROUP_GAP
     groups = min(CONTACTS_A_LINE, max(1, len(shown)))
     lines_px = [max(heights_px[i : i + groups]) for i in range(0, len(shown), groups)]
@@ -98,6 +99,10 @@ def _paste(sheet: Image.Image, corner: tuple[int, int], cell: SheetCell, size_px
         # Hatched: plain black could pass for a shadow.
         rows, columns = np.indices(cell.missing.shape)
         colour[cell.missing & ((rows + columns) % 8 == 0)] = MISSING
-    height_px, width_px = cell.image.shape
-    tile = Image.fromarray(colour).resize((width_px * SCALE, height_px * SCALE), Image.Resampling.NEAREST)
-    sheet.paste(tile, corner)
+    sheet.paste(Image.fromarray(colour).resize(_drawn_px(cell.image), Image.Resampling.NEAREST), corner)
+
+
+def _drawn_px(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> tuple[int, int]:
+    """Return width and height on the sheet."""
+    scale = SCALE if max(image.shape) <= MAX_SCALED_PX else 1
+    return image.shape[1] * scale, image.shape[0] * scale

@@ -166,6 +166,12 @@ class Watcher:
         with self._lock:
             return all(i in self.shore and self.shore[i].complete for i in self.encoded)
 
+    @property
+    def images_at_shore(self) -> int:
+        """Number of images at the shore site of which at least one pixel was received."""
+        with self._lock:
+            return sum(image.missing_fraction < 1 for image in self.shore.values())
+
     def busy(self, files_expected: int, since_utc_s: float) -> str:
         """Return what still keeps the chain busy, an empty text if nothing does.
 

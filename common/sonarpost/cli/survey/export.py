@@ -11,8 +11,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
-from sonarpost.cli.shared import Subparsers
-from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.cli.shared import (
+    Subparsers,
+    add_survey_options,
+    in_new_folder,
+    print_notes,
+    survey_options_of,
+    utc_text,
+)
+from sonarpost.errors import SurveyFileError
 from sonarpost.files import atomic_file
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import SurveySource
@@ -34,14 +42,24 @@ def add_action(actions: Subparsers) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help="survey file")
     parser.add_argument("--format", choices=("csv", "geojson"), default="csv", help="output format (default: csv)")
     parser.add_argument("--out", type=Path, metavar="FILE", help="output file (default: standard output)")
-    add_option_flags(parser)
+    add_survey_options(parser)
     parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Write the track; return 0."""
+    """Write the track; return 0.
+
+    Raises:
+        SurveyFileError: The recording has no positions, or cannot be read.
+    """
     write = write_csv if parsed.format == "csv" else write_geojson
-    with open_survey(parsed.file, options_of(parsed)) as source:
+    options = survey_options_of(parsed)
+    with ProgressDisplay(step=f"reading {parsed.file}"), open_survey(parsed.file, options) as source:
+        if all(ping.lat_deg is None for ping in source.pings()):
+            raise _no_positions(source)
+        print_notes(source.info)
+        if parsed.out is not None:
+            in_new_folder(parsed.out)
         if parsed.out is None:
             write(source, sys.stdout)
         else:
@@ -50,6 +68,18 @@ def run(parsed: argparse.Namespace) -> int:
                 write(source, out)
                 out.detach()  # flushes the text; `atomic_file` closes the file
     return 0
+
+
+def _no_positions(source: SurveySource) -> SurveyFileError:
+    """Return the error for a recording without fixes."""
+    where, pings = str(source.info.path), f"none in {source.info.ping_count} pings"
+    if source.info.grid is None:
+        return SurveyFileError(where, "positions", pings, "a recording with positions")
+    if source.options.projected_crs is None:
+        return SurveyFileError(
+            where, "positions", "metres", "their projection, --crs EPSG:N (see sonarpost survey info)"
+        )
+    return SurveyFileError(where, "positions", pings, f"coordinates of {source.options.projected_crs}")
 
 
 def write_csv(source: SurveySource, out: TextIO) -> None:

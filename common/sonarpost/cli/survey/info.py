@@ -8,15 +8,19 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sonarpost.cli.shared import Subparsers
-from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.cli.shared import Subparsers, add_survey_options, survey_options_of, utc_text
 from sonarpost.sonar.geometry import Position, offset_between_m
+from sonarpost.sonar.projection import GridExtent, Projection
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import SurveySource
 from sonarpost.sonar.survey import Ping, Side
 
 _MAX_VALUES = 16
 """Maximum number of sample counts and frequencies in the list."""
+_NAVIGATION = ("lat_deg", "lon_deg", "heading_deg", "altitude_m", "depth_m", "speed_mps")
+_GRID = ("easting_m", "northing_m", "first_m", "last_m")
+"""Coordinates that only files in metres have."""
 _STEP_M = 5.0
 """Step of the track length: fixes are often coarse and repeated over many pings."""
 
@@ -26,27 +30,28 @@ def add_action(actions: Subparsers) -> None:
     parser = actions.add_parser("info", help="list contents and irregularities of recordings")
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="survey file")
     parser.add_argument("--json", action="store_true", help="print one JSON object for each file, one per line")
-    add_option_flags(parser)
+    add_survey_options(parser)
     parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:
     """Describe every file; return 0."""
-    options = options_of(parsed)
+    options = survey_options_of(parsed)
     for path in parsed.files:
-        with open_survey(path, options) as source:
+        with ProgressDisplay(step=f"reading {path}"), open_survey(path, options) as source:
             contents = describe(source)
         if parsed.json:
             print(json.dumps(contents))
             continue
         print(path)
-        warnings = contents.pop("warnings")
-        assert isinstance(warnings, list)
+        notes = [(kind, contents.pop(f"{kind}s")) for kind in ("warning", "hint")]
         for name, value in contents.items():
-            if name != "file":
+            if name != "file" and not (name in _GRID and value is None):
                 print(f"  {name:20} {_text(value)}")
-        for warning in warnings:
-            print(f"  note: {warning}")
+        for kind, lines in notes:
+            assert isinstance(lines, list)
+            for line in lines:
+                print(f"  {'note' if kind == 'warning' else kind}: {line}")
     return 0
 
 
@@ -55,16 +60,22 @@ def _text(value: object) -> str:
         return "-"
     if isinstance(value, list):
         return " to ".join(_text(each) for each in value) if len(value) == 2 else ", ".join(map(_text, value))
-    return f"{value:.7g}" if isinstance(value, float) else str(value)
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_text(each)}" for name, each in value.items())
+    if isinstance(value, float):
+        return f"{round(value, 1):.10g}" if abs(value) >= 10_000 else f"{value:.7g}"
+    return str(value)
 
 
 @dataclass
 class _Range:
     low: float = math.inf
     high: float = -math.inf
+    count: int = 0
 
     def add(self, value: float | None) -> None:
         if value is not None:
+            self.count += 1
             self.low, self.high = min(self.low, value), max(self.high, value)
 
     def pair(self) -> list[float] | None:
@@ -88,7 +99,7 @@ class _Statistics:
 
     def add(self, ping: Ping) -> None:
         self._extend("time", ping.time_utc_s)
-        for name in ("lat_deg", "lon_deg", "altitude_m", "depth_m", "speed_mps"):
+        for name in _NAVIGATION:
             self._extend(name, getattr(ping, name))
         self._add_used_channels(ping)
         for channel in ping.channels:
@@ -120,6 +131,23 @@ class _Statistics:
         pings = f"several channels a side in {self.pings_with_more_channels} of {total} pings"
         return [f"{pings}: images and contacts are of the first{frequencies}, slant range {ranges} m"]
 
+    def hints(self, total: int) -> list[str]:
+        """Return what is missing in the navigation, and its effect."""
+        effects = {
+            "heading_deg": "contacts without a heading have no position",
+            "altitude_m": "it is taken from the first bottom return",
+        }
+        hints = [
+            f"{name} {f'only in {count} of' if count else 'in none of'} {total} pings: {effect}"
+            for name, effect in effects.items()
+            if (count := self.ranges[name].count) < total / 2
+        ]
+        if not self.fixes:
+            hints.append("no positions: contacts have no position")
+        elif self.fixes > 1 and all(self.ranges[name].low == self.ranges[name].high for name in ("lat_deg", "lon_deg")):
+            hints.append("the position is the same in every ping")
+        return hints
+
     def _extend(self, name: str, value: float | None) -> None:
         self.ranges.setdefault(name, _Range()).add(value)
 
@@ -145,10 +173,7 @@ def describe(source: SurveySource) -> dict[str, object]:
         statistics.add(ping)
     times = statistics.ranges["time"]
     info = source.info
-    ranges = {
-        name: statistics.ranges.get(name, _Range()).pair()
-        for name in ("lat_deg", "lon_deg", "altitude_m", "depth_m", "speed_mps", "slant_range_m")
-    }
+    ranges = {name: statistics.ranges.get(name, _Range()).pair() for name in (*_NAVIGATION, "slant_range_m")}
     return {
         "file": str(info.path),
         "sonar": info.sonar_id,
@@ -162,6 +187,45 @@ def describe(source: SurveySource) -> dict[str, object]:
         "duration_s": round(times.high - times.low, 3),
         "fixes": statistics.fixes,
         "track_m": round(statistics.track_m, 1),
+        **_stored_coordinates(info.grid),
         **ranges,
         "warnings": [*info.warnings, *statistics.warnings(info.ping_count)],
+        "hints": [*projection_hints(source, statistics.fixes), *statistics.hints(info.ping_count)],
     }
+
+
+def _stored_coordinates(grid: GridExtent | None) -> dict[str, object]:
+    """Return the coordinates of a file in metres, as they are stored."""
+    if grid is None:
+        return dict.fromkeys(_GRID)
+    axes = ("easting", "northing")
+    ranges = {f"{axis}_m": [grid.min_m[n], grid.max_m[n]] for n, axis in enumerate(axes)}
+    return ranges | {
+        "first_m": dict(zip(axes, grid.first_m, strict=True)),
+        "last_m": dict(zip(axes, grid.last_m, strict=True)),
+    }
+
+
+def projection_hints(source: SurveySource, fixes: int) -> list[str]:
+    """Return which projection a file in metres can have, if it has no positions without one."""
+    grid, crs = source.info.grid, source.options.projected_crs
+    if grid is None or fixes:
+        return []
+    (west_m, south_m), (east_m, north_m) = grid.min_m, grid.max_m
+    if crs is not None:
+        return [f"{crs} has no position for these eastings and northings: it is not the projection of this file"]
+    if max(abs(west_m), abs(east_m)) <= 180 and max(abs(south_m), abs(north_m)) <= 90:
+        return ["the positions look like degrees, but NavUnits (byte 164 of the file) is 0 for metres: write 3 there"]
+    name = "positions are in metres: name their projection with --crs EPSG:N (see the recorder's settings)"
+    utm = [
+        f"EPSG:{code}ZZ at latitude {abs(position.lat_deg):.1f} {letter}"
+        for code, letter in (("326", "N"), ("327", "S"))
+        if 100_000 <= west_m <= east_m <= 900_000
+        and 0 < south_m <= north_m < 10_000_000
+        # The latitude is nearly the same in every zone.
+        and (position := Projection(f"EPSG:{code}31").position(500_000, grid.first_m[1])) is not None
+    ]
+    if not utm:
+        return [f"{name}; they are not UTM coordinates"]
+    zone = "zone ZZ = (longitude + 180) / 6, rounded up: 16 at 87 W"
+    return [f"{name}; if it is UTM, {' or '.join(utm)}; {zone}"]

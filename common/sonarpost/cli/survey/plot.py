@@ -12,8 +12,15 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
-from sonarpost.cli.shared import Subparsers
-from sonarpost.cli.survey.common import add_option_flags, options_of, utc_text
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.cli.shared import (
+    Subparsers,
+    add_survey_options,
+    make_output_folder,
+    print_notes,
+    survey_options_of,
+    utc_text,
+)
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
 from sonarpost.sonar.bottom_track import altitudes_m
@@ -56,7 +63,7 @@ def add_action(actions: Subparsers) -> None:
         metavar="N",
         help="maximum rows, by averaging pings (default: %(default)s)",
     )
-    add_option_flags(parser)
+    add_survey_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -66,9 +73,11 @@ def run(parsed: argparse.Namespace) -> int:
         raise ConfigError("survey plot", "--rows", parsed.rows, f"1 to {_MAX_ROWS_OPTION}")
     if parsed.even and not parsed.ground:
         raise ConfigError("survey plot", "--even", "without --ground", "--even together with --ground")
-    options = options_of(parsed)
+    options = survey_options_of(parsed)
+    make_output_folder(parsed.out)
     for path in parsed.files:
-        with open_survey(path, options) as source:
+        with ProgressDisplay(step=f"drawing {path}"), open_survey(path, options) as source:
+            print_notes(source.info)
             name = source.info.line_name
             title = f"{name}   {source.info.sonar_id}   {source.info.ping_count} pings"
             reduced = reduce_survey(source, over_ground=parsed.ground, max_rows=parsed.rows)
@@ -78,7 +87,6 @@ def run(parsed: argparse.Namespace) -> int:
                 "waterfall": draw_waterfall(reduced, title, over_ground=parsed.ground),
                 "track": draw_track(thinned_track(source.pings()), title),
             }
-        parsed.out.mkdir(parents=True, exist_ok=True)
         for kind, image in images.items():
             target = parsed.out / f"{name}-{kind}.png"
             write_atomically(target, encode_png(image))
@@ -150,11 +158,12 @@ class Reduced:
     """A recording averaged to the size of an image.
 
     Attributes:
-        echo: Mean echo, shape (rows, 2 * SIDE_PX), port mirrored to the left; NaN where not recorded.
+        echo: Mean echo, shape (rows, 2 * side_px), port mirrored to the left; NaN where not recorded.
         altitude_m: Mean altitude of each row; NaN if unknown.
         times_utc_s: Time of the first ping of each row.
         numbers: Number of the first ping of each row.
         max_range_m: Range of the outer edges.
+        pings_per_row: Number of pings averaged in a row.
     """
 
     echo: FloatArray
@@ -162,15 +171,33 @@ class Reduced:
     times_utc_s: list[float]
     numbers: list[int]
     max_range_m: float
+    pings_per_row: int
+
+    @property
+    def side_px(self) -> int:
+        """Columns of one side."""
+        return int(self.echo.shape[1]) // 2
+
+    def x(self, side: Side, slant_range_m: float) -> float:
+        """Return the column of a slant range in the drawn image."""
+        distance = slant_range_m / self.max_range_m * self.side_px
+        return _LEFT_PX + self.side_px + (-distance if side is Side.PORT else distance)
+
+    def y(self, ping_index: float) -> float:
+        """Return the row of a ping in the drawn image."""
+        return _TOP_PX + ping_index / self.pings_per_row
 
 
-def reduce_survey(source: SurveySource, *, over_ground: bool, max_rows: int = MAX_ROWS) -> Reduced:
+def reduce_survey(
+    source: SurveySource, *, over_ground: bool, max_rows: int = MAX_ROWS, side_px: int = SIDE_PX
+) -> Reduced:
     """Read a recording and average it into at most `max_rows` rows.
 
     Args:
         source: The recording.
         over_ground: Ground range without the water column, in place of slant range.
         max_rows: Maximum rows of the image, at least 1.
+        side_px: Columns of one side.
 
     Raises:
         SurveyFileError: The file cannot be read.
@@ -179,14 +206,14 @@ def reduce_survey(source: SurveySource, *, over_ground: bool, max_rows: int = MA
     max_range_m = max(range_m for range_m in ranges_m if range_m is not None)
     per_row = math.ceil(source.info.ping_count / max_rows)
     rows = math.ceil(source.info.ping_count / per_row)
-    total, count = np.zeros((rows, 2 * SIDE_PX)), np.zeros((rows, 2 * SIDE_PX))
+    total, count = np.zeros((rows, 2 * side_px)), np.zeros((rows, 2 * side_px))
     heights, known = np.zeros(rows), np.zeros(rows)
     times: list[float] = []
     numbers: list[int] = []
     first = 0
     for survey, altitude_m in _parts_with_altitude(source):
         row_of_ping = (first + np.arange(len(survey.pings))) // per_row
-        image = _both_sides(survey, altitude_m if over_ground else np.zeros_like(altitude_m), max_range_m)
+        image = _both_sides(survey, altitude_m if over_ground else np.zeros_like(altitude_m), max_range_m, side_px)
         valid = np.isfinite(image)
         np.add.at(total, row_of_ping, np.where(valid, image, 0))
         np.add.at(count, row_of_ping, valid)
@@ -198,7 +225,8 @@ def reduce_survey(source: SurveySource, *, over_ground: bool, max_rows: int = MA
                 numbers.append(ping.number)
         first += len(survey.pings)
     echo = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    return Reduced(echo, np.where(known > 0, heights / np.maximum(known, 1), np.nan), times, numbers, max_range_m)
+    altitudes = np.where(known > 0, heights / np.maximum(known, 1), np.nan)
+    return Reduced(echo, altitudes, times, numbers, max_range_m, per_row)
 
 
 def _parts_with_altitude(source: SurveySource) -> Iterator[tuple[Survey, FloatArray]]:
@@ -211,23 +239,23 @@ def _parts_with_altitude(source: SurveySource) -> Iterator[tuple[Survey, FloatAr
         yield replace(survey, pings=strip.pings[begin:end]), altitudes_m(survey)[begin:end]
 
 
-def _both_sides(survey: Survey, altitude_m: FloatArray, max_range_m: float) -> FloatArray:
-    """Return both sides in SIDE_PX columns each; an altitude of 0 gives slant range."""
-    image = np.full((len(survey.pings), 2 * SIDE_PX), np.nan)
+def _both_sides(survey: Survey, altitude_m: FloatArray, max_range_m: float, side_px: int) -> FloatArray:
+    """Return both sides in `side_px` columns each; an altitude of 0 gives slant range."""
+    image = np.full((len(survey.pings), 2 * side_px), np.nan)
     for side in survey.sides():
-        half = ground_range_image(survey, side, altitude_m, max_range_m / SIDE_PX)[:, :SIDE_PX]
+        half = ground_range_image(survey, side, altitude_m, max_range_m / side_px)[:, :side_px]
         if side is Side.PORT:
-            image[:, SIDE_PX - half.shape[1] : SIDE_PX] = half[:, ::-1]
+            image[:, side_px - half.shape[1] : side_px] = half[:, ::-1]
         else:
-            image[:, SIDE_PX : SIDE_PX + half.shape[1]] = half
+            image[:, side_px : side_px + half.shape[1]] = half
     return image
 
 
 def angle_normalised(reduced: Reduced) -> Reduced:
     """Return a recording over ground range, each side divided by the mean echo at each angle."""
-    spacing_m = reduced.max_range_m / SIDE_PX
-    port = reduced.echo[:, :SIDE_PX][:, ::-1].astype(np.float32)
-    starboard = reduced.echo[:, SIDE_PX:].astype(np.float32)
+    spacing_m = reduced.max_range_m / reduced.side_px
+    port = reduced.echo[:, : reduced.side_px][:, ::-1].astype(np.float32)
+    starboard = reduced.echo[:, reduced.side_px :].astype(np.float32)
     halves = [beam_normalised(half, reduced.altitude_m, spacing_m) for half in (port, starboard)]
     return replace(reduced, echo=np.hstack([halves[0][:, ::-1], halves[1]]).astype(np.float64))
 
@@ -239,14 +267,14 @@ def draw_waterfall(reduced: Reduced, title: str, *, over_ground: bool) -> Image.
         RGB image. In slant range, the first bottom return is drawn in yellow where the altitude is known.
     """
     rows = reduced.echo.shape[0]
-    image = Image.new("RGB", (_LEFT_PX + 2 * SIDE_PX + _RIGHT_PX, _TOP_PX + rows + _BOTTOM_PX), _PAPER)
+    image = Image.new("RGB", (_LEFT_PX + 2 * reduced.side_px + _RIGHT_PX, _TOP_PX + rows + _BOTTOM_PX), _PAPER)
     image.paste(Image.fromarray(_grey(reduced.echo)), (_LEFT_PX, _TOP_PX))
     draw = ImageDraw.Draw(image)
     axis = "ground range, m" if over_ground else "slant range, m"
     draw.text((6, 4), f"{title}   {axis}", fill=_INK)
     if not over_ground:
         _draw_bottom(draw, reduced)
-    _draw_ranges(draw, reduced.max_range_m, _TOP_PX + rows)
+    _draw_ranges(draw, reduced, _TOP_PX + rows)
     step = max(rows // 12, 24)
     for row in range(0, rows, step):
         y = _TOP_PX + row
@@ -270,23 +298,22 @@ def _grey(echo: FloatArray) -> npt.NDArray[np.uint8]:
 
 
 def _draw_bottom(draw: ImageDraw.ImageDraw, reduced: Reduced) -> None:
-    middle = _LEFT_PX + SIDE_PX
     for row, altitude_m in enumerate(reduced.altitude_m.tolist()):
         if math.isfinite(altitude_m) and altitude_m < reduced.max_range_m:
-            x = round(altitude_m / reduced.max_range_m * SIDE_PX)
-            draw.point([(middle - 1 - x, _TOP_PX + row), (middle + x, _TOP_PX + row)], fill=_BOTTOM_COLOUR)
+            port_x, starboard_x = (round(reduced.x(side, altitude_m)) for side in Side)
+            draw.point([(port_x - 1, _TOP_PX + row), (starboard_x, _TOP_PX + row)], fill=_BOTTOM_COLOUR)
 
 
-def _draw_ranges(draw: ImageDraw.ImageDraw, max_range_m: float, y: int) -> None:
-    step_m = nice_step(max_range_m / 5)
-    for number in range(int(max_range_m / step_m) + 1):
-        x_m = number * step_m
-        for sign in (-1, 1) if number else (1,):
-            x = _LEFT_PX + SIDE_PX + sign * round(x_m / max_range_m * SIDE_PX)
+def _draw_ranges(draw: ImageDraw.ImageDraw, reduced: Reduced, y: int) -> None:
+    step_m = nice_step(reduced.max_range_m / 5)
+    for number in range(int(reduced.max_range_m / step_m) + 1):
+        range_m = number * step_m
+        for side in Side if number else (Side.STARBOARD,):
+            x = round(reduced.x(side, range_m))
             draw.line((x, y, x, y + 6), fill=_INK)
-            draw.text((x, y + 8), f"{x_m:g}", fill=_INK, anchor="mt")
-    for text, x in (("port", _LEFT_PX + SIDE_PX // 2), ("starboard", _LEFT_PX + SIDE_PX * 3 // 2)):
-        draw.text((x, y + 22), text, fill=_INK, anchor="mt")
+            draw.text((x, y + 8), f"{range_m:g}", fill=_INK, anchor="mt")
+    for side in Side:
+        draw.text((reduced.x(side, reduced.max_range_m / 2), y + 22), side.value, fill=_INK, anchor="mt")
 
 
 def nice_step(limit: float) -> float:

@@ -1,0 +1,116 @@
+"""`sonarpost modem ping`: ask a modem for the acoustic travel time to another one, without any service."""
+
+from __future__ import annotations
+
+import argparse
+import queue
+import time
+
+from sonarpost.cli.shared import Subparsers, add_command
+from sonarpost.errors import ConfigError, PortError
+from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, ModemEvent, PingAnswered
+from sonarpost.modem.micromodem import events as ev
+from sonarpost.modem.micromodem.nmea import MAX_ADDRESS
+from sonarpost.runtime.modem_runner import ModemRunner
+from sonarpost.runtime.serial_port import SerialPort
+
+EXIT_UNANSWERED = 1
+SOUND_SPEED_M_PER_S = 1500.0
+PING_TIMEOUT_S = 60.0
+"""Maximum time of one ping; the driver itself gives up earlier."""
+
+_PING = """Configure a modem as the services do, and ping another modem through the water. Stop the service that uses
+the port first. Exit status: 0 if every ping was answered, 1 if one was not, 2 if the modem itself does not reply."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the command and its action."""
+    actions = add_command(subparsers, "modem", "test a Micro-Modem without services")
+    ping = actions.add_parser("ping", help="measure the travel time to another modem", description=_PING)
+    ping.add_argument("--port", required=True, metavar="URL", help="as in the configuration, for example /dev/ttyUSB0")
+    ping.add_argument("--baud", type=int, default=19200, metavar="B", help="of the serial line (default: 19200)")
+    ping.add_argument("--address", type=int, required=True, metavar="N", help="address to give to this modem, 0 to 127")
+    ping.add_argument("--destination", type=int, required=True, metavar="N", help="address of the other modem")
+    ping.add_argument("--count", type=int, default=3, metavar="N", help="number of pings (default: 3)")
+    ping.add_argument("--wait", type=float, default=30.0, metavar="S", help="maximum wait for this modem (default: 30)")
+    ping.set_defaults(run=run)
+
+
+def run(parsed: argparse.Namespace) -> int:
+    """Ping; print one line for each ping.
+
+    Raises:
+        ConfigError: An option is out of range, or the kind of port is not supported.
+        PortError: The port cannot be opened, or the modem does not reply.
+    """
+    if not 0 <= parsed.destination <= MAX_ADDRESS or parsed.destination == parsed.address:
+        expected = f"0..{MAX_ADDRESS}, another one than --address"
+        raise ConfigError("command line", "--destination", parsed.destination, expected)
+    events: queue.SimpleQueue[ModemEvent] = queue.SimpleQueue()
+    port = SerialPort(parsed.port, parsed.baud)
+    runner = ModemRunner(MicroModem(MicroModemConfig(parsed.address), parsed.port), port, events.put)
+    runner.start()
+    try:
+        _wait_until_ready(events, port, parsed.wait)
+        answered = sum(_ping(runner, events, parsed.destination, number) for number in range(1, parsed.count + 1))
+    finally:
+        runner.stop()
+    print(f"{answered} of {parsed.count} pings answered")
+    return 0 if answered == parsed.count else EXIT_UNANSWERED
+
+
+def _wait_until_ready(events: queue.SimpleQueue[ModemEvent], port: SerialPort, wait_s: float) -> None:
+    deadline_s = time.monotonic() + wait_s
+    waiting_for = ""
+    while True:
+        try:
+            event = events.get(timeout=max(0.0, deadline_s - time.monotonic()))
+        except queue.Empty:
+            reason = port.error if not port.is_open else f"the modem does not reply{waiting_for}"
+            raise PortError(f"{port.url}: {reason or 'not open yet'}") from None
+        match event:
+            case ev.ModemReady():
+                print(f"modem ready: address {event.address}, firmware {event.firmware or 'unknown'}", flush=True)
+                return
+            case ev.ModemUnresponsive():
+                waiting_for = f" to {event.waiting_for}"
+            case ev.SettingUnconfirmed():
+                print(f"modem did not confirm a setting: {event.command}", flush=True)
+            case _:
+                pass
+
+
+def _ping(runner: ModemRunner, events: queue.SimpleQueue[ModemEvent], destination: int, number: int) -> bool:
+    """Send one ping, print its result and return whether it was answered."""
+    while not events.empty():
+        events.get()  # of an earlier ping
+    request = runner.request(lambda driver, now: driver.ping(destination, now))
+    travel_s: float | None = None
+    deadline_s = time.monotonic() + PING_TIMEOUT_S
+    reason = "no end of the request"
+    while (left_s := deadline_s - time.monotonic()) > 0:
+        try:
+            event = events.get(timeout=left_s)
+        except queue.Empty:
+            break
+        match event:
+            case PingAnswered(src=source) if source == destination:
+                travel_s = event.travel_s
+            case ev.RequestDone(request_id=done) if done == request:
+                print(f"ping {number}: {_travel_text(travel_s)}", flush=True)
+                return True
+            case ev.RequestFailed(request_id=failed) if failed == request:
+                reason = str(event.reason)
+                break
+            case ev.ModemError():
+                print(f"modem reports an error: {event.report}", flush=True)
+            case _:
+                pass
+    print(f"ping {number}: not answered ({reason})", flush=True)
+    return False
+
+
+def _travel_text(travel_s: float | None) -> str:
+    if travel_s is None:
+        return "answered, without a travel time"
+    return f"one way {travel_s:.4f} s, {travel_s * SOUND_SPEED_M_PER_S:.1f} m at {SOUND_SPEED_M_PER_S:.0f} m/s"

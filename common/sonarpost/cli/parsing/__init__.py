@@ -1,0 +1,1 @@
+"""Parser of the command line, its tables of commands and examples, shell completion."""

@@ -1,0 +1,97 @@
+"""Tables of the commands: modules, summaries, former names, examples, extras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
+    "demo": ("cli.demo", "run the whole chain on this host, from a survey file to the shore"),
+    "run": ("cli.run", "run one service of the chain, or all services of a platform"),
+    "router": ("cli.run", "run an embedded Zenoh router"),
+    "status": ("cli.status", "show the services of all platforms, live"),
+    "c2": ("cli.c2", "list, export and watch the contacts of a shore site; send commands"),
+    "store": ("cli.store", "check the store of a stopped service, and recover a damaged one"),
+    "config": ("cli.deployment.config_files", "print an example configuration; check a configuration file"),
+    "install-units": ("cli.deployment.install_units", "write the systemd units of a platform"),
+    "console": ("services.console.command", "manage the users of the console; serve simulated contacts for training"),
+    "metrics": ("cli.metrics", "serve the health of all platforms to Prometheus"),
+    "simulate": ("cli.simulate", "write a simulated side-scan survey as XTF"),
+    "survey": ("cli.survey", "describe, draw and export recordings of side-scan sonars"),
+    "detect": ("cli.detect", "detect contacts in survey files"),
+    "encode": ("cli.encode", "encode an image or a folder of images"),
+    "decode": ("cli.encode", "decode a stream or a folder of streams to TIFF and PNG"),
+    "codebook": ("cli.codebook", "build, compare and adapt tile codebooks"),
+    "prepare": ("cli.prepare", "compile the machine code of the codecs in advance"),
+    "pki": ("cli.pki", "certificates of the fleet, access control of its routers, key of its acoustic link"),
+    "modem": ("cli.deployment.modem_ping", "test a Micro-Modem without services"),
+    "modem-emulator": ("cli.modem_emulator", "emulated acoustic modems on pseudo-terminals or TCP ports"),
+    "completion": ("cli.parsing.completion", "print the completion script of a shell"),
+}
+"""Name -> module and summary. Only the module of the given command is imported: all of them together take seconds."""
+
+RENAMED_COMMANDS: Final[Mapping[str, str]] = {
+    "catalogue": "sonarpost codebook",
+    "survey-panel": "python -m research.user_study",
+    "codebook nominal": "python -m research.default_codebooks",
+    "bench": "python -m research.codecs (research/README.md lists the others)",
+    "bench codecs": "python -m research.codecs",
+    "bench link": "python -m research.link",
+    "bench detect": "python -m research.detection",
+    "bench recognition": "python -m research.recognition",
+    "bench paper": "python -m research.paper",
+    "bench sea-trial": "python -m research.sea_trial",
+    "bench mission": "python -m research.mission",
+    "bench busy": "python -m research.utilisation",
+}
+"""Commands of version 0.1 that have another name now."""
+
+EXTRAS: Final[Mapping[str, str]] = {"starlette": "console", "uvicorn": "console", "matplotlib": "research"}
+"""Package -> the extra that installs it."""
+
+EXAMPLES: Final[Mapping[str, str]] = {
+    "demo": "demo --loss 0.3 --seed 3",
+    "run": "run compressor --config uuv.toml",
+    "router": "router --listen tcp/127.0.0.1:7447",
+    "status": "status --router tcp/127.0.0.1:7447 --once",
+    "c2 ls": "c2 ls --since 24h --json",
+    "c2 get": "c2 get uuv-1/0001",
+    "c2 export": "c2 export --out contacts.geojson --out contacts.kmz",
+    "c2 watch": "c2 watch --router tcp/127.0.0.1:7447 --count 1",
+    "c2 command": "c2 command uuv-1/0001 --vessel vessel-1 --kind refine",
+    "c2 comment": "c2 comment uuv-1/0001 --vessel vessel-1 --verdict mine_like --remark 'same as last year'",
+    "store check": "store check state/relay.db",
+    "store salvage": "store salvage state/relay.db --out relay-new.db",
+    "config example": "config example uuv --out uuv.toml",
+    "config check": "config check uuv.toml",
+    "install-units": "install-units vessel --dry-run",
+    "console": "console --training 40",
+    "console user add": "console user add anna --role operator --state-dir state",
+    "console user passwd": "console user passwd anna --state-dir state",
+    "console user rm": "console user rm anna --state-dir state",
+    "console user ls": "console user ls --state-dir state",
+    "metrics": "metrics --router tcp/127.0.0.1:7447 --port 9464",
+    "simulate": "simulate line.xtf --seabed ripples --truth truth.json",
+    "survey info": "survey info line.xtf --json",
+    "survey plot": "survey plot line.xtf --ground --out plots",
+    "survey export": "survey export line.xtf --format geojson --out track.geojson",
+    "detect": "detect line.xtf --threshold 0.5 --plot contacts.png",
+    "encode": "encode contact.png --budget 64 --out streams",
+    "decode": "decode streams --out images",
+    "codebook build": "codebook build --images images --out own.tiles",
+    "codebook info": "codebook info nominal-10",
+    "codebook diff": "codebook diff nominal-10 own.tiles",
+    "codebook adapt": "codebook adapt nominal-10 --images images --out adapted.tiles",
+    "prepare": "prepare",
+    "pki init": "pki init --dir fleet --fleet north",
+    "pki issue": "pki issue vessel-1 --dir fleet --role vessel --host 192.0.2.1",
+    "pki renew": "pki renew vessel-1 --dir fleet --out vessel-1-2027",
+    "pki revoke": "pki revoke vessel-1 --dir fleet --reason 'computer lost'",
+    "pki list": "pki list --dir fleet",
+    "pki router-config": "pki router-config --dir fleet --platform vessel-1 --out vessel-1.json5",
+    "pki acoustic": "pki acoustic --dir fleet",
+    "modem ping": "modem ping --port /dev/ttyUSB0 --address 3 --destination 1",
+    "modem-emulator": "modem-emulator --modems 2 --tcp --loss 0.1",
+    "completion": "completion bash > ~/.local/share/bash-completion/completions/sonarpost",
+}
+"""Command -> arguments of its example. Every command without actions has one."""

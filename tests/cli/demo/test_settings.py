@@ -1,0 +1,29 @@
+"""Ports of the demo."""
+
+from __future__ import annotations
+
+import socket
+
+from builders.common import free_port
+
+from sonarpost.cli.demo.settings import reserved_ports
+
+
+def test_free_port_is_reserved_and_can_be_listened_on() -> None:
+    wanted = free_port()
+    with reserved_ports(wanted) as (port,), socket.socket() as listener:
+        assert port == wanted
+        listener.bind(("127.0.0.1", port))
+        # Another demo, while this one runs and before its router listens.
+        with reserved_ports(wanted) as (other,):
+            assert other > wanted
+    with reserved_ports(wanted) as (again,):
+        assert again == wanted
+
+
+def test_port_of_another_program_is_skipped() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        taken = listener.getsockname()[1]
+        with reserved_ports(taken, taken) as ports:
+            assert len({taken, *ports}) == 3
+            assert all(port > taken for port in ports)

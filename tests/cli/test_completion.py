@@ -1,0 +1,66 @@
+"""`sonarpost completion`: the script of each shell, run by the shell where it is installed."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from sonarpost.cli.main import COMMANDS, main
+
+
+def script(shell: str, capsys: pytest.CaptureFixture[str]) -> str:
+    assert main(["completion", shell]) == 0
+    return capsys.readouterr().out
+
+
+def completed(text: str, folder: Path, *words: str) -> list[str]:
+    """Return what bash offers after `sonarpost WORDS`; the last word is the one to complete."""
+    (folder / "script").write_text(text)
+    program = 'source ./script; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _sonarpost; printf "%s\\n" "${COMPREPLY[@]}"'
+    command = ["bash", "-uc", program, "bash", "sonarpost", *words]
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout.split()
+
+
+def test_bash_completes_commands_actions_options_and_values(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = script("bash", capsys)
+    assert set(completed(text, tmp_path, "")) >= {*COMMANDS, "--version", "-v"}
+    assert completed(text, tmp_path, "enc") == ["encode"]
+    assert completed(text, tmp_path, "-q", "c2", "ex") == ["export"]
+    assert completed(text, tmp_path, "console", "user", "pass") == ["passwd"]
+    assert completed(text, tmp_path, "encode", "a.png", "--codeb") == ["--codebook"]
+    assert completed(text, tmp_path, "simulate", "a.xtf", "--seabed", "rip") == ["ripples"]
+    assert completed(text, tmp_path, "run", "comp") == ["compressor"]
+    assert completed(text, tmp_path, "encode", "photo.p") == []
+    assert "task" not in completed(text, tmp_path, "c2", ""), "a refused former name"
+
+
+def test_bash_loads_the_script_and_registers_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "script").write_text(script("bash", capsys))
+    command = ["bash", "-euc", "source ./script; complete -p sonarpost"]
+    printed = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    assert printed == "complete -o default -F _sonarpost sonarpost\n"
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_zsh_and_fish_accept_their_script(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = script(shell, capsys)
+    assert "router-config" in text
+    assert "nominal" not in text
+    program = shutil.which(shell)
+    if program is None:
+        pytest.skip(f"{shell} is not installed")
+    (tmp_path / "script").write_text(text)
+    subprocess.run([program, "-n", str(tmp_path / "script")], check=True, capture_output=True)
+    if shell == "fish":
+        command = [program, "-c", "source script; complete -C 'sonarpost console user pass'"]
+        printed = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+        assert printed.split() == ["passwd"]
+
+
+def test_an_unknown_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["completion", "zhs"])
+    assert "did you mean zsh?" in capsys.readouterr().err
