@@ -1,19 +1,21 @@
 """Configuration of the target detection: the `[atd_stub]` table."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from sonarpost.codec.fitting import Fit
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX
+from sonarpost.errors import ConfigError
 from sonarpost.runtime.retention import MaxBytes, RetentionConfig
-from sonarpost.sonar.options import ErrorBudget, Mounting, SurveyOptions
+from sonarpost.sonar.options import SurveyOptions, load_options
 
 SidePx = Annotated[int, Field(ge=MIN_SIDE_PX, le=MAX_SIDE_PX)]
 
 
-class AtdStubConfig(RetentionConfig):
-    """Input files, detection, snippets and release.
+class AtdStubConfig(RetentionConfig, SurveyOptions):
+    """Input files, detection, snippets and release, with the options for survey files.
 
     Attributes:
         mode: "survey" detects contacts in survey files; "snippets" sends image files as snippets (the paper's talker).
@@ -34,12 +36,11 @@ class AtdStubConfig(RetentionConfig):
         snippet_height_px: Rows (along-track) of a snippet.
         snippet_width_px: Columns (across-track) of a snippet.
         snippet_pixel_m: Side of a snippet's pixels on the ground; 0 for the sonar's own, ping by sample.
+        fit: In snippets mode, what is done with an image outside 16..512 px a side: "resize" keeps the aspect ratio and
+            corrects the pixel size, "crop" sends the centre, "refuse" quarantines it.
         snippet_dir: Where each contact's snippet is stored with a text file beside it; by default nowhere.
-        projected_crs: Coordinate system of survey files in metres (`EPSG:32619`).
-        position_source: Which position of a survey file is used, the sensor's or the ship's.
-        port_order: Order of the port samples in survey files.
-        mounting: Position of the sonar relative to the position in the file: offsets, layback, heading.
-        errors: Standard deviations of positions, headings and altitudes.
+        survey_options: File of survey options, as for `--options` of `sonarpost detect`. Its keys can be in this table
+            instead; beside a file only `projected_crs` can, which replaces the one in the file.
         retain_days: Time after which a processed input file and a stored snippet are removed, and the entry of a
             processed file is deleted.
         max_bytes: Maximum size of the processed input files, and of the files in `snippet_dir`; above it the oldest are
@@ -60,20 +61,23 @@ class AtdStubConfig(RetentionConfig):
     snippet_height_px: SidePx = 80
     snippet_width_px: SidePx = 140
     snippet_pixel_m: Annotated[float, Field(ge=0, le=10)] = 0.0
+    fit: Fit = "resize"
     snippet_dir: Path | None = None
-    projected_crs: str | None = None
-    position_source: Literal["sensor", "ship"] = "sensor"
-    port_order: Literal["farthest_first", "nearest_first"] = "farthest_first"
-    mounting: Mounting = Mounting()
-    errors: ErrorBudget = ErrorBudget()
+    survey_options: Path | None = None
     max_bytes: MaxBytes = 100_000_000_000
 
-    def survey_options(self) -> SurveyOptions:
-        """Return the options of the survey readers."""
-        return SurveyOptions(
-            projected_crs=self.projected_crs,
-            position_source=self.position_source,
-            port_order=self.port_order,
-            mounting=self.mounting,
-            errors=self.errors,
-        )
+    @model_validator(mode="before")
+    @classmethod
+    def _read_survey_options(cls, table: Any) -> Any:  # noqa: ANN401 - the table before its validation
+        """Add the keys of the file `survey_options` to the table.
+
+        Raises:
+            ConfigError: The file is invalid, or the table has a key that belongs into the file.
+        """
+        path = table.get("survey_options") if isinstance(table, dict) else None
+        if not isinstance(path, (str, Path)):
+            return table
+        both = sorted((SurveyOptions.model_fields.keys() & table.keys()) - {"projected_crs"})
+        if both:
+            raise ConfigError("atd_stub", ", ".join(both), "keys beside survey_options", f"them in {path} only")
+        return load_options(Path(path)).model_dump(mode="json", exclude_unset=True) | table

@@ -64,6 +64,11 @@ class BoundaryDetection(DetectionPosition):
 
     held: bytes | None = None
 
+    @property
+    def held_contact_id(self) -> str:
+        """Identifier of the held contact; empty for none."""
+        return "" if self.held is None else wire.decode(Snippet, self.held, "file end").contact.contact_id
+
     def is_same_object(self, other: DetectionPosition) -> bool:
         """Return whether both detections are of one object."""
         return self.is_near(other, *_SAME_OBJECT_M, overlapping=True)
@@ -217,6 +222,11 @@ class FileEndStore:
                 self._uncommitted[name] = end.without_held()
                 effects.put_state(name, pack(self._uncommitted[name]))
         return tuple(expired)
+
+    @property
+    def held_until_utc_s(self) -> float:
+        """When the last held contact is released without a continuation file; 0 if none is held."""
+        return max((end.hold_until_utc_s for end in self._ends.values() if end.held), default=0.0)
 
     def committed(self) -> None:
         """Apply the last change in memory."""

@@ -6,6 +6,7 @@ import logging
 import shutil
 import time
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 
 import msgpack
@@ -14,6 +15,7 @@ from sonarpost.archive.retention import DAY_S, Stored, remove_files, select_for_
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
+from sonarpost.detection.detector import counts_text
 from sonarpost.errors import DeliveryError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.logs import kv
@@ -33,11 +35,11 @@ from sonarpost.services.atd_stub.input_folder import (
 from sonarpost.services.atd_stub.release import ContactRelease
 from sonarpost.services.atd_stub.snippet_files import SNIPPET_SUFFIXES, read_snippet, write_snippet
 from sonarpost.services.atd_stub.survey_detection import DetectionResult, detect_in_survey
+from sonarpost.sonar.image_files import IMAGE_SUFFIXES
 from sonarpost.sonar.readers import SUPPORTED_SUFFIXES
 
 log = logging.getLogger(__name__)
 
-IMAGE_SUFFIXES = (".tif", ".tiff", ".png")
 _FILE = "file:"
 
 
@@ -80,6 +82,7 @@ class AtdStubService(Service[AtdStubConfig]):
         return {
             "files_waiting": float(self._files_waiting),
             "contacts_waiting": float(self._release.pending + self._file_ends.held_count),
+            "contacts_held": float(self._file_ends.held_count),
             "contacts_in_flight": float(self._release.in_flight),
         }
 
@@ -88,8 +91,12 @@ class AtdStubService(Service[AtdStubConfig]):
         return self._release.error
 
     def warning(self) -> str:
-        """Return how many contacts wait for release."""
-        return self._release.status
+        """Return how many contacts wait for release, and how many for the continuation of their file."""
+        waiting = ""
+        if held := self._file_ends.held_count:
+            until = datetime.fromtimestamp(self._file_ends.held_until_utc_s, UTC).strftime("%H:%M:%S")
+            waiting = f"{held} contacts held for a continuation file until {until} UTC"
+        return "; ".join(filter(None, (self._release.status, waiting)))
 
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Check for free credit after the compressor has accepted or refused a snippet."""
@@ -208,7 +215,8 @@ class AtdStubService(Service[AtdStubConfig]):
 
     def _contacts_of(self, path: Path, content: str) -> DetectionResult:
         if self.config.mode == "snippets":
-            return DetectionResult((read_snippet(path, content, self.platform.id),), contact_count=1)
+            file = read_snippet(path, content, self.platform.id, self.config.fit)
+            return DetectionResult((file.snippet,), contact_count=1, warnings=file.notes)
         file_ends = self._file_ends.by_sonar()
         return detect_in_survey(path, content, self.platform.id, self.config, file_ends, time.time())
 
@@ -220,12 +228,31 @@ class AtdStubService(Service[AtdStubConfig]):
         effects.count("contacts_detected", result.contact_count)
         no_continuation = self._file_ends.put(effects, result.file_end, joined=result.joined)
         self._commit_contacts(effects, (*result.snippets, *no_continuation))
+        counts = {}
+        if self.config.mode == "survey":
+            threshold = self.config.confidence_threshold
+            counts["counts"] = counts_text(threshold, result.contact_count, result.weaker)
         log.info(
             "File processed",
-            extra=kv(file=path.name, contacts=result.contact_count, joined=result.joined, duration_s=duration_s),
+            extra=kv(
+                file=path.name,
+                contacts=result.contact_count,
+                joined=result.joined,
+                duration_s=duration_s,
+                **counts,
+            ),
         )
+        for contact_id, reason in result.released:
+            log.info("Held contact released", extra=kv(contact_id=contact_id, reason=reason))
+        self._log_released(no_continuation, f"not continued by {path.name}")
+        for snippet in result.file_end.held_snippets() if result.file_end is not None else ():
+            log.info(
+                "Contact held for continuation file",
+                extra=kv(contact_id=snippet.contact.contact_id, file=snippet.source, wait_s=self.config.join_timeout_s),
+            )
+        message = "Survey reader warning" if self.config.mode == "survey" else "Image file warning"
         for warning in result.warnings:
-            log.warning("Survey reader warning", extra=kv(file=path.name, warning=printable(warning)))
+            log.warning(message, extra=kv(file=path.name, warning=printable(warning)))
 
     def _commit_contacts(self, effects: UnitOfWork, snippets: tuple[Snippet, ...]) -> None:
         """Commit `effects` and contacts that are ready for release; their files are written before."""
@@ -249,10 +276,12 @@ class AtdStubService(Service[AtdStubConfig]):
         effects = UnitOfWork()
         expired = self._file_ends.release_expired(effects, time.time(), self.config.join_timeout_s)
         if expired:
-            log.info(
-                "No continuation file within join_timeout_s; releasing held contacts", extra=kv(contacts=len(expired))
-            )
             self._commit_contacts(effects, expired)
+            self._log_released(expired, f"no continuation file within {self.config.join_timeout_s:g} s")
+
+    def _log_released(self, snippets: tuple[Snippet, ...], reason: str) -> None:
+        for snippet in snippets:
+            log.info("Held contact released", extra=kv(contact_id=snippet.contact.contact_id, reason=reason))
 
     def _skip_known(self, path: Path, content: str, entry: bytes) -> None:
         """Skip a file that was processed before; move one that was refused to the quarantine again."""

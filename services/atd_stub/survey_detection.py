@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Final
 
 from sonarpost import wire
 from sonarpost.codec.interface import MIN_SIDE_PX
-from sonarpost.detection.detector import Detection, detect
+from sonarpost.detection.detector import Detection, search
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image
 from sonarpost.messages import Contact, Pixels, Snippet
@@ -38,7 +39,10 @@ class DetectionResult:
         contact_count: Number of new contacts, those that are held at the end of the file included.
         file_end: The end of the file with the held contacts; None where none is kept.
         joined: Whether the file continued the previous one.
-        warnings: Warnings of the survey reader.
+        warnings: Warnings of the reader.
+        weaker: What lower thresholds would have given: the number of contacts, by confidence. Approximate at the
+            boundaries of files and of parts of 1000 pings.
+        released: Held contacts of the previous file that are no longer held: identifier and reason.
     """
 
     snippets: tuple[Snippet, ...]
@@ -46,6 +50,8 @@ class DetectionResult:
     file_end: FileEnd | None = None
     joined: bool = False
     warnings: tuple[str, ...] = ()
+    weaker: Mapping[float, int] = field(default_factory=dict)
+    released: tuple[tuple[str, str], ...] = ()
 
 
 def detect_in_survey(
@@ -69,7 +75,7 @@ def detect_in_survey(
     Raises:
         SurveyFileError: The file is not a readable survey.
     """
-    with open_survey(path, config.survey_options()) as source:
+    with open_survey(path, config) as source:
         origin = Origin(content, printable(path.name), printable(source.info.line_name))
         search = _SurveySearch(source, origin, vehicle_id, config)
         return search.run((file_ends or {}).get(source.info.sonar_id), now_utc_s)
@@ -101,6 +107,8 @@ class _SurveySearch:
         self._held: list[BoundaryDetection] = []
         self._known: list[BoundaryDetection] = []
         self._candidates: list[_Candidate] = []
+        self._weaker: Counter[float] = Counter()
+        self._released: list[tuple[str, str]] = []
 
     def run(self, file_end: FileEnd | None, now_utc_s: float) -> DetectionResult:
         pings = self._joined_pings(self._source.pings(), file_end)
@@ -128,7 +136,10 @@ class _SurveySearch:
         # Rows before the middle of an overlap belong to the previous strip or file, which shows more around them.
         lower = strip.first_row + self._overlap - half if strip.first_row else self._first_row
         upper = math.inf if strip.is_last else strip.first_row + len(strip.pings) - half
-        for detection in detect(survey, self._settings):
+        result = search(survey, self._settings)
+        for confidence, rows in result.weaker.items():
+            self._weaker[confidence] += sum(lower <= strip.first_row + row < upper for row in rows)
+        for detection in result.detections:
             position = BoundaryDetection.of_detection(detection, strip.first_row)
             if lower - _ROW_TOLERANCE <= position.row < upper + _ROW_TOLERANCE:
                 self._add(survey, detection, position)
@@ -141,6 +152,7 @@ class _SurveySearch:
             # This strip shows the whole object: its snippet replaces the held one.
             self._held.remove(known)
             self._known.remove(known)
+            self._released.append((known.held_contact_id, f"seen whole in {self._origin.source}"))
             is_new = False
         self._known.append(position)
         snippet = snippet_of(survey, detection, self._origin_of(position.row), self._vehicle_id, self._config)
@@ -168,6 +180,7 @@ class _SurveySearch:
         held = [candidate for candidate in self._candidates if candidate.position.row >= held_from]
         # Held contacts of the previous file that were not detected again are released with their first snippet.
         not_repeated = tuple(wire.decode(Snippet, known.held, "file end") for known in self._held if known.held)
+        self._released += [(s.contact.contact_id, f"not detected again in {self._origin.source}") for s in not_repeated]
         file_end = None
         if stored:
             start = end - stored
@@ -187,6 +200,8 @@ class _SurveySearch:
             file_end=file_end,
             joined=self._previous is not None,
             warnings=info.warnings,
+            weaker=dict(self._weaker),
+            released=tuple(self._released),
         )
 
 
@@ -221,7 +236,7 @@ def snippet_of(survey: Survey, detection: Detection, origin: Origin, vehicle_id:
         survey.pings[detection.ping_index],
         detection.side,
         detection.sample,
-        config.survey_options(),
+        config,
         tracked_altitude_m=detection.altitude_m,
     )
     position = detection.position if place is not None else None

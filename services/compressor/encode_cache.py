@@ -1,4 +1,4 @@
-"""Cache of recently encoded images, used to answer refine, resend and expand commands."""
+"""Cache of recently encoded images, used to answer refine, resend, expand and original commands."""
 
 from __future__ import annotations
 
@@ -23,11 +23,13 @@ class CachedImage:
         image: The `encoded_image` record, encoded, with the complete stream.
         snippet: The `snippet` record it was made of, encoded.
         expanded_id: Identifier of the image that shows more seabed around it; empty where none was made.
+        original_id: Identifier of the image without despeckling; empty where none was made.
     """
 
     image: bytes
     snippet: bytes
     expanded_id: str = ""
+    original_id: str = ""
 
 
 class EncodeCache:
@@ -69,7 +71,7 @@ class EncodeCache:
         effects.put_state(_INDEX, msgpack.packb(list(index.items())))
         for image_id, cached in images.items():
             if image_id in index:
-                entry = msgpack.packb([cached.image, cached.snippet, cached.expanded_id])
+                entry = msgpack.packb([cached.image, cached.snippet, cached.expanded_id, cached.original_id])
                 effects.put_state(_ENTRY + image_id, entry)
 
     def get(self, image_id: str) -> CachedImage | None:
@@ -85,7 +87,10 @@ class EncodeCache:
             case [bytes(image), bytes(snippet)]:  # written before expanded images existed
                 return CachedImage(image, snippet)
             case [bytes(image), bytes(snippet), str(expanded_id)]:
+                # written before images without despeckling existed
                 return CachedImage(image, snippet, expanded_id)
+            case [bytes(image), bytes(snippet), str(expanded_id), str(original_id)]:
+                return CachedImage(image, snippet, expanded_id, original_id)
             case other:
                 raise PayloadError(entry_location(image_id), "", other, "an image and a snippet")
 

@@ -7,7 +7,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.interface import Codec, ExtensibleCodec
+from sonarpost.codec import emb
+from sonarpost.codec.interface import Codec, ExtensibleCodec, StreamHeader
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
 from sonarpost.messages import Snippet
 
@@ -54,6 +55,15 @@ def refine(codec: Codec, stream: bytes, image: GreyImage) -> bytes:
         return codec.extend(stream, image, length)
     longer = codec.encode(image, min(length, MAX_STREAM_BYTES))
     return longer if len(longer) > len(stream) and longer.startswith(stream) else stream
+
+
+def is_despeckled(stream: bytes) -> bool:
+    """Return whether a stream contains a despeckled image.
+
+    Raises:
+        StreamError: The header is invalid.
+    """
+    return StreamHeader.unpack(stream).codec_id in emb.DESPECKLED_CODEC_IDS.values()
 
 
 def expand(snippet: Snippet) -> Snippet | None:

@@ -1,4 +1,4 @@
-"""The compressor service: encodes snippets and answers refine, resend and expand commands."""
+"""The compressor service: encodes snippets and answers refine, resend, expand and original commands."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Final
 
 from sonarpost import keys, wire
 from sonarpost.codec.interface import Codec
@@ -20,12 +21,13 @@ from sonarpost.messages import Command, CommandKind, EncodedImage, Record, Snipp
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.compressor.config import CompressorConfig
 from sonarpost.services.compressor.encode_cache import CachedImage, EncodeCache, entry_location
-from sonarpost.services.compressor.encoding import encode, expand, refine, transmit_part
+from sonarpost.services.compressor.encoding import encode, expand, is_despeckled, refine, transmit_part
 
 log = logging.getLogger(__name__)
 
 IMAGE_IDS = MAX_NUMBER
 """Image identifiers are the image numbers of the v1 link, 1 to this."""
+_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "wider", "original")
 _CONSUMER = "uuv_modem"
 _NEXT_IMAGE = "next_image"
 _COMMAND_PRIORITY = 3
@@ -43,11 +45,13 @@ class CompressorService(Service[CompressorConfig]):
     NAME = "compressor"
 
     def __init__(self, platform: PlatformConfig, config: CompressorConfig) -> None:
-        use_code_folder(platform.state_dir / "machine-code")
+        use_code_folder(platform.state_dir)
         # Before the store is opened, so that a configuration error leaves no open store.
-        tiles = open_codebook(config.codebook).tiles
-        self._codec: Codec = default_registry().create(
-            config.codec, CodecResources(tiles, config.packing, config.model)
+        self._tiles = open_codebook(config.codebook).tiles
+        resources = CodecResources(self._tiles, config.packing, config.model, strength=config.despeckle_strength)
+        self._codec: Codec = default_registry().create(config.codec, resources)
+        self._codec_without_despeckling: Codec = default_registry().create(
+            config.codec, replace(resources, strength=0.0)
         )
         super().__init__(platform, config)
         self._cache = EncodeCache(self.store, config.cache_images, config.cache_s)
@@ -55,7 +59,7 @@ class CompressorService(Service[CompressorConfig]):
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Return the keys of this vehicle's snippets, and of commands for its images."""
-        commands = {keys.command(self.platform.id, kind): Command for kind in ("refine", "resend", "wider")}
+        commands = {keys.command(self.platform.id, kind): Command for kind in _KINDS}
         return {keys.contact_detected(self.platform.id): Snippet, **commands}
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
@@ -64,12 +68,12 @@ class CompressorService(Service[CompressorConfig]):
             self._execute(record, effects)
             return
         assert isinstance(record, Snippet)
-        image_id, cached = self._encode(record, effects, effects.payload)
+        image_id, cached = self._encode(record, effects, effects.payload, self._codec)
         if self.config.cache_images:
             self._cache.put(effects, {image_id: cached}, time.time())
 
     def _encode(
-        self, snippet: Snippet, effects: UnitOfWork, payload: bytes, priority: int = 4
+        self, snippet: Snippet, effects: UnitOfWork, payload: bytes, codec: Codec, priority: int = 4
     ) -> tuple[str, CachedImage]:
         """Encode a snippet as a new image and send it; return its identifier and cache entry.
 
@@ -77,19 +81,20 @@ class CompressorService(Service[CompressorConfig]):
             snippet: The snippet.
             effects: Receives the record.
             payload: The snippet, encoded.
+            codec: The codec, with or without despeckling.
             priority: Delivery priority.
         """
         started = time.perf_counter()
-        complete = encode(self._codec, snippet.picture.to_array(), self.config.budget_bytes, self.config.refine_bytes)
-        stream = transmit_part(self._codec, complete)
+        complete = encode(codec, snippet.picture.to_array(), self.config.budget_bytes, self.config.refine_bytes)
+        stream = transmit_part(codec, complete)
         number = self._next_number()
         effects.put_state(_NEXT_IMAGE, str(number % IMAGE_IDS + 1).encode())
         image = EncodedImage(
             vehicle_id=self.platform.id,
             image_id=format_image_id(number),
             contact=snippet.contact,
-            codec=self._codec.name,
-            model=self._codec.model_hash,
+            codec=codec.name,
+            model=codec.model_hash,
             height_px=snippet.picture.height_px,
             width_px=snippet.picture.width_px,
             stream=stream,
@@ -106,6 +111,8 @@ class CompressorService(Service[CompressorConfig]):
                 image_id=image.image_id,
                 pixels=f"{image.width_px}x{image.height_px}",
                 bytes=len(stream),
+                # Codecs without despeckling do not have this attribute.
+                despeckle_strength=getattr(codec, "strength", 0.0),
                 encode_ms=round(1000 * (time.perf_counter() - started), 1),
             ),
         )
@@ -119,6 +126,8 @@ class CompressorService(Service[CompressorConfig]):
             log.warning("Image of command not in cache", extra=kv(image_id=image_id, kind=command.kind))
         elif command.kind == "wider":
             self._expand(image_id, cached, effects)
+        elif command.kind == "original":
+            self._send_original(image_id, cached, effects)
         else:
             self._resend(command.kind, image_id, cached, effects)
 
@@ -133,10 +142,31 @@ class CompressorService(Service[CompressorConfig]):
             effects.count("commands_without_expanded_image")
             log.warning("Snippet has no expanded image", extra=kv(image_id=image_id))
             return
-        expanded_id, entry = self._encode(snippet, effects, wire.encode(snippet), priority=_COMMAND_PRIORITY)
+        expanded_id, entry = self._encode(
+            snippet, effects, wire.encode(snippet), self._codec, priority=_COMMAND_PRIORITY
+        )
         self._cache.put(effects, {image_id: replace(cached, expanded_id=expanded_id), expanded_id: entry}, time.time())
         effects.count("images_expanded")
         log.info("Expanded image sent", extra=kv(image_id=image_id, expanded_id=expanded_id))
+
+    def _send_original(self, image_id: str, cached: CachedImage, effects: UnitOfWork) -> None:
+        """Send a contact without despeckling as an image of its own; a repeated command sends the same image."""
+        original = self._cache.get(cached.original_id) if cached.original_id else None
+        if original is not None:
+            self._resend("resend", cached.original_id, original, effects)
+            return
+        image = wire.decode(EncodedImage, cached.image, entry_location(image_id))
+        if not is_despeckled(image.stream):
+            effects.count("commands_without_despeckling")
+            log.warning("Image is not despeckled", extra=kv(image_id=image_id, codec=image.codec))
+            return
+        snippet = wire.decode(Snippet, cached.snippet, entry_location(image_id))
+        original_id, entry = self._encode(
+            snippet, effects, cached.snippet, self._codec_without_despeckling, priority=_COMMAND_PRIORITY
+        )
+        self._cache.put(effects, {image_id: replace(cached, original_id=original_id), original_id: entry}, time.time())
+        effects.count("images_original")
+        log.info("Image without despeckling sent", extra=kv(image_id=image_id, original_id=original_id))
 
     def _resend(self, kind: CommandKind, image_id: str, cached: CachedImage, effects: UnitOfWork) -> None:
         """Send an image again, with a longer stream for a refine command if the codec can extend it.
@@ -145,20 +175,31 @@ class CompressorService(Service[CompressorConfig]):
         """
         image = wire.decode(EncodedImage, cached.image, entry_location(image_id))
         # An image that was encoded with another codec is sent unchanged.
-        same_codec = (present_name(image.codec), image.model) == (self._codec.name, self._codec.model_hash)
-        if kind == "refine" and same_codec:
+        codec = self._codec_of(image)
+        if kind == "refine" and codec is not None:
             snippet = wire.decode(Snippet, cached.snippet, entry_location(image_id))
-            longer = refine(self._codec, image.stream, snippet.picture.to_array())
+            longer = refine(codec, image.stream, snippet.picture.to_array())
             if longer != image.stream:
                 image = image.model_copy(update={"stream": longer})
                 self._cache.put(effects, {image_id: replace(cached, image=wire.encode(image))}, time.time())
                 effects.count("images_refined")
-        if same_codec:
-            stream = transmit_part(self._codec, image.stream)
-            image = image.model_copy(update={"codec": self._codec.name, "stream": stream})
+        if codec is not None:
+            stream = transmit_part(codec, image.stream)
+            image = image.model_copy(update={"codec": codec.name, "stream": stream})
         effects.send(keys.image_encoded(self.platform.id), _CONSUMER, image, priority=_COMMAND_PRIORITY)
         effects.count("images_resent")
         log.info("Image sent again", extra=kv(image_id=image_id, kind=kind, bytes=len(image.stream)))
+
+    def _codec_of(self, image: EncodedImage) -> Codec | None:
+        """Return the codec that continues the stream of a cached image, with the model that began it.
+
+        The configuration may have changed since: model and strength of despeckling are those of the stream. None for
+        an image of another codec than the configured one, or of a model or codebook that this installation lacks.
+        """
+        if present_name(image.codec) != self._codec.name:
+            return None
+        codec = default_registry().create_for_stream(image.stream, CodecResources(self._tiles))
+        return codec if codec.model_hash == image.model else None
 
     def _next_number(self) -> int:
         """Return the next image number.

@@ -1,4 +1,4 @@
-"""Options and actions of `sonarpost console`: users, and the training console."""
+"""`sonarpost console`: users, the training console, and the view of a folder of c2."""
 
 from __future__ import annotations
 
@@ -7,30 +7,42 @@ import getpass
 import secrets
 import sys
 import tempfile
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from sonarpost.archive.shore_index import FILE_NAME as FILE_NAME_OF_INDEX
 from sonarpost.config import load
-from sonarpost.errors import ConfigError
+from sonarpost.errors import ConfigError, PortError
+from sonarpost.keys import SHORE
+from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.database import DATABASE_NAME, ROLES, Database
 from sonarpost.services.console.store.users import FILE_NAME, Users
-from sonarpost.services.console.web.server import ConsoleApp, WebServer
 from sonarpost.stop_signals import stop_on_signals
+
+if TYPE_CHECKING:
+    from sonarpost.services.console.state import ConsoleState
+    from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 TRAINING_USERS = (("watch", "observer"), ("op", "operator"), ("expert", "expert"))
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options and actions of `sonarpost console`."""
-    parser.add_argument("--training", type=int, metavar="N", help="serve a training console with N simulated contacts")
-    parser.add_argument("--port", type=int, default=8470, help="port of the training console (default: 8470; 0: any)")
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command and its actions."""
+    summary = "manage the users of the console; serve simulated contacts for training"
+    parser = subparsers.add_parser("console", help=summary, description=f"{summary.capitalize()}.")
+    parser.set_defaults(run=run)
+    page = parser.add_mutually_exclusive_group()
+    page.add_argument("--training", type=int, metavar="N", help="serve a training console with N simulated contacts")
+    page.add_argument("--view", type=Path, metavar="DIR", help="serve the contacts in a folder of c2, read only")
+    parser.add_argument("--port", type=int, help="port of the page (default: 8470, or any if it is in use; 0: any)")
     parser.add_argument("--state", type=Path, metavar="DIR", help="folder for the training data (default: none)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the simulation (default: 1)")
     parser.add_argument("--interval", type=float, default=6.0, metavar="S", help="time between packets (default: 6)")
-    parser.add_argument("--password", help="password of all training users (default: random)")
+    parser.add_argument("--password", help="password of the users of --training or --view (default: random)")
     actions = parser.add_subparsers(metavar="ACTION", required=False)
     user = actions.add_parser("user", help="manage the users of a console")
     user_actions = user.add_subparsers(metavar="ACTION", required=True)
@@ -66,8 +78,11 @@ def run(parsed: argparse.Namespace) -> int:
         with closing(Users(folder / FILE_NAME)) as users:
             parsed.run_action(parsed, users)
         return 0
+    if parsed.view is not None:
+        return _run_view(parsed)
     if parsed.training is None:
-        raise ConfigError("console", "", "no action", "`user …` or --training N; the service: `sonarpost run console`")
+        expected = "`user …`, --training N or --view DIR; the service: `sonarpost run console`"
+        raise ConfigError("console", "", "no action", expected)
     if not 1 <= parsed.training <= 100_000:
         raise ConfigError("console", "--training", parsed.training, "1 to 100000")
     return _run_training(parsed)
@@ -76,6 +91,8 @@ def run(parsed: argparse.Namespace) -> int:
 def _read_password(parsed: argparse.Namespace) -> str:
     if parsed.password_stdin:
         return sys.stdin.readline().rstrip("\n")
+    if not sys.stdin.isatty():
+        raise ConfigError("console", "password", "no terminal to ask", "--password-stdin")
     password = getpass.getpass(f"Password of {parsed.name}: ")
     if getpass.getpass("Again: ") != password:
         raise ConfigError("console", "password", "two different ones", "the same one twice")
@@ -105,30 +122,89 @@ def _list(_parsed: argparse.Namespace, users: Users) -> None:
 
 
 def _run_training(parsed: argparse.Namespace) -> int:
-    # Imported here because it loads the codecs and their compiler.
+    # Imported lazily, as below: the management of users needs neither the codecs nor the web server.
+    from sonarpost.services.console.state import ConsoleState  # noqa: PLC0415
     from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator  # noqa: PLC0415
 
-    config = ConsoleConfig(port=parsed.port, vessel_lat_deg=56.4495, vessel_lon_deg=-5.6012)
+    config = ConsoleConfig(vessel_lat_deg=56.4495, vessel_lon_deg=-5.6012)
     with ExitStack() as stack:
         scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="sonarpost-training-"))
         folder: Path = parsed.state or Path(scratch)
-        database = stack.enter_context(closing(Database(folder / DATABASE_NAME)))
+        state = ConsoleState(config, stack.enter_context(closing(Database(folder / DATABASE_NAME))))
+        simulator = TrainingSimulator(state, parsed.training, parsed.seed, parsed.interval)
+
+        def start() -> None:
+            stack.callback(simulator.stop)
+            simulator.load_backlog(parsed.training * 2 // 3)
+            simulator.start()
+
+        note = "All contacts are simulated. Ctrl-C ends the training."
+        _serve(parsed, state, folder, TRAINING_USERS, VESSEL, note, start)
+    return 0
+
+
+def _run_view(parsed: argparse.Namespace) -> int:
+    from sonarpost.services.console.service import stored_records  # noqa: PLC0415
+    from sonarpost.services.console.state import ConsoleState  # noqa: PLC0415
+
+    if not (parsed.view / FILE_NAME_OF_INDEX).is_file():
+        raise ConfigError("console", "--view", str(parsed.view), "a folder of c2, with its index")
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sonarpost-view-")))
+        state = ConsoleState(
+            ConsoleConfig(role="shore"), stack.enter_context(closing(Database(folder / DATABASE_NAME)))
+        )
+        records = list(stored_records(parsed.view))
+        state.store_images([record for record in records if isinstance(record, ReconstructedImage)])
+        for record in records:
+            if isinstance(record, Decision):
+                state.store_decision(record)
+        note = f"{state.counts().total} contacts in {parsed.view}, read only. Ctrl-C ends the page."
+        # An observer: a comment could not be sent.
+        _serve(parsed, state, folder, (("watch", "observer"),), SHORE, note)
+    return 0
+
+
+def _serve(
+    parsed: argparse.Namespace,
+    state: ConsoleState,
+    folder: Path,
+    accounts: Sequence[tuple[str, str]],
+    platform_id: str,
+    note: str,
+    start: Callable[[], None] = lambda: None,
+) -> None:
+    """Print address, users and password, and serve the page until a signal; `start` is called before.
+
+    Raises:
+        PortError: The port of `--port` is in use.
+    """
+    from sonarpost.services.console.web.server import ConsoleApp  # noqa: PLC0415
+
+    with ExitStack() as stack:
         users = stack.enter_context(closing(Users(folder / FILE_NAME)))
         password = parsed.password or secrets.token_urlsafe(9)
-        for name, role in TRAINING_USERS:
+        for name, role in accounts:
             users.add(name, role, password)
-        state = ConsoleState(config, database)
-        app = ConsoleApp(state, users, VESSEL, training=True)
-        server = WebServer(app.asgi, config.host, config.port)
-        simulator = TrainingSimulator(state, parsed.training, parsed.seed, parsed.interval)
-        print(f"{server.address}  users {', '.join(name for name, _ in TRAINING_USERS)}  password {password}")
-        print("All contacts are simulated. Ctrl-C ends the training.", flush=True)
+        app = ConsoleApp(state, users, platform_id, training=parsed.training is not None)
+        server = _server(app, state.config, parsed.port)
+        print(f"{server.address}  user: {' or '.join(name for name, _ in accounts)}  password: {password}")
+        print(note, flush=True)
         stop = stack.enter_context(stop_on_signals())
         server.start()
-        for part in (server, app, simulator):
-            stack.callback(part.stop)
-        simulator.load_backlog(parsed.training * 2 // 3)
-        simulator.start()
+        stack.callback(server.stop)
+        stack.callback(app.stop)
+        start()
         while server.running and not stop.wait(0.5):
             pass
-    return 0
+
+
+def _server(app: ConsoleApp, config: ConsoleConfig, port: int | None) -> WebServer:
+    from sonarpost.services.console.web.server import WebServer  # noqa: PLC0415
+
+    if port is not None:
+        return WebServer(app.asgi, config.host, port)
+    try:
+        return WebServer(app.asgi, config.host, config.port)
+    except PortError:
+        return WebServer(app.asgi, config.host, 0)

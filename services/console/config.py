@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
 from ipaddress import IPv4Network, IPv6Network
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sonarpost.config import ConsumerName
+from sonarpost.config import ConsumerName, PlatformConfig
+from sonarpost.errors import ConfigError
 from sonarpost.keys import SHORE
 from sonarpost.messages import Latitude, Longitude, PlatformId
 from sonarpost.runtime.retention import MaxBytes, RetentionConfig
@@ -81,6 +83,18 @@ class ConsoleConfig(RetentionConfig):
         if (self.vessel_lat_deg is None) != (self.vessel_lon_deg is None):
             raise ValueError("vessel_lat_deg and vessel_lon_deg together")
         return self
+
+    def check_with(self, platform: PlatformConfig) -> None:
+        """Check that the web server is installed, and that there is a certificate for `tls`.
+
+        Raises:
+            ConfigError: The extra `console` is not installed, or `tls` is set and the platform has no certificate.
+        """
+        if importlib.util.find_spec("uvicorn") is None:
+            expected = "the extra console: pip install 'sonarpost[console]'; or a file without this table"
+            raise ConfigError("[console]", "", "no web server installed", expected)
+        if self.tls and platform.tls is None:
+            raise ConfigError("[console]", "tls", "true", "a certificate in [platform] tls")
 
     def vehicle_name(self, address: int) -> str:
         """Return the name of the vehicle with a modem address."""

@@ -17,7 +17,7 @@ from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
-from sonarpost.errors import BadInputError, ConfigError, DeliveryError, PayloadError
+from sonarpost.errors import BadInputError, DeliveryError, PayloadError
 from sonarpost.export.contacts import SideCar, read_stored_records
 from sonarpost.logs import kv
 from sonarpost.messages import (
@@ -75,8 +75,7 @@ class ConsoleService(Service[ConsoleConfig]):
     NAME = "console"
 
     def __init__(self, platform: PlatformConfig, config: ConsoleConfig) -> None:
-        if config.tls and platform.tls is None:
-            raise ConfigError("[console]", "tls", "true", "a certificate in [platform] tls")
+        config.check_with(platform)
         super().__init__(platform, config)
         self._database = Database(platform.state_dir / DATABASE_NAME)
         self._users = Users(platform.state_dir / FILE_NAME, config.session_s, config.session_max_s)

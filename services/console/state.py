@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 
 from sonarpost import wire
 from sonarpost.messages import Advice, Command, CommandKind, Decision, DownlinkState, ReconstructedImage, TaskingState
-from sonarpost.review.costs import request_cost
+from sonarpost.review.costs import NEW_IMAGE_KINDS, request_cost
 from sonarpost.review.measurement import Line, measure_line
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.events import EventHub
@@ -256,8 +256,8 @@ class ConsoleState:
             first = contacts.find_version(db, contact_id, 1)
         vehicle_id = row["vehicle_id"]
         rate = self.fleet.uplink_rate(vehicle_id, self.config.assumed_rate)
-        # An expanded image has about the length of this image's first version, before more detail was requested.
-        expanded_bytes = (0 if first is None else decode_image(first).bytes_total) or row["bytes_total"]
+        # A new image has about the length of this image's first version, before more detail was requested.
+        new_image_bytes = (0 if first is None else decode_image(first).bytes_total) or row["bytes_total"]
         found: list[Json] = []
         for kind in requests.REQUEST_KINDS:
             reason = requests.unavailable_reason(row, kind)
@@ -265,8 +265,8 @@ class ConsoleState:
                 kind,
                 downlink_rate=self.config.downlink_rate,
                 uplink_rate=rate,
-                bytes_received=0 if kind == "wider" else row["bytes_received"],
-                bytes_total=expanded_bytes if kind == "wider" else row["bytes_total"],
+                bytes_received=0 if kind in NEW_IMAGE_KINDS else row["bytes_received"],
+                bytes_total=new_image_bytes if kind in NEW_IMAGE_KINDS else row["bytes_total"],
                 loss=self.fleet.frame_loss(vehicle_id),
                 overhead_bytes=FRAME_HEADER_BYTES,
             )

@@ -5,7 +5,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from sonarpost.config import ConsumerName
+from sonarpost.codec.vq.codebook import open_codebook
+from sonarpost.config import ConsumerName, PlatformConfig
 from sonarpost.runtime.retention import MaxBytes, RetentionConfig
 
 
@@ -24,3 +25,12 @@ class DecompressorConfig(RetentionConfig):
     max_bytes: MaxBytes = 20_000_000_000
     codebooks: Annotated[tuple[str, ...], Field(min_length=1)] = ("nominal-10", "nominal-20")
     image_consumers: tuple[ConsumerName, ...] = ("relay",)
+
+    def check_with(self, platform: PlatformConfig) -> None:
+        """Check that the codebooks can be read.
+
+        Raises:
+            CodebookError: One cannot be read.
+        """
+        for name in self.codebooks:
+            open_codebook(name)

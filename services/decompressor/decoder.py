@@ -93,6 +93,7 @@ def _record(
         last_frame_utc_s=received.last_frame_utc_s,
         notes=tuple(notes),
         authenticated=received.authenticated,
+        despeckle_strength=decoded.despeckle_strength,
     )
 
 

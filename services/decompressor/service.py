@@ -33,7 +33,7 @@ class DecompressorService(Service[DecompressorConfig]):
     PAGE_BYTES = 512
 
     def __init__(self, platform: PlatformConfig, config: DecompressorConfig) -> None:
-        use_code_folder(platform.state_dir / "machine-code")
+        use_code_folder(platform.state_dir)
         # Before the store is opened, so that a configuration error leaves no open store.
         self._decoder = Decoder(config.codebooks)
         super().__init__(platform, config)

@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sonarpost.config import ConsumerName
+from sonarpost.config import ConsumerName, PlatformConfig
+from sonarpost.errors import ConfigError
 from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.mac import Tdma
 from sonarpost.link.receiver import WireFormat
@@ -94,6 +95,17 @@ class OpModemConfig(ModemServiceConfig):
         if self.slot_s - self.guard_s < packet_s:
             raise ValueError(f"slot_s - guard_s of at least {packet_s} s, a packet of downlink_rate")
         return self
+
+    def check_with(self, platform: PlatformConfig) -> None:
+        """Check the port, the acoustic key and that a wire format can be authenticated.
+
+        Raises:
+            ConfigError: As `DownlinkService`.
+        """
+        if platform.acoustic_auth != "none" and "v1" not in self.wire_formats:
+            expected = '"v1", or acoustic_auth = "none" in [platform]: the paper format has no authentication'
+            raise ConfigError("[op_modem]", "wire_formats", self.wire_formats, expected)
+        super().check_with(platform)
 
     @property
     def transmits(self) -> bool:

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from sonarpost import keys
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem
-from sonarpost.errors import ConfigError, DeliveryError, FrameError, PayloadError
+from sonarpost.errors import DeliveryError, FrameError, PayloadError
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
 from sonarpost.link.downlink.commands import PendingCommand
@@ -49,9 +49,7 @@ class DownlinkService(ModemService[OpModemConfig]):
 
     def __init__(self, platform: PlatformConfig, config: OpModemConfig) -> None:
         # Before the store is opened, so that a configuration error leaves no open store.
-        if platform.acoustic_auth != "none" and "v1" not in config.wire_formats:
-            expected = '"v1", or acoustic_auth = "none" in [platform]: the paper format has no authentication'
-            raise ConfigError("[op_modem]", "wire_formats", config.wire_formats, expected)
+        config.check_with(platform)
         super().__init__(platform, config)
         self._authenticated_since_s = self._begin_authentication()
         self._partial_packet: list[FrameReceived] = []

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Final
+
 from sonarpost.errors import FrameError, PayloadError
 from sonarpost.link import migration
 from sonarpost.link.auth.authentication import FrameAuthenticator
@@ -12,7 +15,7 @@ from sonarpost.link.frames.v1.frame import segments_room
 from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.link.state import Parts, below, prefixed, unpack_plain
-from sonarpost.messages import Command, Decision, DownlinkState, ReceivedImage
+from sonarpost.messages import Command, CommandKind, Decision, DownlinkState, ReceivedImage
 from sonarpost.modem.micromodem import RATES
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.image_limiter import ImageLimiter
@@ -150,6 +153,14 @@ class VesselLink:
         self.restore(parts)
 
 
+_NUMBER_MESSAGES: Final[Mapping[CommandKind, type[dl.ResendMessage | dl.ExpandMessage | dl.OriginalMessage]]] = {
+    "resend": dl.ResendMessage,
+    "wider": dl.ExpandMessage,
+    "original": dl.OriginalMessage,
+}
+"""Messages that have only the number of the contact."""
+
+
 def message_of(record: Command | Decision, token: int) -> dl.DownlinkCommand:
     """Return the acoustic message of a record.
 
@@ -170,7 +181,7 @@ def message_of(record: Command | Decision, token: int) -> dl.DownlinkCommand:
     number = dl.number_of_image(record.image_id)
     if record.kind == "refine":
         return dl.RefineMessage(token, issued, number)
-    return (dl.ExpandMessage if record.kind == "wider" else dl.ResendMessage)(token, issued, number)
+    return _NUMBER_MESSAGES[record.kind](token, issued, number)
 
 
 def _issued_utc_s(record: Command | Decision) -> float:

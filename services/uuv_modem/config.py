@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sonarpost.config import ConsumerName
+from sonarpost.config import ConsumerName, PlatformConfig
+from sonarpost.errors import ConfigError
 from sonarpost.link.config import QueueConfig
 from sonarpost.link.mac import Continuous, Csma, MediumAccess, Polled, Tdma
 from sonarpost.modem.micromodem import RATES
@@ -31,6 +32,7 @@ class UuvModemConfig(ModemServiceConfig):
         frames_per_image: v1: average frames for an image without feedback.
         stream_bytes: v1: with feedback, maximum bytes of an image's stream that are sent without a command.
         group_delay_s: v1: how long an announced image waits for others, to be coded in one group with them.
+        max_defer_s: v1: time without feedback after which more symbols of an image are sent, in case all were lost.
         image_airtime_share: v1: share of frames for images, however many messages wait.
         aging_s: v1: a message becomes one level more urgent each time it has waited so long.
         max_messages: v1: maximum number of waiting messages; further ones stay with their senders.
@@ -45,7 +47,7 @@ class UuvModemConfig(ModemServiceConfig):
         guard_s: TDMA: time at the end of the slot without transmission.
         mean_backoff_s: CSMA: mean of the random waits.
         queue_interval_s: Maximum time between two publications of the queue state.
-        refine_consumers: v1: services that receive the commands refine, resend and expand.
+        refine_consumers: v1: services that receive the commands refine, resend, expand and original.
         revisit_consumers: v1: services that receive the command revisit.
         decision_consumers: v1: services that receive operators' decisions.
     """
@@ -61,6 +63,7 @@ class UuvModemConfig(ModemServiceConfig):
     frames_per_image: Annotated[float, Field(ge=1, le=255)] = 6.0
     stream_bytes: Annotated[int, Field(ge=16, le=65535)] = 512
     group_delay_s: Annotated[float, Field(ge=0, le=86400)] = 20.0
+    max_defer_s: Seconds = 120.0
     image_airtime_share: Annotated[float, Field(ge=0, le=1)] = 0.25
     aging_s: Seconds = 600.0
     max_messages: Annotated[int, Field(ge=1, le=100_000)] = 2000
@@ -89,6 +92,17 @@ class UuvModemConfig(ModemServiceConfig):
             raise ValueError(f"slot_s - guard_s of at least {longest_s} s, the longest packet")
         return self
 
+    def check_with(self, platform: PlatformConfig) -> None:
+        """Check the port, the acoustic key and that the wire format can be authenticated.
+
+        Raises:
+            ConfigError: As `UuvModemService`.
+        """
+        if self.link == "paper" and platform.acoustic_auth != "none":
+            expected = '"v1", or acoustic_auth = "none" in [platform]: the paper format has no authentication'
+            raise ConfigError("[uuv_modem]", "link", self.link, expected)
+        super().check_with(platform)
+
     def new_mac(self) -> MediumAccess:
         """Return the policy of medium access control; the `paper` format always sends at once."""
         if self.link == "paper":
@@ -110,6 +124,7 @@ class UuvModemConfig(ModemServiceConfig):
             first_rate=self.rate,
             expected_loss=self.expected_loss,
             feedback=self.feedback,
+            max_defer_s=self.max_defer_s,
             image_airtime_share=self.image_airtime_share,
             aging_s=self.aging_s,
             max_messages=self.max_messages,

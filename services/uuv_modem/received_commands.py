@@ -12,6 +12,7 @@ from sonarpost.link.downlink.messages import (
     DecisionMessage,
     DownlinkCommand,
     ExpandMessage,
+    OriginalMessage,
     RefineMessage,
     ResendMessage,
     RevisitMessage,
@@ -29,6 +30,7 @@ _KINDS: Final[dict[type, CommandKind]] = {
     ResendMessage: "resend",
     RevisitMessage: "revisit",
     ExpandMessage: "wider",
+    OriginalMessage: "original",
 }
 
 

@@ -12,7 +12,7 @@ from typing import Final
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem
-from sonarpost.errors import BadInputError, ConfigError, DeliveryError, RetryLaterError
+from sonarpost.errors import BadInputError, DeliveryError, RetryLaterError
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage, Record
 from sonarpost.modem.micromodem import (
@@ -59,9 +59,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
     PAGE_BYTES = 512
 
     def __init__(self, platform: PlatformConfig, config: UuvModemConfig) -> None:
-        if config.link == "paper" and platform.acoustic_auth != "none":
-            expected = '"v1", or acoustic_auth = "none" in [platform]: the paper format has no authentication'
-            raise ConfigError("[uuv_modem]", "link", config.link, expected)
+        config.check_with(platform)
         super().__init__(platform, config)
         try:
             self._migrate()

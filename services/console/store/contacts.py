@@ -30,7 +30,15 @@ SORT_COLUMNS: Final[Mapping[Sort, str]] = {
 }
 _METRES_PER_DEGREE: Final = 111_000.0
 _RECORD_COLUMNS: Final = ("atd_class", "atd_confidence", "lat_deg", "lon_deg", "position_sigma_m")
-_IMAGE_COLUMNS: Final = ("version", "codec", "bytes_received", "bytes_total", "first_frame_utc_s", "last_frame_utc_s")
+_IMAGE_COLUMNS: Final = (
+    "version",
+    "codec",
+    "despeckle_strength",
+    "bytes_received",
+    "bytes_total",
+    "first_frame_utc_s",
+    "last_frame_utc_s",
+)
 
 
 class ContactFilter(BaseModel):

@@ -156,8 +156,8 @@ def attach_waiting_records(db: sqlite3.Connection, contact_id: str, now_utc_s: f
         ).rowcount
     if attached:
         db.execute(
-            "UPDATE contact SET advised = EXISTS (SELECT 1 FROM advice WHERE contact_id = ?1) WHERE id = ?1",
-            (contact_id,),
+            "UPDATE contact SET advised = EXISTS (SELECT 1 FROM advice WHERE contact_id = ?) WHERE id = ?",
+            (contact_id, contact_id),
         )
         _update_contact(db, contact_id, now_utc_s)
 
@@ -203,9 +203,9 @@ def apply_acknowledgement(
 def mark_delivered_to_shore(db: sqlite3.Connection, before_utc_s: float) -> list[str]:
     """Mark decisions that the relay stored before a time as delivered to shore; return their identifiers."""
     rows = db.execute(
-        "UPDATE decision SET shore = 'delivered', changed_utc_s = MAX(changed_utc_s, ?1)"
-        " WHERE shore = 'relay' AND COALESCE(relayed_utc_s, changed_utc_s) < ?1 RETURNING decision_id",
-        (before_utc_s,),
+        "UPDATE decision SET shore = 'delivered', changed_utc_s = MAX(changed_utc_s, ?)"
+        " WHERE shore = 'relay' AND COALESCE(relayed_utc_s, changed_utc_s) < ? RETURNING decision_id",
+        (before_utc_s, before_utc_s),
     )
     return [str(row["decision_id"]) for row in rows.fetchall()]
 

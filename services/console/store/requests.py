@@ -21,8 +21,8 @@ from sonarpost.services.console.store.database import (
 )
 from sonarpost.services.console.store.serialisers import Json
 
-REQUEST_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider")
-"""Kinds in the order of the page. `wider` is displayed as "expand"."""
+REQUEST_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider", "original")
+"""Kinds in the order of the page. `wider` is displayed as "expand", `original` as "unfiltered image"."""
 
 _STATE_ORDER: Final = {
     "none": 0,
@@ -44,6 +44,11 @@ def unavailable_reason(row: sqlite3.Row, kind: str) -> str:
         return "the image is complete"
     if kind == "refine" and not default_registry().is_embedded(row["codec"]):
         return f"the codec {row['codec']} cannot add detail" if row["codec"] else "no part of the image was received"
+    if kind == "original" and not row["codec"]:
+        return "no part of the image was received"
+    if kind == "original" and not row["despeckle_strength"]:
+        known = row["despeckle_strength"] is not None
+        return "the image is not despeckled" if known else "the stream of the image states no despeckling"
     return ""
 
 

@@ -39,7 +39,7 @@ _ADVICE_COLUMNS: Final = "advice_id version verdict confidence mlo_class remark 
 _AUDIT_COLUMNS: Final = "seq utc_s user role address action version sha256 layer"
 _VERSION_FIELDS: Final = (
     "version codec model complete missing_fraction bytes_received bytes_total frames_received first_frame_utc_s"
-    " last_frame_utc_s authenticated"
+    " last_frame_utc_s authenticated despeckle_strength"
 )
 
 

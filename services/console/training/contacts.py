@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from sonarpost.codec import emb
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import Codec, DecodedImage, StreamHeader
 from sonarpost.codec.vq.codebook import open_codebook
@@ -82,6 +83,17 @@ class SimulatedContact:
             expanded_snippet=None,
         )
 
+    def unfiltered(self, image_id: str) -> SimulatedContact | None:
+        """Return an image of the contact without despeckling; None if this image is not despeckled.
+
+        Args:
+            image_id: Identifier of the new image.
+        """
+        if not self.versions[-1].decoded.despeckle_strength:
+            return None
+        codec = EmbCodec(strength=0.0)
+        return replace(self, image_id=image_id, versions=_versions(codec, self.snippet, incomplete=False), codec=codec)
+
     def with_next_version(self, *, refine: bool) -> SimulatedContact:
         """Return the contact with one more, complete version; with `refine`, of a stream of twice the length."""
         last = self.versions[-1]
@@ -117,6 +129,7 @@ class SimulatedContact:
             first_frame_utc_s=first_utc_s,
             last_frame_utc_s=max(first_utc_s, now_utc_s),
             notes=("simulated, for training", *decoded.notes),
+            despeckle_strength=decoded.despeckle_strength,
         )
 
 
@@ -130,7 +143,7 @@ def simulated_contacts(seed: int, first_utc_s: float) -> Iterator[SimulatedConta
         first_utc_s: Time of the first ping.
     """
     draws = random.Random(seed)  # noqa: S311  not used for secrets
-    codecs: tuple[Codec, Codec] = (EmbCodec(), VqCodec(open_codebook("nominal-10").tiles))
+    codecs: tuple[Codec, Codec] = (EmbCodec(strength=emb.DEFAULT_STRENGTH), VqCodec(open_codebook("nominal-10").tiles))
     made: list[SimulatedContact] = []
     for line in range(_LINES):
         seabed = (SeabedKind.SAND, SeabedKind.RIPPLES, SeabedKind.MIXED)[line % 3]

@@ -24,6 +24,7 @@ from sonarpost.messages import (
     ReconstructedImage,
 )
 from sonarpost.modem.micromodem import RATES
+from sonarpost.review.costs import NEW_IMAGE_KINDS
 from sonarpost.services.console.fleet import frame_event
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.training.contacts import (
@@ -78,7 +79,8 @@ class TrainingSimulator:
         self._packet = 0
         self._transfers: list[_Transfer] = []
         self._cache: dict[str, _Transfer] = {}
-        self._expanded: dict[str, str] = {}
+        # Identifiers of the new images that commands have requested, by kind and image of the command.
+        self._requested: dict[tuple[str, str], str] = {}
         self._downlink: list[_DownlinkRecord] = []
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="training", daemon=True)
@@ -155,17 +157,19 @@ class TrainingSimulator:
     def _execute_command(self, command: Command, now_utc_s: float) -> None:
         """Queue the image that a vehicle would send."""
         image_id = command.image_id or ""
-        is_expand = command.kind == "wider"
-        # A repeated command to expand sends the expanded image again.
-        cached = self._cache.get(self._expanded.get(image_id, image_id) if is_expand else image_id)
+        requested = command.kind, image_id
+        # A repeated command for a new image sends this image again.
+        cached = self._cache.get(self._requested.get(requested, image_id))
         if cached is None or command.kind == "revisit":
             return
-        if is_expand and image_id not in self._expanded:
-            # Identifiers of expanded images count down from the last one, those of contacts count up.
-            expanded = cached.simulated.expanded(format_image_id(-1 - len(self._expanded)))
-            if expanded is not None:
-                self._expanded[image_id] = expanded.image_id
-                self._transfers.append(_Transfer(expanded, now_utc_s))
+        if command.kind in NEW_IMAGE_KINDS and requested not in self._requested:
+            # Identifiers of requested images count down from the last one, those of contacts count up.
+            new_id = format_image_id(-1 - len(self._requested))
+            simulated = cached.simulated
+            new = simulated.expanded(new_id) if command.kind == "wider" else simulated.unfiltered(new_id)
+            if new is not None:
+                self._requested[requested] = new_id
+                self._transfers.append(_Transfer(new, now_utc_s))
             return
         refined = cached.simulated.with_next_version(refine=command.kind == "refine")
         self._transfers.append(_Transfer(refined, cached.first_frame_utc_s, len(refined.versions) - 1))

@@ -110,7 +110,7 @@ class ExportRoutes:
     """Routes of exports and reports.
 
     An export is written to a temporary file without a name in the folder of the database: the operating system
-    deletes it when the process ends, for whatever reason.
+    deletes it when the process ends, also after a crash.
     """
 
     def __init__(self, state: ConsoleState) -> None:
@@ -234,6 +234,12 @@ _AUTHENTICATION: Final[Mapping[bool | None, str]] = {
 }
 
 
+def _despeckling_text(strength: float | None) -> str:
+    if strength is None:
+        return ""
+    return f"despeckled, strength {strength:.2f}" if strength > 0 else "not despeckled"
+
+
 def report_html(detail: Json, image: ReconstructedImage, now_utc_s: float) -> str:
     """Return a page about a contact for printing on one or two sheets. Text of operators is escaped.
 
@@ -260,6 +266,7 @@ def report_html(detail: Json, image: ReconstructedImage, now_utc_s: float) -> st
         ("Detected", _time_text(contact["seen_utc_s"])),
         *((f"{label}, m", record.get(key)) for label, key in _LENGTHS),
         ("Codec", image.codec),
+        ("Despeckling", _despeckling_text(image.despeckle_strength)),
         ("Version of the image", image.version),
         ("Received", f"{image.bytes_received} of {image.bytes_total} bytes, {contact['percent_received']} %"),
         ("Area not received", f"{100 * float(image.missing().mean()):.1f} % (black in the image)"),
@@ -296,10 +303,10 @@ def _time_text(utc_s: object) -> str:
 
 def _scale_text(record: Json, image: ReconstructedImage) -> str:
     along, across = record.get("pixel_along_m"), record.get("pixel_across_m")
-    size = f"{image.picture.width_px} x {image.picture.height_px} px"
+    size = f"{image.picture.width_px} × {image.picture.height_px} px"
     if not isinstance(along, float) or not isinstance(across, float):
         return f"{size}, scale unknown; raw, as received"
-    metres = f"{image.picture.height_px * along:.1f} m along x {image.picture.width_px * across:.1f} m across the track"
+    metres = f"{image.picture.height_px * along:.1f} m along × {image.picture.width_px * across:.1f} m across the track"
     return f"{size}, {metres}; raw, as received; nadir {record.get('nadir_side') or 'side unknown'}"
 
 

@@ -17,6 +17,8 @@ from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import BoundaryDetection, Origin, pack, stored_ping_count, unpack
 from sonarpost.services.atd_stub.service import AtdStubService
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 from sonarpost.sonar.xtf_writer import write_xtf
@@ -238,6 +240,87 @@ def test_a_held_contact_is_released_when_no_continuation_file_arrives(start_serv
     eventually(lambda: files_processed(service) == 2)
     eventually(lambda: service.health().gauges["contacts_waiting"] == service.health().gauges["outbox"] == 0)
     assert len(near(compressor.received, 120)) == 1, "the second search recognises it"
+
+
+def lines(caplog, message):
+    return [record.fields for record in caplog.records if record.message == message]
+
+
+def test_a_held_contact_is_logged_with_its_wait_and_with_the_reason_of_its_release(
+    start_service, runner, halves, caplog
+):
+    caplog.set_level("INFO")
+    runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    service = start_service(join_timeout_s=3600.0)
+    halves(0)
+    eventually(lambda: lines(caplog, "Contact held for continuation file"))
+    [held] = lines(caplog, "Contact held for continuation file")
+    assert (held["wait_s"], held["file"]) == (3600.0, "line-0.xtf")
+    assert held["contact_id"].startswith("line-0-")
+    assert service.health().gauges["contacts_held"] == 1
+    assert "1 contacts held for a continuation file until " in service.health().detail
+    assert lines(caplog, "Held contact released") == []
+    halves(1)
+    eventually(lambda: lines(caplog, "Held contact released"))
+    [released] = lines(caplog, "Held contact released")
+    assert released == {"contact_id": held["contact_id"], "reason": "seen whole in line-1.xtf"}
+    assert service.health().gauges["contacts_held"] == 0
+    assert "held" not in service.health().detail
+
+
+@pytest.mark.parametrize(
+    ("wait_s", "reason"), [(0.2, "no continuation file within 0.2 s"), (3600.0, "not continued by")]
+)
+def test_a_held_contact_without_a_continuation_is_logged(
+    wait_s, reason, start_service, runner, halves, tmp_path, caplog
+):
+    caplog.set_level("INFO")
+    compressor = runner.peer("uuv-1", "compressor", {KEY: Snippet})
+    service = start_service(join_timeout_s=wait_s)
+    halves(0)
+    eventually(lambda: files_processed(service) == 1)
+    if wait_s > 1:
+        later = survey_of(120, seed=9)
+        later = replace(later, pings=tuple(replace(p, time_utc_s=p.time_utc_s + 7200) for p in later.pings))
+        write_xtf(later, tmp_path / "incoming" / "other.xtf")
+    eventually(lambda: len(near(compressor.received, 120)) == 1)
+    eventually(lambda: lines(caplog, "Held contact released"))
+    [released] = lines(caplog, "Held contact released")
+    assert released["reason"].startswith(reason)
+    assert released["contact_id"] == near(compressor.received, 120)[0].contact.contact_id
+
+
+def test_a_held_contact_that_is_not_detected_again_is_released_with_the_reason(tmp_path):
+    first, second = split(tmp_path, survey_of(240, Box(118)), (0, 120), (120, 240))
+    config = AtdStubConfig(join_timeout_s=30.0)
+    end = detect_in_survey(first, "0" * 64, "uuv-1", config, {}, 100.0).file_end
+    [held] = end.held_snippets()
+    strict = AtdStubConfig(join_timeout_s=30.0, confidence_threshold=2.0)
+    result = detect_in_survey(second, "1" * 64, "uuv-1", strict, {end.sonar_id: end}, 101.0)
+    assert result.released == ((held.contact.contact_id, "not detected again in line-1.xtf"),)
+    assert [s.contact.contact_id for s in result.snippets] == [held.contact.contact_id]
+
+
+@pytest.mark.parametrize("pings", [300, 1700])
+def test_counts_at_lower_thresholds_are_logged(pings, tmp_path, start_service, caplog):
+    caplog.set_level("INFO")
+    spec = SurveySpec(seed=2, seabed=SeabedKind.ROCK, pings=pings, samples=400, targets=2, clutter=4)
+    path = tmp_path / "rock.xtf"
+    write_xtf(simulate_survey(spec).survey, path)
+    result = detect_in_survey(path, "0" * 64, "uuv-1", AtdStubConfig(confidence_threshold=2.0))
+    assert result.contact_count == 0
+    assert list(result.weaker) == [1.0, 0.5, 0.3, 0.1]
+    assert result.weaker[0.1] > result.weaker[0.3] > result.weaker[1.0] >= 1
+    for confidence, count in result.weaker.items():
+        found = detect_in_survey(path, "0" * 64, "uuv-1", AtdStubConfig(confidence_threshold=confidence))
+        # Approximate where parts of a long file overlap.
+        assert count == pytest.approx(found.contact_count, abs=0 if pings <= 1000 else 2)
+    service = start_service(confidence_threshold=2.0)
+    path.rename(service.config.input_dir / path.name)
+    eventually(lambda: lines(caplog, "File processed"))
+    [line] = lines(caplog, "File processed")
+    weaker = ", ".join(f"{count} above {confidence}" for confidence, count in result.weaker.items())
+    assert line["counts"] == f"0 contacts above 2.0; {weaker}"
 
 
 def test_the_builders_write_the_pings_of_each_part(tmp_path):

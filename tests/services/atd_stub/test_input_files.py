@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders.common import eventually
+from PIL import Image
 
 from sonarpost import keys
 from sonarpost.detection.detector import detect
@@ -146,7 +147,7 @@ def test_files_are_processed_oldest_first(start_service, compressor, put_file, t
     ("name", "spoil", "expected"),
     [
         ("empty.xtf", lambda data: b"", "empty.xtf"),
-        ("cut.xtf", lambda data: data[:-100], "cut.xtf"),
+        ("cut.xtf", lambda data: data[:1200], "cut.xtf"),
         ("header-only.xtf", lambda data: data[:700], "header-only.xtf"),
         ("text.XTF", lambda data: b"this is no survey\n" * 200, "text.XTF"),
     ],
@@ -166,6 +167,20 @@ def test_a_bad_survey_is_quarantined_with_its_reason(
     put_file("good.xtf", survey_bytes(2))
     eventually(lambda: len(compressor.received) == 3, what="the file after the bad one")
     assert service.health().state == "ok"
+
+
+def test_a_survey_cut_by_a_power_failure_is_processed_with_a_warning(
+    start_service, compressor, put_file, survey_bytes, caplog
+):
+    service = start_service()
+    path = put_file("cut.xtf", survey_bytes(1)[:-658])
+    eventually(lambda: len(compressor.received) == 3)
+    assert counter(service, "files_processed") == 1
+    assert counter(service, "files_quarantined") == 0
+    assert path.exists()
+    [warning] = [r for r in caplog.records if r.message == "Survey reader warning"]
+    assert warning.fields["file"] == "cut.xtf"
+    assert "the file ends inside its last packet" in warning.fields["warning"]
 
 
 def test_two_bad_files_of_one_name_are_both_kept_in_quarantine(start_service, put_file, tmp_path):
@@ -231,20 +246,34 @@ def test_image_files_are_sent_unchanged(start_service, compressor, put_file, tex
         assert snippet.contact.atd_confidence is None, "no confidence is invented"
 
 
+def test_a_large_colour_jpeg_is_sent_with_its_position_and_a_warning(
+    start_service, compressor, put_file, texture, caplog
+):
+    put_file("p.txt", b"lat_deg: 56.4\nlon_deg: -5.6\npixel_along_m: 0.1\n")
+    path = put_file(".p.jpg", b"")
+    Image.fromarray(np.dstack([texture(1024, 400)] * 2 + [texture(1024, 400) // 2])).save(path)
+    path.rename(path.with_name("p.jpg"))
+    start_service(mode="snippets")
+    eventually(lambda: len(compressor.received) == 1)
+    (snippet,) = compressor.received
+    assert (snippet.picture.width_px, snippet.picture.height_px) == (200, 512)
+    assert (snippet.contact.lat_deg, snippet.contact.pixel_along_m) == (56.4, 0.2)
+    warnings = [r.fields["warning"] for r in caplog.records if r.message == "Image file warning"]
+    assert warnings[1] == "400 × 1024 px resized to 200 × 512 px"
+
+
 @pytest.mark.parametrize(
     ("name", "pixels", "expected"),
     [
-        ("deep.tiff", np.zeros((40, 40), np.uint32), "32 bits"),
-        ("float.tiff", np.zeros((40, 40), np.float32), "float"),
-        ("small.tiff", np.zeros((15, 40), np.uint8), "height_px: got 15, expected 16..512"),
-        ("wide.tiff", np.zeros((40, 513), np.uint8), "width_px: got 513, expected 16..512"),
-        ("colour.tiff", np.dstack([np.full((40, 40), n, np.uint8) for n in (1, 2, 3)]), "RGB"),
+        ("complex.tiff", np.zeros((40, 40), np.complex64), "sample type: got 'complex64', expected integer or float"),
+        ("small.tiff", np.zeros((15, 40), np.uint8), "got '40 × 15 px', expected 16 to 512 px a side; fit ="),
+        ("wide.tiff", np.zeros((40, 513), np.uint8), "got '513 × 40 px', expected 16 to 512 px a side; fit ="),
     ],
 )
 def test_an_image_that_cannot_be_sent_is_quarantined(name, pixels, expected, start_service, put_file, check_next_image):
     import tifffile
 
-    service = start_service(mode="snippets")
+    service = start_service(mode="snippets", fit="refuse")
     path = put_file(f".{name}", b"")
     tifffile.imwrite(path, pixels)
     path = path.rename(path.with_name(name))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from builders.common import eventually
 from builders.record_samples import BARE_CONTACT, FULL_CONTACT
+from PIL import Image
 
 from sonarpost import keys
 from sonarpost.config import load
@@ -21,13 +22,14 @@ from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import Origin
 from sonarpost.services.atd_stub.input_folder import InputFile, StableFiles, list_input_files
 from sonarpost.services.atd_stub.service import AtdStubService
-from sonarpost.services.atd_stub.snippet_files import contact_text, read_contact, read_snippet, write_snippet
+from sonarpost.services.atd_stub.snippet_files import read_snippet, write_snippet
 from sonarpost.services.atd_stub.survey_detection import snippet_of
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.image_files import read_image, write_tiff
 from sonarpost.sonar.options import ErrorBudget, Mounting
 from sonarpost.sonar.readers import open_survey
+from sonarpost.sonar.side_car import SideCar, contact_text, read_side_car
 from sonarpost.sonar.source import load_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
@@ -44,7 +46,7 @@ def line(tmp_path_factory) -> Path:
 
 
 def best_contact_of(path: Path, config: AtdStubConfig, change=lambda ping: ping):
-    with open_survey(path, config.survey_options()) as source:
+    with open_survey(path, config) as source:
         survey = load_survey(source)
     survey = replace(survey, pings=tuple(change(ping) for ping in survey.pings))
     found = detect(survey)[0]
@@ -107,11 +109,10 @@ def test_errors_name_invalid_survey_options_of_the_configuration(tmp_path):
     head = '[platform]\nid = "uuv-1"\n[atd_stub]\nport_order = "nearest_first"\nprojected_crs = "EPSG:32619"\n'
     path.write_text(head + "[atd_stub.mounting]\nlayback_m = 25\n[atd_stub.errors]\nposition_m = 1.5\n")
     _, config = load(path, "atd_stub", AtdStubConfig, {})
-    options = config.survey_options()
-    assert (options.mounting.layback_m, options.errors.position_m) == (25.0, 1.5)
-    assert (options.port_order, options.projected_crs) == ("nearest_first", "EPSG:32619")
+    assert (config.mounting.layback_m, config.errors.position_m) == (25.0, 1.5)
+    assert (config.port_order, config.projected_crs) == ("nearest_first", "EPSG:32619")
     _, config = load(path, "atd_stub", AtdStubConfig, {"SONARPOST_ATD_STUB__MOUNTING": "{ forward_m = -2.0 }"})
-    assert config.survey_options().mounting == Mounting(forward_m=-2.0)
+    assert config.mounting == Mounting(forward_m=-2.0)
     for line_of, value in (("layback_m", "-1"), ("layback", "5")):
         path.write_text(head + f"[atd_stub.mounting]\n{line_of} = {value}\n")
         with pytest.raises(ConfigError, match=rf"uuv\.toml:7: atd_stub\.mounting\.{line_of}: got"):
@@ -205,7 +206,7 @@ def test_without_more_seabed_in_the_survey_there_is_no_expanded_image(detection)
 
 def test_snippets_mode_has_no_expanded_image(tmp_path, texture):
     write_tiff(tmp_path / "p.tiff", texture())
-    assert read_snippet(tmp_path / "p.tiff", "ab" * 32, "uuv-1").wide is None
+    assert read_snippet(tmp_path / "p.tiff", "ab" * 32, "uuv-1", "refuse").snippet.wide is None
 
 
 def test_unrecorded_seabed_is_black(detection):
@@ -243,7 +244,7 @@ def test_the_record_has_the_pixel_size_of_its_image(line):
 def test_a_written_text_file_reads_back_equal(contact, tmp_path):
     path = tmp_path / "c.txt"
     path.write_text(contact_text(contact))
-    assert read_contact(path, "other", contact.vehicle_id) == contact
+    assert read_side_car(path, "other", contact.vehicle_id) == SideCar(contact, ())
 
 
 def test_a_text_file_is_readable():
@@ -258,20 +259,23 @@ def test_a_handwritten_text_file_may_have_few_fields(tmp_path):
     path.write_text(
         "\ufeff lat_deg :41.5\nlon_deg: -70\n\nseen_by: diver\nvehicle_id: uuv-9\ntime_utc: 2016-10-12T09:20\n"
     )
-    contact = read_contact(path, "c1", "uuv-1")
-    assert contact == Contact(contact_id="c1", vehicle_id="uuv-1", lat_deg=41.5, lon_deg=-70.0, time_utc_s=1476264000.0)
+    side_car = read_side_car(path, "c1", "uuv-1")
+    assert side_car.notes == ("line 4 ignored: 'seen_by' is not a field of a contact",)
+    assert side_car.contact == Contact(
+        contact_id="c1", vehicle_id="uuv-1", lat_deg=41.5, lon_deg=-70.0, time_utc_s=1476264000.0
+    )
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("lat_deg: 91\n", "lat_deg: got 91, expected"),
-        ("lat_deg: north\n", "lat_deg: got 'north', expected a number"),
+        ("lon_deg: 1\nlat_deg: 91\n", "c.txt line 2: lat_deg: got 91, expected"),
+        ("\nlat_deg: north\n", "c.txt line 2: lat_deg: got 'north', expected a number"),
         ("lat_deg: nan\n", "lat_deg"),
         ("ping_number: 1.5\n", "ping_number"),
         ("channel: middle\n", "channel: got 'middle'"),
         ("time_utc: yesterday\n", "time_utc: got 'yesterday', expected a time as"),
-        ("what is this\n", "line 1: got 'what is this', expected name: value"),
+        ("what is this\n", "c.txt line 1: got 'what is this', expected name: value"),
         ("x" * 70_000, "size: got 70000"),
         (b"\xff\xfe\x00", "UTF-8"),
     ],
@@ -279,8 +283,8 @@ def test_a_handwritten_text_file_may_have_few_fields(tmp_path):
 def test_errors_name_the_invalid_line_or_field_of_a_text_file(text, expected, tmp_path):
     path = tmp_path / "c.txt"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(SurveyFileError, match=r"c\.txt: ") as caught:
-        read_contact(path, "c1", "uuv-1")
+    with pytest.raises(SurveyFileError, match=r"c\.txt( line \d)?: ") as caught:
+        read_side_car(path, "c1", "uuv-1")
     assert expected in str(caught.value)
 
 
@@ -290,7 +294,34 @@ def test_the_file_name_of_a_snippet_is_its_contact_id_without_path_separators(tm
     tiff = write_snippet(tmp_path / "new" / "out", Snippet(contact=contact, picture=Pixels.from_array(image)))
     assert tiff.parent == tmp_path / "new" / "out"
     np.testing.assert_array_equal(read_image(tiff), image)
-    assert read_contact(tiff.with_suffix(".txt"), "x", "uuv-1") == contact
+    assert read_side_car(tiff.with_suffix(".txt"), "x", "uuv-1").contact == contact
+
+
+@pytest.mark.parametrize(("fit", "shape", "scale"), [("resize", (256, 512), 2.5), ("crop", (512, 512), 1.0)])
+def test_a_large_colour_image_is_fitted_and_its_pixel_size_corrected(fit, shape, scale, tmp_path, texture):
+    large = np.dstack([texture(640, 1280)] * 2 + [texture(640, 1280) // 2])
+    Image.fromarray(large).save(tmp_path / "p.jpg")
+    (tmp_path / "p.txt").write_text("lat_deg: 56.4\nlon_deg: -5.6\npixel_along_m: 0.1\npixel_across_m: 0.05\nby: me\n")
+    file = read_snippet(tmp_path / "p.jpg", "ab" * 32, "uuv-1", fit)
+    contact = file.snippet.contact
+    assert file.snippet.picture.to_array().shape == shape
+    assert (contact.lat_deg, contact.lon_deg) == (56.4, -5.6)
+    assert contact.pixel_along_m == pytest.approx(0.1 * scale)
+    assert contact.pixel_across_m == pytest.approx(0.05 * scale)
+    assert len(file.notes) == 3
+    assert "colour" in file.notes[0]
+    assert "1280 × 640 px" in file.notes[1]
+    assert "'by'" in file.notes[2]
+
+
+def test_an_image_that_does_not_fit_is_an_error_that_names_the_key(tmp_path, texture):
+    write_tiff(tmp_path / "p.tiff", texture(20, 600))
+    with pytest.raises(SurveyFileError, match='fit = "crop" or fit = "resize"'):
+        read_snippet(tmp_path / "p.tiff", "ab" * 32, "uuv-1", "refuse")
+    (tmp_path / "p.txt").write_text("pixel_along_m: 99\n")
+    write_tiff(tmp_path / "p.tiff", texture(40, 600))
+    with pytest.raises(SurveyFileError, match=r"p\.txt: pixel size: got '116\.471 m'"):
+        read_snippet(tmp_path / "p.tiff", "ab" * 32, "uuv-1", "resize")
 
 
 # The service

@@ -99,7 +99,7 @@ def test_two_images_of_one_name_and_version_are_stored_and_reported(
         assert kept.store_image(repeated, 6.0)[1:] == (False, conflict)
     kept.flush()
     assert len(kept.index().images()) == 2
-    assert main(["c2", "ls", "--out-dir", str(out)]) == 0
+    assert main(["c2", "ls", "--archive", str(out)]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if "uuv-1/AAAA" in line]
     assert ["1 (conflict)" in line for line in lines] == [False, True]
 
@@ -167,7 +167,7 @@ def test_missing_and_changed_files_are_counted_logged_once_and_listed(
     assert filled.defect_counts() == {"missing": 2, "changed": 3, "unreadable": 0, "conflicting": 0}
     verify_all(filled, 1e9 + 2 * DAY_S)
     assert [record.message for record in caplog.records] == ["Stored files differ from the index"]
-    assert main(["c2", "ls", "--out-dir", str(out)]) == 0
+    assert main(["c2", "ls", "--archive", str(out)]) == 0
     text = capsys.readouterr().out
     assert text.count("1 (missing)") == 2
     assert text.count("1 (changed)") == 2
@@ -263,7 +263,7 @@ def version_1(filled: Archive, out: Path) -> list[ImageRow]:
         old = {t: [r[1] for r in db.execute(f"PRAGMA table_info({t})")] for t in ("picture", "decision")}
         data = {t: db.execute(f"SELECT * FROM {t}").fetchall() for t in old}
     path.unlink()
-    new = {"conflict", "files_sha256", "verified_utc_s", "fault"}
+    new = {"conflict", "files_sha256", "verified_utc_s", "fault", "despeckle_strength"}
     with closing(sqlite3.connect(path)) as db, db:
         db.executescript(VERSION_1)
         for table, columns in old.items():
@@ -293,3 +293,20 @@ def test_index_of_version_1_is_migrated_and_gets_digests(
     tiff.write_bytes(tiff.read_bytes()[:-1] + b"\xff")
     verify_all(migrated, 1e9 + 2 * DAY_S)
     assert migrated.defect_counts()["changed"] == 2
+
+
+def test_index_of_version_2_gains_the_strength_of_despeckling(
+    archive: Callable[..., Archive], filled: Archive, out: Path
+) -> None:
+    before = filled.index().images()
+    filled.close()
+    with closing(sqlite3.connect(out / FILE_NAME)) as db, db:
+        db.execute("ALTER TABLE picture DROP COLUMN despeckle_strength")
+        db.execute("PRAGMA user_version = 2")
+    with closing(ShoreIndex(out, writable=False)) as index:
+        assert index.images() == before
+    migrated = archive()
+    assert migrated.index().images() == before
+    migrated.store_image(image("000A").model_copy(update={"despeckle_strength": 0.5}), 5.0)
+    migrated.flush()
+    assert [row.despeckle_strength for row in migrated.index().images() if row.image_id == "000A"] == [0.5]

@@ -174,7 +174,7 @@ def test_a_cache_entry_without_an_expanded_id_is_sent(start_service, send_comman
     atd.send(IN, "compressor", snippet("c1"))
     eventually(lambda: len(modem.received) == 1)
     name = f"kept/{modem.received[0].image_id}"
-    image, packed, _ = msgpack.unpackb(service.store.get_state(name))
+    image, packed, *_ = msgpack.unpackb(service.store.get_state(name))
     with service.store.transaction() as tx:
         tx.put_state(name, msgpack.packb([image, packed]))
     send_command("resend", modem.received[0].image_id)

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import io
 import json
+import signal
+import socket
 import ssl
+import subprocess
+import sys
 import time
 import urllib.request
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
+import httpx2
 import pytest
 from builders.common import eventually
-from builders.console import PASSWORD
+from builders.console import PASSWORD, Browser, image_record
+from builders.records import decision_record
 
 from sonarpost.cli.main import main
 from sonarpost.config import TlsConfig
 from sonarpost.errors import ConfigError
 from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
+from sonarpost.services.c2.archive import Archive
+from sonarpost.services.c2.config import C2Config
 from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.training.contacts import simulated_contacts
 from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator
@@ -46,9 +55,17 @@ def test_add_change_and_remove_users(tmp_path, capsys, monkeypatch):
     assert "user anna removed" in capsys.readouterr().out
 
 
+def test_without_a_terminal_the_error_names_the_option(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO(f"{PASSWORD}\n"))
+    assert user(tmp_path, "add", "anna") == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert line == "sonarpost: console: password: got 'no terminal to ask', expected --password-stdin"
+
+
 def test_password_prompt_is_repeated(tmp_path, capsys, monkeypatch):
     answers = iter([PASSWORD, "another", PASSWORD, PASSWORD, "short", "short"])
     monkeypatch.setattr("getpass.getpass", lambda _prompt: next(answers))
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
     config = tmp_path / "vessel.toml"
     config.write_text(f'[platform]\nid = "vessel-1"\nstate_dir = "{tmp_path}/state"\n')
     assert main(["console", "user", "add", "anna", "--config", str(config)]) == 2
@@ -62,6 +79,37 @@ def test_missing_action_and_invalid_number_are_errors(capsys):
     assert main(["console"]) == 2
     assert main(["console", "--training", "0"]) == 2
     assert "1 to 100000" in capsys.readouterr().err
+    assert main(["console", "--view", "/nowhere"]) == 2
+    assert "--view: got '/nowhere', expected a folder of c2" in capsys.readouterr().err
+
+
+def test_folder_of_c2_is_shown_to_an_observer_on_any_free_port(tmp_path):
+    archive = Archive(C2Config(out_dir=tmp_path / "out"))
+    archive.store_image(image_record("AAAA"), 5.0)
+    archive.store_decision(decision_record("d1"))
+    archive.flush()
+    archive.close()
+    words = ["console", "--view", str(tmp_path / "out"), "--password", PASSWORD]
+    command = [sys.executable, "-m", "sonarpost.cli.main", *words]
+    # 8470 may be in use: the page is at another port then.
+    with suppress(OSError), socket.create_server(("127.0.0.1", 8470)):
+        show_folder(command)
+    show_folder(command)
+
+
+def show_folder(command):
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            url, _, user = process.stdout.readline().split()[:3]
+            assert "1 contacts in" in process.stdout.readline()
+            with httpx2.Client(base_url=url, timeout=20) as client:
+                browser = Browser(client)
+                assert browser.login(user, PASSWORD).json()["role"] == "observer"
+                [contact] = client.get("/api/contacts").json()["items"]
+                assert contact["review"] == "mine_like"
+        finally:
+            process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=20) == 0
 
 
 def test_simulated_contacts_arrive_in_versions_and_are_marked():
@@ -109,7 +157,8 @@ def test_training_delivers_decisions_and_requests(console):
     assert any(vehicle["snr_in_db"] is not None and vehicle["queue"] for vehicle in vehicles)
 
 
-def test_training_sends_an_expanded_image_once(console):
+@pytest.mark.parametrize("kind", ["wider", "original"])
+def test_training_sends_a_new_image_once(kind, console):
     simulator = TrainingSimulator(console.state, contacts=1, interval_s=0.01)
     simulator.load_backlog(1)
     anna = console.browser("anna")
@@ -117,8 +166,8 @@ def test_training_sends_an_expanded_image_once(console):
     def rows() -> dict[str, dict[str, object]]:
         return {row["image_id"]: row for row in anna.get("/api/contacts").json()["items"]}
 
-    def ask(image_id: str) -> None:
-        assert anna.post(f"/api/contacts/{rows()[image_id]['id']}/requests", {"kind": "wider"}).status_code == 201
+    def ask(image_id: str, expected: int = 201) -> None:
+        assert anna.post(f"/api/contacts/{rows()[image_id]['id']}/requests", {"kind": kind}).status_code == expected
         now = time.time()
         simulator.accept_records(now)
         simulator.advance_downlink(now + 11.0)
@@ -128,12 +177,15 @@ def test_training_sends_an_expanded_image_once(console):
     (first,) = rows()
     ask(first)
     assert set(rows()) == {first, "ZZZZ"}
-    original, expanded = (console.state.image(str(rows()[name]["id"]), 1) for name in (first, "ZZZZ"))
-    assert expanded.contact.pixel_along_m == 2 * original.contact.pixel_along_m
-    assert expanded.contact.pixel_across_m == 2 * original.contact.pixel_across_m
+    known, new = (console.state.image(str(rows()[name]["id"]), 1) for name in (first, "ZZZZ"))
+    scale = 2 if kind == "wider" else 1
+    assert new.contact.pixel_along_m == scale * known.contact.pixel_along_m
+    assert new.contact.pixel_across_m == scale * known.contact.pixel_across_m
+    assert (known.despeckle_strength, new.despeckle_strength) == (1.0, 1.0 if kind == "wider" else 0.0)
     assert rows()["ZZZZ"]["complete"]
     ask(first)  # a repeated request
-    ask("ZZZZ")  # an expanded image cannot be expanded
+    # An expanded image cannot be expanded, and the console refuses the other request.
+    ask("ZZZZ", expected=201 if kind == "wider" else 400)
     assert set(rows()) == {first, "ZZZZ"}
 
 

@@ -18,7 +18,7 @@ from sonarpost.review.positions import Look, nearest_group
 from sonarpost.services.console.store.contacts import ContactFilter
 from sonarpost.services.console.store.database import Actor, DisplayedImage
 from sonarpost.services.console.store.decisions import ConflictError, DecisionInput
-from sonarpost.services.console.store.requests import is_later_state
+from sonarpost.services.console.store.requests import REQUEST_KINDS, is_later_state
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 SECONDS = count()
@@ -301,7 +301,7 @@ def test_records_before_their_image_are_attached_to_it(make_console):
 
 def test_request_costs_and_no_repeated_request(make_console):
     console = make_console(assumed_rate=1)
-    console.state.store_image(image_record(missing_rows=30))
+    console.state.store_image(image_record(missing_rows=30).model_copy(update={"despeckle_strength": 1.0}))
     anna = console.browser("anna")
     costs = {cost["kind"]: cost for cost in anna.get(f"/api/contacts/{ID}/costs").json()["costs"]}
     # 150 of 200 bytes are missing: 3 frames of 64 bytes, one packet of 6.1 s, after one of 3.2 s down.
@@ -314,6 +314,7 @@ def test_request_costs_and_no_repeated_request(make_console):
     assert (costs["wider"]["bytes"], costs["wider"]["packets"]) == (200, 2)
     assert costs["wider"]["airtime_s"] == pytest.approx(3.2 + 2 * 6.1)
     assert costs["wider"]["basis"] == "latest rate 1, a new image of 200 bytes"
+    assert {**costs["original"], "kind": "wider"} == costs["wider"]
     path = f"/api/contacts/{ID}/requests"
     asked = anna.post(path, {"kind": "resend", "airtime_s": 9.3})
     assert (asked.status_code, asked.json()["state"]) == (201, "waiting")
@@ -323,15 +324,18 @@ def test_request_costs_and_no_repeated_request(make_console):
     assert (request["state"], request["reason"]) == ("refused", "no transmitter")
     assert anna.post(path, {"kind": "resend"}).status_code == 201
     assert anna.post(path, {"kind": "wider"}).status_code == 201
+    assert anna.post(path, {"kind": "original"}).status_code == 201
+    assert anna.post(path, {"kind": "original"}).status_code == 400
     assert anna.post(path, {"kind": "larger"}).status_code == 400
 
 
-def test_expanded_image_costs_as_much_as_the_first_version(make_console):
+def test_new_images_cost_as_much_as_the_first_version(make_console):
     console = make_console(assumed_rate=1)
     console.state.store_image(image_record())
-    console.state.store_image(image_record(version=2).model_copy(update={"bytes_received": 400, "bytes_total": 400}))
+    longer = {"bytes_received": 400, "bytes_total": 400, "despeckle_strength": 1.0}
+    console.state.store_image(image_record(version=2).model_copy(update=longer))
     costs = {cost["kind"]: cost for cost in console.browser("anna").get(f"/api/contacts/{ID}/costs").json()["costs"]}
-    assert (costs["refine"]["bytes"], costs["wider"]["bytes"]) == (400, 200)
+    assert [costs[kind]["bytes"] for kind in ("refine", "wider", "original")] == [400, 200, 200]
 
 
 def test_unknown_cost_is_none(console):
@@ -348,17 +352,19 @@ def test_unknown_cost_is_none(console):
         ({"position": None, "codec": "vq"}, {"wider"}),
         ({"missing_rows": 10, "codec": "vq"}, {"resend", "revisit", "wider"}),
         ({"missing_rows": 10}, {"refine", "resend", "revisit", "wider"}),
+        ({"despeckle_strength": 0.0}, {"refine", "revisit", "wider"}),
+        ({"despeckle_strength": 0.0625}, {"refine", "revisit", "wider", "original"}),
     ],
 )
 def test_impossible_requests_are_rejected(console, changes, possible):
-    arguments = {name: value for name, value in changes.items() if name != "codec"}
-    image = image_record(**arguments)
-    console.state.store_image(image.model_copy(update={"codec": changes.get("codec", "emb")}))
+    of_codec = {name: value for name, value in changes.items() if name in ("codec", "despeckle_strength")}
+    image = image_record(**{name: value for name, value in changes.items() if name not in of_codec})
+    console.state.store_image(image.model_copy(update=of_codec))
     anna = console.browser("anna")
     costs = anna.get(f"/api/contacts/{ID}/costs").json()["costs"]
     assert {cost["kind"] for cost in costs if cost["available"]} == possible
     assert all(cost["reason"] for cost in costs if not cost["available"])
-    for kind in ("refine", "resend", "revisit", "wider"):
+    for kind in REQUEST_KINDS:
         answer = anna.post(f"/api/contacts/{ID}/requests", {"kind": kind})
         assert answer.status_code == (201 if kind in possible else 400)
     assert len(console.state.unsent_records()) == len(possible)

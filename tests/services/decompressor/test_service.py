@@ -16,6 +16,7 @@ from PIL import Image
 
 from sonarpost import keys
 from sonarpost.archive.image_files import image_file_name
+from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import Codebook, open_codebook, save
@@ -375,3 +376,24 @@ def test_record_and_side_car_state_the_authentication(begin, modem, relay, strea
     side_car = json.loads((out / f"{image_file_name(relay.received[0])}.json").read_text())
     assert side_car.get("authenticated") is authenticated
     assert ("authenticated" in side_car) == (authenticated is not None)
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.5, 1.0, None])
+def test_record_and_side_car_state_the_strength_of_despeckling(begin, modem, relay, stream, texture, out, strength):
+    begin()
+    # The streams of vq do not state a strength.
+    coded = stream() if strength is None else EmbCodec(strength=strength).encode(texture(40, 60), 200)
+    modem.send(IN, "decompressor", *updates(*frames_of("00A7", coded)))
+    eventually(lambda: any(image.complete for image in relay.received))
+    record = next(image for image in relay.received if image.complete)
+    assert record.despeckle_strength == strength
+    side_car = json.loads((out / f"{image_file_name(record)}.json").read_text())
+    assert side_car.get("despeckle_strength") == strength
+    assert ("despeckle_strength" in side_car) == (strength is not None)
+
+
+def test_contact_record_without_an_image_states_no_strength(begin, modem, relay):
+    begin()
+    modem.send(IN, "decompressor", *updates(ContactFrame("00A7", CONTACT).pack()))
+    eventually(lambda: len(relay.received) == 1)
+    assert (relay.received[0].codec, relay.received[0].despeckle_strength) == ("", None)

@@ -170,6 +170,7 @@ def test_commands_are_sent_and_confirmed(authenticated, modem_pair, begin, conso
         "c-2": command("resend", "c-2"),
         "c-3": command("revisit", "c-3"),
         "c-4": command("wider", "c-4"),
+        "c-5": command("original", "c-5"),
     }
     for record in sent.values():
         console.send(keys.command(VESSEL, record.kind), "op_modem", record)
@@ -185,7 +186,8 @@ def test_commands_are_sent_and_confirmed(authenticated, modem_pair, begin, conso
         assert steps[0] == "asked"
         assert set(steps[1:-1]) == {"sent"}
     by_kind = {type(found): found for found in far.commands}
-    assert by_kind[dl.RefineMessage].number == by_kind[dl.ResendMessage].number == by_kind[dl.ExpandMessage].number == 7
+    for_images = (dl.RefineMessage, dl.ResendMessage, dl.ExpandMessage, dl.OriginalMessage)
+    assert {by_kind[kind].number for kind in for_images} == {7}
     assert (by_kind[dl.RevisitMessage].lat_deg, by_kind[dl.RevisitMessage].lon_deg) == (41.5, -70.5)
     decided = by_kind[dl.DecisionMessage]
     assert (decided.verdict, decided.confidence, decided.version) == ("mine_like", 0.5, 2)

@@ -22,6 +22,7 @@ from sonarpost.link.downlink.messages import (
     DataMessage,
     DecisionMessage,
     ExpandMessage,
+    OriginalMessage,
     RefineMessage,
     ResendMessage,
     RevisitMessage,
@@ -236,6 +237,7 @@ COMMANDS = [
     (ResendMessage(2, 1001, 3), "resend", "0003"),
     (RevisitMessage(3, 1002, 56.5, -5.25), "revisit", None),
     (ExpandMessage(5, 1004, 4), "wider", "0004"),
+    (OriginalMessage(6, 1005, 5), "original", "0005"),
 ]
 
 
@@ -251,20 +253,21 @@ def test_commands_become_one_record_each_and_are_confirmed_each_time(vessel, sta
     def outcomes() -> list[tuple[int, CommandOutcome]]:
         return [o for m in vessel.messages() if isinstance(m, ConfirmationMessage) for o in m.outcomes]
 
-    vessel.send_messages(*commands, until=lambda: {token for token, _ in outcomes()} == {1, 2, 3, 4, 5})
+    vessel.send_messages(*commands, until=lambda: {token for token, _ in outcomes()} == {1, 2, 3, 4, 5, 6})
     before = outcomes().count((1, CommandOutcome.ACCEPTED))
     vessel.send_messages(commands[0], until=lambda: outcomes().count((1, CommandOutcome.ACCEPTED)) > before)
-    eventually(lambda: len(compressor.received) == 3 and len(autonomy.received) == 2)
+    eventually(lambda: len(compressor.received) == 4 and len(autonomy.received) == 2)
     assert {outcome for _, outcome in outcomes()} == {CommandOutcome.ACCEPTED}
     assert {(c.kind, c.image_id) for c in compressor.received} == {
         ("refine", "0002"),
         ("resend", "0003"),
         ("wider", "0004"),
+        ("original", "0005"),
     }
     revisit, decision = sorted(autonomy.received, key=lambda r: r.TYPE)
     assert (revisit.lat_deg, revisit.lon_deg, revisit.command_id) == (56.5, -5.25, "a1-00000003")
     assert (decision.verdict, decision.mlo_class, decision.image_id) == ("mine_like", "sphere", "0002")
-    assert service.health().counters["commands_received"] == 5
+    assert service.health().counters["commands_received"] == 6
 
 
 def test_command_without_a_consumer_is_confirmed_as_unsupported(vessel, start_service):

@@ -8,7 +8,8 @@ const known = (value) => value !== null && value !== undefined && Number.isFinit
 
 export const verdict = (name) => VERDICTS[name] ?? name ?? DASH;
 /** Name of a kind of request for operators. */
-export const requestKind = (kind) => (kind === "wider" ? "expand" : kind);
+const REQUEST_KINDS = { wider: "expand", original: "unfiltered image" };
+export const requestKind = (kind) => REQUEST_KINDS[kind] ?? kind;
 export const symbol = (name) => SYMBOLS[name] ?? "·";
 
 /** A number and its unit, separated by a thin space. */
@@ -22,6 +23,12 @@ export const percent = (value, digits = 0) => (known(value) ? `${value.toFixed(d
 export function authentication(row) {
   if (row.authenticated === null || row.authenticated === undefined) return null;
   return row.authenticated ? "authenticated" : "unauthenticated: any modem in range can have forged this contact";
+}
+
+/** Statement about the despeckling of an image; null where it is not known. */
+export function despeckling(version) {
+  if (!known(version.despeckle_strength)) return null;
+  return version.despeckle_strength > 0 ? `strength ${version.despeckle_strength.toFixed(2)}` : "not despeckled";
 }
 
 /** Percent received; below 100 until the image is complete. */

@@ -1,7 +1,9 @@
 // The data integrity strip: codec, received and missing parts, and whether the displayed layer is measurable.
 
 import { h } from "./dom.js";
-import { authentication, bytes, duration, percent, received } from "./format.js";
+import { authentication, bytes, despeckling, duration, percent, received } from "./format.js";
+
+const DESPECKLING = "The vehicle estimates the image without speckle and sends the estimate. The request \u201cunfiltered image\u201d sends the image without this step.";
 
 function item(name, value, props = {}) {
   return h("div", props, h("dt", { text: name }), h("dd", { class: "number", text: value }));
@@ -13,9 +15,11 @@ export function integrityStrip(version, layer) {
   const airtime = version.airtime_s === null ? "unknown" : `${version.airtime_is === "estimated" ? "≈ " : ""}${duration(version.airtime_s)}`;
   const missing = 100 * version.missing_fraction;
   const guessed = 100 * (version.guessed_fraction ?? 0);
+  const despeckled = despeckling(version);
   const facts = h("dl", {},
     version.authenticated === false ? item("acoustic frames", "unauthenticated", { class: "missing", title: authentication(version) }) : null,
     item("codec", version.codec || "none", { title: version.model ? `model ${version.model}` : "no model" }),
+    despeckled ? item("despeckling", despeckled, { title: DESPECKLING }) : null,
     item("bytes", version.bytes_total ? `${version.bytes_received} of ${bytes(version.bytes_total)}` : bytes(version.bytes_received)),
     item("frames", String(version.frames_received)),
     item("air time", airtime),

@@ -7,7 +7,7 @@ import { emit, state } from "./state.js";
 
 const DESCRIPTIONS = {
   refine: "more detail in the whole image", resend: "missing parts of the image", wider: "more seabed around the contact",
-  revisit: "pass the position again",
+  revisit: "pass the position again", original: "the image without despeckling",
 };
 
 function costRow(cost, index) {
