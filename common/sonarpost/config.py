@@ -2,7 +2,7 @@
 
 `[platform]` applies to all services of the file, `[{service}]` to one service. An unknown table or key is an error that
 names file, line and key. The environment variable `SONARPOST_{TABLE}__{KEY}` overrides a value; its text is parsed as a
-TOML value, or used as a string if it is not one.
+TOML value, or used as a string if it is not one. An empty variable overrides nothing.
 """
 
 from __future__ import annotations
@@ -89,6 +89,13 @@ class ServiceConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    def check_with(self, platform: PlatformConfig) -> None:
+        """Check the table together with `[platform]`, and the files that both name; the default accepts everything.
+
+        Raises:
+            ConfigError: The service cannot start with both.
+        """
+
 
 C = TypeVar("C", bound=ServiceConfig)
 
@@ -153,40 +160,128 @@ def load(path: Path, service: str, model: type[C], environment: Mapping[str, str
         ConfigError: The file is unreadable or not TOML, a table or key is unknown, or a value is invalid; names file,
             line and key.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(str(path), "", str(error), "a readable TOML file") from error
-    try:
-        tables: dict[str, object] = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        # tomllib raises other errors than its own for very long numbers and deep nesting.
-        raise ConfigError(str(path), "", str(error), "valid TOML") from error
-    source = _Source(path, text)
-    for name, table in tables.items():
-        if name not in ("platform", *SERVICES):
-            raise source.error((name,), "an unknown table", "platform, " + ", ".join(SERVICES))
-        if not isinstance(table, dict):
-            raise source.error((name,), table, f"a table [{name}]")
-    overrides = _overrides(environment)
-    platform = _validated(PlatformConfig, "platform", tables, overrides, source)
-    return platform, _validated(model, service, tables, overrides, source)
+    file = ConfigFile(path, environment)
+    platform, own = file.table("platform", PlatformConfig), file.table(service, model)
+    if platform is None or own is None or file.errors:
+        raise file.errors[0]
+    return platform, own
 
 
-class _Source:
-    """Creates errors with the file and line of a key."""
+def overridden_keys(service: str, environment: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the keys of `[platform]` and of a service's table that environment variables set, as `table.key`."""
+    prefixes = tuple(f"{ENVIRONMENT_PREFIX}{table.upper()}__" for table in ("platform", service))
+    names = sorted(name for name, text in environment.items() if text and name.startswith(prefixes))
+    return tuple(name.removeprefix(ENVIRONMENT_PREFIX).lower().replace("__", ".") for name in names)
 
-    def __init__(self, path: Path, text: str) -> None:
-        self._path = path
-        self._text = text
+
+class ConfigFile:
+    """A configuration file with its overrides, validated table by table.
+
+    Args:
+        path: The TOML file.
+        environment: Environment variables with overrides.
+
+    Attributes:
+        path: The TOML file.
+        services: Services that have a table in the file, in the order of `SERVICES`.
+        errors: What is invalid: unknown tables and overrides, and the keys of the tables that `table` has validated.
+
+    Raises:
+        ConfigError: The file is unreadable or not TOML.
+    """
+
+    def __init__(self, path: Path, environment: Mapping[str, str]) -> None:
+        self.path = path
+        try:
+            self._text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(str(path), "", str(error), "a readable TOML file") from error
+        try:
+            self._tables: dict[str, object] = tomllib.loads(self._text)
+        except (ValueError, RecursionError) as error:
+            # tomllib raises other errors than its own for very long numbers and deep nesting.
+            raise ConfigError(str(path), "", str(error), "valid TOML") from error
+        self.services = tuple(name for name in SERVICES if name in self._tables)
+        self.errors: list[ConfigError] = []
+        for name, table in self._tables.items():
+            if name not in ("platform", *SERVICES):
+                self.errors.append(self.error((name,), "an unknown table", "platform, " + ", ".join(SERVICES)))
+            elif not isinstance(table, dict):
+                self.errors.append(self.error((name,), table, f"a table [{name}]"))
+        self._overrides: dict[str, dict[str, object]] = {}
+        for name, text in environment.items():
+            self._add_override(name, text)
 
     def error(self, names: Sequence[str], value: object, expected: str) -> ConfigError:
+        """Return an error with the line of a key or, if the key is absent, of the nearest table around it."""
         lines = key_lines(self._text)
-        # The line of the key or, if the key is absent, of the nearest table around it.
         known = (lines.get(tuple(names[:length])) for length in range(len(names), 0, -1))
         line = next((number for number in known if number is not None), None)
-        where = str(self._path) if line is None else f"{self._path}:{line}"
+        where = str(self.path) if line is None else f"{self.path}:{line}"
         return ConfigError(where, ".".join(names), value, expected)
+
+    def table(self, name: str, model: type[C]) -> C | None:
+        """Return a table with its overrides; None if it is invalid, with all its errors in `errors`.
+
+        Args:
+            name: "platform" or a service; an absent table has default values.
+            model: Type of the table.
+        """
+        written = self._tables.get(name, {})
+        if not isinstance(written, dict):
+            return None  # in `errors` already
+        overrides = self._overrides.get(name, {})
+        merged, renamed = _merged(name, written, overrides), self._renamed(name, written, overrides)
+        self.errors += renamed.values()
+        for key in renamed:
+            merged.pop(key, None)
+        try:
+            # As JSON, whose types fit pydantic's strict mode: no "5" for 5, no true for 1.
+            table = model.model_validate_json(to_json(merged), strict=True)
+        except ConfigError as error:  # in a file that the table names
+            self.errors.append(error)
+            return None
+        except ValidationError as error:
+            for details in error.errors(include_url=False):
+                names = [str(part) for part in details["loc"] if part != "[key]"]
+                value = "nothing" if details["type"] == "missing" else details["input"]
+                expected = expected_text(details["type"], details["msg"])
+                if details["type"] == "extra_forbidden":
+                    value, expected = "an unknown key", _known_keys(model, names)
+                by_environment = next((n for n in ("__".join(names[:2]), *names[:1]) if n in overrides), None)
+                if by_environment is not None:
+                    self.errors.append(_override_error(name, by_environment, value, expected))
+                else:
+                    self.errors.append(self.error((name, *names), value, expected))
+            return None
+        return None if renamed else table
+
+    def _add_override(self, name: str, text: str) -> None:
+        if not text or not name.startswith(ENVIRONMENT_PREFIX) or "__" not in name:
+            return
+        table, _, key = name[len(ENVIRONMENT_PREFIX) :].lower().partition("__")
+        if key and table in ("platform", *SERVICES):
+            self._overrides.setdefault(table, {})[key] = _toml_value(text)
+        else:
+            expected = "SONARPOST_{platform or a service's name}__{KEY}"
+            self.errors.append(ConfigError("environment", name, text, expected))
+
+    def _renamed(
+        self, table: str, written: Mapping[str, object], overrides: Mapping[str, object]
+    ) -> dict[str, ConfigError]:
+        """Return an error for each key that has its name of version 0.1; the error names the present one."""
+        found: dict[str, ConfigError] = {}
+        for old, new in RENAMED_KEYS.get(table, {}).items():
+            value, expected = "the key's name of version 0.1", f"its new name, {new}"
+            if old in written:
+                found[old] = self.error((table, old), value, expected)
+            elif old in overrides:
+                found[old] = _override_error(table, old, value, expected)
+        return found
+
+
+def _override_error(table: str, key: str, value: object, expected: str) -> ConfigError:
+    return ConfigError("environment", f"{ENVIRONMENT_PREFIX}{table.upper()}__{key.upper()}", value, expected)
 
 
 def key_lines(text: str) -> dict[tuple[str, ...], int]:
@@ -223,18 +318,6 @@ def _paths(value: object, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...
         yield from _paths(member, (*path, str(name)))
 
 
-def _overrides(environment: Mapping[str, str]) -> dict[str, dict[str, object]]:
-    found: dict[str, dict[str, object]] = {}
-    for name, text in environment.items():
-        if not name.startswith(ENVIRONMENT_PREFIX) or "__" not in name:
-            continue
-        table, _, key = name[len(ENVIRONMENT_PREFIX) :].lower().partition("__")
-        if not key or table not in ("platform", *SERVICES):
-            raise ConfigError("environment", name, text, "SONARPOST_{platform or a service's name}__{KEY}")
-        found.setdefault(table, {})[key] = _toml_value(text)
-    return found
-
-
 def _merged(table: str, written: Mapping[str, object], overrides: Mapping[str, object]) -> dict[str, object]:
     """Return a table with its overrides."""
     merged = dict(written)
@@ -255,46 +338,6 @@ def _toml_value(text: str) -> object:
         return text
     # Text of several lines can parse as several keys; it is one value.
     return parsed["value"] if len(parsed) == 1 else text
-
-
-def _validated(
-    model: type[C],
-    table: str,
-    tables: Mapping[str, object],
-    overrides: Mapping[str, Mapping[str, object]],
-    source: _Source,
-) -> C:
-    written = tables.get(table, {})
-    assert isinstance(written, dict)
-    own_overrides = overrides.get(table, {})
-    _reject_renamed(table, written, own_overrides, source)
-    try:
-        # As JSON, whose types fit pydantic's strict mode: no "5" for 5, no true for 1.
-        return model.model_validate_json(to_json(_merged(table, written, own_overrides)), strict=True)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        names = [str(part) for part in first["loc"] if part != "[key]"]
-        value = "nothing" if first["type"] == "missing" else first["input"]
-        expected = expected_text(first["type"], first["msg"])
-        if first["type"] == "extra_forbidden":
-            value, expected = "an unknown key", _known_keys(model, names)
-        by_environment = next((n for n in ("__".join(names[:2]), *names[:1]) if n in own_overrides), None)
-        if by_environment is not None:
-            name = f"{ENVIRONMENT_PREFIX}{table.upper()}__{by_environment.upper()}"
-            raise ConfigError("environment", name, value, expected) from error
-        raise source.error((table, *names), value, expected) from error
-
-
-def _reject_renamed(
-    table: str, written: Mapping[str, object], overrides: Mapping[str, object], source: _Source
-) -> None:
-    """Raise ConfigError if a key has its name of version 0.1; the error names the present one."""
-    for old, new in RENAMED_KEYS.get(table, {}).items():
-        value, expected = "the key's name of version 0.1", f"its new name, {new}"
-        if old in written:
-            raise source.error((table, old), value, expected)
-        if old in overrides:
-            raise ConfigError("environment", f"{ENVIRONMENT_PREFIX}{table.upper()}__{old.upper()}", value, expected)
 
 
 def _known_keys(model: type[ServiceConfig], names: Sequence[str]) -> str:

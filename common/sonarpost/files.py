@@ -61,7 +61,11 @@ def _create_temporary(path: Path, mode: int) -> tuple[int, Path]:
     """Create a temporary file for `path` with a mode that the umask limits; return its descriptor and path."""
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-    return os.open(temporary, flags, mode), temporary
+    try:
+        return os.open(temporary, flags, mode), temporary
+    except OSError as error:
+        error.filename = str(path)  # the file that the caller knows
+        raise
 
 
 def make_private(path: Path) -> None:

@@ -8,7 +8,7 @@ is None. Times are seconds since 1970-01-01 UTC.
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -35,12 +35,20 @@ RecordId = Annotated[str, Field(pattern=r"^[!-~]{1,64}$")]
 
 Channel = Literal["port", "starboard"]
 Verdict = Literal["mine_like", "not_mine_like", "unsure"]
-CommandKind = Literal["refine", "resend", "revisit", "wider"]
+CommandKind = Literal["refine", "resend", "revisit", "wider", "original"]
 TaskingKind = Literal["advice", "command"]
 DeliveryState = Literal["waiting", "delivered", "refused"]
-DownlinkKind = Literal["refine", "resend", "revisit", "decision", "wider"]
+DownlinkKind = Literal["refine", "resend", "revisit", "decision", "wider", "original"]
 DownlinkStep = Literal["asked", "sent", "confirmed", "refused", "expired"]
 ServiceState = Literal["starting", "ok", "degraded", "stopping"]
+
+_IMAGE_OF_COMMAND: Final = {
+    "refine": "the image to refine",
+    "resend": "the image to resend",
+    "wider": "the image to show more around",
+    "original": "the image to send without despeckling",
+}
+"""The image that each kind of command names, for error messages."""
 
 
 class Record(BaseModel):
@@ -79,7 +87,7 @@ class Pixels(Record):
         height_px, width_px, bits = info.data["height_px"], info.data["width_px"], info.data["bits"]
         expected = height_px * width_px * bits // 8
         if len(data) != expected:
-            raise ValueError(f"{expected} bytes for {width_px} x {height_px} px of {bits} bits, not {len(data)}")
+            raise ValueError(f"{expected} bytes for {width_px} × {height_px} px of {bits} bits, not {len(data)}")
         return data
 
     @classmethod
@@ -364,6 +372,8 @@ class ReconstructedImage(Record):
         notes: Remarks for the operator about this image.
         authenticated: Whether all acoustic frames that contributed were authenticated with a key. None: not known, in
             records of earlier versions.
+        despeckle_strength: Strength with which the vehicle removed speckle before coding, 0 for none. None: not known,
+            with codecs without despeckling and in records of earlier versions.
     """
 
     TYPE: ClassVar[str] = "reconstructed_image"
@@ -388,6 +398,7 @@ class ReconstructedImage(Record):
     last_frame_utc_s: Time
     notes: tuple[Text, ...] = ()
     authenticated: bool | None = None
+    despeckle_strength: Fraction | None = None
 
     @field_validator("picture_sha256")
     @classmethod
@@ -581,7 +592,7 @@ class Command(Record):
     Attributes:
         command_id: Unique; a repeated command is recognised by it.
         kind: refine: more detail. resend: the same again. wider: more seabed around the contact, as an image of its
-            own. revisit: survey a position again.
+            own. original: the contact without despeckling, as an image of its own. revisit: survey a position again.
         vehicle_id: Vehicle that receives it.
         image_id: Image of the request; None only for `revisit`.
         lat_deg: Position to revisit. None for the other kinds.
@@ -605,8 +616,8 @@ class Command(Record):
     @classmethod
     def _check_image_id(cls, image_id: str | None, info: ValidationInfo) -> str | None:
         kind = info.data.get("kind")
-        if image_id is None and kind in ("refine", "resend", "wider"):
-            raise ValueError("the image to show more around" if kind == "wider" else f"the image to {kind}")
+        if image_id is None and kind in _IMAGE_OF_COMMAND:
+            raise ValueError(_IMAGE_OF_COMMAND[kind])
         return image_id
 
     @field_validator("lat_deg", "lon_deg")
