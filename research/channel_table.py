@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.events import AcousticPacket, ArrivalEnded, FrameOutcome, PacketKind
@@ -73,4 +74,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with ProgressDisplay(step="channel_table"):
+        main()

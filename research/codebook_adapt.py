@@ -21,7 +21,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from research.common.images import missing_data
 from research.common.patches import stretch
+from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split
 from sonarpost.codec.vq.builder import TrainingImage
 from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, load_default
@@ -45,21 +47,22 @@ def main() -> int:
         default=folder,
         required=folder is None,
         metavar="DIR",
-        help="folder of recordings (default: the environment variable SONARPOST_DATA)",
+        help="folder of recordings, see research/README.md#data (default: the environment variable SONARPOST_DATA)",
     )
     args = parser.parse_args()
     if os.environ.get("OMP_NUM_THREADS") != "1":
         # The libraries read this when they are loaded, so the program restarts itself.
         os.environ.update({f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")})
         os.execv(sys.executable, [sys.executable, "-m", "research.codebook_adapt", *sys.argv[1:]])
+    for pattern in SETS.values():
+        if not any(args.data.glob(pattern)):
+            print(f"codebook_adapt: {missing_data(args.data, f'no {pattern}')}", file=sys.stderr)
+            return 2
     print("| images | base | PSNR before / after | FOM before / after | better in | time, one core |")
     print("|---|---|---|---|---|---|")
     improved = True
     for title, pattern in SETS.items():
         images = list(_windows(sorted(args.data.glob(pattern))))
-        if not images:
-            print(f"codebook_adapt: no {pattern} in {args.data}", file=sys.stderr)
-            return 2
         for tile_px in DEFAULT_TILE_PX:
             improved &= _row(title, images, tile_px)
     return 0 if improved else 1
@@ -104,4 +107,5 @@ def _means(measured: list[CodebookQuality]) -> tuple[float, float]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with ProgressDisplay(step="codebook_adapt"):
+        sys.exit(main())

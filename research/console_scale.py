@@ -25,6 +25,7 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.demo.settings import free_ports
+from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.config import PlatformConfig
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
@@ -148,4 +149,5 @@ def show(name: str, times_s: list[float]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with ProgressDisplay(step="console_scale"):
+        main()

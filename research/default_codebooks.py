@@ -165,7 +165,12 @@ def _channel(folder: Path, channel: str) -> npt.NDArray[np.generic]:
     images = sorted(folder.glob(f"*{channel}*.png"))
     if recordings or len(images) != 1:
         found = [path.name for path in (*recordings, *images)]
-        raise CodebookError(str(folder), channel, found, f"one {channel}.SON, or one PNG with {channel} in its name")
+        raise CodebookError(
+            str(folder),
+            channel,
+            found,
+            f"one {channel}.SON, or one PNG with {channel} in its name (research/README.md#data)",
+        )
     return read_image(images[0])
 
 

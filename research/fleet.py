@@ -40,6 +40,7 @@ from sonarpost import keys
 from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.bus.session import client_config
 from sonarpost.cli.demo.settings import free_ports
+from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.messages import Pixels, ReconstructedImage, Record
 from sonarpost.runtime.service import Service, UnitOfWork
@@ -380,7 +381,7 @@ def main() -> int:
         return 0
     passed = True
     for count in [int(n) for n in args.grow.split(",")] if args.grow else [args.vehicles]:
-        with tempfile.TemporaryDirectory(dir=args.dir) as name:
+        with ProgressDisplay(step=f"fleet of {count}"), tempfile.TemporaryDirectory(dir=args.dir) as name:
             result = run(Path(name), count, args.vessels, args.seconds, args.every)
         print(json.dumps(result), flush=True)
         passed = passed and bool(result["good"])

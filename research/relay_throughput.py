@@ -41,6 +41,7 @@ from research.fleet import noise_image
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.demo.settings import free_ports
+from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.protocol import CHUNK_BYTES
 from sonarpost.delivery.scheduler import WINDOW, WINDOW_BYTES
@@ -209,7 +210,7 @@ def main() -> int:
     if args.far_side:
         far_side(args.far_side[0], Path(args.far_side[1]))
         return 0
-    with tempfile.TemporaryDirectory(dir=args.dir) as name:
+    with ProgressDisplay(step="relay_throughput"), tempfile.TemporaryDirectory(dir=args.dir) as name:
         return compare(Path(name), args.decisions, args.pictures)
 
 

@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from research.common.patches import stretch
+from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.interface import to_uint8
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, Tiles, cut_tiles
@@ -60,7 +61,7 @@ def main() -> int:
     database = load_default(10).tiles
     images = [cut_tiles(image, 10) for image in _images(args.images, args.pictures)]
     if not images:
-        print(f"tile_search: no image of {WIDTH_PX} x {HEIGHT_PX} px or more in {args.images}", file=sys.stderr)
+        print(f"tile_search: no image of {WIDTH_PX} × {HEIGHT_PX} px or more in {args.images}", file=sys.stderr)
         return 2
     index = faiss.IndexFlatL2(database.dims)
     index.add(_coordinates(database, database.tiles))
@@ -161,4 +162,5 @@ def _centre(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with ProgressDisplay(step="tile_search"):
+        sys.exit(main())

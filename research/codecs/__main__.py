@@ -11,16 +11,26 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from research.codecs.report import curves, details, json_line, miss_lines, rate_differences, result_rows, text
 from research.common.command import (
     add_codec_arguments,
+    add_strength_argument,
     command_parser,
     parse_budgets,
     report_progress,
     run_command,
     selected_codecs,
+    warn,
 )
 from research.common.images import ImageSet, SampleImage, read_image_folder, sdvd_crops, simulated_images
-from research.common.measurement import SHIPPED_CODEBOOKS, BudgetResult, CodecUnderTest, code_image, measure_codec
+from research.common.measurement import (
+    SHIPPED_CODEBOOKS,
+    BudgetResult,
+    CodecUnderTest,
+    code_image,
+    measure_codec,
+    scene_reference,
+)
 from research.common.plots import SheetCell, new_figure, save_figure, write_sheet
 from research.common.statistics import bootstrap_weights, finite_mean
+from sonarpost.cli.shared import add_fit_option, in_new_folder
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
@@ -44,10 +54,9 @@ def new_parser() -> argparse.ArgumentParser:
         "images are cut from simulated surveys.",
     )
     source = parser.add_mutually_exclusive_group()
-    source.add_argument(
-        "--images", type=Path, metavar="DIR", help="grey PNG, JPEG or TIFF images of 16..512 px a side, at any depth"
-    )
+    source.add_argument("--images", type=Path, metavar="DIR", help="JPEG, PNG or TIFF images of any depth and colour")
     source.add_argument("--sdvd", type=Path, metavar="DIR", help="the SDVD data set: crops of its test split")
+    add_fit_option(parser)
     parser.add_argument(
         "--crop", type=int, metavar="PX", help="side of the crops or simulated images (80); --images is SDVD then"
     )
@@ -56,6 +65,7 @@ def new_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the simulated images (default: 0)")
     add_codec_arguments(parser)
+    add_strength_argument(parser)
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw rate-distortion curves (needs matplotlib)")
     parser.add_argument(
         "--details", type=Path, metavar="FILE.json", help="write all figures: intervals, misses, variants"
@@ -75,8 +85,12 @@ def new_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def selected_images(args: argparse.Namespace) -> ImageSet:
+def selected_images(args: argparse.Namespace, *, with_scenes: bool = False) -> ImageSet:
     """Return the images of the options; print rejected files to standard error.
+
+    Args:
+        args: The parsed options.
+        with_scenes: Whether simulated images have their speckle-free scenes.
 
     Raises:
         SurveyFileError: The folder or the data set cannot be read.
@@ -89,10 +103,12 @@ def selected_images(args: argparse.Namespace) -> ImageSet:
     if sdvd is not None:
         return sdvd_crops(sdvd, "test", side_px)
     if args.images is None:
-        return simulated_images(args.count, args.seed, side_px)
-    found = read_image_folder(args.images)
+        return simulated_images(args.count, args.seed, side_px, with_scenes=with_scenes)
+    found = read_image_folder(args.images, args.fit)
     for line in found.rejected:
-        report_progress(f"rejected: {line}")
+        warn(f"rejected: {line}")
+    for line in found.notes:
+        warn(line)
     return found
 
 
@@ -104,12 +120,20 @@ def run(args: argparse.Namespace) -> int:
         OSError: A file cannot be written.
     """
     budgets = parse_budgets(args.budgets)
-    _check_output_folders(args)
+    for path in (args.plot, args.sheet, args.details):
+        if path is not None:
+            in_new_folder(path)
     if args.plot is not None:
         new_figure(1, 1)  # a missing extra is reported before the measurement
     tested = selected_codecs(args, cut=args.cut, codebooks=args.codebooks)
-    measured = selected_images(args)
-    results = [result for codec in tested for result in measure_codec(codec, measured.images, budgets, report_progress)]
+    with_scenes = args.json or args.details is not None  # the tables do not show these measures
+    measured = selected_images(args, with_scenes=with_scenes)
+    references = [scene_reference(image) for image in measured.images] if with_scenes else []
+    results = [
+        result
+        for codec in tested
+        for result in measure_codec(codec, measured.images, budgets, report_progress, references)
+    ]
     weights = bootstrap_weights([image.source for image in measured.images])
     title = f"{len(measured.images)} images of {measured.origin}"
     if args.plot is not None:
@@ -122,18 +146,10 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json_line(result_rows(results, budgets), len(measured.images), differences))
         for line in miss_lines(results):
-            report_progress(line)
+            warn(line)
     else:
         print(text(results, measured, weights, differences))
     return 0
-
-
-def _check_output_folders(args: argparse.Namespace) -> None:
-    """Report an output file that cannot be written before the measurement."""
-    for option in ("plot", "sheet", "details"):
-        path: Path | None = getattr(args, option)
-        if path is not None and not path.absolute().parent.is_dir():
-            raise ConfigError("research", f"--{option}", str(path), "a file in a folder that exists")
 
 
 def sheet_rows(

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from research.common.images import ImageSet
-from research.common.measurement import BudgetResult, best_within_budgets
+from research.common.measurement import SCENE_MEASURES, BudgetResult, best_within_budgets
 from research.common.statistics import (
     Interval,
     Values,
@@ -72,7 +72,16 @@ def _figures(result: BudgetResult) -> dict[str, float | None]:
         "msssim": _rounded(finite_mean(result.msssim), 5),
         "encode_ms": _rounded(_finite_median(result.encode_ms), 3),
         "decode_ms": _rounded(_finite_median(result.decode_ms), 3),
+        **{name: _scene_figure(result, name) for name in SCENE_MEASURES},
     }
+
+
+def _scene_figure(result: BudgetResult, name: str) -> float | None:
+    """Return the mean of PSNR or dots, or the median of errors; None if it does not apply or was not measured."""
+    values = result.scene.get(name)
+    if values is None:
+        return None
+    return _rounded(_finite_median(values) if "error" in name else finite_mean(values), 4)
 
 
 def detail_rows(results: Sequence[BudgetResult], weights: Values) -> list[_Json]:

@@ -8,7 +8,10 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from research.common.measurement import SHIPPED_CODEBOOKS, CodecUnderTest, create_codecs
-from sonarpost.cli.main import exit_status
+from sonarpost.cli.main import apply_verbosity, exit_status
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.codec import emb
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import ConfigError
 
@@ -18,7 +21,7 @@ MAX_BUDGET_BYTES: Final = 1 << 20
 
 def command_parser(name: str, description: str) -> argparse.ArgumentParser:
     """Return the parser of `python -m research.NAME`."""
-    return argparse.ArgumentParser(prog=f"python -m research.{name}", description=description)
+    return CommandParser(prog=f"python -m research.{name}", description=description)
 
 
 def run_command(
@@ -31,12 +34,29 @@ def run_command(
     An error of the package or of the operating system is printed as one line and gives status 2.
     """
     parsed = parser.parse_args(arguments)
-    return exit_status(lambda: run(parsed), parser.prog)
+    apply_verbosity(parsed)
+    with ProgressDisplay(step=parser.prog.removeprefix("python -m ")) as display:
+        _displays.append(display)
+        try:
+            return exit_status(lambda: run(parsed), parser.prog)
+        finally:
+            _displays.remove(display)
 
 
-def report_progress(line: str) -> None:
-    """Print a line to standard error, apart from the results."""
+_displays: list[ProgressDisplay] = []
+"""The display of the command that runs."""
+
+
+def warn(line: str) -> None:
+    """Print a line about the input or the result to standard error, with --quiet as well."""
     print(line, file=sys.stderr, flush=True)
+
+
+def report_progress(step: str) -> None:
+    """Print the step that begins, or ended, to standard error; until the next one its time is shown."""
+    for display in _displays:
+        display.show(step)
+        display.line(step)
 
 
 def add_codec_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,6 +68,17 @@ def add_codec_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
 
 
+def add_strength_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the option for the strength of despeckling."""
+    parser.add_argument(
+        "--strength",
+        type=float,
+        metavar="S",
+        default=emb.DEFAULT_STRENGTH,
+        help="emb: strength of despeckling, 0 (code the image as it is) to 1 (default: %(default)g)",
+    )
+
+
 def selected_codecs(
     args: argparse.Namespace,
     *,
@@ -57,16 +88,19 @@ def selected_codecs(
 ) -> list[CodecUnderTest]:
     """Return the codecs of the options; print unavailable ones to standard error.
 
+    The strength of despeckling is the default one if the command does not have that option.
+
     Raises:
-        ConfigError: A requested codec is unknown or not available.
+        ConfigError: A requested codec is unknown or not available, or the strength is out of range.
         CodebookError: A codebook cannot be read.
     """
+    strength: float | None = getattr(args, "strength", None)
     names = None if args.codecs is None else [name.strip() for name in args.codecs.split(",")]
     found, unavailable = create_codecs(
-        default_registry(), names, all_packings=all_packings, cut=cut, codebooks=codebooks
+        default_registry(), names, all_packings=all_packings, cut=cut, codebooks=codebooks, strength=strength
     )
     for line in unavailable:
-        report_progress(f"left out: {line}")
+        warn(f"left out: {line}")
     return found
 
 

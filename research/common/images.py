@@ -13,27 +13,24 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
 import re
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 from PIL import Image as PillowImage
 
+from research.common.scene_measures import ObjectPlace, place_in_window
+from sonarpost.codec.fitting import Fit, fit_image
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX, Image, to_uint8
-from sonarpost.detection.snippets import to_grey
-from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.detection.snippets import HIGH_PERCENTILE, LOW_PERCENTILE, to_grey
+from sonarpost.errors import BadInputError, ConfigError, SurveyFileError
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
-from sonarpost.sonar.image_files import MAX_FILE_BYTES, MAX_PIXELS, read_image
-
-JPEG_SUFFIXES: Final = (".jpg", ".jpeg")
-SUFFIXES: Final = (*JPEG_SUFFIXES, ".png", ".tif", ".tiff")
-MAX_IMAGES: Final = 100_000
+from sonarpost.sonar.image_files import IMAGE_SUFFIXES, MAX_IMAGES, list_images, read_any_image, read_image
 
 _FIRST_SEED: Final = 910_000
 """Differs from the seeds of the shipped codebooks (7000 to 7051): no test image is a training image."""
@@ -44,7 +41,8 @@ WINDOW_PX: Final = 120
 TILE_PX: Final = 256
 CROPS: Final = {"train": 6, "test": 2}
 _SHIFT_PX: Final = 12
-_FIELDS: Final = ("split", "image", "target_px", "x0", "y0", "x1", "y1")
+SDVD_FIELDS: Final = ("split", "image", "w", "h", "target_px", "x0", "y0", "x1", "y1")
+_FIELDS: Final = tuple(field for field in SDVD_FIELDS if field not in ("w", "h"))
 _MAX_INDEX_BYTES: Final = 1 << 24
 _TIME: Final = re.compile(r"_(\d{12})\d{2}[HL]_")
 
@@ -59,6 +57,8 @@ class SampleImage:
         pixels: Shape (16..512, 16..512), uint8.
         group: Survey line, if known.
         is_target: Whether it shows a target; None if unknown.
+        clean: The same scene without speckle, same shape and grey scale; None if unknown.
+        place: Place of the object that it was cut around; None if unknown.
     """
 
     name: str
@@ -66,6 +66,8 @@ class SampleImage:
     pixels: Image
     group: str = ""
     is_target: bool | None = None
+    clean: Image | None = None
+    place: ObjectPlace | None = None
 
 
 @dataclass(frozen=True)
@@ -76,98 +78,46 @@ class ImageSet:
         origin: Description of where they are from.
         images: At least one.
         rejected: One line for each file that cannot be used, with the reason.
+        notes: One line for each conversion of an image.
     """
 
     origin: str
     images: tuple[SampleImage, ...]
     rejected: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
-def read_image_folder(folder: Path) -> ImageSet:
-    """Read every grey PNG, JPEG and TIFF in a folder and its subfolders, in order of their paths.
+def read_image_folder(folder: Path, fit: Fit = "refuse") -> ImageSet:
+    """Read every JPEG, PNG and TIFF in a folder and its subfolders, in order of their paths, as grey of 8 bits.
 
-    Files that cannot be measured on (a side outside 16..512 px, colour, damage) are rejected and listed. 16-bit images
-    are mapped to 8 bits as the codecs do. Links to folders are not followed.
+    Files that cannot be measured on (damage, a side outside 16..512 px unless `fit` changes it) are rejected and
+    listed, and so are other files. 16-bit images are mapped to 8 bits as the codecs do. Links to folders are not
+    followed.
 
     Raises:
         SurveyFileError: Not a folder, not readable, or without a usable image.
     """
-    if not folder.is_dir():
-        raise SurveyFileError(str(folder), "", "not a folder or absent", "a folder of PNG, JPEG or TIFF images")
+    found = list_images(folder, recursive=True)
     images: list[SampleImage] = []
     rejected: list[str] = []
-    for path in _image_paths(folder):
+    notes: list[str] = []
+    for path in found.images:
         name = str(path.relative_to(folder))
         try:
-            images.append(SampleImage(name, name, _read_usable(path)))
-        except SurveyFileError as error:
+            read = read_any_image(path)
+            fitted = fit_image(read.pixels, fit, str(path))
+        except BadInputError as error:
             rejected.append(str(error))
+            continue
+        images.append(SampleImage(name, name, to_uint8(fitted.pixels)))
+        notes += [f"{path}: {note}" for note in (*read.notes, *fitted.notes)]
     if not images:
-        expected = f"at least one grey {', '.join(SUFFIXES)} of {MIN_SIDE_PX}..{MAX_SIDE_PX} px a side"
-        if rejected:
-            expected += f" (the first one rejected is {rejected[0]})"
+        expected = f"at least one {', '.join(IMAGE_SUFFIXES)} (the first one rejected is {rejected[0]})"
         raise SurveyFileError(str(folder), "images", f"none, {len(rejected)} rejected", expected)
-    return ImageSet(str(folder), tuple(images), tuple(rejected))
+    return ImageSet(str(folder), tuple(images), (*rejected, *found.unused), tuple(notes))
 
 
-def _image_paths(folder: Path) -> list[Path]:
-    def fail(error: OSError) -> None:
-        raise SurveyFileError(str(folder), "", error.strerror or str(error), "readable folders") from error
-
-    paths = [
-        Path(place) / name
-        for place, _, names in os.walk(folder, onerror=fail)
-        for name in names
-        if Path(name).suffix.lower() in SUFFIXES
-    ]
-    if len(paths) > MAX_IMAGES:
-        raise SurveyFileError(str(folder), "images", len(paths), f"at most {MAX_IMAGES}")
-    return sorted(paths)
-
-
-def _read_usable(path: Path) -> Image:
-    pixels = read_grey(path)
-    for field, value in (("height", pixels.shape[0]), ("width", pixels.shape[1])):
-        if not MIN_SIDE_PX <= value <= MAX_SIDE_PX:
-            raise SurveyFileError(str(path), field, f"{value} px", f"{MIN_SIDE_PX}..{MAX_SIDE_PX} px")
-    return pixels
-
-
-def read_grey(path: Path) -> Image:
-    """Read a grey PNG, JPEG or TIFF, shape (rows, columns), mapped to uint8.
-
-    Raises:
-        SurveyFileError: The file cannot be read, is damaged, too large, or in colour.
-    """
-    return _read_jpeg(path) if path.suffix.lower() in JPEG_SUFFIXES else to_uint8(read_image(path))
-
-
-def _read_jpeg(path: Path) -> Image:
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise SurveyFileError(str(path), "file size", path.stat().st_size, f"at most {MAX_FILE_BYTES} bytes")
-        raw = path.read_bytes()
-    except OSError as error:
-        raise SurveyFileError(str(path), "", error.strerror or str(error), "a readable image") from error
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with PillowImage.open(io.BytesIO(raw), formats=["JPEG"]) as image:
-                size = image.size
-                fits = size[0] * size[1] <= MAX_PIXELS  # the declared size is checked before decoding
-                pixels = np.asarray(image, dtype=np.uint8) if fits else np.empty(0, dtype=np.uint8)
-    except Exception as error:  # Pillow raises OSError, SyntaxError, ValueError, struct.error, ...
-        raise SurveyFileError(str(path), "JPEG data", str(error), "an undamaged JPEG") from error
-    if not fits:
-        raise SurveyFileError(str(path), "size", f"{size[0]} x {size[1]}", f"at most {MAX_PIXELS} pixels")
-    if pixels.ndim == 3 and pixels.shape[2] == 3 and (pixels == pixels[..., :1]).all():
-        pixels = pixels[..., 0]
-    if pixels.ndim != 2:
-        raise SurveyFileError(str(path), "colour", f"{pixels.shape}", "a grey image")
-    return np.ascontiguousarray(pixels)
-
-
-def simulated_images(count: int, seed: int = 0, side_px: int = 80) -> ImageSet:
+def simulated_images(count: int, seed: int = 0, side_px: int = 80, *, with_scenes: bool = False) -> ImageSet:
     """Cut images from simulated surveys over every kind of seabed, half of them with a mine-like object.
 
     Each image is cut at the resolution of the survey around a mine-like object, another object, or (every fourth of
@@ -177,6 +127,7 @@ def simulated_images(count: int, seed: int = 0, side_px: int = 80) -> ImageSet:
         count: Number of images, 1..100,000.
         seed: The same values give the same images.
         side_px: Side of the square images, 16..500 px.
+        with_scenes: Whether to simulate each survey without speckle as well, for `clean` and `place`.
 
     Raises:
         ConfigError: A number out of range.
@@ -195,12 +146,13 @@ def simulated_images(count: int, seed: int = 0, side_px: int = 80) -> ImageSet:
             targets=_OBJECTS_PER_LINE,
             clutter=_OBJECTS_PER_LINE,
         )
-        images += _cut_simulated(spec, side_px)
+        images += _cut_simulated(spec, side_px, with_scenes=with_scenes)
     return ImageSet(f"simulated surveys, seed {seed}", tuple(images[:count]))
 
 
-def _cut_simulated(spec: SurveySpec, side_px: int) -> list[SampleImage]:
+def _cut_simulated(spec: SurveySpec, side_px: int, *, with_scenes: bool) -> list[SampleImage]:
     simulated = simulate_survey(spec)
+    without_speckle = simulate_survey(spec, speckle=False).survey if with_scenes else None
     rng = np.random.default_rng(spec.seed)
     waterfalls = {side: simulated.survey.waterfall(side) for side in simulated.survey.sides()}
     line = simulated.survey.line_name
@@ -211,20 +163,43 @@ def _cut_simulated(spec: SurveySpec, side_px: int) -> list[SampleImage]:
         rows, columns = waterfall.shape
         down, right = (int(v) for v in rng.integers(-side_px // 10, side_px // 10 + 1, 2))
         row, column = thing.ping + down, thing.sample_index + side_px // 8 + right
+        is_bare_seabed = False
         if not thing.is_mine_like:
             others += 1
-            if others % 4 == 0:
+            is_bare_seabed = others % 4 == 0
+            if is_bare_seabed:
                 row, column = int(rng.integers(0, rows)), int(rng.integers(columns // 3, columns))
         top = min(max(row - side_px // 2, 0), rows - side_px)
         left = min(max(column - side_px // 2, 0), columns - side_px)
         window = waterfall[top : top + side_px, left : left + side_px]
         grey = to_grey(window.astype(np.uint32), np.ones(window.shape, dtype=np.bool_))
         name = f"{line} {number}"
-        images.append(SampleImage(name, name, grey, line, thing.is_mine_like))
+        clean, place = None, None
+        if without_speckle is not None:
+            scene = without_speckle.waterfall(thing.side)[top : top + side_px, left : left + side_px]
+            clean = grey_on_scale(scene, window)
+            altitude_m = simulated.survey.pings[thing.ping].altitude_m
+            if not is_bare_seabed and altitude_m is not None:
+                place = place_in_window(thing, spec, altitude_m, top, left)
+        images.append(SampleImage(name, name, grey, line, thing.is_mine_like, clean, place))
     # Alternating, so that the first images of the set contain both kinds.
     targets = [image for image in images if image.is_target]
     rest = [image for image in images if not image.is_target]
     return [image for pair in zip(targets, rest, strict=True) for image in pair]
+
+
+def grey_on_scale(values: npt.NDArray[np.float32], scale: npt.NDArray[np.float32]) -> Image:
+    """Map file values to grey as `to_grey` maps them, with the percentiles of `scale`.
+
+    Args:
+        values: Shape (rows, columns), not negative.
+        scale: File values whose grey scale is used, of any shape.
+    """
+    low, high = np.percentile(np.sqrt(scale.astype(np.float64)), (LOW_PERCENTILE, HIGH_PERCENTILE))
+    if high <= low:
+        return np.full(values.shape, 128, dtype=np.uint8)
+    scaled = 255.0 * (np.sqrt(values.astype(np.float64)) - low) / (high - low)
+    return np.asarray(np.clip(np.rint(scaled), 0, 255), dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -289,6 +264,11 @@ def _corners(tile: SdvdTile, rng: np.random.Generator) -> Iterator[tuple[int, in
         yield min(max(x, half), TILE_PX - half) - half, min(max(y, half), TILE_PX - half) - half
 
 
+def missing_data(path: Path, found: str) -> SurveyFileError:
+    """Return the error for recordings that are not there, which says where to get them."""
+    return SurveyFileError(str(path), "", found, "recordings; research/README.md#data states where to get them")
+
+
 def read_sdvd_index(folder: Path) -> list[SdvdTile]:
     """Read `index.csv` of the data set.
 
@@ -301,7 +281,7 @@ def read_sdvd_index(folder: Path) -> list[SdvdTile]:
             raise SurveyFileError(str(path), "file size", path.stat().st_size, f"at most {_MAX_INDEX_BYTES} bytes")
         text = path.read_bytes().decode("utf-8")
     except OSError as error:
-        raise SurveyFileError(str(path), "", error.strerror or str(error), "the data set's index.csv") from error
+        raise missing_data(path, error.strerror or str(error)) from error
     except UnicodeDecodeError as error:
         raise SurveyFileError(str(path), "text", str(error), "UTF-8") from error
     try:
@@ -329,7 +309,8 @@ def _tile(row: dict[str, str], where: str) -> SdvdTile:
 
 
 def _read_tile(path: Path) -> PillowImage.Image:
-    pixels = read_grey(path)
+    pixels = to_uint8(read_image(path))
     if pixels.shape != (TILE_PX, TILE_PX):
-        raise SurveyFileError(str(path), "size", pixels.shape, f"{TILE_PX} x {TILE_PX} px")
+        size = f"{pixels.shape[1]} × {pixels.shape[0]} px"
+        raise SurveyFileError(str(path), "size", size, f"{TILE_PX} × {TILE_PX} px")
     return PillowImage.fromarray(pixels)

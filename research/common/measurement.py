@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, TypeVar
 
@@ -12,10 +13,18 @@ import numpy as np
 import numpy.typing as npt
 
 from research.common.images import SampleImage
+from research.common.nonlocal_means import reference_filtered
 from research.common.quality import ms_ssim
+from research.common.scene_measures import (
+    ObjectMeasurement,
+    clipped_psnr_db,
+    count_dots,
+    measure_object,
+    object_errors,
+)
 from sonarpost.codec import emb
 from sonarpost.codec.interface import Codec, Image
-from sonarpost.codec.quality import psnr_db, ssim
+from sonarpost.codec.quality import ssim
 from sonarpost.codec.registry import CodecRegistry, CodecResources, default_registry
 from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, open_codebook
 from sonarpost.codec.vq.codec import IndexPacking
@@ -24,8 +33,8 @@ from sonarpost.errors import ConfigError, StreamError
 Values = npt.NDArray[np.float64]
 T = TypeVar("T")
 
-PSNR_LIMIT_DB: Final = 60.0
-"""Upper limit of the PSNR, which is infinite for an image without error and would make every mean infinite."""
+SCENE_MEASURES: Final = ("clean_psnr", "dots", "highlight_error", "shadow_error_px", "height_error", "despeckled_psnr")
+"""Names of the measures against the scene, see `scene_measures`."""
 SHIPPED_CODEBOOKS: Final = tuple(f"nominal-{tile_px}" for tile_px in DEFAULT_TILE_PX)
 
 
@@ -82,6 +91,8 @@ class BudgetResult:
         encode_ms: Time to encode; for an embedded codec the time for the largest budget.
         decode_ms: Time to decode.
         reasons: Reasons of the misses with their counts.
+        scene: Measures of `scene_measures` by name, each of shape (images,), NaN where a measure does not apply; empty
+            if they were not measured.
     """
 
     tested: CodecUnderTest
@@ -93,6 +104,7 @@ class BudgetResult:
     encode_ms: Values
     decode_ms: Values
     reasons: Counter[str] = field(default_factory=Counter)
+    scene: Mapping[str, Values] = field(default_factory=dict)
 
     @property
     def hits(self) -> npt.NDArray[np.bool_]:
@@ -119,6 +131,7 @@ def create_codecs(
     all_packings: bool = True,
     cut: bool = False,
     codebooks: Sequence[str] = SHIPPED_CODEBOOKS,
+    strength: float | None = None,
 ) -> tuple[list[CodecUnderTest], list[str]]:
     """Create the codecs to measure.
 
@@ -128,6 +141,7 @@ def create_codecs(
         all_packings: Whether vq is measured with every packing of an index, or with the shortest only.
         cut: Whether embedded codecs code one stream that is truncated for each budget.
         codebooks: Names of shipped codebooks, or paths of others, for vq.
+        strength: Strength of despeckling of emb, 0..1; None for the default.
 
     Returns:
         The codecs, and one line for each that is not available (only with `names` None).
@@ -146,7 +160,9 @@ def create_codecs(
                 found += _with_codebooks(registry, codec_name, packings, codebooks)
             else:
                 is_embedded = cut and registry.is_embedded(codec_name)
-                found.append(CodecUnderTest(create_codec(name, registry), is_embedded=is_embedded, model=model))
+                found.append(
+                    CodecUnderTest(create_codec(name, registry, strength), is_embedded=is_embedded, model=model)
+                )
         except ConfigError as error:
             if names is not None:
                 raise
@@ -154,14 +170,20 @@ def create_codecs(
     return found, unavailable
 
 
-def create_codec(name: str, registry: CodecRegistry | None = None) -> Codec:
+def create_codec(name: str, registry: CodecRegistry | None = None, strength: float | None = None) -> Codec:
     """Create a codec from `NAME` or `NAME:MODEL`.
 
+    Args:
+        name: Name of the codec, with its model if that is not the default.
+        registry: Registry of the codecs; None for that of the package.
+        strength: Strength of despeckling of emb, 0..1; None for the default.
+
     Raises:
-        ConfigError: No codec or model has this name, or the codec needs a codebook.
+        ConfigError: No codec or model has this name, the codec needs a codebook, or the strength is out of range.
     """
     codec_name, _, model = name.partition(":")
-    return (registry or default_registry()).create(codec_name, CodecResources(model=model or None))
+    resources = CodecResources(model=model or None, strength=strength)
+    return (registry or default_registry()).create(codec_name, resources)
 
 
 def _names_with_models(registry: CodecRegistry) -> list[str]:
@@ -249,10 +271,18 @@ def measure_codec(
     images: Sequence[SampleImage],
     budgets: Sequence[int],
     progress: Callable[[str], None] | None = None,
+    references: Sequence[SceneReference] = (),
 ) -> list[BudgetResult]:
     """Measure one codec over all images.
 
     The first image is coded once in advance, so that loading and compiling on first use are not counted.
+
+    Args:
+        tested: The codec.
+        images: At least one.
+        budgets: Maximum lengths of a stream.
+        progress: Receives a line at the end.
+        references: One for each image, for the measures against the scene; empty: these are not measured.
 
     Returns:
         One result a budget, in their order; a single one for a codec of natural size.
@@ -260,19 +290,69 @@ def measure_codec(
     code_image(tested, images[0].pixels, budgets)
     result_budgets: tuple[int | None, ...] = (None,) if tested.is_natural else tuple(budgets)
     results = [_empty_result(tested, budget, len(images)) for budget in result_budgets]
+    scenes = [{name: np.full(len(images), np.nan) for name in SCENE_MEASURES} for _ in results] if references else []
+    for result, scene in zip(results, scenes, strict=bool(references)):
+        result.scene = scene
     for number, image in enumerate(images):
         for result, coded in zip(results, code_image(tested, image.pixels, budgets), strict=True):
             if isinstance(coded, str):
                 result.reasons[coded] += 1
                 continue
             result.stream_bytes[number] = len(coded.stream)
-            result.psnr[number] = min(psnr_db(image.pixels, coded.decoded), PSNR_LIMIT_DB)
+            result.psnr[number] = clipped_psnr_db(image.pixels, coded.decoded)
             result.ssim[number] = ssim(image.pixels, coded.decoded)
             result.msssim[number] = ms_ssim(image.pixels, coded.decoded)
             result.encode_ms[number], result.decode_ms[number] = coded.encode_ms, coded.decode_ms
+            if references:
+                for name, value in scene_measures(image, references[number], coded.decoded).items():
+                    result.scene[name][number] = value
     if progress is not None:
         progress(f"{tested.label}: {len(images)} images")
     return results
+
+
+@dataclass(frozen=True)
+class SceneReference:
+    """What the decoded versions of an image are compared with.
+
+    Attributes:
+        despeckled: The image after `reference_filtered`, if its speckle-free scene is unknown, else None.
+        object: Measurement of the object in the speckle-free scene; None without scene or object.
+    """
+
+    despeckled: Image | None
+    object: ObjectMeasurement | None
+
+
+def scene_reference(image: SampleImage) -> SceneReference:
+    """Return the reference of an image."""
+    if image.clean is None:
+        return SceneReference(reference_filtered(image.pixels), None)
+    return SceneReference(None, None if image.place is None else measure_object(image.clean, image.place))
+
+
+def scene_measures(image: SampleImage, reference: SceneReference, decoded: Image) -> dict[str, float]:
+    """Compare a decoded image with the scene; NaN for a measure that does not apply.
+
+    Returns:
+        By name: `clean_psnr`, PSNR in dB against the speckle-free scene; `dots`, see `count_dots`; `highlight_error`,
+        `shadow_error_px` and `height_error`, see `ObjectErrors`, against the speckle-free scene; `despeckled_psnr`,
+        PSNR in dB against the image after `reference_filtered`, for an image without known scene.
+    """
+    found = dict.fromkeys(SCENE_MEASURES, math.nan)
+    found["dots"] = float(count_dots(decoded))
+    if image.clean is not None:
+        found["clean_psnr"] = clipped_psnr_db(image.clean, decoded)
+    if reference.despeckled is not None:
+        found["despeckled_psnr"] = clipped_psnr_db(reference.despeckled, decoded)
+    if reference.object is not None and image.place is not None:
+        errors = object_errors(measure_object(decoded, image.place), reference.object)
+        found |= {
+            "highlight_error": errors.highlight,
+            "shadow_error_px": errors.shadow_px,
+            "height_error": errors.height,
+        }
+    return found
 
 
 def best_within_budgets(variants: Sequence[BudgetResult], budgets: Sequence[int]) -> list[BudgetResult]:
@@ -290,6 +370,7 @@ def best_within_budgets(variants: Sequence[BudgetResult], budgets: Sequence[int]
     others = [
         np.stack(each) for each in zip(*((r.ssim, r.msssim, r.encode_ms, r.decode_ms) for r in variants), strict=True)
     ]
+    scenes = {name: np.stack([result.scene[name] for result in variants]) for name in variants[0].scene}
     images = np.arange(lengths.shape[1])
     found = []
     for budget in budgets:
@@ -304,6 +385,7 @@ def best_within_budgets(variants: Sequence[BudgetResult], budgets: Sequence[int]
         )
         tested = CodecUnderTest(variants[0].tested.codec)
         result = BudgetResult(tested, budget, size, psnr, ssim_, msssim, encode_ms, decode_ms)
+        result.scene = {name: np.where(coded, values[chosen, images], np.nan) for name, values in scenes.items()}
         misses = int(np.count_nonzero(~coded))
         if misses:
             result.reasons[f"budget_bytes: expected at least {int(np.nanmin(lengths))}"] = misses

@@ -58,7 +58,9 @@ class SheetCell:
     detail: str = ""
 
 
-def write_sheet(path: Path, title: str, rows: Sequence[Sequence[SheetCell]], scale: int = 2) -> None:
+def write_sheet(
+    path: Path, title: str, rows: Sequence[Sequence[SheetCell]], scale: int = 2, *, is_grey: bool = False
+) -> None:
     """Draw images in rows, enlarged by pixel replication, with captions below.
 
     Args:
@@ -66,6 +68,7 @@ def write_sheet(path: Path, title: str, rows: Sequence[Sequence[SheetCell]], sca
         title: Line at the top.
         rows: The cells; rows may differ in length.
         scale: Enlargement.
+        is_grey: Whether to save grey levels, a third smaller, instead of colours.
 
     Raises:
         OSError: The file cannot be written.
@@ -85,7 +88,7 @@ def write_sheet(path: Path, title: str, rows: Sequence[Sequence[SheetCell]], sca
             _draw_cell(sheet, draw, cell, (left, top, width_px, height_px), scale)
         top += height_px + _CAPTION
     buffer = io.BytesIO()
-    sheet.save(buffer, format="PNG")
+    (sheet.convert("L") if is_grey else sheet).save(buffer, format="PNG", optimize=is_grey)
     write_atomically(path, buffer.getvalue())
 
 

@@ -82,11 +82,11 @@ def run(args: argparse.Namespace) -> int:
             raise ConfigError("detection", option, value, f"{low}..{high}")
     budgets = parse_budgets(args.budgets)
     tested = selected_codecs(args, all_packings=False) if args.codecs is not None else []
+    tiles = () if args.sdvd is None else tile_scores(args.sdvd)
     files: list[EvaluatedFile] = []
     for kind in SeabedKind:
         files += [evaluate_file(kind, args.seed + number) for number in range(args.files)]
         report_progress(f"{kind}: detected")
-    tiles = () if args.sdvd is None else tile_scores(args.sdvd)
     snippets = contact_snippets(files, args.pictures) if tested else []
     effects = [effect for codec in tested for effect in codec_effects(snippets, codec, budgets)]
     if args.plot is not None:

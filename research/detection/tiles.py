@@ -8,10 +8,12 @@ from typing import Final
 
 import numpy as np
 
-from research.common.images import read_grey, read_sdvd_index, survey_line
+from research.common.images import read_sdvd_index, survey_line
 from research.common.statistics import Interval, auc, bootstrap_weights, interval
 from research.detection.image_detector import ScaledImage, detect_in_image
+from sonarpost.codec.interface import to_uint8
 from sonarpost.errors import SurveyFileError
+from sonarpost.sonar.image_files import read_image
 
 PIXEL_M: Final = 0.05
 """Pixel size, which the data set does not state: its targets are 1.8 m long, their boxes 40 x 35 px (median)."""
@@ -35,7 +37,7 @@ def tile_scores(folder: Path) -> tuple[TileScore, ...]:
     """
     scores = []
     for tile in read_sdvd_index(folder):
-        image = ScaledImage(read_grey(folder / tile.split / "images" / tile.image), PIXEL_M, PIXEL_M)
+        image = ScaledImage(to_uint8(read_image(folder / tile.split / "images" / tile.image)), PIXEL_M, PIXEL_M)
         found = detect_in_image(image)
         confidence = 0.0 if found is None else found.confidence
         scores.append(TileScore(tile.split, tile.image, tile.target_centre is not None, confidence))

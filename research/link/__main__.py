@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from research.common.command import command_parser, report_progress, run_command
+from research.common.command import command_parser, report_progress, run_command, warn
 from research.common.images import ImageSet, read_image_folder, simulated_images
 from research.link.schemes import (
     Codecs,
@@ -95,7 +95,7 @@ def _images(args: argparse.Namespace) -> ImageSet:
         return simulated_images(int(count_or_folder), args.seed)
     found = read_image_folder(Path(count_or_folder))
     for line in found.rejected:
-        report_progress(f"rejected: {line}")
+        warn(f"rejected: {line}")
     return found
 
 

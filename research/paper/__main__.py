@@ -199,16 +199,16 @@ def page(
 
 
 _TABLE2_NOTE = (
-    f"Means over {{images}} images of {WIDTH_PX} x {HEIGHT_PX} px ({PIXELS} B): {{origin}}. The budget of each "
+    f"Means over {{images}} images of {WIDTH_PX} × {HEIGHT_PX} px ({PIXELS} B): {{origin}}. The budget of each "
     "codec follows from the paper's ratio for such an image (vq has its natural size); bytes include the header."
 )
 _FIG3_NOTE = (
-    f"Databases of {TILE_PX} x {TILE_PX} px tiles built by Table IV (figure of merit below {FOM_BELOW:g}, distance "
+    f"Databases of {TILE_PX} × {TILE_PX} px tiles built by Table IV (figure of merit below {FOM_BELOW:g}, distance "
     f"above {DISTANCE_ABOVE:g}) from {{training}} simulated images, with the search in the rotated space as in the "
     "paper, tested on {test} others."
 )
 _VQ_NOTE = (
-    "The paper omits edge pixels that fill no tile (10 tiles of 20 x 20 px in this image, 44 of 10 x 10 px) and has no "
+    "The paper omits edge pixels that fill no tile (10 tiles of 20 × 20 px in this image, 44 of 10 × 10 px) and has no "
     "header. Here the whole image is coded, 18 and 60 tiles at 14 bits, after a header of 7 bytes with codec, codebook "
     "and size. The stream is therefore longer, and decodable without further information."
 )

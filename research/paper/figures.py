@@ -9,9 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from research.common.measurement import PSNR_LIMIT_DB, CodecUnderTest, CodedImage, code_image
+from research.common.measurement import CodecUnderTest, CodedImage, code_image
+from research.common.scene_measures import clipped_psnr_db
 from sonarpost.codec.interface import Image
-from sonarpost.codec.quality import psnr_db, ssim
+from sonarpost.codec.quality import ssim
 from sonarpost.detection.detector import detect
 from sonarpost.detection.snippets import cut_snippet
 from sonarpost.errors import SurveyFileError
@@ -153,10 +154,10 @@ def _reproduce(figure: PaperFigure, tested: Sequence[CodecUnderTest], images: Se
             reason = coded
             continue
         sizes.append(float(len(coded.stream)))
-        psnrs.append(min(psnr_db(image, coded.decoded), PSNR_LIMIT_DB))
+        psnrs.append(clipped_psnr_db(image, coded.decoded))
         ssims.append(ssim(image, coded.decoded))
         with_emb = code_emb(tested, image, len(coded.stream))
         if isinstance(with_emb, CodedImage):
-            emb_psnrs.append(min(psnr_db(image, with_emb.decoded), PSNR_LIMIT_DB))
+            emb_psnrs.append(clipped_psnr_db(image, with_emb.decoded))
     means = [float(np.mean(values)) if values else None for values in (sizes, psnrs, ssims, emb_psnrs)]
     return Reproduced(figure, means[0], means[1], means[2], means[3], len(sizes), reason)

@@ -16,11 +16,13 @@ import numpy as np
 from research.codecs.report import aligned
 from research.common.command import (
     add_codec_arguments,
+    add_strength_argument,
     command_parser,
     parse_budgets,
     report_progress,
     run_command,
     selected_codecs,
+    warn,
 )
 from research.common.images import SampleImage, sdvd_crops, simulated_images
 from research.common.measurement import CodecUnderTest, code_image
@@ -50,6 +52,7 @@ def new_parser() -> argparse.ArgumentParser:
     parser.add_argument("--sdvd", type=Path, required=True, metavar="DIR", help="folder of the SDVD data set")
     parser.add_argument("--crop", type=int, default=80, metavar="PX", help="side of the crops (default: 80)")
     add_codec_arguments(parser)
+    add_strength_argument(parser)
     parser.add_argument(
         "--simulated", type=int, default=_SIMULATED, metavar="N", help="simulated training images (%(default)s)"
     )
@@ -124,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
         report_progress(f"{codec.label}: classified")
     print(_json_line(results, len(test)) if args.json else _table(results))
     if originals.area is None or originals.area < args.least_auc:
-        report_progress(
+        warn(
             f"AUC of the classifier on originals: got {originals.area}, expected at least {args.least_auc}; "
             "the results are not valid"
         )

@@ -16,6 +16,7 @@ from research.common.command import command_parser, report_progress, run_command
 from research.common.images import SampleImage, simulated_images
 from research.common.plots import new_figure, save_figure
 from research.sea_trial.rig import CodedSnippet, DeliveryCounts, send_images
+from sonarpost.cli.shared import in_new_folder
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.errors import ConfigError
@@ -103,6 +104,8 @@ def run(args: argparse.Namespace) -> int:
     ):
         if not low <= value <= high:
             raise ConfigError("sea_trial", option, value, f"{low}..{high}")
+    if args.plot is not None:
+        in_new_folder(args.plot)
     report_progress(f"simulating {args.pictures} images")
     cells = measure(args.pictures, args.seed, RANGES_M, SIZES_PX)
     if args.plot is not None:
@@ -131,7 +134,7 @@ def measure(images: int, seed: int, ranges_m: Sequence[int], sizes_px: Sequence[
     for width_px, height_px in sizes_px:
         snippets = _coded_snippets(simulated, codec, width_px, height_px)
         for rate in RATES_USED:
-            report_progress(f"{width_px} x {height_px} px at rate {rate}")
+            report_progress(f"{width_px} × {height_px} px at rate {rate}")
             for range_m in ranges_m:
                 own = channel.model_copy(update={"seed": _cell_seed(seed, rate, width_px, height_px, range_m)})
                 cells.append(Cell(rate, width_px, height_px, range_m, send_images(own, range_m, rate, snippets)))
@@ -176,7 +179,7 @@ def claims(cells: Sequence[Cell]) -> list[dict[str, str | float | bool]]:
         add("below 130 m most packets are received", share, agrees=min(c.packets for c in near) > 0.5)
     if largest:
         share = _share([(c.delivered.whole_pictures, c.delivered.pictures) for c in largest])
-        add("below 130 m all pictures of 140 x 80 px are received", share, agrees=share == 1.0)
+        add("below 130 m all pictures of 140 × 80 px are received", share, agrees=share == 1.0)
     if smaller:
         share = _share([(c.delivered.second_lost, c.delivered.pictures) for c in smaller])
         only_smaller = not any(c.delivered.second_lost for c in largest)
@@ -205,7 +208,7 @@ def table(cells: Sequence[Cell]) -> str:
         lines += [
             f"Rate {rate}: complete packets / complete images, in percent",
             "",
-            "| range m | " + " | ".join(f"{width} x {height} px" for width, height in sizes) + " | the paper |",
+            "| range m | " + " | ".join(f"{width} × {height} px" for width, height in sizes) + " | the paper |",
             "|" + "---|" * (len(sizes) + 2),
         ]
         for range_m in dict.fromkeys(cell.range_m for cell in at_rate):
@@ -270,7 +273,7 @@ def _draw(axis: Axes, cells: Sequence[Cell], share: Callable[[Cell], float]) -> 
             marker=marker,
             markersize=3.5,
             linewidth=1.2,
-            label=f"{size[0]} x {size[1]} px",
+            label=f"{size[0]} × {size[1]} px",
         )
     axis.set_xlim(0, 305)
     axis.set_ylim(-3, 103)
@@ -285,7 +288,7 @@ def _draw_paper_result(axis: Axes, *, of_images: bool) -> None:
     axis.axvline(BOUNDARY_M, color="#777777", linestyle="--", linewidth=1)
     if of_images:
         axis.plot([0, BOUNDARY_M], [100, 100], color="#222222", linestyle=":", linewidth=1.5)
-        text = "the paper (dotted):\nbelow 130 m all images\nof 140 x 80 px"
+        text = "the paper (dotted):\nbelow 130 m all images\nof 140 × 80 px"
     else:
         text = "the paper (shaded): most\nreceived below 130 m,\nmost lost beyond"
     axis.text(295, 62, text, ha="right", fontsize=8)

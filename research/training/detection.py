@@ -27,6 +27,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 
 from research.detection.simulated import Scale, object_at
+from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.detection.candidates import Candidate, find_candidates
 from sonarpost.detection.fusion import (
     FILTERS,
@@ -203,4 +204,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with ProgressDisplay(step="training.detection"):
+        main()

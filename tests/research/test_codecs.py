@@ -17,7 +17,9 @@ from research.codecs.report import RateDifference, json_line
 from research.common import measurement as measuring
 from research.common.images import SampleImage, read_image_folder, sdvd_crops, simulated_images, survey_line
 from research.common.measurement import CodecUnderTest, code_image, measure_codec
+from research.common.scene_measures import PSNR_LIMIT_DB
 from research.recognition.classifier import with_grain
+from sonarpost.codec.emb import DEFAULT_STRENGTH
 from sonarpost.codec.interface import DecodedImage, StreamHeader
 from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.vq.codebook import Codebook, save
@@ -79,7 +81,8 @@ class Halving:
         return DecodedImage(np.ascontiguousarray(image), np.zeros(image.shape, np.bool_))
 
 
-ROW_KEYS = {"codec", "budget", "bytes", "psnr", "ssim", "msssim", "encode_ms", "decode_ms"}
+ROW_KEYS = {"codec", "budget", "bytes", "psnr", "ssim", "msssim", "encode_ms", "decode_ms", *measuring.SCENE_MEASURES}
+SIMULATED_KEYS = {"clean_psnr", "highlight_error", "shadow_error_px", "height_error"}
 
 
 def test_json_object_has_the_documented_keys(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,9 +98,44 @@ def test_json_object_has_the_documented_keys(folder: Path, capsys: pytest.Captur
         (codec, budget) for codec in ("spiht", "vq") for budget in (16, 44, 128)
     ]
     for row in found["results"]:
+        assert all(row[name] is None for name in SIMULATED_KEYS)
         if row["psnr"] is not None:
             assert 0 < row["bytes"] <= row["budget"]
             assert row["encode_ms"] > 0
+            assert row["despeckled_psnr"] > row["psnr"]  # the speckle that coding removes is no error
+            assert row["dots"] >= 0
+        else:
+            assert row["despeckled_psnr"] is row["dots"] is None
+
+
+def test_rows_of_simulated_images_are_compared_with_their_scenes(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("research.common.images._PINGS", 260)
+    rows = {}
+    for strength in ("0", "0.5", "1"):
+        options = ("--count", 6, "--codecs", "emb,vq", "--budgets", 128, "--json", "--strength", strength)
+        assert run(*options) == 0
+        rows[strength] = json.loads(capsys.readouterr().out)["results"]
+    emb, vq = zip(*rows.values(), strict=True)
+    for row in (*emb, *vq):
+        assert set(row) == ROW_KEYS
+        assert row["despeckled_psnr"] is None
+        assert all(row[name] >= 0 for name in (*SIMULATED_KEYS, "dots"))
+    assert emb[0]["clean_psnr"] < emb[1]["clean_psnr"] < emb[2]["clean_psnr"]
+    assert emb[0]["psnr"] > emb[2]["psnr"]
+    times = ("encode_ms", "decode_ms")
+    others = [{name: value for name, value in row.items() if name not in times} for row in vq]
+    assert others[0] == others[1] == others[2]  # the strength affects emb only
+
+
+def test_default_strength_is_that_of_emb() -> None:
+    options = command.new_parser().parse_args([])
+    assert options.strength == DEFAULT_STRENGTH
+    ((tested,), _) = measuring.create_codecs(measuring_registry(), ["emb"])
+    assert tested.codec.strength == DEFAULT_STRENGTH
+    ((plain,), _) = measuring.create_codecs(measuring_registry(), ["emb"], strength=0.0)
+    assert plain.codec.strength == 0
 
 
 def test_row_with_many_misses_is_null_and_details_have_the_figures(
@@ -172,12 +210,13 @@ def test_bd_rate_compares_emb_with_every_other_codec(
 
 
 @pytest.mark.parametrize("option", ["--plot", "--sheet", "--details"])
-def test_missing_output_folder_is_an_error_before_the_measurement(
+def test_output_folder_that_cannot_be_created_is_an_error_before_the_measurement(
     folder: Path, tmp_path: Path, option: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("research.codecs.__main__.measure_codec", lambda *_: pytest.fail("measured"))
-    with pytest.raises(ConfigError, match=f"{option}.*a folder that exists"):
-        run("--images", folder, "--codecs", "huffman", option, tmp_path / "absent" / "file.png")
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="expected a folder to write into"):
+        run("--images", folder, "--codecs", "huffman", option, tmp_path / "file" / "file.png")
 
 
 def measuring_registry():
@@ -255,7 +294,7 @@ def test_embedded_stream_is_encoded_once_and_truncated() -> None:
 def test_image_without_error_has_a_finite_psnr() -> None:
     flat = SampleImage("flat", "flat", np.full((32, 32), 77, np.uint8))
     (point,) = measure_codec(CodecUnderTest(Halving()), [flat], [100])
-    assert point.psnr[0] == measuring.PSNR_LIMIT_DB
+    assert point.psnr[0] == PSNR_LIMIT_DB
     assert math.isfinite(point.psnr[0])
 
 
@@ -268,30 +307,38 @@ def test_folder_is_read_recursively_and_rejections_are_listed(folder: Path) -> N
     (folder / "torn.jpg").write_bytes((folder / "deeper" / "c.JPG").read_bytes()[:200])
     (folder / "notes.txt").write_text("not a picture")
     found = read_image_folder(folder)
-    assert [p.name for p in found.images] == ["a.png", "deeper/b.tiff", "deeper/c.JPG"]
-    assert [p.pixels.dtype for p in found.images] == [np.uint8] * 3
-    assert len(found.rejected) == 6
+    names = ["a.png", "colour.jpg", "colour.png", "deeper/b.tiff", "deeper/c.JPG"]
+    assert [p.name for p in found.images] == names
+    assert [p.pixels.dtype for p in found.images] == [np.uint8] * 5
+    assert [Path(line.partition(":")[0]).name for line in found.notes] == ["colour.jpg", "colour.png"]
+    assert len(found.rejected) == 5
     refused = "\n".join(found.rejected)
-    for name in ("too_small.png: height", "too_wide.png: width", "colour.png", "colour.jpg: colour", "torn.png"):
+    for name in ("too_small.png: size", "too_wide.png: size", "torn.png", "torn.jpg: JPEG data", "notes.txt: not used"):
         assert name in refused
-    assert "torn.jpg: JPEG data" in refused
+    fitted = read_image_folder(folder, "crop")
+    assert [p.name for p in fitted.images] == [*names, "too_wide.png"]
+    assert any("too_wide.png: centre of 513 × 20 px cropped to 512 × 20 px" in line for line in fitted.notes)
 
 
 def test_rejected_files_are_printed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_png(folder / "tall.png", np.zeros((600, 20), np.uint8))
     run("--images", folder, "--codecs", "spiht", "--budgets", "64")
     output = capsys.readouterr()
-    assert "tall.png: height: got '600 px'" in output.err
+    assert "tall.png: size: got '20 × 600 px'" in output.err
     assert "1 rejected" in output.out
+    run("--images", folder, "--codecs", "spiht", "--budgets", "64", "--fit", "crop")
+    output = capsys.readouterr()
+    assert "tall.png: centre of 20 × 600 px cropped to 20 × 512 px" in output.err
+    assert "rejected:" not in output.err
 
 
 def test_invalid_folder_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(SurveyFileError, match="not a folder"):
+    with pytest.raises(SurveyFileError, match="no such folder"):
         run("--images", tmp_path / "absent")
-    with pytest.raises(SurveyFileError, match="at least one grey"):
+    with pytest.raises(SurveyFileError, match="images: got 0"):
         run("--images", tmp_path)
     write_png(tmp_path / "small.png", np.zeros((8, 8), np.uint8))
-    with pytest.raises(SurveyFileError, match=r"none, 1 rejected.*small\.png: height"):
+    with pytest.raises(SurveyFileError, match=r"none, 1 rejected.*small\.png: size"):
         run("--images", tmp_path)
     with pytest.raises(SurveyFileError, match=r"index\.csv"):
         run("--sdvd", tmp_path)
@@ -310,6 +357,8 @@ def test_invalid_folder_is_an_error(tmp_path: Path) -> None:
         ["--crop", "15"],
         ["--crop", "501"],
         ["--seed", "-1"],
+        ["--codecs", "emb", "--strength", "1.1"],
+        ["--codecs", "emb", "--strength", "nan"],
     ],
 )
 def test_invalid_option_is_an_error(options: list[str]) -> None:
@@ -383,7 +432,7 @@ def test_survey_line_of_a_tile_name() -> None:
         ("split,image,w,h,target_px,x0,y0,x1,y1\ntest,a.png,256,256,many,,,,\n", "target_px"),
         ("split,image,w,h,target_px,x0,y0,x1,y1\ntrain,a.png,256,256,0,,,,\n", "no tile of 'test'"),
         ("split,image,w,h,target_px,x0,y0,x1,y1\ntest,absent.png,256,256,0,,,,\n", r"absent\.png"),
-        ("split,image,w,h,target_px,x0,y0,x1,y1\ntest,small.png,256,256,0,,,,\n", "256 x 256 px"),
+        ("split,image,w,h,target_px,x0,y0,x1,y1\ntest,small.png,256,256,0,,,,\n", "256 × 256 px"),
         ('split,image,w,h,target_px,x0,y0,x1,y1\ntest,"a\n', "text"),
     ],
 )
@@ -443,8 +492,8 @@ def test_models_of_emb_are_measured_under_their_own_names() -> None:
     registry = measuring_registry()
     found, _ = measuring.create_codecs(registry, ["emb", "emb:structure"])
     assert [(one.name, one.label, one.codec.codec_id) for one in found] == [
-        ("emb", "emb", 0x20),
-        ("emb:structure", "emb:structure", 0x21),
+        ("emb", "emb", 0x22),
+        ("emb:structure", "emb:structure", 0x23),
     ]
     everything, _ = measuring.create_codecs(registry, None, all_packings=False)
     assert [one.name for one in everything if one.codec.name == "emb"] == ["emb", "emb:structure"]

@@ -12,12 +12,15 @@ import pytest
 from PIL import Image
 
 from research.common.images import SampleImage
+from research.common.measurement import CodecUnderTest
 from research.common.statistics import auc
 from research.paper import __main__ as paper
 from research.paper.dimensions import RotatedTiles, sensitivity
 from research.paper.figures import FIG2, PIXELS, TABLE2, contact_images, reproduce
 from research.recognition import __main__ as recognition
 from research.recognition.classifier import FOLDS, TargetClassifier, features
+from sonarpost.codec.emb import DEFAULT_STRENGTH
+from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.vq.tiles import cut_tiles
 from sonarpost.errors import ConfigError, SurveyFileError
@@ -157,6 +160,25 @@ def test_recognition_results_of_decoded_images(data_set: Path, capsys: pytest.Ca
     assert 0 <= low <= rows["spiht", 128]["auc"] <= high <= 1
     assert run(recognition, *options) == 0
     assert "original" in capsys.readouterr().out
+
+
+def test_strength_of_despeckling_is_that_of_the_option(
+    data_set: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    strengths: list[float] = []
+
+    def record(_: object, tested: CodecUnderTest, *rest: object) -> list[object]:
+        assert isinstance(tested.codec, EmbCodec)
+        strengths.append(tested.codec.strength)
+        return []
+
+    monkeypatch.setattr(recognition, "_codec_results", record)
+    options = ["--sdvd", data_set, "--codecs", "emb", "--budgets", "64", "--simulated", "0"]
+    for more in (["--strength", "0"], ["--strength", "0.5"], []):
+        assert run(recognition, *options, *more) == 0
+    assert strengths == [0.0, 0.5, DEFAULT_STRENGTH]
+    with pytest.raises(ConfigError, match="strength"):
+        run(recognition, *options, "--strength", "-0.5")
 
 
 def test_streams_with_grain_keep_the_budget(data_set: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -148,9 +148,12 @@ def main() -> None:  # noqa: PLR0915  a script
     codec = EmbCodec(parse(args.model.read_bytes()))
     started_s = time.time()
     sets = {}
-    for name, source in (("train", pool["tp80"][-args.pictures :]), ("check", pool["vp80"][:100])):
+    for name, part in (("train", slice(-args.pictures, None)), ("check", slice(100))):
+        key = "tp80" if name == "train" else "vp80"
+        # A pool of despeckled images holds the scenes themselves as well.
+        source, truth = pool[key][part], pool[f"truth_{key}" if f"truth_{key}" in pool else key][part]
         plane, mean, features = coded(codec, source, rng, args.streams if name == "train" else 2)
-        sets[name] = (source.repeat(len(plane) // len(source), 0), plane, mean, features)
+        sets[name] = (truth.repeat(len(plane) // len(truth), 0), plane, mean, features)
     print(f"coded, {time.time() - started_s:.0f} s", flush=True)
     params = resumed(codec.network) if args.resume else start(rng)
 

@@ -8,10 +8,13 @@ The figures are those of `python -m research.codecs --sdvd`, without misses and 
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from research.common.command import command_parser, run_command
 from research.common.images import sdvd_crops
 from research.common.measurement import create_codec
 from research.common.quality import ms_ssim
@@ -22,16 +25,12 @@ from sonarpost.errors import StreamError
 BUDGETS = (22, 44, 64, 88, 128, 192, 256, 384, 512)
 
 
-def main() -> None:
+def run(args: argparse.Namespace) -> int:
     """Print mean bytes, PSNR, SSIM and MS-SSIM of each codec and budget, and the rate differences."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--codecs", nargs="+", default=["emb", "spiht", "jpeg2000-packets", "jpeg2000"])
-    args = parser.parse_args()
     images = [image.pixels for image in sdvd_crops(args.data / "snippets" / "sdvd").images]
     curves: dict[str, list[tuple[float, float]]] = {}
     for name in args.codecs:
-        codec, curves[name] = create_codec(name), []
+        codec, curves[name] = create_codec(name, strength=0.0), []
         for budget in BUDGETS:
             try:
                 streams = [codec.encode(image, budget) for image in images]
@@ -53,7 +52,16 @@ def main() -> None:
         difference = bd_rate_percent(rates, quality, other_rates, other_quality)
         if difference is not None:
             print(f"{first} against {name}: {difference:+.1f} %")
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return the exit status."""
+    parser = command_parser("training.emb.evaluate", __doc__ or "")
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--codecs", nargs="+", default=["emb", "spiht", "jpeg2000-packets", "jpeg2000"])
+    return run_command(parser, run, arguments)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb import kernel, transform
+from sonarpost.codec.emb import kernel, range_coder, transform
 from sonarpost.codec.emb.bitplanes import START_THRESHOLDS, code_planes, extra_planes
 from sonarpost.codec.emb.coder import UNIT_SCALE, Coder, CoefficientState
 from sonarpost.codec.emb.model import FORMAT_2, Model, model_of
@@ -65,11 +65,11 @@ def list_examples(
             + 1
             - side.extra_planes
         )
-        coder = Coder(kernel.COLLECT, np.zeros(0, np.uint8))
+        coder = Coder(range_coder.COLLECT, np.zeros(0, np.uint8))
         coder.decisions, coder.sign_decisions = rows, sign_rows
-        coder.words[kernel.CODER_CODE] = int(rng.integers(1 << 30))
+        coder.words[range_coder.CODER_CODE] = int(rng.integers(1 << 30))
         code_planes(coder, CoefficientState(target.layout), model, target.targets, side, planes=planes)
-        used, used_signs = (int(coder.words[word]) for word in (kernel.CODER_ROWS, kernel.CODER_SIGN_ROWS))
+        used, used_signs = (int(coder.words[word]) for word in (range_coder.CODER_ROWS, range_coder.CODER_SIGN_ROWS))
         weight = np.full((used, 1), min(12500 // size, 32000), np.int16)
         decisions.append(np.concatenate([rows[:used], weight], axis=1))
         signs.append(sign_rows[:used_signs].copy())

@@ -10,12 +10,16 @@ the last fifth of every recording, every sixth tile, other seeds of the simulato
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from research.common.command import command_parser, run_command
+from research.common.images import missing_data
 from sonarpost.detection.snippets import to_grey
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
@@ -37,6 +41,8 @@ def survey_sheets(root: Path) -> list[tuple[Floats, str]]:
         sheets += [(np.asarray(survey.waterfall(side), np.float64), path.stem) for side in survey.sides()]
     for path in sorted(root.glob("surveys/derived/pyhum*.png")):
         sheets.append((np.asarray(Image.open(path), np.float64), path.stem))
+    if not sheets:
+        raise missing_data(root / "surveys", "no recording")
     return sheets
 
 
@@ -141,12 +147,8 @@ def _blob(dy: Floats, dx: Floats, turn: float, long: float, wide: float, boxy: b
     return np.asarray(1 / (1 + np.exp(np.clip(5 * (reach - 1), -30, 30))))
 
 
-def main() -> None:
+def run(args: argparse.Namespace) -> int:
     """Write the pool."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
-    args = parser.parse_args()
     out = {}
     for validation, counts in ((False, TRAIN_COUNTS), (True, VALIDATION_COUNTS)):
         rng = np.random.default_rng(SEED + validation)
@@ -157,7 +159,16 @@ def main() -> None:
                 paint_objects(images, rng)
                 out[("v" if validation else "t") + name] = np.rint(images).astype(np.uint8)
     np.savez(args.out, allow_pickle=False, **out)
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return the exit status."""
+    parser = command_parser("training.emb.pool", __doc__ or "")
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    return run_command(parser, run, arguments)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Comparison of the despeckling network of emb with classical filters."""

@@ -1,0 +1,230 @@
+"""Simulated pairs, measures against the scene, and classical filters."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from research.common import images as image_sets
+from research.common.images import grey_on_scale, simulated_images
+from research.common.nonlocal_means import nonlocal_means, reference_filtered
+from research.common.scene_measures import (
+    ObjectPlace,
+    count_dots,
+    finite_median,
+    measure_object,
+    object_errors,
+    place_in_window,
+)
+from research.common.speckle import (
+    FIRST_SEED,
+    HEIGHT_PX,
+    WIDTH_PX,
+    SpecklePair,
+    grey_gain,
+    scaled_grey,
+    speckle_pairs,
+)
+from research.despeckling.filters import FILTERS
+from sonarpost.codec.quality import psnr_db
+from sonarpost.detection.snippets import to_grey
+from sonarpost.errors import ConfigError
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.targets import ObjectKind
+from sonarpost.simulation.seabed.terrain import SeabedKind
+
+PLACE = ObjectPlace(row=40, column=30, half_rows=5, half_columns=6, sample_m=0.03, first_slant_m=10.0, altitude_m=5.0)
+
+
+@pytest.fixture(scope="module")
+def pairs() -> list[SpecklePair]:
+    return speckle_pairs(6, seed=3, pings=180)
+
+
+def scene(peak: int = 250, shadow_end: int = 70) -> np.ndarray:
+    """Return seabed of 80 grey levels with a highlight in columns 26 to 29 and a shadow behind it."""
+    image = np.full((80, 140), 80, np.uint8)
+    image[35:46, 26:30] = peak
+    image[35:46, 30:shadow_end] = 4
+    return image
+
+
+def with_speckle(image: np.ndarray, seed: int = 0) -> np.ndarray:
+    power = np.random.default_rng(seed).gamma(2.0, 0.5, image.shape)
+    return np.clip(np.rint(image * np.sqrt(power)), 0, 255).astype(np.uint8)
+
+
+def test_pairs_differ_by_the_speckle_only(pairs: list[SpecklePair]) -> None:
+    assert {pair.seabed for pair in pairs} == set(SeabedKind)
+    for pair in pairs:
+        assert pair.noisy.shape == pair.clean.shape == (HEIGHT_PX, WIDTH_PX)
+        assert pair.noisy.dtype == pair.clean.dtype == np.uint8
+        assert psnr_db(pair.clean, pair.noisy) < 30
+        # The same scene: block means, which have little speckle, are proportional.
+        clean, noisy = (one.reshape(8, 10, 14, 10).mean(axis=(1, 3)).ravel() for one in (pair.clean, pair.noisy))
+        if clean.std() > 5:
+            assert np.corrcoef(clean, noisy)[0, 1] > 0.9
+        if pair.place is not None:
+            assert 0 <= pair.place.row < HEIGHT_PX
+            assert 0 <= pair.place.column < WIDTH_PX
+
+
+def test_pairs_are_reproducible_and_differ_from_the_seeds_of_training(pairs: list[SpecklePair]) -> None:
+    again = speckle_pairs(1, seed=3, pings=180)
+    assert np.array_equal(again[0].noisy.shape, pairs[0].noisy.shape)
+    assert again[0].source == pairs[0].source == f"simulated-{SeabedKind.SAND}-{FIRST_SEED + 3000}"
+    assert np.array_equal(again[0].noisy, pairs[0].noisy)
+    assert np.array_equal(again[0].clean, pairs[0].clean)
+    assert FIRST_SEED > 100_260
+
+
+@pytest.mark.parametrize(("count", "seed"), [(0, 0), (10_001, 0), (1, -1), (1, 1_000_001)])
+def test_invalid_number_of_pairs_or_seed_is_an_error(count: int, seed: int) -> None:
+    with pytest.raises(ConfigError, match="--count" if seed == 0 else "--seed"):
+        speckle_pairs(count, seed)
+
+
+def test_grey_scale_of_a_pair() -> None:
+    amplitude = np.linspace(0, 100, 1001, dtype=np.float32)[None]
+    assert grey_gain(amplitude) == pytest.approx(255 / 99.5)
+    assert grey_gain(np.full((4, 4), 2.0, np.float32)) == 8.0
+    assert grey_gain(np.zeros((4, 4), np.float32)) == 8.0
+    assert scaled_grey(amplitude, 3.0)[0, [0, 100, 1000]].tolist() == [0, 30, 255]
+
+
+def test_dots_are_small_groups_that_differ_from_their_surroundings() -> None:
+    image = np.full((40, 40), 100, np.uint8)
+    assert count_dots(image) == 0
+    image[5, 5] = 119  # a dot of one pixel
+    image[10:12, 10:13] = 60  # a dot of six pixels
+    image[20, 20] = image[21, 21] = 130  # one dot, connected by a corner
+    image[30, 30] = 118  # 18 grey levels are not more than 18
+    assert count_dots(image) == 3
+    image[5, 20:27] = 150  # a line of seven pixels is no dot
+    assert count_dots(image) == 3
+
+
+def test_highlight_shadow_and_height_of_an_object() -> None:
+    found = measure_object(scene(), PLACE)
+    assert found.peak == 250
+    assert 36 <= found.peak_row <= 44
+    assert 27 <= found.peak_column <= 28
+    assert found.seabed == 80
+    assert found.shadow_px == pytest.approx(40, abs=1)
+    assert not found.shadow_is_cut
+    shadow_m, end_m = found.shadow_px * 0.03, 10.0 + 70 * 0.03
+    assert found.height_m == pytest.approx(shadow_m * 5.0 / end_m, rel=0.02)
+
+
+def test_shadow_survives_speckle_and_short_gaps() -> None:
+    image = with_speckle(scene())
+    image[38, 45] = 255
+    clean, noisy = measure_object(scene(), PLACE), measure_object(image, PLACE)
+    errors = object_errors(noisy, clean)
+    assert errors.shadow_px <= 2
+    assert errors.height < 0.06
+    assert errors.highlight < 0.25
+
+
+def test_shadow_to_the_end_of_the_image_is_cut_and_not_compared() -> None:
+    cut = measure_object(scene(shadow_end=140), PLACE)
+    assert cut.shadow_is_cut
+    errors = object_errors(measure_object(scene(), PLACE), cut)
+    assert math.isnan(errors.shadow_px)
+    assert math.isnan(errors.height)
+    assert errors.highlight == 0
+
+
+def test_object_without_highlight_or_shadow_is_not_compared() -> None:
+    flat = measure_object(np.full((80, 140), 80, np.uint8), PLACE)
+    assert flat.shadow_px == 0
+    assert flat.height_m == 0
+    errors = object_errors(measure_object(scene(), PLACE), flat)
+    assert all(math.isnan(value) for value in dataclasses.astuple(errors))
+    lost = object_errors(flat, measure_object(scene(), PLACE))
+    assert lost.highlight == pytest.approx(170 / 250)
+    assert lost.shadow_px == pytest.approx(40, abs=1)
+    assert lost.height == 1
+    assert math.isnan(finite_median([math.nan]))
+    assert finite_median([3.0, math.nan, 1.0]) == 2.0
+
+
+def test_place_of_an_object_in_a_window() -> None:
+    spec = SurveySpec(seed=8, pings=100, targets=(ObjectKind.CYLINDER,), clutter=0)
+    (item,) = simulate_survey(spec).truth
+    across = place_in_window(dataclasses.replace(item, orientation_deg=90.0), spec, 5.0, item.ping - 7, 100)
+    along = place_in_window(dataclasses.replace(item, orientation_deg=0.0), spec, 5.0, item.ping - 7, 100)
+    assert (along.row, along.column) == (7, item.sample_index - 100)
+    assert along.half_rows == round(item.length_m / 2 / spec.ping_spacing_m)
+    assert across.half_columns == round((item.length_m + item.height_m) / 2 / spec.sample_m)
+    assert along.first_slant_m == pytest.approx(100 * spec.sample_m)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_filter_reduces_speckle_and_preserves_the_scene(name: str) -> None:
+    clean = scene()[:60, :90]
+    noisy = with_speckle(clean)
+    filtered = FILTERS[name](noisy)
+    assert filtered.shape == noisy.shape
+    assert filtered.dtype == np.uint8
+    assert psnr_db(clean, filtered) > psnr_db(clean, noisy) + 3
+    assert filtered[5:30, 50:80].std() < 0.6 * noisy[5:30, 50:80].std()
+    assert filtered[5:30, 50:80].mean() == pytest.approx(80, rel=0.1)
+    assert np.array_equal(filtered, FILTERS[name](noisy))
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("level", [0, 77, 255])
+def test_filter_preserves_a_constant_image(name: str, level: int) -> None:
+    image = np.full((24, 30), level, np.uint8)
+    assert np.abs(FILTERS[name](image).astype(int) - level).max() <= 1
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_filter_accepts_areas_without_echo(name: str) -> None:
+    image = with_speckle(np.full((40, 60), 251, np.uint8))
+    image[:, 20:45] = 0
+    filtered = FILTERS[name](image)
+    assert filtered[10:30, 28:37].max() <= 1
+    assert filtered[:, :10].mean() > 200
+
+
+def test_nonlocal_means_of_additive_noise() -> None:
+    clean = np.where(np.arange(60) < 30, 50.0, 150.0) * np.ones((40, 1))
+    noisy = clean + np.random.default_rng(1).normal(0, 10, clean.shape)
+    filtered = nonlocal_means(noisy, strength=1.0, patch_px=2, search_px=5)
+    assert np.abs(filtered - clean).mean() < 0.5 * np.abs(noisy - clean).mean()
+    assert filtered[:, 29].mean() < 60  # the edge stays
+    assert filtered[:, 30].mean() > 140
+
+
+def test_reference_filter_does_not_change() -> None:
+    filtered = reference_filtered(with_speckle(scene()))
+    assert psnr_db(scene(), filtered) > psnr_db(scene(), with_speckle(scene())) + 4
+    assert filtered.sum(dtype=np.int64) == 794_360
+
+
+def test_simulated_images_have_their_scenes_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(image_sets, "_PINGS", 260)
+    plain = simulated_images(4, seed=5, side_px=64).images
+    found = simulated_images(4, seed=5, side_px=64, with_scenes=True).images
+    assert all(image.clean is None and image.place is None for image in plain)
+    for image, before in zip(found, plain, strict=True):
+        assert np.array_equal(image.pixels, before.pixels)
+        assert image.clean is not None
+        assert image.clean.shape == (64, 64)
+        assert image.clean.std() > 0
+        assert not np.array_equal(image.clean, image.pixels)
+    assert sum(image.place is not None for image in found) >= 3
+
+
+def test_scene_has_the_grey_scale_of_the_snippet() -> None:
+    raw = np.random.default_rng(0).integers(0, 200, (20, 30)).astype(np.float32)
+    known = np.ones(raw.shape, np.bool_)
+    assert np.array_equal(grey_on_scale(raw, raw), to_grey(raw.astype(np.uint32), known))
+    assert grey_on_scale(raw[:, :10], raw).shape == (20, 10)
+    assert np.array_equal(grey_on_scale(raw[:, :10], raw), grey_on_scale(raw, raw)[:, :10])
+    assert (grey_on_scale(raw, np.full((3, 3), 9, np.float32)) == 128).all()
