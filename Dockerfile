@@ -44,6 +44,7 @@ COPY pyproject.toml README.md LICENSE NOTICE /src/
 COPY packaging/warm.py /src/packaging/
 COPY common/ /src/common/
 COPY services/ /src/services/
+COPY config/ /src/config/
 # The codecs' machine code is made here, for any processor of this architecture, so that no service compiles at its start.
 RUN cd /src && /opt/build/bin/python -m build --wheel --no-isolation --outdir /dist . \
     && /opt/build/bin/pip --python /opt/sonarpost/bin/python install --no-deps --no-index --target /opt/app /dist/*.whl \

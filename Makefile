@@ -12,16 +12,20 @@ setup: $(STAMP)
 
 # The locked run-time dependencies, sonarpost itself, editable, and the machine code of its codecs. Enough for `make demo`.
 $(RUN_TIME): requirements.lock requirements-build.lock pyproject.toml
-	$(PYTHON) -m venv $(VENV)
-	$(PIP) install --require-hashes -r requirements.lock
-	$(PIP) install --require-hashes -r requirements-build.lock
-	$(PIP) install --no-deps --no-build-isolation -e .
-	$(BIN)/sonarpost prepare
+	@echo "1 of 3: creating $(VENV) and installing the locked packages: 150 MB to download, about 30 s and the download"
+	@$(PYTHON) -m venv $(VENV)
+	@$(PIP) install --require-hashes -r requirements.lock
+	@echo "2 of 3: installing sonarpost: about 10 s"
+	@$(PIP) install --require-hashes -r requirements-build.lock
+	@$(PIP) install --no-deps --no-build-isolation -e .
+	@echo "3 of 3: compiling the codecs: about 10 s"
+	@$(BIN)/sonarpost prepare
 	touch $@
 
 # The tools for tests, checks and documentation.
 $(STAMP): $(RUN_TIME) requirements-dev.lock
-	$(PIP) install --require-hashes -r requirements-dev.lock
+	@echo "installing the tools for tests, checks and documentation: 300 MB to download, about 60 s and the download"
+	@$(PIP) install --require-hashes -r requirements-dev.lock
 	touch $@
 
 demo: $(RUN_TIME)
@@ -43,7 +47,8 @@ check: setup docs
 	$(BIN)/lint-imports
 	$(BIN)/python tests/check_wheel.py
 
-# The images of docker-compose.yml; without an image registry they are built from Debian and PyPI.
+# The images of docker-compose.yml; without an image registry they are built from Debian and PyPI. If debootstrap is needed
+# and not installed, `make images INSTALL=yes` installs it on this host.
 images:
 	packaging/images.sh
 
@@ -76,7 +81,7 @@ COMPILE = build/lock/bin/uv pip compile --quiet --upgrade --generate-hashes --py
 lock:
 	rm -rf build/lock && $(PYTHON) -m venv build/lock
 	build/lock/bin/python -m pip install --quiet --disable-pip-version-check uv
-	$(COMPILE) pyproject.toml --output-file requirements.lock
+	$(COMPILE) pyproject.toml --extra console --output-file requirements.lock
 	$(COMPILE) --group build --constraint requirements.lock --output-file requirements-build.lock
 	$(COMPILE) pyproject.toml --group build --extra dev --extra docs \
 		--constraint requirements.lock --constraint requirements-build.lock --output-file requirements-dev.lock

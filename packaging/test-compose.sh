@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Builds the images, runs the whole chain in containers, tests it, and takes everything away again.
 #
-#   packaging/test-compose.sh [PYTEST ARGUMENT...]     PYTHON names the interpreter that has pytest
+#   packaging/test-compose.sh [PYTEST ARGUMENT...]     PYTHON names the interpreter that has pytest; INSTALL=yes as in
+#                                                      packaging/images.sh
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -19,7 +20,7 @@ clear_up() {
     docker ps -aq --filter "label=com.docker.compose.project=$SONARPOST_COMPOSE_PROJECT" | xargs -r docker rm -f >/dev/null
     docker network ls -q --filter "label=com.docker.compose.project=$SONARPOST_COMPOSE_PROJECT" | xargs -r docker network rm >/dev/null
     docker volume ls -q --filter "label=com.docker.compose.project=$SONARPOST_COMPOSE_PROJECT" | xargs -r docker volume rm >/dev/null
-    docker image rm "$SONARPOST_IMAGE-next" >/dev/null 2>&1 || true
+    docker image rm "$SONARPOST_IMAGE-next" "$SONARPOST_IMAGE-systemd" >/dev/null 2>&1 || true
 }
 trap clear_up EXIT
 status=0

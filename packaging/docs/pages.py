@@ -1,4 +1,4 @@
-"""MkDocs hooks: adds pages that are files outside `docs`, rewrites their links and fills in the generated tables."""
+"""MkDocs hooks: adds pages that are files outside `docs`, rewrites their links, links terms and fills in the tables."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from mkdocs.structure.pages import Page
 from mkdocs.utils import get_relative_url
 
 sys.path.insert(0, str(Path(__file__).parent))
+import glossary
 import reference
 
 from sonarpost.config import SERVICES
@@ -34,6 +35,8 @@ REPOSITORY_PAGES: Mapping[str, str] = {
     "research/training/emb/README.md": "research/training-emb.md",
     **{f"services/{name}/README.md": f"reference/services/{name}.md" for name in SERVICES},
 }
+# Pages whose text consists of names.
+WITHOUT_TERMS = frozenset({"changelog.md"})
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s#]*)(#[^)\s]*)?\)")
 _CODE = re.compile(r"(^```.*?^```$|^    .*?$)", re.MULTILINE | re.DOTALL)
 _GENERATED = re.compile(r"^<!-- generated: (\w+)(?: (\w+))? -->$", re.MULTILINE)
@@ -48,13 +51,18 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Rewrite links to files outside `docs` and replace each mark `<!-- generated: NAME ARGUMENT -->` by its table."""
+    """Rewrite links to files outside `docs`, link terms, and replace each mark `<!-- generated: NAME ARGUMENT -->`."""
     uri = page.file.src_uri
     source = next((s for s, u in REPOSITORY_PAGES.items() if u == uri and page.file.generated_by), f"docs/{uri}")
     linked = "".join(
         part if index % 2 else _LINK.sub(lambda link: _site_link(link, source, uri), part)
         for index, part in enumerate(_CODE.split(markdown))
     )
+    terms = glossary.anchors((REPOSITORY / "docs" / glossary.PAGE).read_text(encoding="utf-8"))
+    if uri == glossary.PAGE:
+        linked = glossary.with_anchors(linked)
+    elif uri not in WITHOUT_TERMS:
+        linked = glossary.with_links(linked, terms, get_relative_url(glossary.PAGE, uri))
     return _GENERATED.sub(lambda mark: reference.generate(*mark.groups(default="")), linked)
 
 

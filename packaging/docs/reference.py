@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import inspect
 import json
 import re
@@ -13,14 +12,15 @@ from enum import Enum
 from typing import Any
 
 import griffe
+import rates
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from sonarpost import keys, messages
+from sonarpost.cli.deployment import config_files
 from sonarpost.cli.main import parser
 from sonarpost.config import SERVICES, PlatformConfig, ServiceConfig
 from sonarpost.messages import Record
-from sonarpost.modem.micromodem import RATES
 from sonarpost.monitoring.fleet import FleetState
 from sonarpost.monitoring.metrics import FleetCollector
 
@@ -76,6 +76,11 @@ class Command:
     name: str
     description: str
     parser: argparse.ArgumentParser
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether this is `sonarpost` itself, which describes the options that every command has."""
+        return " " not in self.name
 
 
 def generate(name: str, argument: str) -> str:
@@ -170,12 +175,7 @@ def configuration(service: str = "") -> str:
 
 def configuration_type(service: str) -> type[ServiceConfig]:
     """Return the model of a configuration table."""
-    if service == "platform":
-        return PlatformConfig
-    module = importlib.import_module(f"sonarpost.services.{service}.config")
-    name = "".join(part.capitalize() for part in service.split("_")) + "Config"
-    found: type[ServiceConfig] = getattr(module, name)
-    return found
+    return PlatformConfig if service == "platform" else config_files.configuration_type(service)
 
 
 def commands(_: str = "") -> str:
@@ -189,21 +189,14 @@ def command_list() -> list[Command]:
     return list(_walk(Command("sonarpost", whole.description or "", whole)))
 
 
-def rates(_: str = "") -> str:
+def rate_table(_: str = "") -> str:
     """Return the table of Micro-Modem rates."""
-    rows = [
-        (
-            str(rate.number),
-            rate.modulation,
-            f"{rate.frames} x {rate.frame_bytes}",
-            str(rate.packet_bytes),
-            f"{rate.airtime_s:g}",
-            f"{rate.throughput_bps:.0f}",
-        )
-        for rate in RATES.values()
-    ]
-    header = ("rate", "modulation and code", "frames x B", "packet, B", "air time, s", "throughput, bit/s")
-    return table(header, rows)
+    return table(rates.RATE_HEADER, rates.rate_rows())
+
+
+def image_table(_: str = "") -> str:
+    """Return the table of images a minute at each rate."""
+    return table(rates.IMAGE_HEADER, rates.image_rows())
 
 
 def metrics(_: str = "") -> str:
@@ -222,7 +215,8 @@ GENERATORS: Mapping[str, Callable[[str], str]] = {
     "wildcards": wildcard_table,
     "configuration": configuration,
     "commands": commands,
-    "rates": rates,
+    "rates": rate_table,
+    "images": image_table,
     "metrics": metrics,
 }
 
@@ -407,13 +401,16 @@ def _walk(command: Command) -> Iterator[Command]:
 
 def _command_section(command: Command) -> str:
     usage = " ".join(command.parser.format_usage().removeprefix("usage: ").split())
+    if not command.is_whole:
+        usage = usage.replace(" [-h] [-v | -q]", "")
     heading = "#" * (len(command.name.split()) + 1)
-    text = f"{heading} {command.name}\n\n{command.description}\n\n```text\n{usage}\n```"
+    example = f"\n{command.parser.epilog}" if command.parser.epilog and not command.is_whole else ""
+    text = f"{heading} {command.name}\n\n{command.description}\n\n```text\n{usage}{example}\n```"
     rows = []
     for action in command.parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             rows += [(f"`{choice.dest}`", choice.help or "", "") for choice in action._choices_actions]
-        elif action.help != argparse.SUPPRESS and not isinstance(action, argparse._HelpAction):
+        elif action.help != argparse.SUPPRESS and (action.dest not in ("help", "verbosity") or command.is_whole):
             meaning = argument_help(action, command.parser)
             rows.append(
                 (f"`{argument_name(action)}`", meaning, "" if "default" in meaning else _argument_default(action))
