@@ -2,14 +2,19 @@
 
 import json
 import pathlib
+import signal
 import sys
 
 import msgpack
 import zenoh
 
-folder = pathlib.Path(*sys.argv[2:3])
-config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": sys.argv[1:2]}}))
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the program, also while it waits for the router
+(folder := pathlib.Path(*sys.argv[2:3])).mkdir(parents=True, exist_ok=True)
+connect = {"endpoints": sys.argv[1:2], "timeout_ms": -1}  # wait for the router without a time limit
+config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": connect}))
+print(f"waiting for {sys.argv[1]}", file=sys.stderr)
 with zenoh.open(config) as session, session.declare_subscriber("sonarpost/v1/shore/contact/**") as records:
+    print("subscribed", file=sys.stderr)
     for sample in records:
         r = msgpack.unpackb(sample.payload.to_bytes())
         print(r["type"], r["vehicle_id"], r["image_id"], r.get("verdict"), r.get("contact"), flush=True)
