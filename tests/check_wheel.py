@@ -15,7 +15,24 @@ def wanted() -> set[str]:
     """Return the files of the source tree that belong into the wheel."""
     files = {p.relative_to(REPOSITORY / "common").as_posix() for p in (REPOSITORY / "common" / "sonarpost").rglob("*")}
     files |= {f"sonarpost/{p.relative_to(REPOSITORY).as_posix()}" for p in (REPOSITORY / "services").rglob("*")}
-    suffixes = (".py", ".typed", ".tiles", ".model", ".json", ".md", ".html", ".css", ".js", ".svg")
+    files |= {f"sonarpost/cli/deployment/examples/{p.name}" for p in (REPOSITORY / "config").iterdir()}
+    suffixes = (
+        ".py",
+        ".typed",
+        ".tiles",
+        ".model",
+        ".json",
+        ".json5",
+        ".toml",
+        ".service",
+        ".target",
+        ".conf",
+        ".md",
+        ".html",
+        ".css",
+        ".js",
+        ".svg",
+    )
     return {name for name in files if name.endswith(suffixes) and "__pycache__" not in name}
 
 

@@ -299,6 +299,14 @@ def test_environment_can_define_missing_keys(tmp_path: Path) -> None:
     assert (platform.id, table) == ("v", Needy(port="/dev/ttyUSB0"))
 
 
+def test_empty_variable_overrides_nothing(tmp_path: Path) -> None:
+    variables = {"SONARPOST_RELAY__RATE": "", "SONARPOST_PLATFORM__ID": "", "SONARPOST_RELAY__POLL_S": "2.5"}
+    platform, table = load(tmp_path, PLATFORM + "[relay]\nrate = 3\n", **variables)
+    assert (platform.id, table.rate, table.poll_s) == ("vessel-1", 3, 2.5)
+    variables |= {"SONARPOST_PLATFORM__TLS__KEY": "k", "SONARPOST_C2__OUT_DIR": "x", "SONARPOST_IMAGE": "y"}
+    assert config.overridden_keys("relay", variables) == ("platform.tls.key", "relay.poll_s")
+
+
 def test_multi_line_text_is_one_value(tmp_path: Path) -> None:
     _, table = load(tmp_path, PLATFORM, Needy, SONARPOST_RELAY__PORT='"a"\nother = 1')
     assert table == Needy(port='"a"\nother = 1')
@@ -313,7 +321,7 @@ def test_multi_line_text_is_one_value(tmp_path: Path) -> None:
         ("SONARPOST_RELAY__RATES", "1", "got 'an unknown key', expected one of: airtime_s"),
         ("SONARPOST_RELAY__RATE", "fast", "got 'fast', expected a valid integer"),
         ("SONARPOST_RELAY__RATE", "9", "got 9, expected less than or equal to 6"),
-        ("SONARPOST_RELAY__RATE", "", "got '', expected a valid integer"),
+        ("SONARPOST_RELAY__RATE", " ", "got ' ', expected a valid integer"),
         ("SONARPOST_RELAY__OUT_DIR", "7", "got 7"),
         ("SONARPOST_RELAY__NAMES", "a,b", "got 'a,b', expected a valid array"),
         ("SONARPOST_RELAY__POLL_S", "9" * 5000, "expected a valid number"),

@@ -211,3 +211,9 @@ def test_end_of_a_batch_can_be_discarded(tmp_path: Path) -> None:
     assert files.text_of(tmp_path / "b") is None
     files.commit()
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_an_error_names_the_file_and_not_the_temporary_one(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError) as caught:
+        write_atomically(tmp_path / "absent" / "track.csv", b"")
+    assert caught.value.filename == str(tmp_path / "absent" / "track.csv")

@@ -106,7 +106,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "first_frame_utc_s": NO_TIME,
         "last_frame_utc_s": NO_TIME,
     },
-    SAMPLES["reconstructed-image-authenticated"].__class__: {
+    SAMPLES["reconstructed-image-despeckled"].__class__: {
         "vessel_id": NO_NAME,
         "vehicle_id": NO_NAME,
         "image_id": NO_IMAGE,
@@ -123,6 +123,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "first_frame_utc_s": NO_TIME,
         "last_frame_utc_s": NO_TIME,
         "notes": [(LONG,)],
+        "despeckle_strength": [-0.1, 1.1, NAN],
     },
     SAMPLES["outgoing-message"].__class__: {
         "message_id": NO_ID,
@@ -410,6 +411,7 @@ def test_error_names_the_digest_of_another_image() -> None:
         ("refine", {}, "image_id"),
         ("resend", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
         ("wider", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
+        ("original", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
         ("revisit", {"lon_deg": 1.0}, "lat_deg"),
         ("revisit", {"lat_deg": 1.0}, "lon_deg"),
         ("revisit", {"image_id": "0001"}, "lat_deg"),

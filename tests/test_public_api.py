@@ -77,3 +77,19 @@ def test_records_are_packed_and_unpacked() -> None:
         message_id="m1", source="autonomy", priority=3, lifetime_s=60.0, created_utc_s=1.0, data=b"status"
     )
     assert sonarpost.decode_record(sonarpost.OutgoingMessage, sonarpost.encode_record(message), "test") == message
+
+
+def test_a_recording_in_metres_has_positions_with_its_projection(tmp_path: Path) -> None:
+    survey = simulate_survey(SurveySpec(seed=1, pings=200, samples=512, clutter=0)).survey
+    write_xtf(survey, tmp_path / "line.xtf", projected_crs="EPSG:32630")
+    options = sonarpost.SurveyOptions(projected_crs="EPSG:32630")
+    with sonarpost.open_survey(str(tmp_path / "line.xtf"), options) as source:
+        contacts = sonarpost.detect(source)
+        assert source.info.grid is not None
+    assert contacts
+    for contact in contacts:
+        assert contact.position is not None
+        assert (contact.position.lat_deg, contact.position.lon_deg) == pytest.approx((56.45, -5.6), abs=0.002)
+    with sonarpost.open_survey(tmp_path / "line.xtf") as source:
+        assert "set the option projected_crs" in source.info.warnings[0]
+        assert all(contact.position is None for contact in sonarpost.detect(source))

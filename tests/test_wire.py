@@ -265,10 +265,10 @@ def of(sample: str, **change: object) -> bytes:
         ("contact-bare", {"lat_deg": math.nan}, "lat_deg", "lat_deg: got nan, expected a finite number"),
         ("contact-bare", {"channel": "up"}, "channel", "channel: got 'up', expected 'port' or 'starboard'"),
         ("contact-bare", {"ping_number": 1.0}, "ping_number", "ping_number: got 1.0, expected a valid integer"),
-        ("raster-8-bits", {"data": b"1"}, "data", "data: got b'1', expected 6 bytes for 3 x 2 px of 8 bits, not 1"),
+        ("raster-8-bits", {"data": b"1"}, "data", "data: got b'1', expected 6 bytes for 3 × 2 px of 8 bits, not 1"),
         ("health", {"gauges": {"a": math.inf}}, "gauges.a", "gauges.a: got inf, expected a finite number"),
         (
-            "reconstructed-image-unauthenticated",
+            "reconstructed-image-despeckling-unknown",
             {"missing_mask": b"12"},
             "missing_mask",
             "missing_mask: got b'12', expected 0 or 1 bytes, not 2",

@@ -108,7 +108,7 @@ class RunningChain:
         for process, folder in (("decompressor", self.settings.vessel_images), ("c2", self.settings.shore_images)):
             self.history.add("consumer", process)
             for image in latest_versions(folder):
-                self.history.add("handled", process, image.image_id, sha256=image.sha256)
+                self.history.add("handled", process, image.image_id, sha256=image.sha256, detail=image.name)
         verdict = self.history.verdict()
         assert verdict.ok, f"{self.history.path}: {verdict}"
 
@@ -129,15 +129,16 @@ class RunningChain:
         return self.watcher.busy(0, time.time() - 3.0)
 
     def until_idle(self, timeout_s: float = 60.0) -> None:
-        """Wait until the chain has been idle for longer than a packet."""
-        quiet_since: list[float] = []
+        """Wait until the chain has been idle for longer than a packet, by reports made after it became idle."""
+        idle_since_utc_s = 0.0
 
         def quiet() -> bool:
+            nonlocal idle_since_utc_s
             if self.busy():
-                quiet_since.clear()
+                idle_since_utc_s = 0.0
                 return False
-            quiet_since.append(time.monotonic())
-            return quiet_since[-1] - quiet_since[0] > 1.5
+            idle_since_utc_s = idle_since_utc_s or time.time()
+            return time.time() - idle_since_utc_s > 1.5 and not self.watcher.busy(0, idle_since_utc_s)
 
         self.until(quiet, timeout_s, "chain idle")
 

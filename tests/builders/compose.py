@@ -203,7 +203,8 @@ def docker(*arguments: str, check: bool = True) -> str:
     """Run a docker command; its output."""
     done = subprocess.run(["docker", *arguments], capture_output=True, text=True, timeout=120, check=False)
     assert not check or done.returncode == 0, f"{arguments}: {done.stdout}\n{done.stderr}"
-    return done.stdout
+    # A container's standard error is its log.
+    return done.stdout + done.stderr if arguments[0] == "logs" else done.stdout
 
 
 @pytest.fixture(scope="session")

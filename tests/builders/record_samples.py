@@ -256,8 +256,8 @@ SAMPLES: dict[str, Record] = {
         last_frame_utc_s=1476262833.5,
         authenticated=False,
     ),
-    "reconstructed-image-authenticated": COMPLETE_IMAGE,
-    "reconstructed-image-unauthenticated": DAMAGED_IMAGE,
+    "reconstructed-image-despeckled": COMPLETE_IMAGE.model_copy(update={"codec": "emb", "despeckle_strength": 0.75}),
+    "reconstructed-image-despeckling-unknown": DAMAGED_IMAGE,
     "decision-full": Decision(
         decision_id="d-1",
         vessel_id="vessel-1",
@@ -305,6 +305,14 @@ SAMPLES: dict[str, Record] = {
         image_id="00A7",
         issued_by="op",
         issued_utc_s=1476262903.0,
+    ),
+    "command-original": Command(
+        command_id="c-4",
+        kind="original",
+        vehicle_id="uuv-1",
+        image_id="00A7",
+        issued_by="op",
+        issued_utc_s=1476262904.0,
     ),
     "advice-full": Advice(
         advice_id="a-2016-10-12-1",

@@ -132,6 +132,7 @@ def images(draw: st.DrawFn) -> ReconstructedImage:
         last_frame_utc_s=draw(_time),
         notes=tuple(draw(st.lists(_text(0, 2000), max_size=3))),
         authenticated=draw(_maybe(st.booleans())),
+        despeckle_strength=draw(_maybe(_real(0, 1))),
     )
 
 
@@ -163,7 +164,7 @@ def received_images(draw: st.DrawFn) -> ReceivedImage:
 
 @st.composite
 def commands(draw: st.DrawFn) -> Command:
-    kind = draw(st.sampled_from(["refine", "resend", "revisit", "wider"]))
+    kind = draw(st.sampled_from(["refine", "resend", "revisit", "wider", "original"]))
     place = kind == "revisit"
     return Command(
         command_id=draw(_record_id),
@@ -284,7 +285,7 @@ STRATEGIES[DownlinkState] = st.builds(
     DownlinkState,
     vessel_id=_name,
     vehicle_id=_name,
-    kind=st.sampled_from(["refine", "resend", "revisit", "decision", "wider"]),
+    kind=st.sampled_from(["refine", "resend", "revisit", "decision", "wider", "original"]),
     record_id=_record_id,
     state=st.sampled_from(["asked", "sent", "confirmed", "refused", "expired"]),
     times_sent=_count,

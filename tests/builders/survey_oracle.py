@@ -64,8 +64,9 @@ class Readers:
         self._valid = [path.read_bytes() for path in self._files]
 
     def seeds(self) -> list[bytes]:
-        """Return a valid input for each file."""
-        return [bytes([number]) + content for number, content in enumerate(self._valid)]
+        """Return a valid input for each file, and an XTF file whose last packet is cut."""
+        valid = [bytes([number]) + content for number, content in enumerate(self._valid)]
+        return [*valid, valid[0][:-100]]
 
     def check(self, data: bytes) -> str:
         """Read an input; return "rejected" or "read".

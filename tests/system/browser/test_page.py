@@ -173,6 +173,25 @@ def test_integrity_strip_shows_received_and_missing_parts(served):
     assert visit.page.locator("canvas").first.screenshot() != with_hatch
 
 
+def test_despeckled_image_is_named_and_the_image_without_it_can_be_requested(served):
+    for image_id, strength in (("00A6", 0.0), ("00A7", 1.0)):
+        served.state.store_image(image_record(image_id).model_copy(update={"despeckle_strength": strength}))
+    visit = served.visit()
+    visit.wait_for_contact("00A7")
+    assert "strength 1.00" in visit.text(".strip")
+    visit.press("r")
+    visit.wait("dialog .costs")
+    visit.page.locator("dialog .costs input[value=original]").check()
+    assert "unfiltered image" in visit.text("dialog .costs")
+    visit.page.locator("dialog [data-action=send]").click()
+    visit.wait('details[data-name="requests"] >> text=unfiltered image')
+    [item] = served.state.unsent_records()
+    assert (item.record.kind, item.record.image_id) == ("original", "00A7")
+    visit.press("j")
+    visit.wait_for_contact("00A6")
+    assert "not despeckled" in visit.text(".strip")
+
+
 def test_displayed_image_is_updated_by_new_versions(served):
     served.state.store_image(image_record("00A7", 1, missing_rows=20))
     visit = served.visit()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,7 +16,10 @@ from builders.chain import snippet
 from builders.common import eventually
 from PIL import Image
 
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import write_png, write_tiff
+from sonarpost.sonar.xtf_writer import write_xtf
 
 pytestmark = pytest.mark.chain
 
@@ -104,6 +108,56 @@ def snippet_folder(parent: Path) -> Path:
     return folder
 
 
+def own_image_folder(parent: Path) -> Path:
+    folder = parent / "own"
+    folder.mkdir()
+    grey = Image.fromarray(snippet(3)).resize((900, 640))
+    Image.merge("RGB", (grey, grey.point(lambda level: level // 2), grey)).save(folder / "phone.jpg")
+    (folder / "phone.txt").write_text("lat_deg: 56.45\nlon_deg: -5.6\nlatitude: 3\n")
+    write_png(folder / "plain.png", snippet(4))
+    (folder / "phone.heic").write_text("not an image")
+    return folder
+
+
+def test_own_images_arrive_with_positions_and_every_change_is_named(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = ("--images", str(own_image_folder(tmp_path)), "--time-scale", "60", "--fit", "resize", "--json")
+    done = subprocess.run(demo(out, *options), capture_output=True, text=True, timeout=150, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert json.loads(done.stdout.splitlines()[-1])["images_complete"] == 2
+    for text in (
+        "phone.heic: not used: not a JPEG, PNG or TIFF image",
+        "phone.jpg: colour converted to grey",
+        "phone.jpg: 900 × 640 px resized to 512 × 364 px",
+        "phone.jpg: line 3 ignored: 'latitude' is not a field of a contact",
+        "1 of 2 images have a side-car",
+    ):
+        assert text in done.stderr
+    sidecars = [json.loads(path.read_text()) for path in (out / "shore" / "images" / "vessel-1").glob("*.json")]
+    positions = {(s["contact"]["lat_deg"], s["contact"]["lon_deg"]) for s in sidecars}
+    assert (None, None) in positions
+    ((lat_deg, lon_deg),) = positions - {(None, None)}
+    assert lat_deg == pytest.approx(56.45, abs=1e-5)
+    assert lon_deg == pytest.approx(-5.6, abs=1e-5)
+
+
+def test_unusable_images_are_refused_before_the_start(tmp_path: Path) -> None:
+    own = own_image_folder(tmp_path)
+    (own / "plain.png").unlink()
+
+    def refused() -> str:
+        options = demo(tmp_path / "out", "--images", str(own))
+        done = subprocess.run(options, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 2
+        return done.stderr
+
+    assert "phone.jpg: size: got '900 × 640 px', expected 16 to 512 px a side; --fit crop or --fit resize" in refused()
+    Image.fromarray(snippet(3)).save(own / "phone.jpg")
+    (own / "phone.txt").write_text("lat_deg: 56.45\nlon_deg: west\n")
+    assert "phone.txt line 2: lon_deg: got 'west', expected a number" in refused()
+    assert not (tmp_path / "out").exists()
+
+
 def test_folder_of_snippets_is_sent(tmp_path: Path) -> None:
     result = run_demo(tmp_path / "out", "--images", str(snippet_folder(tmp_path)), "--time-scale", "60")
     assert result["contacts"] == result["images_complete"] == 2
@@ -147,7 +201,7 @@ def test_no_process_is_left_when_the_demo_is_ended(tmp_path: Path, number: signa
     ("options", "message"),
     [
         (("--survey", "/nowhere/a.xtf"), "/nowhere/a.xtf: got 'no such file or folder'"),
-        (("--images", "/"), "expected files named *.tif"),
+        (("--images", "/"), "/: images: got 0, expected"),
         (("--rate", "9"), "invalid choice"),
         (("--loss", "1.5"), "expected 0 to 1"),
     ],
@@ -168,11 +222,39 @@ def test_folder_with_other_files_is_not_touched(tmp_path: Path) -> None:
 
 
 def test_unreadable_survey_is_named_with_the_reason(tmp_path: Path) -> None:
-    survey = tmp_path / "empty.xtf"
-    survey.touch()
-    options = ("--survey", str(survey), "--json")
+    (tmp_path / "surveys").mkdir()
+    (tmp_path / "surveys" / "empty.xtf").touch()
+    options = ("--survey", str(tmp_path / "surveys"), "--json")
     done = subprocess.run(demo(tmp_path / "out", *options), capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 1
     assert "refused: " in done.stderr
     assert "empty.xtf" in done.stderr
+    assert "no contacts to send" in done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["contacts"] == 0
+
+
+def test_survey_without_contacts_ends_with_the_counts_at_lower_thresholds(tmp_path: Path) -> None:
+    survey = tmp_path / "a line.xtf"
+    spec = SurveySpec(seed=1, seabed=SeabedKind.ROCK, pings=300, samples=400, targets=2, clutter=4)
+    write_xtf(simulate_survey(spec).survey, survey)
+    options = ("--survey", str(survey), "--threshold", "1.9")
+    done = subprocess.run(demo(tmp_path / "out", *options), capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert re.search(r"a line\.xtf\W+0 contacts above 1\.9; 0 above 1\.0, .*[1-9]\d* above 0\.1", done.stderr)
+    assert "no contacts to send; see --threshold" in done.stderr
+    assert "contact sheet" not in done.stderr
+
+
+def test_survey_in_metres_arrives_with_positions(tmp_path: Path) -> None:
+    simulated = simulate_survey(SurveySpec(seed=1, pings=300, samples=512, targets=2, clutter=0))
+    write_xtf(simulated.survey, tmp_path / "line.xtf", projected_crs="EPSG:32630")
+    (tmp_path / "options.toml").write_text('projected_crs = "EPSG:32619"\n[errors]\nposition_m = 30.0\n')
+    options = ("--survey", str(tmp_path / "line.xtf"), "--time-scale", "60", "--crs", "EPSG:32630")
+    result = run_demo(tmp_path / "out", *options, "--options", str(tmp_path / "options.toml"))
+    assert isinstance(result["contacts"], int)
+    assert result["contacts"] >= 1
+    first = simulated.survey.pings[0]
+    contacts = [json.loads(p.read_text())["contact"] for p in (tmp_path / "out" / "shore").rglob("*.json")]
+    assert len(contacts) >= result["contacts"]
+    for contact in contacts:
+        assert (contact["lat_deg"], contact["lon_deg"]) == pytest.approx((first.lat_deg, first.lon_deg), abs=0.002)

@@ -6,10 +6,15 @@ Each test starts from the state in which the previous one left the chain, as in 
 from __future__ import annotations
 
 import json
+import os
+import re
+import subprocess
 import time
+from pathlib import Path
 
 import pytest
-from builders.compose import KILL, LOG_IN, SERVICES, Project, docker, until
+from builders.common import REPOSITORY
+from builders.compose import KILL, LOG_IN, SERVICES, Project, compose_command, docker, until
 
 ARRIVAL_S = 120.0
 
@@ -67,6 +72,65 @@ def test_a_simulated_survey_is_ashore_as_it_is_aboard(project: Project) -> None:
     aboard, complete = project.pictures("decompressor")
     assert aboard == ashore
     assert complete == contacts
+
+
+def test_commands_of_the_page_show_and_copy_the_images(project: Project, tmp_path: Path) -> None:
+    page = (REPOSITORY / "docs" / "how-to" / "view-images.md").read_text()
+    [commands] = re.findall(r"^```sh\n(docker-compose exec .*?)^```$", page, re.MULTILINE | re.DOTALL)
+    assert commands in (REPOSITORY / "docs" / "how-to" / "containers.md").read_text()
+    # The folder of docker-compose.yml is the project's: only the names differ from those of a user.
+    text = commands.replace("docker-compose ", " ".join(compose_command()) + " ")
+    text = text.replace(" exec ", " exec -T ").replace(" ./pictures", f" {tmp_path}/pictures")
+    done = subprocess.run(
+        ["bash", "-euc", text],
+        cwd=REPOSITORY,
+        env={
+            **os.environ,
+            **project.environment,
+            "COMPOSE_PROJECT_NAME": project.name,
+            "COMPOSE_FILE": ":".join(project.files),
+        },
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    count = len(project.pictures("c2")[0])
+    assert f"{count} images" in done.stdout
+    assert "folder /var/lib/sonarpost/pictures" in done.stderr
+    assert len(list(tmp_path.glob("pictures/vessel-1/*.png"))) >= count
+
+
+EFFECTIVE = """
+import os, pathlib
+from sonarpost.config import load
+from sonarpost.services.compressor.config import CompressorConfig as Config
+platform, table = load(pathlib.Path("/etc/sonarpost/uuv.toml"), "compressor", Config, os.environ)
+print(platform.id, platform.log_level, table.codec, table.budget_bytes)
+"""
+
+
+def test_edited_configuration_holds_unless_a_variable_overrides_it(project: Project, tmp_path: Path) -> None:
+    text = (REPOSITORY / "config" / "uuv.toml").read_text()
+    for key, value in (("id", '"uuv-7"'), ("codec", '"vq"'), ("budget_bytes", "300")):
+        text, count = re.subn(rf"^{key} = \S+", f"{key} = {value}", text, flags=re.MULTILINE)
+        assert count == 1, key
+    config = tmp_path / "config"
+    config.mkdir(mode=0o755)
+    (config / "uuv.toml").write_text(text)
+    mount = tmp_path / "edited.yml"
+    mount.write_text(f'services: {{ compressor: {{ volumes: ["{config}:/etc/sonarpost:ro"] }} }}\n')
+    files = [*project.files, str(mount)]
+    run = ["run", "--rm", "--no-deps", "-T", "compressor", "python", "-c"]
+    edited = Project(project.name, project.environment, files)
+    assert edited.compose(*run, EFFECTIVE).split() == ["uuv-7", "info", "vq", "300"]
+    changed = Project(project.name, {**project.environment, "CODEC": "emb", "LOG_LEVEL": "debug"}, files)
+    assert changed.compose(*run, EFFECTIVE).split() == ["uuv-7", "debug", "emb", "300"]
+    # The running services log what the environment sets: here only what the containers' network needs.
+    log = docker("logs", project.container("op_modem"))
+    assert "Configuration overridden by environment" in log
+    assert "platform.id" not in log
 
 
 def test_people_see_the_contacts_on_both_consoles_after_logging_in(project: Project) -> None:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import re
 import shutil
 import subprocess
 import tomllib
+from pathlib import Path
 
 import pytest
+import yaml
 from builders.common import REPOSITORY
 
-from sonarpost.config import SERVICES
+from sonarpost.config import SERVICES, ServiceConfig, load, overridden_keys
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.compressor.config import CompressorConfig
 
 COMPOSE = REPOSITORY / "docker-compose.yml"
 PLATFORMS = {"uuv": "uuv", "vessel": "vessel", "shore": "shore", "sim": "sim"}
@@ -106,7 +111,101 @@ def test_every_variable_is_in_the_example_with_its_default() -> None:
     assert set(known) - set(used) == {"COMPOSE_FILE"}
     # Other values are examples, marked in the comment.
     same = {name for name, default in used.items() if known[name].strip() == default}
-    assert {"SONARPOST_IMAGE", "ROUTER_IMAGE", "SHORE_PUBLISH", "SIM_TIME_SCALE", "LOG_LEVEL", "CODEC"} <= same
+    assert {"SONARPOST_IMAGE", "ROUTER_IMAGE", "SHORE_PUBLISH", "SERVICE_MEMORY"} <= same
+    # A variable that overrides a key is empty by default; the example shows the value of the file in `config`.
+    for variable, (service, table, key) in overriding_variables().items():
+        [platform] = re.findall(r"command: \[(\w+), ", blocks()[service])
+        platform_table, own = load(
+            REPOSITORY / "config" / f"{platform}.toml", service.removesuffix("-shore"), configuration_type(service), {}
+        )
+        value = getattr(platform_table if table == "platform" else own, key)
+        shown = known[variable].strip()
+        assert (json.dumps(list(value)) if isinstance(value, tuple) else str(value)) == shown, variable
+
+
+def configuration_type(service: str) -> type[ServiceConfig]:
+    name = service.removesuffix("-shore")
+    module = importlib.import_module(f"sonarpost.services.{name}.config")
+    found: type[ServiceConfig] = getattr(module, "".join(part.capitalize() for part in name.split("_")) + "Config")
+    return found
+
+
+def overriding_variables() -> dict[str, tuple[str, str, str]]:
+    """Return the variables of .env that override a key: service, table and key of each."""
+    text = COMPOSE.read_text()
+    anchors = dict(re.findall(r"^x-(uuv|vessel|shore|platform): &\w+\n((?:  .*\n)+)", text, flags=re.MULTILINE))
+    first_service = {"uuv": "atd_stub", "vessel": "relay", "shore": "c2", "platform": "relay"}
+    parts = [*((first_service[name], body) for name, body in anchors.items()), *blocks().items()]
+    found = {}
+    for service, body in parts:
+        for table, key, variable in re.findall(r"SONARPOST_([A-Z0-9_]+?)__(\w+): \$\{(\w+):-\}", body):
+            found[variable] = (service, table.lower(), key.lower())
+    return found
+
+
+def test_only_keys_of_the_containers_networks_are_always_set() -> None:
+    assert len(overriding_variables()) == 16
+    settings = re.findall(r"SONARPOST_([A-Z0-9_]+__\w+): (.*)", COMPOSE.read_text())
+    always = {name for name, value in settings if not re.fullmatch(r"\$\{\w+:-\}", value)}
+    # CONTRIBUTING and containers.md: a key of this list is not taken from config/*.toml.
+    assert always == {
+        "PLATFORM__ROUTER",
+        "UUV_MODEM__PORT",
+        "OP_MODEM__PORT",
+        "CONSOLE__HOST",
+        "CONSOLE__INSECURE",
+    }
+    page = (REPOSITORY / "docs" / "how-to" / "containers.md").read_text()
+    for name in always:
+        assert f"`{name.partition('__')[2].lower()}`" in page, name
+
+
+EDITED = """
+[platform]
+id = "uuv-7"
+log_level = "debug"
+[compressor]
+codec = "vq"
+budget_bytes = 300
+[atd_stub]
+max_contacts = 3
+"""
+
+
+def test_edited_configuration_holds_unless_env_overrides_it(tmp_path: Path) -> None:
+    file = tmp_path / "uuv.toml"
+    file.write_text(EDITED)
+    commands = compose_commands()
+    if not commands:
+        pytest.skip("neither `docker compose` nor docker-compose is installed")
+    for command in commands:
+        for text, expected in (
+            ("", ("uuv-7", "debug", "vq", 300, 3)),
+            ("CODEC=emb\nBUDGET_BYTES=\nUUV_ID=uuv-9\nMAX_CONTACTS=5\n", ("uuv-9", "debug", "emb", 300, 5)),
+        ):
+            (tmp_path / ".env").write_text(text)
+            shutil.copyfile(COMPOSE, tmp_path / "docker-compose.yml")
+            done = subprocess.run(
+                [*command, "--profile", "uuv", "config"],
+                cwd=tmp_path,
+                env={"PATH": os.environ["PATH"], "HOME": str(tmp_path)},
+                capture_output=True,
+                text=True,
+                timeout=60,
+                check=True,
+            )
+            services = yaml.safe_load(done.stdout)["services"]
+            environment = {
+                service: {name: str(value or "") for name, value in services[service]["environment"].items()}
+                for service in ("compressor", "atd_stub")
+            }
+            platform, compressor = load(file, "compressor", CompressorConfig, environment["compressor"])
+            _, stub = load(file, "atd_stub", AtdStubConfig, environment["atd_stub"])
+            values = (platform.id, platform.log_level, compressor.codec, compressor.budget_bytes, stub.max_contacts)
+            assert values == expected
+            keys = overridden_keys("compressor", environment["compressor"])
+            assert ("compressor.codec" in keys) == bool(text)
+            assert "compressor.budget_bytes" not in keys
 
 
 def test_the_dockerfile_and_the_compose_file_name_the_same_base() -> None:

@@ -218,3 +218,16 @@ def test_make_without_a_terminal_reports_the_key_without_passphrase(
     assert script.run(["make"], {}, root) == 0
     assert b"ENCRYPTED" not in (root / "pki" / "fleet" / "ca.key").read_bytes()
     assert "its key has no passphrase: keep the volume pki off the hosts that run services" in capsys.readouterr().out
+
+
+def test_names_come_from_the_configuration_unless_variables_set_them(script: ModuleType, tmp_path: Path) -> None:
+    for platform, name in (("uuv", "uuv-5"), ("vessel", "vessel-5"), ("shore", "shore-5")):
+        (tmp_path / f"{platform}.toml").write_text(f'[platform]\nid = "{name}"\n')
+    environment = {"VESSEL_ID": "vessel-6", "SHORE_ID": "", "FLEET_OBSERVERS": "desk-1"}
+    plan = script.Plan.from_environment(script.with_configured_names(environment, tmp_path))
+    assert (plan.shore, plan.local_vessel, plan.vehicles) == ("shore-5", "vessel-6", ("uuv-5",))
+    assert set(plan.members) == {"shore-5", "vessel-6", "desk-1"}
+    assert script.with_configured_names({}, tmp_path / "absent") == {}
+    (tmp_path / "uuv.toml").write_text("[platform]\nid = 7\n")
+    with pytest.raises(ConfigError, match=r"uuv\.toml:2: platform\.id"):
+        script.with_configured_names({}, tmp_path)

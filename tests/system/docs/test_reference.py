@@ -103,7 +103,10 @@ def test_fixed_metrics_are_described() -> None:
 
 
 def test_rates() -> None:
-    assert "| 1 | PSK BCH 128:8 | 3 x 64 | 192 | 6.1 | 252 |" in reference.rates()
+    assert "| 1 | PSK BCH 128:8 | 3 x 64 | 192 | 6.1 | 31 | -7.1 | 145 |" in reference.rate_table()
+    assert reference.rate_table().count("| not published | not published |") == 4
+    # 3 frames with 54 bytes of payload in 6.1 s, for images of 200 B with a contact record of 25 B.
+    assert "| 1 | 27 | 17.9 | 10.4 | 7.1 | 3.0 |" in reference.image_table()
 
 
 def test_every_public_name_is_in_the_api_page() -> None:

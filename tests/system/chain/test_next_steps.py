@@ -1,0 +1,143 @@
+"""Every command that the demo prints at its end works when it is pasted into a terminal in the same folder."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import pytest
+from builders.chain import snippet
+from builders.common import REPOSITORY, eventually
+
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.image_files import write_png
+from sonarpost.sonar.xtf_writer import write_xtf
+
+pytestmark = pytest.mark.chain
+
+DEMO = [sys.executable, "-m", "sonarpost.cli.main", "demo", "--time-scale", "60"]
+# Another terminal: without the virtual environment, and with the size of a small one.
+TERMINAL = {name: value for name, value in os.environ.items() if name != "VIRTUAL_ENV"} | {
+    "PATH": "/usr/bin:/bin",
+    "COLUMNS": "80",
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with the examples, as in a clone, and a short survey."""
+    write_xtf(simulate_survey(SurveySpec(seed=1, pings=400, targets=2, clutter=1)).survey, tmp_path / "line.xtf")
+    shutil.copytree(REPOSITORY / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("rust"))
+    return tmp_path
+
+
+def printed_commands(text: str) -> list[str]:
+    """Return the commands after `Next`, whose purpose is on the next line."""
+    return re.findall(r"^  (\S.*)\n      \S", text.partition("\nNext")[2], re.MULTILINE)
+
+
+@contextmanager
+def pasted(command: str, folder: Path, errors: IO[str]) -> Iterator[subprocess.Popen[str]]:
+    """Run a command until the end of the block, and end it as Ctrl-C does."""
+    process = subprocess.Popen(
+        ["bash", "-c", f"exec {command}"], cwd=folder, env=TERMINAL, stdout=subprocess.PIPE, stderr=errors, text=True
+    )
+    with process:
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(timeout=30)
+
+
+def list_contacts(command: str, folder: Path) -> str:
+    done = subprocess.run(
+        ["bash", "-c", command], cwd=folder, env=TERMINAL, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "sonarpost c2: folder demo-out/shore/images\n"
+    return done.stdout
+
+
+def test_commands_work_after_the_end(folder: Path) -> None:
+    done = subprocess.run(
+        [*DEMO, "--survey", "line.xtf"],
+        cwd=folder,
+        env=TERMINAL,
+        capture_output=True,
+        text=True,
+        timeout=170,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    # No line is wrapped at 80 columns, and the printed folders hold the images.
+    for path in re.findall(r"^images at the .*: (\S+)$", done.stderr, re.MULTILINE):
+        assert list((folder / path).glob("**/*.tiff")), path
+    ls, view, subscriber = printed_commands(done.stderr)
+    count = int(re.findall(r"^(\d+) contacts$", done.stderr, re.MULTILINE)[0])
+    assert list_contacts(ls, folder).endswith(f"{count} images\n")
+    with (folder / "errors.txt").open("w+") as errors:
+        with pasted(view, folder, errors) as page:
+            assert page.stdout is not None
+            address = page.stdout.readline().split()[0]
+            assert page.stdout.readline().startswith(f"{count} contacts in demo-out/shore/images, read only")
+            with urllib.request.urlopen(address, timeout=10) as reply:
+                assert b"<title>" in reply.read()
+        assert page.returncode == 0
+        with pasted(subscriber, folder, errors):
+            endpoint = subscriber.split()[-2]
+            eventually(lambda: f"waiting for {endpoint}" in (folder / "errors.txt").read_text(), 30, "subscriber")
+            router = [sys.executable, "-m", "sonarpost.bus.router", "--listen", endpoint]
+            with subprocess.Popen(router, stderr=subprocess.DEVNULL) as process:
+                eventually(lambda: "subscribed" in (folder / "errors.txt").read_text(), 60, "subscription")
+                process.terminate()
+    assert "Traceback" not in (folder / "errors.txt").read_text()
+
+
+def test_commands_work_while_the_chain_is_kept_running(folder: Path) -> None:
+    text = folder / "demo.txt"
+    with text.open("w") as errors:
+        demo = subprocess.Popen([*DEMO, "--survey", "line.xtf", "--keep"], cwd=folder, env=TERMINAL, stderr=errors)
+    try:
+        eventually(lambda: "send another survey" in text.read_text(), 150, "the end of the demo")
+        ls, _, subscriber, simulate = printed_commands(text.read_text())
+        listed = list_contacts(ls, folder)
+        with (folder / "errors.txt").open("w") as errors, pasted(subscriber, folder, errors) as process:
+            eventually(lambda: "subscribed" in (folder / "errors.txt").read_text(), 30, "subscription")
+            subprocess.run(["bash", "-c", simulate], cwd=folder, env=TERMINAL, timeout=60, check=True)
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("reconstructed_image uuv-1 ")
+            # The example prints a record before it writes the image.
+            eventually(lambda: any((folder / "demo-out").glob("uuv-1_*.pgm")), 30, "the image")
+        assert len(list_contacts(ls, folder).splitlines()) > len(listed.splitlines())
+    finally:
+        demo.send_signal(signal.SIGINT)
+        status = demo.wait(timeout=60)
+    assert status == 0
+    assert "Traceback" not in text.read_text()
+
+
+def test_folder_and_programs_elsewhere_are_in_the_commands(tmp_path: Path) -> None:
+    """Without the examples, `c2 watch` is the subscriber; another output folder is named."""
+    (tmp_path / "snippets").mkdir()
+    write_png(tmp_path / "snippets" / "a.png", snippet(1))
+    options = ["--out", "my results", "--images", "snippets"]
+    done = subprocess.run(
+        [*DEMO, *options], cwd=tmp_path, env=TERMINAL, capture_output=True, text=True, timeout=150, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    ls, view, watch = printed_commands(done.stderr)
+    assert ls.endswith("c2 ls --archive 'my results/shore/images'")
+    assert view.endswith("console --view 'my results/shore/images'")
+    assert re.search(r"c2 watch --router tcp/127\.0\.0\.1:\d+$", watch)
+    listed = subprocess.run(["bash", "-c", ls], cwd=tmp_path, env=TERMINAL, capture_output=True, text=True, check=True)
+    assert listed.stdout.endswith("1 images\n")

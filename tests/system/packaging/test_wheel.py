@@ -1,0 +1,155 @@
+"""The wheel in an empty environment: without extras, and with other versions of Python."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders.common import REPOSITORY
+from packaging.requirements import Requirement
+
+from sonarpost.sonar.image_files import write_png
+
+TIMEOUT_S = 900
+CHAIN_SERVICES = ["atd_stub", "compressor", "uuv_modem", "acoustic_channel", "op_modem", "decompressor", "relay", "c2"]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(REPOSITORY)]
+    subprocess.run(command, check=True, capture_output=True, timeout=TIMEOUT_S)
+    [path] = folder.glob("*.whl")
+    return path
+
+
+def closure(requirements: Iterable[str] | None) -> set[str]:
+    """Return the names of the distributions that requirements without extras need, dependencies included."""
+    found = set[str]()
+    for requirement in map(Requirement, requirements or ()):
+        if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+            found |= {requirement.name} | closure(importlib.metadata.requires(requirement.name))
+    return found
+
+
+@pytest.fixture(scope="module")
+def minimal(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the programs of an environment with the wheel and, as links, its dependencies without any extra."""
+    environment = tmp_path_factory.mktemp("minimal")
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(environment)], check=True)
+    pip = [sys.executable, "-m", "pip", "--python", str(environment / "bin" / "python"), "install", "--no-deps"]
+    subprocess.run([*pip, "--no-index", "--quiet", str(wheel)], check=True, timeout=TIMEOUT_S)
+    [site] = environment.glob("lib/python3*/site-packages")
+    [metadata] = site.glob("sonarpost-*.dist-info")
+    names = closure(importlib.metadata.Distribution.at(metadata).requires)
+    assert {"numpy", "eclipse-zenoh"} <= names
+    assert not {"starlette", "uvicorn", "matplotlib"} & names
+    for name in names:
+        link_distribution(name, site)
+    return environment / "bin"
+
+
+def link_distribution(name: str, site: Path) -> None:
+    distribution = importlib.metadata.distribution(name)
+    assert distribution.files is not None
+    for first in {file.parts[0] for file in distribution.files} - {"..", "__pycache__"}:
+        source = Path(str(distribution.locate_file(first)))
+        if not (site / first).exists():
+            (site / first).symlink_to(source)
+
+
+def run(program: Path, *arguments: str, status: int = 0, cwd: Path, **environment: str) -> str:
+    result = subprocess.run(
+        [str(program), *arguments],
+        cwd=cwd,
+        env={"PATH": "/usr/bin:/bin", "HOME": str(cwd), **environment},
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+    assert result.returncode == status, result.stderr
+    return result.stdout + result.stderr
+
+
+def use_the_codecs_and_the_detector(programs: Path, folder: Path) -> None:
+    image = np.random.default_rng(1).gamma(4.0, 25.0, size=(80, 140)).clip(0, 255).astype(np.uint8)
+    write_png(folder / "contact.png", image)
+    sonarpost = programs / "sonarpost"
+    for codec in ("emb", "vq"):
+        run(sonarpost, "encode", "contact.png", "--codec", codec, "--out", codec, cwd=folder)
+        run(sonarpost, "decode", f"{codec}/contact.{codec}", "--out", codec, cwd=folder)
+        assert (folder / codec / "contact.tiff").is_file()
+    run(sonarpost, "simulate", "line.xtf", "--pings", "400", cwd=folder)
+    assert json.loads(run(sonarpost, "detect", "line.xtf", "--json", cwd=folder))["files"]
+
+
+@pytest.mark.timeout(TIMEOUT_S)
+def test_the_codecs_and_the_detector_need_no_extra(minimal: Path, tmp_path: Path) -> None:
+    use_the_codecs_and_the_detector(minimal, tmp_path)
+
+
+@pytest.mark.parametrize("service", CHAIN_SERVICES)
+def test_the_services_of_the_chain_need_no_extra(service: str, minimal: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty.toml").touch()
+    printed = run(minimal / "sonarpost", "run", service, "--config", "empty.toml", status=2, cwd=tmp_path)
+    assert "empty.toml: platform" in printed, "the configuration is read after all modules were imported"
+
+
+@pytest.mark.timeout(TIMEOUT_S)
+@pytest.mark.chain
+def test_the_whole_chain_runs_without_an_extra(minimal: Path, tmp_path: Path) -> None:
+    printed = run(minimal / "sonarpost", "demo", "--time-scale", "10", "--json", cwd=tmp_path)
+    outcome = json.loads(next(line for line in printed.splitlines() if line.startswith("{")))
+    assert outcome["images_shore"] == outcome["images_complete"] > 0
+
+
+def test_users_need_no_extra(minimal: Path, tmp_path: Path) -> None:
+    assert run(minimal / "sonarpost", "console", "user", "ls", "--state-dir", "state", cwd=tmp_path) == ""
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [("console", ["--training", "3"]), ("run", ["console", "--config", "x.toml"]), ("demo", ["--console"])],
+)
+def test_a_command_without_its_extra_says_how_to_install_it(
+    command: str, arguments: list[str], minimal: Path, tmp_path: Path
+) -> None:
+    printed = run(minimal / "sonarpost", command, *arguments, status=2, cwd=tmp_path)
+    assert printed == f"sonarpost {command}: needs the extra console: pip install 'sonarpost[console]'\n"
+
+
+def interpreter(version: str) -> str | None:
+    """Return an interpreter of a version from PATH, or else from pyenv."""
+    found = shutil.which(f"python{version}")
+    installed = sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python"))
+    works = found and subprocess.run([found, "--version"], capture_output=True, check=False).returncode == 0
+    return found if works else str(installed[-1]) if installed else None
+
+
+@pytest.mark.long
+@pytest.mark.timeout(TIMEOUT_S)
+@pytest.mark.parametrize("version", ["3.11", "3.12", "3.13"])
+def test_the_wheel_runs_with_the_locked_packages(version: str, wheel: Path, tmp_path: Path) -> None:
+    python = interpreter(version)
+    if python is None:
+        pytest.skip(f"Python {version} is neither in PATH nor installed with pyenv")
+    environment = tmp_path / "environment"
+    subprocess.run([python, "-m", "venv", str(environment)], check=True)
+    pip = [str(environment / "bin" / "python"), "-m", "pip", "--quiet", "--disable-pip-version-check", "install"]
+    lock = str(REPOSITORY / "requirements.lock")
+    installed = subprocess.run(
+        [*pip, "--require-hashes", "--only-binary", ":all:", "-r", lock], capture_output=True, text=True, check=False
+    )
+    if "No matching distribution" in installed.stderr or "Failed to establish" in installed.stderr:
+        pytest.skip(f"the package index does not have the locked packages: {installed.stderr.splitlines()[-1]}")
+    assert installed.returncode == 0, installed.stderr
+    subprocess.run([*pip, "--no-deps", "--no-index", str(wheel)], check=True)
+    use_the_codecs_and_the_detector(environment / "bin", tmp_path)
