@@ -16,6 +16,7 @@ from builders.chain import snippet
 from builders.common import eventually
 from PIL import Image
 
+from sonarpost.cli.demo.settings import UUV_ADDRESS
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import write_png, write_tiff
@@ -63,13 +64,26 @@ def processes_of(folder: Path) -> list[int]:
     return found
 
 
+def reasons_of_loss(channel_log: Path) -> set[str]:
+    """Return the outcomes of the vehicle's packets of which a frame was lost."""
+    packets = [json.loads(line) for line in channel_log.read_text().splitlines()]
+    return {
+        packet["outcome"]
+        for packet in packets
+        if packet["event"] == "packet"
+        and packet["source"] == UUV_ADDRESS
+        and any(frame["fate"] == "lost" for frame in packet["frames"])
+    }
+
+
 def test_demo_delivers_a_simulated_survey(tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = run_demo(out, "--time-scale", "60")
     assert result["contacts"] == result["images_vessel"] == result["images_shore"] == result["images_complete"]
     assert isinstance(result["contacts"], int)
     assert result["contacts"] >= 6  # the simulated survey has six mine-like objects
-    assert result["frames_lost"] == 0
+    # The channel loses nothing at random. On a slow computer the vessel may transmit while a packet arrives.
+    assert reasons_of_loss(out / "water" / "channel.jsonl") <= {"receiver transmitting"}
     assert result["sha256_match"] is True
     with Image.open(out / "demo.png") as sheet:
         assert sheet.width > 500
