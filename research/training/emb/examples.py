@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.emb import kernel, range_coder, transform
+from sonarpost.codec.emb import contexts, kernel, range_coder, transform
 from sonarpost.codec.emb.bitplanes import START_THRESHOLDS, code_planes, extra_planes
 from sonarpost.codec.emb.coder import UNIT_SCALE, Coder, CoefficientState
 from sonarpost.codec.emb.model import FORMAT_2, Model, model_of
@@ -53,8 +53,8 @@ def list_examples(
     stream the same influence.
     """
     decisions, signs = [], []
-    rows = np.zeros((rows_per_image, kernel.FEATURES + 3), np.int16)
-    sign_rows = np.zeros((rows_per_image // 8, kernel.SIGN_FEATURES + 2), np.int16)
+    rows = np.zeros((rows_per_image, contexts.FEATURES + 3), np.int16)
+    sign_rows = np.zeros((rows_per_image // 8, contexts.SIGN_FEATURES + 2), np.int16)
     for image in images:
         target, mean_index, size = random_target(model, image, rng)
         side = random_side_info(target.targets, mean_index, rng)

@@ -18,6 +18,7 @@ import numpy as np
 import optax
 
 from research.training.emb.examples import Rows, blank_model, list_examples, measure_centres
+from sonarpost.codec.emb import contexts
 from sonarpost.codec.emb import kernel as k
 from sonarpost.codec.emb.model import FORMAT_2, FORMAT_3, Model, model_of, parse, read_arrays
 
@@ -38,8 +39,8 @@ def network(p: Params, x: jax.Array) -> jax.Array:
 
 def sign_network(p: Params, x: jax.Array) -> jax.Array:
     """Return the logit of a positive sign, odd in the odd features; the integer version is `kernel._sign_logit`."""
-    odd = x[:, : k.SIGN_ODD] / 16 @ p["w1"][: k.SIGN_ODD]
-    even = x[:, k.SIGN_ODD :] / 16 @ p["w1"][k.SIGN_ODD :] + p["b1"]
+    odd = x[:, : contexts.SIGN_ODD] / 16 @ p["w1"][: contexts.SIGN_ODD]
+    even = x[:, contexts.SIGN_ODD :] / 16 @ p["w1"][contexts.SIGN_ODD :] + p["b1"]
     return (layer(even + odd) - layer(even - odd)) @ p["w2"]
 
 
@@ -150,7 +151,7 @@ def listed(order: Model, pool: Mapping[str, np.ndarray], images: int, rng: np.ra
 
 def trained_contexts(rows: Rows, steps: int, rng: np.random.Generator) -> list[Params]:
     """Train the networks of significance and refinement."""
-    nets, f = [], k.FEATURES
+    nets, f = [], contexts.FEATURES
     for net, count in ((0, steps), (1, steps // 3)):
         of_net = rows[:, f + 1] == net
         # Weight: number of decisions that a row represents, times the weight of its stream.
@@ -162,7 +163,7 @@ def trained_contexts(rows: Rows, steps: int, rng: np.random.Generator) -> list[P
 
 def trained_signs(rows: Rows, steps: int, rng: np.random.Generator) -> list[Params]:
     """Train the network of signs of each orientation."""
-    signs, f = [], k.SIGN_FEATURES
+    signs, f = [], contexts.SIGN_FEATURES
     for orient in range(4):
         oriented = rows[rows[:, f] == orient]
         first = {

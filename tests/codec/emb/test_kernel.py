@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sonarpost.codec.emb import kernel
+from sonarpost.codec.emb import contexts, kernel
 from sonarpost.codec.emb.bitplanes import PASSES, reconstructed_coefficients
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.coder import CoefficientState
@@ -59,7 +59,7 @@ def test_network_and_adaptation_match_unbounded_integers(net: int, reach: int) -
     base = np.zeros(kernel.HIDDEN_1, np.int32)
     steps_taken = []
     for _ in range(60):
-        f = rng.integers(-reach // 4, reach + 1, kernel.FEATURES).astype(np.int32)
+        f = rng.integers(-reach // 4, reach + 1, contexts.FEATURES).astype(np.int32)
         kernel.band_base(f, MODEL.w1[net], MODEL.b1[net], base)
         logit = kernel._logit(f, base, MODEL.w1[net], MODEL.w2[net], MODEL.b2[net], last_layer, h1, h2)
         expected, hidden = plain_logit(f.tolist(), net, last)
@@ -80,8 +80,8 @@ def plain_sign_logit(features: list[int], orient: int) -> int:
     w1, base, w2 = (getattr(MODEL, name)[orient].tolist() for name in ("sign_w1", "sign_b1", "sign_w2"))
     total = 0
     for j in range(kernel.SIGN_HIDDEN):
-        odd = sum(features[i] * w1[i][j] for i in range(kernel.SIGN_ODD))
-        even = base[j] + sum(features[i] * w1[i][j] for i in range(kernel.SIGN_ODD, kernel.SIGN_FEATURES))
+        odd = sum(features[i] * w1[i][j] for i in range(contexts.SIGN_ODD))
+        even = base[j] + sum(features[i] * w1[i][j] for i in range(contexts.SIGN_ODD, contexts.SIGN_FEATURES))
         total += (min(max(even + odd >> 6, 0), 4095) - min(max(even - odd >> 6, 0), 4095)) * w2[j]
     return min(max(total >> 12, -kernel.LOGIT_LIMIT), kernel.LOGIT_LIMIT)
 
@@ -92,12 +92,12 @@ def test_sign_network_matches_unbounded_integers_and_is_odd(orient: int, reach: 
     rng = np.random.default_rng(reach + orient)
     logits = []
     for _ in range(40):
-        f = rng.integers(-reach, reach + 1, kernel.SIGN_FEATURES).astype(np.int32)
-        f[kernel.SIGN_ODD :] = rng.integers(0, 25, kernel.SIGN_FEATURES - kernel.SIGN_ODD)
+        f = rng.integers(-reach, reach + 1, contexts.SIGN_FEATURES).astype(np.int32)
+        f[contexts.SIGN_ODD :] = rng.integers(0, 25, contexts.SIGN_FEATURES - contexts.SIGN_ODD)
         nets = (MODEL.sign_b1, MODEL.sign_w1, MODEL.sign_w2, orient, np.zeros(2 * kernel.SIGN_HIDDEN, np.int32))
         logits.append(kernel._sign_logit(f, *nets))
         assert logits[-1] == plain_sign_logit(f.tolist(), orient)
-        f[: kernel.SIGN_ODD] *= -1
+        f[: contexts.SIGN_ODD] *= -1
         assert abs(kernel._sign_logit(f, *nets) + logits[-1]) <= 1  # rounded down for both signs
     assert len(set(logits)) > 20
 
@@ -112,41 +112,41 @@ def test_sign_features_are_odd_and_even(orient: int) -> None:
     rng = np.random.default_rng(orient)
     signed = rng.integers(-48, 49, layout.cells).astype(np.int32)
     lows = rng.integers(-3000, 3000, layout.low_cells).astype(np.int32) * 512  # exact multiples of the threshold
-    f, inverted = np.zeros(kernel.SIGN_FEATURES, np.int32), np.zeros(kernel.SIGN_FEATURES, np.int32)
+    f, inverted = np.zeros(contexts.SIGN_FEATURES, np.int32), np.zeros(contexts.SIGN_FEATURES, np.int32)
     band = layout.bands[row]
     width = int(layout.sides[band[LEVEL], 1])
     for y, x in ((0, 0), (2, 3), (int(band[HEIGHT]) - 1, int(band[WIDTH]) - 1)):
         at = int(band[OFFSET] + y * band[STRIDE] + x)
-        kernel._sign_context(f, signed, lows, layout.bands, width, 2048, row, y, x, at)
-        kernel._sign_context(inverted, -signed, -lows, layout.bands, width, 2048, row, y, x, at)
-        assert np.array_equal(f[: kernel.SIGN_ODD], -inverted[: kernel.SIGN_ODD])
-        assert np.array_equal(f[kernel.SIGN_ODD :], inverted[kernel.SIGN_ODD :])
-        assert f[: kernel.SIGN_ODD].any()
+        contexts.sign_context(f, signed, lows, layout.bands, width, 2048, row, y, x, at)
+        contexts.sign_context(inverted, -signed, -lows, layout.bands, width, 2048, row, y, x, at)
+        assert np.array_equal(f[: contexts.SIGN_ODD], -inverted[: contexts.SIGN_ODD])
+        assert np.array_equal(f[contexts.SIGN_ODD :], inverted[contexts.SIGN_ODD :])
+        assert f[: contexts.SIGN_ODD].any()
 
 
 @given(threshold=st.integers(100, 2880 * 64 << 6), size=st.integers(0, 2**40))
 @example(threshold=2880 * 64 << 6, size=48 * (2880 * 64 << 6) - 1)
 def test_quotient_without_division_is_exact(threshold: int, size: int) -> None:
-    inverse = (1 << kernel._INVERSE_BITS) // threshold + 1
+    inverse = (1 << contexts.INVERSE_BITS) // threshold + 1
     for near in (
         size,
         size // threshold * threshold,
         max(size // threshold * threshold - 1, 0),
         size % (50 * threshold),
     ):
-        assert kernel._quotient(near, threshold, inverse) == min(near // threshold, kernel.MAX_EIGHTHS)
+        assert contexts._quotient(near, threshold, inverse) == min(near // threshold, contexts.MAX_EIGHTHS)
 
 
 @given(st.integers(1, 2**40))
 def test_logarithm_is_linear_between_powers_of_two(value: int) -> None:
     power = value.bit_length() - 1
-    assert kernel.log2_eighths(value) == 8 * power + ((value << 3) >> power) - 8
+    assert contexts.log2_eighths(value) == 8 * power + ((value << 3) >> power) - 8
 
 
 def test_adaptation_increases_the_probability_of_a_repeated_bit() -> None:
     last_layer = np.concatenate([MODEL.w3[0].astype(np.int64) << 16, [int(MODEL.b3[0]) << 8]])
     h1, h2 = np.zeros(kernel.HIDDEN_1, np.int32), np.zeros(kernel.HIDDEN_2, np.int32)
-    f, base = np.full(kernel.FEATURES, 6, np.int32), np.zeros(kernel.HIDDEN_1, np.int32)
+    f, base = np.full(contexts.FEATURES, 6, np.int32), np.zeros(kernel.HIDDEN_1, np.int32)
     kernel.band_base(f, MODEL.w1[0], MODEL.b1[0], base)
     logits = []
     for _ in range(40):

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from sonarpost.codec.emb import kernel, perceptual_weights, transform
+from sonarpost.codec.emb import contexts, kernel, perceptual_weights, transform
 from sonarpost.codec.emb.coder import UNIT_SCALE, Coder, CoefficientState
 from sonarpost.codec.emb.kernel import I32, I64
 from sonarpost.codec.emb.model import Model
@@ -51,7 +51,7 @@ def code_planes(
     """
     layout, mean, weights = state.layout, side.mean, model.perceptual
     bands, widths = layout.bands.tolist(), layout.sides[:, 1].tolist()  # Python numbers are ten times faster here
-    features = np.zeros(kernel.FEATURES, np.int32)
+    features = np.zeros(contexts.FEATURES, np.int32)
     insignificant = np.zeros(layout.cells, np.int32)
     originals = targets if originals is None else originals
     scaled = targets if weights is None else perceptual_weights.apply_initial_scales(weights, state, targets)
@@ -137,7 +137,7 @@ def reconstructed_coefficients(state: CoefficientState, model: Model, region: Re
 def image_features(state: CoefficientState, mean: int) -> tuple[int, int, int]:
     """Return the image features of the enhancer: threshold, mean level, share of significant coefficients."""
     share = 8192 * int(np.count_nonzero(state.lower)) // (state.layout.height_px * state.layout.width_px)
-    threshold, level, amount = (kernel.log2_eighths(value) for value in (state.threshold, max(mean, 4), share + 16))
+    threshold, level, amount = (contexts.log2_eighths(value) for value in (state.threshold, max(mean, 4), share + 16))
     return threshold - 96, level - 48, amount - 56
 
 
@@ -152,15 +152,15 @@ def _density(state: CoefficientState, band: list[int]) -> int:
     start = band[OFFSET] - 2 * band[STRIDE] - 2
     stop = start + (band[HEIGHT] + 4) * band[STRIDE]
     significant = int(np.count_nonzero(state.lower[start:stop]))
-    return kernel.log2_eighths((2048 * significant + 512) // (cells + 1) + 1) - 40
+    return contexts.log2_eighths((2048 * significant + 512) // (cells + 1) + 1) - 40
 
 
 def _set_band_features(features: I32, band: list[int], threshold: int, mean: int, density: int) -> None:
-    values = [0] * (kernel.FEATURES - kernel.BAND_FEATURES)
+    values = [0] * (contexts.FEATURES - contexts.BAND_FEATURES)
     if band[ORIENT] != LL:
         values[min(band[LEVEL], 4) - 1] = 32
         values[3 + band[ORIENT]] = 32
-    values[7] = min(kernel.log2_eighths(threshold) - 104, 36)
-    values[8] = kernel.log2_eighths(max(mean, 4)) - 48
+    values[7] = min(contexts.log2_eighths(threshold) - 104, 36)
+    values[8] = contexts.log2_eighths(max(mean, 4)) - 48
     values[9] = density
-    features[kernel.BAND_FEATURES :] = values
+    features[contexts.BAND_FEATURES :] = values

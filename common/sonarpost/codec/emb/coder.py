@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from sonarpost.codec.emb import kernel, range_coder
+from sonarpost.codec.emb import contexts, kernel, range_coder
 from sonarpost.codec.emb.kernel import I16, I32, I64, U8
 from sonarpost.codec.emb.transform import Layout
 
@@ -72,8 +72,8 @@ class Coder:
     words: I64 = field(default_factory=lambda: np.zeros(range_coder.CODER_WORDS, np.int64))
     best: U8 = field(default_factory=lambda: np.zeros(0, np.uint8))
     curve: I64 = field(default_factory=lambda: np.zeros(1, np.int64))
-    decisions: I16 = field(default_factory=lambda: np.zeros((0, kernel.FEATURES + 3), np.int16))
-    sign_decisions: I16 = field(default_factory=lambda: np.zeros((0, kernel.SIGN_FEATURES + 2), np.int16))
+    decisions: I16 = field(default_factory=lambda: np.zeros((0, contexts.FEATURES + 3), np.int16))
+    sign_decisions: I16 = field(default_factory=lambda: np.zeros((0, contexts.SIGN_FEATURES + 2), np.int16))
 
     @classmethod
     def reader(cls, body: bytes) -> Coder:

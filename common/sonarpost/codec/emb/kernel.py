@@ -1,16 +1,28 @@
-"""The coding loop: contexts and networks. The same code encodes, decodes and collects training examples.
+"""The coding loop and the networks. The same code encodes, decodes and collects training examples.
 
 All arithmetic is on int32 and int64. docs/explanation/codecs.md describes the format.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Final, cast
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from sonarpost.codec.emb.contexts import (
+    BAND_FEATURES,
+    FEATURES,
+    INVERSE_BITS,
+    MAX_EIGHTHS,
+    SIGN_FEATURES,
+    SIGN_ODD,
+    clip,
+    coefficient_context,
+    has_significant_neighbour,
+    int64,
+    sign_context,
+)
 from sonarpost.codec.emb.range_coder import (
     CODER_CODE,
     CODER_COST,
@@ -20,22 +32,7 @@ from sonarpost.codec.emb.range_coder import (
     WRITE,
     code_bit,
 )
-from sonarpost.codec.emb.transform import (
-    CHILD,
-    COUSIN_1,
-    HEIGHT,
-    LEVEL,
-    LL,
-    LOW,
-    NEXT_1,
-    OFFSET,
-    ORIENT,
-    PARENT,
-    SIBLING_1,
-    SIBLING_2,
-    STRIDE,
-    WIDTH,
-)
+from sonarpost.codec.emb.transform import HEIGHT, LEVEL, OFFSET, ORIENT, STRIDE, WIDTH
 from sonarpost.codec.jit import inlined, jit
 
 I32 = npt.NDArray[np.int32]
@@ -46,206 +43,19 @@ U8 = npt.NDArray[np.uint8]
 NEAR, REFINE, ALL = 0, 1, 2
 """Kinds of pass: insignificant coefficients with significant neighbours; significant ones; all insignificant ones."""
 
-FEATURES: Final = 54
-BAND_FEATURES: Final = 44
-"""Index of the first feature that is the same for a whole band."""
-SIGN_ODD: Final = 51
-"""Number of odd sign features, which change sign with the image. The even features after them do not."""
-SIGN_FEATURES: Final = 61
 HIDDEN_1: Final = 32
 HIDDEN_2: Final = 16
 SIGN_HIDDEN: Final = 32
-MAX_EIGHTHS: Final = 48
-"""Largest magnitude in a context: 6 thresholds, in eighths."""
 LOGIT_LIMIT: Final = 3071
 """Largest logit, in 1/256. The table of probabilities covers -LOGIT_LIMIT to LOGIT_LIMIT."""
 CENTRE_COLUMNS: Final = 24
 """Columns of the table of reconstruction points: logits from -9 in steps of 1/2."""
 _CENTRE_SHIFT: Final = 2304
 _LIVE_LIMIT: Final = 1 << 34
-_INVERSE_BITS: Final = 54
 # A pass skips a coefficient whose last logit is this far below the minimum of the pass. The first value is for logits
 # of this plane, the second for earlier ones: the probability grows when the threshold is halved.
 _SKIP_NEAR: Final = 384
 _SKIP_FAR: Final = 896
-
-_int64: Final = cast(Callable[[Any], int], np.int64)
-"""Conversion to int64. Compiled functions call one another with int64 only, so that each has one specialisation."""
-
-# Neighbours of a coefficient: steps down and to the right.
-_CROSS: Final = np.array([(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)], np.int64)
-_SIDES: Final = np.array([(0, -1), (0, 1), (-1, 0), (1, 0)], np.int64)
-_CORNERS: Final = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)], np.int64)
-_DISTANT: Final = np.array([(0, -2), (0, 2), (-2, 0), (2, 0)], np.int64)
-_AROUND: Final = np.array([(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)], np.int64)
-
-
-@inlined
-def _clip(value: int, limit: int) -> int:
-    return min(max(value, -limit), limit)
-
-
-@jit
-def log2_eighths(value: int) -> int:
-    """Return 8 log2(value) for value >= 1, linear between powers of two, as an integer."""
-    power, rest = 0, value
-    for step in (32, 16, 8, 4, 2, 1):
-        if rest >> step:
-            power += step
-            rest >>= step
-    return int(8 * power + ((value << 3) >> power) - 8)
-
-
-@jit
-def _sum_around(plane: I32, at: int, stride: int) -> int:
-    """Return the sum of the eight neighbours."""
-    up, down = at - stride, at + stride
-    return int(
-        plane[up - 1]
-        + plane[up]
-        + plane[up + 1]
-        + plane[at - 1]
-        + plane[at + 1]
-        + plane[down - 1]
-        + plane[down]
-        + plane[down + 1]
-    )
-
-
-@jit
-def _gather(f: I32, first: int, plane: I32, at: int, stride: int, places: I64) -> None:
-    """Store neighbours of a cell in `f` from index `first`. `places` has shape (neighbours, 2): steps down and right.
-
-    `first` is an int64, because a literal number gives a specialisation of its own.
-    """
-    for i in range(places.shape[0]):
-        f[first + i] = plane[at + places[i, 0] * stride + places[i, 1]]
-
-
-@jit
-def _cell_index(bands: I32, row: int, y: int, x: int) -> int:
-    """Return the flat index of a cell, clipped to the band; -1 for an empty band."""
-    height, width = _int64(bands[row, HEIGHT]), _int64(bands[row, WIDTH])
-    if height == 0 or width == 0:
-        return -1
-    return int(bands[row, OFFSET] + min(y, height - 1) * bands[row, STRIDE] + min(x, width - 1))
-
-
-@inlined
-def _has_significant_neighbour(sizes: I32, bands: I32, row: int, y: int, x: int, at: int) -> bool:
-    """Return whether a neighbour, the parent or a sibling is significant, or the band has no parent."""
-    if bands[row, PARENT] < 0:
-        return True
-    if _sum_around(sizes, at, _int64(bands[row, STRIDE])) > 0:
-        return True
-    parent = _cell_index(bands, _int64(bands[row, PARENT]), y >> 1, x >> 1)
-    if parent >= 0 and sizes[parent] > 0:
-        return True
-    for column in range(SIBLING_1, SIBLING_2 + 1):
-        sibling = bands[row, column]
-        if sibling >= 0 and sizes[bands[sibling, OFFSET] + y * bands[sibling, STRIDE] + x] > 0:
-            return True
-    return False
-
-
-@inlined
-def _quotient(size: int, threshold: int, inverse: int) -> int:
-    """Return min(size // threshold, MAX_EIGHTHS) without a division; `inverse` is 2^54 // threshold + 1.
-
-    The result is exact: the multiplied size is below 48 thresholds, and 48 times the largest threshold squared is below
-    2^54.
-    """
-    return int((size * inverse) >> _INVERSE_BITS) if size < MAX_EIGHTHS * threshold else MAX_EIGHTHS
-
-
-@jit
-def _context(  # noqa: C901, PLR0912, PLR0915  44 features, one after the other
-    f: I32,
-    sizes: I32,
-    insignificant: I32,
-    lows: I32,
-    bands: I32,
-    low_width: int,
-    threshold: int,
-    inverse: int,
-    row: int,
-    y: int,
-    x: int,
-    at: int,
-) -> None:
-    """Compute the features of one coefficient. The band features at the end of `f` are set already."""
-    stride = _int64(bands[row, STRIDE])
-    f[0], f[1] = sizes[at - 1], sizes[at - stride]
-    f[2], f[3] = sizes[at - stride - 1], sizes[at - stride + 1]
-    f[4], f[5] = sizes[at + 1], sizes[at + stride]
-    f[6], f[7] = sizes[at + stride - 1], sizes[at + stride + 1]
-    f[8], f[9] = sizes[at - 2], sizes[at - 2 * stride]
-    f[10], f[11] = sizes[at + 2], sizes[at + 2 * stride]
-    f[12] = sizes[at]
-    window = _int64(0)
-    for dy in range(-2, 3):
-        line = at + dy * stride
-        window += sizes[line - 2] + sizes[line - 1] + sizes[line] + sizes[line + 1] + sizes[line + 2]
-    f[13] = (window - sizes[at]) >> 2
-    for i in range(14, BAND_FEATURES):
-        f[i] = 0
-    f[40] = min(y, bands[row, HEIGHT] - 1 - y, 6) * 4
-    f[41] = min(x, bands[row, WIDTH] - 1 - x, 6) * 4
-    f[42] = _sum_around(insignificant, at, stride) * 6
-    if bands[row, ORIENT] == LL:
-        f[31], f[32] = min(y, 8) * 4, min(x, 8) * 4
-        f[33] = 32 if y == 0 and x == 0 else 0
-        return
-    parent = _int64(bands[row, PARENT])
-    if parent >= 0:
-        cell = _cell_index(bands, parent, y >> 1, x >> 1)
-        if cell >= 0:
-            width = _int64(bands[parent, STRIDE])
-            f[14], f[15] = sizes[cell], _sum_around(sizes, cell, width) >> 1
-            f[43] += insignificant[cell] * 16
-            f[16], f[17] = sizes[cell - 1] + sizes[cell + 1], sizes[cell - width] + sizes[cell + width]
-            # The parent's neighbour on the side of this coefficient.
-            f[18] = sizes[cell + (1 if x & 1 else -1)]
-            f[19] = sizes[cell + (width if y & 1 else -width)]
-        grand = _int64(bands[parent, PARENT])
-        if grand >= 0:
-            cell = _cell_index(bands, grand, y >> 2, x >> 2)
-            if cell >= 0:
-                f[20], f[21] = sizes[cell], _sum_around(sizes, cell, _int64(bands[grand, STRIDE])) >> 1
-    for k in range(2):
-        sibling = _int64(bands[row, SIBLING_1 + k])
-        if sibling >= 0:
-            width = _int64(bands[sibling, STRIDE])
-            cell = bands[sibling, OFFSET] + y * width + x
-            f[22 + 2 * k], f[23 + 2 * k] = sizes[cell], _sum_around(sizes, cell, width) >> 1
-            f[43] += insignificant[cell] * 16
-        following = _int64(bands[row, NEXT_1 + k])
-        if following >= 0:
-            cell = _cell_index(bands, following, y, x)
-            if cell >= 0:
-                width = _int64(bands[following, STRIDE])
-                f[34 + 2 * k], f[35 + 2 * k] = sizes[cell], _sum_around(sizes, cell, width) >> 1
-        cousin = _int64(bands[row, COUSIN_1 + k])
-        if cousin >= 0:
-            cell = _cell_index(bands, cousin, y >> 1, x >> 1)
-            if cell >= 0:
-                f[38 + k] = (sizes[cell] + _sum_around(sizes, cell, _int64(bands[cousin, STRIDE]))) >> 1
-    child = bands[row, CHILD]
-    if child >= 0:
-        cell = bands[child, OFFSET] + 2 * y * bands[child, STRIDE] + 2 * x
-        below = cell + bands[child, STRIDE]
-        f[26] = (sizes[cell] + sizes[cell + 1] + sizes[below] + sizes[below + 1]) >> 1
-    low_stride = low_width + 2
-    here = bands[row, LOW] + (y + 1) * low_stride + x + 1
-    level = _int64(bands[row, LEVEL])
-    middle, left, right = _int64(lows[here]), _int64(lows[here - 1]), _int64(lows[here + 1])
-    above, below = _int64(lows[here - low_stride]), _int64(lows[here + low_stride])
-    total = left + right + above + below
-    f[27] = min(log2_eighths(max(middle >> level, 256)), 120) - 80  # 1/64 grey, at least 4 grey
-    f[28] = _quotient(abs(right - left) * 4, threshold, inverse)
-    f[29] = _quotient(abs(below - above) * 4, threshold, inverse)
-    f[30] = _quotient(abs(4 * middle - total) * 2, threshold, inverse)
-    f[31] = min(log2_eighths(max(total >> (level + 2), 256)), 120) - 80
 
 
 @inlined
@@ -267,7 +77,7 @@ def _logit(f: I32, base: I32, w1: I32, w2: I32, b2: I32, last_layer: I64, h1: I3
     for j in range(HIDDEN_2):
         h2[j] = b2[j]
     for j in range(HIDDEN_1):
-        h1[j] = _active(_int64(h1[j]), 6)
+        h1[j] = _active(int64(h1[j]), 6)
     for i in range(0, HIDDEN_1, 8):
         p, q, r, s = h1[i], h1[i + 1], h1[i + 2], h1[i + 3]
         t, u, v, w = h1[i + 4], h1[i + 5], h1[i + 6], h1[i + 7]
@@ -276,11 +86,11 @@ def _logit(f: I32, base: I32, w1: I32, w2: I32, b2: I32, last_layer: I64, h1: I3
                 p * w2[i, j] + q * w2[i + 1, j] + r * w2[i + 2, j] + s * w2[i + 3, j]
                 + t * w2[i + 4, j] + u * w2[i + 5, j] + v * w2[i + 6, j] + w * w2[i + 7, j]
             )  # fmt: skip
-    total = _int64(last_layer[HIDDEN_2]) * 256
+    total = int64(last_layer[HIDDEN_2]) * 256
     for i in range(h2.shape[0]):
-        h2[i] = _active(_int64(h2[i]), 12)
-        total += _int64(h2[i]) * last_layer[i]
-    return _clip(total >> 28, LOGIT_LIMIT)
+        h2[i] = _active(int64(h2[i]), 12)
+        total += int64(h2[i]) * last_layer[i]
+    return clip(total >> 28, LOGIT_LIMIT)
 
 
 @inlined
@@ -289,7 +99,7 @@ def _adapt(last_layer: I64, h2: I32, bit: int, probability: int) -> None:
 
     Units: error 1/2^16, hidden units 1/2^8, weights 1/2^28.
     """
-    error = _int64((bit << 16) - probability)
+    error = int64((bit << 16) - probability)
     for i in range(h2.shape[0]):
         last_layer[i] = min(max(last_layer[i] + ((error * h2[i]) >> 4), -_LIVE_LIMIT), _LIVE_LIMIT)
     last_layer[HIDDEN_2] = min(max(last_layer[HIDDEN_2] + (error << 4), -_LIVE_LIMIT), _LIVE_LIMIT)
@@ -306,69 +116,6 @@ def band_base(f: I32, w1: I32, b1: I32, base: I32) -> None:
 
 
 @jit
-def _sign_context(  # noqa: C901, PLR0912, PLR0915  61 features, one after the other
-    f: I32, signed: I32, lows: I32, bands: I32, low_width: int, threshold: int, row: int, y: int, x: int, at: int
-) -> None:
-    """Compute the sign features of a coefficient: signed neighbours (odd features) and its position (even features)."""
-    stride, level = _int64(bands[row, STRIDE]), _int64(bands[row, LEVEL])
-    for i in range(SIGN_FEATURES):
-        f[i] = 0
-    _gather(f, _int64(0), signed, at, stride, _SIDES)
-    _gather(f, _int64(11), signed, at, stride, _CORNERS)
-    f[4], f[5] = f[11] - f[12], f[14] - f[13]
-    _gather(f, _int64(15), signed, at, stride, _DISTANT)
-    f[SIGN_ODD], f[SIGN_ODD + 1] = (x & 1) * 16, (y & 1) * 16
-    f[SIGN_ODD + 2], f[SIGN_ODD + 3] = min(y, 8) * 2, min(x, 8) * 2
-    f[SIGN_ODD + 3 + min(level, 5)] = 16
-    if bands[row, ORIENT] != LL:
-        parent = _int64(bands[row, PARENT])
-        if parent >= 0:
-            cell = _cell_index(bands, parent, y >> 1, x >> 1)
-            if cell >= 0:
-                width = _int64(bands[parent, STRIDE])
-                f[6] = signed[cell]
-                _gather(f, _int64(19), signed, cell, width, _SIDES)
-                _gather(f, _int64(23), signed, cell, width, _CORNERS)
-        for k in range(2):
-            # A band has either sibling k or following band k.
-            beside, cell = _int64(bands[row, SIBLING_1 + k]), _int64(-1)
-            if beside >= 0:
-                cell = bands[beside, OFFSET] + y * bands[beside, STRIDE] + x
-            if bands[row, NEXT_1 + k] >= 0:
-                beside = _int64(bands[row, NEXT_1 + k])
-                cell = _cell_index(bands, beside, y, x)
-            if cell >= 0:
-                _gather(f, 27 + 5 * k, signed, cell, _int64(bands[beside, STRIDE]), _CROSS)
-            cousin = _int64(bands[row, COUSIN_1 + k])
-            if cousin >= 0:
-                cell = _cell_index(bands, cousin, y >> 1, x >> 1)
-                if cell >= 0:
-                    f[37 + k] = signed[cell]
-        child = bands[row, CHILD]
-        if child >= 0:
-            cell = bands[child, OFFSET] + 2 * y * bands[child, STRIDE] + 2 * x
-            below = cell + bands[child, STRIDE]
-            f[39], f[40], f[41], f[42] = signed[cell], signed[cell + 1], signed[below], signed[below + 1]
-        low_stride = low_width + 2
-        here = bands[row, LOW] + (y + 1) * low_stride + x + 1
-        middle = _int64(lows[here])
-        for i in range(8):
-            change = _int64(lows[here + _AROUND[i, 0] * low_stride + _AROUND[i, 1]]) - middle
-            f[43 + i] = _clip(change * 4 // threshold, MAX_EIGHTHS)
-        right, left = _int64(lows[here + 1]), _int64(lows[here - 1])
-        below, above = _int64(lows[here + low_stride]), _int64(lows[here - low_stride])
-        f[7] = _clip((right - left) * 4 // threshold, MAX_EIGHTHS)
-        f[8] = _clip((below - above) * 4 // threshold, MAX_EIGHTHS)
-        f[9] = _clip((right + left - 2 * middle) * 4 // threshold, MAX_EIGHTHS)
-        f[10] = _clip((below + above - 2 * middle) * 4 // threshold, MAX_EIGHTHS)
-    nonzero = 0
-    for i in range(6):
-        if f[i] != 0:
-            nonzero += 4
-    f[SIGN_ODD + 9] = nonzero
-
-
-@jit
 def _sign_logit(f: I32, b1: I32, w1: I32, w2: I32, orient: int, sums: I32) -> int:
     """Return the logit of a positive sign, an odd function of the odd features. One network for each orientation.
 
@@ -381,11 +128,11 @@ def _sign_logit(f: I32, b1: I32, w1: I32, w2: I32, orient: int, sums: I32) -> in
             start = 0 if i < SIGN_ODD else SIGN_HIDDEN
             for j in range(SIGN_HIDDEN):
                 sums[start + j] += f[i] * w1[orient, i, j]
-    total = _int64(0)
+    total = int64(0)
     for j in range(SIGN_HIDDEN):
-        odd, even = _int64(sums[j]), _int64(sums[SIGN_HIDDEN + j])
+        odd, even = int64(sums[j]), int64(sums[SIGN_HIDDEN + j])
         total += (_active(even + odd, 6) - _active(even - odd, 6)) * w2[orient, j]
-    return _clip(total >> 12, LOGIT_LIMIT)
+    return clip(total >> 12, LOGIT_LIMIT)
 
 
 @inlined
@@ -400,9 +147,9 @@ def _reconstruct(lower: int, width: int, logit: int, centres: I32) -> int:
 def reconstruct(lower: I32, widths: I32, signs: I32, logits: I32, centres: I32, out: I32) -> None:
     """Write the reconstruction value of every coefficient to `out`."""
     for at in range(lower.shape[0]):
-        value = _int64(0)
+        value = int64(0)
         if lower[at] > 0:
-            value = _reconstruct(_int64(lower[at]), _int64(widths[at]), _int64(logits[at]), centres)
+            value = _reconstruct(int64(lower[at]), int64(widths[at]), int64(logits[at]), centres)
         out[at] = signs[at] * value
 
 
@@ -442,7 +189,7 @@ def _collect_sign(rows: I16, coder: I64, f: I32, orient: int, sign: int) -> None
 @inlined
 def _transfer(mode: int, bit: int, logit: int, probabilities: I32, costs: I32, coder: I64, data: U8, best: U8) -> int:
     """Write `bit`, or read one; return it, or -1 at the end."""
-    coded = code_bit(coder, data, best, bit, _int64(probabilities[logit + LOGIT_LIMIT]), mode)
+    coded = code_bit(coder, data, best, bit, int64(probabilities[logit + LOGIT_LIMIT]), mode)
     if mode == WRITE and coded >= 0:
         coder[CODER_COST] += costs[(logit if coded else -logit) + LOGIT_LIMIT]
     return coded
@@ -518,25 +265,25 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  one loop keeps modes and passes 
     probabilities, costs, centres = tables
     coder, data, best, curve, originals = stream
     base, h1, h2, sign_features, sums = scratch
-    stride, orient, level = _int64(bands[row, STRIDE]), _int64(bands[row, ORIENT]), _int64(bands[row, LEVEL])
-    inverse = int((1 << _INVERSE_BITS) // _int64(threshold) + 1)
+    stride, orient, level = int64(bands[row, STRIDE]), int64(bands[row, ORIENT]), int64(bands[row, LEVEL])
+    inverse = int((1 << INVERSE_BITS) // int64(threshold) + 1)
     interval = 12 if level == 1 else 4 if level == 2 else 1
     net = 1 if kind == REFINE else 0
     w1, b1, w2, b2, last_layer = nets[0][net], nets[1][net], nets[2][net], nets[3][net], nets[4][net]
     band_base(f, w1, b1, base)
-    for y in range(_int64(bands[row, HEIGHT])):
-        for x in range(_int64(bands[row, WIDTH])):
+    for y in range(int64(bands[row, HEIGHT])):
+        for x in range(int64(bands[row, WIDTH])):
             at = bands[row, OFFSET] + y * stride + x
             if planes[at] == plane or (lower[at] > 0) != (kind == REFINE):
                 continue
-            is_near = kind == REFINE or _has_significant_neighbour(sizes, bands, row, y, x, at)
+            is_near = kind == REFINE or has_significant_neighbour(sizes, bands, row, y, x, at)
             if kind == NEAR and not is_near:
                 continue
             if kind == ALL and logits[at] < min_logit - (_SKIP_NEAR if planes[at] == -plane else _SKIP_FAR):
                 continue
-            magnitude = abs(_int64(targets[at]))
+            magnitude = abs(int64(targets[at]))
             bit = 1 if magnitude >= lower[at] + threshold else 0
-            _context(f, sizes, insignificant, lows, bands, low_width, threshold, inverse, row, y, x, at)
+            coefficient_context(f, sizes, insignificant, lows, bands, low_width, threshold, inverse, row, y, x, at)
             logit = _logit(f, base, w1, w2, b2, last_layer, h1, h2)
             if logit < min_logit:
                 planes[at], logits[at] = -plane, logit
@@ -555,7 +302,7 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  one loop keeps modes and passes 
                 _adapt(last_layer, h2, bit, probabilities[logit + LOGIT_LIMIT])
             before = 0
             if lower[at] > 0:
-                before = _reconstruct(_int64(lower[at]), _int64(widths[at]), _int64(logits[at]), centres)
+                before = _reconstruct(int64(lower[at]), int64(widths[at]), int64(logits[at]), centres)
             logits[at] = logit
             if kind == REFINE:
                 # A plane halves the interval, unless its bounds were rescaled.
@@ -563,7 +310,7 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  one loop keeps modes and passes 
                 lower[at] += threshold * bit
             elif bit:
                 sign = 1 if targets[at] > 0 else 0
-                _sign_context(sign_features, signed, lows, bands, low_width, threshold, row, y, x, at)
+                sign_context(sign_features, signed, lows, bands, low_width, threshold, row, y, x, at)
                 if mode == COLLECT:
                     _collect_sign(examples[1], coder, sign_features, orient, sign)
                 else:
@@ -576,8 +323,8 @@ def code_band(  # noqa: C901, PLR0912, PLR0915  one loop keeps modes and passes 
             if lower[at] > 0:
                 sizes[at] = min((lower[at] + (widths[at] >> 1)) * 8 // threshold, MAX_EIGHTHS)
                 signed[at] = sizes[at] * signs[at]
-                after = _reconstruct(_int64(lower[at]), _int64(widths[at]), _int64(logits[at]), centres)
-                original, own_scale = _int64(originals[at] * signs[at]), _int64(scale[at])
+                after = _reconstruct(int64(lower[at]), int64(widths[at]), int64(logits[at]), centres)
+                original, own_scale = int64(originals[at] * signs[at]), int64(scale[at])
                 error_after, error_before = original - after * 256 // own_scale, original - before * 256 // own_scale
                 curve[0] += error_after**2 - error_before**2
             else:

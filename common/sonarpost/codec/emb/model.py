@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from sonarpost.codec.emb import DEFAULT_MODEL, MODEL_FILES
+from sonarpost.codec.emb import DEFAULT_MODEL, MODEL_FILES, contexts
 from sonarpost.codec.emb import kernel as k
 from sonarpost.codec.emb.kernel import I32
 from sonarpost.errors import ConfigError, StreamError
@@ -70,7 +70,7 @@ _PERCEPTUAL_ARRAYS: Final[Arrays] = (
     ("perceptual_contrast", (CONTRASTS,), "<i2"),
 )
 FORMAT_1: Final = ModelFormat(b"SPEMB1\n", _network_arrays(50, 11, 8))
-FORMAT_2: Final = ModelFormat(b"SPEMB2\n", _network_arrays(k.FEATURES, k.SIGN_FEATURES, k.SIGN_HIDDEN))
+FORMAT_2: Final = ModelFormat(b"SPEMB2\n", _network_arrays(contexts.FEATURES, contexts.SIGN_FEATURES, k.SIGN_HIDDEN))
 FORMAT_3: Final = ModelFormat(b"SPEMB3\n", FORMAT_2.arrays + _PERCEPTUAL_ARRAYS)
 FORMATS: Final = (FORMAT_1, FORMAT_2, FORMAT_3)
 _FORMAT_1_BAND_FEATURES: Final = 40
@@ -155,8 +155,8 @@ def model_of(arrays: dict[str, I32], identity: str = "") -> Model:
     if "perceptual_levels" in arrays:
         perceptual = PerceptualWeights(arrays["perceptual_levels"], arrays["perceptual_contrast"])
     own = {name: array for name, array in arrays.items() if not name.startswith(("taps", "bias", "perceptual_"))}
-    own["w1"] = _with_zero_rows(own["w1"], _FORMAT_1_BAND_FEATURES, k.FEATURES)
-    own["sign_w1"] = _with_zero_rows(own["sign_w1"], own["sign_w1"].shape[1], k.SIGN_FEATURES)
+    own["w1"] = _with_zero_rows(own["w1"], _FORMAT_1_BAND_FEATURES, contexts.FEATURES)
+    own["sign_w1"] = _with_zero_rows(own["sign_w1"], own["sign_w1"].shape[1], contexts.SIGN_FEATURES)
     for name in ("sign_w1", "sign_b1", "sign_w2"):
         missing = k.SIGN_HIDDEN - own[name].shape[-1]
         own[name] = np.pad(own[name], [(0, 0)] * (own[name].ndim - 1) + [(0, missing)])
