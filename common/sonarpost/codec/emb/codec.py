@@ -70,7 +70,11 @@ SEARCHES: Final[tuple[tuple[int, int, tuple[int, ...], int], ...]] = (
 (`next_step`). The trials take about 100 ms for 140 x 80 px."""
 PERCEPTUAL_SEARCHES: Final = (*SEARCHES[:-2], SEARCHES[-1])
 """The same for perceptual models, whose long streams have more planes."""
-DESPECKLED_SEARCHES: Final = ((191, MAX_PIXELS, (0, 4), 0), (MAX_BODY_BYTES, MAX_PIXELS, (0,), 0))
+DESPECKLED_SEARCHES: Final = (
+    (96, MAX_PIXELS, (0, 4), 1),
+    (223, MAX_PIXELS, (0, 4), 0),
+    (MAX_BODY_BYTES, MAX_PIXELS, (0,), 0),
+)
 """The same for despeckled images: further trials gain about 0.02 dB, and despeckling needs the time."""
 # (0.01 * 255)^2 and (0.03 * 255)^2, times 2^16.
 _SSIM_C1: Final = 426148
