@@ -127,6 +127,7 @@ def test_shore_with_unwritable_images_fills_its_store_to_the_reserve_and_recover
     system.watch_health()
     system.send([make_image(n, (200, 600)) for n in range(COUNT)])  # 24 MB
     system.wait_until(lambda: small.free_bytes < 9_000_000, 60, "c2 has filled its disk to the reserve")
+    system.history.fault("disk", "c2 refuses records below the reserve")
     system.wait_until(lambda: state_of(system, "c2") == "degraded", 30, "c2 reports degraded")
     system.wait_until(lambda: (system.depths("relay")["outbox"] or 0) > 0, 30, "the other images wait on the vessel")
     blocked.unlink()
