@@ -13,7 +13,7 @@ import shutil
 import sqlite3
 import threading
 from collections.abc import Iterator, Sequence, Set
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -92,17 +92,15 @@ class Store:
                 make_private(existing)
         except OSError as error:
             raise DeliveryError(f"{path}: cannot be opened as a sonarpost store: {error}") from error
-        try:
-            self._open()
-        except BaseException:
-            for opened in (vars(self).get("_reader"), vars(self).get("_db"), self._lock_file):
-                if opened is not None:
-                    opened.close()
-            raise
+        with ExitStack() as on_error:
+            on_error.callback(self._lock_file.close)
+            self._open(on_error)
+            on_error.pop_all()
 
-    def _open(self) -> None:
+    def _open(self, on_error: ExitStack) -> None:
         try:
             self._db = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
+            on_error.callback(self._db.close)
             self._db.execute(f"PRAGMA page_size={self._page_bytes}")
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute(f"PRAGMA wal_autocheckpoint={CHECKPOINT_BYTES // self._page_bytes}")
@@ -115,6 +113,7 @@ class Store:
             version, self.origin = schema.prepare(self._db, self._page_bytes)
             self._has_legacy_windows = schema.has_legacy_windows(self._db)
             self._reader = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
+            on_error.callback(self._reader.close)
             self._reader.execute("PRAGMA query_only=ON")
         except sqlite3.Error as error:
             reason = f"cannot be opened as a sonarpost store: {_reason(error, self.path)}"
