@@ -154,21 +154,19 @@ def _run_chain(
         outcome = evaluate(settings, watcher.snippets, watcher.contact_of_image, time.monotonic() - started_s)
         results = Console(stderr=True)  # printed with --quiet as well
         refused = _print_refused(settings, results)
-        if not watcher.snippets:
+        keep = bool(watcher.snippets) and (parsed.keep or parsed.console)
+        if watcher.snippets:
+            show(watcher, settings, outcome, results)
+            _print_next_steps(settings, console, running=keep)
+        else:
             _print_no_contacts(settings, results)
-            if parsed.json:
-                print(outcome.as_json(), flush=True)
-            return 1
-        show(watcher, settings, outcome, results)
-        keep = parsed.keep or parsed.console
-        _print_next_steps(settings, console, running=keep)
         if parsed.json:
             print(outcome.as_json(), flush=True)
         if keep:
             if page is not None:
                 page.show(console)
             _keep_running(chain)
-    return 0 if outcome.succeeded and refused < files else 1
+    return 0 if watcher.snippets and outcome.succeeded and refused < files else 1
 
 
 def _print_next_steps(settings: ChainSettings, console: Console, *, running: bool) -> None:
