@@ -30,7 +30,8 @@ from sonarpost.detection.snippets import HIGH_PERCENTILE, LOW_PERCENTILE, to_gre
 from sonarpost.errors import BadInputError, ConfigError, SurveyFileError
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
-from sonarpost.sonar.image_files import IMAGE_SUFFIXES, MAX_IMAGES, list_images, read_any_image, read_image
+from sonarpost.sonar.image_decoding import read_any_image
+from sonarpost.sonar.image_files import IMAGE_SUFFIXES, MAX_IMAGES, list_images, read_image
 
 _FIRST_SEED: Final = 910_000
 """Differs from the seeds of the shipped codebooks (7000 to 7051): no test image is a training image."""

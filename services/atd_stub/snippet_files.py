@@ -12,7 +12,8 @@ from sonarpost.errors import StreamError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.input_folder import printable
-from sonarpost.sonar.image_files import SIDE_CAR_SUFFIX, read_any_image, tiff_bytes
+from sonarpost.sonar.image_decoding import read_any_image
+from sonarpost.sonar.image_files import SIDE_CAR_SUFFIX, tiff_bytes
 from sonarpost.sonar.side_car import SideCar, read_side_car, write_side_car
 
 SNIPPET_SUFFIXES: Final = (".txt", ".tiff")

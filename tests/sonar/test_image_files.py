@@ -18,14 +18,8 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image, ImageOps
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.image_files import (
-    MAX_UNUSED_LINES,
-    list_images,
-    read_any_image,
-    read_image,
-    write_png,
-    write_tiff,
-)
+from sonarpost.sonar.image_decoding import read_any_image
+from sonarpost.sonar.image_files import MAX_UNUSED_LINES, list_images, read_image, write_png, write_tiff
 
 GREY = hnp.arrays(
     st.sampled_from([np.uint8, np.uint16]), hnp.array_shapes(min_dims=2, max_dims=2, max_side=24), fill=st.nothing()

@@ -20,7 +20,8 @@ from sonarpost.codec.vq.codec import codebook_tag
 from sonarpost.codec.vq.comparison import UnmatchedTiles, compare
 from sonarpost.codec.vq.tiles import MAX_DIMS
 from sonarpost.errors import CodebookError, ConfigError, SurveyFileError
-from sonarpost.sonar.image_files import list_images, read_any_image
+from sonarpost.sonar.image_decoding import read_any_image
+from sonarpost.sonar.image_files import list_images
 
 DEFAULT_ROUNDS = "39:16"
 EXIT_SOME_FAILED = 1

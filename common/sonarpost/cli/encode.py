@@ -21,7 +21,8 @@ from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import SonarpostError, StreamError
 from sonarpost.files import write_atomically
-from sonarpost.sonar.image_files import list_images, read_any_image, unused_lines, write_png, write_tiff
+from sonarpost.sonar.image_decoding import read_any_image
+from sonarpost.sonar.image_files import list_images, unused_lines, write_png, write_tiff
 
 STREAM_FOLDER = "streams"
 DECODED_FOLDER = "out"

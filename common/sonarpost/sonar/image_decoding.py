@@ -68,8 +68,8 @@ class DecodedFile:
     notes: tuple[str, ...]
 
 
-def decode_file(path: Path) -> DecodedFile:
-    """Decode a JPEG, PNG or TIFF file.
+def read_any_image(path: Path) -> DecodedFile:
+    """Read a JPEG, PNG or TIFF file of any depth and colour as grey.
 
     Raises:
         SurveyFileError: Not such a file, damaged, truncated, or larger than `MAX_PIXELS` or `MAX_FILE_BYTES`.

@@ -16,7 +16,7 @@ from PIL import Image
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.files import write_atomically
-from sonarpost.sonar.image_decoding import EXPECTED, DecodedFile, GreyImage, decode_file
+from sonarpost.sonar.image_decoding import EXPECTED, GreyImage, read_any_image
 
 IMAGE_SUFFIXES: Final = (".tif", ".tiff", ".png", ".jpg", ".jpeg")
 SIDE_CAR_SUFFIX: Final = ".txt"
@@ -25,7 +25,7 @@ MAX_IMAGES: Final = 100_000
 
 
 def read_image(path: Path) -> GreyImage:
-    """Read an image that is grey of 8 or 16 bits already; `read_any_image` converts others.
+    """Read an image that is grey of 8 or 16 bits already; `image_decoding.read_any_image` converts others.
 
     RGB with three equal channels is grey.
 
@@ -35,19 +35,10 @@ def read_image(path: Path) -> GreyImage:
     Raises:
         SurveyFileError: Not a readable image, or one that has to be converted.
     """
-    decoded = decode_file(path)
+    decoded = read_any_image(path)
     if decoded.notes:
         raise SurveyFileError(str(path), "pixels", "; ".join(decoded.notes), "grey of 8 or 16 bits without conversion")
     return decoded.pixels
-
-
-def read_any_image(path: Path) -> DecodedFile:
-    """Read a JPEG, PNG or TIFF of any depth and colour as grey; `notes` states what was converted.
-
-    Raises:
-        SurveyFileError: Not such a file, damaged, truncated or too large.
-    """
-    return decode_file(path)
 
 
 @dataclass(frozen=True)

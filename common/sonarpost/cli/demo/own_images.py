@@ -8,7 +8,8 @@ from rich.console import Console
 
 from sonarpost.codec.fitting import Fit, fit_image
 from sonarpost.errors import BadInputError, SurveyFileError
-from sonarpost.sonar.image_files import SIDE_CAR_SUFFIX, list_images, read_any_image
+from sonarpost.sonar.image_decoding import read_any_image
+from sonarpost.sonar.image_files import SIDE_CAR_SUFFIX, list_images
 from sonarpost.sonar.side_car import read_side_car
 
 
