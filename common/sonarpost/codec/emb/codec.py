@@ -141,7 +141,7 @@ class TrialEncoder:
         """Write bodies with several start steps and return the one with the smallest error.
 
         `sent` is the side information but for the start step and the extra planes. Without `start_steps`, those of
-        `SEARCHES` are tried.
+        `SEARCHES`, or of the table for the model, are tried.
         """
         pixels = targets.plane.size
         searches = SEARCHES if self.model.perceptual is None else PERCEPTUAL_SEARCHES
@@ -251,9 +251,8 @@ class Encoded:
         stream: Header and body.
         mean_square_error: Shape (len(stream) + 1,), float64: estimated mean squared error, in grey levels squared, of
             the image that the first n bytes decode to; infinite for prefixes without an image. It is computed from the
-            coefficients: clipping and the enhancer reduce the true error by some per cent. Against the despeckled image
-            if the codec despeckles. With a region of interest,
-            the error in it weighs 9/4.
+            coefficients: clipping and the enhancer reduce the true error by some per cent. The reference is the
+            despeckled image if the codec despeckles. With a region of interest, the error in it weighs 9/4.
     """
 
     stream: bytes

@@ -1,6 +1,7 @@
 """Contexts: what the networks know of a coefficient, as integers.
 
-All arithmetic is on int32 and int64. docs/explanation/codecs.md describes the features.
+The features of a decision are magnitudes and signs around the coefficient, in eighths of the threshold, its place, and
+the low-pass image decoded so far (docs/specifications/emb-stream.md). All arithmetic is on int32 and int64.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The coding loop and the networks. The same code encodes, decodes and collects training examples.
 
-All arithmetic is on int32 and int64. docs/explanation/codecs.md describes the format.
+All arithmetic is on int32 and int64. docs/specifications/emb-stream.md describes the format.
 """
 
 from __future__ import annotations
