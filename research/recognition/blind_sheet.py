@@ -4,7 +4,7 @@
     python -m research.recognition.blind_sheet --sdvd DIR --judgements judgements.json
 
 The person gives each image a number from 0 (certainly no target) to 10 (certainly a target). Half of the images have a
-target. Name and place of an image do not depend on codec and budget: one seed gives the same order.
+target. The crops and their order depend on the seed only, not on codec and budget.
 """
 
 from __future__ import annotations
@@ -82,11 +82,14 @@ def read_judgements(path: Path) -> dict[str, list[float]]:
         sheets = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ConfigError(str(path), "JSON", str(error), f'{{"SHEET": [{expected}]}}') from error
-    for name, numbers in sheets.items() if isinstance(sheets, dict) else [("sheets", sheets)]:
-        valid = isinstance(numbers, list) and len(numbers) == COUNT and isinstance(sheets, dict)
-        if not (valid and all(isinstance(number, int | float) and 0 <= number <= LIMIT for number in numbers)):
+    if not isinstance(sheets, dict):
+        raise ConfigError(str(path), "JSON", type(sheets).__name__, f'{{"SHEET": [{expected}]}}')
+    for name, numbers in sheets.items():
+        if not isinstance(numbers, list) or len(numbers) != COUNT:
             raise ConfigError(str(path), name, numbers, expected)
-    return dict(sheets)
+        if not all(isinstance(number, int | float) and 0 <= number <= LIMIT for number in numbers):
+            raise ConfigError(str(path), name, numbers, expected)
+    return sheets
 
 
 def evaluate(judgements: dict[str, list[float]], has_target: Sequence[bool]) -> list[tuple[str, float, int | None]]:
