@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -120,50 +121,36 @@ def readable_key(path: Path) -> str:
     return f"platform.acoustic_key_file: {path.parent}/acoustic/acoustic.key: got '0644', expected 0600"
 
 
-def paper_with_key(path: Path) -> str:
-    path.write_text(path.read_text().replace('link = "v1"', 'link = "paper"'))
-    return "uuv_modem.link: got 'paper'"
+def with_change(old: str, new: str, expected: str) -> Callable[[Path], str]:
+    """Return a defect: a replaced text, and the start of the error."""
+
+    def change(path: Path) -> str:
+        path.write_text(path.read_text().replace(old, new))
+        return expected
+
+    return change
 
 
-def unknown_codec(path: Path) -> str:
-    path.write_text(path.read_text().replace('codec = "emb"', 'codec = "spith"'))
-    return "compressor.codec: got 'spith', expected one of"
+TLS = 'tls = { ca = "ca.pem", certificate = "c.pem", key = "k.pem" }'
+DEFECTS = {
+    "without_key": without_key,
+    "readable_key": readable_key,
+    "paper_with_key": with_change('link = "v1"', 'link = "paper"', "uuv_modem.link: got 'paper'"),
+    "unknown_codec": with_change('codec = "emb"', 'codec = "spith"', "compressor.codec: got 'spith', expected one of"),
+    "unknown_model": with_change(
+        'model = "standard"', 'model = "small"', "compressor.model: got 'small', expected standard or structure"
+    ),
+    "unsupported_port": with_change(
+        '"/dev/ttyUSB0"',
+        '"carrier://pigeon"',
+        "uuv_modem.port: got 'carrier://pigeon 19200', expected a device path",
+    ),
+    "no_certificate": with_change("tcp/127.0.0.1", "tls/127.0.0.1", "platform.tls: got 'nothing'"),
+    "absent_certificate": with_change('id = "uuv-1"', f'id = "uuv-1"\n{TLS}', "platform.tls."),
+}
 
 
-def unknown_model(path: Path) -> str:
-    path.write_text(path.read_text().replace('model = "standard"', 'model = "small"'))
-    return "compressor.model: got 'small', expected standard or structure"
-
-
-def unsupported_port(path: Path) -> str:
-    path.write_text(path.read_text().replace('"/dev/ttyUSB0"', '"carrier://pigeon"'))
-    return "uuv_modem.port: got 'carrier://pigeon 19200', expected a device path"
-
-
-def no_certificate(path: Path) -> str:
-    path.write_text(path.read_text().replace("tcp/127.0.0.1", "tls/127.0.0.1"))
-    return "platform.tls: got 'nothing'"
-
-
-def absent_certificate(path: Path) -> str:
-    tls = 'id = "uuv-1"\ntls = { ca = "ca.pem", certificate = "c.pem", key = "k.pem" }'
-    path.write_text(path.read_text().replace('id = "uuv-1"', tls))
-    return "platform.tls."
-
-
-DEFECTS = (
-    without_key,
-    readable_key,
-    paper_with_key,
-    unknown_codec,
-    unknown_model,
-    unsupported_port,
-    no_certificate,
-    absent_certificate,
-)
-
-
-@pytest.mark.parametrize("defect", DEFECTS, ids=lambda defect: defect.__name__)
+@pytest.mark.parametrize("defect", DEFECTS.values(), ids=DEFECTS)
 def test_values_that_a_service_would_refuse_at_its_start_are_located(defect, tmp_path, capsys) -> None:
     path = example(tmp_path, "uuv")
     expected = defect(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from builders.records import command_record
 
 from sonarpost import keys
 from sonarpost.codec.registry import CodecResources, default_registry
@@ -32,6 +33,20 @@ def modem(runner):
 @pytest.fixture
 def atd(runner):
     return runner.peer("uuv-1", "atd_stub")
+
+
+@pytest.fixture
+def send_command(runner):
+    """Send commands as uuv_modem does, each with an identifier of its own."""
+    uuv_modem = runner.peer("uuv-1", "vehicle_commands")
+    sent = []
+
+    def send(kind, image_id):
+        sent.append(kind)
+        record = command_record(kind, image_id).model_copy(update={"command_id": f"c-{len(sent)}"})
+        uuv_modem.send(keys.command("uuv-1", kind), "compressor", record)
+
+    return send
 
 
 @pytest.fixture(scope="session")

@@ -29,20 +29,6 @@ def start_emb(start_service):
     return lambda **options: start_service(**{"codec": "emb", "budget_bytes": BUDGET_BYTES, **options})
 
 
-@pytest.fixture
-def send_command(runner):
-    """Send commands as uuv_modem does, each with an identifier of its own."""
-    uuv_modem = runner.peer("uuv-1", "vehicle_commands")
-    sent = []
-
-    def send(kind, image_id):
-        sent.append(kind)
-        record = command_record(kind, image_id).model_copy(update={"command_id": f"c-{len(sent)}"})
-        uuv_modem.send(keys.command("uuv-1", kind), "compressor", record)
-
-    return send
-
-
 def strength_of(image):
     return EmbCodec().decode(image.stream).despeckle_strength
 

@@ -37,20 +37,6 @@ def expandable_snippet(snippet):
     return make
 
 
-@pytest.fixture
-def send_command(runner):
-    """Send commands as uuv_modem does, each with an identifier of its own."""
-    uuv_modem = runner.peer("uuv-1", "vehicle_commands")
-    sent = []
-
-    def send(kind, image_id):
-        sent.append(kind)
-        record = command_record(kind, image_id).model_copy(update={"command_id": f"c-{len(sent)}"})
-        uuv_modem.send(keys.command("uuv-1", kind), "compressor", record)
-
-    return send
-
-
 def test_expand_sends_more_seabed_as_an_image_of_its_own(
     start_service, send_command, atd, modem, expandable_snippet, vq
 ):

@@ -52,16 +52,17 @@ def test_a_later_version_replaces_the_mark(console, watcher):
     assert next(row["authenticated"] for row in rows if row["image_id"] == "0002") is True
 
 
-def test_database_of_an_earlier_version_gains_the_column(tmp_path):
+@pytest.mark.parametrize("column", ["authenticated", "despeckle_strength"])
+def test_database_of_an_earlier_version_gains_the_column(column, tmp_path):
     path = tmp_path / "console-review.db"
     Database(path).close()
     old = sqlite3.connect(path)
-    old.execute("ALTER TABLE contact DROP COLUMN authenticated")
+    old.execute(f"ALTER TABLE contact DROP COLUMN {column}")
     old.commit()
     old.close()
     database = Database(path)
     with database.read() as db:
         assert list_contacts(db, ContactFilter())["matching"] == 0
-        assert "authenticated" in {row["name"] for row in db.execute("PRAGMA table_info(contact)")}
+        assert column in {row["name"] for row in db.execute("PRAGMA table_info(contact)")}
     database.close()
     Database(path).close()

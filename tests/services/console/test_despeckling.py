@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import sqlite3
-
 import pytest
 from builders.console import image_record
 
 from sonarpost.messages import Command
-from sonarpost.services.console.store.contacts import ContactFilter, list_contacts
-from sonarpost.services.console.store.database import Database
 
 STRENGTHS = {"0001": 1.0, "0002": 0.0625, "0003": 0.0, "0004": None}
 
@@ -76,17 +72,3 @@ def test_request_is_refused_for_a_contact_without_an_image(console):
     [row] = anna.get("/api/contacts").json()["items"]
     costs = anna.get(f"/api/contacts/{row['id']}/costs").json()["costs"]
     assert [cost["reason"] for cost in costs if cost["kind"] == "original"] == ["no part of the image was received"]
-
-
-def test_database_of_an_earlier_version_gains_the_column(tmp_path):
-    path = tmp_path / "console-review.db"
-    Database(path).close()
-    old = sqlite3.connect(path)
-    old.execute("ALTER TABLE contact DROP COLUMN despeckle_strength")
-    old.commit()
-    old.close()
-    database = Database(path)
-    with database.read() as db:
-        assert list_contacts(db, ContactFilter())["matching"] == 0
-        assert "despeckle_strength" in {row["name"] for row in db.execute("PRAGMA table_info(contact)")}
-    database.close()
