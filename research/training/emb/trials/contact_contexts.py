@@ -3,8 +3,8 @@
     python -m research.training.emb.trials.contact_contexts --data DIR
 
 The shipped networks are trained further with and without these features on the decisions of real streams. Printed are
-the bits that each needs for the decisions of 64 and 128 B streams of held-out survey lines. Neither network learns
-during coding. Requires jax and optax.
+the bits that each needs for the decisions of 64 and 128 B streams of other images: other simulated lines, and SDVD's
+test split, which shares survey lines with its train split. Neither network learns during coding. Requires jax, optax.
 """
 
 from __future__ import annotations
@@ -244,7 +244,7 @@ def measure(
 
 
 def run(args: argparse.Namespace) -> int:
-    """List the decisions of training and held-out lines, train, print the bits."""
+    """List the decisions of training and held-out images, train, print the bits."""
     rng = np.random.default_rng(7)
     listed: list[tuple[I16, Weights, I16]] = []
     for contact in (*sdvd_contacts(args.data, "train"), *simulated_contacts(SIMULATED[0])):
