@@ -135,7 +135,7 @@ class Contact(Record):
         time_utc_s: Time of that ping.
         lat_deg: Position of the object, north positive.
         lon_deg: Position of the object, east positive.
-        position_sigma_m: Standard deviation of the position: root mean square distance of the true position from it.
+        position_sigma_m: One standard deviation of the position along the worse axis of its error ellipse.
         depth_m: Depth of the vehicle below the surface.
         altitude_m: Altitude of the vehicle above the seabed.
         heading_deg: Heading of the vehicle, clockwise from true north.

@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 
 from sonarpost.codec.fitting import Fit
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX
+from sonarpost.detection.settings import DetectorSettings, DetectorTuning
 from sonarpost.errors import ConfigError
 from sonarpost.runtime.retention import MaxBytes, RetentionConfig
 from sonarpost.sonar.options import SurveyOptions, load_options
@@ -29,6 +30,7 @@ class AtdStubConfig(RetentionConfig, SurveyOptions):
         max_contacts: Maximum number of contacts of one survey file, most confident first; 0 for no limit.
         max_in_flight: Maximum number of contacts between this service and their transmission. The others wait here and
             the most confident is released first. 0 for no limit, with a modem service that publishes no queue_state.
+        detector: Object sizes, windows and limits of the detector, as for `--settings` of `sonarpost detect`.
         join_overlap_pings: Last pings of a file that are searched again together with the continuation file; also
             the overlap between parts of a long file. Twice a snippet's height is enough.
         join_timeout_s: How long a contact in the later half of these pings waits for the continuation file; 0 releases
@@ -56,6 +58,7 @@ class AtdStubConfig(RetentionConfig, SurveyOptions):
     confidence_threshold: Annotated[float, Field(ge=0, le=2)] = 1.0
     max_contacts: Annotated[int, Field(ge=0)] = 0
     max_in_flight: Annotated[int, Field(ge=0, le=100_000)] = 32
+    detector: DetectorTuning = DetectorTuning()
     join_overlap_pings: Annotated[int, Field(ge=0, le=900)] = 200
     join_timeout_s: Annotated[float, Field(ge=0, le=86400)] = 0.0
     snippet_height_px: SidePx = 80
@@ -65,6 +68,15 @@ class AtdStubConfig(RetentionConfig, SurveyOptions):
     snippet_dir: Path | None = None
     survey_options: Path | None = None
     max_bytes: MaxBytes = 100_000_000_000
+
+    def detector_settings(self) -> DetectorSettings:
+        """Return all settings of the detector."""
+        return DetectorSettings(
+            **self.detector.model_dump(),
+            confidence_threshold=self.confidence_threshold,
+            max_contacts=self.max_contacts or None,
+            join_overlap_pings=self.join_overlap_pings,
+        )
 
     @model_validator(mode="before")
     @classmethod

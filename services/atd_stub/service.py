@@ -36,7 +36,7 @@ from sonarpost.services.atd_stub.release import ContactRelease
 from sonarpost.services.atd_stub.snippet_files import SNIPPET_SUFFIXES, read_snippet, write_snippet
 from sonarpost.services.atd_stub.survey_detection import DetectionResult, detect_in_survey
 from sonarpost.sonar.image_files import IMAGE_SUFFIXES
-from sonarpost.sonar.readers import SUPPORTED_SUFFIXES
+from sonarpost.sonar.readers import single_file_suffixes
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ class AtdStubService(Service[AtdStubConfig]):
 
     def __init__(self, platform: PlatformConfig, config: AtdStubConfig) -> None:
         super().__init__(platform, config)
-        self._suffixes = SUPPORTED_SUFFIXES if config.mode == "survey" else IMAGE_SUFFIXES
+        self._suffixes = single_file_suffixes() if config.mode == "survey" else IMAGE_SUFFIXES
         self._stable_files = StableFiles(config.settle_s, require_done_marker=config.require_done_marker)
         self._processed: dict[InputFile, str] = {}  # with the digest of the content
         self._retention_due_s = 0.0
@@ -217,17 +217,16 @@ class AtdStubService(Service[AtdStubConfig]):
         if self.config.mode == "snippets":
             file = read_snippet(path, content, self.platform.id, self.config.fit)
             return DetectionResult((file.snippet,), contact_count=1, warnings=file.notes)
-        file_ends = self._file_ends.by_sonar()
-        return detect_in_survey(path, content, self.platform.id, self.config, file_ends, time.time())
+        return detect_in_survey(path, content, self.platform.id, self.config, self._file_ends.by_sonar())
 
     def _commit_result(self, path: Path, content: str, result: DetectionResult, duration_s: float) -> None:
         effects = UnitOfWork()
         entry = {"file": printable(path.name), "contacts": result.contact_count, "processed_utc_s": time.time()}
         effects.put_state(_state_name(content), msgpack.packb(entry))
         effects.count("files_processed")
-        effects.count("contacts_detected", result.contact_count)
-        no_continuation = self._file_ends.put(effects, result.file_end, joined=result.joined)
-        self._commit_contacts(effects, (*result.snippets, *no_continuation))
+        if result.ends is not None:
+            self._file_ends.put(effects, result.ends, time.time() + self.config.join_timeout_s)
+        self._commit_contacts(effects, (*result.snippets, *result.not_continued))
         counts = {}
         if self.config.mode == "survey":
             threshold = self.config.confidence_threshold
@@ -242,10 +241,15 @@ class AtdStubService(Service[AtdStubConfig]):
                 **counts,
             ),
         )
-        for contact_id, reason in result.released:
-            log.info("Held contact released", extra=kv(contact_id=contact_id, reason=reason))
-        self._log_released(no_continuation, f"not continued by {path.name}")
-        for snippet in result.file_end.held_snippets() if result.file_end is not None else ():
+        for contact_id in result.replaced:
+            log.info(
+                "Held contact released", extra=kv(contact_id=contact_id, reason=f"seen whole in {printable(path.name)}")
+            )
+        for contact_id in result.dropped:
+            reason = f"not detected in the pings joined with {printable(path.name)}"
+            log.info("Held contact dropped", extra=kv(contact_id=contact_id, reason=reason))
+        self._log_released(result.not_continued, f"not continued by {printable(path.name)}")
+        for snippet in result.held:
             log.info(
                 "Contact held for continuation file",
                 extra=kv(contact_id=snippet.contact.contact_id, file=snippet.source, wait_s=self.config.join_timeout_s),
@@ -255,7 +259,8 @@ class AtdStubService(Service[AtdStubConfig]):
             log.warning(message, extra=kv(file=path.name, warning=printable(warning)))
 
     def _commit_contacts(self, effects: UnitOfWork, snippets: tuple[Snippet, ...]) -> None:
-        """Commit `effects` and contacts that are ready for release; their files are written before."""
+        """Count and commit contacts that are ready for release, with `effects`; their files are written before."""
+        effects.count("contacts_detected", len(snippets))
         if self.config.snippet_dir is not None:
             for snippet in snippets:
                 write_snippet(self.config.snippet_dir, snippet)

@@ -9,7 +9,7 @@ import numpy as np
 
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.survey_detection import detect_in_survey
+from sonarpost.services.atd_stub.survey_detection import detect_in_survey, snippets_of
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -70,17 +70,12 @@ def split(folder: Path, survey: Survey, *spans: tuple[int, int], sonar: str = ""
 def detect_in_files(paths: list[Path], **changes) -> list[Snippet]:
     """Return the contacts of consecutive files, with those held at the end of the last one."""
     config = AtdStubConfig(**changes)
-    file_ends, sent, total = {}, [], 0
+    ends, sent = {}, []
     for path in paths:
-        result = detect_in_survey(path, path.stem.ljust(64, "0"), "uuv-1", config, file_ends, 100.0)
-        if not result.joined:
-            sent += [snippet for end in file_ends.values() for snippet in end.held_snippets()]
-        sent += result.snippets
-        total += result.contact_count
-        file_ends = {} if result.file_end is None else {result.file_end.sonar_id: result.file_end}
-    sent += [snippet for end in file_ends.values() for snippet in end.held_snippets()]
-    assert len(sent) == total, "every contact is counted once"
-    return sent
+        result = detect_in_survey(path, path.stem.ljust(64, "0"), "uuv-1", config, ends)
+        sent += [*result.not_continued, *result.snippets]
+        ends = result.ends
+    return sent + [snippet for end in ends.values() for snippet in snippets_of(end.held)]
 
 
 def near(sent: list[Snippet], row: int, side: Side = Side.PORT) -> list[Snippet]:

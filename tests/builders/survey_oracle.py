@@ -111,4 +111,4 @@ def check_ping(ping: Ping) -> None:
         assert channel.slant_range_m > 0
         assert np.isfinite(channel.echo()).all()
         found = georeference(ping, channel.side, len(channel.samples) - 1, OPTIONS)
-        assert found is None or (abs(found.position.lat_deg) <= 90.5 and math.isfinite(found.drms_m))
+        assert found is None or (abs(found.position.lat_deg) <= 90.5 and math.isfinite(found.sigma_m))

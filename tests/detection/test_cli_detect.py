@@ -17,7 +17,9 @@ from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.messages import Contact
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.side_car import read_side_car
+from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import Side
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -61,7 +63,7 @@ def test_json_is_one_object_with_contacts_of_every_file(file, capsys):
     assert contact["time_utc"].startswith("2001-09-09T01:46:5")
     assert 1.0 <= contact["atd_confidence"] <= 2.0
     assert contact["lat_deg"] == pytest.approx(60.0, abs=0.01)
-    assert contact["position_sigma_m"] == pytest.approx(7.1, abs=0.2)
+    assert contact["position_sigma_m"] == pytest.approx(5.0, abs=0.2)
     missing = set(Contact.model_fields) - set(contact)
     assert missing <= {"type", "v", "schema_version", "time_utc_s"}, missing
 
@@ -116,7 +118,7 @@ def test_long_recording_is_reduced_in_the_plot(make_survey):
     survey = make_survey({"ping": 120})
     long = replace(survey, pings=survey.pings * 20)
     found = detect(survey)
-    image = np.asarray(annotated_waterfall(long, found)).astype(int)
+    image = np.asarray(annotated_waterfall(InMemorySource(long, SurveyOptions()), found)).astype(int)
     assert image.shape[0] == 22 + 1334 + 34  # 4000 pings, 3 in a row
     rows, _ = np.nonzero((image[..., 0] == 255) & (image[..., 1] == 80) & (image[..., 2] == 60))
     assert rows.min() == pytest.approx(22 + 120 / 3 - 6, abs=4)
@@ -185,11 +187,44 @@ def test_error_names_option_out_of_range(file, options):
         run(file, *options)
 
 
+def test_settings_are_read_from_a_file(file, tmp_path, capsys):
+    settings = tmp_path / "settings.toml"
+    settings.write_text("confidence_threshold = 0.001\nmax_contacts = 4\nmine_length_m = [0.01, 0.02]\n")
+    assert run(file, "--settings", settings, "--json") == 0
+    (found,) = json.loads(capsys.readouterr().out)["files"]
+    assert [contact["atd_class"] for contact in found["contacts"]] == ["clutter"] * 4
+    assert list(found["contacts_above"]) == ["0.001"]
+    assert run(file, "--settings", settings, "--threshold", "1", "--json") == 0
+    (found,) = json.loads(capsys.readouterr().out)["files"]
+    assert len(found["contacts"]) == 1, "an option overrides the file"
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("ring_m = 0", "ring_m: got 0, expected greater than 0"),
+        ("rings = 1", "rings"),
+        ("ring_m = [", "TOML"),
+        ("a = " + "[" * 5000, "TOML"),
+        ("#" * 70_000, "file size"),
+    ],
+)
+def test_error_names_invalid_setting(file, tmp_path, text, error):
+    (tmp_path / "settings.toml").write_text(text)
+    with pytest.raises(ConfigError, match=rf"settings\.toml: .*{error}"):
+        run(file, "--settings", tmp_path / "settings.toml")
+
+
+def test_error_names_invalid_vehicle(file):
+    with pytest.raises(ConfigError, match="--vehicle: got 'no vehicle'"):
+        run(file, "--vehicle", "no vehicle")
+
+
 def test_invalid_file_and_output_are_reported_before_the_work(file, tmp_path, monkeypatch):
     (tmp_path / "bad.xtf").write_bytes(b"not a survey")
     with pytest.raises(SurveyFileError):
         run(tmp_path / "bad.xtf")
-    monkeypatch.setattr(command, "_detect_files", lambda *_: pytest.fail("the work has begun"))
+    monkeypatch.setattr(command._Detection, "run", lambda *_: pytest.fail("the work has begun"))
     for option in ("--plot", "--snippets"):
         with pytest.raises(ConfigError, match=r"output folder: got .*bad\.xtf"):
             run(file, option, tmp_path / "bad.xtf" / "out.png")
@@ -206,4 +241,5 @@ def test_file_cut_by_a_power_failure_has_a_note(file, tmp_path, capsys):
 
 
 def test_waterfall_of_one_side(make_survey):
-    assert annotated_waterfall(make_survey(sides=(Side.STARBOARD,)), ()).size == (150 + 2 * 512 + 30, 22 + 200 + 34)
+    source = InMemorySource(make_survey(sides=(Side.STARBOARD,)), SurveyOptions())
+    assert annotated_waterfall(source, ()).size == (150 + 2 * 512 + 30, 22 + 200 + 34)

@@ -1,4 +1,4 @@
-"""Detection over consecutive files."""
+"""The streaming detector: each object is one contact at any boundary of strips and of files."""
 
 from __future__ import annotations
 
@@ -6,27 +6,45 @@ import itertools
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from sonarpost.detection import stream
 from sonarpost.detection.detector import detect
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.stream import StreamDetector, is_continuation
-from sonarpost.sonar.survey import ChannelPing, Side
+from sonarpost.detection.stream import FileOrigin, StreamDetector, stored_ping_count
+from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.source import InMemorySource
+from sonarpost.sonar.survey import ChannelPing, Ping, Side
 
 
 def split(survey, *boundaries):
     """Return the survey as consecutive files that start at these pings."""
     edges = [0, *boundaries, len(survey.pings)]
     return [
-        replace(survey, path=Path(f"{number}.xtf"), pings=survey.pings[first:last])
+        replace(survey, path=Path(f"{number}.xtf"), line_name=str(number), pings=survey.pings[first:last])
         for number, (first, last) in enumerate(itertools.pairwise(edges))
     ]
 
 
+def detector_of(settings=None, ends=None):
+    """Return a detector of whose contacts the detection and the number of its ping are known."""
+    return StreamDetector(lambda survey, d, origin: (survey.pings[d.ping_index].number, d), settings, ends)
+
+
+def add(detector, survey):
+    source = InMemorySource(survey, SurveyOptions())
+    return detector.add_file(source, FileOrigin.of(source, survey.path.stem))
+
+
 def contacts_of(files, settings=None):
-    detector = StreamDetector(settings)
-    found = [contact for survey in files for contact in detector.add_file(survey)]
-    return [*found, *detector.finish()]
+    detector = detector_of(settings)
+    results = [add(detector, survey) for survey in files]
+    return [contact for r in results for contact in (*r.released, *r.contacts)] + list(detector.finish())
+
+
+def numbers(contacts):
+    return sorted(contact.content[0] - 1000 for contact in contacts)
 
 
 @pytest.mark.parametrize("boundary", [90, 98, 100, 103, 110])
@@ -34,61 +52,151 @@ def test_target_at_file_boundary_is_detected_once(make_survey, boundary):
     survey = make_survey({"ping": 100, "sample": 250})
     (expected,) = detect(survey)
     (found,) = contacts_of(split(survey, boundary))
-    first = {Path("0.xtf"): 0, Path("1.xtf"): boundary}[found.path]
-    assert first + found.ping == pytest.approx(expected.ping_index, abs=2)
-    assert found.detection.sample == pytest.approx(expected.sample, abs=4)
-    assert found.detection.length_m == pytest.approx(expected.length_m, abs=0.3)
-    assert found.detection.confidence > 1.5
-    assert found.survey.pings[found.detection.ping_index].number == 1000 + first + found.ping
+    number, detection = found.content
+    assert number - 1000 == pytest.approx(expected.ping_index, abs=2)
+    assert number == 1000 + found.origin.row + (boundary if found.origin.file.source == "1.xtf" else 0)
+    assert detection.sample == pytest.approx(expected.sample, abs=4)
+    assert detection.length_m == pytest.approx(expected.length_m, abs=0.3)
+    assert detection.confidence == pytest.approx(expected.confidence, abs=0.01), "the joined pings are the same"
+    assert found.origin.file.contact_id(detection) == (
+        f"{found.origin.file.source[0]}-{found.origin.file.source[0]}-{number}-{detection.side}-{detection.sample}"
+    )
 
 
 def test_every_contact_of_a_line_is_returned_once(make_survey):
     survey = make_survey(
         {"ping": 30}, {"ping": 75, "sample": 330}, {"ping": 128}, {"ping": 180, "side": Side.STARBOARD}
     )
-    files = split(survey, 70, 130)
-    found = contacts_of(files)
-    firsts = {Path("0.xtf"): 0, Path("1.xtf"): 70, Path("2.xtf"): 130}
-    pings = sorted(firsts[c.path] + c.ping for c in found)
-    assert pings == [pytest.approx(p, abs=3) for p in (30, 75, 128, 180)]
+    found = contacts_of(split(survey, 70, 130))
+    assert numbers(found) == [pytest.approx(p, abs=3) for p in (30, 75, 128, 180)]
+
+
+@pytest.mark.parametrize("boundaries", [(97, 103), (99, 100, 101), tuple(range(20, 200, 20))])
+def test_files_shorter_than_the_overlap(make_survey, boundaries):
+    survey = make_survey({"ping": 100})
+    (expected,) = detect(survey)
+    (found,) = contacts_of(split(survey, *boundaries))
+    assert found.content[0] - 1000 == pytest.approx(expected.ping_index, abs=3)
+
+
+@pytest.mark.parametrize("boundary", [(), (120,)])
+@pytest.mark.parametrize("ping", [79, 101, 120])
+def test_target_at_strip_boundary_is_detected_once(make_survey, monkeypatch, ping, boundary):
+    monkeypatch.setattr(stream, "STRIP_PINGS", 60)
+    settings = DetectorSettings(join_overlap_pings=40)
+    survey = make_survey({"ping": ping})
+    (found,) = contacts_of(split(survey, *boundary), settings)
+    assert found.content[0] - 1000 == pytest.approx(ping, abs=3)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_an_end_restores_the_detector(make_survey, held):
+    survey = make_survey({"ping": 40}, {"ping": 100})
+    files = split(survey, 99)
+    detector = detector_of()
+    first = add(detector, files[0])
+    assert first.contacts == ()
+    assert 39 <= numbers(first.held)[0] <= 41
+    given = () if held else detector.release(survey.sonar_id)
+    second = detector_of(ends=detector.ends)
+    result = add(second, files[1])
+    assert result.joined
+    assert len(given) + len(result.contacts) + len(second.finish()) == 2
+    assert {contact.content[0] for contact in (*result.replaced, *result.dropped)} == (
+        {contact.content[0] for contact in first.held} if held else set()
+    )
 
 
 def test_contact_near_end_waits_for_next_file_or_end_of_line(make_survey):
     survey = make_survey({"ping": 60}, {"ping": 175})
-    detector = StreamDetector()
-    (early,) = detector.add_file(survey)
-    assert early.ping == pytest.approx(60, abs=3)
-    (late,) = detector.finish()
-    assert late.ping == pytest.approx(175, abs=3)
+    detector = detector_of(DetectorSettings(join_overlap_pings=100))
+    assert numbers(add(detector, survey).contacts) == [pytest.approx(60, abs=3)]
+    assert numbers(detector.finish()) == [pytest.approx(175, abs=3)]
     assert detector.finish() == ()
-    other_sonar = replace(survey, sonar_id="another")
-    detector.add_file(survey)
-    assert sorted(c.ping for c in detector.add_file(other_sonar)) == [
-        pytest.approx(60, abs=3),
-        pytest.approx(175, abs=3),
-    ]
 
 
-def test_continuation_requires_same_sonar_sampling_and_time(make_survey):
-    survey = make_survey()
-    before, after = split(survey, 100)
-    assert is_continuation(before, after)
-    assert not is_continuation(after, before)
-    assert not is_continuation(before, replace(after, sonar_id="another"))
-    assert not is_continuation(before, replace(after, pings=()))
-    late = tuple(replace(p, time_utc_s=p.time_utc_s + 60.0) for p in after.pings)
-    assert not is_continuation(before, replace(after, pings=late))
-    short = tuple(
-        replace(p, channels=tuple(ChannelPing(c.side, c.samples[:300], c.slant_range_m) for c in p.channels))
-        for p in after.pings
-    )
-    assert not is_continuation(before, replace(after, pings=short))
+def test_contacts_of_an_interrupted_recording_are_released(make_survey):
+    survey = make_survey({"ping": 60}, {"ping": 175})
+    detector = detector_of()
+    held = add(detector, survey).held
+    other = add(detector, replace(survey, sonar_id="another"))
+    assert (other.joined, other.released) == (False, ()), "files of two sonars may alternate"
+    later = tuple(replace(p, time_utc_s=p.time_utc_s + 3600) for p in survey.pings)
+    assert add(detector, replace(survey, pings=later)).released == held
 
 
-def test_file_shorter_than_overlap(make_survey):
+def test_ends_of_at_most_eight_sonars_are_kept(make_survey):
     survey = make_survey({"ping": 100})
-    settings = DetectorSettings()
-    for boundaries in ((97, 103), (99, 100, 101)):
-        found = contacts_of(split(survey, *boundaries), settings)
-        firsts = {Path(f"{n}.xtf"): first for n, first in enumerate((0, *boundaries))}
-        assert [firsts[c.path] + c.ping for c in found] == [pytest.approx(100, abs=3)], boundaries
+    detector = detector_of()
+    results = [add(detector, replace(survey, sonar_id=f"sonar {n}")) for n in range(9)]
+    assert [len(result.released) for result in results] == [0] * 8 + [1]
+    assert list(detector.ends) == [f"sonar {n}" for n in range(1, 9)]
+
+
+def test_a_contact_that_the_joined_pings_do_not_confirm_is_dropped(make_survey):
+    files = split(make_survey({"ping": 98}), 100)
+    detector = detector_of()
+    held = add(detector, files[0]).held
+    assert len(held) == 1
+    strict = detector_of(DetectorSettings(confidence_threshold=2.0), detector.ends)
+    result = add(strict, files[1])
+    assert (result.dropped, result.replaced, result.contacts, strict.finish()) == (held, (), (), ())
+
+
+def test_limit_applies_to_each_file_with_held_contacts(make_survey):
+    survey = make_survey(*({"ping": ping, "sample": 200 + ping} for ping in (20, 60, 120, 180)))
+    detector = detector_of(DetectorSettings(max_contacts=3, join_overlap_pings=100))
+    result = add(detector, survey)
+    best = detect(survey)[:3]
+    given = [contact.content[1] for contact in (*result.contacts, *detector.finish())]
+    assert sorted(d.ping_index for d in given) == sorted(d.ping_index for d in best)
+
+
+def with_channels(ping, change):
+    return replace(ping, channels=tuple(change(channel) for channel in ping.channels))
+
+
+@pytest.mark.parametrize(
+    ("change", "continues"),
+    [
+        (lambda ping: ping, True),
+        (lambda ping: replace(ping, time_utc_s=ping.time_utc_s + 60.0), False),
+        (lambda ping: replace(ping, time_utc_s=ping.time_utc_s - 60.0), False),
+        (lambda ping: replace(ping, lat_deg=ping.lat_deg + 0.001), False),
+        (lambda ping: replace(ping, grid_m=(5e5, 6e6)), True),
+        (lambda ping: with_channels(ping, lambda c: replace(c, samples=c.samples[:300])), False),
+        (lambda ping: with_channels(ping, lambda c: replace(c, samples=c.samples.astype(np.uint32))), False),
+        (lambda ping: with_channels(ping, lambda c: replace(c, slant_range_m=c.slant_range_m * 1.02)), False),
+        (lambda ping: replace(ping, channels=(*ping.channels, ping.channels[0])), False),
+    ],
+)
+def test_continuation_requires_same_sampling_time_and_place(make_survey, change, continues):
+    before, after = split(make_survey(), 100)
+    detector = detector_of()
+    add(detector, before)
+    assert add(detector, replace(after, pings=tuple(map(change, after.pings)))).joined is continues
+
+
+def test_coordinates_in_metres_show_a_jump(make_survey):
+    survey = make_survey()
+    grid = tuple(
+        replace(p, lat_deg=None, lon_deg=None, grid_m=(5e5, 6e6 + 0.1 * row + (40.0 if row >= 100 else 0.0)))
+        for row, p in enumerate(survey.pings)
+    )
+    before, after = split(replace(survey, pings=grid), 100)
+    detector = detector_of()
+    add(detector, before)
+    assert not add(detector, after).joined
+
+
+def test_repeated_pings_are_left_out(make_survey):
+    survey = make_survey({"ping": 100})
+    files = [replace(survey, pings=survey.pings[:120]), replace(survey, pings=survey.pings[80:])]
+    assert len(contacts_of(files)) == 1
+
+
+def test_the_end_of_a_recording_keeps_at_most_16_mib_of_samples():
+    ping = Ping(0, 0.0, (ChannelPing(Side.PORT, np.zeros(1 << 20, dtype=np.uint32), 10.0),))
+    assert stored_ping_count([ping] * 50, 200) == 4
+    assert stored_ping_count([ping] * 2, 200) == 2
+    assert stored_ping_count([], 200) == 0

@@ -14,10 +14,12 @@ from sonarpost.detection.detector import detect
 from sonarpost.detection.normalisation import normalise_side
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image
-from sonarpost.detection.stream import StreamDetector, is_continuation
+from sonarpost.detection.stream import FileOrigin, StreamDetector
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.ground_range import MAX_COLUMNS
+from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import Side
 
 SAMPLES, RANGE_M = 512, 30.0
@@ -115,28 +117,40 @@ def test_sample_beyond_first_frequency_is_rejected(make_survey):
 @SECOND
 def test_annotated_waterfall_shows_first_frequency(samples, range_m, make_survey, tmp_path):
     alone, both = read_both(make_survey({}), tmp_path, samples, range_m)
-    images = [np.asarray(annotated_waterfall(survey, detect(survey))) for survey in (alone, both)]
+    images = [
+        np.asarray(annotated_waterfall(InMemorySource(survey, SurveyOptions()), detect(survey)))
+        for survey in (alone, both)
+    ]
     np.testing.assert_array_equal(*images)
+
+
+def files_of(survey, boundary):
+    return [replace(survey, pings=survey.pings[:boundary]), replace(survey, pings=survey.pings[boundary:])]
+
+
+def results_of(files):
+    """Return the results of consecutive files and the contacts held at the end; contacts are their detections."""
+    detector = StreamDetector(lambda _survey, detection, origin: (origin.row, detection))
+    sources = [InMemorySource(file, SurveyOptions()) for file in files]
+    return [detector.add_file(source, FileOrigin.of(source, "0")) for source in sources], detector.finish()
 
 
 @SECOND
 def test_line_of_several_files(samples, range_m, make_survey, tmp_path):
     found = []
     for survey in read_both(make_survey({}), tmp_path, samples, range_m):
-        detector = StreamDetector()
-        files = (replace(survey, pings=survey.pings[:98]), replace(survey, pings=survey.pings[98:]))
-        contacts = [contact for file in files for contact in detector.add_file(file)] + list(detector.finish())
-        found.append([(contact.file, contact.ping, contact.detection) for contact in contacts])
+        results, held = results_of(files_of(survey, 98))
+        found.append([contact.content for result in results for contact in result.contacts] + [c.content for c in held])
     assert found[0] == found[1] != []
 
 
 def test_exchanged_frequencies_are_no_continuation(make_survey):
     survey = with_second_frequency(make_survey({}), 512, 10.0)
-    first, second = replace(survey, pings=survey.pings[:98]), replace(survey, pings=survey.pings[98:])
-    assert is_continuation(first, second)
+    first, second = files_of(survey, 98)
+    assert results_of([first, second])[0][1].joined
     # The second channels of both sides come first: the image would continue at another scale.
     exchanged = tuple(replace(p, channels=(*p.channels[2:], *p.channels[:2])) for p in second.pings)
-    assert not is_continuation(first, replace(second, pings=exchanged))
+    assert not results_of([first, replace(second, pings=exchanged)])[0][1].joined
 
 
 @SECOND

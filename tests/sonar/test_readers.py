@@ -13,9 +13,9 @@ from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.sonar import readers
 from sonarpost.sonar.options import load_options
 from sonarpost.sonar.readers import (
-    SUPPORTED_SUFFIXES,
     open_survey,
     read_survey,
+    single_file_suffixes,
     supported_suffixes,
 )
 from sonarpost.sonar.source import InMemorySource
@@ -44,6 +44,7 @@ def plug_in(monkeypatch, small_survey):
 @pytest.mark.usefixtures("plug_in")
 def test_plug_in_reader_opens_its_suffix(tmp_path, small_survey):
     assert {".jsf", ".sdf", ".xtf"} <= set(supported_suffixes())
+    assert set(supported_suffixes()) - set(single_file_suffixes()) == {".dat", ".waterfall.toml"}
     assert len(read_survey(tmp_path / "line.JSF").pings) == 5
     with pytest.raises(SurveyFileError, match=r"survey reader sdf: got .absent_package:open: ModuleNotFoundError"):
         open_survey(tmp_path / "line.sdf")
@@ -56,7 +57,7 @@ def test_plug_in_reader_opens_its_suffix(tmp_path, small_survey):
 def test_reader_registry(small_survey, tmp_path):
     write_xtf(small_survey(), tmp_path / "A.XTF")
     assert len(read_survey(tmp_path / "A.XTF").pings) == 5
-    assert ".xtf" in SUPPORTED_SUFFIXES
+    assert single_file_suffixes() == (".xtf",)
     with pytest.raises(SurveyFileError, match=r"suffix: got '.jsf', expected .*\.xtf"):
         read_survey(tmp_path / "a.jsf")
 

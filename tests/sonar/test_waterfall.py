@@ -130,8 +130,9 @@ def test_table_in_metres_has_positions_and_its_extent(small_survey, tmp_path):
     with pytest.raises(SurveyFileError, match=r"projected_crs: got None, expected .* \(--crs\)"):
         open_survey(path)
     with open_survey(path, SurveyOptions(projected_crs="EPSG:32619")) as source:
-        for ping, want in zip(source.pings(), small_survey(), strict=True):
+        for ping, want, point in zip(source.pings(), small_survey(), points, strict=True):
             assert (ping.lat_deg, ping.lon_deg) == pytest.approx((want.lat_deg, want.lon_deg), abs=1e-8)
+            assert ping.grid_m == point
         grid = source.info.grid
     assert (grid.first_m, grid.last_m) == (points[0], points[-1])
     eastings, northings = zip(*points, strict=True)

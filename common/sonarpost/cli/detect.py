@@ -7,13 +7,15 @@ import dataclasses
 import hashlib
 import json
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cache
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 from PIL import Image, ImageDraw
+from pydantic import ValidationError
 
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import (
@@ -25,18 +27,20 @@ from sonarpost.cli.shared import (
 )
 from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
 from sonarpost.detection.detector import MINE_LIKE, Detection, counts_text
-from sonarpost.detection.settings import DetectorSettings
+from sonarpost.detection.record import contact_record
+from sonarpost.detection.settings import DetectorSettings, checked_settings, load_settings
 from sonarpost.detection.snippets import cut_snippet, ground_projected_image
-from sonarpost.detection.stream import StreamContact, StreamDetector
-from sonarpost.errors import ConfigError
+from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamDetector
+from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.messages import Contact
 from sonarpost.sonar.image_files import encode_png, write_png
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.side_car import write_side_car
-from sonarpost.sonar.source import InMemorySource
-from sonarpost.sonar.survey import Survey
+from sonarpost.sonar.source import SurveyInfo, SurveySource
+from sonarpost.sonar.survey import Side, Survey
+from sonarpost.wire import first_error
 
 _HEADER = (
     "  n  conf  class      side       ping  sample  range_m  length_m  width_m  shadow_m  height_m"
@@ -70,12 +74,14 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--threshold",
         type=float,
-        default=DetectorSettings().confidence_threshold,
         metavar="CONFIDENCE",
-        help="minimum confidence, 0 to 2 (default: %(default)s)",
+        help="minimum confidence, 0 to 2 (default: that of --settings, else 1.0)",
     )
     parser.add_argument(
         "--max-contacts", type=int, metavar="N", help="list at most the N most confident contacts of a file"
+    )
+    parser.add_argument(
+        "--settings", type=Path, metavar="FILE.toml", help="settings of the detector, as in [atd_stub.detector]"
     )
     add_survey_options(parser)
     parser.add_argument("--vehicle", default="uuv", metavar="ID", help="vehicle_id of the records (default: uuv)")
@@ -84,11 +90,8 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(parsed: argparse.Namespace) -> int:
     """Detect in every file and print the contacts."""
-    try:
-        settings = DetectorSettings(confidence_threshold=parsed.threshold, max_contacts=parsed.max_contacts)
-    except ValueError as error:
-        value = (parsed.threshold, parsed.max_contacts)
-        raise ConfigError("detect", "--threshold, --max-contacts", value, str(error)) from error
+    settings = _settings(parsed)
+    _check_vehicle_id(parsed.vehicle)
     options = survey_options_of(parsed)
     files: list[Path] = parsed.files
     if parsed.plot is not None:
@@ -96,54 +99,122 @@ def run(parsed: argparse.Namespace) -> int:
     if parsed.snippets is not None:
         make_output_folder(parsed.snippets)
     with ProgressDisplay() as display:
-        results = _detect_files(files, settings, options, display)
+        detection = _Detection(settings, options, parsed.vehicle, with_images=parsed.snippets is not None)
+        results = detection.run(files, display)
     for result in results:
         if not parsed.json:
             _print_table(result, settings.confidence_threshold)
         if parsed.plot is not None:
-            path = _plot_path(parsed.plot, result.survey.path, several=len(files) > 1)
-            image = annotated_waterfall(result.survey, [contact.in_file() for contact in result.contacts])
+            path = _plot_path(parsed.plot, result.info.path, several=len(files) > 1)
+            with open_survey(result.info.path, options) as source:
+                image = annotated_waterfall(source, [contact.detection for contact in result.contacts])
             write_atomically(path, encode_png(image))
         if parsed.snippets is not None:
-            _write_snippets(parsed.snippets, result, parsed.vehicle)
+            _write_snippets(parsed.snippets, result)
     if parsed.json:
-        found = [_file_json(r, parsed.vehicle, settings.confidence_threshold) for r in results]
+        found = [_file_json(r, settings.confidence_threshold) for r in results]
         print(json.dumps({"files": found}, allow_nan=False))
     return 0
 
 
-def _detect_files(
-    files: Sequence[Path], settings: DetectorSettings, options: SurveyOptions, display: ProgressDisplay
-) -> list[FileResult]:
-    """Detect in the files in their order; a contact belongs to the file that contains its ping."""
-    detector = StreamDetector(settings, options)
-    results: list[FileResult] = []
-    for number, path in enumerate(files):
-        display.show(f"reading {path}", number, len(files))
-        survey = read_survey(path, options)
-        display.show(f"detecting in {path}", number, len(files))
-        started_s = time.perf_counter()
-        contacts = detector.add_file(survey)
-        results.append(FileResult(survey, []))
-        results[-1].seconds += time.perf_counter() - started_s
-        _assign(contacts, results)
-    _assign(detector.finish(), results)
-    for result, weaker in zip(results, detector.weaker, strict=True):
-        result.count, result.weaker = len(result.contacts), weaker
-        result.contacts.sort(key=lambda c: -c.detection.confidence)
-        del result.contacts[settings.max_contacts or len(result.contacts) :]
-    return results
+def _settings(parsed: argparse.Namespace) -> DetectorSettings:
+    """Return the settings of --settings with --threshold and --max-contacts.
+
+    Raises:
+        ConfigError: The file or an option is invalid.
+    """
+    settings = DetectorSettings() if parsed.settings is None else load_settings(parsed.settings)
+    given = {"confidence_threshold": parsed.threshold, "max_contacts": parsed.max_contacts}
+    changes = {name: value for name, value in given.items() if value is not None}
+    return checked_settings(settings.model_dump() | changes, "detect")
 
 
-def _assign(contacts: Sequence[StreamContact], results: Sequence[FileResult]) -> None:
-    for contact in contacts:
-        results[contact.file].contacts.append(contact)
+def _check_vehicle_id(vehicle_id: str) -> None:
+    try:
+        Contact(contact_id="checked", vehicle_id=vehicle_id)
+    except ValidationError as error:
+        _, value, expected = first_error(error)
+        raise ConfigError("detect", "--vehicle", value, expected) from error
 
 
-def _print_table(result: FileResult, threshold: float) -> None:
-    survey = result.survey
-    print(f"{survey.path}: {len(survey.pings)} pings, {len(result.contacts)} contacts")
-    for warning in survey.warnings:
+@dataclass(frozen=True, slots=True)
+class ListedContact:
+    """A contact with what the command prints and writes of it.
+
+    Attributes:
+        detection: The detection; its ping indices are those of its file. The highlight may begin before its first ping.
+        record: Its contact record.
+        image: Its snippet at the resolution of the recording; None without --snippets.
+        ground: Its snippet projected to the bottom; None without --snippets, and where it is not known.
+    """
+
+    detection: Detection
+    record: Contact
+    image: npt.NDArray[np.uint8] | None = None
+    ground: npt.NDArray[np.uint8] | None = None
+
+
+@dataclass
+class FileListing:
+    """A file, its contacts, their number at lower thresholds, and the time of the detection."""
+
+    info: SurveyInfo
+    origin: FileOrigin
+    weaker: Mapping[float, int]
+    seconds: float
+    contacts: list[ListedContact] = field(default_factory=list)
+
+
+class _Detection:
+    """The detection in the files of one call."""
+
+    def __init__(
+        self, settings: DetectorSettings, options: SurveyOptions, vehicle_id: str, *, with_images: bool
+    ) -> None:
+        self._options = options
+        self._vehicle_id = vehicle_id
+        self._with_images = with_images
+        self._detector = StreamDetector(self._describe, settings)
+        self._results: list[FileListing] = []
+
+    def run(self, files: Sequence[Path], display: ProgressDisplay) -> list[FileListing]:
+        """Detect in the files in their order; a contact belongs to the file that contains its ping."""
+        for number, path in enumerate(files):
+            display.show(f"detecting in {path}", number, len(files))
+            content = _content_hash(path)
+            with open_survey(path, self._options) as source:
+                info = source.info
+                origin = FileOrigin.of(source, content)
+                started_s = time.perf_counter()
+                found = self._detector.add_file(source, origin)
+            self._assign(found.released)
+            self._results.append(FileListing(info, origin, found.weaker, time.perf_counter() - started_s))
+            self._assign(found.contacts)
+        self._assign(self._detector.finish())
+        for result in self._results:
+            result.contacts.sort(key=lambda contact: -contact.detection.confidence)
+        return self._results
+
+    def _assign(self, contacts: Sequence[StreamContact[ListedContact]]) -> None:
+        for contact in contacts:
+            latest = next(result for result in reversed(self._results) if result.origin == contact.origin.file)
+            latest.contacts.append(contact.content)
+
+    def _describe(self, survey: Survey, detection: Detection, origin: PingOrigin) -> ListedContact:
+        record = contact_record(detection, origin.file, self._vehicle_id, survey.sonar_id)
+        first, end = (row + origin.row - detection.ping_index for row in detection.highlight_pings)
+        in_file = replace(detection, ping_index=origin.row, highlight_pings=(first, end))
+        if not self._with_images:
+            return ListedContact(in_file, record)
+        image = cut_snippet(survey, detection).image
+        ground = ground_projected_image(survey, detection, _GROUND_PX, _GROUND_PX, _GROUND_PIXEL_M)
+        return ListedContact(in_file, record, image, ground)
+
+
+def _print_table(result: FileListing, threshold: float) -> None:
+    info = result.info
+    print(f"{info.path}: {info.ping_count} pings, {len(result.contacts)} contacts")
+    for warning in info.warnings:
         print(f"  note: {warning}")
     print(_HEADER if result.contacts else f"{counts_text(threshold, 0, result.weaker)}; see --threshold")
     for number, contact in enumerate(result.contacts, start=1):
@@ -160,14 +231,15 @@ def _metres(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _file_json(result: FileResult, vehicle_id: str, threshold: float) -> dict[str, object]:
+def _file_json(result: FileListing, threshold: float) -> dict[str, object]:
+    counts = ((threshold, len(result.contacts)), *result.weaker.items())
     return {
-        "file": str(result.survey.path),
-        "pings": len(result.survey.pings),
-        "warnings": list(result.survey.warnings),
+        "file": str(result.info.path),
+        "pings": result.info.ping_count,
+        "warnings": list(result.info.warnings),
         "seconds": round(result.seconds, 3),
-        "contacts_above": {str(confidence): n for confidence, n in ((threshold, result.count), *result.weaker.items())},
-        "contacts": [contact_json(result.survey, contact, vehicle_id) for contact in result.contacts],
+        "contacts_above": {str(confidence): n for confidence, n in counts},
+        "contacts": [contact_json(contact) for contact in result.contacts],
     }
 
 
@@ -175,85 +247,50 @@ def _plot_path(plot: Path, survey_path: Path, *, several: bool) -> Path:
     return plot.with_name(f"{plot.stem}-{survey_path.stem}{plot.suffix}") if several else plot
 
 
-def _write_snippets(folder: Path, result: FileResult, vehicle_id: str) -> None:
+def _write_snippets(folder: Path, result: FileListing) -> None:
     """Write the snippet of each contact at the resolution of the recording and, if possible, at 10 cm a pixel.
 
     Each has a side-car with the fields of the contact.
     """
     for number, contact in enumerate(result.contacts, start=1):
-        name = f"{result.survey.path.stem}-{number:03d}"
-        fields = contact_json(result.survey, contact, vehicle_id) | {"time_utc_s": contact.detection.time_utc_s}
-        record = Contact.model_validate({key: value for key, value in fields.items() if key in Contact.model_fields})
-        write_png(folder / f"{name}.png", cut_snippet(contact.survey, contact.detection).image)
-        write_side_car(folder / f"{name}.txt", record)
-        ground = ground_projected_image(contact.survey, contact.detection, _GROUND_PX, _GROUND_PX, _GROUND_PIXEL_M)
-        if ground is not None:
-            write_png(folder / f"{name}-ground.png", ground)
+        name = f"{result.info.path.stem}-{number:03d}"
+        if contact.image is not None:
+            write_png(folder / f"{name}.png", contact.image)
+            write_side_car(folder / f"{name}.txt", contact.record)
+        if contact.ground is not None:
+            write_png(folder / f"{name}-ground.png", contact.ground)
             changes = {
-                "contact_id": f"{record.contact_id}-ground",
+                "contact_id": f"{contact.record.contact_id}-ground",
                 "pixel_along_m": _GROUND_PIXEL_M,
                 "pixel_across_m": _GROUND_PIXEL_M,
             }
-            write_side_car(folder / f"{name}-ground.txt", record.model_copy(update=changes))
+            write_side_car(folder / f"{name}-ground.txt", contact.record.model_copy(update=changes))
 
 
-@dataclass
-class FileResult:
-    """A file, its contacts, their number at the threshold and at lower ones, and the time of the detection."""
-
-    survey: Survey
-    contacts: list[StreamContact]
-    seconds: float = 0.0
-    count: int = 0
-    weaker: dict[float, int] = field(default_factory=dict)
-
-
-def contact_json(survey: Survey, contact: StreamContact, vehicle_id: str) -> dict[str, object]:
-    """Return one contact as JSON types: the fields of the contact record and its place in the survey.
-
-    Args:
-        survey: The file that contains the ping of the contact.
-        contact: The contact.
-        vehicle_id: Vehicle of the record.
-    """
+def contact_json(contact: ListedContact) -> dict[str, object]:
+    """Return one contact as JSON types: the fields of the contact record and its place in the survey."""
     d = contact.detection
-    line_name = survey.line_name.encode("utf-8", "backslashreplace").decode()
-    return {
-        "contact_id": f"{line_name[:60]}-{_content_hash(survey.path)[:8]}-{d.ping_number}-{d.side.value}-{d.sample}",
-        "vehicle_id": vehicle_id,
-        "sonar_id": survey.sonar_id,
-        "line_name": line_name,
-        "ping_number": d.ping_number,
-        "channel": d.side.value,
-        "ping": contact.ping,
+    fields = contact.record.model_dump(mode="json", exclude={"type", "v", "schema_version", "time_utc_s"})
+    return fields | {
+        "ping": d.ping_index,
         "sample": d.sample,
         "time_utc": datetime.fromtimestamp(d.time_utc_s, UTC).isoformat(timespec="milliseconds"),
-        "lat_deg": None if d.position is None else d.position.lat_deg,
-        "lon_deg": None if d.position is None else d.position.lon_deg,
-        "position_sigma_m": d.position_sigma_m,
-        "depth_m": d.depth_m,
-        "altitude_m": d.altitude_m,
-        "heading_deg": d.heading_deg,
-        "speed_mps": d.speed_mps,
-        "slant_range_m": d.slant_range_m,
-        "ground_range_m": d.ground_range_m,
-        "atd_class": d.atd_class,
-        "atd_confidence": d.confidence,
-        "length_m": d.length_m,
-        "width_m": d.width_m,
-        "shadow_m": d.shadow_m,
         "shadow_is_cut": d.shadow_is_cut,
-        "height_m": d.height_m,
-        "pixel_along_m": d.pixel_along_m,
-        "pixel_across_m": d.pixel_across_m,
         "scores": dataclasses.asdict(d.scores),
     }
 
 
-@cache
 def _content_hash(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Return the hex SHA-256 of a file.
+
+    Raises:
+        SurveyFileError: It cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise SurveyFileError(str(path), "", error.strerror or str(error), "a readable survey file") from error
 
 
 _COLOURS = {MINE_LIKE: (255, 80, 60)}
@@ -262,7 +299,7 @@ _MARGIN_PX = 6
 _MAX_SIDE_PX = 1000
 
 
-def annotated_waterfall(survey: Survey, detections: Sequence[Detection]) -> Image.Image:
+def annotated_waterfall(source: SurveySource, detections: Sequence[Detection]) -> Image.Image:
     """Draw the waterfall of `sonarpost survey plot` with a frame around highlight and shadow of each contact.
 
     A frame is red if the contact is mine-like, else yellow. Its text is the number in `detections` (from 1) and the
@@ -271,9 +308,9 @@ def annotated_waterfall(survey: Survey, detections: Sequence[Detection]) -> Imag
     Returns:
         RGB image with scales of slant range, time and ping number.
     """
-    side_px = min(max(survey.sample_count(side) for side in survey.sides()), _MAX_SIDE_PX)
-    reduced = reduce_survey(InMemorySource(survey, SurveyOptions()), over_ground=False, side_px=side_px)
-    image = draw_waterfall(reduced, f"{survey.line_name}   {len(detections)} contacts", over_ground=False)
+    samples = (len(channel.samples) for ping in source.pings() for side in Side if (channel := ping.channel(side)))
+    reduced = reduce_survey(source, over_ground=False, side_px=min(max(samples), _MAX_SIDE_PX))
+    image = draw_waterfall(reduced, f"{source.info.line_name}   {len(detections)} contacts", over_ground=False)
     draw = ImageDraw.Draw(image)
     for number, detection in enumerate(detections, start=1):
         far_sample = detection.highlight_samples[1] + detection.shadow_samples

@@ -1,28 +1,17 @@
-"""Association of repeated detections: which detections from overlapping pings are one object.
-
-A line is recorded in several files, and a long file is processed in strips. Objects near a boundary are detected
-twice. Two programs use this module, with different rules for contacts at the end of a file:
-
-- `sonarpost.detection.stream`, for commands, has whole files in memory. It holds contacts near the end of a file back
-  and detects them again together with the next file.
-- `atd_stub` has strips of files of any length and keeps its state over restarts. It replaces a held contact by the
-  same contact from the next file, or releases it unchanged if that file does not contain it.
-"""
+"""Association of repeated detections: which detections from overlapping parts of a recording are one object."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Self
 
 from sonarpost.detection.detector import Detection
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import Side
-
-DEFAULT_ROW_SPACING_M: Final = 0.2
-"""Distance between two rows if the survey does not contain it, as in the settings of the detector."""
 
 
 @dataclass(frozen=True, slots=True)
-class DetectionPosition:
+class DetectionPlace:
     """The place of a detection in a stream of pings.
 
     Places are compared by rows, not by time, so that a stopped clock does not merge all contacts.
@@ -33,6 +22,8 @@ class DetectionPosition:
         first_row: First row of the highlight.
         end_row: One past its last row.
         slant_range_m: Slant range of its centre.
+        near_m: Slant range of its near edge.
+        far_m: Slant range of the end of its shadow.
         along_m: Distance between two rows.
     """
 
@@ -41,39 +32,46 @@ class DetectionPosition:
     first_row: int
     end_row: int
     slant_range_m: float
+    near_m: float
+    far_m: float
     along_m: float
 
     @classmethod
-    def of_detection(
-        cls, detection: Detection, first_row: int = 0, default_along_m: float = DEFAULT_ROW_SPACING_M
-    ) -> Self:
+    def of_detection(cls, detection: Detection, settings: DetectorSettings, first_row: int = 0) -> Self:
         """Return the place of a detection.
 
         Args:
             detection: The detection.
+            settings: For the distance between two rows if the detection has none.
             first_row: Row in the stream of the first ping of the detection's survey.
-            default_along_m: Distance between two rows if the detection has none.
         """
-        along_m = detection.pixel_along_m if detection.pixel_along_m is not None else default_along_m
-        first, end = detection.highlight_pings
-        place = cls(detection.side, detection.ping_index, first, end, detection.slant_range_m, along_m)
+        d = detection
+        place = cls(
+            side=d.side,
+            row=d.ping_index,
+            first_row=d.highlight_pings[0],
+            end_row=d.highlight_pings[1],
+            slant_range_m=d.slant_range_m,
+            near_m=d.highlight_samples[0] * d.pixel_across_m,
+            far_m=(d.highlight_samples[1] + d.shadow_samples) * d.pixel_across_m,
+            along_m=d.pixel_along_m if d.pixel_along_m is not None else settings.assumed_row_along_m,
+        )
         return place.shifted(first_row)
 
     def shifted(self, rows: int) -> Self:
         """Return the place with `rows` added to its rows."""
         return replace(self, row=self.row + rows, first_row=self.first_row + rows, end_row=self.end_row + rows)
 
-    def is_near(self, other: DetectionPosition, along_m: float, across_m: float, *, overlapping: bool = False) -> bool:
-        """Return whether two detections are one object: on the same side, and near in both directions.
+    def is_same_object(self, other: DetectionPlace, settings: DetectorSettings) -> bool:
+        """Return whether two detections are one object, as within one search.
 
-        Args:
-            other: Another detection, with rows of the same stream.
-            along_m: Centres nearer than this are near along-track, at the distance between rows of this detection.
-            across_m: Centres nearer than this in slant range are near across-track.
-            overlapping: Whether highlights with a common row are also near along-track: a detection at a boundary
-                covers only a part of the object.
+        They are on one side. Their centres lie within `separation_along_m` and `separation_across_m`; or their
+        highlights have a common row, because one of them covers only a part of the object, and their centres lie within
+        `separation_across_m`, or the highlight of one lies in highlight or shadow of the other.
         """
-        if self.side is not other.side or not abs(self.slant_range_m - other.slant_range_m) < across_m:
+        if self.side is not other.side:
             return False
-        overlap = overlapping and self.first_row < other.end_row and other.first_row < self.end_row
-        return overlap or abs(self.row - other.row) * self.along_m < along_m
+        is_near = abs(self.slant_range_m - other.slant_range_m) < settings.separation_across_m
+        if self.first_row < other.end_row and other.first_row < self.end_row:
+            return is_near or (self.near_m < other.far_m and other.near_m < self.far_m)
+        return is_near and abs(self.row - other.row) * self.along_m < settings.separation_along_m

@@ -176,7 +176,7 @@ class Detection:
         highlight_pings: First and one-past-last ping index of the highlight.
         highlight_samples: First and one-past-last sample of the highlight.
         shadow_samples: Length of the shadow in samples.
-        position_sigma_m: Root mean square distance (DRMS) between true position and `position`, from the error
+        position_sigma_m: One standard deviation of `position` along the worse axis of its error ellipse, from the error
             budget of the survey's options; None without a position.
     """
 
@@ -368,7 +368,7 @@ def _detection(
         highlight_pings=measurement.rows,
         highlight_samples=samples,
         shadow_samples=measurement.shadow_cells * grid.samples_per_cell,
-        position_sigma_m=None if reference is None else reference.drms_m,
+        position_sigma_m=None if reference is None else reference.sigma_m,
     )
 
 

@@ -2,17 +2,36 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from sonarpost.errors import ConfigError
+from sonarpost.sonar.options import load_table
+from sonarpost.wire import first_error
 
 
-@dataclass(frozen=True, slots=True)
-class DetectorSettings:
-    """Object sizes, windows and thresholds of the detector. Lengths are in metres; across-track they are slant range.
+def _as_tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
+
+
+# Configurations are validated in strict mode, in which a list is no tuple.
+_FromList = BeforeValidator(_as_tuple)
+_Length = Annotated[float, Field(gt=0, le=10_000)]
+_Size = Annotated[tuple[_Length, _Length], _FromList]
+# The matched filter needs memory in proportion to its greatest object.
+_ObjectLength = Annotated[float, Field(gt=0, le=50)]
+_ObjectLengths = Annotated[tuple[_ObjectLength, ...], Field(min_length=1, max_length=16), _FromList]
+_ObjectSize = Annotated[tuple[_ObjectLength, _ObjectLength], _FromList]
+_ObjectSizes = Annotated[tuple[_ObjectSize, ...], Field(min_length=1, max_length=16), _FromList]
+
+
+class DetectorTuning(BaseModel):
+    """Object sizes, windows and limits of the detector. Lengths are in metres; across-track they are slant range.
 
     Attributes:
-        confidence_threshold: Minimum fused confidence (0 to 2) of a contact; 1.0 is the operating point.
-        max_contacts: Maximum number of contacts of a survey, most confident first; None for no limit.
         cell_across_m: Target slant range of one grid cell; the samples of the file are averaged to it.
         assumed_row_along_m: Distance between pings if the file has neither speed nor track.
         median_window_pings: Window of the median echo at each range.
@@ -36,48 +55,60 @@ class DetectorSettings:
         mine_elongation: Maximum ratio of the longer to the shorter side of the highlight of a mine-like contact.
     """
 
-    confidence_threshold: float = 1.0
-    max_contacts: int | None = None
-    cell_across_m: float = 0.06
-    assumed_row_along_m: float = 0.2
-    median_window_pings: int = 400
-    bottom_step_m: float = 1.0
-    blanking_m: float = 0.7
-    bottom_margin_m: float = 0.3
-    highlight_sizes_m: tuple[tuple[float, float], ...] = ((0.4, 0.25), (0.9, 0.4), (1.8, 0.6), (4.0, 0.9))
-    shadow_lengths_m: tuple[float, ...] = (0.6, 1.4, 3.0, 6.0)
-    noise_window_m: tuple[float, float] = (24.0, 12.0)
-    guard_m: float = 0.6
-    ring_m: float = 1.5
-    min_matched_response: float = 1.6
-    clutter_radius_m: float = 30.0
-    clutter_area_m2: float = 90.0
-    separation_along_m: float = 3.0
-    separation_across_m: float = 3.0
-    mine_length_m: tuple[float, float] = (0.3, 4.0)
-    mine_width_m: tuple[float, float] = (0.1, 2.5)
-    mine_height_m: tuple[float, float] = (0.1, 2.0)
-    mine_elongation: float = 8.0
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ValueError: A length, size or response is not a finite number above 0, the confidence threshold is not
-                within 0 to 2, or there is no highlight size or shadow length.
-        """
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if item.name != "confidence_threshold" and not all(math.isfinite(n) and n > 0 for n in _numbers(value)):
-                raise ValueError(f"{item.name}: got {value!r}, expected finite numbers above 0")
-        if not 0 <= self.confidence_threshold <= 2:
-            raise ValueError(f"confidence_threshold: got {self.confidence_threshold!r}, expected 0 to 2")
-        if not self.highlight_sizes_m or not self.shadow_lengths_m:
-            raise ValueError("highlight_sizes_m, shadow_lengths_m: got an empty tuple, expected at least one size")
+    cell_across_m: _Length = 0.06
+    assumed_row_along_m: _Length = 0.2
+    median_window_pings: Annotated[int, Field(gt=0, le=100_000)] = 400
+    bottom_step_m: _Length = 1.0
+    blanking_m: _Length = 0.7
+    bottom_margin_m: _Length = 0.3
+    highlight_sizes_m: _ObjectSizes = ((0.4, 0.25), (0.9, 0.4), (1.8, 0.6), (4.0, 0.9))
+    shadow_lengths_m: _ObjectLengths = (0.6, 1.4, 3.0, 6.0)
+    noise_window_m: _Size = (24.0, 12.0)
+    guard_m: _Length = 0.6
+    ring_m: _Length = 1.5
+    min_matched_response: Annotated[float, Field(gt=0, le=1000)] = 1.6
+    clutter_radius_m: _Length = 30.0
+    clutter_area_m2: Annotated[float, Field(gt=0, le=1e8)] = 90.0
+    separation_along_m: _Length = 3.0
+    separation_across_m: _Length = 3.0
+    mine_length_m: _Size = (0.3, 4.0)
+    mine_width_m: _Size = (0.1, 2.5)
+    mine_height_m: _Size = (0.1, 2.0)
+    mine_elongation: Annotated[float, Field(gt=0, le=1000)] = 8.0
 
 
-def _numbers(value: object) -> list[float]:
-    """Return every number in nested tuples; none for None."""
-    if isinstance(value, tuple):
-        return [n for item in value for n in _numbers(item)]
-    return [float(value)] if isinstance(value, (int, float)) else []
+class DetectorSettings(DetectorTuning):
+    """All settings of a detector: its tuning, the threshold, and the division of long recordings.
+
+    Attributes:
+        confidence_threshold: Minimum fused confidence (0 to 2) of a contact; 1.0 is the operating point.
+        max_contacts: Maximum number of contacts of a survey, most confident first; None for no limit.
+        join_overlap_pings: Pings that consecutive parts of a recording, and consecutive files, have in common.
+    """
+
+    confidence_threshold: Annotated[float, Field(ge=0, le=2)] = 1.0
+    max_contacts: Annotated[int, Field(gt=0)] | None = None
+    join_overlap_pings: Annotated[int, Field(ge=0, le=900)] = 200
+
+
+def load_settings(path: Path) -> DetectorSettings:
+    """Read settings from a TOML file with the fields of `DetectorSettings`.
+
+    Raises:
+        ConfigError: The file cannot be read, is not TOML, or contains an invalid field or value.
+    """
+    return checked_settings(load_table(path), str(path))
+
+
+def checked_settings(table: Mapping[str, object], where: str) -> DetectorSettings:
+    """Return settings from their names and values.
+
+    Raises:
+        ConfigError: A name or value is invalid; names `where`.
+    """
+    try:
+        return DetectorSettings.model_validate(table)
+    except ValidationError as error:
+        raise ConfigError(where, *first_error(error)) from error

@@ -1,176 +1,389 @@
-"""Detection in a survey line that is recorded in several files. An object at a file boundary is detected once.
+"""The streaming detector: contacts of recordings of any length and of consecutive files, each contact once.
 
-A recorder starts a new file after a number of pings, possibly in the middle of an object. The detector holds contacts
-near the end of a file back. If the next file continues the line, its pings are processed together with the last pings
-of the file before, so that the filters have the seabed on both sides of the boundary.
+Commands and the vehicle's service use it alike. A recording is searched in overlapping strips, so that memory does not
+depend on its length. The end of a file is kept, and a file that continues it is searched together with it: a recorder
+starts a new file after a number of pings, possibly in the middle of an object.
+
+One rule holds at the boundaries of strips and of files. Of the overlap of two strips, the first strip decides about the
+first half and the second strip about the second half: each shows more of the seabed around its half. Contacts in the
+second half are held until the next strip is searched; at the end of a file they wait for the next file. Repeated
+detections of one object are associated by place (`sonarpost.detection.association`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Final, NamedTuple
+from itertools import chain
+from typing import Final, Generic, NamedTuple, Self, TypeVar
 
-from sonarpost.detection.association import DetectionPosition
+import numpy as np
+
+from sonarpost.detection.association import DetectionPlace
 from sonarpost.detection.detector import Detection, search
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.sonar.geometry import ping_spacing_m
-from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.survey import Ping, Side, Survey
+from sonarpost.sonar.geometry import Position, offset_between_m
+from sonarpost.sonar.source import Strip, SurveySource, strips
+from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
-OVERLAP_M: Final = 40.0
-"""Length of the file end that is processed together with the next file: more than the reach of the filters."""
-HELD_BACK_M: Final = 6.0
-"""Contacts this near to the end of a file wait for the next one: the longest mine, its shadow and its surroundings."""
-_MAX_GAP_S: Final = 5.0
-_MAX_GAP_PINGS: Final = 5.0
+STRIP_PINGS: Final = 1000
+MAX_SONARS: Final = 8
+_MIN_GAP_LIMIT_S: Final = 1.0
+_GAP_LIMIT_INTERVALS: Final = 3.0
+_MAX_GAP_M: Final = 30.0
+_RANGE_TOLERANCE: Final = 0.01
+_MAX_SAMPLE_BYTES: Final = 1 << 24
 
-
-@dataclass(frozen=True, slots=True)
-class StreamContact:
-    """A contact of a line.
-
-    Attributes:
-        file: Number of the file that contains the ping of its centre, from 0 in order of processing.
-        path: That file.
-        ping: Index of that ping in that file.
-        detection: The contact; its indices refer to `survey`.
-        survey: The pings in which it was detected, for its snippets: those of one file, or with the last pings of
-            earlier files first.
-    """
-
-    file: int
-    path: Path
-    ping: int
-    detection: Detection
-    survey: Survey
-
-    def in_file(self) -> Detection:
-        """Return the detection with ping indices of its own file; the highlight may begin before its first ping."""
-        shift = self.ping - self.detection.ping_index
-        first, last = self.detection.highlight_pings
-        return replace(self.detection, ping_index=self.ping, highlight_pings=(first + shift, last + shift))
-
-
-class _Origin(NamedTuple):
-    file: int
-    path: Path
-    ping: int
+T = TypeVar("T")
+"""What the caller makes of a detection."""
 
 
 @dataclass(frozen=True, slots=True)
-class _FileEnd:
-    """The end of the pings processed so far.
+class FileOrigin:
+    """The file that a ping was recorded in.
 
     Attributes:
-        survey: The last pings, of one file or several.
-        origins: File number, path and index in that file of each of them.
-        held: Contacts held back near the end.
-        reported: Places of the contacts returned already; row 0 is the first ping of `survey`.
+        content: Hex SHA-256 of the file.
+        source: Its name, printable.
+        line_name: Survey line, printable.
     """
 
-    survey: Survey
-    origins: tuple[_Origin, ...]
-    held: tuple[StreamContact, ...]
-    reported: tuple[DetectionPosition, ...]
+    content: str
+    source: str
+    line_name: str
+
+    @classmethod
+    def of(cls, source: SurveySource, content: str) -> Self:
+        """Return the origin of an open file; undecodable bytes of its name are escaped.
+
+        Args:
+            source: The open file.
+            content: Hex SHA-256 of the file.
+        """
+        names = (source.info.path.name, source.info.line_name)
+        return cls(content, *(name.encode("utf-8", "backslashreplace").decode() for name in names))
+
+    def contact_id(self, detection: Detection) -> str:
+        """Return the identifier of a contact whose centre is in this file."""
+        place = f"{detection.ping_number}-{detection.side.value}-{detection.sample}"
+        return f"{self.line_name[:60]}-{self.content[:8]}-{place}"
 
 
-class StreamDetector:
-    """Detects file by file, in the order of recording.
+class PingOrigin(NamedTuple):
+    """File of a ping and its row in that file."""
 
-    Args:
-        settings: None for the defaults. The maximum number of contacts applies to each file, held ones included.
-        options: The options with which the surveys were opened; None for the defaults.
+    file: FileOrigin
+    row: int
+
+
+Describe = Callable[[Survey, Detection, PingOrigin], T]
+"""Makes what the caller needs of a contact, from pings around it, the detection in them, and the origin of its ping."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamContact(Generic[T]):
+    """A contact of a stream.
+
+    Attributes:
+        origin: File and row of the ping of its centre.
+        place: Its place; in a `StreamEnd`, row 0 is the first ping there.
+        content: What the caller made of the detection.
     """
 
-    def __init__(self, settings: DetectorSettings | None = None, options: SurveyOptions | None = None) -> None:
-        self._settings = settings if settings is not None else DetectorSettings()
-        self._options = options if options is not None else SurveyOptions()
-        self._end: _FileEnd | None = None
-        self._files = 0
-        self.weaker: list[dict[float, int]] = []
-        """For each file, the number of contacts at the confidences of `LISTED_CONFIDENCES` below the threshold."""
+    origin: PingOrigin
+    place: DetectionPlace
+    content: T
 
-    def add_file(self, survey: Survey) -> tuple[StreamContact, ...]:
-        """Process the next file.
+
+@dataclass(frozen=True, slots=True)
+class StreamEnd(Generic[T]):
+    """The end of the recording of one sonar: what the next file may continue.
+
+    Attributes:
+        sonar_id: Sonar of the recording.
+        pings: The last pings; from several files where these are short.
+        origins: The origin of each.
+        open_row: The first of these rows about which no strip has decided.
+        reported: Places of the contacts given before; row 0 is the first of `pings`.
+        held: Contacts from `open_row` on, which wait for the next file.
+    """
+
+    sonar_id: str
+    pings: tuple[Ping, ...]
+    origins: tuple[PingOrigin, ...]
+    open_row: int
+    reported: tuple[DetectionPlace, ...]
+    held: tuple[StreamContact[T], ...]
+
+    def without_held(self) -> StreamEnd[T]:
+        """Return this end after its held contacts were given: they are not given again."""
+        return replace(self, reported=(*self.reported, *(contact.place for contact in self.held)), held=())
+
+    def continued_by(self, first: Ping) -> StreamEnd[T] | None:
+        """Return the part of this end before `first`, the first ping of another file of the same sonar.
+
+        A recorder may repeat the last pings at the beginning of the next file; the repeated ones are left out.
 
         Returns:
-            The contacts of this file except those near its end, and those held back from the file before, most
-            confident first.
+            None if that file does not continue the recording: the gap exceeds three ping intervals (at least one
+            second) or 30 m, or the channels differ.
         """
-        before, self._end = self._end, None
-        origins = tuple(_Origin(self._files, survey.path, row) for row in range(len(survey.pings)))
-        self._files += 1
-        released: tuple[StreamContact, ...] = ()
-        reported: tuple[DetectionPosition, ...] = ()
-        first_row = new_row = 0
-        if before is not None and is_continuation(before.survey, survey):
-            first_row = max(0, len(before.survey.pings) - self._pings(before.survey, HELD_BACK_M))
-            reported = before.reported
-            survey = replace(survey, pings=before.survey.pings + survey.pings)
-            origins = before.origins + origins
-            new_row = len(before.survey.pings)
-        elif before is not None:
-            released = before.held
-        result = search(survey, self._settings, self._options)
-        self.weaker.append({c: sum(row >= new_row for row in rows) for c, rows in result.weaker.items()})
-        found = [
-            StreamContact(*origins[d.ping_index], d, survey)
-            for d in result.detections
-            if d.ping_index >= first_row and not self._is_reported(d, reported)
-        ]
-        end = len(survey.pings) - self._pings(survey, HELD_BACK_M)
-        held = tuple(c for c in found if c.detection.ping_index >= end)
-        final = tuple(c for c in found if c.detection.ping_index < end)
-        self._end = self._end_of(survey, origins, held, (*reported, *(self._place(c.detection) for c in final)))
-        return _by_confidence((*released, *final))
+        count = next((n for n, ping in enumerate(self.pings) if ping.time_utc_s >= first.time_utc_s), len(self.pings))
+        if count == 0:
+            return None
+        last = self.pings[count - 1]
+        times = [ping.time_utc_s for ping in self.pings[:count]]
+        interval_s = float(np.median(np.diff(times))) if count > 1 else 0.0
+        if first.time_utc_s - last.time_utc_s > max(_MIN_GAP_LIMIT_S, _GAP_LIMIT_INTERVALS * interval_s):
+            return None
+        if not (_same_channels(last, first) and _is_near(last, first)):
+            return None
+        return replace(self, pings=self.pings[:count], origins=self.origins[:count])
 
-    def finish(self) -> tuple[StreamContact, ...]:
-        """End the line; return the contacts held back from the last file."""
-        before, self._end = self._end, None
-        return () if before is None else _by_confidence(before.held)
 
-    def _end_of(
+def _same_channels(one: Ping, other: Ping) -> bool:
+    """Return whether two pings can be rows of one image: the same channels, sampled alike."""
+    for side in Side:
+        ours = [channel for channel in one.channels if channel.side is side]
+        theirs = [channel for channel in other.channels if channel.side is side]
+        # A dual-frequency sonar has two channels a side, each with its own range; a file keeps their order.
+        if len(ours) != len(theirs) or not all(map(_same_sampling, ours, theirs)):
+            return False
+    return True
+
+
+def _same_sampling(one: ChannelPing, other: ChannelPing) -> bool:
+    return (
+        one.samples.dtype == other.samples.dtype
+        and len(one.samples) == len(other.samples)
+        and math.isclose(one.slant_range_m, other.slant_range_m, rel_tol=_RANGE_TOLERANCE)
+    )
+
+
+def _is_near(one: Ping, other: Ping) -> bool:
+    if one.grid_m is not None and other.grid_m is not None:
+        return math.dist(one.grid_m, other.grid_m) <= _MAX_GAP_M
+    if one.lat_deg is None or one.lon_deg is None or other.lat_deg is None or other.lon_deg is None:
+        return True
+    offset_m = offset_between_m(Position(one.lat_deg, one.lon_deg), Position(other.lat_deg, other.lon_deg))
+    return math.hypot(*offset_m) <= _MAX_GAP_M
+
+
+@dataclass(frozen=True, slots=True)
+class FileResult(Generic[T]):
+    """The contacts of one file.
+
+    Attributes:
+        contacts: Contacts decided with this file, most confident first; at most `max_contacts` with `held`. Their
+            centres may lie in the file before.
+        held: Contacts that wait for the next file, most confident first.
+        released: Contacts held at the end of an earlier recording, which this file does not continue.
+        joined: Whether the file continued an earlier one.
+        replaced: Contacts held at the end of that one and detected again, now whole.
+        dropped: Contacts held there and not detected in the joined pings.
+        weaker: Number of contacts in this file at the confidences of `LISTED_CONFIDENCES` below the threshold;
+            approximate at the boundaries of strips and files.
+    """
+
+    contacts: tuple[StreamContact[T], ...]
+    held: tuple[StreamContact[T], ...]
+    released: tuple[StreamContact[T], ...]
+    joined: bool
+    replaced: tuple[StreamContact[T], ...]
+    dropped: tuple[StreamContact[T], ...]
+    weaker: Mapping[float, int]
+
+
+class StreamDetector(Generic[T]):
+    """Detects file by file, in the order of recording. Files of up to eight sonars may alternate.
+
+    Args:
+        describe: Called for each contact, while the pings around it are in memory.
+        settings: None for the defaults. The maximum number of contacts applies to each file, held ones included.
+        ends: Ends of earlier recordings by sonar, as `ends` of another detector returned them.
+    """
+
+    def __init__(
         self,
-        survey: Survey,
-        origins: tuple[_Origin, ...],
-        held: tuple[StreamContact, ...],
-        reported: tuple[DetectionPosition, ...],
-    ) -> _FileEnd:
-        cut = max(0, len(survey.pings) - self._pings(survey, OVERLAP_M))
-        kept = tuple(place.shifted(-cut) for place in reported if place.row >= cut)
-        return _FileEnd(replace(survey, pings=survey.pings[cut:]), origins[cut:], held, kept)
+        describe: Describe[T],
+        settings: DetectorSettings | None = None,
+        ends: Mapping[str, StreamEnd[T]] | None = None,
+    ) -> None:
+        self._describe = describe
+        self._settings = settings if settings is not None else DetectorSettings()
+        self._ends: dict[str, StreamEnd[T]] = dict(ends or {})
 
-    def _pings(self, survey: Survey, length_m: float) -> int:
-        return math.ceil(length_m / (ping_spacing_m(survey) or self._settings.assumed_row_along_m))
+    @property
+    def ends(self) -> Mapping[str, StreamEnd[T]]:
+        """The state between two files: the end of the latest recording of each sonar, the latest file last."""
+        return dict(self._ends)
 
-    def _place(self, detection: Detection) -> DetectionPosition:
-        return DetectionPosition.of_detection(detection, default_along_m=self._settings.assumed_row_along_m)
+    def add_file(self, source: SurveySource, origin: FileOrigin) -> FileResult[T]:
+        """Process the next file.
 
-    def _is_reported(self, detection: Detection, reported: Sequence[DetectionPosition]) -> bool:
-        # A contact is returned only if it lies `HELD_BACK_M` before the end: both detections then have the same centre.
-        new, limits_m = self._place(detection), (self._settings.separation_along_m, self._settings.separation_across_m)
-        return any(new.is_near(place, *limits_m) for place in reported)
+        Raises:
+            SurveyFileError: The file has changed or cannot be read. The state is unchanged.
+        """
+        pings = source.pings()
+        first = next(pings)
+        end = self._ends.get(source.info.sonar_id)
+        previous = end.continued_by(first) if end is not None else None
+        search_of_file = _FileSearch(source, origin, previous, self._describe, self._settings)
+        new_end = search_of_file.run(chain((first,), pings))
+        released = () if end is None or previous is not None else end.held
+        self._ends.pop(new_end.sonar_id, None)
+        self._ends[new_end.sonar_id] = new_end
+        while len(self._ends) > MAX_SONARS:
+            released += self._ends.pop(next(iter(self._ends))).held
+        return replace(search_of_file.result, released=released)
+
+    def release(self, sonar_id: str) -> tuple[StreamContact[T], ...]:
+        """Give the contacts that are held for the continuation of a sonar's recording."""
+        end = self._ends.get(sonar_id)
+        if end is None:
+            return ()
+        self._ends[sonar_id] = end.without_held()
+        return end.held
+
+    def finish(self) -> tuple[StreamContact[T], ...]:
+        """Give all contacts that are held."""
+        return tuple(contact for sonar_id in tuple(self._ends) for contact in self.release(sonar_id))
 
 
-def is_continuation(before: Survey, after: Survey) -> bool:
-    """Return whether a file continues another: same sonar, same sampling, a gap of a few pings at most."""
-    if not before.pings or not after.pings or before.sonar_id != after.sonar_id:
-        return False
-    last, first = before.pings[-1], after.pings[0]
-    gap_s = first.time_utc_s - last.time_utc_s
-    interval_s = (last.time_utc_s - before.pings[0].time_utc_s) / max(len(before.pings) - 1, 1)
-    if not 0 <= gap_s <= max(_MAX_GAP_S if interval_s <= 0 else 0.0, _MAX_GAP_PINGS * interval_s):
-        return False
-    return _sampling(last) == _sampling(first)
+@dataclass(frozen=True, slots=True)
+class _Found(Generic[T]):
+    confidence: float
+    contact: StreamContact[T]
 
 
-def _sampling(ping: Ping) -> dict[Side, list[tuple[int, float]]]:
-    """Return sample count and slant range of each channel of a side, in their order."""
-    return {side: [(len(c.samples), c.slant_range_m) for c in ping.channels if c.side is side] for side in Side}
+class _FileSearch(Generic[T]):
+    """The search of one file; `run` is called once and sets `result`. Row 0 is the first ping of `previous`."""
+
+    def __init__(
+        self,
+        source: SurveySource,
+        origin: FileOrigin,
+        previous: StreamEnd[T] | None,
+        describe: Describe[T],
+        settings: DetectorSettings,
+    ) -> None:
+        self._source = source
+        self._origin = origin
+        self._previous = previous
+        self._describe = describe
+        self._settings = settings
+        # The limit is applied to the file.
+        self._strip_settings = settings.model_copy(update={"max_contacts": None})
+        self._overlap = settings.join_overlap_pings
+        self._first_new_row = len(previous.pings) if previous is not None else 0
+        self._open_row = previous.open_row if previous is not None else 0
+        self._reported = list(previous.reported) if previous is not None else []
+        self._held = [contact.place for contact in previous.held] if previous is not None else []
+        self._repeated: set[int] = set()
+        """Indices of the contacts held by `previous` that were detected again."""
+        self._decided: list[_Found[T]] = []
+        self._waiting: list[_Found[T]] = []
+        self._weaker: Counter[float] = Counter()
+        self.result: FileResult[T]
+
+    def run(self, pings: Iterable[Ping]) -> StreamEnd[T]:
+        """Search the file; return its end."""
+        joined = chain(self._previous.pings, pings) if self._previous is not None else iter(pings)
+        last: Strip | None = None
+        for last in strips(joined, max(STRIP_PINGS, 2 * self._overlap), self._overlap):
+            self._search_strip(last)
+        assert last is not None, "an open survey has pings"
+        return self._finish(last)
+
+    def _search_strip(self, strip: Strip) -> None:
+        info, lower = self._source.info, self._open_row
+        survey = Survey(info.path, info.sonar_id, info.line_name, strip.pings, info.warnings)
+        end = strip.first_row + len(strip.pings)
+        stored = stored_ping_count(strip.pings, self._overlap) if strip.is_last else self._overlap
+        upper = max(lower, end - min(self._overlap // 2, stored))
+        found = search(survey, self._strip_settings, self._source.options)
+        for confidence, rows in found.weaker.items():
+            in_strip = (strip.first_row + row for row in rows)
+            first, behind = max(lower, self._first_new_row), math.inf if strip.is_last else upper
+            self._weaker[confidence] += sum(first <= row < behind for row in in_strip)
+        known, held = tuple(self._reported), self._held
+        self._held = []
+        for detection in found.detections:
+            place = DetectionPlace.of_detection(detection, self._settings, strip.first_row)
+            earlier = [n for n, other in enumerate(held) if place.is_same_object(other, self._settings)]
+            if any(place.is_same_object(other, self._settings) for other in known):
+                continue
+            if place.row < lower and not earlier:
+                continue  # the strip before has decided about it
+            if strip.first_row == 0:
+                self._repeated.update(earlier)
+            if place.row < upper:
+                self._reported.append(place)
+                self._decided.append(self._described(survey, detection, place))
+            else:
+                self._held.append(place)
+                if strip.is_last:
+                    self._waiting.append(self._described(survey, detection, place))
+        self._open_row = upper
+        self._decided.sort(key=_descending_confidence)
+        del self._decided[self._settings.max_contacts or len(self._decided) :]
+        start = end - self._overlap
+        self._reported = [place for place in self._reported if self._last_row(place) >= start]
+
+    def _described(self, survey: Survey, detection: Detection, place: DetectionPlace) -> _Found[T]:
+        origin = self._origin_of(place.row)
+        content = self._describe(survey, detection, origin)
+        return _Found(detection.confidence, StreamContact(origin, place, content))
+
+    def _origin_of(self, row: int) -> PingOrigin:
+        if self._previous is not None and row < self._first_new_row:
+            return self._previous.origins[row]
+        return PingOrigin(self._origin, row - self._first_new_row)
+
+    def _last_row(self, place: DetectionPlace) -> int:
+        """Return the last row in which a detection may be the same object."""
+        return max(place.end_row, place.row + math.ceil(self._settings.separation_along_m / place.along_m))
+
+    def _finish(self, last: Strip) -> StreamEnd[T]:
+        both = sorted((*self._decided, *self._waiting), key=_descending_confidence)
+        waiting = {id(found) for found in self._waiting}
+        kept = both[: self._settings.max_contacts]
+        held = tuple(found.contact for found in kept if id(found) in waiting)
+        before = self._previous.held if self._previous is not None else ()
+        self.result = FileResult(
+            contacts=tuple(found.contact for found in kept if id(found) not in waiting),
+            held=held,
+            released=(),
+            joined=self._previous is not None,
+            replaced=tuple(contact for n, contact in enumerate(before) if n in self._repeated),
+            dropped=tuple(contact for n, contact in enumerate(before) if n not in self._repeated),
+            weaker=dict(self._weaker),
+        )
+        end = last.first_row + len(last.pings)
+        stored = stored_ping_count(last.pings, self._overlap)
+        start = end - stored
+        return StreamEnd(
+            sonar_id=self._source.info.sonar_id,
+            pings=last.pings[len(last.pings) - stored :],
+            origins=tuple(self._origin_of(row) for row in range(start, end)),
+            open_row=self._open_row - start,
+            reported=tuple(place.shifted(-start) for place in self._reported),
+            held=tuple(replace(contact, place=contact.place.shifted(-start)) for contact in held),
+        )
 
 
-def _by_confidence(contacts: Sequence[StreamContact]) -> tuple[StreamContact, ...]:
-    return tuple(sorted(contacts, key=lambda c: -c.detection.confidence))
+def _descending_confidence(found: _Found[T]) -> float:
+    return -found.confidence
+
+
+def stored_ping_count(pings: Sequence[Ping], max_pings: int) -> int:
+    """Return how many of the last pings the end of a recording keeps: `max_pings`, at most 16 MiB of samples."""
+    size = count = 0
+    for ping in reversed(pings):
+        size += sum(channel.samples.nbytes for channel in ping.channels)
+        if count == max_pings or size > _MAX_SAMPLE_BYTES:
+            break
+        count += 1
+    return count

@@ -84,8 +84,9 @@ def cot_event(contact: ExportContact, now_utc_s: float, options: CotOptions | No
     """Return one event as a single line of XML, UTF-8, without XML declaration.
 
     `time` and `start` are the time of sending, because the clock of the vehicle may be wrong. The time of detection is
-    in the remarks. `ce` is `position_sigma_m`, one standard deviation as CoT defines it. The height above the ellipsoid
-    is unknown, because depth is measured from the surface.
+    in the remarks. `ce` is `position_sigma_m` times 1: the base schema defines an error as the one-sigma point of a
+    zero-mean normal distribution, and the circle with the worse axis as radius contains the error ellipse. The height
+    above the ellipsoid is unknown, because depth is measured from the surface.
 
     Raises:
         ValueError: The contact has no position.

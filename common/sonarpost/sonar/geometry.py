@@ -34,6 +34,8 @@ WGS84_FLATTENING: Final = 1 / 298.257_223_563
 _ECCENTRICITY_SQUARED: Final = WGS84_FLATTENING * (2 - WGS84_FLATTENING)
 _TRACK_SMOOTHING_S: Final = 4.0
 """Averaging time of the track: fixes are often rounded to metres and repeated over many pings."""
+_MAX_SPEED_RATIO: Final = 1.5
+"""Maximum ratio of the distances by speed and by positions; a confusion of knots and m/s is 1.94."""
 _MAX_LATITUDE_DEG: Final = 89.0
 _DEFAULT_SPEED_MPS: Final = 2.0
 """Typical speed of a survey vehicle, for the time contribution of a ping without speed."""
@@ -120,26 +122,33 @@ def ground_position(ping: Ping, side: Side, ground_range_m: float) -> Position |
 def along_track_m(survey: Survey) -> FloatArray | None:
     """Return the distance along the track since the first ping.
 
-    It is computed from the fixes, smoothed over a few seconds and interpolated over pings without one, else from speed
-    and time.
+    The sources are, in this order, what the file states in metres, so that neither a projection nor missing positions
+    change the distance:
+
+    1. speed and time, if at least half of the pings have a speed,
+    2. coordinates in metres,
+    3. fixes in degrees,
+    4. speed and time of fewer pings.
+
+    A speed that contradicts the positions (more than 1.5 times or less than two thirds of their distance: another
+    unit, a constant of the recorder) is not used. Positions are smoothed over a few seconds and interpolated over pings
+    without one.
 
     Returns:
-        Shape (pings,), float64, not decreasing, starting at 0; None if the file has neither.
+        Shape (pings,), float64, not decreasing, starting at 0; None if the file has none of them.
     """
     times = np.array([ping.time_utc_s for ping in survey.pings], dtype=np.float64)
-    fixed = [row for row, ping in enumerate(survey.pings) if ping.lat_deg is not None and ping.lon_deg is not None]
-    if len(fixed) >= 2:
-        track = _track_m(survey, fixed)
-        window = _window_pings(times)
-        smooth = np.stack([_moving_average(track[:, axis], window) for axis in (0, 1)], axis=1)
-        return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(smooth, axis=0).T))])
-    speeds = np.array([np.nan if p.speed_mps is None else p.speed_mps for p in survey.pings], dtype=np.float64)
-    known = np.flatnonzero(np.isfinite(speeds))
-    if not known.size:
-        return None
-    filled = np.interp(np.arange(len(speeds)), known, speeds[known])
-    steps = np.maximum(np.diff(times), 0) * (filled[1:] + filled[:-1]) / 2
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    speed_m = _distance_by_speed_m(survey, times)
+    track = _track_m(survey)
+    if track is None:
+        return speed_m
+    window = _window_pings(times)
+    smooth = np.stack([_moving_average(track[:, axis], window) for axis in (0, 1)], axis=1)
+    track_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(smooth, axis=0).T))])
+    has_speed = 2 * sum(ping.speed_mps is not None for ping in survey.pings) >= len(survey.pings)
+    if speed_m is None or not has_speed or not _agree(float(speed_m[-1]), float(track_m[-1])):
+        return track_m
+    return speed_m
 
 
 def ping_spacing_m(survey: Survey) -> float | None:
@@ -150,10 +159,39 @@ def ping_spacing_m(survey: Survey) -> float | None:
     return float(distance_m[-1]) / (len(distance_m) - 1)
 
 
-def _track_m(survey: Survey, fixed: list[int]) -> FloatArray:
-    """Return (north, east) of every ping, shape (pings, 2), interpolated and extrapolated over missing fixes."""
-    positions = [Position(survey.pings[row].lat_deg, survey.pings[row].lon_deg) for row in fixed]  # type: ignore[arg-type]
-    known = np.array([offset_between_m(positions[0], position) for position in positions], dtype=np.float64)
+def _distance_by_speed_m(survey: Survey, times: FloatArray) -> FloatArray | None:
+    """Return the distance of every ping from speed and time, shape (pings,); None without a speed."""
+    speeds = np.array([np.nan if p.speed_mps is None else p.speed_mps for p in survey.pings], dtype=np.float64)
+    known = np.flatnonzero(np.isfinite(speeds))
+    if not known.size:
+        return None
+    filled = np.interp(np.arange(len(speeds)), known, speeds[known])
+    steps = np.maximum(np.diff(times), 0) * (filled[1:] + filled[:-1]) / 2
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _agree(speed_m: float, track_m: float) -> bool:
+    """Return whether a distance by speed is plausible beside the length of the track."""
+    return speed_m > 0 and (track_m <= 0 or 1 / _MAX_SPEED_RATIO <= speed_m / track_m <= _MAX_SPEED_RATIO)
+
+
+def _track_m(survey: Survey) -> FloatArray | None:
+    """Return (north, east) of every ping, shape (pings, 2), interpolated and extrapolated; None below two positions."""
+    points: dict[int, tuple[float, float]] = {
+        row: (ping.grid_m[1], ping.grid_m[0]) for row, ping in enumerate(survey.pings) if ping.grid_m is not None
+    }
+    if len(points) < 2:
+        fixes = {
+            row: Position(ping.lat_deg, ping.lon_deg)
+            for row, ping in enumerate(survey.pings)
+            if ping.lat_deg is not None and ping.lon_deg is not None
+        }
+        first = next(iter(fixes.values()), None)
+        points = {row: offset_between_m(first, fix) for row, fix in fixes.items() if first is not None}
+    if len(points) < 2:
+        return None
+    fixed = list(points)
+    known = np.array(list(points.values()), dtype=np.float64)
     rows = np.arange(len(survey.pings))
     track = np.stack([np.interp(rows, fixed, known[:, axis]) for axis in (0, 1)], axis=1)
     step = (known[-1] - known[0]) / (fixed[-1] - fixed[0])
@@ -199,9 +237,9 @@ class GeoReference:
     bearing_deg: float
 
     @property
-    def drms_m(self) -> float:
-        """Root mean square distance between true position and `position`, in metres."""
-        return math.hypot(self.across_sigma_m, self.along_sigma_m)
+    def sigma_m(self) -> float:
+        """Standard deviation along the worse axis of the error ellipse, in metres."""
+        return max(self.across_sigma_m, self.along_sigma_m)
 
 
 def georeference(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Final, TypeAlias
 
 from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
 from sonarpost.sonar.options import Mounting
@@ -28,6 +28,9 @@ _MAX_CORRECTION_M: Final = 100.0
 _NEW_PLACE_PINGS: Final = 5
 """Number of consecutive fixes that agree with each other and are then accepted at any distance."""
 
+_Place: TypeAlias = Position | tuple[float, float]
+"""A position, or easting and northing in metres."""
+
 
 def is_plausible(name: str, value: float) -> bool:
     """Return whether a navigation value is finite and within `NAVIGATION_LIMITS`."""
@@ -50,15 +53,16 @@ class PositionJumpFilter:
     """
 
     def __init__(self) -> None:
-        self._accepted: tuple[float, Position] | None = None
-        self._doubtful: tuple[float, Position] | None = None
+        self._accepted: tuple[float, _Place] | None = None
+        self._doubtful: tuple[float, _Place] | None = None
         self._agreeing = 0
 
     def filter(self, ping: Ping) -> Ping:
         """Return the ping, without its position if that is doubtful. Call it once for each ping, in order."""
-        if ping.lat_deg is None or ping.lon_deg is None:
+        place = _place(ping)
+        if place is None:
             return ping
-        fix = (ping.time_utc_s, Position(ping.lat_deg, ping.lon_deg))
+        fix = (ping.time_utc_s, place)
         if self._accepted is None or _reachable(self._accepted, fix):
             self._accepted, self._doubtful, self._agreeing = fix, None, 0
             return ping
@@ -68,11 +72,21 @@ class PositionJumpFilter:
         if self._agreeing >= _NEW_PLACE_PINGS:
             self._accepted, self._doubtful, self._agreeing = fix, None, 0
             return ping
-        return replace(ping, lat_deg=None, lon_deg=None)
+        return replace(ping, lat_deg=None, lon_deg=None, grid_m=None)
 
 
-def _reachable(start: tuple[float, Position], end: tuple[float, Position]) -> bool:
+def _place(ping: Ping) -> _Place | None:
+    """Return the recorded place of a ping: coordinates in metres, else its position."""
+    if ping.grid_m is not None:
+        return ping.grid_m
+    return None if ping.lat_deg is None or ping.lon_deg is None else Position(ping.lat_deg, ping.lon_deg)
+
+
+def _reachable(start: tuple[float, _Place], end: tuple[float, _Place]) -> bool:
     limit_m = _MAX_CORRECTION_M + _MAX_SPEED_MPS * max(end[0] - start[0], 0.0)
+    if isinstance(start[1], tuple) or isinstance(end[1], tuple):
+        # A file has one kind of coordinates: two kinds are not comparable.
+        return isinstance(start[1], tuple) and isinstance(end[1], tuple) and math.dist(start[1], end[1]) <= limit_m
     if abs(start[1].lat_deg - end[1].lat_deg) * 110_000 > limit_m:
         return False
     return math.hypot(*offset_between_m(start[1], end[1])) <= limit_m

@@ -115,15 +115,23 @@ def load_options(path: Path) -> SurveyOptions:
     Raises:
         ConfigError: The file cannot be read, is not TOML, or contains an invalid field or value.
     """
+    return checked_options(load_table(path), str(path))
+
+
+def load_table(path: Path) -> dict[str, object]:
+    """Read a TOML file of options, at most 64 KiB.
+
+    Raises:
+        ConfigError: The file cannot be read, is longer, or is not TOML.
+    """
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise ConfigError(str(path), "file size", path.stat().st_size, f"at most {_MAX_BYTES} bytes")
-        table = tomllib.loads(path.read_text("utf-8"))
+        return tomllib.loads(path.read_text("utf-8"))
     except OSError as error:
         raise ConfigError(str(path), "", error.strerror or str(error), "a readable TOML file") from error
-    except ValueError as error:  # not UTF-8, or not TOML
+    except (ValueError, RecursionError) as error:  # not UTF-8, or not TOML
         raise ConfigError(str(path), "", str(error), "TOML") from error
-    return checked_options(table, str(path))
 
 
 def checked_options(table: Mapping[str, object], where: str) -> SurveyOptions:

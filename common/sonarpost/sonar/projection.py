@@ -12,6 +12,8 @@ from pyproj.exceptions import ProjError
 from sonarpost.sonar.geometry import Position
 
 _WGS84: Final = "EPSG:4326"
+MAX_COORDINATE_M: Final = 1e8
+"""Maximum easting or northing: twice and a half the circumference of the Earth."""
 _EXPECTED: Final = "a projected coordinate system in metres, for example EPSG:32616"
 
 
@@ -32,10 +34,17 @@ class GridExtent:
     max_m: tuple[float, float]
 
 
-def extended(extent: GridExtent | None, easting_m: float, northing_m: float) -> GridExtent | None:
-    """Return an extent that includes further coordinates; unchanged if these are 0/0 or not finite."""
+def grid_coordinates(easting_m: float, northing_m: float) -> tuple[float, float] | None:
+    """Return coordinates as stored in a file; None if they are 0/0, not finite or beyond any projection."""
     here = (easting_m, northing_m)
-    if here == (0.0, 0.0) or not all(map(math.isfinite, here)):
+    valid = here != (0.0, 0.0) and all(math.isfinite(value) and abs(value) <= MAX_COORDINATE_M for value in here)
+    return here if valid else None
+
+
+def extended(extent: GridExtent | None, easting_m: float, northing_m: float) -> GridExtent | None:
+    """Return an extent that includes further coordinates; unchanged if these are not valid."""
+    here = grid_coordinates(easting_m, northing_m)
+    if here is None:
         return extent
     if extent is None:
         return GridExtent(here, here, here, here)

@@ -70,6 +70,7 @@ class Ping:
         speed_mps: Speed, forward positive.
         pitch_deg: Pitch as recorded.
         roll_deg: Roll as recorded.
+        grid_m: Easting and northing of a file with coordinates in metres, as recorded; known without a projection.
     """
 
     number: int
@@ -83,6 +84,7 @@ class Ping:
     speed_mps: float | None = None
     pitch_deg: float | None = None
     roll_deg: float | None = None
+    grid_m: tuple[float, float] | None = None
 
     def channel(self, side: Side) -> ChannelPing | None:
         """Return the first channel of `side`, or None.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 
+import msgpack
 import numpy as np
 import pytest
 from builders.common import GOLDEN_FOLDER, eventually
@@ -12,19 +13,22 @@ from builders.joined_surveys import RANGE_M, SAMPLES, START_S, Box, detect_in_fi
 from builders.two_frequencies import with_second_frequency
 
 from sonarpost import keys
+from sonarpost.detection.association import DetectionPlace
+from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamEnd
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.file_boundary import BoundaryDetection, Origin, pack, stored_ping_count, unpack
+from sonarpost.services.atd_stub.file_boundary import StoredEnd, pack, unpack
 from sonarpost.services.atd_stub.service import AtdStubService
-from sonarpost.services.atd_stub.survey_detection import detect_in_survey
+from sonarpost.services.atd_stub.survey_detection import detect_in_survey, snippets_of
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.readers import read_survey
-from sonarpost.sonar.survey import ChannelPing, Ping, Side
+from sonarpost.sonar.survey import Side
 from sonarpost.sonar.xtf_writer import write_xtf
 
 KEY = keys.contact_detected("uuv-1")
-GOLDEN = GOLDEN_FOLDER / "atd_stub" / "seam-format-1.hex"
+GOLDEN = GOLDEN_FOLDER / "atd_stub"
+HOLDING = AtdStubConfig(join_timeout_s=30.0)
 
 
 @pytest.mark.parametrize("wait_s", [0.0, 30.0])
@@ -47,11 +51,10 @@ def test_an_object_is_one_contact_at_any_file_boundary(boundary, wait_s, tmp_pat
 def test_contacts_far_from_the_boundary_are_not_held(tmp_path):
     survey = survey_of(300, Box(100), Box(260, Side.STARBOARD))
     (path,) = split(tmp_path, survey, (0, 300))
-    result = detect_in_survey(path, "0" * 64, "uuv-1", AtdStubConfig(join_timeout_s=30.0), {}, 100.0)
+    result = detect_in_survey(path, "0" * 64, "uuv-1", HOLDING)
     assert near(list(result.snippets), 100)
     assert not near(list(result.snippets), 260, Side.STARBOARD)
-    assert near(result.file_end.held_snippets(), 260, Side.STARBOARD)
-    assert result.file_end.hold_until_utc_s == 130.0
+    assert near(list(result.held), 260, Side.STARBOARD)
 
 
 def test_short_files_are_joined(tmp_path):
@@ -95,10 +98,11 @@ def test_a_file_that_is_no_continuation_is_not_joined(what, tmp_path):
         case "one more channel":
             later = with_second_frequency(replace(survey, pings=later), SAMPLES, RANGE_M).pings
     write_xtf(replace(survey, pings=later, sonar_id="else" if what == "other sonar" else "made"), second)
-    config = AtdStubConfig(join_timeout_s=30.0)
-    file_end = detect_in_survey(first, "0" * 64, "uuv-1", config, {}, 100.0).file_end
-    assert near(file_end.held_snippets(), 97)
-    assert not detect_in_survey(second, "1" * 64, "uuv-1", config, {file_end.sonar_id: file_end}, 100.0).joined
+    before = detect_in_survey(first, "0" * 64, "uuv-1", HOLDING)
+    assert near(list(before.held), 97)
+    after = detect_in_survey(second, "1" * 64, "uuv-1", HOLDING, before.ends)
+    assert not after.joined
+    assert bool(near(list(after.not_continued), 97)) is (what != "other sonar")
 
 
 def test_a_stopped_clock_does_not_merge_contacts(tmp_path):
@@ -116,17 +120,13 @@ def test_max_contacts_keeps_the_most_confident(tmp_path):
 
 
 def test_a_file_end_is_restored_from_the_store(tmp_path):
-    (path,) = split(tmp_path, survey_of(150, Box(130)), (0, 150))
-    file_end = detect_in_survey(path, "0" * 64, "uuv-1", AtdStubConfig(join_timeout_s=30.0), {}, 100.0).file_end
-    restored = unpack(pack(file_end))
-    assert (restored.sonar_id, restored.origins, restored.detections, restored.hold_until_utc_s) == (
-        file_end.sonar_id,
-        file_end.origins,
-        file_end.detections,
-        file_end.hold_until_utc_s,
-    )
-    assert restored.held
-    for one, other in zip(file_end.pings, restored.pings, strict=True):
+    (path,) = split(tmp_path, survey_of(250, Box(130), Box(200)), (0, 250))
+    [end] = detect_in_survey(path, "0" * 64, "uuv-1", HOLDING).ends.values()
+    restored = unpack(pack(StoredEnd(end, 130.0)))
+    assert restored.hold_until_utc_s == 130.0
+    assert restored.end.held
+    assert replace(restored.end, pings=()) == replace(end, pings=())
+    for one, other in zip(end.pings, restored.end.pings, strict=True):
         assert replace(one, channels=()) == replace(other, channels=())
         for channel, restored_channel in zip(one.channels, other.channels, strict=True):
             np.testing.assert_array_equal(channel.samples, restored_channel.samples)
@@ -136,49 +136,89 @@ def test_a_file_end_is_restored_from_the_store(tmp_path):
                 restored_channel.slant_range_m,
                 restored_channel.scale,
             )
-    with pytest.raises(ValueError, match="format: got 2, expected 1"):
-        unpack(pack(file_end).replace(b"\xa6format\x01", b"\xa6format\x02"))
 
 
-def test_a_stored_file_end_of_format_1_is_read_and_written_unchanged():
-    packed = bytes.fromhex(GOLDEN.read_text())
-    file_end = unpack(packed)
-    first, second = Origin("0a" * 32, "line-0.xtf", "line-0"), Origin("1b" * 32, "line-1.xtf", "line-1")
-    assert (file_end.sonar_id, file_end.hold_until_utc_s, file_end.origins) == (
-        "made",
-        1.0e9 + 30.0,
-        (first, first, second),
-    )
-    assert file_end.detections == (
-        BoundaryDetection(Side.PORT, -2, -5, 1, 11.25, 0.2),
-        BoundaryDetection(Side.STARBOARD, 1, 0, 3, 12.5, 0.125, b"\x81a snippet's payload"),
-    )
-    assert file_end.held == (b"\x81a snippet's payload",)
-    assert [ping.number for ping in file_end.pings] == [98, 99, 100]
-    assert (file_end.pings[0].pitch_deg, file_end.pings[0].roll_deg, file_end.pings[1].lat_deg) == (0.5, -0.25, None)
-    starboard = file_end.pings[2].channel(Side.STARBOARD)
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda fields: fields | {"format": 3}, "format: got 3, expected 1 or 2"),
+        (lambda fields: {"format": 2}, "content: got KeyError"),
+        (lambda fields: fields | {"origins": [[7, 0]]}, "content: got IndexError"),
+        (lambda fields: fields | {"held": [[1]]}, "got"),
+        (lambda fields: [1, 2], "content: got TypeError"),
+    ],
+)
+def test_an_unreadable_file_end_is_one_error(change, message):
+    fields = msgpack.unpackb(bytes.fromhex((GOLDEN / "seam-format-2.hex").read_text()))
+    with pytest.raises(ValueError, match=message):
+        unpack(msgpack.packb(change(fields)))
+
+
+FIRST, SECOND = FileOrigin("0a" * 32, "line-0.xtf", "line-0"), FileOrigin("1b" * 32, "line-1.xtf", "line-1")
+
+
+def check_golden_pings(pings):
+    assert [ping.number for ping in pings] == [98, 99, 100]
+    assert (pings[0].pitch_deg, pings[0].roll_deg, pings[1].lat_deg) == (0.5, -0.25, None)
+    starboard = pings[2].channel(Side.STARBOARD)
     assert (starboard.frequency_hz, starboard.scale, starboard.samples.dtype) == (600e3, 0.5, np.uint16)
     np.testing.assert_array_equal(starboard.samples, [7, 8, 65535])
-    assert pack(file_end) == packed
 
 
-def test_detections_of_one_object_are_near_each_other():
-    detection = BoundaryDetection(Side.PORT, 50, 46, 54, 11.0, 0.1)
-    assert detection.is_same_object(detection)
-    assert detection.is_same_object(replace(detection, row=79, first_row=75, end_row=83))
-    assert not detection.is_same_object(replace(detection, row=81, first_row=77, end_row=85))
-    assert detection.is_same_object(replace(detection, row=90, first_row=53, end_row=127)), (
-        "one of them shows the whole object"
+def test_a_stored_file_end_of_format_1_is_migrated():
+    stored = unpack(bytes.fromhex((GOLDEN / "seam-format-1.hex").read_text()))
+    assert stored.hold_until_utc_s == 1.0e9 + 30.0
+    held = DetectionPlace(Side.STARBOARD, 1, 0, 3, 12.5, 12.5, 12.5, 0.125)
+    assert replace(stored.end, pings=()) == StreamEnd(
+        sonar_id="made",
+        pings=(),
+        origins=(PingOrigin(FIRST, 0), PingOrigin(FIRST, 1), PingOrigin(SECOND, 0)),
+        open_row=1,
+        reported=(DetectionPlace(Side.PORT, -2, -5, 1, 11.25, 11.25, 11.25, 0.2),),
+        held=(StreamContact(PingOrigin(FIRST, 1), held, b"\x81a snippet's payload"),),
     )
-    assert not detection.is_same_object(replace(detection, side=Side.STARBOARD))
-    assert not detection.is_same_object(replace(detection, slant_range_m=14.1))
+    check_golden_pings(stored.end.pings)
+    again = unpack(pack(stored))
+    assert replace(again.end, pings=()) == replace(stored.end, pings=())
 
 
-def test_a_file_end_holds_at_most_16_mib_of_samples():
-    ping = Ping(0, 0.0, (ChannelPing(Side.PORT, np.zeros(1 << 20, dtype=np.uint32), 10.0),))
-    assert stored_ping_count([ping] * 50, 200) == 4
-    assert stored_ping_count([ping] * 2, 200) == 2
-    assert stored_ping_count([], 200) == 0
+def test_a_stored_file_end_of_format_2_is_read_and_written_unchanged():
+    packed = bytes.fromhex((GOLDEN / "seam-format-2.hex").read_text())
+    stored = unpack(packed)
+    held = DetectionPlace(Side.STARBOARD, 1, 0, 3, 12.5, 12.0, 14.25, 0.125)
+    assert replace(stored.end, pings=()) == StreamEnd(
+        sonar_id="made",
+        pings=(),
+        origins=(PingOrigin(FIRST, 98), PingOrigin(FIRST, 99), PingOrigin(SECOND, 0)),
+        open_row=1,
+        reported=(DetectionPlace(Side.PORT, -2, -5, 1, 11.25, 11.0, 13.5, 0.2),),
+        held=(StreamContact(PingOrigin(FIRST, 99), held, b"\x81a snippet's payload"),),
+    )
+    assert [ping.grid_m for ping in stored.end.pings] == [None, None, (500_000.25, 6_651_000.5)]
+    check_golden_pings(stored.end.pings)
+    assert pack(stored) == packed
+
+
+def test_a_file_after_an_upgrade_continues_a_file_end_of_format_1(tmp_path):
+    """The file end of the earlier version holds a contact; the continuation file gives it once."""
+    first, second = split(tmp_path, survey_of(240, Box(120)), (0, 119), (119, 240))
+    before = detect_in_survey(first, "0" * 64, "uuv-1", HOLDING)
+    [end] = before.ends.values()
+    fields = msgpack.unpackb(pack(StoredEnd(end, 130.0)))
+    places = [(place, content) for place, content in fields.pop("held")]
+    old = fields | {
+        "format": 1,
+        "file_of": [number for number, _ in fields.pop("origins")],
+        "pings": [ping[:-1] for ping in fields["pings"]],
+        "looks": [[*place[:5], place[7], held] for place, held in places]
+        + [[*place[:5], place[7], None] for place in fields.pop("reported")],
+    }
+    migrated = unpack(msgpack.packb(old)).end
+    result = detect_in_survey(second, "1" * 64, "uuv-1", HOLDING, {"made": migrated})
+    assert result.joined
+    held = [snippet for end in result.ends.values() for snippet in snippets_of(end.held)]
+    assert len(near([*result.snippets, *held], 120)) == 1
+    assert result.replaced == tuple(s.contact.contact_id for s in before.held)
 
 
 # The service
@@ -290,15 +330,13 @@ def test_a_held_contact_without_a_continuation_is_logged(
     assert released["contact_id"] == near(compressor.received, 120)[0].contact.contact_id
 
 
-def test_a_held_contact_that_is_not_detected_again_is_released_with_the_reason(tmp_path):
+def test_a_held_contact_that_the_joined_pings_do_not_confirm_is_dropped(tmp_path):
     first, second = split(tmp_path, survey_of(240, Box(118)), (0, 120), (120, 240))
-    config = AtdStubConfig(join_timeout_s=30.0)
-    end = detect_in_survey(first, "0" * 64, "uuv-1", config, {}, 100.0).file_end
-    [held] = end.held_snippets()
+    before = detect_in_survey(first, "0" * 64, "uuv-1", HOLDING)
+    [held] = before.held
     strict = AtdStubConfig(join_timeout_s=30.0, confidence_threshold=2.0)
-    result = detect_in_survey(second, "1" * 64, "uuv-1", strict, {end.sonar_id: end}, 101.0)
-    assert result.released == ((held.contact.contact_id, "not detected again in line-1.xtf"),)
-    assert [s.contact.contact_id for s in result.snippets] == [held.contact.contact_id]
+    result = detect_in_survey(second, "1" * 64, "uuv-1", strict, before.ends)
+    assert (result.dropped, result.snippets) == ((held.contact.contact_id,), ())
 
 
 @pytest.mark.parametrize("pings", [300, 1700])

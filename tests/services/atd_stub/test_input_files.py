@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +21,10 @@ from sonarpost.services.atd_stub import service as atd_stub
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.input_folder import InputFile, StableFiles, list_input_files
 from sonarpost.services.atd_stub.service import AtdStubService
+from sonarpost.sonar import readers
 from sonarpost.sonar.image_files import read_image, write_png, write_tiff
 from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.readers.xtf import XtfSource
 
 KEY = keys.contact_detected("uuv-1")
 THRESHOLD = 0.3
@@ -120,6 +125,28 @@ def test_a_file_is_processed_once_under_any_name(start_service, runner, compress
     eventually(lambda: all_processed(again) and len(again._processed) == 4)
     assert counter(again, "files_processed") == 0
     assert len({s.contact.contact_id for s in compressor.received}) == len(compressor.received) == 6
+
+
+@pytest.fixture
+def jsf_reader(monkeypatch):
+    """Register a reader of `.jsf`, whose files are XTF, as an installed package does."""
+    module = types.ModuleType("plug_in_sonar")
+    module.open_jsf = XtfSource
+    monkeypatch.setitem(sys.modules, "plug_in_sonar", module)
+    point = importlib.metadata.EntryPoint("jsf", "plug_in_sonar:open_jsf", readers.ENTRY_POINTS)
+    monkeypatch.setattr(readers, "entry_points", lambda group: [point] if group == readers.ENTRY_POINTS else [])
+    readers._plug_ins.cache_clear()
+    yield
+    readers._plug_ins.cache_clear()
+
+
+@pytest.mark.usefixtures("jsf_reader")
+def test_files_of_a_plug_in_reader_are_processed(start_service, compressor, put_file, survey_bytes):
+    put_file("line.JSF", survey_bytes(1))
+    service = start_service()
+    eventually(lambda: len(compressor.received) == 3)
+    assert {snippet.source for snippet in compressor.received} == {"line.JSF"}
+    assert counter(service, "files_quarantined") == 0
 
 
 def test_contacts_wait_in_the_store_while_the_compressor_is_down(start_service, runner, put_file, survey_bytes):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,11 +17,12 @@ from PIL import Image
 from sonarpost import keys
 from sonarpost.config import load
 from sonarpost.detection.detector import FilterScores, detect
+from sonarpost.detection.settings import DetectorSettings, DetectorTuning, load_settings
 from sonarpost.detection.snippets import ground_projected_image
+from sonarpost.detection.stream import FileOrigin
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.file_boundary import Origin
 from sonarpost.services.atd_stub.input_folder import InputFile, StableFiles, list_input_files
 from sonarpost.services.atd_stub.service import AtdStubService
 from sonarpost.services.atd_stub.snippet_files import read_snippet, write_snippet
@@ -35,7 +38,7 @@ from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
 KEY = keys.contact_detected("uuv-1")
-ORIGIN = Origin("ab" * 32, "line-7.xtf", "line-7")
+ORIGIN = FileOrigin("ab" * 32, "line-7.xtf", "line-7")
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +52,7 @@ def best_contact_of(path: Path, config: AtdStubConfig, change=lambda ping: ping)
     with open_survey(path, config) as source:
         survey = load_survey(source)
     survey = replace(survey, pings=tuple(change(ping) for ping in survey.pings))
-    found = detect(survey)[0]
+    found = detect(survey, None, config)[0]
     return survey, found, snippet_of(survey, found, ORIGIN, "uuv-1", config).contact
 
 
@@ -70,7 +73,7 @@ def test_a_contact_has_every_field_of_the_record(line):
 
 def test_the_position_error_follows_from_the_configured_error_budget(line):
     _, _, default = best_contact_of(line, AtdStubConfig())
-    assert 5 * 2**0.5 < default.position_sigma_m < 12
+    assert 5 < default.position_sigma_m < 8
     _, _, precise = best_contact_of(line, AtdStubConfig(errors=ErrorBudget(position_m=0.5)))
     assert precise.position_sigma_m < default.position_sigma_m - 3
     assert (precise.lat_deg, precise.lon_deg) == (default.lat_deg, default.lon_deg)
@@ -117,6 +120,45 @@ def test_errors_name_invalid_survey_options_of_the_configuration(tmp_path):
         path.write_text(head + f"[atd_stub.mounting]\n{line_of} = {value}\n")
         with pytest.raises(ConfigError, match=rf"uuv\.toml:7: atd_stub\.mounting\.{line_of}: got"):
             load(path, "atd_stub", AtdStubConfig, {})
+
+
+def test_settings_of_the_detector_are_configured(tmp_path):
+    path = tmp_path / "uuv.toml"
+    head = '[platform]\nid = "uuv-1"\n[atd_stub]\nconfidence_threshold = 0.5\njoin_overlap_pings = 100\n'
+    path.write_text(head)
+    _, config = load(path, "atd_stub", AtdStubConfig, {})
+    assert config.detector_settings() == DetectorSettings(confidence_threshold=0.5, join_overlap_pings=100)
+    values = DetectorTuning().model_dump(mode="json")
+    # Every setting can be configured: each is written with another value.
+    changed = json.loads(json.dumps(values), parse_float=lambda text: float(text) * 1.5, parse_int=lambda n: int(n) + 1)
+    lines = "".join(f"{name} = {json.dumps(value)}\n" for name, value in changed.items())
+    path.write_text(f"{head}[atd_stub.detector]\n{lines}")
+    _, config = load(path, "atd_stub", AtdStubConfig, {})
+    settings = config.detector_settings()
+    assert {name: settings.model_dump(mode="json")[name] for name in values} == changed
+    assert all(changed[name] != value for name, value in values.items())
+    (tmp_path / "settings.toml").write_text(f"{lines}confidence_threshold = 0.5\njoin_overlap_pings = 100\n")
+    assert load_settings(tmp_path / "settings.toml") == settings, "the command reads the same keys"
+
+
+@pytest.mark.parametrize(
+    ("line", "field", "expected"),
+    [
+        ("ring_m = -1", "ring_m", "greater than 0"),
+        ("ring = 1", "ring", "a key that this table has"),
+        ("guard_m = nan", "guard_m", "finite"),
+        ("shadow_lengths_m = []", "shadow_lengths_m", "at least 1"),
+        ("highlight_sizes_m = [[1.0]]", "highlight_sizes_m.0.1", "a value"),
+        ("highlight_sizes_m = [[1.0, 51.0]]", "highlight_sizes_m.0.1", "less than or equal to 50"),
+        ("median_window_pings = 1.5", "median_window_pings", "integer"),
+        ("confidence_threshold = 1.0", "confidence_threshold", "a key that this table has"),
+    ],
+)
+def test_errors_name_invalid_settings_of_the_detector(line, field, expected, tmp_path):
+    path = tmp_path / "uuv.toml"
+    path.write_text(f'[platform]\nid = "uuv-1"\n[atd_stub]\n[atd_stub.detector]\n{line}\n')
+    with pytest.raises(ConfigError, match=rf"uuv\.toml:5: atd_stub\.detector\.{re.escape(field)}: got .*{expected}"):
+        load(path, "atd_stub", AtdStubConfig, {})
 
 
 # Images with square pixels on the ground

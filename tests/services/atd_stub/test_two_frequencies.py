@@ -8,9 +8,8 @@ import pytest
 from builders.joined_surveys import RANGE_M, SAMPLES, Box, detect_in_files, near, split, survey_of
 from builders.two_frequencies import files_of, with_second_frequency
 
-from sonarpost.detection.stream import is_continuation
 from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.file_boundary import pack, unpack
+from sonarpost.services.atd_stub.file_boundary import StoredEnd, pack, unpack
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Side
@@ -40,12 +39,10 @@ def test_dual_frequency_files_are_joined(samples, range_m, tmp_path):
     paths = split(tmp_path, survey, (0, 149), (149, 300))
     read = [read_survey(path) for path in paths]
     assert [len(ping.channels) for ping in (read[0].pings[-1], read[1].pings[0])] == [4, 4]
-    assert is_continuation(*read), "the command line joins them too"
     assert len(near(detect_in_files(paths, join_timeout_s=30.0), 150)) == 1
-    file_end = detect_in_survey(paths[0], "0" * 64, "uuv-1", AtdStubConfig(join_timeout_s=30.0), {}, 100.0).file_end
-    assert detect_in_survey(
-        paths[1], "1" * 64, "uuv-1", AtdStubConfig(), {file_end.sonar_id: unpack(pack(file_end))}, 100.0
-    ).joined
+    [end] = detect_in_survey(paths[0], "0" * 64, "uuv-1", AtdStubConfig(join_timeout_s=30.0)).ends.values()
+    restored = unpack(pack(StoredEnd(end, 130.0))).end
+    assert detect_in_survey(paths[1], "1" * 64, "uuv-1", AtdStubConfig(), {end.sonar_id: restored}).joined
 
 
 def test_a_second_frequency_with_another_range_is_no_continuation(tmp_path):
@@ -53,6 +50,5 @@ def test_a_second_frequency_with_another_range_is_no_continuation(tmp_path):
     before, after = (with_second_frequency(survey, 320, range_m) for range_m in (12.5, 10.0))
     first, second = split(tmp_path, before, (0, 100), (100, 200))
     write_xtf(replace(after, pings=after.pings[100:]), second)
-    assert not is_continuation(read_survey(first), read_survey(second))
-    file_end = detect_in_survey(first, "0" * 64, "uuv-1", AtdStubConfig(), {}, 100.0).file_end
-    assert not detect_in_survey(second, "1" * 64, "uuv-1", AtdStubConfig(), {file_end.sonar_id: file_end}, 100.0).joined
+    ends = detect_in_survey(first, "0" * 64, "uuv-1", AtdStubConfig()).ends
+    assert not detect_in_survey(second, "1" * 64, "uuv-1", AtdStubConfig(), ends).joined

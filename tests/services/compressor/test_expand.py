@@ -10,10 +10,10 @@ from builders.records import command_record
 
 from sonarpost import keys
 from sonarpost.detection.detector import detect
+from sonarpost.detection.stream import FileOrigin
 from sonarpost.link.downlink import messages as dl
 from sonarpost.messages import Contact, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.file_boundary import Origin
 from sonarpost.services.atd_stub.survey_detection import snippet_of
 from sonarpost.services.compressor.encoding import expand
 from sonarpost.services.op_modem.vessel_endpoint import message_of
@@ -58,7 +58,7 @@ def test_expand_sends_more_seabed_as_an_image_of_its_own(
 def test_expand_of_a_detection_shows_twice_the_ground(start_service, runner, atd, modem, emb):
     survey = simulate_survey(SurveySpec(seed=1, pings=400, samples=1024, clutter=0)).survey
     config = AtdStubConfig()
-    origin = Origin("ab" * 32, "line-7.xtf", "line-7")
+    origin = FileOrigin("ab" * 32, "line-7.xtf", "line-7")
     # Away from the ends of the recording, where the expanded image would be shifted.
     detection = next(each for each in detect(survey) if 80 <= each.ping_index < 320 and 150 <= each.sample < 850)
     sent = snippet_of(survey, detection, origin, "uuv-1", config)

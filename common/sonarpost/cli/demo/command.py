@@ -29,7 +29,7 @@ from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import SIDE_CAR_SUFFIX
-from sonarpost.sonar.readers import SUPPORTED_SUFFIXES, open_survey
+from sonarpost.sonar.readers import open_survey, single_file_suffixes
 from sonarpost.sonar.survey import Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -206,15 +206,16 @@ def _inputs(parsed: argparse.Namespace, console: Console) -> tuple[Path, ...] | 
     given: Path | None = parsed.survey
     if given is None:
         return None
+    suffixes = single_file_suffixes()
     if given.is_file():
-        if not given.name.lower().endswith(SUPPORTED_SUFFIXES):
-            raise SurveyFileError(str(given), "suffix", given.suffix, "one of " + ", ".join(SUPPORTED_SUFFIXES))
+        if not given.name.lower().endswith(suffixes):
+            raise SurveyFileError(str(given), "suffix", given.suffix, "one of " + ", ".join(suffixes))
         return (given,)
     if not given.is_dir():
         raise SurveyFileError(str(given), "", "no such file or folder", "a file or folder that exists")
-    found = tuple(sorted(p for p in given.iterdir() if p.suffix.lower() in SUPPORTED_SUFFIXES and p.is_file()))
+    found = tuple(sorted(p for p in given.iterdir() if p.name.lower().endswith(suffixes) and p.is_file()))
     if not found:
-        raise SurveyFileError(str(given), "", "no such file in it", "files named *" + ", *".join(SUPPORTED_SUFFIXES))
+        raise SurveyFileError(str(given), "", "no such file in it", "files named *" + ", *".join(suffixes))
     return found
 
 

@@ -58,8 +58,8 @@ class ContactSummary:
         ground_range_m: Distance from the track to the contact (0..3276.5 m can be sent); requires `side`.
         pixel_along_m: Size of a pixel along the track (5 mm to 2.69 m can be sent).
         pixel_across_m: Size of a pixel across the track.
-        position_sigma_m: Standard deviation of the position along its worse horizontal axis; requires a position. It is
-            rounded up, so that a position never appears better than it is.
+        position_sigma_m: One standard deviation of the position along the worse axis of its error ellipse; requires a
+            position. It is rounded up, so that a position never appears better than it is.
 
     Raises:
         FrameError: A value is not finite, out of range, or present without the value that it requires.

@@ -30,10 +30,21 @@ _READERS: Final[Mapping[str, SurveyReader]] = {
     ".waterfall.toml": WaterfallSource,
 }
 
+_SEVERAL_FILES: Final = frozenset({".dat", ".waterfall.toml"})
+"""Formats of this package whose recordings consist of several files."""
+
 
 def supported_suffixes() -> tuple[str, ...]:
     """Return the suffixes that have a reader, including plug-ins, lower case, sorted."""
     return tuple(sorted({*_READERS, *_plug_ins()}))
+
+
+def single_file_suffixes() -> tuple[str, ...]:
+    """Return the suffixes of recordings that consist of one file, including those of all plug-ins, sorted.
+
+    A folder can be watched for them. When all files of the other formats have arrived cannot be determined.
+    """
+    return tuple(suffix for suffix in supported_suffixes() if suffix not in _SEVERAL_FILES)
 
 
 def open_survey(path: Path | str, options: SurveyOptions | None = None) -> SurveySource:
@@ -88,7 +99,3 @@ def _load_plug_in(path: Path, point: EntryPoint) -> SurveyReader:
 def _plug_ins() -> dict[str, EntryPoint]:
     """Return suffix to entry point. A plug-in is imported only when its suffix is used."""
     return {f".{point.name.lower()}": point for point in entry_points(group=ENTRY_POINTS)}
-
-
-SUPPORTED_SUFFIXES: tuple[str, ...] = (".xtf",)
-"""Formats of a single file, which a folder can be watched for; the others consist of several files."""

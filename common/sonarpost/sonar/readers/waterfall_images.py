@@ -39,7 +39,7 @@ from sonarpost.sonar.navigation import (
     position_in_degrees,
 )
 from sonarpost.sonar.options import ProjectedCrs, SurveyOptions
-from sonarpost.sonar.projection import GridExtent, Projection, extended
+from sonarpost.sonar.projection import GridExtent, Projection, extended, grid_coordinates
 from sonarpost.sonar.readers.open_file import CheckedFile
 from sonarpost.sonar.source import StreamedSource
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Ping, Side
@@ -186,6 +186,7 @@ class WaterfallSource(StreamedSource):
             channels=channels,
             lat_deg=position.lat_deg if position else None,
             lon_deg=position.lon_deg if position else None,
+            grid_m=self._coordinates(row, values),
             **navigation,
         )
 
@@ -211,6 +212,13 @@ class WaterfallSource(StreamedSource):
         if first_pass:
             self._implausible.setdefault(name, PingCounter()).add(row)
         return None
+
+    def _coordinates(self, row: int, values: dict[str, str]) -> tuple[float, float] | None:
+        """Return easting and northing of a table in metres."""
+        if self._config.positions != "metres":
+            return None
+        north, east = (self._number(row, name, values) for name in _COORDINATES["metres"])
+        return None if north is None or east is None else grid_coordinates(east, north)
 
     def _position(self, row: int, values: dict[str, str]) -> Position | None:
         north, east = (self._number(row, name, values) for name in _COORDINATES[self._config.positions])

@@ -35,7 +35,7 @@ from sonarpost.sonar.navigation import (
     position_in_degrees,
 )
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.projection import GridExtent, Projection, extended
+from sonarpost.sonar.projection import GridExtent, Projection, extended, grid_coordinates
 from sonarpost.sonar.readers.open_file import CheckedFile, SequentialReader
 from sonarpost.sonar.source import StreamedSource
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Ping, Samples, Side
@@ -498,7 +498,10 @@ class NavigationCleaner:
             values["heading_deg"] = 0.0
         position = self._position(stored)
         lat_deg, lon_deg = (None, None) if position is None else (position.lat_deg, position.lon_deg)
-        return replace(stored, lat_deg=lat_deg, lon_deg=lon_deg, **values)
+        grid_m = None
+        if self._nav_units == NAV_UNITS_METRES and stored.lat_deg is not None and stored.lon_deg is not None:
+            grid_m = grid_coordinates(stored.lon_deg, stored.lat_deg)
+        return replace(stored, lat_deg=lat_deg, lon_deg=lon_deg, grid_m=grid_m, **values)
 
     def warnings(self, total: int) -> list[str]:
         """Return one line for each kind of irregularity in `total` pings."""
