@@ -1,23 +1,28 @@
 """`python -m research.survey_memory`: memory needed to read surveys, by file size.
 
-    python -m research.survey_memory [--sizes-mb 100,2048] [--actions read,plot,detect] [--folder DIR]
+    python -m research.survey_memory [--sizes-mb 100,2048] [--actions read,plot,detect,vehicle] [--folder DIR]
 
 Writes XTF recordings of the given sizes: repeated simulated pings with consecutive numbers and times. A separate
-process then reads each file ping by ping, draws it as a waterfall, or detects contacts in it as on the vehicle (at most
-20 contacts a file). Prints the peak resident memory and the time of the process. Deletes the files afterwards.
+process then reads each file ping by ping, draws it as a waterfall, or detects contacts in it, as `sonarpost detect` or
+as the vehicle does (at most 20 contacts a file). Prints the peak resident memory and the time of the process. Deletes
+the files afterwards.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import resource
 import subprocess
 import sys
 import tempfile
 import time
+from contextlib import redirect_stdout
 from datetime import UTC, datetime, timedelta
+from io import StringIO
 from pathlib import Path
 
+from sonarpost.cli.main import main as main_command
 from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey
@@ -54,6 +59,10 @@ def process(path: Path, action: str) -> None:
     """Perform one action on a file; print peak memory and time."""
     start = time.perf_counter()
     if action == "detect":
+        with redirect_stdout(StringIO()) as output:
+            main_command(["detect", str(path), "--max-contacts", "20", "--json"])
+        count = len(json.loads(output.getvalue())["files"][0]["contacts"])
+    elif action == "vehicle":
         count = detect_in_survey(path, "0" * 64, "uuv-1", AtdStubConfig(max_contacts=20)).contact_count
     else:
         with open_survey(path) as source:
@@ -64,15 +73,15 @@ def process(path: Path, action: str) -> None:
     duration_s = time.perf_counter() - start
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     size_mb = path.stat().st_size / 1e6
-    unit = {"read": "pings", "plot": "rows", "detect": "contacts"}[action]
-    print(f"{size_mb:8.0f} MB  {action:6} {count:8} {unit:8} {peak_mib:6.0f} MiB peak {duration_s:7.1f} s", flush=True)
+    unit = {"read": "pings", "plot": "rows", "detect": "contacts", "vehicle": "contacts"}[action]
+    print(f"{size_mb:8.0f} MB  {action:7} {count:8} {unit:8} {peak_mib:6.0f} MiB peak {duration_s:7.1f} s", flush=True)
 
 
 def main() -> None:
     """Measure every size."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--sizes-mb", default="20,100,2048", help="(default: %(default)s)")
-    parser.add_argument("--actions", default="read,plot", help="of read, plot, detect (default: %(default)s)")
+    parser.add_argument("--actions", default="read,plot", help="of read, plot, detect, vehicle (default: %(default)s)")
     parser.add_argument(
         "--folder", type=Path, help="where the files are written (default: the system's temporary folder)"
     )

@@ -359,7 +359,10 @@ def _model_named(annotation: object, title: str) -> type[BaseModel]:
 def _configuration_type_text(schema: Mapping[str, Any], annotation: object) -> str:
     match schema.get("type"):
         case "array":
-            return f"list of {_configuration_type_text(schema['items'], None)}s"
+            fixed = schema.get("prefixItems", ())
+            item = _configuration_type_text(fixed[0] if fixed else schema["items"], None)
+            items = item.replace("list", "lists", 1) if item.startswith("list") else f"{item}s"
+            return f"list of {len(fixed)} {items}" if fixed else f"list of {items}"
         case "object":
             return "table"
         case "string":
