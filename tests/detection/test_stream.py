@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sonarpost.detection import stream
-from sonarpost.detection.detector import detect
+from sonarpost.detection.detector import SearchResult, detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.stream import FileOrigin, StreamDetector, stored_ping_count
 from sonarpost.sonar.options import SurveyOptions
@@ -150,6 +150,28 @@ def test_limit_applies_to_each_file_with_held_contacts(make_survey):
     best = detect(survey)[:3]
     given = [contact.content[1] for contact in (*result.contacts, *detector.finish())]
     assert sorted(d.ping_index for d in given) == sorted(d.ping_index for d in best)
+
+
+@pytest.mark.parametrize(
+    ("seen", "reported", "count"),
+    [
+        pytest.param(None, False, 1, id="the part in the first file is not detected"),
+        pytest.param((40, 60), False, 0, id="the first file shows it whole"),
+        pytest.param(None, True, 0, id="the part in the first file is reported"),
+    ],
+)
+def test_object_that_ends_beyond_a_file_is_taken_from_the_next(make_survey, monkeypatch, seen, reported, count):
+    survey = make_survey({"ping": 100})
+    (one,) = detect(survey)
+    rows = seen or (40, 130)
+    whole = replace(one, ping_index=45, highlight_pings=rows)
+    found = {100: (replace(whole, highlight_pings=(40, 60)),) if reported else (), 200: (whole,)}
+    monkeypatch.setattr(stream, "search", lambda survey, *_: SearchResult(found[len(survey.pings)], {}))
+    files = split(survey, 100)
+    detector = detector_of(DetectorSettings(join_overlap_pings=100))
+    assert len(add(detector, files[0]).contacts) == reported
+    result = add(detector, files[1])
+    assert len(result.contacts) + len(detector.finish()) == count
 
 
 def with_channels(ping, change):

@@ -17,7 +17,7 @@ def _as_tuple(value: object) -> object:
     return tuple(value) if isinstance(value, list) else value
 
 
-# Configurations are validated in strict mode, in which a list is no tuple.
+# Settings are validated in strict mode, in which a list is no tuple.
 _FromList = BeforeValidator(_as_tuple)
 _Length = Annotated[float, Field(gt=0, le=10_000)]
 _Size = Annotated[tuple[_Length, _Length], _FromList]
@@ -109,6 +109,6 @@ def checked_settings(table: Mapping[str, object], where: str) -> DetectorSetting
         ConfigError: A name or value is invalid; names `where`.
     """
     try:
-        return DetectorSettings.model_validate(table)
+        return DetectorSettings.model_validate(table, strict=True)
     except ValidationError as error:
         raise ConfigError(where, *first_error(error)) from error

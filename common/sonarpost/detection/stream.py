@@ -6,8 +6,9 @@ starts a new file after a number of pings, possibly in the middle of an object.
 
 One rule holds at the boundaries of strips and of files. Of the overlap of two strips, the first strip decides about the
 first half and the second strip about the second half: each shows more of the seabed around its half. Contacts in the
-second half are held until the next strip is searched; at the end of a file they wait for the next file. Repeated
-detections of one object are associated by place (`sonarpost.detection.association`).
+second half are held until the next strip is searched; at the end of a file they wait for the next file. An object that
+ends beyond the first strip, such as a wreck, is taken from the second strip unless the first one has reported it.
+Repeated detections of one object are associated by place (`sonarpost.detection.association`).
 """
 
 from __future__ import annotations
@@ -279,6 +280,7 @@ class _FileSearch(Generic[T]):
         self._overlap = settings.join_overlap_pings
         self._first_new_row = len(previous.pings) if previous is not None else 0
         self._open_row = previous.open_row if previous is not None else 0
+        self._seen_rows = self._first_new_row
         self._reported = list(previous.reported) if previous is not None else []
         self._held = [contact.place for contact in previous.held] if previous is not None else []
         self._repeated: set[int] = set()
@@ -315,8 +317,8 @@ class _FileSearch(Generic[T]):
             earlier = [n for n, other in enumerate(held) if place.is_same_object(other, self._settings)]
             if any(place.is_same_object(other, self._settings) for other in known):
                 continue
-            if place.row < lower and not earlier:
-                continue  # the strip before has decided about it
+            if place.row < lower and not earlier and place.end_row <= self._seen_rows:
+                continue  # the strip before has shown it whole and decided about it
             if strip.first_row == 0:
                 self._repeated.update(earlier)
             if place.row < upper:
@@ -326,7 +328,7 @@ class _FileSearch(Generic[T]):
                 self._held.append(place)
                 if strip.is_last:
                     self._waiting.append(self._described(survey, detection, place))
-        self._open_row = upper
+        self._open_row, self._seen_rows = upper, end
         self._decided.sort(key=_descending_confidence)
         del self._decided[self._settings.max_contacts or len(self._decided) :]
         start = end - self._overlap
