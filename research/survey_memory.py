@@ -1,6 +1,7 @@
 """`python -m research.survey_memory`: memory needed to read surveys, by file size.
 
-    python -m research.survey_memory [--sizes-mb 100,2048] [--actions read,plot,detect,vehicle] [--folder DIR]
+    python -m research.survey_memory [--sizes-mb 100,2048] [--actions read,plot,detect,vehicle] [--samples N]
+        [--folder DIR]
 
 Writes XTF recordings of the given sizes: repeated simulated pings with consecutive numbers and times. A separate
 process then reads each file ping by ping, draws it as a waterfall, or detects contacts in it, as `sonarpost detect` or
@@ -36,9 +37,9 @@ NUMBER_OFFSET, TIME_OFFSET = 28, 14
 START = datetime(2026, 1, 1, tzinfo=UTC)
 
 
-def write_long(path: Path, size_bytes: int) -> int:
-    """Write a recording of about this size; return its number of pings."""
-    write_xtf(simulate_survey(SurveySpec(seed=3, pings=PINGS, samples=1024)).survey, path)
+def write_long(path: Path, size_bytes: int, samples: int) -> int:
+    """Write a recording of about this size with pings of 2 x `samples`; return its number of pings."""
+    write_xtf(simulate_survey(SurveySpec(seed=3, pings=PINGS, samples=samples)).survey, path)
     raw = path.read_bytes()
     ping_bytes = (len(raw) - HEADER_BYTES) // PINGS
     pings = [bytearray(raw[HEADER_BYTES + row * ping_bytes :][:ping_bytes]) for row in range(PINGS)]
@@ -83,6 +84,12 @@ def main() -> None:
     parser.add_argument("--sizes-mb", default="20,100,2048", help="(default: %(default)s)")
     parser.add_argument("--actions", default="read,plot", help="of read, plot, detect, vehicle (default: %(default)s)")
     parser.add_argument(
+        "--samples",
+        type=int,
+        default=1024,
+        help="samples of a ping on each side: longer pings are processed in less time (default: %(default)s)",
+    )
+    parser.add_argument(
         "--folder", type=Path, help="where the files are written (default: the system's temporary folder)"
     )
     parser.add_argument("--process", nargs=2, metavar=("FILE", "ACTION"), help=argparse.SUPPRESS)
@@ -93,7 +100,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=parsed.folder) as folder:
         for size_mb in map(int, parsed.sizes_mb.split(",")):
             path = Path(folder) / "long.xtf"
-            write_long(path, size_mb * 1_000_000)
+            write_long(path, size_mb * 1_000_000, parsed.samples)
             for action in parsed.actions.split(","):
                 subprocess.run(
                     [sys.executable, "-m", "research.survey_memory", "--process", str(path), action], check=True

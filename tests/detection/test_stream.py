@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from sonarpost.detection import stream
 from sonarpost.detection.detector import SearchResult, detect
@@ -15,7 +17,14 @@ from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.stream import FileOrigin, StreamDetector, stored_ping_count
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource
-from sonarpost.sonar.survey import ChannelPing, Ping, Side
+from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
+
+
+@pytest.fixture(scope="module")
+def template(make_survey):
+    """A detection, with 0.1 m between its pings."""
+    (found,) = detect(make_survey({}))
+    return replace(found, pixel_along_m=0.1)
 
 
 def split(survey, *boundaries):
@@ -215,6 +224,67 @@ def test_repeated_pings_are_left_out(make_survey):
     survey = make_survey({"ping": 100})
     files = [replace(survey, pings=survey.pings[:120]), replace(survey, pings=survey.pings[80:])]
     assert len(contacts_of(files)) == 1
+
+
+HALF_ROWS = 4
+
+
+def visible_objects(template, objects):
+    """Return a search that finds the visible part of each object of 8 rows, with a centre that differs by the strip."""
+
+    def search(survey, *_):
+        first, last = survey.pings[0].number, survey.pings[-1].number
+        found = []
+        for row, side in objects:
+            begin, end = max(row - HALF_ROWS, first), min(row + HALF_ROWS, last + 1)
+            if begin < end:
+                centre = (begin + end) // 2 + (row + first + 3 * last) % 5 - 2
+                found.append(
+                    replace(
+                        template,
+                        side=side,
+                        ping_index=min(max(centre, first), last) - first,
+                        highlight_pings=(begin - first, end - first),
+                    )
+                )
+        return SearchResult(tuple(found), {})
+
+    return search
+
+
+@given(
+    rows=st.integers(60, 700),
+    spacing=st.integers(38, 90),
+    first=st.integers(0, 80),
+    boundaries=st.sets(st.integers(1, 699), max_size=8),
+    overlap=st.integers(36, 120),
+    strip=st.integers(50, 400),
+    restored=st.booleans(),
+)
+@settings(max_examples=200)
+def test_each_object_is_given_once_for_any_division(
+    template, rows, spacing, first, boundaries, overlap, strip, restored
+):
+    objects = [(row, list(Side)[row % 2]) for row in range(first, rows, spacing)]
+    channels = (ChannelPing(Side.PORT, np.zeros(4, np.uint8), 20.0),)
+    pings = tuple(Ping(row, 0.1 * row, channels) for row in range(rows))
+    line = Survey(Path("x.xtf"), "x", "x", pings)
+    files = split(line, *sorted(row for row in boundaries if row < rows))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stream, "STRIP_PINGS", strip)
+        patch.setattr(stream, "search", visible_objects(template, objects))
+        detector = detector_of(DetectorSettings(join_overlap_pings=overlap))
+        given_numbers = []
+        for file in files:
+            result = add(detector, file)
+            given_numbers += [contact.content[0] for contact in result.contacts]
+            assert result.released == ()
+            if restored:
+                detector = detector_of(DetectorSettings(join_overlap_pings=overlap), detector.ends)
+        given_numbers += [contact.content[0] for contact in detector.finish()]
+    assert len(given_numbers) == len(objects)
+    for number, (row, _) in zip(sorted(given_numbers), objects, strict=True):
+        assert abs(number - row) <= HALF_ROWS + 2
 
 
 def test_the_end_of_a_recording_keeps_at_most_16_mib_of_samples():
