@@ -47,22 +47,28 @@ def command(router: str, *arguments: str) -> list[str]:
 
 
 class Subscriber:
-    """`zenoh subscribe` as a process; what it prints, decoded with base64 and msgpack and nothing else."""
+    """`zenoh subscribe` as a process for each key; what it prints, decoded with base64 and msgpack and nothing else.
+
+    One process for several keys may print two values at once on one line.
+    """
 
     def __init__(self, router: str, *key_expressions: str) -> None:
-        wanted = [part for key in key_expressions for part in ("-k", key)]
-        self._process = subprocess.Popen(
-            command(router, "subscribe", *wanted, "--decoder", "base64", "--line", "{key} {value}"),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
         self._lines: queue.Queue[str] = queue.Queue()
-        threading.Thread(target=self._read, daemon=True).start()
+        self._processes = [
+            subprocess.Popen(
+                command(router, "subscribe", "-k", key, "--decoder", "base64", "--line", "{key} {value}"),
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+            )
+            for key in key_expressions
+        ]
+        for process in self._processes:
+            threading.Thread(target=self._read, args=(process,), daemon=True).start()
 
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
             self._lines.put(line)
 
     def next(self) -> tuple[str, dict[str, Any]]:
@@ -78,8 +84,10 @@ class Subscriber:
         pytest.fail(f"nothing on {key}")
 
     def close(self) -> None:
-        self._process.terminate()
-        self._process.communicate(timeout=10)
+        for process in self._processes:
+            process.terminate()
+        for process in self._processes:
+            process.communicate(timeout=10)
 
 
 @pytest.fixture
