@@ -100,6 +100,8 @@ def expected_text(kind: str, message: str) -> str:
     """Return the text after 'expected' for an error of pydantic."""
     if kind == "missing":
         return "a value"
+    if kind == "extra_forbidden":
+        return "a known name"
     for prefix in ("Input should be ", "Value error, "):
         if message.startswith(prefix):
             return message[len(prefix) :]
