@@ -17,7 +17,8 @@ from sonarpost.detection.snippets import cut_snippet
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.bottom_track import track_bottom
-from sonarpost.sonar.geometry import Position, offset_between_m
+from sonarpost.sonar.geometry import Position, georeference, offset_between_m
+from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Ping, Side, Survey
 
@@ -184,7 +185,10 @@ def test_scotsman_label_matches_a_contact_and_positions_match_geodesic(data_dir)
         (geod.inv(*label, d.position.lon_deg, d.position.lat_deg)[2], d) for d in found if d.side is Side.STARBOARD
     ]
     distance_m, nearest = min(distances, key=lambda pair: pair[0])
-    assert distance_m < 2 * nearest.position_sigma_m
+    reference = georeference(survey.pings[nearest.ping_index], nearest.side, nearest.sample, SurveyOptions())
+    assert nearest.position_sigma_m == max(reference.across_sigma_m, reference.along_sigma_m)
+    # Within the root mean square distance (DRMS) that the error budget predicts.
+    assert distance_m < np.hypot(reference.across_sigma_m, reference.along_sigma_m)
     for d in found:
         at = survey.pings[d.ping_index]
         slant_m = (d.sample + 0.5) * at.channel(d.side).sample_spacing_m
