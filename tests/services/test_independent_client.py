@@ -1,6 +1,6 @@
-"""A program of other people: `zenoh` (zenoh-cli), which knows nothing of sonarpost, and plain msgpack.
+"""An independent client: `zenoh` (zenoh-cli), which has no code of sonarpost, and plain msgpack.
 
-It sees what services publish, can decode it, and cannot do harm by publishing rubbish.
+It receives and decodes what services publish. Services refuse the invalid payloads that it publishes.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def decision(number: int) -> bytes:
                 "image_id": "0001",
                 "image_version": 1,
                 "verdict": "unsure",
-                "operator": "somebody",
+                "operator": "operator-7",
                 "decided_utc_s": 1476262900,
             }
         )
@@ -168,19 +168,19 @@ def envelope(payload: bytes, key: str = DECISION_KEY) -> bytes:
     return bytes(msgpack.packb(fields))
 
 
-RUBBISH = {
-    "no msgpack": (b"\xc1 rubbish", "payload"),
+INVALID = {
+    "no msgpack": (b"\xc1 text", "payload"),
     "text": (b"hello", "payload"),
     "another record": (decision(9), "type"),
     "a later version": (msgpack.packb(msgpack.unpackb(envelope(decision(9))) | {"v": 2}), "v"),
     "a field missing": (msgpack.packb({"type": "relayed", "v": 1, "vessel_id": "vessel-1"}), "key"),
-    "rubbish in an envelope": (envelope(b"\xc1"), "payload"),
+    "no record in an envelope": (envelope(b"\xc1"), "payload"),
     "an unknown key in an envelope": (envelope(decision(9), "sonarpost/v1/vessel-1/etc/passwd"), "key"),
     "one vessel in the name of another": (envelope(decision(9), "sonarpost/v1/vessel-2/contact/decision"), "key"),
 }
 
 
-def test_rubbish_is_refused_and_logged_and_the_service_goes_on(
+def test_invalid_payloads_are_refused_and_logged_and_the_service_continues(
     tmp_path: Path,
     router: str,
     platform: PlatformMaker,
@@ -194,22 +194,22 @@ def test_rubbish_is_refused_and_logged_and_the_service_goes_on(
         watcher.until("sonarpost/v1/shore-1/health/c2")
         put(router, INBOX, envelope(decision(1)))
         assert watcher.until(ACCEPTED)["decision_id"] == "d1"
-        for number, (payload, _) in enumerate(RUBBISH.values(), start=1):
+        for number, (payload, _) in enumerate(INVALID.values(), start=1):
             put(router, INBOX, payload)
             eventually(lambda number=number: service.store.refused_count() == number)  # type: ignore[misc]
-        # What is right still comes through, and what was wrong has harmed nothing.
+        # Valid records are still accepted.
         put(router, INBOX, envelope(decision(2)))
         assert watcher.until(ACCEPTED)["decision_id"] == "d2"
         health = watcher.until("sonarpost/v1/shore-1/health/c2")
         assert health["state"] == "ok"
-        assert health["counters"]["records_refused"] == len(RUBBISH)
-        assert health["gauges"]["refused"] == len(RUBBISH)
+        assert health["counters"]["records_refused"] == len(INVALID)
+        assert health["gauges"]["refused"] == len(INVALID)
         reasons = [str(row[0]) for row in service.store._query("SELECT reason FROM refused ORDER BY id")]
     finally:
         service.stop()
     kept = sorted(path.name for path in (tmp_path / "out").rglob("*.json"))
     assert kept == ["6431.json", "6432.json"]
-    fields = [field for _, field in RUBBISH.values()]
+    fields = [field for _, field in INVALID.values()]
     assert [reason.split(": ")[1] for reason in reasons] == fields
     assert all("expected" in reason for reason in reasons)
     # The log has the first refusal of a peer in each minute, and the number of the others.
