@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sonarpost.cli import detect as command
-from sonarpost.cli.detect import annotated_waterfall
+from sonarpost.cli.detection import command
+from sonarpost.cli.detection.command import annotated_waterfall
 from sonarpost.detection.detector import detect
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.messages import Contact

@@ -9,7 +9,7 @@ import pytest
 from builders.two_frequencies import read_both, with_second_frequency
 
 from research.detection.codec_effect import confidence_with
-from sonarpost.cli.detect import annotated_waterfall
+from sonarpost.cli.detection.command import annotated_waterfall
 from sonarpost.detection.detector import detect
 from sonarpost.detection.normalisation import normalise_side
 from sonarpost.detection.settings import DetectorSettings

@@ -143,6 +143,8 @@ def _structure(
 
 MINE_LIKE = "mine-like"
 CLUTTER = "clutter"
+STRUCTURE = "structure"
+"""A wreck, wall or outcrop: an object larger than a mine, with its extent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +172,9 @@ class Detection:
         shadow_is_cut: True if the recording ends within the shadow; `shadow_m` and `height_m` are then lower bounds.
         confidence: 0 to 2, see `sonarpost.detection.fusion`.
         scores: Scores of the filters.
-        atd_class: "mine-like" or "clutter", see `classify`.
+        atd_class: `MINE_LIKE`, `CLUTTER` or `STRUCTURE`.
+        p_mine_like: Probability that the contact is a mine-like object, 0 to 1; None if it was not classified.
+        p_other_object: Probability that it is another object on the bottom, 0 to 1; None if it was not classified.
         pixel_along_m: Distance between two pings.
         pixel_across_m: Slant range of one sample.
         highlight_pings: First and one-past-last ping index of the highlight.
@@ -207,6 +211,8 @@ class Detection:
     highlight_samples: tuple[int, int]
     shadow_samples: int
     position_sigma_m: float | None = None
+    p_mine_like: float | None = None
+    p_other_object: float | None = None
 
 
 LISTED_CONFIDENCES: Final = (1.0, 0.5, 0.3, 0.1)

@@ -1,0 +1,1 @@
+"""The `sonarpost detect` command: contacts of survey files."""
