@@ -28,20 +28,25 @@ from research.detection.simulated import (
     MAX_FILES,
     EvaluatedFile,
     evaluate_file,
+    mine_like_share,
     operating_point,
     pd_at,
     reliability,
     roc,
+    share_interval,
 )
 from research.detection.tiles import TileScore, tile_auc, tile_scores
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.errors import ConfigError
 from sonarpost.simulation.seabed.targets import MINE_LIKE_KINDS
 from sonarpost.simulation.seabed.terrain import SeabedKind
 
-OPERATING_CONFIDENCE: Final = 1.0
+OPERATING_CONFIDENCE: Final = DetectorSettings().confidence_threshold
 PLAIN: Final = (SeabedKind.SAND, SeabedKind.MUD, SeabedKind.GRAVEL)
 """Seabeds of the figures `pd` and `false_alarms_per_file`; the others are listed separately."""
 _MAX_FALSE_ALARMS: Final = 6.0
+_CONTACTS_PER_FILE: Final = (4, 6, 8, 12)
+"""Numbers of contacts at which the share of mine-like objects is measured."""
 
 
 def new_parser() -> argparse.ArgumentParser:
@@ -50,8 +55,8 @@ def new_parser() -> argparse.ArgumentParser:
         "detection",
         description="Detect in simulated files of every seabed that were not used for training (1000 pings, four "
         "mine-like and six other objects each), score real tiles with and without a target, and with --codecs detect "
-        "again after each codec. pd and false_alarms_per_file are for confidence 1.0 on sand, mud and gravel together; "
-        "a contact on one of the other objects is not a false alarm and is counted separately.",
+        "again after each codec. pd and false_alarms_per_file are for the default threshold on sand, mud and gravel "
+        "together; a contact on one of the other objects is not a false alarm and is counted separately.",
     )
     parser.add_argument(
         "--files", type=int, default=3, metavar="N", help="simulated files of each seabed (default: %(default)s)"
@@ -112,6 +117,7 @@ def _result(
         "auc_sdvd_splits": {s: {"auc": round(a, 4), "ci": ci} for s, (a, ci) in splits.items()},
         "seabeds": {kind.value: _seabed_json([f for f in files if f.seabed is kind]) for kind in SeabedKind},
         "shapes": {kind.value: _shape_pd(files, kind.value) for kind in MINE_LIKE_KINDS},
+        "mine_like_share": {str(n): round(mine_like_share(files, n), 4) for n in _CONTACTS_PER_FILE},
         "reliability": [
             {"contacts": b.contacts, "claimed": round(b.claimed, 3), "true": round(b.true_share, 3)}
             for b in reliability(files)
@@ -131,14 +137,22 @@ def _result(
     }
 
 
-def _seabed_json(files: Sequence[EvaluatedFile]) -> dict[str, float]:
-    point = operating_point(files, OPERATING_CONFIDENCE)
+def _seabed_json(files: Sequence[EvaluatedFile]) -> dict[str, object]:
+    point, (pd, low, high) = operating_point(files, OPERATING_CONFIDENCE), _pd_at_one_false_alarm(files)
     return {
         "pd": round(point.pd, 4),
         "false_alarms_per_file": round(point.false_alarms_per_file, 4),
         "others_per_file": round(point.others_per_file, 4),
-        "pd_at_one_false_alarm": round(pd_at(roc(files), 1.0), 4),
+        "pd_at_one_false_alarm": round(pd, 4),
+        "interval_95": [round(low, 4), round(high, 4)],
     }
+
+
+def _pd_at_one_false_alarm(files: Sequence[EvaluatedFile]) -> tuple[float, float, float]:
+    """Return the probability of detection at one false alarm a file with its 95 % interval."""
+    objects = sum(t.is_mine_like for f in files for t in f.truth)
+    pd = pd_at(roc(files), 1.0)
+    return pd, *share_interval(pd * objects, objects)
 
 
 def _shape_pd(files: Sequence[EvaluatedFile], kind: str) -> float:
@@ -158,19 +172,22 @@ def _rounded(value: float) -> float | None:
 
 
 def _text(files: Sequence[EvaluatedFile], tiles: tuple[TileScore, ...], effects: Sequence[CodecEffect]) -> str:
-    rows = [("seabed", "files", "Pd", "false alarms/file", "others/file", "Pd at 1 false alarm/file")]
+    rows = [("seabed", "files", "Pd", "false alarms/file", "others/file", "Pd at 1 false alarm/file", "95 %")]
     for kind in SeabedKind:
         of_kind = [f for f in files if f.seabed is kind]
         point = operating_point(of_kind, OPERATING_CONFIDENCE)
         figures = (f"{point.pd:.3f}", f"{point.false_alarms_per_file:.2f}", f"{point.others_per_file:.2f}")
-        rows.append((kind.value, str(len(of_kind)), *figures, f"{pd_at(roc(of_kind), 1.0):.3f}"))
+        pd, low, high = _pd_at_one_false_alarm(of_kind)
+        rows.append((kind.value, str(len(of_kind)), *figures, f"{pd:.3f}", f"{low:.2f}..{high:.2f}"))
     parts = [aligned(rows)]
     parts.append(
         aligned(
-            [("contacts", "confidence / 2", "share of objects")]
+            [("contacts", "confidence / 2", "share of mine-like objects")]
             + [(str(b.contacts), f"{b.claimed:.2f}", f"{b.true_share:.2f}") for b in reliability(files)]
         )
     )
+    shares = ", ".join(f"{mine_like_share(files, n):.3f} of {n}" for n in _CONTACTS_PER_FILE)
+    parts.append(f"share of mine-like objects among the most confident contacts a file: {shares}")
     for split in sorted({t.split for t in tiles}):
         area, ci = tile_auc(tuple(t for t in tiles if t.split == split))
         parts.append(f"SDVD {split}: AUC {area:.3f}" + ("" if ci is None else f" (95 %: {ci[0]:.3f}..{ci[1]:.3f})"))
@@ -222,7 +239,7 @@ def _plot_roc(path: Path, files: Sequence[EvaluatedFile]) -> None:
 
 
 def _plot_reliability(path: Path, files: Sequence[EvaluatedFile]) -> None:
-    """Draw the true share of objects over the claimed share."""
+    """Draw the true share of mine-like objects over the claimed share."""
     figure = new_figure(5, 4.2)
     axis = figure.subplots()
     bins = reliability(files)
@@ -233,7 +250,7 @@ def _plot_reliability(path: Path, files: Sequence[EvaluatedFile]) -> None:
             str(b.contacts), (b.claimed, b.true_share), fontsize=8, xytext=(4, -10), textcoords="offset points"
         )
     axis.set_xlabel("confidence / 2")
-    axis.set_ylabel("share of contacts that are objects")
+    axis.set_ylabel("share of contacts that are mine-like objects")
     axis.grid(alpha=0.3)
     save_figure(figure, path)
 

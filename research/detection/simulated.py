@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.detection.detector import Detection, detect
+from sonarpost.detection.detector import STRUCTURE, Detection, detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
@@ -19,7 +19,7 @@ from sonarpost.sonar.survey import Side, Survey
 Floats = npt.NDArray[np.float64]
 
 FIRST_SEED: Final = 5000
-"""Training uses seeds 1000 to 1007 (research/training/detection.py)."""
+"""Training uses seeds from 20,000 on (research/training/detection)."""
 MAX_FILES: Final = 1000
 NEAR_M: Final = 1.5
 """A contact within this distance of the centre of an object, along and across, is that object; for objects that are
@@ -57,11 +57,13 @@ class EvaluatedContact:
         confidence: Confidence of the contact.
         target: The object; None for a false alarm.
         is_first: Whether it is the most confident contact of its object (True for a false alarm).
+        is_structure: Whether it is of class "structure", whose confidence is not a probability.
     """
 
     confidence: float
     target: TruthObject | None
     is_first: bool
+    is_structure: bool = False
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def evaluate_file(seabed: SeabedKind, seed: int) -> EvaluatedFile:
         scale = Scale(d.pixel_along_m or _ALL_CONTACTS.assumed_row_along_m, d.pixel_across_m)
         index = object_at(simulated.truth, d.side, d.ping_index, d.sample, scale)
         target = None if index is None else simulated.truth[index]
-        contacts.append(EvaluatedContact(d.confidence, target, index not in assigned))
+        contacts.append(EvaluatedContact(d.confidence, target, index not in assigned, d.atd_class == STRUCTURE))
         if index is not None:
             assigned.add(index)
     return EvaluatedFile(seabed, survey, detections, tuple(contacts), simulated.truth, seconds)
@@ -165,7 +167,7 @@ class ReliabilityBin:
     Attributes:
         contacts: Their number.
         claimed: Their mean confidence / 2.
-        true_share: Share of them that are objects.
+        true_share: Share of them that are mine-like objects.
     """
 
     contacts: int
@@ -174,8 +176,9 @@ class ReliabilityBin:
 
 
 def reliability(files: Sequence[EvaluatedFile], bins: int = 10) -> tuple[ReliabilityBin, ...]:
-    """Return claimed and true share of objects by confidence, without empty bins."""
-    pairs = [(c.confidence / 2, c.target is not None) for f in files for c in f.contacts if c.is_first]
+    """Return claimed and true share of mine-like objects by confidence, without structures and empty bins."""
+    contacts = [c for f in files for c in f.contacts if c.is_first and not c.is_structure]
+    pairs = [(c.confidence / 2, c.target is not None and c.target.is_mine_like) for c in contacts]
     found = []
     for number in range(bins):
         inside = [p for p in pairs if number <= min(p[0] * bins, bins - 1e-9) < number + 1]
@@ -183,3 +186,26 @@ def reliability(files: Sequence[EvaluatedFile], bins: int = 10) -> tuple[Reliabi
             claimed = float(np.mean([p[0] for p in inside]))
             found.append(ReliabilityBin(len(inside), claimed, float(np.mean([p[1] for p in inside]))))
     return tuple(found)
+
+
+def mine_like_share(files: Sequence[EvaluatedFile], contacts_per_file: int) -> float:
+    """Return the share of mine-like objects among the most confident contacts of all files.
+
+    Args:
+        files: The files.
+        contacts_per_file: Number of contacts, on average over the files.
+    """
+    contacts = sorted((c for f in files for c in f.contacts), key=lambda c: -c.confidence)
+    chosen = contacts[: contacts_per_file * len(files)]
+    mines = sum(c.is_first and c.target is not None and c.target.is_mine_like for c in chosen)
+    return mines / (contacts_per_file * len(files))
+
+
+def share_interval(hits: float, count: int) -> tuple[float, float]:
+    """Return the 95 % Wilson score interval of a share of `hits` in `count` (Wilson, JASA 22, 1927)."""
+    if count == 0:
+        return 0.0, 1.0
+    z, share = 1.96, hits / count
+    centre = (share + z * z / (2 * count)) / (1 + z * z / count)
+    half = z / (1 + z * z / count) * (share * (1 - share) / count + z * z / (4 * count * count)) ** 0.5
+    return max(0.0, centre - half), min(1.0, centre + half)

@@ -10,8 +10,8 @@ import numpy as np
 
 from research.common.images import read_sdvd_index, survey_line
 from research.common.statistics import Interval, auc, bootstrap_weights, interval
-from research.detection.image_detector import ScaledImage, detect_in_image
 from sonarpost.codec.interface import to_uint8
+from sonarpost.detection.images import ScaledImage, detect_in_image
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.image_files import read_image
 

@@ -1,145 +1,30 @@
-"""Detection of contacts in a survey: compact objects from the filters, and large structures.
-
-Large structures (wrecks, walls) are a deep shadow of several square metres with a highlight before it. The filters for
-compact objects compare a place with the seabed around it, but a wreck fills that neighbourhood. Its shadow is
-detectable: metres wide and without echo. Shadows of ripples, stones and rock are lit from other sides. Each connected
-dark region of at least 7 m² whose near edge is bright for a good part of its length is a structure.
-
-Outcrops of rock cast such shadows too, but in large numbers: each distant region of comparable size reduces the
-confidence. The simulator has no wrecks, so this confidence is not calibrated: 1.0 is the minimum area with a bright
-edge along half of its length, and it increases with both.
-"""
+"""Detection of contacts in a survey: compact objects from the classifier, and large structures."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
-import numpy as np
-import numpy.typing as npt
-from scipy import ndimage
-
-from sonarpost.detection.candidates import Candidate, FilterScores, Measurement, find_candidates
-from sonarpost.detection.fusion import fused_confidences, suppress_duplicates
+from sonarpost.detection.candidates import (
+    FilterScores,
+    Measurement,
+    PlacedCandidate,
+    classified_candidates,
+    distinct_candidates,
+)
+from sonarpost.detection.classifier import Classifier, default_classifier, load_classifier_once
+from sonarpost.detection.matched_filter import matched_response
 from sonarpost.detection.normalisation import FloatVector, LevelGrid, normalise_side
 from sonarpost.detection.settings import DetectorSettings
+from sonarpost.detection.structures import find_structures, find_water_structures, is_part_of_structure
 from sonarpost.sonar.bottom_track import altitudes_m
 from sonarpost.sonar.geometry import Position, georeference, sample_slant_range_m, slant_to_ground_range_m
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import SurveySource, load_survey
 from sonarpost.sonar.survey import Side, Survey
-
-_SMOOTH_M: Final = 0.4
-_DARK_LEVEL: Final = -1.3
-_BRIGHT_LEVEL: Final = 0.6
-_MIN_AREA_M2: Final = 7.0
-_EDGE_M: Final = 1.2
-"""The highlight of a structure lies within this distance before its shadow."""
-_EDGE_SHARE: Final = 0.5
-_MIN_EDGE_SHARE: Final = 0.25
-_MAX_LENGTH_M: Final = 60.0
-_NEAR_M: Final = 2.0
-_SEPARATE_M: Final = 20.0
-
-
-@dataclass(frozen=True, slots=True)
-class Structure:
-    """A structure as a candidate, with its confidence and the area of its shadow in slant range."""
-
-    confidence: float
-    candidate: Candidate
-    area_m2: float
-
-
-def find_structures(grid: LevelGrid) -> list[Structure]:
-    """Return the structures of one side, most confident first."""
-    size = (max(1, round(_SMOOTH_M / grid.row_along_m)), max(1, round(_SMOOTH_M / grid.cell_across_m)))
-    known = np.isfinite(grid.level)
-    level = ndimage.uniform_filter(np.where(known, grid.level, 0.0).astype(np.float32), size=size, mode="nearest")
-    labels, _ = ndimage.label(known & (level < _DARK_LEVEL))
-    areas_m2 = np.bincount(labels.ravel()) * (grid.row_along_m * grid.cell_across_m)
-    found = []
-    for number, box in enumerate(ndimage.find_objects(labels), start=1):
-        if box is None or areas_m2[number] < _MIN_AREA_M2:
-            continue
-        if (box[0].stop - box[0].start) * grid.row_along_m > _MAX_LENGTH_M:
-            continue
-        structure = _structure(grid, level, labels[box] == number, (box[0].start, box[1].start), areas_m2[number])
-        if structure is not None:
-            found.append(structure)
-    weighted = [replace(s, confidence=s.confidence / (1 + _comparable(s, found, grid))) for s in found]
-    return sorted(weighted, key=lambda s: -s.confidence)
-
-
-def is_part_of_structure(contact: Candidate, structure: Candidate, grid: LevelGrid) -> bool:
-    """Return whether the centre of a contact lies in or within 2 m of a structure's highlight or shadow."""
-    rows, cells = _NEAR_M / grid.row_along_m, _NEAR_M / grid.cell_across_m
-    centre, large = contact.measurement, structure.measurement
-    along = large.rows[0] - rows <= centre.row < large.rows[1] + rows
-    return along and large.cells[0] - cells <= centre.cell < large.cells[1] + large.shadow_cells + cells
-
-
-def _comparable(one: Structure, found: list[Structure], grid: LevelGrid) -> int:
-    """Return how many others of at least half the area are too far away to be parts of the same structure."""
-    count = 0
-    for other in found:
-        along_m = abs(other.candidate.measurement.row - one.candidate.measurement.row) * grid.row_along_m
-        across_m = abs(other.candidate.measurement.cell - one.candidate.measurement.cell) * grid.cell_across_m
-        count += other.area_m2 >= one.area_m2 / 2 and max(along_m, across_m) > _SEPARATE_M
-    return count
-
-
-def _structure(
-    grid: LevelGrid,
-    level: npt.NDArray[np.float32],
-    dark: npt.NDArray[np.bool_],
-    corner: tuple[int, int],
-    area: np.float64,
-) -> Structure | None:
-    """Return the structure that casts a shadow; None if less than a quarter of its near edge is bright.
-
-    Args:
-        grid: One side of a survey.
-        level: Its smoothed levels.
-        dark: The cells of the shadow within its bounding box.
-        corner: First row and cell of that box.
-        area: Area of the shadow in square metres.
-    """
-    area_m2 = float(area)
-    reach = max(2, round(_EDGE_M / grid.cell_across_m))
-    rows = np.flatnonzero(dark.any(axis=1))
-    near = corner[1] + dark[rows].argmax(axis=1)
-    columns = near[:, None] - 1 - np.arange(reach)[None, :]
-    strip = np.where(columns >= 0, level[corner[0] + rows[:, None], np.maximum(columns, 0)], -np.inf)
-    bright = strip > _BRIGHT_LEVEL
-    lit = bright.any(axis=1)
-    share = float(lit.mean())
-    if share < _MIN_EDGE_SHARE:
-        return None
-    lit_rows = rows[lit]
-    middle = int(np.flatnonzero(lit)[np.argmax(strip[lit].max(axis=1))])
-    cells = bright[middle].nonzero()[0]
-    last, first = int(near[middle]) - int(cells[0]), int(near[middle]) - 1 - int(cells[-1])
-    shadow_end = corner[1] + int(np.flatnonzero(dark[rows[middle]])[-1]) + 1
-    confidence = 2.0 * area_m2 / (area_m2 + _MIN_AREA_M2) * min(1.0, share / _EDGE_SHARE)
-    patch = grid.level[corner[0] : corner[0] + dark.shape[0], corner[1] : corner[1] + dark.shape[1]]
-    measurement = Measurement(
-        row=corner[0] + int(rows[middle]),
-        cell=(first + last) // 2,
-        rows=(corner[0] + int(lit_rows[0]), corner[0] + int(lit_rows[-1]) + 1),
-        cells=(max(first, 0), last),
-        shadow_cells=shadow_end - last,
-        shadow_is_cut=shadow_end >= grid.level.shape[1],
-        matched=0.0,
-        cfar=float(strip[lit].max(axis=1).mean()),
-        shadow=float(-np.nanmean(patch[dark])),
-        shadow_rows=int(rows[-1] - rows[0]) + 1,
-    )
-    scores = FilterScores(0.0, measurement.cfar, measurement.shadow, 0.0, min(1.0, share))
-    return Structure(confidence, Candidate(measurement, scores), area_m2)
-
 
 MINE_LIKE = "mine-like"
 CLUTTER = "clutter"
@@ -170,7 +55,7 @@ class Detection:
         shadow_m: Length of the shadow in slant range, from the outer edge of the highlight.
         height_m: shadow x altitude / (slant range + shadow), by similar triangles over a flat bottom.
         shadow_is_cut: True if the recording ends within the shadow; `shadow_m` and `height_m` are then lower bounds.
-        confidence: 0 to 2, see `sonarpost.detection.fusion`.
+        confidence: 0 to 2: twice the probability of a mine-like object; of a structure, see `detection.structures`.
         scores: Scores of the filters.
         atd_class: `MINE_LIKE`, `CLUTTER` or `STRUCTURE`.
         p_mine_like: Probability that the contact is a mine-like object, 0 to 1; None if it was not classified.
@@ -279,6 +164,7 @@ def search(
     """
     settings = settings if settings is not None else DetectorSettings()
     options = options if options is not None else SurveyOptions()
+    classifier = classifier_of(settings)
     altitude_m = altitudes_m(survey)
     found: list[Detection] = []
     weaker: dict[float, list[int]] = {c: [] for c in LISTED_CONFIDENCES if c < settings.confidence_threshold}
@@ -286,51 +172,68 @@ def search(
         grid = normalise_side(survey, side, settings, altitude_m)
         if grid is None:
             continue
-        contacts = _SideContacts(grid, settings, min((settings.confidence_threshold, *weaker)))
+        contacts = _SideContacts(grid, settings, classifier, min((settings.confidence_threshold, *weaker)))
         for confidence, rows in weaker.items():
-            candidates = (candidate for _, candidate in contacts.at(confidence))
-            rows += [c.measurement.row for c in candidates if survey.pings[c.measurement.row].channel(side) is not None]
-        for confidence, candidate in contacts.at(settings.confidence_threshold):
-            detection = _detection(survey, grid, confidence, candidate, settings, options, altitude_m)
+            places = [contact.measurement.row for contact in contacts.at(confidence)]
+            rows += [row for row in places if survey.pings[row].channel(side) is not None]
+        for contact in contacts.at(settings.confidence_threshold):
+            detection = _detection(survey, grid, contact, options, altitude_m)
             found += [detection] if detection is not None else []
     found.sort(key=lambda d: (-d.confidence, d.ping_index, d.side.value, d.sample))
     return SearchResult(tuple(found[: settings.max_contacts]), {c: tuple(rows) for c, rows in weaker.items()})
 
 
+@dataclass(frozen=True, slots=True)
+class _Contact:
+    """A contact in grid cells. The probabilities of a structure are None: it is not classified."""
+
+    confidence: float
+    measurement: Measurement
+    atd_class: str
+    p_mine_like: float | None = None
+    p_other_object: float | None = None
+
+
 class _SideContacts:
     """The contacts of one side at any threshold down to `lowest`."""
 
-    def __init__(self, grid: LevelGrid, settings: DetectorSettings, lowest: float) -> None:
-        candidates = find_candidates(grid, settings)
-        scored = zip(fused_confidences(candidates, grid, settings), candidates, strict=True)
+    def __init__(self, grid: LevelGrid, settings: DetectorSettings, classifier: Classifier, lowest: float) -> None:
+        response = matched_response(grid, settings)
+        candidates = classified_candidates(response, grid, settings, classifier)
         # Only more confident candidates suppress one: those at a higher threshold are the first of this list.
-        self._kept = suppress_duplicates([c for c in scored if c[0] >= lowest], grid, settings)
-        self._structures = find_structures(grid)
+        self._kept = [_compact(c) for c in distinct_candidates(candidates, grid, settings, lowest)]
+        structures = (*find_structures(grid), *find_water_structures(grid))
+        self._structures = sorted(structures, key=lambda structure: -structure.confidence)
         self._grid = grid
 
-    def at(self, threshold: float) -> list[tuple[float, Candidate]]:
-        """Return confidence and candidate of each contact at or above a threshold."""
-        kept = [c for c in self._kept if c[0] >= threshold]
+    def at(self, threshold: float) -> list[_Contact]:
+        """Return each contact at or above a threshold."""
+        kept = [c for c in self._kept if c.confidence >= threshold]
         # A structure that contains a contact or a more confident structure is not reported again.
         for structure in self._structures:
             if structure.confidence < threshold:
                 break
-            if not any(is_part_of_structure(other, structure.candidate, self._grid) for _, other in kept):
-                kept.append((structure.confidence, structure.candidate))
+            if not any(is_part_of_structure(c.measurement, structure.measurement, self._grid) for c in kept):
+                kept.append(_Contact(structure.confidence, structure.measurement, STRUCTURE))
         return kept
+
+
+def _compact(placed: PlacedCandidate) -> _Contact:
+    candidate = placed.candidate
+    atd_class = MINE_LIKE if candidate.p_mine_like >= candidate.p_other_object else CLUTTER
+    p_mine_like, p_other_object = round(candidate.p_mine_like, 4), round(candidate.p_other_object, 4)
+    return _Contact(candidate.confidence, placed.measurement, atd_class, p_mine_like, p_other_object)
 
 
 def _detection(
     survey: Survey,
     grid: LevelGrid,
-    confidence: float,
-    candidate: Candidate,
-    settings: DetectorSettings,
+    contact: _Contact,
     options: SurveyOptions,
     altitudes: FloatVector,
 ) -> Detection | None:
-    """Convert a candidate from grid cells to metres and positions; None if its ping has no such channel."""
-    measurement = candidate.measurement
+    """Convert a contact from grid cells to metres and positions; None if its ping has no such channel."""
+    measurement = contact.measurement
     ping = survey.pings[measurement.row]
     channel = ping.channel(grid.side)
     if channel is None:
@@ -366,15 +269,17 @@ def _detection(
         shadow_m=shadow_m,
         height_m=height_m,
         shadow_is_cut=measurement.shadow_is_cut,
-        confidence=confidence,
-        scores=candidate.scores,
-        atd_class=classify(length_m, width_m, height_m, settings),
+        confidence=contact.confidence,
+        scores=measurement.scores,
+        atd_class=contact.atd_class,
         pixel_along_m=grid.row_along_m if grid.row_is_measured else None,
         pixel_across_m=across_m,
         highlight_pings=measurement.rows,
         highlight_samples=samples,
         shadow_samples=measurement.shadow_cells * grid.samples_per_cell,
         position_sigma_m=None if reference is None else reference.sigma_m,
+        p_mine_like=contact.p_mine_like,
+        p_other_object=contact.p_other_object,
     )
 
 
@@ -387,19 +292,15 @@ def height_from_shadow_m(shadow_m: float, slant_range_m: float, altitude_m: floa
     return shadow_m * altitude_m / (slant_range_m + shadow_m)
 
 
-def classify(length_m: float, width_m: float, height_m: float | None, settings: DetectorSettings) -> str:
-    """Return "mine-like" for a contact with the size and shape of a mine, else "clutter".
+def classifier_of(settings: DetectorSettings) -> Classifier:
+    """Return the classifier of the settings: that of their file, else the default one.
 
-    Mine-like: length, width and (if known) height are within the limits of the settings, and neither side of the
-    highlight exceeds `mine_elongation` times the other. The class is about size only.
+    Raises:
+        ConfigError: The file cannot be read, or does not have the identity of the settings.
     """
-    fits = (
-        settings.mine_length_m[0] <= length_m <= settings.mine_length_m[1]
-        and settings.mine_width_m[0] <= width_m <= settings.mine_width_m[1]
-        and max(length_m, width_m) <= settings.mine_elongation * min(length_m, width_m)
-        and (height_m is None or settings.mine_height_m[0] <= height_m <= settings.mine_height_m[1])
-    )
-    return MINE_LIKE if fits else CLUTTER
+    if settings.classifier is None:
+        return default_classifier()
+    return load_classifier_once(Path(settings.classifier), settings.classifier_identity)
 
 
 def _altitude_m(altitudes: FloatVector, grid: LevelGrid, row: int) -> float | None:

@@ -7,7 +7,9 @@ the surrounding pings. Level 0 is ordinary seabed, +1 twice its echo, -1 half of
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +25,9 @@ FloatTable = npt.NDArray[np.float64]
 
 _EXCLUDED_RISE = -4.0
 """Rise in octaves that excludes a cell from the bottom path."""
+_NEAR_SEABED_M: Final = 5.0
+_WATER_MARGIN_M: Final = 0.6
+"""Distance before the first bottom return that does not count as water."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +44,8 @@ class LevelGrid:
         cell_across_m: Slant range of one cell.
         row_along_m: Distance between two pings.
         row_is_measured: False if the file has no speed or track and `row_along_m` is the assumed one.
+        water_echo: Shape (pings, cells up to the greatest first return), float32: echo in the water above that of the
+            usual ping at this range, over the median echo of the nearest 5 m of seabed; 0 outside the water. None for an image.
     """
 
     side: Side
@@ -49,6 +56,7 @@ class LevelGrid:
     cell_across_m: float
     row_along_m: float
     row_is_measured: bool
+    water_echo: FloatImage | None = None
 
 
 def levels_of_ratio(ratio: FloatImage) -> FloatImage:
@@ -86,7 +94,11 @@ def normalise_side(
     # The margin covers the glare of the first return; its slant range may be two percent too short.
     margin = max(1, round(settings.bottom_margin_m / cell_m))
     bottom = np.minimum((first_return * 1.02).astype(np.int64) + margin, amplitude.shape[1])
+    water = amplitude[:, : int(first_return.max()) + 1].copy()
     amplitude[np.arange(amplitude.shape[1])[None, :] < bottom[:, None]] = np.nan
+    near = np.arange(amplitude.shape[1])[None, :] < (bottom + round(_NEAR_SEABED_M / cell_m))[:, None]
+    near &= np.isfinite(amplitude)
+    near_seabed = float(np.median(amplitude[near])) if near.any() else math.inf
     ratio = _ratio_to_range_median(amplitude, settings.median_window_pings)
     if ratio is None:
         return None
@@ -99,7 +111,23 @@ def normalise_side(
         cell_across_m=cell_m,
         row_along_m=measured_m if measured_m is not None else settings.assumed_row_along_m,
         row_is_measured=measured_m is not None,
+        water_echo=_water_echo(water, first_return, near_seabed, cell_m, settings),
     )
+
+
+def _water_echo(
+    amplitude: FloatImage, first_return: IntVector, seabed: float, cell_m: float, settings: DetectorSettings
+) -> FloatImage:
+    """Return the echo in the water; see `LevelGrid.water_echo`.
+
+    The median over all pings is subtracted: ringing of the transducer and the echo of the surface stay at one range.
+    """
+    cells = np.arange(amplitude.shape[1])[None, :]
+    end = first_return * 0.97 - max(1, round(_WATER_MARGIN_M / cell_m))
+    is_water = (cells < end[:, None]) & (cells >= round(settings.blanking_m / cell_m)) & np.isfinite(amplitude)
+    usual = _filled(_column_medians(np.where(is_water, amplitude, np.nan))[None], 0.0)
+    excess = (amplitude - usual) / max(seabed, 1e-6)
+    return np.asarray(np.where(is_water, excess, 0.0), dtype=np.float32)
 
 
 def _sample_spacing_m(survey: Survey, side: Side) -> float | None:

@@ -44,15 +44,10 @@ class DetectorTuning(BaseModel):
         guard_m: Guard distance between a highlight and the ring of seabed of the CFAR test.
         ring_m: Width of that ring.
         min_matched_response: Minimum matched-filter response, in local noise units, of a candidate.
-        clutter_radius_m: Distance, along and across, within which other candidates define the local clutter.
-        clutter_area_m2: Area of seabed for each accepted candidate: the local clutter level is the evidence that one
-            candidate in this area reaches.
         separation_along_m: Candidates nearer than this along-track, and `separation_across_m` across, are one contact.
         separation_across_m: See `separation_along_m`.
-        mine_length_m: Minimum and maximum highlight length of a mine-like contact.
-        mine_width_m: Minimum and maximum highlight width of a mine-like contact.
-        mine_height_m: Minimum and maximum height of a mine-like contact, if the altitude is known.
-        mine_elongation: Maximum ratio of the longer to the shorter side of the highlight of a mine-like contact.
+        classifier: File with the weights of the classifier of candidates; None for the one of the package.
+        classifier_identity: Identity that this file must have, 16 hexadecimal digits; None for any.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -68,27 +63,23 @@ class DetectorTuning(BaseModel):
     noise_window_m: _Size = (24.0, 12.0)
     guard_m: _Length = 0.6
     ring_m: _Length = 1.5
-    min_matched_response: Annotated[float, Field(gt=0, le=1000)] = 1.6
-    clutter_radius_m: _Length = 30.0
-    clutter_area_m2: Annotated[float, Field(gt=0, le=1e8)] = 90.0
+    min_matched_response: Annotated[float, Field(gt=0, le=1000)] = 1.2
     separation_along_m: _Length = 3.0
     separation_across_m: _Length = 3.0
-    mine_length_m: _Size = (0.3, 4.0)
-    mine_width_m: _Size = (0.1, 2.5)
-    mine_height_m: _Size = (0.1, 2.0)
-    mine_elongation: Annotated[float, Field(gt=0, le=1000)] = 8.0
+    classifier: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
+    classifier_identity: Annotated[str, Field(pattern="^[0-9a-f]{16}$")] | None = None
 
 
 class DetectorSettings(DetectorTuning):
     """All settings of a detector: its tuning, the threshold, and the division of long recordings.
 
     Attributes:
-        confidence_threshold: Minimum fused confidence (0 to 2) of a contact; 1.0 is the operating point.
+        confidence_threshold: Minimum confidence (0 to 2) of a contact: twice its probability of a mine-like object.
         max_contacts: Maximum number of contacts of a survey, most confident first; None for no limit.
         join_overlap_pings: Pings that consecutive parts of a recording, and consecutive files, have in common.
     """
 
-    confidence_threshold: Annotated[float, Field(ge=0, le=2)] = 1.0
+    confidence_threshold: Annotated[float, Field(ge=0, le=2)] = 0.5
     max_contacts: Annotated[int, Field(gt=0)] | None = None
     join_overlap_pings: Annotated[int, Field(ge=0, le=900)] = 200
 

@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from sonarpost.detection.candidates import FilterScores, find_candidates
-from sonarpost.detection.fusion import fused_confidences
+from sonarpost.detection.candidates import classified_candidates
+from sonarpost.detection.detector import classifier_of
+from sonarpost.detection.matched_filter import matched_response
 from sonarpost.detection.normalisation import LevelGrid, levels_of_ratio
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import FloatImage, Side
@@ -53,15 +54,15 @@ class ImageDetection:
     """The most confident candidate of an image.
 
     Attributes:
-        confidence: 0 to 2, see `sonarpost.detection.fusion`.
-        scores: Scores of the filters.
+        confidence: 0 to 2: twice the probability of a mine-like object.
+        p_mine_like: That probability.
         side: Direction of the shadow: right (starboard) or left (port).
         row: Row of the centre of the highlight.
         column: Its column.
     """
 
     confidence: float
-    scores: FilterScores
+    p_mine_like: float
     side: Side
     row: int
     column: int
@@ -89,13 +90,13 @@ def _detections(image: ScaledImage, settings: DetectorSettings, side: Side) -> l
     rows_per_cell = round(grid.row_along_m / image.pixel_along_m)
     last = image.pixels.shape[1] - 1
     found = []
-    candidates = find_candidates(grid, settings)
-    for confidence, candidate in zip(fused_confidences(candidates, grid, settings), candidates, strict=True):
-        centre = candidate.measurement
-        outward = min(centre.cell * grid.samples_per_cell + grid.samples_per_cell // 2, last)
+    response = matched_response(grid, settings)
+    for candidate in classified_candidates(response, grid, settings, classifier_of(settings)):
+        peak = candidate.peak
+        outward = min(peak.cell * grid.samples_per_cell + grid.samples_per_cell // 2, last)
         column = outward if side is Side.STARBOARD else last - outward
-        row = min(centre.row * rows_per_cell + rows_per_cell // 2, image.pixels.shape[0] - 1)
-        found.append(ImageDetection(confidence, candidate.scores, side, row, column))
+        row = min(peak.row * rows_per_cell + rows_per_cell // 2, image.pixels.shape[0] - 1)
+        found.append(ImageDetection(candidate.confidence, candidate.p_mine_like, side, row, column))
     return found
 
 

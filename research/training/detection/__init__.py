@@ -1,0 +1,1 @@
+"""Training of the classifier of candidates: examples, network, calibration."""
