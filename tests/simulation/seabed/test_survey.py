@@ -57,8 +57,8 @@ def test_survey_without_speckle_has_the_same_other_draws(monkeypatch):
     noisy, clean = simulate_survey(spec), simulate_survey(spec, speckle=False)
     drawn = simulator._speckle
 
-    def ones(shape, rng):
-        return np.ones_like(drawn(shape, rng))
+    def ones(shape, rng, sigma):
+        return np.ones_like(drawn(shape, rng, sigma))
 
     monkeypatch.setattr(simulator, "_speckle", ones)
     expected = simulate_survey(spec)

@@ -7,7 +7,11 @@ import pytest
 
 from sonarpost.simulation.seabed.targets import (
     CLUTTER_KINDS,
+    FURTHER_CLUTTER_KINDS,
+    FURTHER_MINE_LIKE_KINDS,
     MINE_LIKE_KINDS,
+    STRUCTURE_KINDS,
+    SUSPENDED_KINDS,
     ObjectKind,
     SeabedObject,
     place_object,
@@ -23,10 +27,10 @@ def plan(extent_m: float = 6.0, step_m: float = 0.02) -> tuple[np.ndarray, np.nd
     return u, v
 
 
-@pytest.mark.parametrize("kind", list(ObjectKind))
+@pytest.mark.parametrize("kind", [kind for kind in ObjectKind if kind not in SUSPENDED_KINDS])
 def test_object_surfaces_have_the_specified_size(kind):
     rng = np.random.default_rng(8)
-    u, v = plan()
+    u, v = plan(36.0, 0.1) if kind in STRUCTURE_KINDS else plan(10.0, 0.04) if kind in FURTHER_CLUTTER_KINDS else plan()
     for _ in range(4):
         item = random_object(kind, 0.0, 0.0, rng)
         top = surface_height_m(item, u, v)
@@ -57,10 +61,12 @@ def test_mine_shapes_match_their_geometry():
 
 
 def test_only_mine_shapes_are_mine_like():
-    assert set(MINE_LIKE_KINDS) | set(CLUTTER_KINDS) == set(ObjectKind)
+    mines, others = MINE_LIKE_KINDS + FURTHER_MINE_LIKE_KINDS, CLUTTER_KINDS + FURTHER_CLUTTER_KINDS + STRUCTURE_KINDS
+    assert set(mines) | set(others) == set(ObjectKind)
+    assert len(mines + others) == len(ObjectKind)
     rng = np.random.default_rng(0)
-    assert [random_object(k, 0, 0, rng).is_mine_like for k in MINE_LIKE_KINDS] == [True] * 4
-    assert [random_object(k, 0, 0, rng).is_mine_like for k in CLUTTER_KINDS] == [False] * 3
+    assert all(random_object(k, 0, 0, rng).is_mine_like for k in mines)
+    assert not any(random_object(k, 0, 0, rng).is_mine_like for k in others)
 
 
 def flat(cell_m: float = 0.05) -> Seabed:

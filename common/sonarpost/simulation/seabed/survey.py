@@ -10,7 +10,7 @@ dark water column and the first bottom return follow from geometry.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -19,17 +19,35 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
 from sonarpost.errors import ConfigError
+from sonarpost.simulation.seabed.midwater import Track, body_echoes, slices, unblocked
+from sonarpost.simulation.seabed.objects import settled
+from sonarpost.simulation.seabed.receiver import varied_amplitudes
+from sonarpost.simulation.seabed.scattering import bin_by_range, scattered, vertical_beam
+from sonarpost.simulation.seabed.spec import SurveySpec
 from sonarpost.simulation.seabed.targets import (
     CLUTTER_KINDS,
     MINE_LIKE_KINDS,
+    STRUCTURE_KINDS,
+    SUSPENDED_KINDS,
     ObjectKind,
     SeabedObject,
     place_object,
     random_object,
 )
-from sonarpost.simulation.seabed.terrain import SAND_BACKSCATTER, Seabed, SeabedKind, make_seabed
+from sonarpost.simulation.seabed.terrain import SAND_BACKSCATTER, RippleOptions, Seabed, make_seabed
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.survey import ChannelPing, Ping, Samples, Side, Survey
+
+__all__ = [
+    "SONAR_NAME",
+    "SimulatedSurvey",
+    "SurveySpec",
+    "Track",
+    "TruthObject",
+    "echo_intensity",
+    "received_amplitude",
+    "simulate_survey",
+]
 
 FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
@@ -41,107 +59,18 @@ _SAND_LEVEL: Final = 0.26
 _MARGIN_M: Final = 2.0
 _MIN_DISTANCE_M: Final = 5.0
 _PLACEMENT_TRIES: Final = 400
+_TALLEST: Final = 0.6
+"""Greatest height of a structure or of an object above the seabed, as a fraction of the altitude."""
 
 _CELLS_PER_SAMPLE: Final = 2
 _CHUNK_PINGS: Final = 128
-_PULSE_SIGMA_SAMPLES: Final = 0.7
-_BEAM_WIDTH_DEG: Final = 0.5
 _APERTURE_M: Final = 0.12
 """Near the vehicle the beam is as wide as the effective length of the array."""
-_MAIN_LOBE_DEG: Final = 22.0
-_LOBE_WIDTH_DEG: Final = 34.0
-_BACK_LOBE: Final = 0.02
-"""Response of the vertical beam far outside its main lobe, in intensity."""
-_SPECULAR: Final = 1.5
-_SPECULAR_POWER: Final = 40
 _TVG_POWER: Final = 2.1
 """Time-varied gain; it also compensates part of the decrease with grazing angle by Lambert's law."""
 _SPECKLE_LOOKS: Final = 2
 _NOISE: Final = 0.012
 """Noise at full range after gain, in the intensity of sand at half range."""
-
-
-@dataclass(frozen=True, slots=True)
-class SurveySpec:
-    """Specification of a survey. The same values give the same survey, sample for sample.
-
-    Attributes:
-        seed: Seed of every random draw.
-        pings: 1 to 10,000.
-        samples: Samples per side, 64 to 8192.
-        range_m: Slant range per side.
-        altitude_m: Mean altitude; at most half the range.
-        speed_mps: Speed over ground.
-        ping_rate_hz: Pings per second; the echo must return before the next ping.
-        heading_deg: Mean course, true.
-        start_lat_deg: Latitude of the first ping.
-        start_lon_deg: Longitude of the first ping.
-        start_time_utc_s: Time of the first ping.
-        seabed: Type of seabed.
-        targets: Number or kinds of the mine-like objects.
-        clutter: Number or kinds of the other objects.
-        bits: 8 or 16 bits per sample.
-        motion: Scale of the vehicle's yaw, roll and altitude variations: 0 none, 1 typical.
-        water_depth_m: Mean depth of the seabed; at least the altitude.
-        frequency_hz: Sonar frequency, recorded in the survey.
-
-    Raises:
-        ConfigError: A value outside these limits.
-    """
-
-    seed: int = 0
-    pings: int = 1000
-    samples: int = 1024
-    range_m: float = 30.0
-    altitude_m: float = 5.0
-    speed_mps: float = 1.5
-    ping_rate_hz: float = 15.0
-    heading_deg: float = 40.0
-    start_lat_deg: float = 56.45
-    start_lon_deg: float = -5.6
-    start_time_utc_s: float = 1_475_568_000.0
-    seabed: SeabedKind = SeabedKind.MIXED
-    targets: int | tuple[ObjectKind, ...] = 4
-    clutter: int | tuple[ObjectKind, ...] = 6
-    bits: int = 8
-    motion: float = 1.0
-    water_depth_m: float = 20.0
-    frequency_hz: float = 600_000.0
-
-    def __post_init__(self) -> None:
-        limits = {
-            "seed": (self.seed, 0, 2**63),
-            "pings": (self.pings, 1, 10_000),
-            "samples": (self.samples, 64, 8192),
-            "range_m": (self.range_m, 5, 200),
-            "altitude_m": (self.altitude_m, 1, self.range_m / 2),
-            "speed_mps": (self.speed_mps, 0.2, 10),
-            "ping_rate_hz": (self.ping_rate_hz, 0.5, 750 / self.range_m),
-            "heading_deg": (self.heading_deg, 0, 360),
-            "start_lat_deg": (self.start_lat_deg, -85, 85),
-            "start_lon_deg": (self.start_lon_deg, -180, 180),
-            "start_time_utc_s": (self.start_time_utc_s, 0, 2**33),
-            "motion": (self.motion, 0, 5),
-            "water_depth_m": (self.water_depth_m, self.altitude_m, 6000),
-            "frequency_hz": (self.frequency_hz, 20_000, 5_000_000),
-            "targets": (_count(self.targets), 0, 1000),
-            "clutter": (_count(self.clutter), 0, 1000),
-        }
-        for name, (value, low, high) in limits.items():
-            if not low <= value <= high:
-                raise ConfigError("survey simulator", name, value, f"{low:g} to {high:g}")
-        if self.bits not in (8, 16):
-            raise ConfigError("survey simulator", "bits", self.bits, "8 or 16")
-
-    @property
-    def ping_spacing_m(self) -> float:
-        """Distance between pings along the track."""
-        return self.speed_mps / self.ping_rate_hz
-
-    @property
-    def sample_m(self) -> float:
-        """Slant range of one sample."""
-        return self.range_m / self.samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,8 +128,8 @@ def simulate_survey(spec: SurveySpec, *, speckle: bool = True) -> SimulatedSurve
         ConfigError: More objects than fit with the minimum distance between them.
     """
     # Separate generators: another number of targets does not change seabed, track and noise.
-    seabed_rng, object_rng, track_rng, noise_rng = (
-        np.random.default_rng(s) for s in np.random.SeedSequence(spec.seed).spawn(4)
+    seabed_rng, object_rng, track_rng, noise_rng, settling_rng, receiver_rng = (
+        np.random.default_rng(s) for s in np.random.SeedSequence(spec.seed).spawn(6)
     )
     length_m = spec.ping_spacing_m * (spec.pings - 1)
     reach_m = spec.range_m + _MARGIN_M
@@ -210,24 +139,27 @@ def simulate_survey(spec: SurveySpec, *, speckle: bool = True) -> SimulatedSurve
         across_m=(-reach_m, reach_m),
         cell_m=min(max(spec.range_m / 600, 0.025), 0.15),
         rng=seabed_rng,
+        ripples=RippleOptions(spec.ripple_wavelength_m, spec.ripple_systems, (spec.seed, 1)),
     )
-    objects = _random_objects(spec, length_m, object_rng)
+    current_deg = float(settling_rng.uniform(0, 360))
+    objects = [
+        settled(item, spec.burial, spec.tilt_deg, spec.scour, current_deg, settling_rng)
+        for item in _random_objects(spec, length_m, object_rng)
+    ]
     grounds_m = [place_object(seabed, item) for item in objects]
     track, altitude_m = _simulate_track(spec, seabed, track_rng)
-    sides = {
-        side: _quantised(
-            received_amplitude(echo_intensity(seabed, track, spec, sign), altitude_m, spec, noise_rng, speckle=speckle),
-            spec.bits,
+    amplitudes = {
+        side: received_amplitude(
+            echo_intensity(seabed, track, spec, sign), altitude_m, spec, noise_rng, speckle=speckle
         )
         for side, sign in _SIGN.items()
     }
+    depth_m = spec.water_depth_m - track.height_m
+    varied = varied_amplitudes(amplitudes, depth_m, spec, receiver_rng, speckle=speckle)
+    sides = {side: _quantised(amplitude, spec.bits) for side, amplitude in varied.items()}
     truth = [_truth(spec, track, *pair) for pair in zip(objects, grounds_m, strict=True)]
     truth.sort(key=lambda item: item.ping)
     return SimulatedSurvey(_survey(spec, track, altitude_m, sides), tuple(truth))
-
-
-def _count(objects: int | tuple[ObjectKind, ...]) -> int:
-    return objects if isinstance(objects, int) else len(objects)
 
 
 def _kinds(
@@ -243,6 +175,8 @@ def _kinds(
 def _random_objects(spec: SurveySpec, length_m: float, rng: np.random.Generator) -> list[SeabedObject]:
     """Place objects on both sides at random, away from nadir, from the far edge and from each other."""
     kinds = _kinds(spec.targets, MINE_LIKE_KINDS, rng) + _kinds(spec.clutter, CLUTTER_KINDS, rng)
+    # Structures first: they find no place between many small objects.
+    kinds.sort(key=lambda kind: kind not in STRUCTURE_KINDS)
     inset_m = min(4.0, length_m / 4)
     objects: list[SeabedObject] = []
     for kind in kinds:
@@ -250,13 +184,48 @@ def _random_objects(spec: SurveySpec, length_m: float, rng: np.random.Generator)
             along_m = float(rng.uniform(inset_m, length_m - inset_m))
             ground_m = float(rng.uniform(1.1 * spec.altitude_m, 0.8 * spec.range_m))
             across_m = ground_m if rng.random() < 0.5 else -ground_m
-            if all(math.hypot(along_m - t.along_m, across_m - t.across_m) > _MIN_DISTANCE_M for t in objects):
-                objects.append(random_object(kind, along_m, across_m, rng))
+            if kind in STRUCTURE_KINDS:
+                structure = _limited_height(random_object(kind, along_m, across_m, rng), spec)
+                # The vehicle does not pass over a structure.
+                nearest_m = float(np.min(np.sign(across_m) * _axis_m(structure)[:, 1])) - structure.width_m / 2
+                if nearest_m > 0.5 * spec.altitude_m and all(_gap_m(structure, t) > _MIN_DISTANCE_M for t in objects):
+                    objects.append(structure)
+                    break
+            elif all(_distance_m(t, along_m, across_m) > _MIN_DISTANCE_M for t in objects):
+                objects.append(_limited_height(random_object(kind, along_m, across_m, rng), spec))
                 break
         else:
             expected = f"objects that fit on {length_m:.0f} m of track"
             raise ConfigError("survey simulator", "targets and clutter", len(kinds), expected)
     return objects
+
+
+def _limited_height(item: SeabedObject, spec: SurveySpec) -> SeabedObject:
+    """Return a structure or an object above the seabed, lowered to stay below the vehicle."""
+    if not (item.is_structure or item.kind in SUSPENDED_KINDS):
+        return item
+    lowest_m = item.thickness_m if item.kind in SUSPENDED_KINDS else 0.0
+    return replace(item, height_m=max(min(item.height_m, _TALLEST * spec.altitude_m), lowest_m))
+
+
+def _axis_m(item: SeabedObject) -> FloatArray:
+    """Return points of an object, shape (points, 2), along and across: its centre, or the long axis of a structure."""
+    half_m = item.length_m / 2 if item.is_structure else 0.0
+    at_m = np.linspace(-half_m, half_m, 1 + 2 * math.ceil(half_m))
+    turn = math.radians(item.orientation_deg)
+    return np.stack([item.along_m + at_m * math.cos(turn), item.across_m + at_m * math.sin(turn)], axis=1)
+
+
+def _distance_m(item: SeabedObject, along_m: float, across_m: float) -> float:
+    """Return the distance of a position from the centre of an object, or from the side of a structure."""
+    if not item.is_structure:
+        return math.hypot(along_m - item.along_m, across_m - item.across_m)
+    off = _axis_m(item) - (along_m, across_m)
+    return float(np.hypot(off[:, 0], off[:, 1]).min()) - item.width_m / 2
+
+
+def _gap_m(one: SeabedObject, other: SeabedObject) -> float:
+    return min(_distance_m(other, *map(float, point)) for point in _axis_m(one)) - one.width_m / 2
 
 
 def _smooth_noise(count: int, scale_pings: float, rng: np.random.Generator) -> FloatArray:
@@ -330,7 +299,7 @@ def _truth(spec: SurveySpec, track: Track, item: SeabedObject, ground_m: float) 
     ahead = along * np.cos(track.yaw_rad) + across * np.sin(track.yaw_rad)
     row = int(np.argmin(np.abs(ahead)))
     abeam_m = float(across[row] * math.cos(track.yaw_rad[row]) - along[row] * math.sin(track.yaw_rad[row]))
-    drop_m = float(track.height_m[row]) - ground_m - item.height_m / 2
+    drop_m = float(track.height_m[row]) - ground_m - item.centre_height_m
     slant_m = math.hypot(abeam_m, drop_m)
     position = _geographic_position(spec, item.along_m, item.across_m)
     return TruthObject(
@@ -349,17 +318,6 @@ def _truth(spec: SurveySpec, track: Track, item: SeabedObject, ground_m: float) 
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Track:
-    """Position and attitude of the sonar at each ping, in the strip's coordinates; arrays (pings,), float64."""
-
-    along_m: FloatArray
-    across_m: FloatArray
-    height_m: FloatArray
-    yaw_rad: FloatArray
-    roll_rad: FloatArray
-
-
 def echo_intensity(seabed: Seabed, track: Track, spec: SurveySpec, sign: int) -> FloatImage:
     """Return the mean echo intensity of one side, without speckle and noise: 1 is flat sand at half range.
 
@@ -373,7 +331,7 @@ def echo_intensity(seabed: Seabed, track: Track, spec: SurveySpec, sign: int) ->
     for first in range(0, pings, _CHUNK_PINGS):
         last = min(first + _CHUNK_PINGS, pings)
         image[first:last] = _cast_rays(seabed, track, spec, sign, (first, last))
-    image = gaussian_filter1d(image, _PULSE_SIGMA_SAMPLES, axis=1, mode="constant")
+    image = gaussian_filter1d(image, spec.pulse_sigma_samples, axis=1, mode="constant")
     return _spread_beam(image, spec)
 
 
@@ -389,15 +347,20 @@ def _cast_rays(seabed: Seabed, track: Track, spec: SurveySpec, sign: int, pings:
     ahead, _ = seabed.sampled(along + seabed.cell_m, across)
     slope_along = (ahead - height) / np.float32(seabed.cell_m)
     drop_m = (track.height_m[rows, None] - height).astype(np.float32)
-    insonified = _insonified(drop_m, ground_m.astype(np.float32))
+    insonified: npt.NDArray[np.bool_ | np.floating] = _insonified(drop_m, ground_m.astype(np.float32))
+    sliced = slices(seabed.suspended, track, sign, pings)
+    if sliced:
+        insonified = insonified * unblocked(sliced, drop_m, ground_m)
     slant_m = np.hypot(drop_m, ground_m.astype(np.float32))
     slope = np.gradient(height, np.float32(cell_m), axis=1)
     stretch = np.sqrt(1 + slope**2 + slope_along**2)
     incidence = np.clip((ground_m.astype(np.float32) * slope + drop_m) / (slant_m * stretch), 0, 1)
-    scattered = backscatter * (incidence**2 + np.float32(_SPECULAR) * incidence**_SPECULAR_POWER)
+    echo = scattered(backscatter, incidence)
     depression = np.arctan2(drop_m, ground_m.astype(np.float32)) + sign * track.roll_rad[rows, None]
-    energy = insonified * scattered * stretch * _vertical_beam(depression)
-    binned = _bin_by_range(energy, np.asarray(slant_m / np.float32(spec.sample_m)), spec.samples)
+    energy = insonified * echo * stretch * vertical_beam(depression)
+    binned = bin_by_range(energy, np.asarray(slant_m / np.float32(spec.sample_m)), spec.samples)
+    if sliced:
+        binned += body_echoes(sliced, cell_m, spec)
     # Per unit of slant range, with the gain of the receiver, relative to flat sand at half range.
     centres_m = (np.arange(spec.samples) + 0.5) * spec.sample_m
     gain = (centres_m / (spec.range_m / 2)) ** _TVG_POWER / _CELLS_PER_SAMPLE
@@ -412,30 +375,10 @@ def _insonified(drop_m: FloatImage, ground_m: FloatImage) -> npt.NDArray[np.bool
     return np.asarray(rise >= horizon)
 
 
-def _vertical_beam(depression_rad: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """Return the two-way beam pattern over the depression angle: a broad main lobe and a constant side level."""
-    off = (np.degrees(depression_rad) - _MAIN_LOBE_DEG) / _LOBE_WIDTH_DEG
-    return np.asarray((1 - _BACK_LOBE) * np.exp(-(off**2)) + _BACK_LOBE)
-
-
-def _bin_by_range(energy: npt.NDArray[np.floating], position: npt.NDArray[np.floating], samples: int) -> FloatArray:
-    """Divide the energy of each cell between the two samples next to its slant range (`position`, in samples)."""
-    shifted = position - np.float32(0.5)
-    left = np.floor(shifted).astype(np.int64)
-    share = shifted - left
-    row = np.arange(energy.shape[0], dtype=np.int64)[:, None] * (samples + 2)
-    total = np.zeros(energy.shape[0] * (samples + 2))
-    for index, part in ((left, 1 - share), (left + 1, share)):
-        # One column before and one after the samples collect the energy outside the range.
-        flat = (row + np.clip(index + 1, 0, samples + 1)).ravel()
-        total += np.bincount(flat, weights=(energy * part).ravel(), minlength=total.shape[0])
-    return total.reshape(energy.shape[0], samples + 2)[:, 1:-1]
-
-
 def _spread_beam(image: FloatImage, spec: SurveySpec) -> FloatImage:
     """Blur along the track as the horizontal beam widens with range."""
     centres_m = (np.arange(spec.samples) + 0.5) * spec.sample_m
-    width_m = np.hypot(_APERTURE_M, centres_m * math.radians(_BEAM_WIDTH_DEG))
+    width_m = np.hypot(_APERTURE_M, centres_m * math.radians(spec.beam_width_deg))
     sigma_pings = width_m / 2.355 / spec.ping_spacing_m
     levels = np.linspace(sigma_pings.min(), sigma_pings.max(), 4)
     step = max(float(levels[1] - levels[0]), 1e-9)
@@ -473,7 +416,9 @@ def received_amplitude(
     # Faint clouds of plankton and bubbles in the water column.
     cloud = gaussian_filter1d(gaussian_filter1d(rng.standard_normal(intensity.shape), 30.0, axis=0), 12.0, axis=1)
     water = 0.0004 * np.exp(14.0 * cloud) * (centres * spec.range_m < altitude_m[:, None])
-    drawn_speckle = _speckle(intensity.shape, rng)  # drawn in any case: the draws after it stay the same
+    drawn_speckle = _speckle(
+        intensity.shape, rng, max(0.75, spec.pulse_sigma_samples)
+    )  # drawn in any case: the draws after it stay the same
     power = gain * (intensity + water) * (drawn_speckle if speckle else np.float32(1.0))
     power += noise * rng.standard_exponential(intensity.shape, dtype=np.float32)
     amplitude = np.sqrt(power)
@@ -481,7 +426,7 @@ def received_amplitude(
     return np.asarray(amplitude, dtype=np.float32)
 
 
-def _speckle(shape: tuple[int, ...], rng: np.random.Generator) -> FloatImage:
+def _speckle(shape: tuple[int, ...], rng: np.random.Generator, sigma_samples: float) -> FloatImage:
     """Return multi-look speckle of mean 1, correlated over a pulse length.
 
     Real recordings show an amplitude standard deviation of 0.35 to 0.4 of the mean and a correlation of about 0.4
@@ -489,6 +434,6 @@ def _speckle(shape: tuple[int, ...], rng: np.random.Generator) -> FloatImage:
     """
     total = np.zeros(shape, dtype=np.float32)
     for _ in range(2 * _SPECKLE_LOOKS):
-        field = gaussian_filter1d(rng.standard_normal(shape, dtype=np.float32), 0.75, axis=1, mode="wrap")
+        field = gaussian_filter1d(rng.standard_normal(shape, dtype=np.float32), sigma_samples, axis=1, mode="wrap")
         total += field**2
     return total / np.float32(total.mean())

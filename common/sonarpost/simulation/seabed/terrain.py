@@ -9,7 +9,7 @@ and fork, patches with soft borders, rock outcrops in sand.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
@@ -21,6 +21,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 FloatMap = npt.NDArray[np.float32]
 
 SAND_BACKSCATTER: Final = 0.3
+_TALLEST_RIPPLE_M: Final = 0.12
 
 
 class SeabedKind(StrEnum):
@@ -35,8 +36,33 @@ class SeabedKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class SuspendedBody:
+    """A spheroid above the seabed with a vertical axis: solid, or a cloud of fish.
+
+    Attributes:
+        along_m: Along-track coordinate of its centre.
+        across_m: Across-track coordinate of its centre, starboard positive.
+        height_m: Height of its centre in the strip's coordinates.
+        radius_m: Horizontal radius.
+        half_thickness_m: Vertical radius.
+        backscatter: Lambert coefficient of a solid body; strength of one fish.
+        fish: Number of fish; 0 for a solid body.
+        seed: Seed of the positions of the fish.
+    """
+
+    along_m: float
+    across_m: float
+    height_m: float
+    radius_m: float
+    half_thickness_m: float
+    backscatter: float
+    fish: int = 0
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Seabed:
-    """A strip of seabed. Placing an object changes its arrays.
+    """A strip of seabed. Placing an object changes its arrays, and adds to the bodies above the seabed.
 
     Attributes:
         height_m: Shape (along, across), float32, metres.
@@ -44,6 +70,7 @@ class Seabed:
         cell_m: Size of a cell.
         along_start_m: Along-track coordinate of row 0.
         across_start_m: Across-track coordinate of column 0; starboard is positive.
+        suspended: Bodies above the seabed.
     """
 
     height_m: FloatMap
@@ -51,6 +78,7 @@ class Seabed:
     cell_m: float
     along_start_m: float
     across_start_m: float
+    suspended: list[SuspendedBody] = field(default_factory=list)
 
     def sampled(self, along_m: npt.NDArray[np.float64], across_m: npt.NDArray[np.float64]) -> tuple[FloatMap, FloatMap]:
         """Return height and backscatter at positions, linearly interpolated; beyond the edge they are constant."""
@@ -61,29 +89,49 @@ class Seabed:
 
 
 @dataclass(frozen=True, slots=True)
+class RippleOptions:
+    """Ripples of a seabed.
+
+    Attributes:
+        wavelength_m: Distance between crests of the main ripples; None for a random one of 0.55 to 1.1 m.
+        systems: Number of superposed ripple systems; those after the first have 0.3 to 3 times the wavelength.
+        seed: Seed of the systems after the first.
+    """
+
+    wavelength_m: float | None = None
+    systems: int = 1
+    seed: int | tuple[int, ...] = 0
+
+
+@dataclass(frozen=True, slots=True)
 class _Patch:
     height_m: FloatMap
     backscatter: FloatMap
 
 
 class _TextureGenerator:
-    """Generates textures of one size from one random generator."""
+    """Generates textures of one size from one random generator, and further ripples from a second one."""
 
-    def __init__(self, shape: tuple[int, int], cell_m: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, shape: tuple[int, int], cell_m: float, rng: np.random.Generator, ripples: RippleOptions | None = None
+    ) -> None:
         self._shape = shape
         self._cell_m = cell_m
         self._rng = rng
+        self._ripples = ripples or RippleOptions()
         along = scipy.fft.fftfreq(shape[0], cell_m).astype(np.float32)
         across = scipy.fft.rfftfreq(shape[1], cell_m).astype(np.float32)
         self._wavenumber = np.hypot(along[:, None], across[None, :])
 
-    def fractal(self, exponent: float, longest_m: float, shortest_m: float) -> FloatMap:
+    def fractal(
+        self, exponent: float, longest_m: float, shortest_m: float, rng: np.random.Generator | None = None
+    ) -> FloatMap:
         """Return unit-variance noise with power proportional to wavenumber**-exponent between two wavelengths."""
         k = self._wavenumber
         with np.errstate(divide="ignore"):
             amplitude = np.where(k > 0, k ** np.float32(-exponent / 2), np.float32(0))
         amplitude *= (k >= 1 / longest_m) * np.exp(-((k * np.float32(shortest_m) / 2) ** 2))
-        white = self._rng.standard_normal(self._shape, dtype=np.float32)
+        white = (rng or self._rng).standard_normal(self._shape, dtype=np.float32)
         noise = scipy.fft.irfft2(scipy.fft.rfft2(white) * amplitude, s=self._shape)
         spread = float(noise.std())
         # Without a component in the band, as in a very small strip, the texture is flat.
@@ -95,21 +143,37 @@ class _TextureGenerator:
         return _Patch(height, np.asarray(SAND_BACKSCATTER * np.exp(patches), dtype=np.float32))
 
     def ripples(self) -> _Patch:
-        wavelength_m = self._rng.uniform(0.55, 1.1)
-        direction = self._rng.uniform(-math.pi, math.pi)
+        drawn_m = self._rng.uniform(0.55, 1.1)  # drawn in any case: the draws after it stay the same
+        wavelength_m = self._ripples.wavelength_m or drawn_m
+        profile, relief = self._ripple_system(wavelength_m, self._rng.uniform(-math.pi, math.pi))
+        bed = self.sand()
+        extra_rng = np.random.default_rng(self._ripples.seed)
+        for _ in range(self._ripples.systems - 1):
+            # Crossing ripples, weaker than the first.
+            other_m, direction = wavelength_m * extra_rng.uniform(0.3, 3.0), extra_rng.uniform(-math.pi, math.pi)
+            other, more = self._ripple_system(max(other_m, 0.2), direction, extra_rng)
+            share = np.float32(extra_rng.uniform(0.3, 0.8))
+            profile, relief = profile + share * other, relief + share * more
+        # Coarse grains and shells collect in the troughs.
+        coarse = np.asarray(1.15 - 0.12 * np.clip(profile, -1, 1), dtype=np.float32)
+        return _Patch(relief + np.float32(0.6) * bed.height_m, bed.backscatter * coarse)
+
+    def _ripple_system(
+        self, wavelength_m: float, direction: float, rng: np.random.Generator | None = None
+    ) -> tuple[npt.NDArray[np.floating], FloatMap]:
+        """Return profile and relief of ripples of one wavelength and direction."""
         along = np.arange(self._shape[0], dtype=np.float32)[:, None] * self._cell_m
         across = np.arange(self._shape[1], dtype=np.float32)[None, :] * self._cell_m
         carrier = (along * math.cos(direction) + across * math.sin(direction)) / wavelength_m
         # Strong, slow phase variations make the crests meander, fork and end.
-        phase = 2 * math.pi * carrier + 2.2 * self.fractal(3.5, 16.0, 2.0) + 0.35 * self.fractal(2.0, 2.5, 0.4)
+        slow_m = max(16.0, 14.5 * wavelength_m), max(2.0, 1.8 * wavelength_m)
+        fast_m = max(2.5, 2.2 * wavelength_m), max(0.4, 0.35 * wavelength_m)
+        phase = 2 * math.pi * carrier + 2.2 * self.fractal(3.5, *slow_m, rng) + 0.35 * self.fractal(2.0, *fast_m, rng)
         # Wave ripples have sharp crests and round troughs.
         profile = np.exp(1.1 * np.sin(phase)) - 1.26
-        strength = np.clip(0.75 + 0.35 * self.fractal(3.0, 20.0, 3.0), 0.15, 1.3)
-        relief = np.asarray(wavelength_m / 38 * strength * profile, dtype=np.float32)
-        bed = self.sand()
-        # Coarse grains and shells collect in the troughs.
-        coarse = np.asarray(1.15 - 0.12 * np.clip(profile, -1, 1), dtype=np.float32)
-        return _Patch(relief + np.float32(0.6) * bed.height_m, bed.backscatter * coarse)
+        strength = np.clip(0.75 + 0.35 * self.fractal(3.0, 20.0, 3.0, rng), 0.15, 1.3)
+        relief = np.asarray(min(wavelength_m / 38, _TALLEST_RIPPLE_M) * strength * profile, dtype=np.float32)
+        return profile, relief
 
     def gravel(self) -> _Patch:
         stones = np.clip(self.fractal(0.8, 0.8, 0.12) - 0.9, 0, None) * 0.055
@@ -177,6 +241,7 @@ def make_seabed(
     across_m: tuple[float, float],
     cell_m: float,
     rng: np.random.Generator,
+    ripples: RippleOptions | None = None,
 ) -> Seabed:
     """Generate a seabed.
 
@@ -186,6 +251,7 @@ def make_seabed(
         across_m: First and last across-track coordinate to cover, starboard positive.
         cell_m: Size of a cell.
         rng: Random generator; the same state gives the same seabed.
+        ripples: Ripples of `RIPPLES` and of the patches of `MIXED`; None: the default options.
 
     Raises:
         ValueError: An empty strip, or one of more than 200 million cells.
@@ -197,7 +263,7 @@ def make_seabed(
         raise ValueError(f"strip: got {size[0]} x {size[1]} cells, expected at most 200 million (memory)")
     # Lengths with small prime factors make the Fourier transforms fast.
     rows, columns = (scipy.fft.next_fast_len(n, real=True) for n in size)
-    patch = _TextureGenerator((rows, columns), cell_m, rng).generate(kind)
+    patch = _TextureGenerator((rows, columns), cell_m, rng, ripples).generate(kind)
     # Relief is smooth below a few centimetres.
     height = gaussian_filter(patch.height_m, 0.02 / cell_m)
     return Seabed(
