@@ -45,7 +45,8 @@ class LevelGrid:
         row_along_m: Distance between two pings.
         row_is_measured: False if the file has no speed or track and `row_along_m` is the assumed one.
         water_echo: Shape (pings, cells up to the greatest first return), float32: echo in the water above that of the
-            usual ping at this range, over the median echo of the nearest 5 m of seabed; 0 outside the water. None for an image.
+            usual ping at this range, over the median echo of the nearest 5 m of seabed; 0 outside the water. None for
+            an image.
     """
 
     side: Side

@@ -1,6 +1,6 @@
 """Fit the calibration of a trained network to simulated surveys.
 
-    python -m research.training.detection.calibrate --network network.npz --out common/sonarpost/detection/classifier.npz
+    python -m research.training.detection.calibrate --network network.npz --out classifier.npz
 
 A slope for all outputs and an offset for each class are fitted by maximum likelihood to the contacts of surveys that
 took no part in the training: seeds from 21,000 on, of every seabed, with four mine-like and six other objects each.
