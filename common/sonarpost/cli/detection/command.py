@@ -75,7 +75,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "--threshold",
         type=float,
         metavar="CONFIDENCE",
-        help="minimum confidence, 0 to 2 (default: that of --settings, else 1.0)",
+        help="minimum confidence, 0 to 2 (default: that of --settings, else 0.5)",
     )
     parser.add_argument(
         "--max-contacts", type=int, metavar="N", help="list at most the N most confident contacts of a file"
