@@ -7,7 +7,15 @@ from collections import Counter
 from collections.abc import Callable
 from itertools import count
 
-from sonarpost.modem.micromodem import RATES, FrameDecoded, MicroModem, ModemEvent, nmea
+from sonarpost.modem.micromodem import (
+    RATES,
+    FrameDecoded,
+    MicroModem,
+    ModemEvent,
+    TransmissionEnded,
+    TransmissionStarted,
+    nmea,
+)
 from sonarpost.modem.micromodem.sentences import Cycle
 
 DropRule = Callable[[nmea.Sentence, int], bool]
@@ -48,6 +56,7 @@ class FakeModem:
         self.restarts = 0
         self.events: list[ModemEvent] = []
         self.frames_decoded: list[FrameDecoded] = []
+        self.marks: list[TransmissionStarted | TransmissionEnded] = []
         self.received: list[nmea.Sentence] = []
         self.transmitted: list[tuple[bytes, ...]] = []
         self.unresponsive = False
@@ -77,9 +86,11 @@ class FakeModem:
         self._store(self.driver.receive(data, self.now))
 
     def _store(self, events: list[ModemEvent]) -> None:
-        """Store the events, `FrameDecoded` separately."""
+        """Store the events, those of frames and transmissions in progress separately."""
         self.frames_decoded += [event for event in events if isinstance(event, FrameDecoded)]
-        self.events += [event for event in events if not isinstance(event, FrameDecoded)]
+        self.marks += [event for event in events if isinstance(event, (TransmissionStarted, TransmissionEnded))]
+        separate = (FrameDecoded, TransmissionStarted, TransmissionEnded)
+        self.events += [event for event in events if not isinstance(event, separate)]
 
     def schedule(self, delay_s: float, action: Callable[[], None]) -> None:
         heapq.heappush(self._due, (self.now + delay_s, next(self._order), action))

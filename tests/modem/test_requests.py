@@ -8,6 +8,7 @@ import pytest
 
 from sonarpost.errors import FrameError
 from sonarpost.modem.micromodem import (
+    RATES,
     ClockConfirmed,
     FailureReason,
     FlexibleDataReceived,
@@ -27,6 +28,8 @@ from sonarpost.modem.micromodem import (
     SentenceRejected,
     SettingUnconfirmed,
     StatisticsReceived,
+    TransmissionEnded,
+    TransmissionStarted,
     nmea,
 )
 
@@ -69,9 +72,10 @@ def test_unsolicited_short_packets_are_reported() -> None:
 
 def test_bytes_and_events_of_each_request() -> None:
     driver = ready()
+    on_air = [TransmissionStarted(RATES[0].airtime_s), TransmissionEnded(RATES[0].airtime_s)]
     driver.ping(2, 1.0)
     assert driver.bytes_to_send() == b"$CCMPC,1,2*5D\r\n"
-    assert receive(driver, "CAMPC,1,2", "CATXP,0", "CATXF,0", "CARXP,0") == []
+    assert receive(driver, "CAMPC,1,2", "CATXP,0", "CATXF,0", "CARXP,0") == on_air
     assert receive(driver, "CAMPR,2,1,0.0667") == [PingAnswered(2, 1, 0.0667), RequestDone(1, "ping", 2)]
     assert any(isinstance(e, StatisticsReceived) for e in receive(driver, "CACST,6,0,20250606230123.348554"))
     driver.send_mini(2, 5, 2.0)
@@ -79,10 +83,11 @@ def test_bytes_and_events_of_each_request() -> None:
     assert receive(driver, "CAMUR,2,1") == [MiniPacketAnswered(2, 1), RequestDone(2, "mini-packet", 2)]
     driver.send_flexible(2, 1, b"\x01\xff", 3.0)
     assert driver.bytes_to_send().startswith(b"$CCTDP,2,1,0,0,01FF*")
-    assert receive(driver, "CATDP,0,1,2,1,0,0,2", "CATXP,2", "CATXF,2") == [RequestDone(3, "flexible data", 2)]
+    events = receive(driver, "CATDP,0,1,2,1,0,0,2", "CATXP,2", "CATXF,2")
+    assert events == [*on_air, RequestDone(3, "flexible data", 2)]
     driver.request_packet(2, 4, now=4.0)
     assert driver.bytes_to_send().startswith(b"$CCCYC,0,2,1,4,0,2*")
-    assert receive(driver, "CACYC,0,2,1,4,0,2", "CATXP,0", "CATXF,0") == []
+    assert receive(driver, "CACYC,0,2,1,4,0,2", "CATXP,0", "CATXF,0") == on_air
     events = receive(driver, "CARXP,1", "CACYC,0,2,1,4,0,2", "CARXD,2,1,0,1,AA", "CACST,6,0,,,,,,,,,,,,4,2,1,0,3,1,0")
     assert [type(e) for e in events[1:]] == [FrameReceived, PacketReceived, RequestDone]
 

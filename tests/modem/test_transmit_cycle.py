@@ -17,6 +17,8 @@ from sonarpost.modem.micromodem import (
     PacketFailed,
     PacketSent,
     SentenceRejected,
+    TransmissionEnded,
+    TransmissionStarted,
     UnhandledSentence,
     nmea,
 )
@@ -51,8 +53,9 @@ def test_bytes_of_a_complete_cycle() -> None:
     assert driver.receive(b"$CACYC,0,2,1,0,1,1\r\n", 1.1) == []
     assert driver.receive(b"$CADRQ,000001,2,1,1,32,1\r\n", 1.2) == []
     assert driver.bytes_to_send() == b"$CCTXD,2,1,1,00FF41*7F\r\n"
-    for line in (b"$CATXD,2,1,1,3\r\n", b"$CATXP,3\r\n", b"$CATXF,3\r\n"):
-        assert driver.receive(line, 2.0) == []
+    assert driver.receive(b"$CATXD,2,1,1,3\r\n", 2.0) == []
+    assert driver.receive(b"$CATXP,3\r\n", 2.0) == [TransmissionStarted(RATES[0].airtime_s)]
+    assert driver.receive(b"$CATXF,3\r\n", 2.0) == [TransmissionEnded(RATES[0].airtime_s)]
     assert driver.receive(b"$CAXST,7,20250606,230117.336548,3,0,200,5000,25000,0,2,1,1,1,1,1,3\r\n", 5.0) == []
     *_, sent = driver.receive(b"$CAACK,1,2,1,1\r\n", 9.0)
     assert isinstance(sent, PacketSent)
@@ -71,6 +74,9 @@ def test_full_packet_of_every_rate(rate: int) -> None:
     assert modem.transmitted == [tuple(frames)]
     (sent,) = modem.events
     assert sent.frames == tuple(frames)
+    airtime_s = RATES[rate].airtime_s
+    # At rate 0 a header is transmitted before the packet.
+    assert modem.marks[-2:] == [TransmissionStarted(airtime_s), TransmissionEnded(airtime_s)]
     assert modem.driver.queued == 0
 
 

@@ -31,8 +31,10 @@ from sonarpost.modem.micromodem.events import (
     SentenceRejected,
     SettingUnconfirmed,
     StatisticsReceived,
+    TransmissionEnded,
     TransmissionFailing,
     TransmissionRecovered,
+    TransmissionStarted,
     UnhandledSentence,
 )
 from sonarpost.modem.micromodem.rates import RATES, Rate
@@ -78,8 +80,10 @@ __all__ = [
     "SentenceRejected",
     "SettingUnconfirmed",
     "StatisticsReceived",
+    "TransmissionEnded",
     "TransmissionFailing",
     "TransmissionRecovered",
+    "TransmissionStarted",
     "TransmitStatistics",
     "UnhandledSentence",
 ]

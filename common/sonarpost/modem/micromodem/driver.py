@@ -28,6 +28,8 @@ from sonarpost.modem.micromodem.events import (
     PollReceived,
     RequestFailed,
     SentenceRejected,
+    TransmissionEnded,
+    TransmissionStarted,
     UnhandledSentence,
 )
 from sonarpost.modem.micromodem.nmea import FieldReader, LineAssembler, Sentence
@@ -414,6 +416,9 @@ class MicroModem:
 
     def _on_transmission(self, sentence: Sentence, now: float) -> None:
         mark = TransmitMark.parse(sentence)
+        # The nominal duration of a request and of an automatic reply is that of a packet of rate 0.
+        airtime_s = RATES[self._cycle.packet.rate if self._cycle is not None else 0].airtime_s
+        self._events.append(TransmissionEnded(airtime_s) if mark.ends else TransmissionStarted(airtime_s))
         if self._exchange is not None:
             self._exchange.on_transmission(mark, now)
         else:

@@ -78,6 +78,28 @@ class ModemRebooted:
 
 
 @dataclass(frozen=True, slots=True)
+class TransmissionStarted:
+    """The modem has begun to transmit: a packet, a request or an automatic reply.
+
+    Attributes:
+        airtime_s: Nominal duration.
+    """
+
+    airtime_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class TransmissionEnded:
+    """The modem has ended a transmission. The report of its start may have been lost.
+
+    Attributes:
+        airtime_s: Nominal duration.
+    """
+
+    airtime_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class TransmissionFailing:
     """The modem answers, but several packets in a row have failed. Reported once until `TransmissionRecovered`.
 
@@ -326,6 +348,8 @@ ModemEvent = (
     ModemReady
     | ModemUnresponsive
     | ModemRebooted
+    | TransmissionStarted
+    | TransmissionEnded
     | TransmissionFailing
     | TransmissionRecovered
     | RestartRequested
