@@ -228,6 +228,15 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "counters": [{"n": -1}, {"n": 2**63}],
         "gauges": [{"n": NAN}, {"n": -INF}],
     },
+    SAMPLES["transmission"].__class__: {
+        "start_utc_s": NO_TIME,
+        "end_utc_s": [*NO_TIME, 1476262801.0, 1476263102.0],
+    },
+    SAMPLES["transmissions"].__class__: {
+        "platform_id": NO_NAME,
+        "time_utc_s": NO_TIME,
+        "transmissions": [(SAMPLES["transmission"],) * 1001, ({"start_utc_s": 2.0, "end_utc_s": 1.0},)],
+    },
 }
 # Fields that accept every value of their type, or that are records themselves.
 ANY_VALUE = {

@@ -81,6 +81,14 @@ def acoustic_queue_everywhere() -> str:
     return f"{ROOT}/*/acoustic/queue"
 
 
+def acoustic_transmissions(vehicle: str) -> str:
+    """The times at which the vehicle's modem transmitted; uuv_modem also replies to a query with the record.
+
+    Record: transmissions. From: uuv_modem. To: atd_stub, watchers. Delivery: plain, priority 5.
+    """
+    return _of(vehicle, "acoustic/transmissions")
+
+
 def acoustic_downlink(vessel: str) -> str:
     """The progress of a command or decision on its way to a vehicle.
 

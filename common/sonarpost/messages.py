@@ -42,6 +42,9 @@ DownlinkKind = Literal["refine", "resend", "revisit", "decision", "wider", "orig
 DownlinkStep = Literal["asked", "sent", "confirmed", "refused", "expired"]
 ServiceState = Literal["starting", "ok", "degraded", "stopping"]
 
+MAX_TRANSMISSION_S: Final = 300.0
+"""Longer than any transmission of a modem; a longer one in a record means damage."""
+
 _IMAGE_OF_COMMAND: Final = {
     "refine": "the image to refine",
     "resend": "the image to resend",
@@ -500,6 +503,45 @@ class QueueState(Record):
     images_waiting: Count
     images: Annotated[tuple[QueuedImage, ...], Field(max_length=500)]
     images_accepted: Count | None = None
+
+
+class Transmission(Record):
+    """One transmission of a modem.
+
+    Attributes:
+        start_utc_s: Start.
+        end_utc_s: End, at most 300 s later; the nominal one while the transmission is in progress.
+    """
+
+    TYPE: ClassVar[str] = "transmission"
+
+    start_utc_s: Time
+    end_utc_s: Time
+
+    @field_validator("end_utc_s")
+    @classmethod
+    def _check_end(cls, end_utc_s: float, info: ValidationInfo) -> float:
+        start_utc_s = info.data.get("start_utc_s")
+        if start_utc_s is not None and not start_utc_s <= end_utc_s <= start_utc_s + MAX_TRANSMISSION_S:
+            raise ValueError(f"a time from start_utc_s to {MAX_TRANSMISSION_S:g} s later")
+        return end_utc_s
+
+
+class Transmissions(Record):
+    """The latest transmissions of a vehicle's modem, published at the start and at the end of each.
+
+    Attributes:
+        platform_id: The vehicle.
+        time_utc_s: Time of this record, by the clock that the transmissions are timed with.
+        transmissions: Those of the last 30 minutes since uuv_modem has started, oldest first. One with the start of an
+            earlier record replaces the earlier one.
+    """
+
+    TYPE: ClassVar[str] = "transmissions"
+
+    platform_id: PlatformId
+    time_utc_s: Time
+    transmissions: Annotated[tuple[Transmission, ...], Field(max_length=1000)]
 
 
 class ReceivedMessage(Record):

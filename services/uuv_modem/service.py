@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Final
 
+import zenoh
+
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem
@@ -29,6 +31,7 @@ from sonarpost.runtime.modem_service import ModemService, sent_frames
 from sonarpost.runtime.service import UnitOfWork
 from sonarpost.security.acoustic_key import key_warning
 from sonarpost.services.uuv_modem.config import UuvModemConfig
+from sonarpost.services.uuv_modem.transmissions import TransmissionLog
 from sonarpost.services.uuv_modem.vehicle_endpoint import VehicleEndpoint
 
 log = logging.getLogger(__name__)
@@ -70,6 +73,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
             raise
         self._mac = config.new_mac()
         self._failed_packets = self.interval_log(log, logging.WARNING, "Packet not sent; retrying")
+        self._transmissions = TransmissionLog()
         self._events: queue.SimpleQueue[ModemEvent | None] = queue.SimpleQueue()
         self._unsaved: list[Callable[[], None]] = []  # changes of the endpoint that are not committed yet
         self._packet_id: int | None = None  # the packet that the modem is sending
@@ -98,6 +102,8 @@ class UuvModemService(ModemService[UuvModemConfig]):
 
     def on_start(self) -> None:
         """Open the port and start the link's thread."""
+        # Before the port is opened: a subscriber that starts later asks for the transmissions it has missed.
+        self.session.declare_queryable(keys.acoustic_transmissions(self.platform.id), self._reply_transmissions)
         super().on_start()
         if self.config.mac == "polled" and self.config.link == "v1":
             self.modem.set_poll_handler(self._answer_poll)
@@ -141,8 +147,17 @@ class UuvModemService(ModemService[UuvModemConfig]):
     # Events of the modem
 
     def on_modem_event(self, event: ModemEvent) -> None:
-        """Pass an event to the link's thread."""
+        """Publish the start or end of a transmission, and pass the event to the link's thread."""
+        now_utc_s = time.time()
+        if self._transmissions.on_event(event, now_utc_s, time.monotonic()):
+            record = self._transmissions.record(self.platform.id, now_utc_s)
+            self.publish(keys.acoustic_transmissions(self.platform.id), record)
         self._events.put(event)
+
+    def _reply_transmissions(self, query: zenoh.Query) -> None:
+        """Reply with the latest transmissions; called in a thread of Zenoh."""
+        record = self._transmissions.record(self.platform.id, time.time())
+        query.reply(query.key_expr, wire.encode(record), encoding=wire.encoding_of(type(record)))
 
     def _answer_poll(self, poll: PollReceived) -> Sequence[bytes]:
         """Return the frames for another modem that polls this one; called in the modem's thread."""

@@ -23,6 +23,8 @@ from sonarpost.messages import (
     Relayed,
     Snippet,
     TaskingState,
+    Transmission,
+    Transmissions,
 )
 
 BARE_CONTACT = Contact(contact_id="c1", vehicle_id="uuv-1")
@@ -172,6 +174,16 @@ SAMPLES: dict[str, Record] = {
         images_waiting=0,
         images=(),
     ),
+    "transmission": Transmission(start_utc_s=1476262801.25, end_utc_s=1476262807.5),
+    "transmissions": Transmissions(
+        platform_id="uuv-1",
+        time_utc_s=1476262812.0,
+        transmissions=(
+            Transmission(start_utc_s=1476262801.25, end_utc_s=1476262807.5),
+            Transmission(start_utc_s=1476262811.5, end_utc_s=1476262817.75),
+        ),
+    ),
+    "transmissions-none": Transmissions(platform_id="uuv-1", time_utc_s=1476262812.0, transmissions=()),
     "contact-full": FULL_CONTACT,
     "contact-bare": BARE_CONTACT,
     "raster-8-bits": RASTER_8,

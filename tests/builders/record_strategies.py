@@ -29,6 +29,8 @@ from sonarpost.messages import (
     Relayed,
     Snippet,
     TaskingState,
+    Transmission,
+    Transmissions,
 )
 
 _LOWER = string.ascii_lowercase + string.digits
@@ -313,6 +315,17 @@ STRATEGIES[QueueState] = st.builds(
     images_waiting=_count,
     images=st.lists(STRATEGIES[QueuedImage], max_size=3).map(tuple),
     images_accepted=_maybe(_count),
+)
+STRATEGIES[Transmission] = st.builds(
+    lambda start_utc_s, length_s: Transmission(start_utc_s=start_utc_s, end_utc_s=start_utc_s + length_s),
+    start_utc_s=_real(0, 4e9),
+    length_s=_real(0, 299),
+)
+STRATEGIES[Transmissions] = st.builds(
+    Transmissions,
+    platform_id=_name,
+    time_utc_s=_time,
+    transmissions=st.lists(STRATEGIES[Transmission], max_size=3).map(tuple),
 )
 
 any_record: st.SearchStrategy[Record] = st.one_of(*STRATEGIES.values())
