@@ -17,7 +17,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, islice
 from typing import Final, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -122,10 +122,15 @@ class StreamEnd(Generic[T]):
         """Return this end after its held contacts were given: they are not given again."""
         return replace(self, reported=(*self.reported, *(contact.place for contact in self.held)), held=())
 
-    def continued_by(self, first: Ping) -> StreamEnd[T] | None:
+    def continued_by(self, first: Ping, sounded: Ping | None = None) -> StreamEnd[T] | None:
         """Return the part of this end before `first`, the first ping of another file of the same sonar.
 
-        A recorder may repeat the last pings at the beginning of the next file; the repeated ones are left out.
+        A recorder may repeat the last pings at the beginning of the next file; the repeated ones are left out. The
+        channels are compared at the pings nearest the boundary that have channels: masked pings have none.
+
+        Args:
+            first: The first ping.
+            sounded: The first ping with channels; None if it is `first`, or unknown.
 
         Returns:
             None if that file does not continue the recording: the gap exceeds three ping intervals (at least one
@@ -139,7 +144,11 @@ class StreamEnd(Generic[T]):
         interval_s = float(np.median(np.diff(times))) if count > 1 else 0.0
         if first.time_utc_s - last.time_utc_s > max(_MIN_GAP_LIMIT_S, _GAP_LIMIT_INTERVALS * interval_s):
             return None
-        if not (_same_channels(last, first) and _is_near(last, first)):
+        ours = next((ping for ping in reversed(self.pings[:count]) if ping.channels), None)
+        theirs = first if sounded is None else sounded
+        if ours is not None and theirs.channels and not _same_channels(ours, theirs):
+            return None
+        if not _is_near(last, first):
             return None
         return replace(self, pings=self.pings[:count], origins=self.origins[:count])
 
@@ -228,11 +237,16 @@ class StreamDetector(Generic[T]):
             SurveyFileError: The file has changed or cannot be read. The state is unchanged.
         """
         pings = source.pings()
-        first = next(pings)
+        # Pings without channels hold no samples.
+        begin: list[Ping] = []
+        for ping in islice(pings, STRIP_PINGS):
+            begin.append(ping)
+            if ping.channels:
+                break
         end = self._ends.get(source.info.sonar_id)
-        previous = end.continued_by(first) if end is not None else None
+        previous = end.continued_by(begin[0], begin[-1]) if end is not None else None
         search_of_file = _FileSearch(source, origin, previous, self._describe, self._settings)
-        new_end = search_of_file.run(chain((first,), pings))
+        new_end = search_of_file.run(chain(begin, pings))
         released = () if end is None or previous is not None else end.held
         self._ends.pop(new_end.sonar_id, None)
         self._ends[new_end.sonar_id] = new_end
