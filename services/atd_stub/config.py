@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 from sonarpost.codec.fitting import Fit
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX
 from sonarpost.detection.settings import DetectorSettings, DetectorTuning
+from sonarpost.detection.transmissions import MARGIN_AFTER_S, MARGIN_BEFORE_S
 from sonarpost.errors import ConfigError
 from sonarpost.runtime.retention import MaxBytes, RetentionConfig
 from sonarpost.sonar.options import SurveyOptions, load_options
@@ -35,6 +36,12 @@ class AtdStubConfig(RetentionConfig, SurveyOptions):
             the overlap between parts of a long file. Twice a snippet's height is enough.
         join_timeout_s: How long a contact in the later half of these pings waits for the continuation file; 0 releases
             it at once.
+        mask_transmissions: Whether pings that were recorded while the own modem transmitted are masked: no contact is
+            detected in them.
+        mask_before_s: Time before each transmission that is masked too: the tolerance of its reported start.
+        mask_after_s: Time after each transmission that is masked too, for its reverberation.
+        transmissions_file: JSON file to which the transmissions of the last 24 hours are written every minute, for
+            `--transmissions` of `sonarpost detect`; by default none.
         snippet_height_px: Rows (along-track) of a snippet.
         snippet_width_px: Columns (across-track) of a snippet.
         snippet_pixel_m: Side of a snippet's pixels on the ground; 0 for the sonar's own, ping by sample.
@@ -61,6 +68,10 @@ class AtdStubConfig(RetentionConfig, SurveyOptions):
     detector: DetectorTuning = DetectorTuning()
     join_overlap_pings: Annotated[int, Field(ge=0, le=900)] = 200
     join_timeout_s: Annotated[float, Field(ge=0, le=86400)] = 0.0
+    mask_transmissions: bool = True
+    mask_before_s: Annotated[float, Field(ge=0, le=60)] = MARGIN_BEFORE_S
+    mask_after_s: Annotated[float, Field(ge=0, le=60)] = MARGIN_AFTER_S
+    transmissions_file: Path | None = None
     snippet_height_px: SidePx = 80
     snippet_width_px: SidePx = 140
     snippet_pixel_m: Annotated[float, Field(ge=0, le=10)] = 0.0

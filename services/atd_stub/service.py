@@ -16,6 +16,7 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.detection.detector import counts_text
+from sonarpost.detection.transmissions import WARNING_SHARE
 from sonarpost.errors import DeliveryError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.logs import kv
@@ -35,6 +36,7 @@ from sonarpost.services.atd_stub.input_folder import (
 from sonarpost.services.atd_stub.release import ContactRelease
 from sonarpost.services.atd_stub.snippet_files import SNIPPET_SUFFIXES, read_snippet, write_snippet
 from sonarpost.services.atd_stub.survey_detection import DetectionResult, detect_in_survey
+from sonarpost.services.atd_stub.transmissions import TransmissionLog
 from sonarpost.sonar.image_files import IMAGE_SUFFIXES
 from sonarpost.sonar.readers import single_file_suffixes
 
@@ -62,20 +64,30 @@ class AtdStubService(Service[AtdStubConfig]):
         self._files_waiting = -1
         self._release = ContactRelease(platform, self.store, config.max_in_flight, self.commit)
         self._file_ends = FileEndStore(self.store)
+        malformed = self.interval_log(log, logging.WARNING, "Ignoring malformed transmissions")
+        self._transmissions = TransmissionLog(self.store, self.commit, self.count, malformed, config.transmissions_file)
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Not called: this service consumes no records."""
         raise NotImplementedError("atd_stub consumes no records")
 
     def on_start(self) -> None:
-        """Subscribe to the state of the transmit queue, and start to poll and to release."""
+        """Subscribe to the transmit queue and the transmissions of the modem, and start to poll and to release."""
         self._release.subscribe(self.session)
+        if self._masks:
+            self._transmissions.subscribe(self.session, self.platform.id)
         self.start_thread(self._poll, "poll")
         self.start_thread(lambda: self._release.run(self.stopping), "release")
 
     def on_stop(self) -> None:
-        """Wake the release thread, so that it ends."""
+        """Wake the release thread, so that it ends, and store the transmissions."""
         self._release.wake()
+        if self._masks:
+            self._transmissions.save_at_stop()
+
+    @property
+    def _masks(self) -> bool:
+        return self.config.mask_transmissions and self.config.mode == "survey"
 
     def gauges(self) -> Mapping[str, float]:
         """Return the numbers of files (-1 before the first poll) and contacts that wait."""
@@ -84,6 +96,7 @@ class AtdStubService(Service[AtdStubConfig]):
             "contacts_waiting": float(self._release.pending + self._file_ends.held_count),
             "contacts_held": float(self._file_ends.held_count),
             "contacts_in_flight": float(self._release.in_flight),
+            "transmissions_known": float(len(self._transmissions)),
         }
 
     def degraded_reason(self) -> str:
@@ -107,6 +120,8 @@ class AtdStubService(Service[AtdStubConfig]):
             try:
                 self._release_expired_contacts()
                 self._process_folder()
+                if self._masks:
+                    self._transmissions.save(time.monotonic())
                 self._apply_retention(time.time())
             except (OSError, DeliveryError) as error:
                 self.set_degraded(f"{type(error).__name__}: {error}")
@@ -217,13 +232,18 @@ class AtdStubService(Service[AtdStubConfig]):
         if self.config.mode == "snippets":
             file = read_snippet(path, content, self.platform.id, self.config.fit)
             return DetectionResult((file.snippet,), contact_count=1, warnings=file.notes)
-        return detect_in_survey(path, content, self.platform.id, self.config, self._file_ends.by_sonar())
+        config, transmissions = self.config, None
+        if self._masks:
+            transmissions = self._transmissions.intervals(config.mask_before_s, config.mask_after_s)
+        return detect_in_survey(path, content, self.platform.id, config, self._file_ends.by_sonar(), transmissions)
 
     def _commit_result(self, path: Path, content: str, result: DetectionResult, duration_s: float) -> None:
         effects = UnitOfWork()
         entry = {"file": printable(path.name), "contacts": result.contact_count, "processed_utc_s": time.time()}
         effects.put_state(_state_name(content), msgpack.packb(entry))
         effects.count("files_processed")
+        if result.masked_pings:
+            effects.count("pings_masked", result.masked_pings)
         if result.ends is not None:
             self._file_ends.put(effects, result.ends, time.time() + self.config.join_timeout_s)
         self._commit_contacts(effects, (*result.snippets, *result.not_continued))
@@ -237,6 +257,7 @@ class AtdStubService(Service[AtdStubConfig]):
                 file=path.name,
                 contacts=result.contact_count,
                 joined=result.joined,
+                masked_pings=result.masked_pings,
                 duration_s=duration_s,
                 **counts,
             ),
@@ -253,6 +274,11 @@ class AtdStubService(Service[AtdStubConfig]):
             log.info(
                 "Contact held for continuation file",
                 extra=kv(contact_id=snippet.contact.contact_id, file=snippet.source, wait_s=self.config.join_timeout_s),
+            )
+        if result.masked_share > WARNING_SHARE:
+            log.warning(
+                "Most pings masked: the modem transmitted during the recording",
+                extra=kv(file=path.name, share=round(result.masked_share, 2), pings=result.masked_pings),
             )
         message = "Survey reader warning" if self.config.mode == "survey" else "Image file warning"
         for warning in result.warnings:

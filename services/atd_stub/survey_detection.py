@@ -12,6 +12,7 @@ from sonarpost.detection.detector import Detection
 from sonarpost.detection.record import contact_record
 from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamDetector, StreamEnd
+from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals
 from sonarpost.messages import Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.sonar.readers import open_survey
@@ -38,6 +39,8 @@ class DetectionResult:
         warnings: Warnings of the reader.
         weaker: What lower thresholds would have given: the number of contacts, by confidence. Approximate at the
             boundaries of files and of strips.
+        masked_pings: Number of pings that were recorded during a transmission of the own modem.
+        masked_share: The same as a share of the pings of the file, 0 to 1.
     """
 
     snippets: tuple[Snippet, ...]
@@ -50,10 +53,17 @@ class DetectionResult:
     dropped: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     weaker: Mapping[float, int] = field(default_factory=dict)
+    masked_pings: int = 0
+    masked_share: float = 0.0
 
 
 def detect_in_survey(
-    path: Path, content: str, vehicle_id: str, config: AtdStubConfig, ends: Mapping[str, SurveyEnd] | None = None
+    path: Path,
+    content: str,
+    vehicle_id: str,
+    config: AtdStubConfig,
+    ends: Mapping[str, SurveyEnd] | None = None,
+    transmissions: TransmitIntervals | None = None,
 ) -> DetectionResult:
     """Detect the contacts of a survey file.
 
@@ -63,6 +73,7 @@ def detect_in_survey(
         vehicle_id: This vehicle.
         config: Settings of the detector, size of the snippets, and what the file does not contain.
         ends: Ends of earlier recordings, by sonar.
+        transmissions: Times whose pings are masked; None for none.
 
     Raises:
         SurveyFileError: The file is not a readable survey.
@@ -74,7 +85,8 @@ def detect_in_survey(
     detector = StreamDetector(describe, config.detector_settings(), ends)
     with open_survey(path, config) as source:
         info = source.info
-        found = detector.add_file(source, FileOrigin.of(source, content))
+        masked = MaskedSource(source, transmissions or TransmitIntervals())
+        found = detector.add_file(masked, FileOrigin.of(source, content))
     # Contacts are held only while they wait for a continuation.
     at_once = detector.release(info.sonar_id) if config.join_timeout_s == 0 else ()
     ready = sorted(snippets_of((*found.contacts, *at_once)), key=_descending_confidence)
@@ -89,6 +101,8 @@ def detect_in_survey(
         dropped=tuple(snippet.contact.contact_id for snippet in snippets_of(found.dropped)),
         warnings=info.warnings,
         weaker=found.weaker,
+        masked_pings=masked.masked_count,
+        masked_share=masked.masked_share,
     )
 
 
