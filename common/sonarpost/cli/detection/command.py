@@ -17,6 +17,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 from pydantic import ValidationError
 
+from sonarpost.cli.detection.transmissions import add_transmission_options, transmissions_of
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import (
     Subparsers,
@@ -31,6 +32,7 @@ from sonarpost.detection.record import contact_record
 from sonarpost.detection.settings import DetectorSettings, checked_settings, load_settings
 from sonarpost.detection.snippets import cut_snippet, ground_projected_image
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamDetector
+from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.messages import Contact
@@ -83,6 +85,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--settings", type=Path, metavar="FILE.toml", help="settings of the detector, as in [atd_stub.detector]"
     )
+    add_transmission_options(parser)
     add_survey_options(parser)
     parser.add_argument("--vehicle", default="uuv", metavar="ID", help="vehicle_id of the records (default: uuv)")
     parser.set_defaults(run=run)
@@ -93,13 +96,15 @@ def run(parsed: argparse.Namespace) -> int:
     settings = _settings(parsed)
     _check_vehicle_id(parsed.vehicle)
     options = survey_options_of(parsed)
+    transmissions = transmissions_of(parsed)
     files: list[Path] = parsed.files
     if parsed.plot is not None:
         in_new_folder(parsed.plot)
     if parsed.snippets is not None:
         make_output_folder(parsed.snippets)
     with ProgressDisplay() as display:
-        detection = _Detection(settings, options, parsed.vehicle, with_images=parsed.snippets is not None)
+        with_images = parsed.snippets is not None
+        detection = _Detection(settings, options, parsed.vehicle, transmissions, with_images=with_images)
         results = detection.run(files, display)
     for result in results:
         if not parsed.json:
@@ -156,12 +161,13 @@ class ListedContact:
 
 @dataclass
 class FileListing:
-    """A file, its contacts, their number at lower thresholds, and the time of the detection."""
+    """A file, its contacts, their number at lower thresholds, the time of the detection, and the masked pings."""
 
     info: SurveyInfo
     origin: FileOrigin
     weaker: Mapping[float, int]
     seconds: float
+    masked_pings: int
     contacts: list[ListedContact] = field(default_factory=list)
 
 
@@ -169,9 +175,16 @@ class _Detection:
     """The detection in the files of one call."""
 
     def __init__(
-        self, settings: DetectorSettings, options: SurveyOptions, vehicle_id: str, *, with_images: bool
+        self,
+        settings: DetectorSettings,
+        options: SurveyOptions,
+        vehicle_id: str,
+        transmissions: TransmitIntervals,
+        *,
+        with_images: bool,
     ) -> None:
         self._options = options
+        self._transmissions = transmissions
         self._vehicle_id = vehicle_id
         self._with_images = with_images
         self._detector = StreamDetector(self._describe, settings)
@@ -186,9 +199,11 @@ class _Detection:
                 info = source.info
                 origin = FileOrigin.of(source, content)
                 started_s = time.perf_counter()
-                found = self._detector.add_file(source, origin)
+                masked = MaskedSource(source, self._transmissions)
+                found = self._detector.add_file(masked, origin)
             self._assign(found.released)
-            self._results.append(FileListing(info, origin, found.weaker, time.perf_counter() - started_s))
+            seconds = time.perf_counter() - started_s
+            self._results.append(FileListing(info, origin, found.weaker, seconds, masked.masked_count))
             self._assign(found.contacts)
         self._assign(self._detector.finish())
         for result in self._results:
@@ -216,6 +231,8 @@ def _print_table(result: FileListing, threshold: float) -> None:
     print(f"{info.path}: {info.ping_count} pings, {len(result.contacts)} contacts")
     for warning in info.warnings:
         print(f"  note: {warning}")
+    if result.masked_pings:
+        print(f"  note: {result.masked_pings} of {info.ping_count} pings masked: the modem transmitted")
     print(_HEADER if result.contacts else f"{counts_text(threshold, 0, result.weaker)}; see --threshold")
     for number, contact in enumerate(result.contacts, start=1):
         d = contact.detection
@@ -236,6 +253,7 @@ def _file_json(result: FileListing, threshold: float) -> dict[str, object]:
     return {
         "file": str(result.info.path),
         "pings": result.info.ping_count,
+        "masked_pings": result.masked_pings,
         "warnings": list(result.info.warnings),
         "seconds": round(result.seconds, 3),
         "contacts_above": {str(confidence): n for confidence, n in counts},
