@@ -1,0 +1,273 @@
+"""Masking of pings that were recorded while the vehicle's own modem transmitted."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonarpost.cli.detection.transmissions import read_transmissions
+from sonarpost.cli.main import main
+from sonarpost.detection.detector import detect
+from sonarpost.detection.stream import FileOrigin, StreamDetector
+from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals, masked_pings
+from sonarpost.errors import ConfigError
+from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.source import InMemorySource
+from sonarpost.sonar.survey import ChannelPing, Ping, Side
+from sonarpost.sonar.xtf_writer import write_xtf
+
+START_S = 1.0e9
+PINGS_PER_S = 10.0
+RANGE_M = 15.0
+LISTENED_S = 0.02
+BURSTS = ((30, 38), (70, 78), (112, 120), (170, 178))
+"""First and one-past-last ping of each burst."""
+
+
+def ping_at(time_s: float, range_m: float = RANGE_M) -> Ping:
+    samples = np.zeros(4, dtype=np.uint8)
+    return Ping(7, time_s, (ChannelPing(Side.PORT, samples, range_m),), lat_deg=60.0, altitude_m=3.0)
+
+
+def with_bursts(survey, seed=3):
+    """Return the survey with bursts of a modem: loud noise, after which the saturated receiver records little."""
+    rng = np.random.default_rng(seed)
+    pings = list(survey.pings)
+    for first, end in BURSTS:
+        sample = int(rng.integers(150, 350))
+        for row in range(first, end):
+            channels = []
+            for channel in pings[row].channels:
+                samples = channel.samples.astype(np.float64)
+                samples[sample : sample + 12] *= 5.0
+                samples[sample + 12 : sample + 45] *= 0.05
+                channels.append(replace(channel, samples=np.clip(samples, 0, 65535).astype(np.uint16)))
+            pings[row] = replace(pings[row], channels=tuple(channels))
+    return replace(survey, pings=tuple(pings))
+
+
+def transmissions(bursts=BURSTS):
+    """Return start and end of each burst."""
+    return [(START_S + first / PINGS_PER_S, START_S + (end - 1) / PINGS_PER_S) for first, end in bursts]
+
+
+def masked(survey, intervals):
+    return replace(survey, pings=tuple(masked_pings(survey.pings, intervals)))
+
+
+# Intervals
+
+
+@pytest.mark.parametrize(
+    ("time_s", "expected"),
+    [(99.77, False), (99.79, True), (100.0, True), (105.0, True), (105.49, True), (105.5, True), (105.51, False)],
+)
+def test_margins_and_listening_time_belong_to_a_transmission(time_s, expected):
+    assert TransmitIntervals.of([(100.0, 105.0)], 0.2, 0.5).contains(ping_at(time_s)) is expected
+
+
+def test_a_transmission_during_the_reception_of_the_echo_masks_the_ping():
+    intervals = TransmitIntervals.of([(100.0, 101.0)], 0.0, 0.0)
+    assert intervals.contains(ping_at(99.9, 75.0))
+    assert not intervals.contains(ping_at(99.89, 75.0))
+
+
+def test_unsorted_and_overlapping_intervals_are_joined():
+    intervals = TransmitIntervals.of([(30.0, 31.0), (10.0, 20.0), (12.0, 13.0), (19.0, 22.0), (31.5, 32.0)], 0.5, 0.5)
+    assert intervals.starts_utc_s == (9.5, 29.5)
+    assert intervals.ends_utc_s == (22.5, 32.5)
+
+
+@given(
+    st.lists(st.tuples(st.floats(0, 50), st.floats(0, 9)).map(lambda pair: (pair[0], sum(pair))), max_size=12),
+    st.floats(0, 60),
+    st.floats(0, 2),
+    st.floats(0, 2),
+)
+def test_a_ping_is_in_the_union_of_all_intervals(pairs, time_s, before_s, after_s):
+    expected = any(start_s - before_s <= time_s + LISTENED_S and time_s <= end_s + after_s for start_s, end_s in pairs)
+    assert TransmitIntervals.of(pairs, before_s, after_s).contains(ping_at(time_s)) is expected
+
+
+@pytest.mark.parametrize(
+    "pair", [(2.0, 1.0), (math.nan, 1.0), (1.0, math.nan), (-math.inf, 0.0), (0.0, math.inf)], ids=str
+)
+def test_invalid_intervals_are_one_error(pair):
+    with pytest.raises(ValueError, match="transmission: got"):
+        TransmitIntervals.of([(0.0, 1.0), pair])
+
+
+@pytest.mark.parametrize("margins", [(-0.1, 0.0), (0.0, math.nan), (math.inf, 0.0)], ids=str)
+def test_invalid_margins_are_one_error(margins):
+    with pytest.raises(ValueError, match="margins: got"):
+        TransmitIntervals.of([], *margins)
+
+
+def test_a_clock_step_masks_what_each_clock_has_stamped():
+    intervals = TransmitIntervals.of([(1000.0, 1003.0), (400.0, 403.0)])
+    assert [intervals.contains(ping_at(time_s)) for time_s in (1001.0, 401.0, 700.0)] == [True, True, False]
+
+
+def test_a_masked_ping_keeps_its_navigation():
+    quiet, loud = ping_at(90.0), ping_at(101.0)
+    first, second = masked_pings([quiet, loud], TransmitIntervals.of([(100.0, 105.0)]))
+    assert first is quiet
+    assert second == replace(loud, channels=())
+
+
+# Detection
+
+
+def test_bursts_are_contacts_without_masking_and_none_with_it(make_survey):
+    survey = with_bursts(make_survey())
+    found = detect(survey)
+    for first, end in BURSTS:
+        assert [d for d in found if first <= d.ping_index < end], "the bursts must resemble objects"
+    assert detect(masked(survey, TransmitIntervals.of(transmissions()))) == ()
+
+
+def test_an_object_beside_the_bursts_is_found_at_the_same_place(make_survey):
+    quiet = make_survey({"ping": 145, "sample": 260})
+    (expected,) = detect(quiet)
+    (found,) = detect(masked(with_bursts(quiet), TransmitIntervals.of(transmissions())))
+    assert (found.side, found.ping_index, found.sample) == (expected.side, expected.ping_index, expected.sample)
+    assert found.position == expected.position
+    assert (found.length_m, found.shadow_m) == (expected.length_m, expected.shadow_m)
+    assert found.confidence == pytest.approx(expected.confidence, abs=0.15)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("length", [1, 3, 12, 60])
+def test_masked_pings_have_no_edges(length, seed, make_survey):
+    survey = make_survey(seed=seed)
+    bursts = [(first, first + length) for first in (20, 100)]
+    assert detect(masked(survey, TransmitIntervals.of(transmissions(bursts)))) == ()
+
+
+@pytest.mark.parametrize("altitude", [True, False])
+def test_no_contact_has_its_centre_in_a_masked_ping(altitude, make_survey):
+    survey = make_survey({"ping": 100}, altitude=altitude)
+    intervals = TransmitIntervals.of([(START_S + 9.9, START_S + 10.1)])
+    hidden = {row for row, ping in enumerate(survey.pings) if intervals.contains(ping)}
+    assert {d.ping_index for d in detect(masked(survey, intervals))}.isdisjoint(hidden)
+
+
+def test_a_survey_of_masked_pings_has_no_contacts(make_survey):
+    survey = make_survey({"ping": 100})
+    assert detect(masked(survey, TransmitIntervals.of([(START_S, START_S + 60.0)]))) == ()
+
+
+# Files
+
+
+def add(detector, survey, intervals):
+    source = MaskedSource(InMemorySource(survey, SurveyOptions()), intervals)
+    return detector.add_file(source, FileOrigin.of(source, survey.path.stem)), source
+
+
+def halves(survey, boundary):
+    edges = itertools.pairwise((0, boundary, len(survey.pings)))
+    return [replace(survey, path=Path(f"{n}.xtf"), pings=survey.pings[a:b]) for n, (a, b) in enumerate(edges)]
+
+
+def test_masked_pings_are_counted(make_survey):
+    detector = StreamDetector(lambda survey, detection, origin: None)
+    _, source = add(detector, make_survey(), TransmitIntervals.of(transmissions([(0, 150)]), 0.0, 0.0))
+    assert source.masked_count == 150
+    assert source.masked_share == 0.75
+
+
+@pytest.mark.parametrize("burst", [(85, 100), (100, 115), (90, 110)])
+def test_files_are_joined_at_a_boundary_in_masked_pings(burst, make_survey):
+    survey = make_survey({"ping": 70}, {"ping": 140})
+    detector = StreamDetector(lambda survey, detection, origin: survey.pings[detection.ping_index].number - 1000)
+    intervals = TransmitIntervals.of(transmissions([burst]))
+    results = [add(detector, half, intervals)[0] for half in halves(survey, 100)]
+    assert results[1].joined
+    contacts = [c.content for r in results for c in (*r.released, *r.contacts)] + [c.content for c in detector.finish()]
+    assert sorted(contacts) == [pytest.approx(70, abs=3), pytest.approx(140, abs=3)]
+
+
+def test_masked_pings_do_not_join_recordings_with_other_channels(make_survey):
+    first, second = halves(make_survey(), 100)
+    shorter = [
+        replace(p, channels=tuple(replace(c, samples=c.samples[:300]) for c in p.channels)) for p in second.pings
+    ]
+    detector = StreamDetector(lambda survey, detection, origin: None)
+    intervals = TransmitIntervals.of(transmissions([(90, 110)]))
+    add(detector, first, intervals)
+    assert not add(detector, replace(second, pings=tuple(shorter)), intervals)[0].joined
+
+
+# Command
+
+
+@pytest.fixture(scope="module")
+def noisy_file(make_survey, tmp_path_factory):
+    path = tmp_path_factory.mktemp("noisy") / "line.xtf"
+    write_xtf(with_bursts(make_survey({"ping": 145})), path)
+    return path
+
+
+def written(path, name):
+    """Write the transmissions as JSON or CSV."""
+    pairs = transmissions()
+    rows = [{"start_utc_s": start_s, "end_utc_s": end_s} for start_s, end_s in pairs]
+    lines = ["start_utc_s,end_utc_s", *(f"{start_s},{end_s}" for start_s, end_s in pairs)]
+    text = "\n".join(lines) if name.endswith(".csv") else json.dumps({"transmissions": rows, "platform_id": "uuv-1"})
+    (path / name).write_text(text)
+    return path / name
+
+
+@pytest.mark.parametrize("name", ["times.json", "times.csv"])
+def test_the_command_masks_the_transmissions_of_a_file(name, noisy_file, tmp_path, capsys):
+    assert main(["detect", str(noisy_file), "--json", "--transmissions", str(written(tmp_path, name))]) == 0
+    (file,) = json.loads(capsys.readouterr().out)["files"]
+    assert [contact["ping"] for contact in file["contacts"]] == [pytest.approx(145, abs=3)]
+    assert 32 < file["masked_pings"] <= 72
+
+
+def test_the_command_prints_the_masked_pings_and_takes_margins(noisy_file, tmp_path, capsys):
+    options = ["--transmissions", str(written(tmp_path, "times.json")), "--transmission-margins", "20", "20"]
+    assert main(["detect", str(noisy_file), *options]) == 0
+    assert "  note: 200 of 200 pings masked: the modem transmitted" in capsys.readouterr().out.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "field"),
+    [
+        ("a.json", "{", "transmissions"),
+        ("a.json", "[]", "transmissions"),
+        ("a.json", "{}", "transmissions"),
+        ("a.json", '{"transmissions": 5}', "transmissions"),
+        ("a.json", '{"transmissions": [1]}', "transmissions.0"),
+        ("a.json", '{"transmissions": [{"start_utc_s": 1}]}', "transmissions.0.end_utc_s"),
+        ("a.json", '{"transmissions": [{"start_utc_s": 1, "end_utc_s": 302}]}', "transmissions.0.end_utc_s"),
+        ("a.json", '{"transmissions": [{"start_utc_s": NaN, "end_utc_s": 2}]}', "transmissions.0.start_utc_s"),
+        ("a.json", "[" * 100_000, "transmissions"),
+        ("a.csv", "start,end\n1,2\n", "transmissions"),
+        ("a.csv", "start_utc_s,end_utc_s\n1\n", "transmissions"),
+        ("a.csv", "start_utc_s,end_utc_s\n1,x\n", "transmissions"),
+        ("a.csv", "start_utc_s,end_utc_s\n2,1\n", "transmissions.0.end_utc_s"),
+        ("a.csv", "\udcff", "transmissions"),
+    ],
+)
+def test_an_invalid_file_is_one_error(name, text, field, tmp_path):
+    (tmp_path / name).write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(ConfigError) as caught:
+        read_transmissions(tmp_path / name)
+    assert caught.value.field == field
+
+
+def test_an_absent_file_and_invalid_margins_end_the_command(noisy_file, tmp_path, capsys):
+    assert main(["detect", str(noisy_file), "--transmissions", str(tmp_path / "none.json")]) == 2
+    assert main(["detect", str(noisy_file), "--transmission-margins", "-1", "0"]) == 2
+    assert "detect: --transmission-margins: got" in capsys.readouterr().err
