@@ -29,7 +29,7 @@ NO_ID = ["", "x" * 65, "two words", "ünïcode", "tab\t", "\x7f"]
 
 # For every field with a restricted range: invalid values of the correct type.
 OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
-    SAMPLES["contact-full"].__class__: {
+    SAMPLES["contact-classified"].__class__: {
         "contact_id": ["", "x" * 121],
         "vehicle_id": NO_NAME,
         "sonar_id": [LONG],
@@ -54,6 +54,8 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "height_m": NO_METRES,
         "pixel_along_m": [0.0, 100.1, NAN],
         "pixel_across_m": [0.0, 100.1, NAN],
+        "p_mine_like": [-0.1, 1.1, NAN],
+        "p_other_object": [-0.1, 1.1, NAN, 0.2501, None],
     },
     SAMPLES["raster-8-bits"].__class__: {
         "height_px": [0, -1, 4097],
@@ -61,8 +63,8 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "bits": [0, 1, 32],
         "data": [b"", b"12345", b"1234567"],
     },
-    SAMPLES["snippet-without-wide"].__class__: {"source": [LONG]},
-    SAMPLES["encoded-image"].__class__: {
+    SAMPLES["snippet-classified"].__class__: {"source": [LONG]},
+    SAMPLES["encoded-image-unclassified"].__class__: {
         "vehicle_id": NO_NAME,
         "image_id": NO_IMAGE,
         "codec": ["", "x" * 41],
@@ -89,7 +91,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "frame_count": [-1, 9],
         "data": [b"x" * 2049],
     },
-    SAMPLES["received-image-v1-authenticated"].__class__: {
+    SAMPLES["received-image-classified"].__class__: {
         "vessel_id": NO_NAME,
         "vehicle_id": NO_NAME,
         "image_id": NO_IMAGE,
@@ -106,7 +108,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "first_frame_utc_s": NO_TIME,
         "last_frame_utc_s": NO_TIME,
     },
-    SAMPLES["reconstructed-image-despeckled"].__class__: {
+    SAMPLES["reconstructed-image-classified"].__class__: {
         "vessel_id": NO_NAME,
         "vehicle_id": NO_NAME,
         "image_id": NO_IMAGE,
@@ -316,7 +318,7 @@ def test_field_without_a_default_is_required(record_type: type[Record], name: st
         with pytest.raises(ValidationError) as caught:
             record_type(**fields)
         assert caught.value.errors()[0]["loc"] == (name,)
-    elif record_type is not Command:
+    elif record_type is not Command and name not in ("p_mine_like", "p_other_object"):
         default = getattr(record_type(**fields), name)
         assert default is None or default in ("", ())
 

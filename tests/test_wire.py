@@ -36,6 +36,13 @@ RECORD_VECTORS = [(t, name) for t in BY_TYPE for name in vectors(t)]
 # Golden vectors
 
 
+def with_fields_of(vector: object, present: object) -> object:
+    """Return a value without the fields that its records have gained since the vector was made."""
+    if not isinstance(vector, dict) or not isinstance(present, dict):
+        return present
+    return {name: with_fields_of(vector[name], value) for name, value in present.items() if name in vector}
+
+
 @pytest.mark.parametrize(("record_type", "name"), RECORD_VECTORS)
 def test_golden_bytes_decode(record_type: str, name: str) -> None:
     vector = vectors(record_type)[name]
@@ -46,16 +53,17 @@ def test_golden_bytes_decode(record_type: str, name: str) -> None:
     dumped = plain(record.model_dump())
     assert isinstance(dumped, dict)
     for field, value in vector["fields"].items():
-        assert field in ("type", "v") or dumped[field] == value, field
+        assert field in ("type", "v") or with_fields_of(value, dumped[field]) == value, field
 
 
 @pytest.mark.parametrize(("record_type", "name"), RECORD_VECTORS)
 def test_encoding_gives_the_golden_bytes(record_type: str, name: str) -> None:
     vector = vectors(record_type)[name]
     model = BY_TYPE[record_type]
-    if set(vector["fields"]) != {"type", "v", *model.model_fields}:
-        pytest.skip("made before the record gained a field")
     record = wire.decode(model, bytes.fromhex(vector["hex"]), KEY)
+    present = plain({"type": record_type, "v": 1, **record.model_dump()})
+    if with_fields_of(vector["fields"], present) != present:
+        pytest.skip("made before the record gained a field")
     assert wire.encode(record).hex() == vector["hex"]
 
 
@@ -256,15 +264,15 @@ def of(sample: str, **change: object) -> bytes:
 @pytest.mark.parametrize(
     ("sample", "change", "field", "message"),
     [
-        ("contact-bare", {"type": "snippet"}, "type", "type: got 'snippet', expected 'contact'"),
-        ("contact-bare", {"v": 2}, "v", "v: got 2, expected 1"),
-        ("contact-bare", {"v": 1.0}, "v", "v: got 1.0, expected 1"),
-        ("contact-bare", {"v": True}, "v", "v: got True, expected 1"),
-        ("contact-bare", {"lat_deg": "41"}, "lat_deg", "lat_deg: got '41', expected a valid number"),
-        ("contact-bare", {"lat_deg": 91}, "lat_deg", "lat_deg: got 91, expected less than or equal to 90"),
-        ("contact-bare", {"lat_deg": math.nan}, "lat_deg", "lat_deg: got nan, expected a finite number"),
-        ("contact-bare", {"channel": "up"}, "channel", "channel: got 'up', expected 'port' or 'starboard'"),
-        ("contact-bare", {"ping_number": 1.0}, "ping_number", "ping_number: got 1.0, expected a valid integer"),
+        ("contact-unclassified", {"type": "snippet"}, "type", "type: got 'snippet', expected 'contact'"),
+        ("contact-unclassified", {"v": 2}, "v", "v: got 2, expected 1"),
+        ("contact-unclassified", {"v": 1.0}, "v", "v: got 1.0, expected 1"),
+        ("contact-unclassified", {"v": True}, "v", "v: got True, expected 1"),
+        ("contact-unclassified", {"lat_deg": "41"}, "lat_deg", "lat_deg: got '41', expected a valid number"),
+        ("contact-unclassified", {"lat_deg": 91}, "lat_deg", "lat_deg: got 91, expected less than or equal to 90"),
+        ("contact-unclassified", {"lat_deg": math.nan}, "lat_deg", "lat_deg: got nan, expected a finite number"),
+        ("contact-unclassified", {"channel": "up"}, "channel", "channel: got 'up', expected 'port' or 'starboard'"),
+        ("contact-unclassified", {"ping_number": 1.0}, "ping_number", "ping_number: got 1.0, expected a valid integer"),
         ("raster-8-bits", {"data": b"1"}, "data", "data: got b'1', expected 6 bytes for 3 × 2 px of 8 bits, not 1"),
         ("health", {"gauges": {"a": math.inf}}, "gauges.a", "gauges.a: got inf, expected a finite number"),
         (
@@ -285,16 +293,16 @@ def test_error_names_key_field_value_and_expectation(
 
 
 def test_error_names_the_path_of_a_nested_field() -> None:
-    fields = msgpack.unpackb(wire.encode(SAMPLES["snippet-without-wide"]))
+    fields = msgpack.unpackb(wire.encode(SAMPLES["snippet-classified"]))
     del fields["contact"]["vehicle_id"]
     with pytest.raises(PayloadError) as caught:
-        wire.decode(type(SAMPLES["snippet-without-wide"]), msgpack.packb(fields), KEY)
+        wire.decode(type(SAMPLES["snippet-classified"]), msgpack.packb(fields), KEY)
     assert str(caught.value) == f"{KEY}: contact.vehicle_id: got 'nothing', expected a value"
 
 
 @pytest.mark.parametrize("name", ["type", "v"])
 def test_type_and_version_are_required(name: str) -> None:
-    fields = msgpack.unpackb(wire.encode(SAMPLES["contact-bare"]))
+    fields = msgpack.unpackb(wire.encode(SAMPLES["contact-unclassified"]))
     del fields[name]
     with pytest.raises(PayloadError) as caught:
         wire.decode(Contact, msgpack.packb(fields), KEY)
@@ -311,24 +319,24 @@ def test_unknown_fields_are_ignored(sample: Record, value: object) -> None:
 
 
 def test_unknown_nested_fields_are_ignored() -> None:
-    fields = msgpack.unpackb(wire.encode(SAMPLES["snippet-without-wide"]))
+    fields = msgpack.unpackb(wire.encode(SAMPLES["snippet-classified"]))
     fields["contact"]["invented_later"] = fields["picture"]["and_this"] = [1]
     assert (
-        wire.decode(type(SAMPLES["snippet-without-wide"]), msgpack.packb(fields), KEY)
-        == SAMPLES["snippet-without-wide"]
+        wire.decode(type(SAMPLES["snippet-classified"]), msgpack.packb(fields), KEY)
+        == SAMPLES["snippet-classified"]
     )
 
 
 def test_optional_fields_can_be_absent_and_order_is_free() -> None:
     small = {"vehicle_id": "uuv-1", "v": 1, "contact_id": "c1", "type": "contact"}
-    assert wire.decode(Contact, msgpack.packb(small), KEY) == SAMPLES["contact-bare"]
+    assert wire.decode(Contact, msgpack.packb(small), KEY) == SAMPLES["contact-unclassified"]
 
 
 def test_integers_and_single_precision_are_valid_for_floats() -> None:
-    whole = wire.decode(Contact, of("contact-bare", lat_deg=41, heading_deg=0), KEY)
+    whole = wire.decode(Contact, of("contact-unclassified", lat_deg=41, heading_deg=0), KEY)
     assert (whole.lat_deg, whole.heading_deg) == (41.0, 0.0)
     assert isinstance(whole.lat_deg, float)
-    short = msgpack.packb(msgpack.unpackb(of("contact-bare", lat_deg=0.5)), use_single_float=True)
+    short = msgpack.packb(msgpack.unpackb(of("contact-unclassified", lat_deg=0.5)), use_single_float=True)
     assert b"\xca" in short
     assert wire.decode(Contact, short, KEY).lat_deg == 0.5
 

@@ -37,6 +37,7 @@ Channel = Literal["port", "starboard"]
 Verdict = Literal["mine_like", "not_mine_like", "unsure"]
 CommandKind = Literal["refine", "resend", "revisit", "wider", "original"]
 TaskingKind = Literal["advice", "command"]
+AtdClass = Literal["mine-like", "clutter", "structure"]
 DeliveryState = Literal["waiting", "delivered", "refused"]
 DownlinkKind = Literal["refine", "resend", "revisit", "decision", "wider", "original"]
 DownlinkStep = Literal["asked", "sent", "confirmed", "refused", "expired"]
@@ -52,6 +53,10 @@ _IMAGE_OF_COMMAND: Final = {
     "original": "the image to send without despeckling",
 }
 """The image that each kind of command names, for error messages."""
+
+
+PROBABILITY_TOLERANCE: Final = 1e-6
+"""By how much the sum of the probabilities of a contact may exceed 1, because of rounding."""
 
 
 class Record(BaseModel):
@@ -145,7 +150,8 @@ class Contact(Record):
         speed_mps: Speed of the vehicle, forward positive.
         slant_range_m: Distance from the sonar to the object.
         ground_range_m: The same along a flat seabed.
-        atd_class: Class that the detector assigned.
+        atd_class: Class that the detector assigned: `mine-like`, `clutter` (any other object) or `structure` (a wreck, a
+            wall, an outcrop). Other detectors may use other names; the acoustic link does not carry those.
         atd_confidence: Confidence of the detector as in the paper, 2 is the highest.
         length_m: Length along-track.
         width_m: Width across-track.
@@ -154,6 +160,11 @@ class Contact(Record):
             before the shadow does.
         pixel_along_m: Size of a pixel of the image, along-track.
         pixel_across_m: Size of a pixel of the image, across-track.
+        p_mine_like: Probability that the contact is a mine-like object, together with `p_other_object`; their sum is
+            at most 1. None: not classified, and in records of earlier versions. The acoustic link rounds both to
+            multiples of 0.05.
+        p_other_object: Probability that it is another object on the seabed. The rest is the probability that there is
+            seabed alone.
     """
 
     TYPE: ClassVar[str] = "contact"
@@ -182,6 +193,20 @@ class Contact(Record):
     height_m: Metres | None = None
     pixel_along_m: Annotated[float, Field(gt=0, le=100)] | None = None
     pixel_across_m: Annotated[float, Field(gt=0, le=100)] | None = None
+    p_mine_like: Fraction | None = None
+    p_other_object: Annotated[Fraction | None, Field(validate_default=True)] = None
+
+    @field_validator("p_other_object")
+    @classmethod
+    def _check_probabilities(cls, p_other_object: float | None, info: ValidationInfo) -> float | None:
+        if "p_mine_like" not in info.data:
+            return p_other_object  # `p_mine_like` is invalid, and the error is about it
+        p_mine_like = info.data["p_mine_like"]
+        if (p_mine_like is None) != (p_other_object is None):
+            raise ValueError("a value together with p_mine_like, or neither")
+        if p_mine_like is not None and p_mine_like + p_other_object > 1 + PROBABILITY_TOLERANCE:
+            raise ValueError(f"at most {1 - p_mine_like:.6g}, so that the sum with p_mine_like is at most 1")
+        return p_other_object
 
 
 class Snippet(Record):

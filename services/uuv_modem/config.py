@@ -25,6 +25,8 @@ class UuvModemConfig(ModemServiceConfig):
         destination: Address of the vessel's modem; 1 in the paper.
         link: Wire format: "v1", or "paper" for the paper's.
         rate: Micro-Modem rate 0 to 6; the paper uses 4 in a tank and 1 at sea.
+        contact_class: Whether contact records carry the class of the contact and its probabilities. Vessels of versions
+            without them reject such records: false sends every record in the layout that those read.
         retry_s: Wait before a packet that the modem could not send is sent again.
         allowed_rates: v1: further rates that are used when they are faster at the measured loss.
         expected_loss: v1: share of frames lost, until feedback has measured it.
@@ -56,6 +58,7 @@ class UuvModemConfig(ModemServiceConfig):
     destination: Annotated[int, Field(ge=0, le=127)] = 1
     link: Literal["v1", "paper"] = "v1"
     rate: RateNumber = 1
+    contact_class: bool = True
     retry_s: Annotated[float, Field(gt=0, le=600)] = 2.0
     allowed_rates: tuple[RateNumber, ...] = ()
     expected_loss: Annotated[float, Field(ge=0, le=0.95)] = 0.2

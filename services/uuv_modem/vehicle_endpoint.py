@@ -31,7 +31,7 @@ from sonarpost.link.downlink.messages import (
     pack,
     unpack,
 )
-from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.contact_record import ContactSummary, atd_class_of
 from sonarpost.link.frames.paper.sender import PaperSender
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, unpack_mini
 from sonarpost.link.frames.v1.receiver import V1Receiver
@@ -203,7 +203,7 @@ class VehicleEndpoint:
             BadInputError: Names the invalid field.
         """
         if isinstance(record, EncodedImage):
-            self._check_image(image_to_send(record))
+            self._check_image(self._image_to_send(record))
 
     def _check_image(self, image: ImageToSend) -> None:
         if not self._is_v1:
@@ -237,9 +237,12 @@ class VehicleEndpoint:
             )
         else:
             is_new = self.queue.image_id_of(number_of_image(record.image_id)) is None
-            self.queue.add_image(image_to_send(record), now)
+            self.queue.add_image(self._image_to_send(record), now)
             self.images_accepted += is_new
         self.changed = True
+
+    def _image_to_send(self, record: EncodedImage) -> ImageToSend:
+        return image_to_send(record, contact_class=self._config.contact_class)
 
     # Frames received
 
@@ -392,16 +395,25 @@ class VehicleEndpoint:
             )
 
 
-def image_to_send(record: EncodedImage) -> ImageToSend:
-    """Return an encoded image as the transmit queue takes it."""
-    contact = summary_of(record.contact, record.height_px, record.width_px)
+def image_to_send(record: EncodedImage, *, contact_class: bool = True) -> ImageToSend:
+    """Return an encoded image as the transmit queue takes it; `contact_class` as for `summary_of`."""
+    contact = summary_of(record.contact, record.height_px, record.width_px, contact_class=contact_class)
     return ImageToSend(record.image_id, record.contact.contact_id, contact, record.stream)
 
 
-def summary_of(contact: Contact, height_px: int, width_px: int) -> ContactSummary:
+def summary_of(contact: Contact, height_px: int, width_px: int, *, contact_class: bool = True) -> ContactSummary:
     """Return the contact record that is transmitted with an image of this size.
 
     Values that the record cannot hold are sent as unknown: a wrong clock on the vehicle does not lose the image.
+
+    Args:
+        contact: The contact.
+        height_px: Rows of the image, 16..512.
+        width_px: Columns of the image, 16..512.
+        contact_class: Whether the record carries class and probabilities, see `UuvModemConfig`.
+
+    Raises:
+        FrameError: A side of the image is out of range.
     """
     time_utc_s = contact.time_utc_s
     has_fix = contact.lat_deg is not None and contact.lon_deg is not None
@@ -420,4 +432,7 @@ def summary_of(contact: Contact, height_px: int, width_px: int) -> ContactSummar
         pixel_along_m=contact.pixel_along_m,
         pixel_across_m=contact.pixel_across_m,
         position_sigma_m=contact.position_sigma_m if has_fix else None,
+        atd_class=atd_class_of(contact.atd_class) if contact_class else None,
+        p_mine_like=contact.p_mine_like if contact_class else None,
+        p_other_object=contact.p_other_object if contact_class else None,
     )

@@ -46,7 +46,7 @@ FULL_CONTACT = Contact(
     speed_mps=1.5,
     slant_range_m=21.0,
     ground_range_m=20.5,
-    atd_class="sphere",
+    atd_class="mine-like",
     atd_confidence=1.75,
     length_m=1.25,
     width_m=0.5,
@@ -54,6 +54,8 @@ FULL_CONTACT = Contact(
     height_m=0.375,
     pixel_along_m=0.0625,
     pixel_across_m=0.03125,
+    p_mine_like=0.75,
+    p_other_object=0.1875,
 )
 
 RASTER_8 = Pixels(height_px=2, width_px=3, bits=8, data=bytes([0, 1, 2, 127, 128, 255]))
@@ -184,13 +186,13 @@ SAMPLES: dict[str, Record] = {
         ),
     ),
     "transmissions-none": Transmissions(platform_id="uuv-1", time_utc_s=1476262812.0, transmissions=()),
-    "contact-full": FULL_CONTACT,
-    "contact-bare": BARE_CONTACT,
+    "contact-classified": FULL_CONTACT,
+    "contact-unclassified": BARE_CONTACT,
     "raster-8-bits": RASTER_8,
     "raster-16-bits": RASTER_16,
-    "snippet-wide": Snippet(contact=FULL_CONTACT, picture=RASTER_16, source="line-7.xtf", wide=RASTER_8),
-    "snippet-without-wide": Snippet(contact=FULL_CONTACT, picture=RASTER_16, source="line-7.xtf"),
-    "encoded-image": EncodedImage(
+    "snippet-wide-classified": Snippet(contact=FULL_CONTACT, picture=RASTER_16, source="line-7.xtf", wide=RASTER_8),
+    "snippet-classified": Snippet(contact=FULL_CONTACT, picture=RASTER_16, source="line-7.xtf"),
+    "encoded-image-unclassified": EncodedImage(
         vehicle_id="uuv-1",
         image_id="00A7",
         contact=BARE_CONTACT,
@@ -228,7 +230,7 @@ SAMPLES: dict[str, Record] = {
         frame_count=None,
         data=b"",
     ),
-    "received-image-v1-authenticated": ReceivedImage(
+    "received-image-classified": ReceivedImage(
         vessel_id="vessel-1",
         vehicle_id="uuv-1",
         image_id="00A7",
@@ -268,7 +270,7 @@ SAMPLES: dict[str, Record] = {
         last_frame_utc_s=1476262833.5,
         authenticated=False,
     ),
-    "reconstructed-image-despeckled": COMPLETE_IMAGE.model_copy(update={"codec": "emb", "despeckle_strength": 0.75}),
+    "reconstructed-image-classified": COMPLETE_IMAGE.model_copy(update={"codec": "emb", "despeckle_strength": 0.75}),
     "reconstructed-image-despeckling-unknown": DAMAGED_IMAGE,
     "decision-full": Decision(
         decision_id="d-1",

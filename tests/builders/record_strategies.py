@@ -61,7 +61,7 @@ _record_id = st.text([chr(code) for code in range(0x21, 0x7F)], min_size=1, max_
 _lat, _lon = _real(-90, 90), _real(-180, 180)
 _finite = st.floats(allow_nan=False, allow_infinity=False)
 
-contacts = st.builds(
+_contacts = st.builds(
     Contact,
     contact_id=_text(1, 120),
     vehicle_id=_name,
@@ -79,7 +79,7 @@ contacts = st.builds(
     speed_mps=_maybe(_real(-50, 50)),
     slant_range_m=_metres,
     ground_range_m=_metres,
-    atd_class=_maybe(_text(0, 60)),
+    atd_class=st.sampled_from(["mine-like", "clutter", "structure"]) | _maybe(_text(0, 60)),
     atd_confidence=_maybe(_real(0, 2)),
     length_m=_metres,
     width_m=_metres,
@@ -88,6 +88,17 @@ contacts = st.builds(
     pixel_along_m=_maybe(_real(0, 100, exclude_min=True)),
     pixel_across_m=_maybe(_real(0, 100, exclude_min=True)),
 )
+
+
+@st.composite
+def _classified_contacts(draw: st.DrawFn) -> Contact:
+    """Draw a contact with or without probabilities."""
+    p_mine_like = draw(_maybe(_real(0, 1)))
+    p_other_object = None if p_mine_like is None else draw(_real(0, 1 - p_mine_like))
+    return Contact(**draw(_contacts).model_dump() | {"p_mine_like": p_mine_like, "p_other_object": p_other_object})
+
+
+contacts = _classified_contacts()
 
 
 @st.composite

@@ -118,7 +118,7 @@ def test_the_shipped_services_encode_and_decode_and_store_machine_code_in_the_st
         "bytes_received": length,
         "bytes_total": length,
     }
-    received = SAMPLES["received-image-v1-authenticated"].model_copy(update=changes)
+    received = SAMPLES["received-image-classified"].model_copy(update=changes)
     assert isinstance(received, ReceivedImage)
     runner.peer("vessel-1", "op_modem").send(keys.acoustic_image("vessel-1"), "decompressor", received)
     eventually(lambda: relay.received, 200, what=f"an image; see {tmp_path / 'decompressor.log'}")

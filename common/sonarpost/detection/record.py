@@ -42,4 +42,6 @@ def contact_record(detection: Detection, origin: FileOrigin, vehicle_id: str, so
         height_m=None if d.shadow_is_cut else d.height_m,
         pixel_along_m=d.pixel_along_m,
         pixel_across_m=d.pixel_across_m,
+        p_mine_like=d.p_mine_like,
+        p_other_object=d.p_other_object,
     )

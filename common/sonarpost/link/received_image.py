@@ -38,9 +38,12 @@ def received_image(
             altitude_m=summary.altitude_m,
             heading_deg=summary.heading_deg,
             ground_range_m=summary.ground_range_m,
+            atd_class=summary.atd_class,
             atd_confidence=summary.confidence,
             pixel_along_m=summary.pixel_along_m,
             pixel_across_m=summary.pixel_across_m,
+            p_mine_like=summary.p_mine_like,
+            p_other_object=summary.p_other_object,
         )
     )
     return ReceivedImage(

@@ -40,7 +40,7 @@ def test_limits_of_the_wire_format() -> None:
 
 
 def test_example_of_an_error_message() -> None:
-    snippet = SAMPLES["snippet-without-wide"].model_dump()
+    snippet = SAMPLES["snippet-classified"].model_dump()
     snippet["contact"]["lat_deg"] = 91.0
     with pytest.raises(wire.PayloadError) as caught:
         wire.decode(

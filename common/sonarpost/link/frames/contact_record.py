@@ -1,8 +1,11 @@
-"""The contact record: position, time and size of a contact in 25 bytes, in physical units.
+"""The contact record: position, time, size and class of a contact in 25 bytes, in physical units.
 
 With a frame type, an image identifier and a checksum it fills the 32 bytes of a rate-0 frame. Every value that can be
 unknown has a code for it. A value that its field cannot hold is sent as unknown, never as the nearest possible one.
-docs/specifications/acoustic-paper.md specifies every bit.
+
+There are two layouts of the first 11 bytes. A record without class and probabilities has the plain layout, which all
+versions read. In the classified layout the first bit is 1: earlier versions read an image height of at least 2048 px
+there, and reject it. docs/specifications/acoustic-paper.md specifies every bit.
 """
 
 from __future__ import annotations
@@ -10,14 +13,18 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
+from typing import Final, NamedTuple, get_args
 
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX
 from sonarpost.errors import FrameError
+from sonarpost.messages import PROBABILITY_TOLERANCE, AtdClass
 from sonarpost.sonar.survey import Side
 
 RECORD_SIZE = 25
 
-_LAYOUT = struct.Struct(">3siiIBBBHHBBB")
+_HEAD_BYTES: Final = 11
+_PLAIN_HEAD = struct.Struct(">3sii")
+_TAIL = struct.Struct(">IBBBHHBBB")
 _WHERE = "contact record"
 
 _NO_FIX = -(2**31)
@@ -25,6 +32,7 @@ _UNKNOWN_U8, _UNKNOWN_U16, _UNKNOWN_U32 = 0xFF, 0xFFFF, 0xFFFF_FFFF
 _LAST_U8 = 0xFE
 
 _DEGREE_STEPS = 10_000_000  # 1e-7 degree is 11 mm on the equator
+_CLASSIFIED_DEGREE_STEPS = 2_500_000  # 4e-7 degree is 44 mm on the equator
 _CONFIDENCE_STEPS = 127  # 0..254 is 0.0..2.0
 _HEADING_STEPS = 255  # 255 codes for the circle, one for unknown
 _ALTITUDE_STEPS = 2  # 0.5 m
@@ -38,6 +46,25 @@ _LAST_RANGE = 0x7FFD
 
 _PIXEL_MIN_M, _PIXEL_STEPS_PER_OCTAVE = 0.005, 28  # 5 mm to 2.69 m, steps of 2.5 %
 _SIGMA_MIN_M, _SIGMA_STEPS_PER_OCTAVE = 0.1, 16  # 0.1 m to 6.0 km, steps of 4.4 %
+
+_CLASSIFIED_BIT: Final = 0x80
+_CLASSES: Final[tuple[AtdClass | None, ...]] = (None, *get_args(AtdClass))
+"""Classes by their code of 2 bits."""
+_PROBABILITY_STEPS: Final = 20  # 0.05
+_PROBABILITIES: Final = tuple(
+    (mine_like, other_object)
+    for mine_like in range(_PROBABILITY_STEPS + 1)
+    for other_object in range(_PROBABILITY_STEPS + 1 - mine_like)
+)
+"""The 231 pairs of p_mine_like and p_other_object in steps, by their code."""
+_PROBABILITY_CODES: Final = {pair: code for code, pair in enumerate(_PROBABILITIES)}
+_CLASS_BITS, _PROBABILITY_BITS, _SIDE_BITS, _LAT_BITS, _LON_BITS = 2, 8, 9, 29, 30
+_CLASSIFIED_BITS: Final = (1, _CLASS_BITS, _PROBABILITY_BITS, _SIDE_BITS, _SIDE_BITS, _LAT_BITS, _LON_BITS)
+
+
+def atd_class_of(name: str | None) -> AtdClass | None:
+    """Return the class of this name if the record can carry it, else None."""
+    return next((known for known in _CLASSES if known is not None and known == name), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +87,10 @@ class ContactSummary:
         pixel_across_m: Size of a pixel across the track.
         position_sigma_m: One standard deviation of the position along the worse axis of its error ellipse; requires a
             position. It is rounded up, so that a position never appears better than it is.
+        atd_class: Class that the detector assigned.
+        p_mine_like: Probability that the contact is a mine-like object (0..1), together with `p_other_object` (sent in
+            steps of 0.05).
+        p_other_object: Probability that it is another object on the seabed (0..1); the sum is at most 1.
 
     Raises:
         FrameError: A value is not finite, out of range, or present without the value that it requires.
@@ -79,6 +110,9 @@ class ContactSummary:
     pixel_along_m: float | None = None
     pixel_across_m: float | None = None
     position_sigma_m: float | None = None
+    atd_class: AtdClass | None = None
+    p_mine_like: float | None = None
+    p_other_object: float | None = None
 
     def __post_init__(self) -> None:
         _check_together("height_px and width_px", self.height_px, self.width_px)
@@ -100,14 +134,49 @@ class ContactSummary:
             raise FrameError(_WHERE, "side", None, "port or starboard with a ground_range_m")
         if self.position_sigma_m is not None and self.lat_deg is None:
             raise FrameError(_WHERE, "lat_deg", None, "a position with a position_sigma_m")
+        if self.atd_class not in _CLASSES:
+            raise FrameError(_WHERE, "atd_class", self.atd_class, f"{', '.join(get_args(AtdClass))} or None")
+        _check_together("p_mine_like and p_other_object", self.p_mine_like, self.p_other_object)
+        _check_within("p_mine_like", self.p_mine_like, 0, 1)
+        _check_within("p_other_object", self.p_other_object, 0, 1)
+        total = (self.p_mine_like or 0.0) + (self.p_other_object or 0.0)
+        if total > 1 + PROBABILITY_TOLERANCE:
+            raise FrameError(_WHERE, "p_mine_like + p_other_object", total, "at most 1")
+
+    @property
+    def is_classified(self) -> bool:
+        """Whether class or probabilities are known, so that the record has the classified layout."""
+        return self.atd_class is not None or self.p_mine_like is not None
 
     def pack(self) -> bytes:
         """Return the 25 bytes."""
+        return (self._classified_head() if self.is_classified else self._plain_head()) + self._tail()
+
+    def _plain_head(self) -> bytes:
         size = 0 if self.height_px is None or self.width_px is None else (self.height_px << 12) | self.width_px
-        return _LAYOUT.pack(
+        return _PLAIN_HEAD.pack(
             size.to_bytes(3, "big"),
             _NO_FIX if self.lat_deg is None else round(self.lat_deg * _DEGREE_STEPS),
             _NO_FIX if self.lon_deg is None else round(self.lon_deg * _DEGREE_STEPS),
+        )
+
+    def _classified_head(self) -> bytes:
+        codes = (
+            1,
+            _CLASSES.index(self.atd_class),
+            _probability_code(self.p_mine_like, self.p_other_object),
+            0 if self.height_px is None else self.height_px - 1,
+            0 if self.width_px is None else self.width_px - 1,
+            _degree_code(self.lat_deg, _LAT_BITS),
+            _degree_code(self.lon_deg, _LON_BITS),
+        )
+        packed = 0
+        for code, bits in zip(codes, _CLASSIFIED_BITS, strict=True):
+            packed = packed << bits | code
+        return packed.to_bytes(_HEAD_BYTES, "big")
+
+    def _tail(self) -> bytes:
+        return _TAIL.pack(
             _UNKNOWN_U32 if self.time_utc_s is None else round(self.time_utc_s),
             _linear_code(self.confidence, _CONFIDENCE_STEPS, _LAST_U8, _UNKNOWN_U8),
             _heading_code(self.heading_deg),
@@ -128,16 +197,17 @@ class ContactSummary:
         """
         if len(data) != RECORD_SIZE:
             raise FrameError(where, "length", len(data), f"{RECORD_SIZE} bytes")
-        size, lat, lon, time, confidence, heading, altitude, depth, side_range, along, across, sigma = _LAYOUT.unpack(
-            data
-        )
-        size_code = int.from_bytes(size, "big")
+        head = (_unpack_classified if data[0] & _CLASSIFIED_BIT else _unpack_plain)(data[:_HEAD_BYTES], where)
+        time, confidence, heading, altitude, depth, side_range, along, across, sigma = _TAIL.unpack(data[_HEAD_BYTES:])
         side, ground_range_m = _side_range_value(side_range)
         return cls(
-            height_px=(size_code >> 12) or None,
-            width_px=(size_code & 0xFFF) or None,
-            lat_deg=None if lat == _NO_FIX else lat / _DEGREE_STEPS,
-            lon_deg=None if lon == _NO_FIX else lon / _DEGREE_STEPS,
+            height_px=head.height_px,
+            width_px=head.width_px,
+            lat_deg=head.lat_deg,
+            lon_deg=head.lon_deg,
+            atd_class=head.atd_class,
+            p_mine_like=head.p_mine_like,
+            p_other_object=head.p_other_object,
             time_utc_s=None if time == _UNKNOWN_U32 else float(time),
             confidence=None if confidence == _UNKNOWN_U8 else confidence / _CONFIDENCE_STEPS,
             heading_deg=None if heading == _UNKNOWN_U8 else heading * 360 / _HEADING_STEPS,
@@ -157,6 +227,53 @@ class ContactSummary:
         return ContactSummary.unpack(self.pack())
 
 
+class _Head(NamedTuple):
+    """Values of the first 11 bytes of a record."""
+
+    height_px: int | None
+    width_px: int | None
+    lat_deg: float | None
+    lon_deg: float | None
+    atd_class: AtdClass | None = None
+    p_mine_like: float | None = None
+    p_other_object: float | None = None
+
+
+def _unpack_plain(data: bytes, _where: str) -> _Head:
+    size, lat, lon = _PLAIN_HEAD.unpack(data)
+    size_code = int.from_bytes(size, "big")
+    return _Head(
+        height_px=(size_code >> 12) or None,
+        width_px=(size_code & 0xFFF) or None,
+        lat_deg=None if lat == _NO_FIX else lat / _DEGREE_STEPS,
+        lon_deg=None if lon == _NO_FIX else lon / _DEGREE_STEPS,
+    )
+
+
+def _unpack_classified(data: bytes, where: str) -> _Head:
+    packed = int.from_bytes(data, "big")
+    codes = []
+    for bits in reversed(_CLASSIFIED_BITS):
+        codes.append(packed & (1 << bits) - 1)
+        packed >>= bits
+    lon, lat, width, height, probabilities, class_code, _ = codes
+    if len(_PROBABILITIES) <= probabilities < _UNKNOWN_U8:
+        raise FrameError(where, "probabilities", probabilities, f"a code below {len(_PROBABILITIES)}, or 255")
+    if class_code == 0 and probabilities == _UNKNOWN_U8:
+        raise FrameError(where, "class", class_code, "a class or probabilities in the classified layout")
+    known = probabilities != _UNKNOWN_U8
+    mine_like, other_object = _PROBABILITIES[probabilities] if known else (0, 0)
+    return _Head(
+        height_px=height + 1 if height else None,
+        width_px=width + 1 if width else None,
+        lat_deg=_degree_value(lat, _LAT_BITS),
+        lon_deg=_degree_value(lon, _LON_BITS),
+        atd_class=_CLASSES[class_code],
+        p_mine_like=mine_like / _PROBABILITY_STEPS if known else None,
+        p_other_object=other_object / _PROBABILITY_STEPS if known else None,
+    )
+
+
 def _check_together(names: str, first: object, second: object) -> None:
     if (first is None) != (second is None):
         raise FrameError(_WHERE, names, (first, second), "both or neither")
@@ -166,6 +283,27 @@ def _check_within(name: str, value: float | None, low: float, high: float) -> No
     if value is not None and not (math.isfinite(value) and low <= value <= high):
         limits = "a finite number" if low == -math.inf else f"a finite number, {low} to {high}"
         raise FrameError(_WHERE, name, value, limits)
+
+
+def _probability_code(p_mine_like: float | None, p_other_object: float | None) -> int:
+    if p_mine_like is None or p_other_object is None:
+        return _UNKNOWN_U8
+    mine_like = round(p_mine_like * _PROBABILITY_STEPS)
+    # The sum can exceed 1 by a rounding error.
+    other_object = min(round(p_other_object * _PROBABILITY_STEPS), _PROBABILITY_STEPS - mine_like)
+    return _PROBABILITY_CODES[mine_like, other_object]
+
+
+def _degree_code(degrees: float | None, bits: int) -> int:
+    """Return the two's complement of a latitude or longitude; the lowest value means unknown."""
+    code = -(1 << bits - 1) if degrees is None else round(degrees * _CLASSIFIED_DEGREE_STEPS)
+    return code & (1 << bits) - 1
+
+
+def _degree_value(code: int, bits: int) -> float | None:
+    if code == 1 << bits - 1:
+        return None
+    return (code - (1 << bits) if code >> bits - 1 else code) / _CLASSIFIED_DEGREE_STEPS
 
 
 def _linear_code(value: float | None, steps_per_unit: int, last: int, unknown: int) -> int:
