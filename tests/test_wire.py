@@ -321,10 +321,7 @@ def test_unknown_fields_are_ignored(sample: Record, value: object) -> None:
 def test_unknown_nested_fields_are_ignored() -> None:
     fields = msgpack.unpackb(wire.encode(SAMPLES["snippet-classified"]))
     fields["contact"]["invented_later"] = fields["picture"]["and_this"] = [1]
-    assert (
-        wire.decode(type(SAMPLES["snippet-classified"]), msgpack.packb(fields), KEY)
-        == SAMPLES["snippet-classified"]
-    )
+    assert wire.decode(type(SAMPLES["snippet-classified"]), msgpack.packb(fields), KEY) == SAMPLES["snippet-classified"]
 
 
 def test_optional_fields_can_be_absent_and_order_is_free() -> None:

@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,7 +30,9 @@ def image_stream(number: int) -> bytes:
 
 
 def record(number: int) -> ContactSummary:
-    return ContactSummary(lat_deg=number / 1000, lon_deg=1.0, confidence=1.0).rounded()
+    plain = ContactSummary(lat_deg=number / 1000, lon_deg=1.0, confidence=1.0)
+    classified = replace(plain, atd_class="mine-like", p_mine_like=0.8, p_other_object=0.15)
+    return (classified if number % 2 else plain).rounded()
 
 
 def genuine(seed: int) -> Iterator[bytes]:

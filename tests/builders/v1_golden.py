@@ -6,6 +6,7 @@ Existing files are not written again: bytes of a wire format can be added, never
 from __future__ import annotations
 
 import json
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from sonarpost.link.coding.erasure_code import Layering, layered_symbols
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import ContactFrame
 from sonarpost.link.frames.v1.frame import (
     Content,
     Segment,
@@ -58,6 +60,16 @@ CONTACT = ContactSummary(
     pixel_across_m=0.1,
     position_sigma_m=3.1,
 )
+
+CLASSIFIED = {
+    "everything": replace(CONTACT, atd_class="mine-like", p_mine_like=0.83, p_other_object=0.12),
+    "class only": ContactSummary(atd_class="structure"),
+    "clutter": replace(CONTACT, atd_class="clutter", p_mine_like=0.0, p_other_object=1.0),
+    "probabilities only": ContactSummary(p_mine_like=0.0, p_other_object=0.0),
+    "last codes": ContactSummary(512, 512, 90.0, 180.0, atd_class="structure", p_mine_like=1.0, p_other_object=0.0),
+    "first codes": ContactSummary(16, 16, -90.0, -180.0, atd_class="mine-like", p_mine_like=0.0, p_other_object=0.05),
+}
+"""Records of the classified layout by name."""
 
 
 def counted(length: int, first: int = 1) -> bytes:
@@ -211,7 +223,40 @@ def exchange() -> dict[str, Any]:
     return {"steps": steps, "reports": feedback}
 
 
-MAKERS = {"frames": frames, "codes": codes, "objects": objects, "exchange": exchange}
+def classified() -> dict[str, Any]:
+    """Return records of the classified layout, alone and in entries and frames, and records to refuse."""
+    preview = Preview(7, CLASSIFIED["everything"], counted(30))
+    contact = Preview(8, CLASSIFIED["class only"], b"").pack(29)
+    head, tail = int.from_bytes(ContactSummary(atd_class="clutter").pack()[:11], "big"), ContactSummary().pack()[11:]
+    changes = {
+        "reserved probabilities": (0xFF << 77, 231 << 77),
+        "nothing classified": (3 << 85, 0),
+        "height alone": (0x1FF << 68, 79 << 68),
+        "side of 15 px": (0x3FFFF << 59, 14 << 68 | 79 << 59),
+        "latitude alone": (0x1FFFFFFF << 30, 0),
+    }
+    return {
+        "records": [
+            {"name": name, "record": record.pack().hex(), "values": describe_record(record.rounded())}
+            for name, record in CLASSIFIED.items()
+        ],
+        "refused": [
+            {"name": name, "record": (head & ~mask | bits).to_bytes(11, "big").hex() + tail.hex()}
+            for name, (mask, bits) in changes.items()
+        ],
+        "paper": ContactFrame("00A7", CLASSIFIED["everything"]).pack().hex(),
+        "frames": [
+            pack_symbol(Symbol(SymbolKind.PREVIEW, 0, 0, 24, preview.pack(59))).hex(),
+            pack_segments((Segment(SegmentKind.CONTACT, contact),), 32).hex(),
+        ],
+    }
+
+
+def describe_record(record: ContactSummary) -> dict[str, Any]:
+    return {name: value for name, value in asdict(record).items() if value is not None}
+
+
+MAKERS = {"classified": classified, "frames": frames, "codes": codes, "objects": objects, "exchange": exchange}
 
 if __name__ == "__main__":
     FOLDER.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
-from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary
+from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary, atd_class_of
 from sonarpost.sonar.survey import Side
 
 
@@ -22,12 +22,21 @@ def maybe(strategy: st.SearchStrategy[float]) -> st.SearchStrategy[float | None]
 
 SIZES = st.none() | st.tuples(st.integers(16, 512), st.integers(16, 512))
 FIXES = st.none() | st.tuples(st.floats(-90, 90), st.floats(-180, 180), maybe(st.floats(0, 5500)))
+CLASSES = st.sampled_from([None, "mine-like", "clutter", "structure"])
 PLACES = st.none() | st.tuples(st.sampled_from(Side), maybe(st.floats(0, 3276)))
 
 
 @st.composite
+def probabilities(draw: st.DrawFn) -> tuple[float, float]:
+    """Draw p_mine_like and p_other_object; their sum is often exactly 1."""
+    mine_like = draw(st.floats(0, 1))
+    return mine_like, draw(st.just(1 - mine_like) | st.floats(0, 1 - mine_like))
+
+
+@st.composite
 def contacts(draw: st.DrawFn) -> ContactSummary:
-    """Draw a contact with values that the record can hold."""
+    """Draw a contact with values that the record can hold, in either layout."""
+    p_mine_like, p_other_object = draw(st.none() | probabilities()) or (None, None)
     height_px, width_px = draw(SIZES) or (None, None)
     lat_deg, lon_deg, sigma_m = draw(FIXES) or (None, None, None)
     side, ground_range_m = draw(PLACES) or (None, None)
@@ -46,6 +55,9 @@ def contacts(draw: st.DrawFn) -> ContactSummary:
         pixel_along_m=draw(maybe(st.floats(0.005, 2.69))),
         pixel_across_m=draw(maybe(st.floats(0.005, 2.69))),
         position_sigma_m=sigma_m,
+        atd_class=draw(CLASSES),
+        p_mine_like=p_mine_like,
+        p_other_object=p_other_object,
     )
 
 
@@ -64,6 +76,7 @@ HALF_STEPS = {
     "depth_m": 0.05,
     "ground_range_m": 0.05,
 }
+CLASSIFIED_HALF_STEPS = HALF_STEPS | {"lat_deg": 2e-7, "lon_deg": 2e-7, "p_mine_like": 0.025, "p_other_object": 0.025}
 
 
 @given(contacts())
@@ -73,7 +86,8 @@ def test_values_round_trip_within_half_a_step(sent: ContactSummary) -> None:
     read = ContactSummary.unpack(packed)
     assert unknown_fields(read) == unknown_fields(sent)
     assert read.side is sent.side
-    for name, half_step in HALF_STEPS.items():
+    assert read.atd_class == sent.atd_class
+    for name, half_step in (CLASSIFIED_HALF_STEPS if sent.is_classified else HALF_STEPS).items():
         if getattr(sent, name) is not None:
             assert abs(getattr(read, name) - getattr(sent, name)) <= half_step * (1 + 1e-6) + 1e-12, name
     if sent.heading_deg is not None and read.heading_deg is not None:
@@ -95,6 +109,16 @@ def test_rounding_is_idempotent(sent: ContactSummary) -> None:
     assert once.pack() == sent.pack()
 
 
+@given(contacts())
+def test_only_the_classified_layout_begins_with_a_set_bit(sent: ContactSummary) -> None:
+    """Versions without the classified layout read the first 12 bits as the height of the image, at most 512 px."""
+    packed = sent.pack()
+    first_12_bits = int.from_bytes(packed[:2], "big") >> 4
+    assert (first_12_bits > 512) == sent.is_classified == (sent.atd_class is not None or sent.p_mine_like is not None)
+    without = dataclasses.replace(sent, atd_class=None, p_mine_like=None, p_other_object=None)
+    assert packed[11:] == without.pack()[11:]
+
+
 @given(st.binary(min_size=RECORD_SIZE, max_size=RECORD_SIZE))
 def test_any_record_that_parses_packs_to_the_same_bytes(data: bytes) -> None:
     try:
@@ -102,6 +126,97 @@ def test_any_record_that_parses_packs_to_the_same_bytes(data: bytes) -> None:
     except FrameError:
         return
     assert contact.pack() == data
+
+
+def classified_head(*, sizes: int = 0, probabilities: int = 255, class_code: int = 1) -> bytes:
+    """Return the first 11 bytes of the classified layout without a position, as the specification lists the bits."""
+    no_fix = 1 << 58 | 1 << 29
+    return (1 << 87 | class_code << 85 | probabilities << 77 | sizes << 59 | no_fix).to_bytes(11, "big")
+
+
+@given(st.binary(min_size=RECORD_SIZE - 1, max_size=RECORD_SIZE - 1), st.integers(128, 255))
+def test_any_classified_record_that_parses_packs_to_the_same_bytes(rest: bytes, first: int) -> None:
+    data = bytes([first]) + rest
+    # Without a size and a position, which random bytes rarely have in range.
+    for candidate in (data, classified_head(probabilities=rest[0] % 231, class_code=first & 3) + data[11:]):
+        try:
+            contact = ContactSummary.unpack(candidate)
+        except FrameError:
+            continue
+        assert contact.is_classified
+        assert contact.pack() == candidate
+
+
+def test_all_codes_of_class_and_probabilities_round_trip_or_are_rejected() -> None:
+    tail = ContactSummary().pack()[11:]
+    values, rejected = set(), []
+    for class_code in range(4):
+        for code in range(256):
+            data = classified_head(probabilities=code, class_code=class_code) + tail
+            try:
+                contact = ContactSummary.unpack(data)
+            except FrameError as error:
+                rejected.append((class_code, code, error.field))
+                continue
+            assert contact.pack() == data
+            values.add((contact.atd_class, contact.p_mine_like, contact.p_other_object))
+    reserved = [(c, code, "probabilities") for c in range(4) for code in range(231, 255)]
+    assert sorted(rejected) == sorted([*reserved, (0, 255, "class")])
+    assert len(values) == 4 * 232 - 1
+    for _, p_mine_like, p_other_object in values - {(c, None, None) for c in ("mine-like", "clutter", "structure")}:
+        assert p_mine_like + p_other_object <= 1 + 1e-9
+
+
+def test_all_sides_of_the_classified_layout_round_trip_or_are_rejected() -> None:
+    tail = ContactSummary().pack()[11:]
+    for height, width in ((h, w) for h in range(512) for w in (0, 14, 15, 79, 511)):
+        data = classified_head(sizes=height << 9 | width) + tail
+        fits = (height, width) == (0, 0) or (height >= 15 and width >= 15)
+        try:
+            contact = ContactSummary.unpack(data)
+        except FrameError:
+            assert not fits
+            continue
+        assert fits
+        assert contact.pack() == data
+        assert (contact.height_px, contact.width_px) == ((height + 1, width + 1) if height else (None, None))
+
+
+@pytest.mark.parametrize(
+    ("lat_deg", "lon_deg"), [(90.0, 180.0), (-90.0, -180.0), (0.0, 0.0), (-4e-7, 4e-7), (44.7123456, -63.654321)]
+)
+def test_positions_of_the_classified_layout_have_steps_of_44_mm(lat_deg: float, lon_deg: float) -> None:
+    read = ContactSummary(lat_deg=lat_deg, lon_deg=lon_deg, atd_class="structure").rounded()
+    assert read.lat_deg == pytest.approx(lat_deg, abs=2.001e-7)
+    assert read.lon_deg == pytest.approx(lon_deg, abs=2.001e-7)
+
+
+def test_position_out_of_range_is_rejected_in_the_classified_layout() -> None:
+    data = ContactSummary(lat_deg=90.0, lon_deg=180.0, atd_class="clutter").pack()
+    head = int.from_bytes(data[:11], "big")
+    for step, named in ((1 << 30, "lat_deg"), (1, "lon_deg")):
+        with pytest.raises(FrameError) as caught:
+            ContactSummary.unpack((head + step).to_bytes(11, "big") + data[11:])
+        assert caught.value.field == named
+
+
+def test_probabilities_are_rounded_to_steps_and_never_above_1_together() -> None:
+    contact = ContactSummary(p_mine_like=0.83, p_other_object=0.12).rounded()
+    assert (contact.atd_class, contact.p_mine_like, contact.p_other_object) == (None, 0.85, 0.1)
+    for step in range(1001):
+        p_mine_like = step / 1000
+        read = ContactSummary(p_mine_like=p_mine_like, p_other_object=1 - p_mine_like).rounded()
+        assert read.p_mine_like == pytest.approx(p_mine_like, abs=0.025 + 1e-9)
+        assert read.p_other_object == pytest.approx(1 - p_mine_like, abs=0.025 + 1e-9)
+
+
+def test_only_classes_of_the_layout_are_carried() -> None:
+    assert [atd_class_of(name) for name in ("mine-like", "clutter", "structure")] == [
+        "mine-like",
+        "clutter",
+        "structure",
+    ]
+    assert [atd_class_of(name) for name in (None, "", "sphere", "Structure")] == [None] * 4
 
 
 @pytest.mark.parametrize("position", [20, 21, 22, 27, 28, 29])
@@ -179,6 +294,13 @@ def test_value_out_of_the_field_range_is_sent_as_unknown(name: str, value: float
         ({"side": "Starboard"}, "side"),
         ({"pixel_along_m": -0.1}, "pixel_along_m"),
         ({"position_sigma_m": 1.0}, "lat_deg"),
+        ({"atd_class": "sphere"}, "atd_class"),
+        ({"p_mine_like": 0.5}, "p_mine_like and p_other_object"),
+        ({"p_other_object": 0.5}, "p_mine_like and p_other_object"),
+        ({"p_mine_like": -0.1, "p_other_object": 0.5}, "p_mine_like"),
+        ({"p_mine_like": 0.5, "p_other_object": 1.1}, "p_other_object"),
+        ({"p_mine_like": math.nan, "p_other_object": 0.5}, "p_mine_like"),
+        ({"p_mine_like": 0.6, "p_other_object": 0.41}, "p_mine_like + p_other_object"),
     ],
 )
 def test_impossible_values_are_rejected(fields: dict[str, Any], named: str) -> None:

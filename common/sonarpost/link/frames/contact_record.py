@@ -197,7 +197,8 @@ class ContactSummary:
         """
         if len(data) != RECORD_SIZE:
             raise FrameError(where, "length", len(data), f"{RECORD_SIZE} bytes")
-        head = (_unpack_classified if data[0] & _CLASSIFIED_BIT else _unpack_plain)(data[:_HEAD_BYTES], where)
+        is_classified = bool(data[0] & _CLASSIFIED_BIT)
+        head = _unpack_classified(data[:_HEAD_BYTES], where) if is_classified else _unpack_plain(data[:_HEAD_BYTES])
         time, confidence, heading, altitude, depth, side_range, along, across, sigma = _TAIL.unpack(data[_HEAD_BYTES:])
         side, ground_range_m = _side_range_value(side_range)
         return cls(
@@ -239,7 +240,7 @@ class _Head(NamedTuple):
     p_other_object: float | None = None
 
 
-def _unpack_plain(data: bytes, _where: str) -> _Head:
+def _unpack_plain(data: bytes) -> _Head:
     size, lat, lon = _PLAIN_HEAD.unpack(data)
     size_code = int.from_bytes(size, "big")
     return _Head(

@@ -12,16 +12,20 @@ from builders import v1_golden
 from sonarpost.errors import FrameError
 from sonarpost.link.coding import erasure_code as fec
 from sonarpost.link.coding.erasure_code import Layering, recover_layer, recover_layering
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import ContactFrame
+from sonarpost.link.frames.paper.frame import parse_frame as parse_paper_frame
 from sonarpost.link.frames.v1.frame import parse_frame
 from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, Preview, unpack_object
 from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.receiver import ImageUpdate
 
 
 def golden(name: str) -> Any:
     return json.loads((v1_golden.FOLDER / f"{name}.json").read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("name", ["frames", "codes", "objects"])
+@pytest.mark.parametrize("name", ["classified", "frames", "codes", "objects"])
 def test_packed_bytes_equal_the_golden_files(name: str) -> None:
     assert json.loads(json.dumps(v1_golden.MAKERS[name]())) == golden(name)
 
@@ -68,6 +72,24 @@ def test_golden_objects_parse() -> None:
         below = pieces
     (entry,) = read["messages"]
     assert unpack_object(bytes.fromhex(entry["object"])) == MessageObject(entry["number"], bytes.fromhex(entry["data"]))
+
+
+def test_golden_classified_records_parse() -> None:
+    read = golden("classified")
+    records = {}
+    for entry in read["records"]:
+        record = ContactSummary.unpack(bytes.fromhex(entry["record"]))
+        assert v1_golden.describe_record(record) == entry["values"], entry["name"]
+        assert record.pack().hex() == entry["record"]
+        records[entry["name"]] = record
+    for entry in read["refused"]:
+        with pytest.raises(FrameError):
+            ContactSummary.unpack(bytes.fromhex(entry["record"]))
+    assert parse_paper_frame(bytes.fromhex(read["paper"])) == ContactFrame("00A7", records["everything"])
+    receiver = V1Receiver()
+    events = [event for frame in read["frames"] for event in receiver.accept(3, bytes.fromhex(frame), 0.0)]
+    updates = [event for event in events if isinstance(event, ImageUpdate)]
+    assert [update.contact for update in updates] == [records["everything"], records["class only"]]
 
 
 def test_golden_exchange_gives_the_same_events() -> None:
