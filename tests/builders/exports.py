@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -98,7 +98,21 @@ def authenticated_mission(out_dir: Path) -> Path:
     )
 
 
-MISSIONS = {"mission": mission, "authenticated": authenticated_mission}
+def classified_mission(out_dir: Path) -> Path:
+    """Write a contact of each class of the detector, and one with probabilities alone."""
+    return store(
+        out_dir,
+        image("0001", {"atd_class": "mine-like", "p_mine_like": 0.85, "p_other_object": 0.1}, authenticated=True),
+        image("0002", {"lat_deg": 41.5261, "atd_class": "clutter", "p_mine_like": 0.0, "p_other_object": 1.0}),
+        image("0003", {"lat_deg": 41.5271, "atd_class": "structure"}),
+        image("0004", {"lat_deg": 41.5281, "p_mine_like": 0.5, "p_other_object": 0.25}),
+    )
+
+
+MISSIONS = {"mission": mission, "authenticated": authenticated_mission, "classified": classified_mission}
+NEWER: Final = {"mission": ("authenticated", "p_mine_like", "p_other_object"), "classified": ()}
+NEWER["authenticated"] = NEWER["mission"][1:]
+"""The last properties of contacts, which the golden files of a mission do not have because they are older."""
 
 
 def golden_files(name: str, contacts: ContactSet) -> dict[str, bytes]:
@@ -111,13 +125,19 @@ def golden_files(name: str, contacts: ContactSet) -> dict[str, bytes]:
     }
 
 
-def without_authenticated(name: str, data: bytes) -> bytes:
-    """Return an export without the property `authenticated`, as files of earlier versions are."""
-    if name.endswith(".geojson"):
+def as_of_golden_file(name: str, data: bytes) -> bytes:
+    """Return an export without the properties that the golden file does not have; all of them must be unknown."""
+    mission, _, kind = name.rpartition(".")
+    newer = NEWER[mission]
+    if kind == "geojson":
         document = json.loads(data)
         for properties in [f["properties"] for f in document["features"]] + document["unlocated"]:
-            assert properties.pop("authenticated") is None
+            assert [properties.pop(property_name) for property_name in newer] == [None] * len(newer)
         return (json.dumps(document, ensure_ascii=False, indent=1) + "\n").encode()
-    if name.endswith(".csv"):
-        return data.replace(b",authenticated\r\n", b"\r\n").replace(b",\r\n", b"\r\n")
+    if kind == "csv":
+        header, *rows = data.split(b"\r\n")
+        assert all(row.endswith(b"," * len(newer)) for row in rows[:-1])
+        names = "".join(f",{property_name}" for property_name in newer).encode()
+        kept = [header.removesuffix(names), *(row[: len(row) - len(newer)] for row in rows[:-1]), b""]
+        return b"\r\n".join(kept)
     return data

@@ -16,13 +16,14 @@ import xmlschema
 from builders.common import GOLDEN_FOLDER
 from builders.exports import (
     FIRST_UTC_S,
+    as_of_golden_file,
     authenticated_mission,
+    classified_mission,
     decision,
     golden_files,
     image,
     mission,
     store,
-    without_authenticated,
 )
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -33,7 +34,7 @@ from sonarpost.export.contacts import ContactSet, ExportContact, SideCar, load_c
 from sonarpost.export.cot import CotOptions, cot_event, cot_events, cot_type
 from sonarpost.export.kml import kml_bytes, kmz_bytes, write_kml, write_kmz
 from sonarpost.export.tables import COLUMNS, csv_bytes, geojson, geojson_bytes, write_csv, write_geojson
-from sonarpost.export.text import csv_text, html_text, xml_text
+from sonarpost.export.text import csv_text, html_text, probabilities_text, xml_text
 from sonarpost.messages import Decision, Pixels
 
 GOLDEN = GOLDEN_FOLDER / "export"
@@ -59,19 +60,52 @@ def single(record: object, *decisions: Decision) -> ContactSet:
 
 @pytest.mark.parametrize("name", ["mission.geojson", "mission.kml", "mission.csv", "mission.cot"])
 def test_output_equals_golden_file(contacts: ContactSet, name: str) -> None:
-    # The files are older than the property `authenticated`.
-    assert without_authenticated(name, golden_files("mission", contacts)[name]) == (GOLDEN / name).read_bytes()
+    assert as_of_golden_file(name, golden_files("mission", contacts)[name]) == (GOLDEN / name).read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["geojson", "kml", "csv", "cot"])
+def test_every_export_states_class_and_probabilities(tmp_path: Path, kind: str) -> None:
+    name = f"classified.{kind}"
+    output = golden_files("classified", load_contacts(classified_mission(tmp_path)))[name]
+    assert output == (GOLDEN / name).read_bytes()
+    marks = {
+        "geojson": (b'"atd_class": "structure"', b'"p_mine_like": 0.85,', b'"p_other_object": 0.1'),
+        "kml": (b'<Data name="p_mine_like">\n      <value>0.85<', b'<Data name="p_other_object">\n      <value>0.1<'),
+        "csv": (b",true,0.85,0.1\r\n", b",,0.0,1.0\r\n", b",,,\r\n", b",,0.5,0.25\r\n"),
+        "cot": (
+            b"Detector's class mine-like. Detector: mine-like 85 %, other object 10 %, seabed 5 %.",
+            b"Detector's class structure. Detector's confidence",
+            b"Z. Water depth 15.8 m. Detector: mine-like 50 %, other object 25 %, seabed 25 %.",
+        ),
+    }
+    for mark in marks[kind]:
+        assert output.count(mark) == 1, mark
+
+
+@pytest.mark.parametrize(
+    ("p_mine_like", "p_other_object", "text"),
+    [
+        (None, None, ""),
+        (0.5, None, ""),
+        (0.83, 0.12, "mine-like 83 %, other object 12 %, seabed 5 %"),
+        (1.0, 0.0, "mine-like 100 %, other object 0 %, seabed 0 %"),
+        (0.006, 0.994, "mine-like 1 %, other object 99 %, seabed 0 %"),
+        (0.3333, 0.3333, "mine-like 33 %, other object 33 %, seabed 34 %"),
+    ],
+)
+def test_percentages_add_up_to_100(p_mine_like: float | None, p_other_object: float | None, text: str) -> None:
+    assert probabilities_text(p_mine_like, p_other_object) == text
 
 
 @pytest.mark.parametrize("kind", ["geojson", "kml", "csv", "cot"])
 def test_every_export_marks_unauthenticated_contacts(tmp_path: Path, kind: str) -> None:
     name = f"authenticated.{kind}"
     output = golden_files("authenticated", load_contacts(authenticated_mission(tmp_path)))[name]
-    assert output == (GOLDEN / name).read_bytes()
+    assert as_of_golden_file(name, output) == (GOLDEN / name).read_bytes()
     marks = {
         "geojson": b'"authenticated": false',
         "kml": b"<name>uuv-1/0002 (unauthenticated)</name>",
-        "csv": b",false\r\n",
+        "csv": b",false,,\r\n",
         "cot": b"Unauthenticated: any modem in range",
     }
     assert output.count(marks[kind]) == 1

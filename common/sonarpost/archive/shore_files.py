@@ -108,6 +108,8 @@ def image_row(
         conflict=name != image_file_name(image),
         files_sha256=files_digest(folder / f"{name}{suffix}" for suffix in SUFFIXES),
         despeckle_strength=image.despeckle_strength,
+        p_mine_like=contact.p_mine_like if contact else None,
+        p_other_object=contact.p_other_object if contact else None,
     )
 
 

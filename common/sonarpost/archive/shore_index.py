@@ -20,7 +20,7 @@ from sonarpost.files import make_private
 from sonarpost.messages import Decision, DeliveryState, TaskingKind
 
 FILE_NAME = "index.db"
-INDEX_VERSION = 3
+INDEX_VERSION = 4
 BUSY_S = 10.0
 
 _SCHEMA = """
@@ -31,7 +31,7 @@ CREATE TABLE IF NOT EXISTS picture (
     height_px INTEGER NOT NULL, width_px INTEGER NOT NULL, codec TEXT NOT NULL, lat_deg REAL, lon_deg REAL,
     atd_class TEXT, atd_confidence REAL, size_bytes INTEGER NOT NULL, exported_utc_s REAL, removed_utc_s REAL,
     conflict INTEGER NOT NULL DEFAULT 0, files_sha256 TEXT NOT NULL DEFAULT '', verified_utc_s REAL,
-    fault TEXT NOT NULL DEFAULT '', despeckle_strength REAL,
+    fault TEXT NOT NULL DEFAULT '', despeckle_strength REAL, p_mine_like REAL, p_other_object REAL,
     PRIMARY KEY (vessel_id, name)) WITHOUT ROWID;
 CREATE INDEX IF NOT EXISTS picture_age ON picture (accepted_utc_s) WHERE removed_utc_s IS NULL;
 CREATE TABLE IF NOT EXISTS decision (
@@ -62,7 +62,15 @@ ALTER TABLE decision ADD COLUMN verified_utc_s REAL;
 ALTER TABLE decision ADD COLUMN fault TEXT NOT NULL DEFAULT '';
 """
 _MIGRATE_FROM_VERSION_2 = "ALTER TABLE picture ADD COLUMN despeckle_strength REAL;"
-_MIGRATIONS = {1: _MIGRATE_FROM_VERSION_1 + _MIGRATE_FROM_VERSION_2, 2: _MIGRATE_FROM_VERSION_2}
+_MIGRATE_FROM_VERSION_3 = """
+ALTER TABLE picture ADD COLUMN p_mine_like REAL;
+ALTER TABLE picture ADD COLUMN p_other_object REAL;
+"""
+_MIGRATIONS = {
+    1: _MIGRATE_FROM_VERSION_1 + _MIGRATE_FROM_VERSION_2 + _MIGRATE_FROM_VERSION_3,
+    2: _MIGRATE_FROM_VERSION_2 + _MIGRATE_FROM_VERSION_3,
+    3: _MIGRATE_FROM_VERSION_3,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +90,8 @@ class ImageRow:
         verified_utc_s: When its files were last compared with the index; None for never.
         fault: `missing`, `changed` or `unreadable` if the last comparison failed, else empty.
         despeckle_strength: As in `ReconstructedImage`; None in an index of an earlier version.
+        p_mine_like: As in `Contact`; None in an index of an earlier version.
+        p_other_object: As `p_mine_like`.
     """
 
     vessel_id: str
@@ -110,6 +120,8 @@ class ImageRow:
     verified_utc_s: float | None = None
     fault: str = ""
     despeckle_strength: float | None = None
+    p_mine_like: float | None = None
+    p_other_object: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

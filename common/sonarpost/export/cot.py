@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 
 from sonarpost.export.contacts import ContactSet, ExportContact, ReviewState
 from sonarpost.export.tables import DEGREE_DECIMALS
-from sonarpost.export.text import utc_text, xml_text
+from sonarpost.export.text import probabilities_text, utc_text, xml_text
 
 SPOT: Final = "b-m-p-s-m"
 SEA_MINE: Final = "U-W-M"
@@ -164,6 +164,10 @@ def _remarks(contact: ExportContact) -> str:
             parts.append(f"Seen {utc_text(record.time_utc_s)}.")
         if record.depth_m is not None and record.altitude_m is not None:
             parts.append(f"Water depth {record.depth_m + record.altitude_m:.1f} m.")
+        if record.atd_class:
+            parts.append(f"Detector's class {record.atd_class}.")
+        if probabilities := probabilities_text(record.p_mine_like, record.p_other_object):
+            parts.append(f"Detector: {probabilities}.")
         if record.atd_confidence is not None:
             parts.append(f"Detector's confidence {record.atd_confidence:.2f} of 2.")
     if image.missing_fraction > 0:

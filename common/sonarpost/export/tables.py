@@ -81,6 +81,8 @@ _PROPERTIES: Final[Mapping[str, Callable[[ExportContact], Value]]] = {
     "picture_file": lambda c: f"{c.image.vessel_id}/{c.image_path.name}" if c.image_path else None,
     "notes": lambda c: "; ".join(c.image.notes),
     "authenticated": lambda c: c.image.authenticated,
+    "p_mine_like": _from_record("p_mine_like"),
+    "p_other_object": _from_record("p_other_object"),
 }
 
 COLUMNS: Final = tuple(_PROPERTIES)

@@ -1,4 +1,4 @@
-"""Escaping of untrusted text for XML, HTML and CSV, and the text form of times."""
+"""Escaping of untrusted text for XML, HTML and CSV, and the text form of times and probabilities."""
 
 from __future__ import annotations
 
@@ -38,6 +38,23 @@ def csv_text(text: str) -> str:
     """
     cell = _CONTROL.sub(REPLACEMENT, text)
     return f"'{cell}" if cell.lstrip().startswith(tuple(_FORMULA)) else cell
+
+
+def probabilities_text(p_mine_like: float | None, p_other_object: float | None) -> str:
+    """Return the probabilities of a contact as whole percentages that add up to 100; empty if they are not known.
+
+    Args:
+        p_mine_like: Probability of a mine-like object, 0 to 1.
+        p_other_object: Probability of another object, 0 to 1 - `p_mine_like`.
+
+    >>> probabilities_text(0.83, 0.12)
+    'mine-like 83 %, other object 12 %, seabed 5 %'
+    """
+    if p_mine_like is None or p_other_object is None:
+        return ""
+    mine_like = round(100 * p_mine_like)
+    other_object = min(round(100 * p_other_object), 100 - mine_like)
+    return f"mine-like {mine_like} %, other object {other_object} %, seabed {100 - mine_like - other_object} %"
 
 
 def utc_text(time_utc_s: float) -> str:

@@ -29,7 +29,15 @@ SORT_COLUMNS: Final[Mapping[Sort, str]] = {
     "range": "range_m",
 }
 _METRES_PER_DEGREE: Final = 111_000.0
-_RECORD_COLUMNS: Final = ("atd_class", "atd_confidence", "lat_deg", "lon_deg", "position_sigma_m")
+_RECORD_COLUMNS: Final = (
+    "atd_class",
+    "atd_confidence",
+    "p_mine_like",
+    "p_other_object",
+    "lat_deg",
+    "lon_deg",
+    "position_sigma_m",
+)
 _IMAGE_COLUMNS: Final = (
     "version",
     "codec",

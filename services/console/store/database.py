@@ -49,7 +49,7 @@ CREATE TABLE IF NOT EXISTS contact (
     last_frame_utc_s REAL NOT NULL, arrived_utc_s REAL NOT NULL, updated_utc_s REAL NOT NULL,
     complete INTEGER NOT NULL, percent REAL NOT NULL, bytes_received INTEGER NOT NULL, bytes_total INTEGER NOT NULL,
     codec TEXT NOT NULL, has_picture INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL,
-    group_id TEXT, authenticated INTEGER, despeckle_strength REAL
+    group_id TEXT, authenticated INTEGER, despeckle_strength REAL, p_mine_like REAL, p_other_object REAL
 ) WITHOUT ROWID;
 CREATE UNIQUE INDEX IF NOT EXISTS contact_image ON contact (vessel_id, vehicle_id, image_id, first_s);
 CREATE INDEX IF NOT EXISTS contact_updated ON contact (updated_utc_s, id);
@@ -180,8 +180,9 @@ class Database(SqliteFile):
             columns = {row["name"] for row in db.execute("PRAGMA table_info(contact)")}
             if "authenticated" not in columns:  # a database of version 0.1 or 0.2
                 db.execute("ALTER TABLE contact ADD COLUMN authenticated INTEGER")
-            if "despeckle_strength" not in columns:
-                db.execute("ALTER TABLE contact ADD COLUMN despeckle_strength REAL")
+            for name in ("despeckle_strength", "p_mine_like", "p_other_object"):
+                if name not in columns:
+                    db.execute(f"ALTER TABLE contact ADD COLUMN {name} REAL")
             if "removed" not in {row["name"] for row in db.execute("PRAGMA table_info(version)")}:
                 db.execute("ALTER TABLE version ADD COLUMN removed INTEGER NOT NULL DEFAULT 0")
 

@@ -27,8 +27,8 @@ FROM contact c LEFT JOIN decision d ON d.decision_id = c.last_decision
 
 _CONTACT_COLUMNS: Final = (
     "id name vessel_id vehicle_id image_id revision version review mlo_class confidence decided_by decided_utc_s"
-    " atd_class atd_confidence lat_deg lon_deg position_sigma_m range_m seen_utc_s first_frame_utc_s last_frame_utc_s"
-    " updated_utc_s bytes_received bytes_total height_px width_px"
+    " atd_class atd_confidence p_mine_like p_other_object lat_deg lon_deg position_sigma_m range_m seen_utc_s"
+    " first_frame_utc_s last_frame_utc_s updated_utc_s bytes_received bytes_total height_px width_px"
 )
 _DELIVERY_COLUMNS: Final = "shore vehicle reason times_sent changed_utc_s"
 _DECISION_COLUMNS: Final = (

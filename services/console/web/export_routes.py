@@ -28,6 +28,7 @@ from sonarpost.export.contacts import ContactSet, ExportContact, SideCar
 from sonarpost.export.cot import cot_events
 from sonarpost.export.kml import add_kmz
 from sonarpost.export.tables import csv_bytes, geojson_bytes
+from sonarpost.export.text import probabilities_text
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review import rendering
 from sonarpost.services.console.state import ConsoleState
@@ -262,6 +263,8 @@ def report_html(detail: Json, image: ReconstructedImage, now_utc_s: float) -> st
         ("Decided", _time_text(contact["decided_utc_s"])),
         ("Latitude, longitude (WGS 84)", "" if lat is None or lon is None else f"{lat:.7f}, {lon:.7f}"),
         ("Standard deviation of the position, m", contact["position_sigma_m"]),
+        ("Class of the detector", contact["atd_class"]),
+        ("Probabilities of the detector", probabilities_text(contact["p_mine_like"], contact["p_other_object"])),
         ("Confidence of the detector, 0 to 2", contact["atd_confidence"]),
         ("Detected", _time_text(contact["seen_utc_s"])),
         *((f"{label}, m", record.get(key)) for label, key in _LENGTHS),

@@ -60,6 +60,7 @@ def map_json(state: ConsoleState) -> Json:
     with state.database.read() as db:
         rows = db.execute(
             "SELECT c.id, c.name, c.vehicle_id, c.lat_deg, c.lon_deg, c.position_sigma_m, c.review, c.atd_confidence,"
+            " c.atd_class,"
             " c.group_id, c.vehicle_lat_deg, c.vehicle_lon_deg,"
             " COALESCE(c.seen_utc_s, c.first_frame_utc_s) AS at_utc_s,"
             " COUNT(*) OVER (PARTITION BY COALESCE(c.group_id, c.id)) AS looks"
@@ -107,6 +108,7 @@ def _contact_json(row: sqlite3.Row, point: tuple[float, float]) -> Json:
         "sigma_m": row["position_sigma_m"],
         "review": row["review"],
         "atd_confidence": row["atd_confidence"],
+        "atd_class": row["atd_class"],
         "group": row["group_id"] if row["looks"] > 1 else None,
         "looks": row["looks"],
     }

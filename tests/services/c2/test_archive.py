@@ -21,7 +21,7 @@ from sonarpost.archive.shore_index import FILE_NAME, ImageRow, ShoreIndex
 from sonarpost.cli.main import main
 from sonarpost.config import PlatformConfig
 from sonarpost.export.contacts import load_contacts
-from sonarpost.messages import Pixels, ReconstructedImage, Relayed
+from sonarpost.messages import Contact, Pixels, ReconstructedImage, Relayed
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
@@ -263,7 +263,7 @@ def version_1(filled: Archive, out: Path) -> list[ImageRow]:
         old = {t: [r[1] for r in db.execute(f"PRAGMA table_info({t})")] for t in ("picture", "decision")}
         data = {t: db.execute(f"SELECT * FROM {t}").fetchall() for t in old}
     path.unlink()
-    new = {"conflict", "files_sha256", "verified_utc_s", "fault", "despeckle_strength"}
+    new = {"conflict", "files_sha256", "verified_utc_s", "fault", "despeckle_strength", "p_mine_like", "p_other_object"}
     with closing(sqlite3.connect(path)) as db, db:
         db.executescript(VERSION_1)
         for table, columns in old.items():
@@ -301,7 +301,8 @@ def test_index_of_version_2_gains_the_strength_of_despeckling(
     before = filled.index().images()
     filled.close()
     with closing(sqlite3.connect(out / FILE_NAME)) as db, db:
-        db.execute("ALTER TABLE picture DROP COLUMN despeckle_strength")
+        for column in ("despeckle_strength", "p_mine_like", "p_other_object"):
+            db.execute(f"ALTER TABLE picture DROP COLUMN {column}")
         db.execute("PRAGMA user_version = 2")
     with closing(ShoreIndex(out, writable=False)) as index:
         assert index.images() == before
@@ -310,3 +311,25 @@ def test_index_of_version_2_gains_the_strength_of_despeckling(
     migrated.store_image(image("000A").model_copy(update={"despeckle_strength": 0.5}), 5.0)
     migrated.flush()
     assert [row.despeckle_strength for row in migrated.index().images() if row.image_id == "000A"] == [0.5]
+
+
+def test_index_of_version_3_gains_the_probabilities(
+    archive: Callable[..., Archive], filled: Archive, out: Path
+) -> None:
+    before = filled.index().images()
+    filled.close()
+    with closing(sqlite3.connect(out / FILE_NAME)) as db, db:
+        for column in ("p_mine_like", "p_other_object"):
+            db.execute(f"ALTER TABLE picture DROP COLUMN {column}")
+        db.execute("PRAGMA user_version = 3")
+    with closing(ShoreIndex(out, writable=False)) as index:
+        assert index.images() == before
+    migrated = archive()
+    assert migrated.index().images() == before
+    classified = Contact(
+        contact_id="uuv-1/000A", vehicle_id="uuv-1", atd_class="structure", p_mine_like=0.05, p_other_object=0.9
+    )
+    migrated.store_image(image("000A").model_copy(update={"contact": classified}), 5.0)
+    migrated.flush()
+    [row] = [row for row in migrated.index().images() if row.image_id == "000A"]
+    assert (row.atd_class, row.p_mine_like, row.p_other_object) == ("structure", 0.05, 0.9)

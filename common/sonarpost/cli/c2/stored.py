@@ -31,6 +31,7 @@ from sonarpost.export.cot import cot_events
 from sonarpost.export.cot_sender import CotSender, TlsFiles
 from sonarpost.export.kml import write_kml, write_kmz
 from sonarpost.export.tables import write_csv, write_geojson
+from sonarpost.export.text import probabilities_text
 from sonarpost.files import write_atomically
 
 DEMO_IMAGES = Path("demo-out/shore/images")
@@ -245,6 +246,7 @@ def _print_images(rows: Sequence[ListedImage]) -> None:
         image, decision = row.image, row.decision
         located = image.lat_deg is not None and image.lon_deg is not None
         confidence = "" if image.atd_confidence is None else f"{image.atd_confidence:.2f}"
+        named = " ".join(part for part in (image.atd_class or "", confidence) if part)
         cells.append(
             (
                 image.vessel_id,
@@ -253,7 +255,9 @@ def _print_images(rows: Sequence[ListedImage]) -> None:
                 time_text(image.first_frame_utc_s),
                 f"{100 * image.missing_fraction:.0f} %",
                 f"{image.lat_deg:.5f} {image.lon_deg:.5f}" if located else "",
-                " ".join(part for part in (image.atd_class or "", confidence) if part),
+                ", ".join(
+                    part for part in (named, probabilities_text(image.p_mine_like, image.p_other_object)) if part
+                ),
                 "" if decision is None else " ".join(p for p in (decision.verdict, decision.mlo_class or "") if p),
                 "" if decision is None else decision.operator,
             )

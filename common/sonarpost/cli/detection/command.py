@@ -45,7 +45,7 @@ from sonarpost.sonar.survey import Side, Survey
 from sonarpost.wire import first_error
 
 _HEADER = (
-    "  n  conf  class      side       ping  sample  range_m  length_m  width_m  shadow_m  height_m"
+    "  n  conf  class      p_mine  p_other  side       ping  sample  range_m  length_m  width_m  shadow_m  height_m"
     "     lat_deg      lon_deg  sigma_m"
 )
 
@@ -238,13 +238,14 @@ def _print_table(result: FileListing, threshold: float) -> None:
         d = contact.detection
         lat, lon = ("-", "-") if d.position is None else (f"{d.position.lat_deg:.6f}", f"{d.position.lon_deg:.6f}")
         print(
-            f"{number:3d}  {d.confidence:4.2f}  {d.atd_class:9}  {d.side.value:9}  {d.ping_number:5d}  {d.sample:6d}"
-            f"  {d.slant_range_m:7.1f}  {_metres(d.length_m):>8}  {d.width_m:7.2f}  {d.shadow_m:8.2f}"
-            f"  {_metres(d.height_m):>8}  {lat:>10}  {lon:>11}  {_metres(d.position_sigma_m):>7}"
+            f"{number:3d}  {d.confidence:4.2f}  {d.atd_class:9}  {_decimals(d.p_mine_like):>6}"
+            f"  {_decimals(d.p_other_object):>7}  {d.side.value:9}  {d.ping_number:5d}  {d.sample:6d}"
+            f"  {d.slant_range_m:7.1f}  {_decimals(d.length_m):>8}  {d.width_m:7.2f}  {d.shadow_m:8.2f}"
+            f"  {_decimals(d.height_m):>8}  {lat:>10}  {lon:>11}  {_decimals(d.position_sigma_m):>7}"
         )
 
 
-def _metres(value: float | None) -> str:
+def _decimals(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 

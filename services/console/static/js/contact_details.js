@@ -3,7 +3,7 @@
 import { api } from "./api.js";
 import { decisionText } from "./decision_form.js";
 import { fill, h } from "./dom.js";
-import { DASH, authentication, duration, position, quantity, received, requestKind, time, verdict } from "./format.js";
+import { DASH, authentication, duration, position, probabilities, quantity, received, requestKind, time, verdict } from "./format.js";
 import { measurementLine } from "./measurement.js";
 import { emit } from "./state.js";
 
@@ -55,7 +55,8 @@ function recordFacts(contact, record) {
   const r = record ?? {};
   const rows = [
     ["position", position(contact.lat_deg, contact.lon_deg)], ["detected", time(contact.seen_utc_s, { date: true })],
-    ["detector", [r.atd_class, contact.atd_confidence === null ? null : `${contact.atd_confidence.toFixed(2)} of 2`].filter(Boolean).join(", ") || DASH],
+    ["detector", [contact.atd_class, contact.atd_confidence === null ? null : `${contact.atd_confidence.toFixed(2)} of 2`].filter(Boolean).join(", ") || DASH],
+    ...(probabilities(contact) ? [["probabilities", probabilities(contact)]] : []),
     ["size (detector)", [quantity(r.length_m, "m"), quantity(r.width_m, "m")].join(" × ")], ["shadow, height (detector)", `${quantity(r.shadow_m, "m")}, ${quantity(r.height_m, "m")}`],
     ["slant, ground range", `${quantity(r.slant_range_m, "m")}, ${quantity(r.ground_range_m, "m")}`], ["altitude, depth", `${quantity(r.altitude_m, "m")}, ${quantity(r.depth_m, "m")}`],
     ["heading, speed", `${quantity(r.heading_deg, "°", 0)}, ${quantity(r.speed_mps, "m/s")}`], ["side", r.channel ?? DASH], ["pixel along × across", `${quantity(r.pixel_along_m, "m", 3)} × ${quantity(r.pixel_across_m, "m", 3)}`],

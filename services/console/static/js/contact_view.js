@@ -2,7 +2,7 @@
 
 import { api } from "./api.js";
 import { h, fill, toast } from "./dom.js";
-import { DASH, position, quantity, received, time } from "./format.js";
+import { DASH, position, probabilities, quantity, received, time } from "./format.js";
 import { MAPS, autoRange, loadImage } from "./image_data.js";
 import { COMPARE, drawHint, drawTools, drawVersions, startMouse } from "./image_toolbar.js";
 import { ImageView, defaultViewport } from "./image_view.js";
@@ -266,6 +266,7 @@ export class ContactView {
       h("h2", { text: contact.name }),
       h("span", { class: "number", text: time(contact.seen_utc_s ?? contact.first_frame_utc_s, { date: true }) }),
       h("span", { class: "number", text: `ATD ${contact.atd_class ? `${contact.atd_class} ` : ""}${contact.atd_confidence === null ? DASH : contact.atd_confidence.toFixed(2)}` }),
+      probabilities(contact) ? h("span", { class: "number probabilities", text: probabilities(contact) }) : null,
       h("span", { class: "number", text: `${position(contact.lat_deg, contact.lon_deg)}${sigma} · range ${quantity(record?.slant_range_m ?? contact.range_m, "m", 0)} · altitude ${quantity(record?.altitude_m, "m")}` }));
     this.#drawTools();
     drawVersions(this);

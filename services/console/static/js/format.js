@@ -25,6 +25,14 @@ export function authentication(row) {
   return row.authenticated ? "authenticated" : "unauthenticated: any modem in range can have forged this contact";
 }
 
+/** Probabilities of a contact as whole percentages that add up to 100; null where they are not known. */
+export function probabilities(row) {
+  if (!known(row.p_mine_like) || !known(row.p_other_object)) return null;
+  const mineLike = Math.round(100 * row.p_mine_like);
+  const other = Math.min(Math.round(100 * row.p_other_object), 100 - mineLike);
+  return `mine-like ${percent(mineLike)}, other object ${percent(other)}, seabed ${percent(100 - mineLike - other)}`;
+}
+
 /** Statement about the despeckling of an image; null where it is not known. */
 export function despeckling(version) {
   if (!known(version.despeckle_strength)) return null;

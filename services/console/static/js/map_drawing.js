@@ -140,6 +140,11 @@ export function drawContacts({ context, width, height, toScreen, pixelsPerMetre,
       context.arc(x, y, one.sigma_m * pixelsPerMetre, 0, 2 * Math.PI);
       context.stroke();
     }
+    if (one.atd_class === "structure") {
+      context.strokeStyle = tone;
+      context.lineWidth = 1.5;
+      context.strokeRect(x - 9, y - 9, 18, 18);
+    }
     context.textAlign = "center";
     drawText(context, symbol(one.review), x, y, tone, colour("bg"));
     if (one.id === chosen) {

@@ -2,7 +2,7 @@
 
 import { api } from "./api.js";
 import { h } from "./dom.js";
-import { DASH, authentication, quantity, received, symbol, time, verdict } from "./format.js";
+import { DASH, authentication, probabilities, quantity, received, symbol, time, verdict } from "./format.js";
 import { emit, listen, state } from "./state.js";
 
 const MARGIN_ROWS = 6; // rows drawn above and below the visible ones
@@ -103,10 +103,18 @@ function meter(value_percent, title, tone) {
 function rowLabel(row) {
   return [
     row.name, verdict(row.review), row.atd_confidence === null ? "no detector confidence" : `detector ${row.atd_confidence.toFixed(2)} of 2`,
+    row.atd_class ? `class ${row.atd_class}` : "", probabilities(row) ?? "",
     row.complete ? "image complete" : `${received(row)} received`, `seen ${time(row.seen_utc_s ?? row.first_frame_utc_s)}`,
     row.looks > 1 ? `${row.looks} looks at one position` : "", row.advised ? "comment from the shore site" : "",
     row.authenticated === false ? "unauthenticated" : "",
   ].filter(Boolean).join(", ");
+}
+
+/** Class of the detector; a structure has a frame. */
+function classMark(row) {
+  if (!row.atd_class) return null;
+  const title = probabilities(row) ?? "class of the detector";
+  return h("span", { class: row.atd_class === "structure" ? "class structure" : "class", title, text: row.atd_class });
 }
 
 function marks(row) {
@@ -146,6 +154,7 @@ function queueRow(row, index, count, selected) {
     h("div", { class: "third muted number" },
       h("span", { text: time(row.seen_utc_s ?? row.first_frame_utc_s) }),
       h("span", { text: quantity(row.range_m, "m", 0) }),
+      classMark(row),
       h("span", { class: "marks" }, marks(row)))));
 }
 
