@@ -30,7 +30,7 @@ RATES = {0: (1, 32), 1: (3, 64), 2: (3, 64), 3: (2, 256), 4: (2, 256), 5: (8, 25
 
 def test_paper_example_frames_parse_to_the_stated_fields() -> None:
     lines = re.findall(r"^(?:[0-9A-F]{2} ?){15,}$", PAPER, re.MULTILINE)
-    top, bottom, common_top, common_bottom, contact, nothing = (
+    top, bottom, common_top, common_bottom, contact, nothing, classified = (
         parse_paper_frame(bytes.fromhex(line)) for line in lines
     )
     header, common = StreamHeader(0x10, 0xBEEF, 113, 49), StreamHeader(0x10, 0xBEEF, 140, 80)
@@ -40,6 +40,10 @@ def test_paper_example_frames_parse_to_the_stated_fields() -> None:
     assert common_bottom == HalfFrame("bottom", "00A8", 5, 9, common, bytes(range(0xA6, 0xAA)))
     assert nothing == ContactFrame("0000", ContactSummary())
     assert isinstance(contact, ContactFrame)
+    assert isinstance(classified, ContactFrame)
+    found = classified.contact
+    assert (found.atd_class, found.p_mine_like, found.p_other_object) == ("mine-like", 0.85, 0.1)
+    assert (found.lat_deg, found.lon_deg, found.height_px, found.width_px) == (44.7123456, -63.6543208, 113, 49)
     record = contact.contact
     assert (record.lat_deg, record.lon_deg, record.ground_range_m) == (44.7123456, -63.6543210, 33.3)
     assert record.pixel_along_m == pytest.approx(0.25, rel=0.013)
