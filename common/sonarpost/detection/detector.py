@@ -177,15 +177,23 @@ def search(
             places = [contact.measurement.row for contact in contacts.at(confidence)]
             rows += [row for row in places if survey.pings[row].channel(side) is not None]
         for contact in contacts.at(settings.confidence_threshold):
-            detection = _detection(survey, grid, contact, options, altitude_m)
+            detection = detection_of(survey, grid, contact, options, altitude_m)
             found += [detection] if detection is not None else []
     found.sort(key=lambda d: (-d.confidence, d.ping_index, d.side.value, d.sample))
     return SearchResult(tuple(found[: settings.max_contacts]), {c: tuple(rows) for c, rows in weaker.items()})
 
 
 @dataclass(frozen=True, slots=True)
-class _Contact:
-    """A contact in grid cells. The probabilities of a structure are None: it is not classified."""
+class GridContact:
+    """A contact in grid cells.
+
+    Attributes:
+        confidence: 0 to 2.
+        measurement: Its highlight and shadow.
+        atd_class: Class of the detection.
+        p_mine_like: Probability of a mine-like object; None for a structure, which is not classified.
+        p_other_object: Probability of another object; None for a structure.
+    """
 
     confidence: float
     measurement: Measurement
@@ -206,7 +214,7 @@ class _SideContacts:
         self._structures = sorted(structures, key=lambda structure: -structure.confidence)
         self._grid = grid
 
-    def at(self, threshold: float) -> list[_Contact]:
+    def at(self, threshold: float) -> list[GridContact]:
         """Return each contact at or above a threshold."""
         kept = [c for c in self._kept if c.confidence >= threshold]
         # A structure that contains a contact or a more confident structure is not reported again.
@@ -214,21 +222,21 @@ class _SideContacts:
             if structure.confidence < threshold:
                 break
             if not any(is_part_of_structure(c.measurement, structure.measurement, self._grid) for c in kept):
-                kept.append(_Contact(structure.confidence, structure.measurement, STRUCTURE))
+                kept.append(GridContact(structure.confidence, structure.measurement, STRUCTURE))
         return kept
 
 
-def _compact(placed: PlacedCandidate) -> _Contact:
+def _compact(placed: PlacedCandidate) -> GridContact:
     candidate = placed.candidate
     atd_class = MINE_LIKE if candidate.p_mine_like >= candidate.p_other_object else CLUTTER
     p_mine_like, p_other_object = round(candidate.p_mine_like, 4), round(candidate.p_other_object, 4)
-    return _Contact(candidate.confidence, placed.measurement, atd_class, p_mine_like, p_other_object)
+    return GridContact(candidate.confidence, placed.measurement, atd_class, p_mine_like, p_other_object)
 
 
-def _detection(
+def detection_of(
     survey: Survey,
     grid: LevelGrid,
-    contact: _Contact,
+    contact: GridContact,
     options: SurveyOptions,
     altitudes: FloatVector,
 ) -> Detection | None:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 from pydantic import ValidationError
 
+from sonarpost.cli.detection.picks import add_pick_option, contacts_of_picks, located_picks
 from sonarpost.cli.detection.transmissions import add_transmission_options, transmissions_of
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import (
@@ -28,6 +29,7 @@ from sonarpost.cli.shared import (
 )
 from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
 from sonarpost.detection.detector import MINE_LIKE, Detection, counts_text
+from sonarpost.detection.picks import PICKED, LocatedPick, PickedDetection
 from sonarpost.detection.record import contact_record
 from sonarpost.detection.settings import DetectorSettings, checked_settings, load_settings
 from sonarpost.detection.snippets import cut_snippet, ground_projected_image
@@ -85,6 +87,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--settings", type=Path, metavar="FILE.toml", help="settings of the detector, as in [atd_stub.detector]"
     )
+    add_pick_option(parser)
     add_transmission_options(parser)
     add_survey_options(parser)
     parser.add_argument("--vehicle", default="uuv", metavar="ID", help="vehicle_id of the records (default: uuv)")
@@ -98,6 +101,7 @@ def run(parsed: argparse.Namespace) -> int:
     options = survey_options_of(parsed)
     transmissions = transmissions_of(parsed)
     files: list[Path] = parsed.files
+    picks = located_picks(parsed.pick, files, options)
     if parsed.plot is not None:
         in_new_folder(parsed.plot)
     if parsed.snippets is not None:
@@ -106,6 +110,8 @@ def run(parsed: argparse.Namespace) -> int:
         with_images = parsed.snippets is not None
         detection = _Detection(settings, options, parsed.vehicle, transmissions, with_images=with_images)
         results = detection.run(files, display)
+        if picks:
+            detection.add_picks(picks)
     for result in results:
         if not parsed.json:
             _print_table(result, settings.confidence_threshold)
@@ -151,12 +157,14 @@ class ListedContact:
         record: Its contact record.
         image: Its snippet at the resolution of the recording; None without --snippets.
         ground: Its snippet projected to the bottom; None without --snippets, and where it is not known.
+        is_picked: Whether it is at a place of --pick.
     """
 
     detection: Detection
     record: Contact
     image: npt.NDArray[np.uint8] | None = None
     ground: npt.NDArray[np.uint8] | None = None
+    is_picked: bool = False
 
 
 @dataclass
@@ -169,6 +177,10 @@ class FileListing:
     seconds: float
     masked_pings: int
     contacts: list[ListedContact] = field(default_factory=list)
+
+    def sort(self) -> None:
+        """Sort the contacts: most confident first, those without confidence last."""
+        self.contacts.sort(key=lambda contact: -contact.detection.confidence)
 
 
 class _Detection:
@@ -183,6 +195,7 @@ class _Detection:
         *,
         with_images: bool,
     ) -> None:
+        self._settings = settings
         self._options = options
         self._transmissions = transmissions
         self._vehicle_id = vehicle_id
@@ -207,8 +220,24 @@ class _Detection:
             self._assign(found.contacts)
         self._assign(self._detector.finish())
         for result in self._results:
-            result.contacts.sort(key=lambda contact: -contact.detection.confidence)
+            result.sort()
         return self._results
+
+    def add_picks(self, picks: Sequence[LocatedPick]) -> None:
+        """Add the contacts of picks to the only file, and mark those that the detector has listed."""
+        (result,) = self._results
+        listed = [contact.detection for contact in result.contacts]
+        path, origin = result.info.path, result.origin
+        marked, found = contacts_of_picks(
+            path, origin, picks, listed, self._describe_pick, self._settings, self._options
+        )
+        result.contacts = [
+            replace(contact, is_picked=True) if number in marked else contact
+            for number, contact in enumerate(result.contacts)
+        ]
+        # Two picks may be on one object.
+        result.contacts += {contact.record.contact_id: contact for contact in found}.values()
+        result.sort()
 
     def _assign(self, contacts: Sequence[StreamContact[ListedContact]]) -> None:
         for contact in contacts:
@@ -217,6 +246,13 @@ class _Detection:
 
     def _describe(self, survey: Survey, detection: Detection, origin: PingOrigin) -> ListedContact:
         record = contact_record(detection, origin.file, self._vehicle_id, survey.sonar_id)
+        return self._listed(survey, detection, origin, record)
+
+    def _describe_pick(self, survey: Survey, picked: PickedDetection, origin: PingOrigin) -> ListedContact:
+        record = picked.record(origin.file, self._vehicle_id, survey.sonar_id)
+        return replace(self._listed(survey, picked.detection, origin, record), is_picked=True)
+
+    def _listed(self, survey: Survey, detection: Detection, origin: PingOrigin, record: Contact) -> ListedContact:
         first, end = (row + origin.row - detection.ping_index for row in detection.highlight_pings)
         in_file = replace(detection, ping_index=origin.row, highlight_pings=(first, end))
         if not self._with_images:
@@ -235,14 +271,18 @@ def _print_table(result: FileListing, threshold: float) -> None:
         print(f"  note: {result.masked_pings} of {info.ping_count} pings masked: the modem transmitted")
     print(_HEADER if result.contacts else f"{counts_text(threshold, 0, result.weaker)}; see --threshold")
     for number, contact in enumerate(result.contacts, start=1):
-        d = contact.detection
+        d, record = contact.detection, contact.record
         lat, lon = ("-", "-") if d.position is None else (f"{d.position.lat_deg:.6f}", f"{d.position.lon_deg:.6f}")
         print(
-            f"{number:3d}  {d.confidence:4.2f}  {d.atd_class:9}  {_decimals(d.p_mine_like):>6}"
+            f"{number:3d}  {_decimals(record.atd_confidence):>4}  {d.atd_class:9}  {_decimals(d.p_mine_like):>6}"
             f"  {_decimals(d.p_other_object):>7}  {d.side.value:9}  {d.ping_number:5d}  {d.sample:6d}"
-            f"  {d.slant_range_m:7.1f}  {_decimals(d.length_m):>8}  {d.width_m:7.2f}  {d.shadow_m:8.2f}"
-            f"  {_decimals(d.height_m):>8}  {lat:>10}  {lon:>11}  {_decimals(d.position_sigma_m):>7}"
+            f"  {d.slant_range_m:7.1f}  {_decimals(record.length_m):>8}  {_decimals(record.width_m):>7}"
+            f"  {_decimals(record.shadow_m):>8}"
+            f"  {_decimals(d.height_m if record.shadow_m is not None else None):>8}"
+            f"  {lat:>10}  {lon:>11}  {_decimals(d.position_sigma_m):>7}"
         )
+    if picked := [str(number) for number, contact in enumerate(result.contacts, start=1) if contact.is_picked]:
+        print(f"picked: {', '.join(picked)}")
 
 
 def _decimals(value: float | None) -> str:
@@ -250,7 +290,8 @@ def _decimals(value: float | None) -> str:
 
 
 def _file_json(result: FileListing, threshold: float) -> dict[str, object]:
-    counts = ((threshold, len(result.contacts)), *result.weaker.items())
+    detected = sum(not c.is_picked or c.detection.confidence >= threshold for c in result.contacts)
+    counts = ((threshold, detected), *result.weaker.items())
     return {
         "file": str(result.info.path),
         "pings": result.info.ping_count,
@@ -269,10 +310,10 @@ def _plot_path(plot: Path, survey_path: Path, *, several: bool) -> Path:
 def _write_snippets(folder: Path, result: FileListing) -> None:
     """Write the snippet of each contact at the resolution of the recording and, if possible, at 10 cm a pixel.
 
-    Each has a side-car with the fields of the contact.
+    Each has a side-car with the fields of the contact. The names of picked contacts contain "-pick".
     """
     for number, contact in enumerate(result.contacts, start=1):
-        name = f"{result.info.path.stem}-{number:03d}"
+        name = f"{result.info.path.stem}-{number:03d}{'-pick' if contact.is_picked else ''}"
         if contact.image is not None:
             write_png(folder / f"{name}.png", contact.image)
             write_side_car(folder / f"{name}.txt", contact.record)
@@ -296,6 +337,7 @@ def contact_json(contact: ListedContact) -> dict[str, object]:
         "time_utc": datetime.fromtimestamp(d.time_utc_s, UTC).isoformat(timespec="milliseconds"),
         "shadow_is_cut": d.shadow_is_cut,
         "scores": dataclasses.asdict(d.scores),
+        "picked": contact.is_picked,
     }
 
 
@@ -312,7 +354,7 @@ def _content_hash(path: Path) -> str:
         raise SurveyFileError(str(path), "", error.strerror or str(error), "a readable survey file") from error
 
 
-_COLOURS = {MINE_LIKE: (255, 80, 60)}
+_COLOURS = {MINE_LIKE: (255, 80, 60), PICKED: (90, 200, 255)}
 _OTHER_COLOUR = (255, 210, 60)
 _MARGIN_PX = 6
 _MAX_SIDE_PX = 1000
@@ -321,8 +363,8 @@ _MAX_SIDE_PX = 1000
 def annotated_waterfall(source: SurveySource, detections: Sequence[Detection]) -> Image.Image:
     """Draw the waterfall of `sonarpost survey plot` with a frame around highlight and shadow of each contact.
 
-    A frame is red if the contact is mine-like, else yellow. Its text is the number in `detections` (from 1) and the
-    confidence.
+    A frame is red if the contact is mine-like, blue if only a person has picked it, else yellow. Its text is the number
+    in `detections` (from 1) and the confidence.
 
     Returns:
         RGB image with scales of slant range, time and ping number.
@@ -339,5 +381,6 @@ def annotated_waterfall(source: SurveySource, detections: Sequence[Detection]) -
         frame = (left - _MARGIN_PX, top - _MARGIN_PX, right + _MARGIN_PX, bottom + _MARGIN_PX)
         colour = _COLOURS.get(detection.atd_class, _OTHER_COLOUR)
         draw.rectangle(frame, outline=colour)
-        draw.text((frame[0], frame[3] + 1), f"{number}: {detection.confidence:.2f}", fill=colour)
+        confidence = PICKED if detection.atd_class == PICKED else f"{detection.confidence:.2f}"
+        draw.text((frame[0], frame[3] + 1), f"{number}: {confidence}", fill=colour)
     return image
