@@ -1,7 +1,7 @@
 """Picks: places in a recording that a person marks as contacts, whether or not the detector has found them.
 
-A pick is measured like a detection. If the detector has a contact there at a confidence of 0.1 or more, the
-contact is that one, with its confidence and class. Otherwise highlight and shadow are measured at the pick; the contact has the
+A pick is measured like a detection. If the detector has a contact there at a confidence of 0.1 or more, the contact is
+that one, with its confidence and class. Otherwise highlight and shadow are measured at the pick; the contact has the
 class "picked" and no confidence. If nothing can be measured, its sizes are unknown too.
 
 `SURVEY.picks` beside a survey file contains one pick a line, `ping,side,sample`. Empty lines and lines that begin with
@@ -128,14 +128,13 @@ def parse_picks(content: bytes, where: str) -> tuple[tuple[Pick, ...], tuple[Con
         line = raw.strip()
         if not line or line.startswith("#"):
             continue
+        if len(picks) == MAX_PICKS:
+            errors.append(ConfigError(f"{where} line {number}", "picks", "one more", f"at most {MAX_PICKS}"))
+            break
         try:
-            pick = parse_pick(line, f"{where} line {number}")
-            if len(picks) >= MAX_PICKS and pick not in picks:
-                raise ConfigError(f"{where} line {number}", "picks", "one more", f"at most {MAX_PICKS}")
+            picks[parse_pick(line, f"{where} line {number}")] = None
         except ConfigError as error:
             errors.append(error)
-        else:
-            picks[pick] = None
     return tuple(picks), tuple(errors)
 
 
@@ -219,9 +218,9 @@ class PickedDetection:
     def record(self, origin: FileOrigin, vehicle_id: str, sonar_id: str) -> Contact:
         """Return the contact record, in which unknown sizes and the confidence of a person's pick are None."""
         record = contact_record(self.detection, origin, vehicle_id, sonar_id)
-        unknown = () if self.is_candidate else ("atd_confidence",)
+        unknown = [] if self.is_candidate else ["atd_confidence"]
         if not self.is_measured:
-            unknown += ("length_m", "width_m", "shadow_m", "height_m")
+            unknown += ["length_m", "width_m", "shadow_m", "height_m"]
         return record.model_copy(update=dict.fromkeys(unknown))
 
 

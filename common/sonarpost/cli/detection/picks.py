@@ -34,8 +34,8 @@ def add_pick_option(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="PING,SIDE,SAMPLE",
-        help="also list the contact at this place, as columns ping, side and sample of the table give it (index:N,… for "
-        "the ping with index N in the file, from 0); repeatable, for one survey file",
+        help="also list the contact at this place, given as in columns ping, side and sample of the table (index:N,… "
+        "is the ping with index N in the file, from 0); repeatable, for one survey file",
     )
 
 

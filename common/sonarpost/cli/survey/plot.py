@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -211,9 +212,9 @@ def reduce_survey(
     times: list[float] = []
     numbers: list[int] = []
     first = 0
-    for survey, altitude_m in _parts_with_altitude(source):
+    for survey, altitude_m in parts_with_altitude(source):
         row_of_ping = (first + np.arange(len(survey.pings))) // per_row
-        image = _both_sides(survey, altitude_m if over_ground else np.zeros_like(altitude_m), max_range_m, side_px)
+        image = both_sides(survey, altitude_m if over_ground else np.zeros_like(altitude_m), max_range_m, side_px)
         valid = np.isfinite(image)
         np.add.at(total, row_of_ping, np.where(valid, image, 0))
         np.add.at(count, row_of_ping, valid)
@@ -229,7 +230,7 @@ def reduce_survey(
     return Reduced(echo, altitudes, times, numbers, max_range_m, per_row)
 
 
-def _parts_with_altitude(source: SurveySource) -> Iterator[tuple[Survey, FloatArray]]:
+def parts_with_altitude(source: SurveySource) -> Iterator[tuple[Survey, FloatArray]]:
     """Yield the recording in parts with their altitudes; bottom tracking includes pings of the neighbouring parts."""
     info = source.info
     for strip in strips(source.pings(), _STRIP_PINGS, 2 * _MARGIN_PINGS):
@@ -239,8 +240,18 @@ def _parts_with_altitude(source: SurveySource) -> Iterator[tuple[Survey, FloatAr
         yield replace(survey, pings=strip.pings[begin:end]), altitudes_m(survey)[begin:end]
 
 
-def _both_sides(survey: Survey, altitude_m: FloatArray, max_range_m: float, side_px: int) -> FloatArray:
-    """Return both sides in `side_px` columns each; an altitude of 0 gives slant range."""
+def both_sides(survey: Survey, altitude_m: FloatArray, max_range_m: float, side_px: int) -> FloatArray:
+    """Return both sides over ground range, port mirrored to the left; an altitude of 0 gives slant range.
+
+    Args:
+        survey: The pings.
+        altitude_m: Altitude of each ping, shape (pings,), in metres; NaN if unknown.
+        max_range_m: Range of the outer edges.
+        side_px: Columns of one side.
+
+    Returns:
+        Mean echo, shape (pings, 2 * side_px), float64; NaN where not recorded.
+    """
     image = np.full((len(survey.pings), 2 * side_px), np.nan)
     for side in survey.sides():
         half = ground_range_image(survey, side, altitude_m, max_range_m / side_px)[:, :side_px]
@@ -268,7 +279,7 @@ def draw_waterfall(reduced: Reduced, title: str, *, over_ground: bool) -> Image.
     """
     rows = reduced.echo.shape[0]
     image = Image.new("RGB", (_LEFT_PX + 2 * reduced.side_px + _RIGHT_PX, _TOP_PX + rows + _BOTTOM_PX), _PAPER)
-    image.paste(Image.fromarray(_grey(reduced.echo)), (_LEFT_PX, _TOP_PX))
+    image.paste(Image.fromarray(GreyScale.of(reduced.echo).grey(reduced.echo)), (_LEFT_PX, _TOP_PX))
     draw = ImageDraw.Draw(image)
     axis = "ground range, m" if over_ground else "slant range, m"
     draw.text((6, 4), f"{title}   {axis}", fill=_INK)
@@ -284,17 +295,37 @@ def draw_waterfall(reduced: Reduced, title: str, *, over_ground: bool) -> Image.
     return image
 
 
-def _grey(echo: FloatArray) -> npt.NDArray[np.uint8]:
-    """Return the logarithm of the echo, stretched between percentiles, as uint8; 30 where not recorded."""
-    known = np.isfinite(echo)
-    if not known.any():
-        return np.full(echo.shape, 30, dtype=np.uint8)
-    positive = echo[known & (echo > 0)]
-    unit = float(np.median(positive)) if positive.size else 1.0
-    value = np.log1p(np.where(known, echo, 0) / unit * 4)
-    low, high = np.percentile(value[known], (1, 99.5))
-    grey = np.clip((value - low) / max(float(high - low), 1e-9), 0, 1) * 255
-    return np.where(known, grey, 30).astype(np.uint8)
+@dataclass(frozen=True, slots=True)
+class GreyScale:
+    """Mapping of echo to grey: the logarithm, stretched between the 1st and the 99.5th percentile.
+
+    Attributes:
+        unit: Median of the positive echo.
+        low: Logarithm that is black.
+        high: Logarithm that is white.
+    """
+
+    unit: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, echo: FloatArray) -> Self:
+        """Return the scale for an image; NaN is not recorded."""
+        known = echo[np.isfinite(echo)]
+        if not known.size:
+            return cls(1.0, 0.0, 1.0)
+        positive = known[known > 0]
+        unit = float(np.median(positive)) if positive.size else 1.0
+        low, high = np.percentile(np.log1p(known / unit * 4), (1, 99.5))
+        return cls(unit, float(low), float(high))
+
+    def grey(self, echo: FloatArray) -> npt.NDArray[np.uint8]:
+        """Return an image as uint8 of the same shape; 30 where it is not recorded (NaN)."""
+        known = np.isfinite(echo)
+        value = np.log1p(np.where(known, echo, 0) / self.unit * 4)
+        grey = np.clip((value - self.low) / max(self.high - self.low, 1e-9), 0, 1) * 255
+        return np.where(known, grey, 30).astype(np.uint8)
 
 
 def _draw_bottom(draw: ImageDraw.ImageDraw, reduced: Reduced) -> None:
