@@ -1,13 +1,14 @@
-"""`sonarpost survey`: describe, draw and export recordings."""
+"""`sonarpost survey`: describe, draw, view and export recordings."""
 
 from __future__ import annotations
 
 from sonarpost.cli.shared import Subparsers, add_command
 from sonarpost.cli.survey import export, info, plot
+from sonarpost.cli.survey.view import command as view
 
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add the command and its actions."""
-    actions = add_command(subparsers, "survey", "describe, draw and export recordings of side-scan sonars")
-    for module in (info, plot, export):
+    actions = add_command(subparsers, "survey", "describe, draw, view and export recordings of side-scan sonars")
+    for module in (info, plot, view, export):
         module.add_action(actions)
