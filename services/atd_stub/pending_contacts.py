@@ -1,4 +1,4 @@
-"""Durable priority list of the snippets that wait for release, most confident first."""
+"""Durable priority list of the snippets that wait for release: picks of a person first, then the most confident."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from sonarpost.messages import Snippet
 _PREFIX = "pool:"
 _MAX_CONFIDENCE = 2.0
 _STEPS = 1_000_000
+_PICK_RANK = -1
+"""Sorts before all ranks by confidence: `-` comes before the digits."""
 
 
 class PendingContacts:
     """Snippets in the service's store.
 
-    The name of a stored snippet sorts by confidence, then by age. A contact without confidence comes last. All
+    The name of a stored snippet sorts by confidence, then by age. Picks come first, other contacts without confidence
+    last. All
     content is in the store: a unit of work that is not committed changes nothing. One thread adds, one thread removes.
 
     Args:
@@ -39,6 +42,18 @@ class PendingContacts:
             effects.put_state(f"{_PREFIX}{rank:08d}:{self._next_number:015d}", wire.encode(snippet))
             self._next_number += 1
 
+    def add_picks(self, effects: UnitOfWork, snippets: Sequence[Snippet]) -> None:
+        """Queue snippets of picks before all others. Those of the same contacts that wait here are removed."""
+        picked = {snippet.contact.contact_id for snippet in snippets}
+        for name in self._store.state_names(_PREFIX):
+            payload = self._store.get_state(name)
+            # The other thread may have removed it.
+            if payload is not None and wire.decode(Snippet, payload, name).contact.contact_id in picked:
+                effects.delete_state(name)
+        for snippet in snippets:
+            effects.put_state(f"{_PREFIX}{_PICK_RANK:08d}:{self._next_number:015d}", wire.encode(snippet))
+            self._next_number += 1
+
     def remove_first(self, effects: UnitOfWork, count: int | None) -> list[bytes]:
         """Remove up to `count` (None for all) of the most confident snippets; return them encoded, in this order.
 
@@ -48,7 +63,8 @@ class PendingContacts:
         payloads = []
         for name in sorted(self._store.state_names(_PREFIX))[:count]:
             payload = self._store.get_state(name)
-            assert payload is not None, f"{name} was removed by another writer"
+            if payload is None:
+                continue  # replaced by a pick
             effects.delete_state(name)
             payloads.append(payload)
         return payloads

@@ -180,6 +180,16 @@ class ContactRelease:
         self._commit(effects)
         self._wake.set()
 
+    def add_picks(self, effects: UnitOfWork, snippets: tuple[Snippet, ...]) -> None:
+        """As `add`, for snippets of picks: they are released before all others.
+
+        Raises:
+            DeliveryError: The store cannot be written; nothing was stored.
+        """
+        self._pending.add_picks(effects, snippets)
+        self._commit(effects)
+        self._wake.set()
+
     def run(self, stopping: threading.Event) -> None:
         """Release contacts until `stopping` is set."""
         while not stopping.is_set():

@@ -17,6 +17,7 @@ from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.detection.detector import counts_text
 from sonarpost.detection.transmissions import WARNING_SHARE
+from sonarpost.detection.picks import picks_path
 from sonarpost.errors import DeliveryError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.logs import kv
@@ -33,6 +34,8 @@ from sonarpost.services.atd_stub.input_folder import (
     list_input_files,
     printable,
 )
+from sonarpost.services.atd_stub.picks import STATE_PREFIX as _PICKS
+from sonarpost.services.atd_stub.picks import contacts_of_picks, list_picks_files
 from sonarpost.services.atd_stub.release import ContactRelease
 from sonarpost.services.atd_stub.snippet_files import SNIPPET_SUFFIXES, read_snippet, write_snippet
 from sonarpost.services.atd_stub.survey_detection import DetectionResult, detect_in_survey
@@ -60,6 +63,8 @@ class AtdStubService(Service[AtdStubConfig]):
         self._suffixes = single_file_suffixes() if config.mode == "survey" else IMAGE_SUFFIXES
         self._stable_files = StableFiles(config.settle_s, require_done_marker=config.require_done_marker)
         self._processed: dict[InputFile, str] = {}  # with the digest of the content
+        self._stable_picks = StableFiles(config.settle_s)
+        self._handled_picks: set[InputFile] = set()
         self._retention_due_s = 0.0
         self._files_waiting = -1
         self._release = ContactRelease(platform, self.store, config.max_in_flight, self.commit)
@@ -122,6 +127,7 @@ class AtdStubService(Service[AtdStubConfig]):
                 self._process_folder()
                 if self._masks:
                     self._transmissions.save(time.monotonic())
+                self._process_picks()
                 self._apply_retention(time.time())
             except (OSError, DeliveryError) as error:
                 self.set_degraded(f"{type(error).__name__}: {error}")
@@ -153,13 +159,15 @@ class AtdStubService(Service[AtdStubConfig]):
         ]
         removed = select_for_removal(stored, now_utc_s, config.retain_days, config.max_bytes)
         for file in removed:
-            for path in (file.path, file.path.with_suffix(".txt"), file.path.with_name(file.path.name + DONE_SUFFIX)):
+            done = file.path.with_name(file.path.name + DONE_SUFFIX)
+            for path in (file.path, file.path.with_suffix(".txt"), done, picks_path(file.path)):
                 path.unlink(missing_ok=True)
             log.warning("Input file removed by retention", extra=kv(file=printable(file.path.name)))
         present = {content for file, content in self._processed.items() if file not in removed}
         for name, entry in entries.items():
             if name not in present and now_utc_s - entry["processed_utc_s"] > config.retain_days * DAY_S:
                 effects.delete_state(_state_name(name))
+                effects.delete_state(_PICKS + name)
         if removed:
             effects.count("files_removed", len(removed))
         if config.snippet_dir is not None:
@@ -193,6 +201,51 @@ class AtdStubService(Service[AtdStubConfig]):
                 self._files_waiting -= 1
         if first_error is not None:
             raise first_error
+
+    def _process_picks(self) -> None:
+        """Send the contacts of picks of processed surveys; each pick once.
+
+        Raises:
+            OSError: A file or the folder cannot be read.
+            DeliveryError: The store cannot be read or written.
+        """
+        if self.config.mode != "survey":
+            return
+        surveys = list_picks_files(self.config.input_dir, self._processed)
+        self._handled_picks &= surveys.keys()
+        new = tuple(file for file in surveys if file not in self._handled_picks)
+        for file in self._stable_picks.update(new, time.monotonic()):
+            if self.stopping.is_set():
+                return
+            survey = surveys[file]
+            content = self._processed[survey]
+            stored = self.store.get_state(_PICKS + content)
+            try:
+                result = contacts_of_picks(survey.path, content, file.path, stored, self.platform.id, self.config)
+            except FileNotFoundError:
+                continue
+            except SurveyFileError as error:
+                log.error("Picks not processed", extra=kv(file=file.path.name, reason=printable(str(error))))
+                self._handled_picks.add(file)
+                continue
+            effects = UnitOfWork()
+            effects.put_state(_PICKS + content, result.pack(time.time()))
+            if result.errors:
+                effects.count("picks_ignored", len(result.errors))
+            if result.snippets:
+                effects.count("contacts_picked", len(result.snippets))
+            if self.config.snippet_dir is not None:
+                for snippet in result.snippets:
+                    write_snippet(self.config.snippet_dir, snippet)
+            self._release.add_picks(effects, result.snippets)
+            self._handled_picks.add(file)
+            for reason in result.errors:
+                log.warning("Pick ignored", extra=kv(file=file.path.name, reason=printable(reason)))
+            for snippet in result.snippets:
+                log.info(
+                    "Contact picked",
+                    extra=kv(contact_id=snippet.contact.contact_id, file=snippet.source),
+                )
 
     def _process(self, file: InputFile) -> str:
         """Process a file; return its digest, empty if it was removed or changed and has to be tried again."""

@@ -13,7 +13,7 @@ from sonarpost.detection.record import contact_record
 from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamDetector, StreamEnd
 from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals
-from sonarpost.messages import Pixels, Snippet
+from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.survey import Survey
@@ -131,6 +131,14 @@ def snippet_of(
         vehicle_id: This vehicle.
         config: Size of the image.
     """
+    contact = contact_record(detection, origin, vehicle_id, survey.sonar_id)
+    return snippet_with_record(survey, detection, origin, contact, config)
+
+
+def snippet_with_record(
+    survey: Survey, detection: Detection, origin: FileOrigin, contact: Contact, config: AtdStubConfig
+) -> Snippet:
+    """Return the snippet of a detection with its contact record, as `snippet_of`."""
     size = (config.snippet_height_px, config.snippet_width_px)
     cut = cut_snippet(survey, detection, *size)
     image, pixel_sizes = cut.image, {}
@@ -143,7 +151,6 @@ def snippet_of(
             expanded = ground_projected_image(survey, detection, *size, 2 * config.snippet_pixel_m)
     if image is cut.image:
         expanded = cut_expanded(survey, detection, *size)
-    contact = contact_record(detection, origin, vehicle_id, survey.sonar_id)
     return Snippet(
         contact=contact.model_copy(update=pixel_sizes),
         picture=Pixels.from_array(image),

@@ -13,21 +13,21 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeVar
 
 import numpy as np
 
-from sonarpost.detection.candidates import (
-    Candidate,
-    FilterScores,
-    Measurement,
-    TextureMap,
-    geometry_score,
-    measure,
+from sonarpost.detection.candidates import FilterScores, Measurement, measure
+from sonarpost.detection.detector import (
+    LISTED_CONFIDENCES,
+    STRUCTURE,
+    Detection,
+    GridContact,
+    detection_of,
+    search,
 )
-from sonarpost.detection.detector import LISTED_CONFIDENCES, STRUCTURE, Detection, detection_of, search
 from sonarpost.detection.matched_filter import Peak, highlight_size_cells, matched_response
 from sonarpost.detection.normalisation import LevelGrid, normalise_side
 from sonarpost.detection.record import contact_record
@@ -326,15 +326,15 @@ class _StripPicks:
         if found is None:
             found = self._detection(*self._single_sample(row, pick))
         assert found is not None, "the ping of a located pick has this channel"
-        detection = replace(found, atd_class=PICKED, p_mine_like=None, p_other_object=None)
-        return PickedDetection(detection, is_candidate=False, is_measured=is_measured)
+        return PickedDetection(found, is_candidate=False, is_measured=is_measured)
 
-    def _detection(self, grid: LevelGrid, candidate: Candidate) -> Detection | None:
-        """Return a candidate as a detection; None if the ping of its centre has no such channel."""
-        return detection_of(self.survey, grid, 0.0, candidate, self._settings, self._options, self._altitudes_m)
+    def _detection(self, grid: LevelGrid, measurement: Measurement) -> Detection | None:
+        """Return a measurement as a detection; None if the ping of its centre has no such channel."""
+        contact = GridContact(0.0, measurement, PICKED)
+        return detection_of(self.survey, grid, contact, self._options, self._altitudes_m)
 
-    def _single_sample(self, row: int, pick: Pick) -> tuple[LevelGrid, Candidate]:
-        """Return a grid of the samples themselves, and the one at the pick as a candidate without a shadow."""
+    def _single_sample(self, row: int, pick: Pick) -> tuple[LevelGrid, Measurement]:
+        """Return a grid of the samples themselves, and the one at the pick as a measurement without a shadow."""
         channel = self.survey.pings[row].channel(pick.side)
         assert channel is not None, "the ping of a located pick has this channel"
         spacing_m = ping_spacing_m(self.survey)
@@ -356,11 +356,9 @@ class _StripPicks:
             cells=(pick.sample, pick.sample + 1),
             shadow_cells=0,
             shadow_is_cut=False,
-            matched=0.0,
-            cfar=0.0,
-            shadow=0.0,
+            scores=FilterScores(0.0, 0.0, 0.0),
         )
-        return grid, Candidate(place, FilterScores(0.0, 0.0, 0.0, 0.0, 0.0))
+        return grid, place
 
 
 class _SideGrid:
@@ -370,33 +368,25 @@ class _SideGrid:
         self._grid = grid
         self._settings = settings
         self._response = None if grid is None else matched_response(grid, settings)
-        self._texture = None if grid is None else TextureMap(grid)
 
-    def measured_at(self, row: int, sample: int) -> tuple[LevelGrid, Candidate] | None:
+    def measured_at(self, row: int, sample: int) -> tuple[LevelGrid, Measurement] | None:
         """Return the grid, and highlight and shadow near a place; None if they cannot be measured.
 
         Nothing is measured where the highlight does not exceed the seabed around it, or where its centre is farther
         from the pick than the centres of one contact are from each other.
         """
         grid, settings = self._grid, self._settings
-        if grid is None or self._response is None or self._texture is None:
+        if grid is None or self._response is None:
             return None
         peak = self._peak(grid, row, sample // grid.samples_per_cell)
         measurement = None if peak is None else measure(grid, peak, settings)
-        if measurement is None or measurement.cfar < _MIN_HIGHLIGHT:
+        if measurement is None or measurement.scores.cfar < _MIN_HIGHLIGHT:
             return None
         along_m = abs(measurement.row - row) * grid.row_along_m
         across_m = abs(measurement.cell - sample // grid.samples_per_cell) * grid.cell_across_m
         if along_m >= settings.separation_along_m or across_m >= settings.separation_across_m:
             return None
-        scores = FilterScores(
-            matched=measurement.matched,
-            cfar=measurement.cfar,
-            shadow=measurement.shadow,
-            texture=self._texture.anomaly(measurement.row, measurement.cells[1]),
-            geometry=geometry_score(measurement, grid, settings),
-        )
-        return grid, Candidate(measurement, scores)
+        return grid, measurement
 
     def _peak(self, grid: LevelGrid, row: int, cell: int) -> Peak | None:
         """Return the place of the best response of the matched filter near a cell; None in the water column."""
