@@ -151,7 +151,8 @@ class Contact(Record):
         slant_range_m: Distance from the sonar to the object.
         ground_range_m: The same along a flat seabed.
         atd_class: Class that the detector assigned: `mine-like`, `clutter` (any other object) or `structure` (a wreck,
-            a wall, an outcrop). Other detectors may use other names; the acoustic link does not carry those.
+            a wall, an outcrop); `picked` if only a person has marked the place. Other detectors may use other names;
+            the acoustic link does not carry those.
         atd_confidence: Confidence of the detector as in the paper, 2 is the highest.
         length_m: Length along-track.
         width_m: Width across-track.

@@ -35,7 +35,7 @@ from sonarpost.services.atd_stub.input_folder import (
     printable,
 )
 from sonarpost.services.atd_stub.picks import STATE_PREFIX as _PICKS
-from sonarpost.services.atd_stub.picks import contacts_of_picks, list_picks_files
+from sonarpost.services.atd_stub.picks import PicksResult, contacts_of_picks, list_picks_files
 from sonarpost.services.atd_stub.release import ContactRelease
 from sonarpost.services.atd_stub.snippet_files import SNIPPET_SUFFIXES, read_snippet, write_snippet
 from sonarpost.services.atd_stub.survey_detection import DetectionResult, detect_in_survey
@@ -217,35 +217,43 @@ class AtdStubService(Service[AtdStubConfig]):
         for file in self._stable_picks.update(new, time.monotonic()):
             if self.stopping.is_set():
                 return
-            survey = surveys[file]
-            content = self._processed[survey]
-            stored = self.store.get_state(_PICKS + content)
-            try:
-                result = contacts_of_picks(survey.path, content, file.path, stored, self.platform.id, self.config)
-            except FileNotFoundError:
-                continue
-            except SurveyFileError as error:
-                log.error("Picks not processed", extra=kv(file=file.path.name, reason=printable(str(error))))
-                self._handled_picks.add(file)
-                continue
-            effects = UnitOfWork()
-            effects.put_state(_PICKS + content, result.pack(time.time()))
-            if result.errors:
-                effects.count("picks_ignored", len(result.errors))
-            if result.snippets:
-                effects.count("contacts_picked", len(result.snippets))
-            if self.config.snippet_dir is not None:
-                for snippet in result.snippets:
-                    write_snippet(self.config.snippet_dir, snippet)
-            self._release.add_picks(effects, result.snippets)
+            if (result := self._measured_picks(file, surveys[file])) is not None:
+                self._commit_picks(file, self._processed[surveys[file]], result)
             self._handled_picks.add(file)
-            for reason in result.errors:
-                log.warning("Pick ignored", extra=kv(file=file.path.name, reason=printable(reason)))
+
+    def _measured_picks(self, file: InputFile, survey: InputFile) -> PicksResult | None:
+        """Return the contacts of a file of picks; None if it was removed, or the survey cannot be read."""
+        content = self._processed[survey]
+        stored = self.store.get_state(_PICKS + content)
+        try:
+            return contacts_of_picks(survey.path, content, file.path, stored, self.platform.id, self.config)
+        except FileNotFoundError:
+            return None
+        except SurveyFileError as error:
+            log.error("Picks not processed", extra=kv(file=file.path.name, reason=printable(str(error))))
+        except (OSError, DeliveryError):
+            raise
+        except Exception:
+            # A defect of the measurement must not stop the polling.
+            log.exception("Picks not processed", extra=kv(file=file.path.name))
+        return None
+
+    def _commit_picks(self, file: InputFile, content: str, result: PicksResult) -> None:
+        """Commit the contacts of picks; their files are written before."""
+        effects = UnitOfWork()
+        effects.put_state(_PICKS + content, result.pack(time.time()))
+        if result.errors:
+            effects.count("picks_ignored", len(result.errors))
+        if result.snippets:
+            effects.count("contacts_picked", len(result.snippets))
+        if self.config.snippet_dir is not None:
             for snippet in result.snippets:
-                log.info(
-                    "Contact picked",
-                    extra=kv(contact_id=snippet.contact.contact_id, file=snippet.source),
-                )
+                write_snippet(self.config.snippet_dir, snippet)
+        self._release.add_picks(effects, result.snippets)
+        for reason in result.errors:
+            log.warning("Pick ignored", extra=kv(file=file.path.name, reason=printable(reason)))
+        for snippet in result.snippets:
+            log.info("Contact picked", extra=kv(contact_id=snippet.contact.contact_id, file=snippet.source))
 
     def _process(self, file: InputFile) -> str:
         """Process a file; return its digest, empty if it was removed or changed and has to be tried again."""
