@@ -37,6 +37,7 @@ from sonarpost.services.atd_stub.input_folder import (
 from sonarpost.services.atd_stub.picks import STATE_PREFIX as _PICKS
 from sonarpost.services.atd_stub.picks import PicksResult, contacts_of_picks, list_picks_files
 from sonarpost.services.atd_stub.release import ContactRelease
+from sonarpost.services.atd_stub.seabed_history import SeabedHistory
 from sonarpost.services.atd_stub.snippet_files import SNIPPET_SUFFIXES, read_snippet, write_snippet
 from sonarpost.services.atd_stub.survey_detection import DetectionResult, detect_in_survey
 from sonarpost.services.atd_stub.transmissions import TransmissionLog
@@ -71,6 +72,7 @@ class AtdStubService(Service[AtdStubConfig]):
         self._file_ends = FileEndStore(self.store)
         malformed = self.interval_log(log, logging.WARNING, "Ignoring malformed transmissions")
         self._transmissions = TransmissionLog(self.store, self.commit, self.count, malformed, config.transmissions_file)
+        self._seabed = SeabedHistory()
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Not called: this service consumes no records."""
@@ -95,13 +97,14 @@ class AtdStubService(Service[AtdStubConfig]):
         return self.config.mask_transmissions and self.config.mode == "survey"
 
     def gauges(self) -> Mapping[str, float]:
-        """Return the numbers of files (-1 before the first poll) and contacts that wait."""
+        """Return how many files (-1 before the first poll) and contacts wait, and the difficulty of the seabed."""
         return {
             "files_waiting": float(self._files_waiting),
             "contacts_waiting": float(self._release.pending + self._file_ends.held_count),
             "contacts_held": float(self._file_ends.held_count),
             "contacts_in_flight": float(self._release.in_flight),
             "transmissions_known": float(len(self._transmissions)),
+            **self._seabed.gauges(time.monotonic()),
         }
 
     def degraded_reason(self) -> str:
@@ -109,12 +112,12 @@ class AtdStubService(Service[AtdStubConfig]):
         return self._release.error
 
     def warning(self) -> str:
-        """Return how many contacts wait for release, and how many for the continuation of their file."""
+        """Return how many contacts wait for release, how many for a continuation file, and whether Pd is low."""
         waiting = ""
         if held := self._file_ends.held_count:
             until = datetime.fromtimestamp(self._file_ends.held_until_utc_s, UTC).strftime("%H:%M:%S")
             waiting = f"{held} contacts held for a continuation file until {until} UTC"
-        return "; ".join(filter(None, (self._release.status, waiting)))
+        return "; ".join(filter(None, (self._release.status, waiting, self._seabed.warning())))
 
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Check for free credit after the compressor has accepted or refused a snippet."""
@@ -312,6 +315,9 @@ class AtdStubService(Service[AtdStubConfig]):
         if self.config.mode == "survey":
             threshold = self.config.confidence_threshold
             counts["counts"] = counts_text(threshold, result.contact_count, result.weaker)
+            self._seabed.add(result.difficulty, time.monotonic())
+            if result.difficulty is not None:
+                counts["expected_pd"] = f"{result.difficulty.expected_pd:.2f}"
         log.info(
             "File processed",
             extra=kv(

@@ -9,6 +9,7 @@ from pathlib import Path
 from sonarpost import wire
 from sonarpost.codec.interface import MIN_SIDE_PX
 from sonarpost.detection.detector import Detection
+from sonarpost.detection.difficulty import Difficulty
 from sonarpost.detection.record import contact_record
 from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamDetector, StreamEnd
@@ -41,6 +42,7 @@ class DetectionResult:
             boundaries of files and of strips.
         masked_pings: Number of pings that were recorded during a transmission of the own modem.
         masked_share: The same as a share of the pings of the file, 0 to 1.
+        difficulty: Difficulty of the file's seabed; None if too little of it is known.
     """
 
     snippets: tuple[Snippet, ...]
@@ -55,6 +57,7 @@ class DetectionResult:
     weaker: Mapping[float, int] = field(default_factory=dict)
     masked_pings: int = 0
     masked_share: float = 0.0
+    difficulty: Difficulty | None = None
 
 
 def detect_in_survey(
@@ -103,6 +106,7 @@ def detect_in_survey(
         weaker=found.weaker,
         masked_pings=masked.masked_count,
         masked_share=masked.masked_share,
+        difficulty=found.difficulty,
     )
 
 

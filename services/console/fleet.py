@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from sonarpost.detection.difficulty import RELIABLE_PD, unreliable_text
 from sonarpost.messages import AcousticFrame, QueueState
 from sonarpost.monitoring.fleet import FleetTracker, ServiceStatus
 from sonarpost.review.positions import distance_m
@@ -17,6 +20,8 @@ from sonarpost.services.console.store.serialisers import Json
 PACKETS_KEPT = 20
 MAX_VEHICLES = 200
 SERVICE_STALE_S = 15.0
+DETECTOR = "atd_stub"
+"""Service whose health has the difficulty of the seabed."""
 
 
 @dataclass
@@ -95,7 +100,15 @@ class FleetMonitor:
         """Return the link and queue state of all vehicles by name."""
         now = time.monotonic() if now_s is None else now_s
         with self._lock:
-            return {name: self._vehicle_json(name, now) for name in sorted({*self._links, *self._queues})}
+            seabeds = self._seabeds(now)
+            names = sorted({*self._links, *self._queues, *seabeds})
+            return {name: {**self._vehicle_json(name, now), "seabed": seabeds.get(name)} for name in names}
+
+    def _seabeds(self, now: float) -> dict[str, Json]:
+        """Return the difficulty of the seabed by vehicle, from the health of its detector."""
+        detectors = [status for status in self.services.state(now).services if status.service == DETECTOR]
+        known = ((status.platform, _seabed_json(status)) for status in detectors[:MAX_VEHICLES])
+        return {name: seabed for name, seabed in known if seabed is not None}
 
     def _vehicle_json(self, name: str, now: float) -> Json:
         link = self._links.get(name)
@@ -130,7 +143,7 @@ class FleetMonitor:
 
 def unknown_vehicle_json(name: str) -> Json:
     """Return the state of a vehicle without received frames."""
-    unknown = ("last_heard_utc_s", "age_s", "rate", "snr_in_db", "snr_out_db", "loss", "queue")
+    unknown = ("last_heard_utc_s", "age_s", "rate", "snr_in_db", "snr_out_db", "loss", "queue", "seabed")
     zero = ("frames", "bad_frames", "frames_per_minute")
     return {"vehicle_id": name, **dict.fromkeys(unknown), **dict.fromkeys(zero, 0), "stale": True}
 
@@ -163,6 +176,32 @@ def _service_json(status: ServiceStatus) -> Json:
         "age_s": None if status.age_s is None else round(status.age_s, 1),
         "stale": stale,
     }
+
+
+def _seabed_json(status: ServiceStatus) -> Json | None:
+    """Return the difficulty of the seabed in a detector's health; None if it has no valid expected Pd.
+
+    The gauges come from another platform: a value out of its range is None.
+    """
+    gauges = status.health.gauges if status.health else {}
+    expected_pd = _gauge(gauges, "expected_pd", 1.0)
+    if status.health is None or expected_pd is None:
+        return None
+    return {
+        "expected_pd": expected_pd,
+        "worst_expected_pd": _gauge(gauges, "worst_expected_pd", 1.0),
+        "clutter_per_1000_m2": _gauge(gauges, "clutter_per_1000_m2", math.inf),
+        "ripple_strength": _gauge(gauges, "ripple_strength", 1.0),
+        "warning": unreliable_text(expected_pd) if expected_pd < RELIABLE_PD else "",
+        "time_utc_s": status.health.time_utc_s,
+        "age_s": None if status.age_s is None else round(status.age_s, 1),
+        "stale": status.age_s is None or status.age_s > SERVICE_STALE_S,
+    }
+
+
+def _gauge(gauges: Mapping[str, float], name: str, highest: float) -> float | None:
+    value = gauges.get(name)
+    return value if value is not None and math.isfinite(value) and 0.0 <= value <= highest else None
 
 
 def fleet_json(monitor: FleetMonitor, db: sqlite3.Connection, config: ConsoleConfig, now_utc_s: float) -> Json:

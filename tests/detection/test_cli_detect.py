@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -40,8 +41,11 @@ def file(make_survey, tmp_path_factory):
 
 def test_table_lists_each_contact(file, capsys):
     assert run(file) == 0
-    title, columns, line = capsys.readouterr().out.splitlines()
+    title, seabed, columns, line = capsys.readouterr().out.splitlines()
     assert title == f"{file}: 200 pings, 1 contacts"
+    assert re.fullmatch(
+        r"  seabed: \d+ clutter echoes per 1000 m², ripples 0\.\d, expected Pd [01]\.\d\d at threshold 1", seabed
+    )
     assert len(columns.split()) == len(line.split())
     assert {"lat_deg", "lon_deg", "sigma_m"} < set(columns.split())
     assert line.split()[2:4] == ["mine-like", "starboard"]
@@ -66,6 +70,33 @@ def test_json_is_one_object_with_contacts_of_every_file(file, capsys):
     assert contact["position_sigma_m"] == pytest.approx(5.0, abs=0.2)
     missing = set(Contact.model_fields) - set(contact)
     assert missing <= {"type", "v", "schema_version", "time_utc_s"}, missing
+
+
+def test_json_has_the_difficulty_of_the_seabed(file, capsys):
+    assert run(file, "--json", "--threshold", "0.5") == 0
+    seabed = json.loads(capsys.readouterr().out)["files"][0]["seabed"]
+    assert seabed["threshold"] == 0.5
+    assert 0.0 <= seabed["expected_pd"] <= 1.0
+    assert 0.0 <= seabed["ripple_strength"] <= 1.0
+    assert [(s["first_ping"], s["end_ping"], s["channel"]) for s in seabed["strips"]] == [
+        (0, 200, "port"),
+        (0, 200, "starboard"),
+    ]
+    assert sum(s["area_m2"] for s in seabed["strips"]) == pytest.approx(seabed["area_m2"], abs=0.01)
+    echoes = sum(s["area_m2"] * s["clutter_per_1000_m2"] for s in seabed["strips"])
+    assert echoes / seabed["area_m2"] == pytest.approx(seabed["clutter_per_1000_m2"], abs=0.01)
+
+
+def test_seabed_of_a_short_file_is_unknown(make_survey, tmp_path, capsys):
+    survey = make_survey()
+    path = tmp_path / "short.xtf"
+    write_xtf(replace(survey, pings=survey.pings[:30]), path)
+    assert run(path) == 0
+    assert "  seabed: too little of it is known to state its difficulty" in capsys.readouterr().out.splitlines()
+    assert run(path, "--json") == 0
+    seabed = json.loads(capsys.readouterr().out)["files"][0]["seabed"]
+    assert seabed["expected_pd"] is None
+    assert [s["expected_pd"] for s in seabed["strips"]] == [None, None]
 
 
 def test_snippets_are_written_at_both_scales_with_side_cars(file, tmp_path, capsys):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +16,7 @@ from sonarpost.detection.candidates import (
     distinct_candidates,
 )
 from sonarpost.detection.classifier import Classifier, default_classifier, load_classifier_once
+from sonarpost.detection.difficulty import Difficulty, seabed_difficulty
 from sonarpost.detection.matched_filter import matched_response
 from sonarpost.detection.normalisation import FloatVector, LevelGrid, normalise_side
 from sonarpost.detection.settings import DetectorSettings
@@ -112,10 +113,12 @@ class SearchResult:
         detections: Contacts of both sides at or above the confidence threshold, most confident first.
         weaker: What lower thresholds would give: for each of `LISTED_CONFIDENCES` below the threshold, the ping index
             of each contact at or above that confidence.
+        difficulties: Difficulty of the seabed of each side; None where too little of it is known.
     """
 
     detections: tuple[Detection, ...]
     weaker: Mapping[float, tuple[int, ...]]
+    difficulties: Mapping[Side, Difficulty | None] = field(default_factory=dict)
 
 
 def counts_text(threshold: float, count: int, weaker: Mapping[float, int]) -> str:
@@ -155,7 +158,7 @@ def detect(
 def search(
     survey: Survey, settings: DetectorSettings | None = None, options: SurveyOptions | None = None
 ) -> SearchResult:
-    """Detect the contacts of a survey in memory, and count those that lower thresholds would give.
+    """Detect the contacts of a survey in memory, count those that lower thresholds would give, and rate the seabed.
 
     Args:
         survey: The recording.
@@ -168,11 +171,14 @@ def search(
     altitude_m = altitudes_m(survey)
     found: list[Detection] = []
     weaker: dict[float, list[int]] = {c: [] for c in LISTED_CONFIDENCES if c < settings.confidence_threshold}
+    difficulties: dict[Side, Difficulty | None] = {}
     for side in survey.sides():
         grid = normalise_side(survey, side, settings, altitude_m)
         if grid is None:
+            difficulties[side] = None
             continue
         contacts = _SideContacts(grid, settings, classifier, min((settings.confidence_threshold, *weaker)))
+        difficulties[side] = seabed_difficulty(grid, contacts.matched, settings.confidence_threshold)
         for confidence, rows in weaker.items():
             places = [contact.measurement.row for contact in contacts.at(confidence)]
             rows += [row for row in places if survey.pings[row].channel(side) is not None]
@@ -180,7 +186,8 @@ def search(
             detection = detection_of(survey, grid, contact, options, altitude_m)
             found += [detection] if detection is not None else []
     found.sort(key=lambda d: (-d.confidence, d.ping_index, d.side.value, d.sample))
-    return SearchResult(tuple(found[: settings.max_contacts]), {c: tuple(rows) for c, rows in weaker.items()})
+    lower = {c: tuple(rows) for c, rows in weaker.items()}
+    return SearchResult(tuple(found[: settings.max_contacts]), lower, difficulties)
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,6 +215,7 @@ class _SideContacts:
     def __init__(self, grid: LevelGrid, settings: DetectorSettings, classifier: Classifier, lowest: float) -> None:
         response = matched_response(grid, settings)
         candidates = classified_candidates(response, grid, settings, classifier)
+        self.matched = [candidate.peak.score for candidate in candidates]
         # Only more confident candidates suppress one: those at a higher threshold are the first of this list.
         self._kept = [_compact(c) for c in distinct_candidates(candidates, grid, settings, lowest)]
         structures = (*find_structures(grid), *find_water_structures(grid))

@@ -24,6 +24,7 @@ import numpy as np
 
 from sonarpost.detection.association import DetectionPlace
 from sonarpost.detection.detector import Detection, search
+from sonarpost.detection.difficulty import Difficulty, combined
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.source import Strip, SurveySource, strips
@@ -182,6 +183,23 @@ def _is_near(one: Ping, other: Ping) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
+class StripDifficulty:
+    """Difficulty of the seabed of one side of a strip.
+
+    Attributes:
+        first_row: First ping of the strip in its file; 0 if the strip begins in the file before.
+        end_row: One past its last ping.
+        side: Side of the vehicle.
+        difficulty: None if too little of the seabed is known.
+    """
+
+    first_row: int
+    end_row: int
+    side: Side
+    difficulty: Difficulty | None
+
+
+@dataclass(frozen=True, slots=True)
 class FileResult(Generic[T]):
     """The contacts of one file.
 
@@ -195,6 +213,8 @@ class FileResult(Generic[T]):
         dropped: Contacts held there and not detected in the joined pings.
         weaker: Number of contacts in this file at the confidences of `LISTED_CONFIDENCES` below the threshold;
             approximate at the boundaries of strips and files.
+        difficulties: Difficulty of the seabed of each strip. Strips overlap, and the first one of a file that continues
+            another begins with pings of that file.
     """
 
     contacts: tuple[StreamContact[T], ...]
@@ -204,6 +224,12 @@ class FileResult(Generic[T]):
     replaced: tuple[StreamContact[T], ...]
     dropped: tuple[StreamContact[T], ...]
     weaker: Mapping[float, int]
+    difficulties: tuple[StripDifficulty, ...] = ()
+
+    @property
+    def difficulty(self) -> Difficulty | None:
+        """The mean of the strips and sides, weighted by area; None if too little seabed is known."""
+        return combined(strip.difficulty for strip in self.difficulties)
 
 
 class StreamDetector(Generic[T]):
@@ -302,6 +328,7 @@ class _FileSearch(Generic[T]):
         self._decided: list[_Found[T]] = []
         self._waiting: list[_Found[T]] = []
         self._weaker: Counter[float] = Counter()
+        self._difficulties: list[StripDifficulty] = []
         self.result: FileResult[T]
 
     def run(self, pings: Iterable[Ping]) -> StreamEnd[T]:
@@ -320,8 +347,10 @@ class _FileSearch(Generic[T]):
         stored = stored_ping_count(strip.pings, self._overlap) if strip.is_last else self._overlap
         upper = max(lower, end - min(self._overlap // 2, stored))
         found = search(survey, self._strip_settings, self._source.options)
-        for confidence, rows in found.weaker.items():
-            in_strip = (strip.first_row + row for row in rows)
+        rows = (max(0, strip.first_row - self._first_new_row), end - self._first_new_row)
+        self._difficulties += [StripDifficulty(*rows, side, value) for side, value in found.difficulties.items()]
+        for confidence, weaker_rows in found.weaker.items():
+            in_strip = (strip.first_row + row for row in weaker_rows)
             first, behind = max(lower, self._first_new_row), math.inf if strip.is_last else upper
             self._weaker[confidence] += sum(first <= row < behind for row in in_strip)
         known, held = tuple(self._reported), self._held
@@ -376,6 +405,7 @@ class _FileSearch(Generic[T]):
             replaced=tuple(contact for n, contact in enumerate(before) if n in self._repeated),
             dropped=tuple(contact for n, contact in enumerate(before) if n not in self._repeated),
             weaker=dict(self._weaker),
+            difficulties=tuple(self._difficulties),
         )
         end = last.first_row + len(last.pings)
         stored = stored_ping_count(last.pings, self._overlap)

@@ -25,7 +25,7 @@ from sonarpost.messages import (
 )
 from sonarpost.modem.micromodem import RATES
 from sonarpost.review.costs import NEW_IMAGE_KINDS
-from sonarpost.services.console.fleet import frame_event
+from sonarpost.services.console.fleet import DETECTOR, frame_event
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.training.contacts import (
     VEHICLES,
@@ -36,6 +36,11 @@ from sonarpost.services.console.training.contacts import (
 VESSEL = "training"
 RATE = 1
 SERVICES = ("op_modem", "decompressor", "relay", "console")
+SEABEDS = (
+    {"expected_pd": 0.96, "worst_expected_pd": 0.91, "clutter_per_1000_m2": 5.0, "ripple_strength": 0.1},
+    {"expected_pd": 0.62, "worst_expected_pd": 0.35, "clutter_per_1000_m2": 41.0, "ripple_strength": 0.12},
+)
+"""Difficulty of the seabed of each vehicle."""
 UPDATE_INTERVAL_S = 0.5
 BACKLOG_BATCH = 40
 COMMENT_INTERVAL_PACKETS = 5
@@ -246,17 +251,22 @@ class TrainingSimulator:
 
     def _update_health(self, now_utc_s: float) -> None:
         for service in SERVICES:
-            health = Health(
-                platform_id=VESSEL,
-                service=service,
-                time_utc_s=now_utc_s,
-                started_utc_s=now_utc_s,
-                state="ok",
-                detail="simulated, for training",
-                counters={},
-                gauges={},
-            )
-            self._state.fleet.services.add(keys.health(VESSEL, service), wire.encode(health), time.monotonic())
+            self._add_health(VESSEL, service, now_utc_s, {})
+        for vehicle, seabed in zip(VEHICLES, SEABEDS, strict=True):
+            self._add_health(vehicle, DETECTOR, now_utc_s, seabed)
+
+    def _add_health(self, platform: str, service: str, now_utc_s: float, gauges: dict[str, float]) -> None:
+        health = Health(
+            platform_id=platform,
+            service=service,
+            time_utc_s=now_utc_s,
+            started_utc_s=now_utc_s,
+            state="ok",
+            detail="simulated, for training",
+            counters={},
+            gauges=gauges,
+        )
+        self._state.fleet.services.add(keys.health(platform, service), wire.encode(health), time.monotonic())
 
     # Downlink
 

@@ -7,7 +7,8 @@ import math
 import pytest
 from builders.console import image_record
 
-from sonarpost.messages import AcousticFrame, LinkQuality, QueuedImage, QueueState
+from sonarpost import keys, wire
+from sonarpost.messages import AcousticFrame, Health, LinkQuality, QueuedImage, QueueState
 from sonarpost.review.positions import LocalFrame, destination, distance_m, vehicle_position
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
@@ -91,3 +92,56 @@ def test_link_quality_and_stale_link(make_console):
     assert monitor.queue_wait_s("uuv-1", 1010.0) == 30.0
     later = monitor.vehicles(now_s=100.0)["uuv-1"]
     assert (later["stale"], later["queue"]["stale"], later["frames_per_minute"]) == (True, True, 0)
+
+
+def detector_health(vehicle="uuv-1", service="atd_stub", **gauges: float) -> tuple[str, bytes]:
+    health = Health(
+        platform_id=vehicle,
+        service=service,
+        time_utc_s=1000.0,
+        started_utc_s=900.0,
+        state="ok",
+        counters={},
+        gauges=gauges,
+    )
+    return keys.health(vehicle, service), wire.encode(health)
+
+
+def test_seabed_is_from_the_health_of_the_vehicles_detector(make_console):
+    console = make_console()
+    monitor = console.state.fleet
+    gauges = {"expected_pd": 0.62, "worst_expected_pd": 0.35, "clutter_per_1000_m2": 41.0, "ripple_strength": 0.12}
+    monitor.services.add(*detector_health(**gauges), now_s=10.0)
+    monitor.services.add(*detector_health("uuv-2", "compressor", expected_pd=0.1), now_s=10.0)
+    monitor.add_frame("uuv-2", frame(1, 0), now_s=10.0)
+    vehicles = monitor.vehicles(now_s=12.0)
+    assert vehicles["uuv-2"]["seabed"] is None
+    assert vehicles["uuv-1"]["seabed"] == gauges | {
+        "warning": "expected Pd 62 % on this seabed; a clean result does not mean no mines",
+        "time_utc_s": 1000.0,
+        "age_s": 2.0,
+        "stale": False,
+    }
+    assert monitor.vehicles(now_s=100.0)["uuv-1"]["seabed"]["stale"]
+    served = {v["vehicle_id"]: v["seabed"] for v in console.browser("watch").get("/api/fleet").json()["vehicles"]}
+    assert served["uuv-1"]["expected_pd"] == 0.62
+    assert served["uuv-2"] is None
+
+
+@pytest.mark.parametrize(("expected_pd", "warns"), [(0.0, True), (0.799, True), (0.8, False), (1.0, False)])
+def test_warning_of_a_difficult_seabed(make_console, expected_pd, warns):
+    monitor = make_console().state.fleet
+    monitor.services.add(*detector_health(expected_pd=expected_pd), now_s=1.0)
+    seabed = monitor.vehicles(now_s=1.0)["uuv-1"]["seabed"]
+    assert ("a clean result does not mean no mines" in seabed["warning"]) == warns
+    assert seabed["worst_expected_pd"] is None
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, math.inf, math.nan])
+def test_values_of_a_seabed_beyond_their_range_are_unknown(make_console, value):
+    monitor = make_console().state.fleet
+    monitor.add_frame("uuv-1", frame(1, 0), now_s=1.0)
+    monitor.services.add(*detector_health(expected_pd=value), now_s=1.0)
+    assert monitor.vehicles(now_s=1.0)["uuv-1"]["seabed"] is None
+    monitor.services.add(*detector_health(expected_pd=0.5, ripple_strength=value), now_s=1.0)
+    assert monitor.vehicles(now_s=1.0)["uuv-1"]["seabed"]["ripple_strength"] is None

@@ -420,6 +420,32 @@ def test_comment_of_an_expert_is_displayed(serve):
     expert.wait(".advice >> text=have a second look")
 
 
+def test_vehicle_view_warns_of_a_difficult_seabed(served):
+    add_contacts(served, 1)
+    seabeds = {
+        "uuv-1": {"expected_pd": 0.62, "worst_expected_pd": 0.35, "clutter_per_1000_m2": 41.0, "ripple_strength": 0.12},
+        "uuv-2": {"expected_pd": 0.96, "worst_expected_pd": 0.91, "clutter_per_1000_m2": 5.0, "ripple_strength": 0.1},
+    }
+    for vehicle, gauges in seabeds.items():
+        health = Health(
+            platform_id=vehicle,
+            service="atd_stub",
+            time_utc_s=time.time(),
+            started_utc_s=time.time(),
+            state="ok",
+            counters={},
+            gauges=gauges,
+        )
+        served.state.fleet.services.add(keys.health(vehicle, "atd_stub"), wire.encode(health), time.monotonic())
+    visit = served.visit()
+    visit.wait_for_contact("0000")
+    visit.press("f")
+    warning = "Expected Pd 62 % on this seabed; a clean result does not mean no mines"
+    visit.wait(f'article[aria-label="uuv-1"] >> text={warning}')
+    assert "41 echoes per 1000 m², 0.1" in visit.text('article[aria-label="uuv-1"]')
+    assert "a clean result" not in visit.text('article[aria-label="uuv-2"]')
+
+
 def test_all_keys_are_documented(served):
     add_contacts(served, 1)
     visit = served.visit()

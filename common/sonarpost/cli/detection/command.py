@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw
 from pydantic import ValidationError
 
 from sonarpost.cli.detection.picks import add_pick_option, contacts_of_picks, located_picks
+from sonarpost.cli.detection.seabed import seabed_json, seabed_text
 from sonarpost.cli.detection.transmissions import add_transmission_options, transmissions_of
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import (
@@ -33,7 +34,7 @@ from sonarpost.detection.picks import PICKED, LocatedPick, PickedDetection
 from sonarpost.detection.record import contact_record
 from sonarpost.detection.settings import DetectorSettings, checked_settings, load_settings
 from sonarpost.detection.snippets import cut_snippet, ground_projected_image
-from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamDetector
+from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamDetector, StripDifficulty
 from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.files import write_atomically
@@ -169,11 +170,12 @@ class ListedContact:
 
 @dataclass
 class FileListing:
-    """A file, its contacts, their number at lower thresholds, the time of the detection, and the masked pings."""
+    """A file, its contacts, their number at lower thresholds, seabed, time of the detection, and masked pings."""
 
     info: SurveyInfo
     origin: FileOrigin
     weaker: Mapping[float, int]
+    seabed: tuple[StripDifficulty, ...]
     seconds: float
     masked_pings: int
     contacts: list[ListedContact] = field(default_factory=list)
@@ -216,7 +218,8 @@ class _Detection:
                 found = self._detector.add_file(masked, origin)
             self._assign(found.released)
             seconds = time.perf_counter() - started_s
-            self._results.append(FileListing(info, origin, found.weaker, seconds, masked.masked_count))
+            listing = FileListing(info, origin, found.weaker, found.difficulties, seconds, masked.masked_count)
+            self._results.append(listing)
             self._assign(found.contacts)
         self._assign(self._detector.finish())
         for result in self._results:
@@ -269,6 +272,7 @@ def _print_table(result: FileListing, threshold: float) -> None:
         print(f"  note: {warning}")
     if result.masked_pings:
         print(f"  note: {result.masked_pings} of {info.ping_count} pings masked: the modem transmitted")
+    print(f"  {seabed_text(result.seabed, threshold)}")
     print(_HEADER if result.contacts else f"{counts_text(threshold, 0, result.weaker)}; see --threshold")
     for number, contact in enumerate(result.contacts, start=1):
         d, record = contact.detection, contact.record
@@ -298,6 +302,7 @@ def _file_json(result: FileListing, threshold: float) -> dict[str, object]:
         "masked_pings": result.masked_pings,
         "warnings": list(result.info.warnings),
         "seconds": round(result.seconds, 3),
+        "seabed": seabed_json(result.seabed, threshold),
         "contacts_above": {str(confidence): n for confidence, n in counts},
         "contacts": [contact_json(contact) for contact in result.contacts],
     }

@@ -34,6 +34,20 @@ function queueTable(queue) {
   ];
 }
 
+/** Difficulty of the seabed in the last survey file, as the detector of the vehicle reports it. */
+function seabedFacts(seabed) {
+  if (!seabed) return [h("p", { class: "muted", text: "The seabed of the vehicle is not known here." })];
+  const number = (value, decimals) => (value === null ? DASH : value.toFixed(decimals));
+  const pd = (value) => (value === null ? DASH : percent(100 * value, 0));
+  return [
+    seabed.warning ? h("p", { class: "bad", role: "note", text: seabed.warning[0].toUpperCase() + seabed.warning.slice(1) }) : null,
+    h("dl", { class: "facts" },
+      fact("expected Pd, last file", h("span", { class: seabed.warning ? "bad" : "", text: pd(seabed.expected_pd) }), " ", withAge("", seabed.time_utc_s, state.info.stale_after_s.service)),
+      fact("worst of the last hour", pd(seabed.worst_expected_pd)),
+      fact("clutter, ripples", `${number(seabed.clutter_per_1000_m2, 0)} echoes per 1000 m², ${number(seabed.ripple_strength, 1)}`)),
+  ];
+}
+
 function vehicleCard(one) {
   const limit_s = state.info.stale_after_s.vehicle;
   const stale = one.last_heard_utc_s === null || now() - one.last_heard_utc_s > limit_s || !state.online;
@@ -49,6 +63,7 @@ function vehicleCard(one) {
       fact("range", quantity(one.range_m, "m", 0), " ", one.range_m === null ? null : withAge("", one.range_utc_s, limit_s)),
       fact("position", one.lat_deg === null ? DASH : position(one.lat_deg, one.lon_deg), " ", one.lat_deg === null ? null : withAge("at its last contact,", one.position_utc_s, limit_s)),
       fact("open requests", String(one.open_orders))),
+    h("h4", { text: "Seabed" }), seabedFacts(one.seabed),
     h("h4", { text: "Transmit queue" }), queueTable(one.queue));
 }
 
