@@ -1,10 +1,10 @@
 """`python -m research.detection.difficulty`: fit the expected probability of detection to simulated surveys.
 
-    python -m research.detection.difficulty --files 16 --held-out 6 --out common/sonarpost/detection/difficulty.json
+    python -m research.detection.difficulty --files 16 --held-out 8 --out common/sonarpost/detection/difficulty.json
 
-Each file has four mine-like and six other objects; range, altitude, speed and sample type vary. Training uses seeds from
-4000 on, the calibration seeds from 5000 on, as `python -m research.detection` does. Run the command again after each
-change of the detector or of its confidence: it calls `search` only.
+Each file has four mine-like and six other objects; range, altitude, speed and sample type vary. Training uses seeds
+from 4000 on, the calibration seeds from 5000 on, as `python -m research.detection` does. Run the command again after
+each change of the detector or of its confidence: it calls `search` only.
 
 An object counts as found at a threshold if one of its contacts (`research.detection.simulated`) has at least that
 confidence. The model is a logistic regression of "is found" for all thresholds together (proportional odds), with
@@ -43,7 +43,7 @@ FIRST_TRAINING_SEED: Final = 4000
 MAX_FILES: Final = FIRST_SEED - FIRST_TRAINING_SEED
 THRESHOLDS: Final = (0.1, 0.3, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 1.9)
 CALIBRATION_THRESHOLDS: Final = (0.1, 0.5, 1.0, 1.5, 1.9)
-_RIDGE: Final = 1e-3
+_RIDGE: Final = 1e-5
 _MAX_WEIGHT: Final = 100.0
 _MAX_OFFSET: Final = 100.0
 _ALL_CONTACTS: Final = DetectorSettings(confidence_threshold=0.01)
@@ -170,7 +170,9 @@ def calibration(mines: Sequence[Mine], model: PdModel) -> list[Calibration]:
             ]
             found = np.array([m.confidence >= threshold for m in there], dtype=np.float64)
             bounds = interval(weighted_means(found, weights))
-            rows.append(Calibration(kind, threshold, len(there), float(np.mean(predicted)), float(found.mean()), bounds))
+            rows.append(
+                Calibration(kind, threshold, len(there), float(np.mean(predicted)), float(found.mean()), bounds)
+            )
     return rows
 
 
@@ -191,9 +193,11 @@ def new_parser() -> argparse.ArgumentParser:
         description="Fit the expected probability of detection to simulated files of every seabed, print predicted and "
         "actual values on held-out files, and write the model.",
     )
-    parser.add_argument("--files", type=int, default=16, metavar="N", help="training files of each seabed (%(default)s)")
     parser.add_argument(
-        "--held-out", type=int, default=6, metavar="M", help="files of each seabed for the calibration (%(default)s)"
+        "--files", type=int, default=16, metavar="N", help="training files of each seabed (%(default)s)"
+    )
+    parser.add_argument(
+        "--held-out", type=int, default=8, metavar="M", help="files of each seabed for the calibration (%(default)s)"
     )
     parser.add_argument("--out", type=Path, metavar="FILE.json", help="write the model to this file")
     return parser

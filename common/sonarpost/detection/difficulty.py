@@ -4,10 +4,12 @@ A search without contacts means little on rock: the detector finds few of the mi
 one side of a strip. A logistic model turns them and the confidence threshold into the expected probability of detection
 (Pd) of a mine-like object at a random place of that seabed:
 
-    log odds = offset(threshold) - clutter_weight * ln(1 + clutter) - contrast_weight * contrast - ripple_weight * ripples
+    log odds = offset(threshold)
+               - clutter_weight * ln(1 + clutter) - contrast_weight * contrast - ripple_weight * ripples
 
 No weight is negative and the offsets do not increase with the threshold. The expected Pd therefore never increases with
-a feature or with the threshold. `difficulty.json` is fitted to simulated surveys only (`research/detection/difficulty.py`).
+a feature or with the threshold. `difficulty.json` is fitted to simulated surveys only
+(`research/detection/difficulty.py`).
 """
 
 from __future__ import annotations
@@ -104,7 +106,9 @@ class PdModel(BaseModel):
             raise ValueError("offsets that do not increase")
         return self
 
-    def expected_pd(self, clutter_per_1000_m2: float, ripple_strength: float, contrast: float, threshold: float) -> float:
+    def expected_pd(
+        self, clutter_per_1000_m2: float, ripple_strength: float, contrast: float, threshold: float
+    ) -> float:
         """Return the expected probability of detection, 0 to 1.
 
         Args:

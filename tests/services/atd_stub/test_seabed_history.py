@@ -70,4 +70,4 @@ def test_health_has_the_difficulty_of_the_last_file(runner, platform, survey_fil
     assert health.state == "ok", "a difficult seabed is not a failure"
     assert ("a clean result does not mean no mines" in health.detail) == (not expected.is_reliable)
     (line,) = [record for record in caplog.records if record.message == "File processed"]
-    assert line.kv["expected_pd"] == f"{expected.expected_pd:.2f}"
+    assert line.fields["expected_pd"] == f"{expected.expected_pd:.2f}"

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 from builders.common import REPOSITORY, eventually
 from builders.console import PASSWORD, image_record
+
+from sonarpost import keys, wire
+from sonarpost.messages import Health
 
 CONTRAST = """() => {
   const channel = c => { const v = c / 255; return v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4; };
@@ -332,8 +337,8 @@ def test_contrast_and_accessible_names(served, theme):
         "fleet": ["f"],
     }
     marks = {"ask": "dialog .costs", "keys": "dialog .keys", "exports": "dialog .exports", "map": ".map .card"}
-    for name, keys in views.items():
-        for key in keys:
+    for name, keystrokes in views.items():
+        for key in keystrokes:
             visit.press(key)
             if key == "p":
                 visit.until(MAP_DRAWN)
