@@ -16,8 +16,8 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.detection.detector import counts_text
-from sonarpost.detection.transmissions import WARNING_SHARE
 from sonarpost.detection.picks import picks_path
+from sonarpost.detection.transmissions import WARNING_SHARE
 from sonarpost.errors import DeliveryError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.logs import kv
