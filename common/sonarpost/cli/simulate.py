@@ -35,6 +35,8 @@ def add_parser(subparsers: Subparsers) -> None:
         ("altitude_m", "altitude in metres"),
         ("targets", "number of mine-like objects"),
         ("clutter", "number of other objects"),
+        ("burial", "greatest fraction of an object's height below the seabed, 0 to 0.8"),
+        ("scour", "depth of the pits around objects: 0 none, 1 typical"),
     ):
         value = getattr(default, name)
         option = f"--{name.replace('_', '-')}"
@@ -75,6 +77,8 @@ def run_simulate(args: argparse.Namespace) -> int:
         bits=args.bits,
         targets=args.targets,
         clutter=args.clutter,
+        burial=args.burial,
+        scour=args.scour,
     )
     with ProgressDisplay(step=f"simulating {spec.pings} pings"):
         simulated = simulate_survey(spec)

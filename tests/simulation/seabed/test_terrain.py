@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
-from sonarpost.simulation.seabed.terrain import Seabed, SeabedKind, make_seabed
+from sonarpost.simulation.seabed.terrain import RippleOptions, Seabed, SeabedKind, make_seabed
 
 
 def strip(kind: SeabedKind, seed: int = 4, cell_m: float = 0.1) -> Seabed:
@@ -65,3 +67,32 @@ def test_empty_strip_is_rejected(along, across, cell):
 def test_too_large_strip_is_rejected():
     with pytest.raises(ValueError, match="memory"):
         make_seabed(SeabedKind.SAND, along_m=(0, 1e5), across_m=(0, 1e3), cell_m=0.01, rng=np.random.default_rng(0))
+
+
+def rippled(options: RippleOptions | None) -> Seabed:
+    rng = np.random.default_rng(4)
+    area = {"along_m": (-2.0, 40.0), "across_m": (-30.0, 30.0)}
+    return make_seabed(SeabedKind.RIPPLES, **area, cell_m=0.1, rng=rng, ripples=options)
+
+
+def strongest_wavelength_m(bed: Seabed) -> float:
+    power = np.abs(np.fft.rfft2(bed.height_m)) ** 2
+    k = np.hypot(np.fft.fftfreq(421, 0.1)[:, None], np.fft.rfftfreq(601, 0.1)[None, :])
+    # Logarithmic bands without the slow relief of the sand.
+    bands = np.geomspace(0.2, 4.0, 16)
+    strongest = np.argmax([power[(k >= a) & (k < b)].sum() for a, b in itertools.pairwise(bands)])
+    return float(1 / np.sqrt(bands[strongest] * bands[strongest + 1]))
+
+
+@pytest.mark.parametrize("wavelength_m", [0.4, 1.5, 3.0])
+def test_ripples_have_the_specified_wavelength(wavelength_m):
+    bed = rippled(RippleOptions(wavelength_m=wavelength_m))
+    assert strongest_wavelength_m(bed) == pytest.approx(wavelength_m, rel=0.3)
+
+
+def test_further_ripple_systems_are_added_to_the_first():
+    one, two = rippled(None), rippled(RippleOptions(systems=2))
+    np.testing.assert_array_equal(one.height_m, rippled(RippleOptions()).height_m)
+    assert not np.array_equal(two.height_m, rippled(RippleOptions(systems=2, seed=1)).height_m)
+    # The first system and the bed are the same.
+    assert 0.5 < np.corrcoef(one.height_m.ravel(), two.height_m.ravel())[0, 1] < 0.99
