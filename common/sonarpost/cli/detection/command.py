@@ -1,4 +1,7 @@
-"""`sonarpost detect FILE…`: the contacts of survey files as a table, as JSON, or drawn into the waterfall."""
+"""`sonarpost detect FILE…`: the contacts of survey files as a table, as JSON, or drawn into the waterfall.
+
+`sonarpost.cli.detection.images` has the option --images, which scores images instead.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 from pydantic import ValidationError
 
+from sonarpost.cli.detection.images import add_image_options, check_image_options, run_images
 from sonarpost.cli.detection.picks import add_pick_option, contacts_of_picks, located_picks
 from sonarpost.cli.detection.seabed import seabed_json, seabed_text
 from sonarpost.cli.detection.transmissions import add_transmission_options, transmissions_of
@@ -61,12 +65,14 @@ def add_parser(subparsers: Subparsers) -> None:
     """Add the subcommand."""
     parser = subparsers.add_parser(
         "detect",
-        help="detect contacts in survey files",
+        help="detect contacts in survey files, or in a folder of images",
         description="Detect highlights with shadows in side-scan surveys and list them, most confident first. Files "
-        "that continue each other are one line: an object at a file boundary is listed once.",
+        "that continue each other are one line: an object at a file boundary is listed once. With --images, "
+        "score every image of a folder.",
     )
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="survey file")
-    parser.add_argument("--json", action="store_true", help="print one JSON object with every file's contacts")
+    parser.add_argument("files", nargs="*", type=Path, metavar="FILE", help="survey file")
+    add_image_options(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON object with all contacts or scores")
     parser.add_argument(
         "--plot",
         type=Path,
@@ -96,8 +102,11 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Detect in every file and print the contacts."""
+    """Detect in every file and print the contacts, or the scores of images."""
+    check_image_options(parsed)
     settings = _settings(parsed)
+    if parsed.images is not None:
+        return run_images(parsed.images, parsed.pixel_m, settings, as_json=parsed.json)
     _check_vehicle_id(parsed.vehicle)
     options = survey_options_of(parsed)
     transmissions = transmissions_of(parsed)

@@ -18,7 +18,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "metrics": ("cli.metrics", "serve the health of all platforms to Prometheus"),
     "simulate": ("cli.simulate", "write a simulated side-scan survey as XTF"),
     "survey": ("cli.survey", "describe, draw, view and export recordings of side-scan sonars"),
-    "detect": ("cli.detection.command", "detect contacts in survey files"),
+    "detect": ("cli.detection.command", "detect contacts in survey files, or in a folder of images"),
     "encode": ("cli.encode", "encode an image or a folder of images"),
     "decode": ("cli.encode", "decode a stream or a folder of streams to TIFF and PNG"),
     "codebook": ("cli.codebook", "build, compare and adapt tile codebooks"),
