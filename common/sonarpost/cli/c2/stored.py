@@ -78,7 +78,7 @@ class ListedImage:
 def add_actions(actions: Subparsers) -> None:
     """Add the actions `ls`, `get` and `export`."""
     ls = actions.add_parser("ls", help="list images with their decisions, or commands and comments")
-    _add_filters(ls)
+    add_filters(ls)
     ls.add_argument("--undecided", action="store_true", help="only images without a decision")
     ls.add_argument("--all-versions", action="store_true", help="all versions of an image, not only the newest")
     ls.add_argument("--tasking", action="store_true", help="commands and comments, with their delivery state")
@@ -95,7 +95,7 @@ def add_actions(actions: Subparsers) -> None:
     get.set_defaults(run=run_get)
 
     export = actions.add_parser("export", help="write GeoJSON, KML, KMZ or CSV, or send Cursor-on-Target events")
-    _add_filters(export)
+    add_filters(export)
     export.add_argument(
         "--out",
         type=Path,
@@ -148,7 +148,8 @@ def folder_of(parsed: argparse.Namespace) -> Path:
     return folder
 
 
-def _add_filters(parser: argparse.ArgumentParser) -> None:
+def add_filters(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `folder_of` and `RecordFilter`: the folder of c2, --vessel, --vehicle and --since."""
     _add_archive(parser)
     parser.add_argument("--vessel", metavar="NAME", help="only this vessel")
     parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle")
