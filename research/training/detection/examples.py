@@ -49,7 +49,7 @@ from sonarpost.detection.chips import (
     ground_plane,
 )
 from sonarpost.detection.classifier import MINE_LIKE_OBJECT, OTHER_OBJECT, SEABED
-from sonarpost.detection.images import ScaledImage, normalise_image
+from sonarpost.detection.images import ScaledImage, normalise_window, seabed_window
 from sonarpost.detection.matched_filter import Peak, matched_response
 from sonarpost.detection.normalisation import LevelGrid, normalise_side
 from sonarpost.detection.settings import DetectorSettings
@@ -360,12 +360,14 @@ def tile_scenes(data: Path, tile: SdvdTile, group: int) -> list[Scene]:
     for pixel_m in (0.04, 0.05, 0.06):
         scenes = []
         for side in Side:
-            grid = normalise_image(ScaledImage(_recoded(pixels, int(rng.integers(60, 96))), pixel_m, pixel_m), side)
-            if grid is None:
+            window = seabed_window(ScaledImage(_recoded(pixels, int(rng.integers(60, 96))), pixel_m, pixel_m))
+            grid = None if window is None else normalise_window(window, side)
+            if window is None or grid is None:
                 continue
             box = None
             if tile.target_centre is not None:
-                box = _box_in_grid(tile.target_centre, grid, side, pixel_m, pixels.shape[1])
+                x, y = tile.target_centre[0] - window.left, tile.target_centre[1] - window.top
+                box = _box_in_grid((x, y), grid, side, pixel_m, window.values.shape[1])
             scenes.append(_scene(grid, box, 1, group))
         if tile.target_centre is not None and len(scenes) == 2:
             scenes = [max(scenes, key=_response_at_target)]
