@@ -219,18 +219,21 @@ class _SideContacts:
         # Only more confident candidates suppress one: those at a higher threshold are the first of this list.
         self._kept = [_compact(c) for c in distinct_candidates(candidates, grid, settings, lowest)]
         structures = (*find_structures(grid), *find_water_structures(grid))
-        self._structures = sorted(structures, key=lambda structure: -structure.confidence)
+        self._structures = [GridContact(s.confidence, s.measurement, STRUCTURE) for s in structures]
         self._grid = grid
 
     def at(self, threshold: float) -> list[GridContact]:
-        """Return each contact at or above a threshold."""
-        kept = [c for c in self._kept if c.confidence >= threshold]
-        # A structure that contains a contact or a more confident structure is not reported again.
-        for structure in self._structures:
-            if structure.confidence < threshold:
+        """Return each contact at or above a threshold.
+
+        A contact that is part of a more confident structure is not reported.
+        """
+        kept: list[GridContact] = []
+        for contact in sorted((*self._kept, *self._structures), key=lambda c: -c.confidence):
+            if contact.confidence < threshold:
                 break
-            if not any(is_part_of_structure(c.measurement, structure.measurement, self._grid) for c in kept):
-                kept.append(GridContact(structure.confidence, structure.measurement, STRUCTURE))
+            structures = (other for other in kept if other.atd_class == STRUCTURE)
+            if not any(is_part_of_structure(contact.measurement, s.measurement, self._grid) for s in structures):
+                kept.append(contact)
         return kept
 
 
