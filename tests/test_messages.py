@@ -271,6 +271,20 @@ def label(value: object) -> str:
     return value.TYPE if isinstance(value, type) else str(value)
 
 
+@pytest.mark.parametrize(("mine_like", "other"), [(0.5, 0.5), (1.0, 0.0), (0.7, 0.3), (0.0, 0.0), (0.6, 0.4 + 1e-9)])
+def test_probabilities_of_a_contact_add_up_to_at_most_1(mine_like: float, other: float) -> None:
+    contact = Contact(contact_id="c", vehicle_id="uuv-1", p_mine_like=mine_like, p_other_object=other)
+    assert (contact.p_mine_like, contact.p_other_object) == (mine_like, other)
+    with pytest.raises(ValidationError, match="at most"):
+        Contact(contact_id="c", vehicle_id="uuv-1", p_mine_like=mine_like, p_other_object=1.001 - mine_like)
+
+
+@pytest.mark.parametrize("given", ["p_mine_like", "p_other_object"])
+def test_one_probability_alone_is_rejected(given: str) -> None:
+    with pytest.raises(ValidationError, match="a value together with p_mine_like, or neither"):
+        Contact.model_validate({"contact_id": "c", "vehicle_id": "uuv-1", given: 0.5})
+
+
 def test_samples_cover_every_record_type() -> None:
     def subclasses(of: type[Record]) -> set[type[Record]]:
         direct = {t for t in of.__subclasses__() if t.__module__ == "sonarpost.messages"}

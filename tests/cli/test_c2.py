@@ -108,6 +108,30 @@ def test_ls_prints_a_table(capsys, out):
     assert lines[-1] == "3 images"
 
 
+def test_ls_states_class_and_probabilities(capsys, tmp_path):
+    archive = Archive(C2Config(out_dir=tmp_path))
+    fields = {"atd_class": "mine-like", "atd_confidence": 1.5, "p_mine_like": 0.85, "p_other_object": 0.1}
+    for image_id, changes in (("AAAA", fields), ("BBBB", {"atd_class": "structure"})):
+        record = image(image_id)
+        archive.store_image(record.model_copy(update={"contact": record.contact.model_copy(update=changes)}), 5.0)
+    archive.flush()
+    archive.close()
+    rows = {row["image_id"]: row for row in ls(capsys, tmp_path)}
+    assert {name: rows["AAAA"][name] for name in fields} == fields
+    assert [rows["BBBB"][name] for name in fields if name != "atd_confidence"] == ["structure", None, None]
+    assert main(["c2", "ls", "--archive", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    [line] = [line for line in lines if "uuv-1/AAAA" in line]
+    assert "mine-like 1.50, mine-like 85 %, other object 10 %, seabed 5 %" in line
+    [line] = [line for line in lines if "uuv-1/BBBB" in line]
+    assert "structure" in line
+    assert "seabed" not in line
+    assert main(["c2", "get", "uuv-1/AAAA", "--archive", str(tmp_path), "--out", str(tmp_path / "copy")]) == 0
+    [side_car] = (tmp_path / "copy").glob("*.json")
+    contact = json.loads(side_car.read_text())["contact"]
+    assert {name: contact[name] for name in fields} == fields
+
+
 def test_ls_without_an_index_names_the_missing_file(capsys, tmp_path):
     assert main(["c2", "ls", "--archive", str(tmp_path)]) == 2
     assert f"{tmp_path / 'index.db'}: got 'no such file', expected the index" in capsys.readouterr().err

@@ -275,3 +275,24 @@ def test_file_cut_by_a_power_failure_has_a_note(file, tmp_path, capsys):
 def test_waterfall_of_one_side(make_survey):
     source = InMemorySource(make_survey(sides=(Side.STARBOARD,)), SurveyOptions())
     assert annotated_waterfall(source, ()).size == (150 + 2 * 512 + 30, 22 + 200 + 34)
+
+
+@pytest.mark.parametrize(
+    ("p_mine_like", "p_other_object", "cells"), [(0.83, 0.12, ["0.83", "0.12"]), (None, None, ["-", "-"])]
+)
+def test_table_and_json_state_class_and_probabilities(p_mine_like, p_other_object, cells, file, capsys, monkeypatch):
+    describe = command._Detection._describe
+    fields = {"atd_class": "structure", "p_mine_like": p_mine_like, "p_other_object": p_other_object}
+    monkeypatch.setattr(
+        command._Detection,
+        "_describe",
+        lambda self, survey, detection, origin: describe(self, survey, replace(detection, **fields), origin),
+    )
+    assert run(file, "--json") == 0
+    contacts = json.loads(capsys.readouterr().out)["files"][0]["contacts"]
+    assert {name: contacts[0][name] for name in fields} == fields
+    assert run(file) == 0
+    lines = capsys.readouterr().out.splitlines()
+    heading = next(number for number, line in enumerate(lines) if line.split()[:1] == ["n"])
+    columns = dict(zip(lines[heading].split(), lines[heading + 1].split(), strict=True))
+    assert [columns[name] for name in ("class", "p_mine", "p_other")] == ["structure", *cells]

@@ -295,6 +295,16 @@ def test_image_of_the_paper_format_is_sent_after_the_timeout(begin, decompressor
     assert service.health().gauges["images_waiting"] == 0.0
 
 
+def test_class_and_probabilities_are_in_the_record_of_the_image(begin, decompressor):
+    service = begin(pairing_timeout_s=0.3)
+    summary = ContactSummary(lat_deg=1.0, lon_deg=2.0, atd_class="structure", p_mine_like=0.07, p_other_object=0.9)
+    service.on_modem_event(packet(ContactFrame("00A1", summary).pack()))
+    eventually(lambda: len(decompressor.received) == 1)
+    contact = decompressor.received[0].contact
+    assert (contact.atd_class, contact.p_mine_like, contact.p_other_object) == ("structure", 0.05, 0.9)
+    assert (contact.lat_deg, contact.lon_deg) == (1.0, 2.0)
+
+
 # Kills and migration
 
 

@@ -17,6 +17,7 @@ from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.errors import ConfigError
 from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.paper.frame import parse_frame
 from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.messages import AcousticFrame, Contact, EncodedImage
 from sonarpost.modem.micromodem import RATES, nmea
@@ -246,6 +247,22 @@ def test_invalid_image_is_refused_to_its_sender(
     eventually(lambda: service.health().counters.get("images_sent") == 1)
 
 
+@pytest.mark.parametrize("contact_class", [True, False])
+def test_class_of_contacts_is_sent_unless_switched_off(
+    contact_class, modem_pair, start_service, compressor, vessel, encoded
+):
+    modem_pair.start()
+    ready, received = vessel
+    eventually(ready)
+    start_service(contact_class=contact_class)
+    changes = {"atd_class": "structure", "p_mine_like": 0.05, "p_other_object": 0.9}
+    compressor.send(IN, "uuv_modem", encoded(contact=CONTACT.model_copy(update=changes)))
+    eventually(lambda: any(frame.data[:1] == b"C" for frame in received))
+    frame = parse_frame(next(frame.data for frame in received if frame.data[:1] == b"C"))
+    expected = ("structure", 0.05, 0.9) if contact_class else (None, None, None)
+    assert (frame.contact.atd_class, frame.contact.p_mine_like, frame.contact.p_other_object) == expected
+
+
 def test_unsupported_port_is_an_error_before_the_store_is_opened(platform):
     with pytest.raises(ConfigError, match="gopher://sea"):
         UuvModemService(platform("uuv-1"), UuvModemConfig(port="gopher://sea"))
@@ -272,18 +289,32 @@ CONTACTS = st.builds(
     atd_confidence=finite(0, 2),
     pixel_along_m=st.none() | st.floats(0, 100, exclude_min=True),
     pixel_across_m=st.none() | st.floats(0, 100, exclude_min=True),
+    atd_class=st.sampled_from([None, "mine-like", "clutter", "structure", "sphere"]),
 )
 
 
 @settings(max_examples=300, deadline=None)
-@given(contact=CONTACTS, height_px=st.integers(16, 512), width_px=st.integers(16, 512))
-def test_every_valid_contact_has_a_contact_record(contact, height_px, width_px):
+@given(
+    contact=CONTACTS,
+    height_px=st.integers(16, 512),
+    width_px=st.integers(16, 512),
+    probabilities=st.none() | st.floats(0, 1),
+)
+def test_every_valid_contact_has_a_contact_record(contact, height_px, width_px, probabilities):
+    if probabilities is not None:
+        changes = {"p_mine_like": probabilities, "p_other_object": 1 - probabilities}
+        contact = contact.model_copy(update=changes)
+    plain = ContactSummary.unpack(summary_of(contact, height_px, width_px, contact_class=False).pack())
+    assert not plain.is_classified
     record = ContactSummary.unpack(summary_of(contact, height_px, width_px).pack())
     assert (record.height_px, record.width_px) == (height_px, width_px)
+    assert record.atd_class == (None if contact.atd_class == "sphere" else contact.atd_class)
+    assert (record.p_mine_like is None) == (record.p_other_object is None) == (probabilities is None)
     both = contact.lat_deg is not None and contact.lon_deg is not None
     assert (record.lat_deg is not None) == both
     if both:
-        assert math.isclose(record.lat_deg, contact.lat_deg, abs_tol=1e-7)
+        assert math.isclose(record.lat_deg, contact.lat_deg, abs_tol=2.001e-7)
+        assert math.isclose(plain.lat_deg, contact.lat_deg, abs_tol=1e-7)
     if contact.time_utc_s is None or contact.time_utc_s > 0xFFFFFFFE:
         assert record.time_utc_s is None
     else:
