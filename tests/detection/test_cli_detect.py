@@ -6,6 +6,7 @@ import argparse
 import json
 import re
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,9 +14,9 @@ from PIL import Image
 
 from sonarpost.cli.detection import command
 from sonarpost.cli.detection.command import annotated_waterfall
-from sonarpost.detection.detector import detect
+from sonarpost.detection.detector import CLUTTER, MINE_LIKE, STRUCTURE, detect
 from sonarpost.errors import ConfigError, SurveyFileError
-from sonarpost.messages import Contact
+from sonarpost.messages import AtdClass, Contact
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.options import SurveyOptions
@@ -275,6 +276,10 @@ def test_file_cut_by_a_power_failure_has_a_note(file, tmp_path, capsys):
 def test_waterfall_of_one_side(make_survey):
     source = InMemorySource(make_survey(sides=(Side.STARBOARD,)), SurveyOptions())
     assert annotated_waterfall(source, ()).size == (150 + 2 * 512 + 30, 22 + 200 + 34)
+
+
+def test_classes_of_the_detector_are_those_of_the_contact_record():
+    assert set(get_args(AtdClass)) == {MINE_LIKE, CLUTTER, STRUCTURE}
 
 
 @pytest.mark.parametrize(

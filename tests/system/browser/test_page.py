@@ -295,6 +295,25 @@ def test_hostile_text_is_displayed_as_text(served):
     assert report.page.evaluate("window.injected") is None
 
 
+def test_class_and_probabilities_are_shown_where_they_are_known(served):
+    fields = {"atd_class": "structure", "p_mine_like": 0.83, "p_other_object": 0.12}
+    served.state.store_image(image_record("00A7", **fields))
+    visit = served.visit()
+    visit.wait_for_contact("00A7")
+    assert visit.text(f"{row('00A7')} .class.structure") == "structure"
+    expected = "mine-like 83\u202f%, other object 12\u202f%, seabed 5\u202f%"
+    assert visit.text(".heading .probabilities") == expected
+    visit.page.locator("details[data-name=record] > summary").click()
+    assert expected in visit.text("details[data-name=record]")
+    served.state.store_image(image_record("00A8", seed=1))
+    visit.wait(row("00A8"))
+    visit.page.locator(row("00A8")).click()
+    visit.wait_for_contact("00A8")
+    assert visit.page.locator(".probabilities").count() == 0
+    assert visit.page.locator(f"{row('00A8')} .class").count() == 0
+    assert "probabilities" not in visit.text("details[data-name=record]")
+
+
 def test_observer_cannot_decide_or_measure(served):
     add_contacts(served, 1)
     visit = served.visit("watch")
