@@ -275,7 +275,7 @@ def label(value: object) -> str:
 def test_probabilities_of_a_contact_add_up_to_at_most_1(mine_like: float, other: float) -> None:
     contact = Contact(contact_id="c", vehicle_id="uuv-1", p_mine_like=mine_like, p_other_object=other)
     assert (contact.p_mine_like, contact.p_other_object) == (mine_like, other)
-    with pytest.raises(ValidationError, match="at most"):
+    with pytest.raises(ValidationError, match=r"at most|less than or equal to 1"):
         Contact(contact_id="c", vehicle_id="uuv-1", p_mine_like=mine_like, p_other_object=1.001 - mine_like)
 
 
