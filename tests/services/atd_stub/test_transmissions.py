@@ -186,7 +186,7 @@ def noise_times(started_s):
     return started_s + pings[NOISE[0]].time_utc_s - first_s, started_s + pings[NOISE[1]].time_utc_s - first_s
 
 
-def test_noise_of_the_modem_is_a_contact_without_masking(start_service, compressor, put_survey, publish):
+def test_noise_of_the_modem_is_a_contact_without_masking(start_service, compressor, put_survey):
     service = start_service(mask_transmissions=False)
     put_survey("line.xtf", time.time() - 300.0)
     eventually(lambda: counter(service, "files_processed") == 1)

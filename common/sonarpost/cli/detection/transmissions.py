@@ -86,4 +86,7 @@ def _csv_rows(text: str) -> list[dict[str, float]]:
         ValueError, KeyError, TypeError, csv.Error: A column or a number is missing or invalid.
     """
     names = ("start_utc_s", "end_utc_s")
-    return [{name: float(row[name]) for name in names} for row in csv.DictReader(text.splitlines(), strict=True)]
+    reader = csv.DictReader(text.splitlines(), strict=True)
+    if not set(names) <= set(reader.fieldnames or ()):
+        raise KeyError(*names)
+    return [{name: float(row[name]) for name in names} for row in reader]
