@@ -200,8 +200,9 @@ def _seabed_json(status: ServiceStatus) -> Json | None:
 
 
 def _gauge(gauges: Mapping[str, float], name: str, highest: float) -> float | None:
+    """Return a gauge of 0 to `highest`; None if it is absent or out of that range. A record has finite values only."""
     value = gauges.get(name)
-    return value if value is not None and math.isfinite(value) and 0.0 <= value <= highest else None
+    return value if value is not None and 0.0 <= value <= highest else None
 
 
 def fleet_json(monitor: FleetMonitor, db: sqlite3.Connection, config: ConsoleConfig, now_utc_s: float) -> Json:

@@ -137,7 +137,7 @@ def test_warning_of_a_difficult_seabed(make_console, expected_pd, warns):
     assert seabed["worst_expected_pd"] is None
 
 
-@pytest.mark.parametrize("value", [-0.1, 1.1, math.inf, math.nan])
+@pytest.mark.parametrize("value", [-0.1, 1.1, 1e300])
 def test_values_of_a_seabed_beyond_their_range_are_unknown(make_console, value):
     monitor = make_console().state.fleet
     monitor.add_frame("uuv-1", frame(1, 0), now_s=1.0)
