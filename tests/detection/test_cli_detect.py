@@ -184,7 +184,7 @@ def test_nothing_found_says_what_lower_thresholds_give(tmp_path, capsys):
         assert len(listed["contacts"]) == count, confidence
         assert listed["contacts_above"] == {c: n for c, n in counts.items() if float(c) <= float(confidence)}
     assert run(file, "--threshold", "2") == 0
-    title, message = capsys.readouterr().out.splitlines()
+    title, _, message = capsys.readouterr().out.splitlines()
     assert title == f"{file}: 300 pings, 0 contacts"
     lower = ", ".join(f"{counts[c]} above {c}" for c in ("1.0", "0.5", "0.3", "0.1"))
     assert message == f"0 contacts above 2.0; {lower}; see --threshold"
