@@ -8,6 +8,7 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Final
 
 from sonarpost.cli.c2.stored import EXIT_INCOMPLETE, RecordFilter, add_filters, folder_of
 from sonarpost.cli.progress import ProgressDisplay
@@ -17,6 +18,7 @@ from sonarpost.export.coco import (
     ANNOTATIONS_FILE,
     IMAGES_FOLDER,
     LabelledImage,
+    LabelState,
     coco_document,
     groups,
     label_state,
@@ -26,7 +28,7 @@ from sonarpost.export.contacts import ExportContact, load_contacts
 from sonarpost.files import write_atomically
 from sonarpost.sonar.image_files import write_png
 
-_COUNTED = ("disputed", "unsure", "unreviewed", "without_image")
+_COUNTED: Final[tuple[LabelState, ...]] = ("disputed", "unsure", "unreviewed", "without_image")
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -69,7 +71,8 @@ def run_export(parsed: argparse.Namespace) -> int:
         if images:
             group_of = groups(stored.contacts)
             _write(parsed.out, images, json.dumps(coco_document(images, group_of, time.time()), allow_nan=False))
-    counts = {"images": len(images), **{name: states[name] for name in _COUNTED}, "rejected": len(problems)}
+    counts: dict[str, int] = {"images": len(images)}
+    counts |= {name: states[name] for name in _COUNTED} | {"rejected": len(problems)}
     _print_counts(parsed, counts, images)
     for problem in problems:
         print(f"rejected: {printable(str(problem))}", file=sys.stderr)

@@ -102,7 +102,7 @@ def load_labelled_image(contact: ExportContact) -> LabelledImage:
 
 
 def to_8_bits(pixels: GreyImage) -> npt.NDArray[np.uint8]:
-    """Return 8-bit pixels unchanged, 16-bit ones divided so that their 99.9th percentile is 255, rounded and limited."""
+    """Return 8-bit pixels unchanged, 16-bit ones divided so that their 99.9th percentile is 255."""
     if pixels.dtype == np.uint8:
         return pixels.astype(np.uint8)
     bright = max(1.0, float(np.percentile(pixels, _BRIGHT_PERCENTILE)))
