@@ -87,12 +87,19 @@ class EvaluatedFile:
     seconds: float
 
 
-def evaluate_file(seabed: SeabedKind, seed: int) -> EvaluatedFile:
-    """Simulate a file of 1000 pings with four mine-like and six other objects, detect, and evaluate each contact."""
+def evaluate_file(seabed: SeabedKind, seed: int, settings: DetectorSettings = _ALL_CONTACTS) -> EvaluatedFile:
+    """Simulate a file of 1000 pings with four mine-like and six other objects, detect, and evaluate each contact.
+
+    Args:
+        seabed: Kind of seabed.
+        seed: Seed of the survey.
+        settings: Settings of the detector; contacts with a confidence of at least 0.01 are evaluated.
+    """
+    settings = settings.model_copy(update={"confidence_threshold": _ALL_CONTACTS.confidence_threshold})
     simulated = simulate_survey(SurveySpec(seed=seed, seabed=seabed, targets=4, clutter=6))
     survey = simulated.survey
     started_s = time.process_time()
-    detections = detect(survey, _ALL_CONTACTS)
+    detections = detect(survey, settings)
     seconds = time.process_time() - started_s
     assigned: set[int] = set()
     contacts = []
