@@ -18,7 +18,7 @@ from sonarpost.delivery.transaction import Transaction
 from sonarpost.detection.detector import counts_text
 from sonarpost.detection.picks import picks_path
 from sonarpost.detection.transmissions import WARNING_SHARE
-from sonarpost.errors import DeliveryError, SurveyFileError
+from sonarpost.errors import BadInputError, DeliveryError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.logs import kv
 from sonarpost.messages import Record, Snippet
@@ -70,8 +70,10 @@ class AtdStubService(Service[AtdStubConfig]):
         self._files_waiting = -1
         self._release = ContactRelease(platform, self.store, config.max_in_flight, self.commit)
         self._file_ends = FileEndStore(self.store)
-        malformed = self.interval_log(log, logging.WARNING, "Ignoring malformed transmissions")
-        self._transmissions = TransmissionLog(self.store, self.commit, self.count, malformed, config.transmissions_file)
+        self._malformed_transmissions = self.interval_log(log, logging.WARNING, "Ignoring malformed transmissions")
+        self._transmissions = TransmissionLog(
+            self.store, self.commit, self._ignore_transmissions, config.transmissions_file
+        )
         self._seabed = SeabedHistory()
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
@@ -91,6 +93,10 @@ class AtdStubService(Service[AtdStubConfig]):
         self._release.wake()
         if self._masks:
             self._transmissions.save_at_stop()
+
+    def _ignore_transmissions(self, error: BadInputError) -> None:
+        self.count("transmissions_ignored")
+        self._malformed_transmissions.log(reason=str(error))
 
     @property
     def _masks(self) -> bool:

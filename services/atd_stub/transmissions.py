@@ -19,7 +19,7 @@ from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.detection.transmissions import TransmitIntervals
 from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.files import write_atomically
-from sonarpost.logs import IntervalLog, kv
+from sonarpost.logs import kv
 from sonarpost.messages import Transmission, Transmissions
 
 log = logging.getLogger(__name__)
@@ -42,8 +42,7 @@ class TransmissionLog:
     Args:
         store: The service's store.
         commit: Commits a unit of work in one transaction.
-        count: Increases a health counter by 1.
-        malformed: Log for records that are ignored.
+        on_malformed: Called with the error of each record that is ignored.
         file: Where the transmissions are written, for `sonarpost detect --transmissions`; None for nowhere.
     """
 
@@ -51,14 +50,12 @@ class TransmissionLog:
         self,
         store: Store,
         commit: Callable[[UnitOfWork], None],
-        count: Callable[[str], None],
-        malformed: IntervalLog,
+        on_malformed: Callable[[BadInputError], None],
         file: Path | None = None,
     ) -> None:
         self._store = store
         self._commit = commit
-        self._count = count
-        self._malformed = malformed
+        self._on_malformed = on_malformed
         self._file = file
         self._lock = threading.Lock()  # for `_ends`: records arrive in threads of Zenoh
         self._ends: dict[float, float] = {}  # end by start, seconds since 1970-01-01 UTC
@@ -91,8 +88,7 @@ class TransmissionLog:
         try:
             record = wire.decode(Transmissions, payload, key)
         except BadInputError as error:
-            self._count("transmissions_ignored")
-            self._malformed.log(reason=str(error))
+            self._on_malformed(error)
             return
         self.add(record, time.time())
 

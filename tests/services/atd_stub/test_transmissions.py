@@ -15,7 +15,6 @@ from sonarpost import keys, wire
 from sonarpost.cli.detection.transmissions import read_transmissions
 from sonarpost.delivery.store import Store
 from sonarpost.errors import DeliveryError
-from sonarpost.logs import IntervalLog
 from sonarpost.messages import Snippet, Transmission, Transmissions
 from sonarpost.modem.micromodem import TransmissionEnded, TransmissionStarted
 from sonarpost.services.atd_stub.config import AtdStubConfig
@@ -38,8 +37,9 @@ def record_of(*pairs):
 
 @pytest.fixture
 def store(tmp_path):
-    with Store(tmp_path / "atd_stub.db") as store:
-        yield store
+    store = Store(tmp_path / "atd_stub.db")
+    yield store
+    store.close()
 
 
 class Bench:
@@ -49,8 +49,7 @@ class Bench:
         self.commits = 0
         self.fails = False
         self._store = store
-        malformed = IntervalLog(logging.getLogger("test"), logging.WARNING, "malformed")
-        self.log = TransmissionLog(store, self._commit, lambda name: None, malformed, file)
+        self.log = TransmissionLog(store, self._commit, lambda error: None, file)
 
     def _commit(self, effects) -> None:
         if self.fails:

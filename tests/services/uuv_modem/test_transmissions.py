@@ -18,6 +18,8 @@ from sonarpost.modem.micromodem import (
     TransmissionEnded,
     TransmissionStarted,
 )
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.service import OpModemService
 from sonarpost.services.uuv_modem.transmissions import KEPT_S, MAX_KEPT, TransmissionLog
 
 KEY = keys.acoustic_transmissions("uuv-1")
@@ -109,8 +111,11 @@ def test_a_clock_before_1970_and_a_report_after_hours_give_valid_records(clock):
     assert wire.decode(Transmissions, wire.encode(record), KEY) == record
 
 
-def test_the_service_publishes_each_transmission_and_replies_to_a_query(start_service, runner, client, watch):
+def test_the_service_publishes_each_transmission_and_replies_to_a_query(
+    start_service, runner, client, watch, platform, modem_pair
+):
     published = watch(KEY)
+    runner.start(OpModemService(platform("vessel-1"), OpModemConfig(port=modem_pair.port(modem_pair.VESSEL))))
     start_service()
     source = runner.peer("uuv-1", "autonomy")
     before_s = time.time()
