@@ -114,6 +114,7 @@ def test_a_clock_before_1970_and_a_report_after_hours_give_valid_records(clock):
 def test_the_service_publishes_each_transmission_and_replies_to_a_query(
     start_service, runner, client, watch, platform, modem_pair
 ):
+    modem_pair.start()
     published = watch(KEY)
     runner.start(OpModemService(platform("vessel-1"), OpModemConfig(port=modem_pair.port(modem_pair.VESSEL))))
     start_service()
