@@ -15,7 +15,7 @@ from sonarpost.archive.retention import DAY_S, Stored, remove_files, select_for_
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
-from sonarpost.detection.detector import counts_text
+from sonarpost.detection.detector import classifier_of, counts_text
 from sonarpost.detection.picks import picks_path
 from sonarpost.detection.transmissions import WARNING_SHARE
 from sonarpost.errors import BadInputError, DeliveryError, SurveyFileError
@@ -81,7 +81,13 @@ class AtdStubService(Service[AtdStubConfig]):
         raise NotImplementedError("atd_stub consumes no records")
 
     def on_start(self) -> None:
-        """Subscribe to the transmit queue and the transmissions of the modem, and start to poll and to release."""
+        """Check the classifier, subscribe to transmit queue and transmissions, and start to poll and to release.
+
+        Raises:
+            ConfigError: The file of the classifier cannot be read, or has another identity than configured.
+        """
+        if self.config.mode == "survey":
+            classifier_of(self.config.detector_settings())
         self._release.subscribe(self.session)
         if self._masks:
             self._transmissions.subscribe(self.session, self.platform.id)

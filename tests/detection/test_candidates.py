@@ -66,11 +66,12 @@ def test_seabed_without_response_has_no_candidates(make_survey):
     assert distinct_candidates([], grid, SETTINGS, 0.1) == []
 
 
-def test_number_of_candidates_is_limited_by_length(make_survey):
+def test_number_of_candidates_is_limited_by_length(make_survey, monkeypatch):
+    monkeypatch.setattr("sonarpost.detection.candidates._MAX_PER_1000_PINGS", 100)
     grid = normalise_side(make_survey(), Side.PORT, SETTINGS)
     response = matched_response(grid, SETTINGS)
     many = candidate_peaks(response, grid, SETTINGS.model_copy(update={"min_matched_response": 1e-6}))
-    assert len(many) == 400
+    assert len(many) == 100
     assert [p.score for p in many] == sorted((p.score for p in many), reverse=True)
 
 
@@ -88,12 +89,15 @@ def test_candidate_in_the_shadow_of_another_is_the_same_object(make_survey):
     assert [placed.candidate.p_mine_like for placed in kept] == [0.9]
 
 
-def test_place_is_that_of_the_strongest_response_nearby(make_survey):
+def test_place_is_that_of_the_best_product_of_probability_and_response(make_survey):
     grid = normalise_side(make_survey({}), Side.PORT, SETTINGS)
     strong, confident = candidate(100, 125, 0.5, score=9.0), candidate(104, 133, 0.9, score=3.0)
     (kept,) = distinct_candidates([strong, confident], grid, SETTINGS, 0.1)
     assert kept.candidate is confident
     assert kept.measurement.scores.matched == 9.0
+    unlikely = candidate(100, 125, 0.1, score=9.0)
+    (kept,) = distinct_candidates([unlikely, confident], grid, SETTINGS, 0.1)
+    assert kept.measurement.scores.matched == 3.0
 
 
 def test_height_from_shadow_by_similar_triangles():

@@ -224,8 +224,8 @@ def test_search_rates_each_side_at_its_threshold(make_survey):
 
 def test_matched_filter_runs_once_a_side(make_survey, monkeypatch):
     calls = []
-    original = detector.find_candidates
-    monkeypatch.setattr(detector, "find_candidates", lambda *a: calls.append(1) or original(*a))
+    original = detector.matched_response
+    monkeypatch.setattr(detector, "matched_response", lambda *a: calls.append(1) or original(*a))
     search(make_survey({"ping": 100}))
     assert len(calls) == 2
 

@@ -26,8 +26,6 @@ from sonarpost.sonar.survey import FloatImage
 Flags = npt.NDArray[np.bool_]
 
 _MAX_PER_1000_PINGS: Final = 400
-_SAME_HIGHLIGHT_M: Final = 1.2
-"""The place of a contact is that of the strongest matched-filter response within this distance."""
 _MIN_RING_CELLS: Final = 30
 _SHADOW_GAP_M: Final = 0.25
 """A gap of this length, caused by speckle, does not end a shadow."""
@@ -126,6 +124,9 @@ def distinct_candidates(
 ) -> list[PlacedCandidate]:
     """Keep the most confident candidate of every object, most confident first (non-maximum suppression).
 
+    Its highlight and shadow are measured at the candidate around it with the greatest product of probability and
+    matched-filter response: the network recognises an object also from a place beside it.
+
     Two candidates are one object if their highlights lie within `separation_along_m` and `separation_across_m` of
     each other, or if the highlight of one lies in the shadow of the other.
 
@@ -135,8 +136,9 @@ def distinct_candidates(
         settings: Separation of objects.
         lowest: Minimum confidence.
     """
-    rows = np.array([c.peak.row for c in candidates]) * grid.row_along_m
-    cells = np.array([c.peak.cell for c in candidates]) * grid.cell_across_m
+    along_m = np.array([c.peak.row for c in candidates]) * grid.row_along_m
+    across_m = np.array([c.peak.cell for c in candidates]) * grid.cell_across_m
+    strength = np.array([c.p_mine_like * c.peak.score for c in candidates])
     kept: list[PlacedCandidate] = []
     order = sorted(range(len(candidates)), key=lambda i: (-candidates[i].p_mine_like, i))
     for index in order:
@@ -145,9 +147,10 @@ def distinct_candidates(
             break
         if any(_is_near(one.peak.row, one.peak.cell, other.measurement, grid, settings) for other in kept):
             continue
-        near = np.maximum(np.abs(rows - rows[index]), np.abs(cells - cells[index])) <= _SAME_HIGHLIGHT_M
-        strongest = candidates[int(np.flatnonzero(near)[0])].peak  # candidates are in order of response
-        measurement = measure(grid, strongest, settings)
+        near = np.abs(along_m - along_m[index]) < settings.separation_along_m
+        near &= np.abs(across_m - across_m[index]) < settings.separation_across_m
+        strongest = candidates[int(np.argmax(np.where(near, strength, -1.0)))]
+        measurement = measure(grid, strongest.peak, settings)
         if measurement is None:
             continue
         if not any(_is_same_object(measurement, other.measurement, grid, settings) for other in kept):

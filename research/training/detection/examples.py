@@ -2,7 +2,9 @@
 
     python -m research.training.detection.examples --data "$SONARPOST_DATA" --out /tmp/detection/examples.npz
 
-Four sources:
+    python -m research.training.detection.examples --data DIR --hard network.npz --out hard.npz
+
+Five sources:
 
 * Simulated surveys of every seabed, with random sonars, objects and disturbances. The candidates of the matched filter
   are labelled by the ground truth.
@@ -12,6 +14,8 @@ Four sources:
   they are.
 * Simulated objects in real seabed: the difference in level between a simulated survey with and without an object, both
   without speckle, is added to windows of the real recordings and of SDVD's train split.
+* With `--hard`, only these: of each simulated survey on rock, mixed seabed and ripples, the 120 seabed candidates that
+  the given network takes for objects with the greatest probability.
 
 Seeds 20,000 to 20,999 are used here; the evaluation (`python -m research.detection`) uses seeds from 5000 on.
 """
@@ -48,7 +52,7 @@ from sonarpost.detection.chips import (
     geometry_values,
     ground_plane,
 )
-from sonarpost.detection.classifier import MINE_LIKE_OBJECT, OTHER_OBJECT, SEABED
+from sonarpost.detection.classifier import MINE_LIKE_OBJECT, OTHER_OBJECT, SEABED, Classifier, load_classifier
 from sonarpost.detection.images import ScaledImage, normalise_window, seabed_window
 from sonarpost.detection.matched_filter import Peak, matched_response
 from sonarpost.detection.normalisation import LevelGrid, normalise_side
@@ -71,11 +75,13 @@ from sonarpost.sonar.survey import FloatImage, Side, Survey
 
 SETTINGS: Final = DetectorSettings()
 FIRST_SEED: Final = 20_000
-SURVEYS: Final = 170
+SURVEYS: Final = 450
 PASTED_SURVEYS: Final = 36
 RECORDINGS: Final = ("surveys/scotsman-iver2.xtf", "surveys/000_1236.xtf", "surveys/humminbird")
 IGNORED: Final = -1
 _SEABED_PER_SIDE: Final = 150
+_HARD_SEABEDS: Final = (SeabedKind.ROCK, SeabedKind.MIXED, SeabedKind.RIPPLES)
+_HARD_PER_SURVEY: Final = 120
 _NEAR_M: Final = 1.2
 """A candidate within this distance of the centre of an object shows it."""
 _AMBIGUOUS_M: Final = 3.0
@@ -102,7 +108,8 @@ class Examples:
         coarse: Shape (examples, 30, 44, 3), int8, likewise.
         geometry: Shape (examples, 5), float32.
         label: Shape (examples,), int8: class of the classifier.
-        source: Shape (examples,), int8: 0 simulated, 1 SDVD, 2 recordings, 3 simulated objects in real seabed.
+        source: Shape (examples,), int8: 0 simulated, 1 SDVD, 2 recordings, 3 simulated objects in real seabed, 4 hard
+            simulated seabed.
         group: Shape (examples,), int32: survey, recording or survey line.
     """
 
@@ -124,6 +131,10 @@ class Examples:
             np.full(len(chips), source, np.int8),
             np.full(len(chips), group, np.int32),
         )
+
+    def of_source(self, source: int) -> Examples:
+        """Return the same examples with another source."""
+        return replace(self, source=np.full_like(self.source, source))
 
     @classmethod
     def joined(cls, parts: Sequence[Examples]) -> Examples:
@@ -231,8 +242,13 @@ def label_of(truth: Sequence[TruthObject], side: Side, row: float, sample: float
     return label
 
 
-def simulated_examples(seed: int) -> Examples | None:
-    """Return the examples of one simulated survey; None if its objects do not fit on the line."""
+def simulated_examples(seed: int, seabed_per_side: int = _SEABED_PER_SIDE) -> Examples | None:
+    """Return the examples of one simulated survey; None if its objects do not fit on the line.
+
+    Args:
+        seed: Seed of the survey.
+        seabed_per_side: Maximum number of seabed candidates of each side, chosen at random.
+    """
     simulated = _simulated(random_spec(seed))
     if simulated is None:
         return None
@@ -253,11 +269,26 @@ def simulated_examples(seed: int) -> Examples | None:
             dtype=np.int64,
         )
         seabed = np.flatnonzero(labels == SEABED)
-        chosen = rng.permutation(seabed)[:_SEABED_PER_SIDE]
+        chosen = rng.permutation(seabed)[:seabed_per_side]
         kept = np.sort(np.concatenate([np.flatnonzero(labels > SEABED), chosen])).astype(np.int64)
         chips = ChipCutter(grid).chips([found[i] for i in kept])
         parts.append(Examples.of_chips(chips, labels[kept].astype(np.int8), 0, seed))
     return Examples.joined(parts) if parts else None
+
+
+def hard_examples(work: tuple[int, Classifier]) -> Examples | None:
+    """Return the seabed candidates of one survey that a network takes for objects; None on an easy seabed."""
+    seed, classifier = work
+    if random_spec(seed).seabed not in _HARD_SEABEDS:
+        return None
+    found = simulated_examples(seed, seabed_per_side=10_000)
+    if found is None:
+        return None
+    rows = np.flatnonzero(found.label == SEABED)
+    scale = np.float32(1 / _LEVEL_SCALE)
+    chips = ChipBatch(found.fine[rows] * scale, found.coarse[rows] * scale, found.geometry[rows])
+    hardest = rows[np.argsort(classifier.probabilities(chips)[:, SEABED], kind="stable")[:_HARD_PER_SURVEY]]
+    return Examples(*(getattr(found, name)[hardest] for name in Examples.__dataclass_fields__)).of_source(4)
 
 
 def _simulated(spec: SurveySpec) -> tuple[Survey, tuple[TruthObject, ...]] | None:
@@ -514,19 +545,34 @@ def make_examples(data: Path, surveys: int, pasted_surveys: int, workers: int) -
     return Examples.joined(parts)
 
 
+def make_hard_examples(classifier: Classifier, surveys: int, workers: int) -> Examples:
+    """Return the hard examples of all surveys."""
+    parts = []
+    with ProgressDisplay() as progress, multiprocessing.Pool(workers) as pool:
+        work = [(FIRST_SEED + number, classifier) for number in range(surveys)]
+        for number, part in enumerate(pool.imap(hard_examples, work), start=1):
+            parts += [part] if part is not None else []
+            progress.show("simulated surveys", number, surveys)
+    return Examples.joined(parts)
+
+
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="folder of the real recordings")
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--hard", type=Path, metavar="NETWORK.npz", help="hard examples of this network only")
     parser.add_argument("--surveys", type=int, default=SURVEYS)
     parser.add_argument("--pasted-surveys", type=int, default=PASTED_SURVEYS)
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
-    examples = make_examples(arguments.data, arguments.surveys, arguments.pasted_surveys, arguments.workers)
+    if arguments.hard is not None:
+        examples = make_hard_examples(load_classifier(arguments.hard), arguments.surveys, arguments.workers)
+    else:
+        examples = make_examples(arguments.data, arguments.surveys, arguments.pasted_surveys, arguments.workers)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     examples.save(arguments.out)
-    for source in range(4):
+    for source in range(5):
         of_source = examples.label[examples.source == source]
         print(f"source {source}: " + ", ".join(f"{(of_source == label).sum()} of class {label}" for label in range(3)))
 

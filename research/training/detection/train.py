@@ -5,7 +5,7 @@
 Requires PyTorch (CPU), which is not a dependency of the package. Each step draws the same number of examples of each
 class, by source in the shares of `SOURCE_SHARES`, and changes them at random: mirror along-track, gain, contrast,
 noise, unknown borders, unknown geometry. The loss is the cross-entropy with smoothed labels. The result is an
-exponential moving average of the weights. `--start` continues from weights that exist, with examples of its own.
+exponential moving average of the weights. `--start` continues from weights that exist.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ LEARNING_RATE: Final = 2e-3
 AVERAGE: Final = 0.998
 SMOOTHING: Final = 0.02
 CLASS_SHARES: Final = (0.5, 0.2, 0.3)
-SOURCE_SHARES: Final = (0.6, 0.15, 0.05, 0.2)
-"""Share of the examples of each source: simulated, SDVD, recordings, simulated objects in real seabed."""
+SOURCE_SHARES: Final = (0.45, 0.22, 0.05, 0.18, 0.1)
+"""Share of the examples of each source: simulated, SDVD, recordings, simulated objects in real seabed, hard ones."""
 _SCALE: Final = 1 / 30.0
 
 
@@ -198,14 +198,15 @@ def classifier_of(parameters: dict[str, Any]) -> Classifier:
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--examples", type=Path, required=True)
+    parser.add_argument("--examples", type=Path, nargs="+", required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--seed", type=int, default=11)
     parser.add_argument("--start", type=Path, help="continue from these weights")
     arguments = parser.parse_args()
     start = None if arguments.start is None else load_classifier(arguments.start)
-    classifier = train(Examples.load(arguments.examples), arguments.steps, arguments.seed, start)
+    examples = Examples.joined([Examples.load(path) for path in arguments.examples])
+    classifier = train(examples, arguments.steps, arguments.seed, start)
     with arguments.out.open("wb") as file:
         write_classifier(classifier, file)
     print(f"{arguments.out}: identity {classifier.identity}")

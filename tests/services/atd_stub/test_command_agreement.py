@@ -77,7 +77,8 @@ def test_simulated_line_with_settings(tmp_path, capsys):
     paths = split(tmp_path, simulate_survey(spec).survey, (0, 180), (180, 260), (260, 500))
     tuning = {"separation_along_m": 2.0, "shadow_lengths_m": [1.0, 4.0]}
     (tmp_path / "settings.toml").write_text(
-        "separation_along_m = 2.0\nshadow_lengths_m = [1.0, 4.0]\njoin_overlap_pings = 100\nconfidence_threshold = 0.2\n"
+        "separation_along_m = 2.0\nshadow_lengths_m = [1.0, 4.0]\n"
+        "join_overlap_pings = 100\nconfidence_threshold = 0.2\n"
     )
     (tmp_path / "options.toml").write_text("[errors]\nposition_m = 1.5\n")
     options = ("--settings", str(tmp_path / "settings.toml"), "--options", str(tmp_path / "options.toml"))

@@ -16,6 +16,7 @@ from PIL import Image
 
 from sonarpost import keys
 from sonarpost.config import load
+from sonarpost.detection.classifier import default_classifier, write_classifier
 from sonarpost.detection.detector import FilterScores, detect
 from sonarpost.detection.settings import DetectorSettings, DetectorTuning, load_settings
 from sonarpost.detection.snippets import ground_projected_image
@@ -131,6 +132,7 @@ def test_settings_of_the_detector_are_configured(tmp_path):
     values = DetectorTuning().model_dump(mode="json")
     # Every setting can be configured: each is written with another value.
     changed = json.loads(json.dumps(values), parse_float=lambda text: float(text) * 1.5, parse_int=lambda n: int(n) + 1)
+    changed |= {"classifier": "/srv/classifier.npz", "classifier_identity": "0123456789abcdef"}
     lines = "".join(f"{name} = {json.dumps(value)}\n" for name, value in changed.items())
     path.write_text(f"{head}[atd_stub.detector]\n{lines}")
     _, config = load(path, "atd_stub", AtdStubConfig, {})
@@ -139,6 +141,15 @@ def test_settings_of_the_detector_are_configured(tmp_path):
     assert all(changed[name] != value for name, value in values.items())
     (tmp_path / "settings.toml").write_text(f"{lines}confidence_threshold = 0.5\njoin_overlap_pings = 100\n")
     assert load_settings(tmp_path / "settings.toml") == settings, "the command reads the same keys"
+
+
+def test_another_classifier_than_configured_stops_the_start(start_service, tmp_path):
+    path = tmp_path / "classifier.npz"
+    with path.open("wb") as file:
+        write_classifier(default_classifier(), file)
+    tuning = DetectorTuning(classifier=str(path), classifier_identity="0" * 16)
+    with pytest.raises(ConfigError, match="identity: got"):
+        start_service(detector=tuning)
 
 
 @pytest.mark.parametrize(
