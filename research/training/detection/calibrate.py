@@ -41,8 +41,9 @@ from sonarpost.sonar.bottom_track import altitudes_m
 Floats = npt.NDArray[np.float64]
 
 FIRST_SEED: Final = 21_000
-FILES: Final = 4
+FILES: Final = 6
 _LOWEST: Final = 0.01
+_ROUNDS: Final = 2
 _SETTINGS: Final = DetectorSettings()
 
 
@@ -88,16 +89,25 @@ def fitted_calibration(outputs: Floats, labels: npt.NDArray[np.int64]) -> tuple[
 
 
 def calibrated(classifier: Classifier, files: int, workers: int) -> Classifier:
-    """Return a classifier with the calibration that `files` surveys of each seabed give."""
-    neutral = classifier.with_calibration(1.0, (0.0, 0.0, 0.0))
-    work = [(neutral, kind, FIRST_SEED + n) for n in range(files) for kind in SeabedKind]
-    parts = []
-    with ProgressDisplay() as progress, multiprocessing.Pool(workers) as pool:
-        for number, part in enumerate(pool.imap(contact_outputs, work), start=1):
-            parts.append(part)
-            progress.show("surveys", number, len(work))
-    slope, offsets = fitted_calibration(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]))
-    return neutral.with_calibration(slope, offsets)
+    """Return a classifier with the calibration that `files` surveys of each seabed give.
+
+    The calibration decides which candidate of a place is the most confident one. So a second round fits the contacts
+    of the first calibration.
+    """
+    slope, offsets = 1.0, (0.0, 0.0, 0.0)
+    for _ in range(_ROUNDS):
+        present = classifier.with_calibration(slope, offsets)
+        work = [(present, kind, FIRST_SEED + n) for n in range(files) for kind in SeabedKind]
+        parts = []
+        with ProgressDisplay() as progress, multiprocessing.Pool(workers) as pool:
+            for number, part in enumerate(pool.imap(contact_outputs, work), start=1):
+                parts.append(part)
+                progress.show("surveys", number, len(work))
+        outputs, labels = (np.concatenate([part[n] for part in parts]) for n in (0, 1))
+        factor, more = fitted_calibration(outputs, labels)
+        slope = factor * slope
+        offsets = (0.0, factor * offsets[1] + more[1], factor * offsets[2] + more[2])
+    return classifier.with_calibration(slope, offsets)
 
 
 def main() -> None:
