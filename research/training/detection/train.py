@@ -22,6 +22,7 @@ from torch import nn
 from torch.nn import functional
 
 from research.training.detection.examples import Examples
+from sonarpost.detection.chips import COARSE_CENTRE, COARSE_STEP, FINE_CENTRE
 from sonarpost.detection.classifier import (
     CLASSES,
     COARSE_CHANNELS,
@@ -125,25 +126,14 @@ def augmented(
 
 
 def _hide_border(fine: npt.NDArray[np.float32], coarse: npt.NDArray[np.float32], rng: np.random.Generator) -> None:
-    """Make the chip unknown beyond a line on one of its four sides."""
-    side = int(rng.integers(4))
-    if side < 2:
-        rows = int(rng.integers(12, 26))
-        keep = slice(15 - rows // 2, None) if side == 0 else slice(0, 15 + rows // 2)
-        mask = np.zeros(coarse.shape[0], dtype=np.float32)
-        mask[keep] = 1.0
-        coarse *= mask[:, None, None]
-        fine *= np.repeat(mask, 4)[42 : 42 + fine.shape[0], None, None]
-    else:
-        mask = np.zeros(coarse.shape[1], dtype=np.float32)
-        columns = int(rng.integers(3, 12))
-        mask[14 - columns :] = 1.0
-        if side == 3:
-            mask[:] = 1.0
-            mask[14 + int(rng.integers(6, 25)) :] = 0.0
-        coarse *= mask[None, :, None]
-        # Fine column 0 is 16 pixels before the centre, which is coarse column 14.
-        fine *= np.repeat(mask, 4)[14 * 4 + 2 - 16 :][: fine.shape[1]][None, :, None]
+    """Make the chip unknown beyond a line on one of its four sides, which may cut the object itself."""
+    axis, is_before = int(rng.integers(2)), bool(rng.integers(2))
+    # Distance of the line from the centre in fine pixels; before the object along-track, highlight and shadow remain.
+    distance = int(rng.integers(1, 50)) if axis == 0 else int(rng.integers(10, 40))
+    for plane, centre, step in ((fine, FINE_CENTRE, 1), (coarse, COARSE_CENTRE, COARSE_STEP)):
+        offset = (np.arange(plane.shape[axis]) - centre[axis]) * step
+        keep = (offset >= -distance if is_before else offset <= distance).astype(np.float32)
+        np.multiply(plane, keep[:, None, None] if axis == 0 else keep[None, :, None], out=plane)
 
 
 def train(

@@ -110,7 +110,13 @@ def test_structure_changes_a_large_area(kind):
     before, after = (s.survey.waterfall(item.side).astype(float) for s in (empty, full))
     rows = np.flatnonzero((np.abs(after - before) > 0.3 * before.mean()).sum(axis=1) > 2)
     assert 10 < np.ptp(rows) <= (item.length_m * 1.3 + 4) / 0.15
-    assert (after < 0.3 * before).sum() > 200
+    assert (np.abs(after - before) > 0.3 * before.mean()).sum() > 300
+    assert (after < 0.5 * before).sum() > 50
+
+
+def changed_rows(one, other):
+    """Return the rows with a change of a tenth of the mean echo; the vehicle follows the seabed with the object."""
+    return np.flatnonzero((np.abs(one - other) > 0.1 * one.mean()).any(axis=1))
 
 
 def test_objects_change_only_their_surroundings():
@@ -118,11 +124,11 @@ def test_objects_change_only_their_surroundings():
     full = simulate_survey(spec, speckle=False)
     empty = simulate_survey(dataclasses.replace(spec, targets=()), speckle=False)
     (item,) = full.truth
-    rows = np.flatnonzero((full.survey.waterfall(item.side) != empty.survey.waterfall(item.side)).any(axis=1))
-    assert rows.size
-    assert np.abs(rows - item.ping).max() < 30
     other = Side.PORT if item.side is Side.STARBOARD else Side.STARBOARD
-    np.testing.assert_array_equal(full.survey.waterfall(other), empty.survey.waterfall(other))
+    changed = {side: changed_rows(full.survey.waterfall(side), empty.survey.waterfall(side)) for side in Side}
+    assert changed[item.side].size
+    assert np.abs(changed[item.side] - item.ping).max() < 30
+    assert not changed[other].size
 
 
 def test_all_kinds_fit_into_one_survey():
@@ -139,8 +145,8 @@ def test_burial_tilt_and_scour_leave_positions_and_the_seabed():
     assert [(t.ping, t.kind, t.lat_deg) for t in whole.truth] == [(t.ping, t.kind, t.lat_deg) for t in sunk.truth]
     assert all(b.height_m < a.height_m for a, b in zip(whole.truth, sunk.truth, strict=True))
     for side in Side:
-        same = whole.survey.waterfall(side) == sunk.survey.waterfall(side)
-        assert same.mean() > 0.7
+        one, other = whole.survey.waterfall(side), sunk.survey.waterfall(side)
+        assert (np.abs(one - other) < 0.1 * one.mean()).mean() > 0.7
 
 
 def images(**fields: object) -> tuple[np.ndarray, np.ndarray]:
