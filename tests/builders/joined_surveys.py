@@ -19,7 +19,7 @@ OBJECT_SAMPLE = 150
 
 @dataclass(frozen=True)
 class Box:
-    """A bright box of 8 pings and 10 samples with its shadow, centred on a row."""
+    """A bright box of 8 pings and 6 samples (0.8 m x 0.5 m) with its shadow, centred on a row."""
 
     row: int
     side: Side = Side.PORT
@@ -34,8 +34,8 @@ def survey_of(rows: int, *boxes: Box, seed: int = 5, first_row: int = 0) -> Surv
         for box in boxes:
             if box.side is side:
                 span = slice(box.row - 4, box.row + 4)
-                mean[span, OBJECT_SAMPLE - 5 : OBJECT_SAMPLE + 5] = 6.0
-                mean[span, OBJECT_SAMPLE + 5 : OBJECT_SAMPLE + 30] = 0.04
+                mean[span, OBJECT_SAMPLE - 3 : OBJECT_SAMPLE + 3] = 5.0
+                mean[span, OBJECT_SAMPLE + 3 : OBJECT_SAMPLE + 23] = 0.04
         ranges = (np.arange(SAMPLES) + 0.5) * RANGE_M / SAMPLES
         mean *= 1.0 / (1.0 + ranges / 8.0)
         mean[:, ranges < ALTITUDE_M] = 0.004

@@ -45,11 +45,12 @@ def test_table_lists_each_contact(file, capsys):
     title, seabed, columns, line = capsys.readouterr().out.splitlines()
     assert title == f"{file}: 200 pings, 1 contacts"
     assert re.fullmatch(
-        r"  seabed: \d+ clutter echoes per 1000 m², ripples 0\.\d, expected Pd [01]\.\d\d at threshold 1", seabed
+        r"  seabed: \d+ clutter echoes per 1000 m², ripples 0\.\d, expected Pd [01]\.\d\d at threshold 0\.5", seabed
     )
     assert len(columns.split()) == len(line.split())
     assert {"lat_deg", "lon_deg", "sigma_m"} < set(columns.split())
-    assert line.split()[2:4] == ["mine-like", "starboard"]
+    assert line.split()[2] == "mine-like"
+    assert line.split()[5] == "starboard"
 
 
 def test_json_is_one_object_with_contacts_of_every_file(file, capsys):
@@ -161,10 +162,15 @@ def test_several_files_give_one_plot_each(file, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["out-line7.png"]
 
 
-def test_options_limit_number_of_contacts(file, capsys):
-    assert run(file, "--threshold", "0.001", "--max-contacts", "3", "--json") == 0
+def test_options_limit_number_of_contacts(tmp_path, capsys):
+    file = tmp_path / "line.xtf"
+    write_xtf(simulate_survey(SurveySpec(seed=4, pings=400, samples=512, targets=6)).survey, file)
+    assert run(file, "--threshold", "0.001", "--json") == 0
     (found,) = json.loads(capsys.readouterr().out)["files"]
-    assert len(found["contacts"]) == 3
+    assert len(found["contacts"]) > 3
+    assert run(file, "--threshold", "0.001", "--max-contacts", "3", "--json") == 0
+    (limited,) = json.loads(capsys.readouterr().out)["files"]
+    assert limited["contacts"] == found["contacts"][:3]
 
 
 def test_nothing_found_says_what_lower_thresholds_give(tmp_path, capsys):
@@ -221,11 +227,11 @@ def test_error_names_option_out_of_range(file, options):
 
 def test_settings_are_read_from_a_file(file, tmp_path, capsys):
     settings = tmp_path / "settings.toml"
-    settings.write_text("confidence_threshold = 0.001\nmax_contacts = 4\nmine_length_m = [0.01, 0.02]\n")
+    settings.write_text("confidence_threshold = 2.0\nmax_contacts = 4\n")
     assert run(file, "--settings", settings, "--json") == 0
     (found,) = json.loads(capsys.readouterr().out)["files"]
-    assert [contact["atd_class"] for contact in found["contacts"]] == ["clutter"] * 4
-    assert list(found["contacts_above"]) == ["0.001"]
+    assert found["contacts"] == []
+    assert list(found["contacts_above"]) == ["2.0", "1.0", "0.5", "0.3", "0.1"]
     assert run(file, "--settings", settings, "--threshold", "1", "--json") == 0
     (found,) = json.loads(capsys.readouterr().out)["files"]
     assert len(found["contacts"]) == 1, "an option overrides the file"

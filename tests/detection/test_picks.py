@@ -212,10 +212,10 @@ def test_command_lists_picks_with_the_detected_contacts(file, capsys):
 
 def test_table_marks_picks_and_unknown_values(file, capsys):
     assert main(["detect", str(file), "--pick", "1030,port,10"]) == 0
-    _, columns, _, line, note = capsys.readouterr().out.splitlines()
+    _, _, columns, _, line, note = capsys.readouterr().out.splitlines()
     assert len(columns.split()) == len(line.split())
-    assert line.split()[1:6] == ["-", "picked", "port", "1030", "10"]
-    assert line.split()[7:11] == ["-"] * 4
+    assert line.split()[1:8] == ["-", "picked", "-", "-", "port", "1030", "10"]
+    assert line.split()[9:13] == ["-"] * 4
     assert note == "picked: 2"
 
 

@@ -68,7 +68,7 @@ def test_each_object_counts_once_and_contacts_without_object_are_false_alarms():
     assert [pd_at(curve, n) for n in (0.0, 1.0, 2.0)] == [0.5, 1.0, 1.0]
     assert pd_at(roc([one], "cylinder"), 9.0) == 0.0
     bins = reliability([one], bins=2)
-    assert [(b.contacts, b.true_share) for b in bins] == [(2, 0.5), (3, pytest.approx(2 / 3))]
+    assert [(b.contacts, b.true_share) for b in bins] == [(2, 0.5), (3, pytest.approx(1 / 3))]
 
 
 COLUMNS = "split,image,target_px,x0,y0,x1,y1"

@@ -217,6 +217,7 @@ def test_a_mostly_masked_file_is_one_warning(start_service, put_survey, publish,
     eventually(lambda: known(service) == 1)
     put_survey("line.xtf", started_s)
     eventually(lambda: counter(service, "files_processed") == 1)
+    eventually(lambda: "Most pings masked" in caplog.text)
     (warning,) = [r for r in caplog.records if r.message.startswith("Most pings masked")]
     assert warning.levelno == logging.WARNING
     assert counter(service, "pings_masked") == 240
