@@ -27,11 +27,13 @@ from research.detection.simulated import (
     FIRST_SEED,
     MAX_FILES,
     EvaluatedFile,
+    ReliabilityBin,
     evaluate_file,
     mine_like_share,
     operating_point,
     pd_at,
     reliability,
+    reliability_bins,
     roc,
     share_interval,
 )
@@ -121,6 +123,10 @@ def _result(
         "reliability": [
             {"contacts": b.contacts, "claimed": round(b.claimed, 3), "true": round(b.true_share, 3)}
             for b in reliability(files)
+        ],
+        "reliability_sdvd_test": [
+            {"tiles": b.contacts, "claimed": round(b.claimed, 3), "true": round(b.true_share, 3)}
+            for b in _tile_reliability(tiles)
         ],
         "codecs": [
             {
@@ -212,7 +218,7 @@ def plot_all(
     """
     folder.mkdir(parents=True, exist_ok=True)
     _plot_roc(folder / "roc.png", files)
-    _plot_reliability(folder / "reliability.png", files)
+    _plot_reliability(folder / "reliability.png", files, tiles)
     if tiles:
         _plot_tiles(folder / "tiles.png", tiles)
     if effects:
@@ -238,14 +244,25 @@ def _plot_roc(path: Path, files: Sequence[EvaluatedFile]) -> None:
     save_figure(figure, path)
 
 
-def _plot_reliability(path: Path, files: Sequence[EvaluatedFile]) -> None:
+def _tile_reliability(tiles: Sequence[TileScore]) -> tuple[ReliabilityBin, ...]:
+    """Return the reliability of the tiles that took no part in the training, in five bins."""
+    return reliability_bins([(t.confidence / 2, t.is_target) for t in tiles if t.split == "test"], 5)
+
+
+def _plot_reliability(path: Path, files: Sequence[EvaluatedFile], tiles: Sequence[TileScore]) -> None:
     """Draw the true share of mine-like objects over the claimed share."""
     figure = new_figure(5, 4.2)
     axis = figure.subplots()
     bins = reliability(files)
     axis.plot([0, 1], [0, 1], color="grey", linewidth=1)
-    axis.plot([b.claimed for b in bins], [b.true_share for b in bins], "o-")
-    for b in bins:
+    axis.plot([b.claimed for b in bins], [b.true_share for b in bins], "o-", label="contacts of simulated surveys")
+    of_tiles = _tile_reliability(tiles)
+    if of_tiles:
+        axis.plot(
+            [b.claimed for b in of_tiles], [b.true_share for b in of_tiles], "s--", label="SDVD tiles, test split"
+        )
+        axis.legend(loc="upper left", fontsize=8)
+    for b in (*bins, *of_tiles):
         axis.annotate(
             str(b.contacts), (b.claimed, b.true_share), fontsize=8, xytext=(4, -10), textcoords="offset points"
         )

@@ -185,7 +185,13 @@ class ReliabilityBin:
 def reliability(files: Sequence[EvaluatedFile], bins: int = 10) -> tuple[ReliabilityBin, ...]:
     """Return claimed and true share of mine-like objects by confidence, without structures and empty bins."""
     contacts = [c for f in files for c in f.contacts if c.is_first and not c.is_structure]
-    pairs = [(c.confidence / 2, c.target is not None and c.target.is_mine_like) for c in contacts]
+    return reliability_bins(
+        [(c.confidence / 2, c.target is not None and c.target.is_mine_like) for c in contacts], bins
+    )
+
+
+def reliability_bins(pairs: Sequence[tuple[float, bool]], bins: int) -> tuple[ReliabilityBin, ...]:
+    """Return claimed and true share of pairs of a claimed probability and the truth, without empty bins."""
     found = []
     for number in range(bins):
         inside = [p for p in pairs if number <= min(p[0] * bins, bins - 1e-9) < number + 1]
