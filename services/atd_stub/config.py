@@ -62,7 +62,7 @@ class AtdStubConfig(RetentionConfig, SurveyOptions):
     poll_s: Annotated[float, Field(gt=0, le=3600)] = 1.0
     settle_s: Annotated[float, Field(ge=0, le=3600)] = 3.0
     require_done_marker: bool = False
-    confidence_threshold: Annotated[float, Field(ge=0, le=2)] = 0.5
+    confidence_threshold: Annotated[float, Field(ge=0, le=2)] = 0.3
     max_contacts: Annotated[int, Field(ge=0)] = 0
     max_in_flight: Annotated[int, Field(ge=0, le=100_000)] = 32
     detector: DetectorTuning = DetectorTuning()

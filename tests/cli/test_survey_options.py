@@ -166,7 +166,7 @@ def test_a_recorded_wreck_in_metres_has_the_same_contacts_and_positions(
     write_xtf(read_survey(recorded), tmp_path / recorded.name, projected_crs="EPSG:32616")
     contacts = []
     for path, crs in ((recorded, []), (tmp_path / recorded.name, ["--crs", "EPSG:32616"])):
-        assert main(["detect", "--json", "--threshold", "0.1", str(path), *crs]) == 0
+        assert main(["detect", "--json", str(path), *crs]) == 0
         contacts.append(json.loads(capsys.readouterr().out)["files"][0]["contacts"])
     assert len(contacts[0]) == len(contacts[1]) >= 4
     for one, other in zip(*contacts, strict=True):

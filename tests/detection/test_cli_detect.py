@@ -45,7 +45,7 @@ def test_table_lists_each_contact(file, capsys):
     title, seabed, columns, line = capsys.readouterr().out.splitlines()
     assert title == f"{file}: 200 pings, 1 contacts"
     assert re.fullmatch(
-        r"  seabed: \d+ clutter echoes per 1000 m², ripples 0\.\d, expected Pd [01]\.\d\d at threshold 0\.5", seabed
+        r"  seabed: \d+ clutter echoes per 1000 m², ripples 0\.\d, expected Pd [01]\.\d\d at threshold 0\.3", seabed
     )
     assert len(columns.split()) == len(line.split())
     assert {"lat_deg", "lon_deg", "sigma_m"} < set(columns.split())

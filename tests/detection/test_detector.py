@@ -117,7 +117,7 @@ def test_short_and_empty_surveys_give_no_detections(make_survey, pings):
 def test_simulated_mines_are_detected_with_few_false_alarms(seabed):
     simulated = simulate_survey(SurveySpec(seed=7, seabed=seabed, targets=8, clutter=2))
     start_s = time.process_time()
-    found = detect(simulated.survey, DetectorSettings(confidence_threshold=0.3))
+    found = detect(simulated.survey)
     duration_s = time.process_time() - start_s
 
     def near(detection, truth):
@@ -187,7 +187,7 @@ def test_scotsman_label_matches_a_contact_and_positions_match_geodesic(data_dir)
         return lon, lat
 
     label = lon_lat(ping, Side.STARBOARD, (column + 0.5) * spacing_m)
-    found = detect(survey, DetectorSettings(confidence_threshold=0.3))
+    found = detect(survey)
     distances = [
         (geod.inv(*label, d.position.lon_deg, d.position.lat_deg)[2], d) for d in found if d.side is Side.STARBOARD
     ]

@@ -79,7 +79,7 @@ class DetectorSettings(DetectorTuning):
         join_overlap_pings: Pings that consecutive parts of a recording, and consecutive files, have in common.
     """
 
-    confidence_threshold: Annotated[float, Field(ge=0, le=2)] = 0.5
+    confidence_threshold: Annotated[float, Field(ge=0, le=2)] = 0.3
     max_contacts: Annotated[int, Field(gt=0)] | None = None
     join_overlap_pings: Annotated[int, Field(ge=0, le=900)] = 200
 

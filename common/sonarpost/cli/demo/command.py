@@ -81,7 +81,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--console", action="store_true", help="like --keep, and serve the operator's page: user and password are shown"
     )
     parser.add_argument(
-        "--threshold", type=float, metavar="CONFIDENCE", help="minimum confidence of a contact, 0 to 2 (default: 0.5)"
+        "--threshold", type=float, metavar="CONFIDENCE", help="minimum confidence of a contact, 0 to 2 (default: 0.3)"
     )
     add_survey_options(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")

@@ -86,7 +86,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "--threshold",
         type=float,
         metavar="CONFIDENCE",
-        help="minimum confidence, 0 to 2 (default: that of --settings, else 0.5)",
+        help="minimum confidence, 0 to 2 (default: that of --settings, else 0.3)",
     )
     parser.add_argument(
         "--max-contacts", type=int, metavar="N", help="list at most the N most confident contacts of a file"
