@@ -88,7 +88,8 @@ def indices_by_class_and_source(examples: Examples) -> list[list[npt.NDArray[np.
 def drawn_batch(table: list[list[npt.NDArray[np.int64]]], rng: np.random.Generator) -> npt.NDArray[np.int64]:
     """Return the indices of a batch: classes by `CLASS_SHARES`, sources by `SOURCE_SHARES` where they have examples."""
     chosen = []
-    for label in rng.choice(CLASSES, size=BATCH, p=CLASS_SHARES):
+    present = np.array([any(map(len, parts)) for parts in table]) * np.array(CLASS_SHARES)
+    for label in rng.choice(CLASSES, size=BATCH, p=present / present.sum()):
         shares = np.array(
             [share if len(part) else 0.0 for share, part in zip(SOURCE_SHARES, table[label], strict=True)]
         )
