@@ -13,7 +13,8 @@ import { Queue } from "./queue.js";
 import { QueueFilters } from "./queue_filters.js";
 import { openRequestDialog } from "./request_dialog.js";
 import { shortcutTable, showHelp, startShortcuts } from "./shortcuts.js";
-import { emit, listen, setClock, state } from "./state.js";
+import { emit, listen, setClock, setting, state } from "./state.js";
+import { loadLanguage } from "./texts.js";
 
 class App {
   constructor() {
@@ -182,6 +183,7 @@ async function saveExport(button, progress, format, filter) {
 
 restoreTheme();
 try {
+  await loadLanguage(setting("language"));
   [state.session, state.info] = await Promise.all([api.session(), api.info()]);
   setToken(state.session.csrf);
   setClock(state.info.now_utc_s);

@@ -1,12 +1,14 @@
 // Text of values. An unknown value is a dash.
 
+import { t } from "./texts.js";
+
 export const DASH = "–";
-export const VERDICTS = { mine_like: "mine-like", not_mine_like: "not mine-like", unsure: "unsure", unreviewed: "unreviewed" };
+const VERDICTS = ["mine_like", "not_mine_like", "unsure", "unreviewed"];
 const SYMBOLS = { mine_like: "▲", not_mine_like: "○", unsure: "?", unreviewed: "◆" };
 
 const known = (value) => value !== null && value !== undefined && Number.isFinite(value);
 
-export const verdict = (name) => VERDICTS[name] ?? name ?? DASH;
+export const verdict = (name) => (VERDICTS.includes(name) ? t(`verdict.${name}`) : name ?? DASH);
 /** Name of a kind of request for operators. */
 const REQUEST_KINDS = { wider: "expand", original: "unfiltered image" };
 export const requestKind = (kind) => REQUEST_KINDS[kind] ?? kind;

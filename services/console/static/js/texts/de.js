@@ -1,0 +1,4 @@
+// German texts; see en.js.
+
+export default {
+};

@@ -1,0 +1,4 @@
+// French texts; see en.js.
+
+export default {
+};
