@@ -1,4 +1,4 @@
-"""A console page in Chromium, driven by Playwright. Requests to other hosts fail the test."""
+"""A console page in Chromium and in Firefox, driven by Playwright. Requests to other hosts fail the test."""
 
 from __future__ import annotations
 
@@ -10,7 +10,15 @@ from urllib.parse import urlsplit
 
 import pytest
 from builders.console import console, fast_password_hashes, make_console, users_file
-from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, sync_playwright
+from playwright.sync_api import (
+    Browser,
+    BrowserContext,
+    ConsoleMessage,
+    Page,
+    Playwright,
+    Request,
+    sync_playwright,
+)
 
 from sonarpost.services.console.store.users import Users
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
@@ -19,22 +27,34 @@ __all__ = ["console", "fast_password_hashes", "make_console", "users_file"]
 
 SMALL = {"width": 1366, "height": 768}
 TIMEOUT_MS = 20_000
+COMMANDS = {"chromium": ("chromium",), "firefox": ("firefox", "firefox-esr")}
+"""Commands of a browser; the last one is the name of its Debian package."""
 
 
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
-    """Chromium, one for the tests of a file."""
-    path = os.environ.get("SONARPOST_CHROMIUM") or shutil.which("chromium")
-    if path is None:
-        pytest.skip("no Chromium: apt-get install chromium, or set SONARPOST_CHROMIUM")
-    # Chromium's sandbox does not run as root, for example in containers.
-    arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
-    # Only the local host can be resolved.
-    arguments += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
+@pytest.fixture(scope="session")
+def playwright() -> Iterator[Playwright]:
     with sync_playwright() as playwright:
+        yield playwright
+
+
+@pytest.fixture(scope="module", params=["chromium", "firefox"])
+def browser(request: pytest.FixtureRequest, playwright: Playwright) -> Iterator[Browser]:
+    """Each browser, one for the tests of a file."""
+    name = request.param
+    found = (shutil.which(command) for command in COMMANDS[name])
+    path = os.environ.get(f"SONARPOST_{name.upper()}") or next(filter(None, found), None)
+    if path is None:
+        pytest.skip(f"no {name}: apt-get install {COMMANDS[name][-1]}, or set SONARPOST_{name.upper()}")
+    if name == "firefox":
+        browser = playwright.firefox.launch(channel="moz-firefox", executable_path=path)
+    else:
+        # Chromium's sandbox does not run as root, for example in containers.
+        arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
+        # Only the local host can be resolved.
+        arguments += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
         browser = playwright.chromium.launch(executable_path=path, args=arguments)
-        yield browser
-        browser.close()
+    yield browser
+    browser.close()
 
 
 class Visit:
@@ -109,14 +129,14 @@ Visitor = Callable[..., Visit]
 
 
 @pytest.fixture
-def visit(chromium: Browser) -> Iterator[Callable[..., Visit]]:
+def visit(browser: Browser) -> Iterator[Callable[..., Visit]]:
     """Opens pages of a console with `visit(address, token)`, and checks them after the test."""
     contexts: list[BrowserContext] = []
     visits: list[Visit] = []
 
     def open_page(address: str, token: str = "", path: str = "", **options: Any) -> Visit:
         defaults: dict[str, Any] = {"viewport": SMALL, "reduced_motion": "reduce", "color_scheme": "light"}
-        context = chromium.new_context(**(defaults | options))
+        context = browser.new_context(**(defaults | options))
         contexts.append(context)
         if token:
             context.add_cookies([{"name": "sonarpost_session", "value": token, "url": address}])
