@@ -171,7 +171,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "images": [tuple(SAMPLES["queued-image"].model_dump() for _ in range(501))],
         "images_accepted": NO_COUNT,
     },
-    SAMPLES["decision-full"].__class__: {
+    SAMPLES["decision-withdrawal"].__class__: {
         "decision_id": NO_ID,
         "vessel_id": NO_NAME,
         "vehicle_id": NO_NAME,
@@ -183,6 +183,8 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "remark": [LONG],
         "operator": ["", "x" * 121],
         "decided_utc_s": NO_TIME,
+        "withdraws": ["", "x" * 65],
+        "overrules": [("",), ("d",) * 17],
     },
     SAMPLES["command-refine"].__class__: {
         "command_id": NO_ID,

@@ -43,6 +43,9 @@ DownlinkKind = Literal["refine", "resend", "revisit", "decision", "wider", "orig
 DownlinkStep = Literal["asked", "sent", "confirmed", "refused", "expired"]
 ServiceState = Literal["starting", "ok", "degraded", "stopping"]
 
+MAX_OVERRULED: Final = 16
+"""Decisions that one decision can overrule."""
+
 MAX_TRANSMISSION_S: Final = 300.0
 """Longer than any transmission of a modem; a longer one in a record means damage."""
 
@@ -637,6 +640,9 @@ class Decision(Record):
         remark: Free text.
         operator: Name of the operator.
         decided_utc_s: Time of the decision.
+        withdraws: Decision on the same image that this record takes back; it repeats the verdict before that one,
+            `unsure` if there was none. None if the record is a decision, and in records of earlier versions.
+        overrules: Decisions of other operators on the same image that this one replaces.
     """
 
     TYPE: ClassVar[str] = "decision"
@@ -652,6 +658,8 @@ class Decision(Record):
     remark: Text = ""
     operator: Annotated[str, Field(min_length=1, max_length=120)]
     decided_utc_s: Time
+    withdraws: RecordId | None = None
+    overrules: Annotated[tuple[RecordId, ...], Field(max_length=MAX_OVERRULED)] = ()
 
 
 class Command(Record):

@@ -272,7 +272,21 @@ SAMPLES: dict[str, Record] = {
     ),
     "reconstructed-image-classified": COMPLETE_IMAGE.model_copy(update={"codec": "emb", "despeckle_strength": 0.75}),
     "reconstructed-image-despeckling-unknown": DAMAGED_IMAGE,
-    "decision-full": Decision(
+    "decision-withdrawal": Decision(
+        decision_id="d-4",
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        image_id="00A7",
+        image_version=2,
+        verdict="mine_like",
+        confidence=0.75,
+        mlo_class="cylinder",
+        remark="withdraws decision d-1",
+        operator="op",
+        decided_utc_s=1476262901.0,
+        withdraws="d-1",
+    ),
+    "decision-overruling": Decision(
         decision_id="d-1",
         vessel_id="vessel-1",
         vehicle_id="uuv-1",
@@ -284,8 +298,9 @@ SAMPLES: dict[str, Record] = {
         remark="shadow länger als das Echo",
         operator="op",
         decided_utc_s=1476262900.0,
+        overrules=("d-0", "d-3"),
     ),
-    "decision-bare": Decision(
+    "decision-plain": Decision(
         decision_id="d-2",
         vessel_id="vessel-1",
         vehicle_id="uuv-1",

@@ -237,6 +237,8 @@ STRATEGIES: dict[type[Record], st.SearchStrategy[Any]] = {
         remark=_text(0, 2000),
         operator=_text(1, 120),
         decided_utc_s=_time,
+        withdraws=_maybe(_record_id),
+        overrules=st.lists(_record_id, max_size=16).map(tuple),
     ),
     Advice: st.builds(
         Advice,

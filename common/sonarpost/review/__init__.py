@@ -1,1 +1,1 @@
-"""Functions for an operator's review: grouping, measurement, cost of requests, rendering. No input or output."""
+"""Functions for an operator's review: decisions, grouping, measurement, cost, rendering. No input or output."""

@@ -58,7 +58,7 @@ def hex_block(name: str) -> bytes:
 
 
 def test_hex_examples_equal_the_encoded_records() -> None:
-    decision = wire.encode(SAMPLES["decision-bare"])
+    decision = wire.encode(SAMPLES["decision-plain"])
     item = OutboxItem("relay", 1, "k", "", 4, decision, hashlib.sha256(decision).digest())
     assert {name: hex_block(name) for name in blocks("hex")} == {
         "raster": wire.encode(SAMPLES["raster-16-bits"]),
@@ -193,7 +193,7 @@ def test_delivery_program_waits_for_its_consumer(
     try:
         program.wait()
         assert program.lines.get(timeout=5) == "stored"
-        eventually(lambda: consumer.received == [SAMPLES["decision-bare"]])
+        eventually(lambda: consumer.received == [SAMPLES["decision-plain"]])
     finally:
         consumer.stop()
 
@@ -226,7 +226,7 @@ class Producer(Service[ServiceConfig]):
 
 def queue_decision(producer: Producer, consumer: str, number: int) -> None:
     effects = UnitOfWork()
-    fields = SAMPLES["decision-bare"].model_dump() | {"decision_id": f"d{number}"}
+    fields = SAMPLES["decision-plain"].model_dump() | {"decision_id": f"d{number}"}
     effects.send(DecisionConsumer.key, consumer, Decision(**fields))
     producer.commit(effects)
 
