@@ -8,6 +8,7 @@ import { debounce, h, showDialog, toast } from "./dom.js";
 import { startEvents } from "./event_stream.js";
 import { FleetView } from "./fleet_view.js";
 import { Header, restoreTheme, toggleTheme, toggleTypeSize } from "./header.js";
+import { Drawer, onSwipe } from "./layout.js";
 import { MapView } from "./map_view.js";
 import { Queue } from "./queue.js";
 import { QueueFilters } from "./queue_filters.js";
@@ -30,8 +31,10 @@ class App {
     this.requestNumber = 0; // last request for a contact
     this.displayedNumber = 0; // request whose response is displayed
     this.panel = h("div", { class: "panel", role: "region", "aria-label": "Decision" }, this.decision.element, this.details.element);
+    this.drawer = new Drawer(this.panel);
     this.review = h("section", { class: "review", "aria-label": "Review" },
       h("div", { class: "side" }, this.filters.element, this.queue.element), this.view.element, this.panel);
+    onSwipe(this.view.stage, () => !this.view.zoomed && !this.view.measurement.active, (step) => this.queue.move(step));
     document.getElementById("main").append(this.review, this.map.element, this.fleet.element);
     this.keys = shortcutTable({ app: this, queue: this.queue, view: this.view, decision: this.decision, map: this.map });
     this.header = new Header({ exports: () => this.exports(), help: () => this.help() });
@@ -119,7 +122,7 @@ class App {
     for (const [one, element] of [["review", this.review], ["map", this.map.element], ["fleet", this.fleet.element]]) element.classList.toggle("hidden", one !== name);
     this.header.setView(name);
     if (name === "map") { this.map.load().catch((error) => toast(error.message, { bad: true })); this.map.canvas.focus(); }
-    if (name === "fleet") this.fleet.render();
+    if (name === "fleet") { this.fleet.render(); this.fleet.element.focus(); }
     if (name === "review") { this.queue.draw(); this.view.redraw(); this.queue.list.focus(); }
   }
 
@@ -133,7 +136,7 @@ class App {
     this.select(group[(group.findIndex((row) => row.id === state.selected) + 1) % group.length].id);
   }
 
-  search() { this.filters.search.focus(); this.filters.search.select(); }
+  search() { this.filters.openSearch(); }
 
   toggleReview() { this.filters.setReview(this.filters.review === "unreviewed" ? "" : "unreviewed"); }
 

@@ -7,8 +7,10 @@ import { MAPS, autoRange, loadImage } from "./image_data.js";
 import { COMPARE, drawHint, drawTools, drawVersions, startMouse } from "./image_toolbar.js";
 import { ImageView, defaultViewport } from "./image_view.js";
 import { integrityStrip } from "./integrity_strip.js";
+import { toolbarWithMore } from "./layout.js";
 import { MeasurementTool, measurementLine } from "./measurement.js";
 import { setting, state } from "./state.js";
+import { t } from "./texts.js";
 
 const GAIN_STEP = 5;
 
@@ -33,17 +35,20 @@ export class ContactView {
     this.canvases = ["Image of the contact", "Compared image"].map((label) => h("canvas", { role: "img", "aria-label": label }));
     this.views = this.canvases.map((canvas) => new ImageView(canvas, viewport));
     for (const view of this.views) view.display = this.display;
-    this.heading = h("div", { class: "heading" });
+    this.heading = h("div", { class: "heading", role: "group", tabindex: 0, "aria-label": t("contact_view.heading") });
     this.tools = h("div", { class: "tools", role: "toolbar", "aria-label": "Image" });
     this.placeholder = h("p", { class: "placeholder" });
     this.stage = h("div", { class: "stage" }, this.canvases, this.placeholder);
     this.versions = h("div", { class: "versions", role: "toolbar", "aria-label": "Versions of the image" });
-    this.strip = h("div", { class: "strip", role: "region", "aria-label": "Data integrity of this image" });
-    this.element = h("section", { class: "contact", "aria-label": "Contact" }, this.heading, this.tools, this.stage, this.versions, this.strip);
+    this.strip = h("div", { class: "strip", role: "region", tabindex: 0, "aria-label": "Data integrity of this image" });
+    this.element = h("section", { class: "contact", "aria-label": "Contact" }, this.heading, toolbarWithMore(this.tools), this.stage,
+      h("div", { class: "contact-foot" }, this.versions, this.strip));
   }
 
   get shown() { return this.detail?.versions.find((one) => one.version === this.version) ?? null; }
   get shownLayer() { return this.shown?.layers.find((one) => one.name === this.layer) ?? null; }
+
+  get zoomed() { return this.views[0].viewport.zoom > 1; }
 
   #displayed() {
     const view = this.views[0];

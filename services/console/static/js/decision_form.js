@@ -64,11 +64,11 @@ export class DecisionForm {
     this.form = h("form", { on: { submit: (event) => { event.preventDefault(); this.submit(); } } },
       h("fieldset", { id: "decide" },
         h("legend", { text: this.isComment ? "Your comment for the vessel" : "Your decision" }),
-        h("div", { class: "verdicts", role: "group", "aria-label": "Verdict" }, this.buttons),
+        h("div", { class: "verdicts in-bar", role: "group", "aria-label": "Verdict" }, this.buttons),
         h("label", {}, h("span", {}, "confidence: ", this.confidenceText), this.confidence),
         labelled("class", this.mloClass), h("datalist", { id: "classes" }, state.info.classes.map((name) => h("option", { value: name }))),
         labelled("remark", this.remark),
-        h("div", { class: "send" }, this.send, this.isComment ? null : this.undoButton)));
+        h("div", { class: "send in-bar" }, this.send, this.isComment ? null : this.undoButton)));
     this.element.append(this.current, this.form);
   }
 

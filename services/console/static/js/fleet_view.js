@@ -81,7 +81,7 @@ export class FleetView {
     this.services = h("tbody", {});
     this.frameList = h("ol", { class: "frames number", "aria-label": "Received frames" });
     this.frames = [];
-    this.element = h("section", { class: "fleet hidden", "aria-label": "Link and fleet" },
+    this.element = h("section", { class: "fleet hidden", tabindex: 0, "aria-label": "Link and fleet" },
       h("div", {}, h("h2", { text: "Vehicles" }), this.vehicles),
       h("div", {}, h("h2", { text: "Services" }),
         h("table", {}, h("thead", {}, h("tr", {}, ["platform", "service", "state", "last health", "detail"].map((name) => h("th", { scope: "col", text: name })))), this.services),

@@ -3,7 +3,9 @@
 import { api } from "./api.js";
 import { fill, h } from "./dom.js";
 import { duration, quantity } from "./format.js";
+import { opener } from "./layout.js";
 import { emit, listen, now, setting, state } from "./state.js";
+import { t } from "./texts.js";
 
 export const VIEWS = [["review", "Review", "q"], ["map", "Map", "p"], ["fleet", "Link", "f"]];
 
@@ -66,15 +68,19 @@ export class Header {
     this.tabs = VIEWS.map(([name, title, key]) => h("button", {
       type: "button", "aria-pressed": "false", data: { view: name }, on: { click: () => emit("view", { name }) },
     }, `${title} `, h("kbd", { text: key })));
-    fill(this.element,
-      h("h1", {}, h("img", { src: "/static/icon.svg", alt: "", width: 26, height: 26 }), state.info.platform_id),
+    const menu = h("div", { class: "menu-items" },
       h("nav", { "aria-label": "Views" }, this.tabs),
-      this.count, h("span", { class: "gap" }), this.link, this.live,
       h("button", { type: "button", title: "Exports (x)", "aria-label": "Exports (x)", on: { click: actions.exports } }, "⇩"),
       h("button", { type: "button", title: "Day or night (t)", "aria-label": "Day or night theme (t)", on: { click: toggleTheme } }, "◐"),
       h("button", { type: "button", title: "Type size (z)", "aria-label": "Type size (z)", on: { click: toggleTypeSize } }, "A±"),
       h("button", { type: "button", title: "Keys (?)", "aria-label": "Keys (?)", on: { click: actions.help } }, "?"),
       accountButtons());
+    const menuButton = h("button", { type: "button", class: "menu-button", "aria-label": t("layout.menu"), title: t("layout.menu"), text: "☰" });
+    const { close } = opener(menuButton, menu);
+    menu.addEventListener("click", (event) => { if (event.target.closest("button, a")) close(); });
+    fill(this.element,
+      h("h1", {}, h("img", { src: "/static/icon.svg", alt: "", width: 26, height: 26 }), state.info.platform_id),
+      this.count, h("span", { class: "gap" }), this.link, this.live, menuButton, menu);
     listen("counts", () => this.#renderCounts());
     listen("contact", ({ unreviewed, total }) => { Object.assign(state, { unreviewed, total }); this.#renderCounts(); });
     listen("online", () => this.render());

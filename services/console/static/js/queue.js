@@ -4,6 +4,7 @@ import { api } from "./api.js";
 import { h } from "./dom.js";
 import { DASH, authentication, probabilities, quantity, received, symbol, time, verdict } from "./format.js";
 import { emit, listen, state } from "./state.js";
+import { t } from "./texts.js";
 
 const MARGIN_ROWS = 6; // rows drawn above and below the visible ones
 const PAGE = 100;
@@ -102,32 +103,32 @@ function meter(value_percent, title, tone) {
 /** Label of a row for screen readers. */
 function rowLabel(row) {
   return [
-    row.name, verdict(row.review), row.atd_confidence === null ? "no detector confidence" : `detector ${row.atd_confidence.toFixed(2)} of 2`,
-    row.atd_class ? `class ${row.atd_class}` : "", probabilities(row) ?? "",
-    row.complete ? "image complete" : `${received(row)} received`, `seen ${time(row.seen_utc_s ?? row.first_frame_utc_s)}`,
-    row.looks > 1 ? `${row.looks} looks at one position` : "", row.advised ? "comment from the shore site" : "",
-    row.authenticated === false ? "unauthenticated" : "",
+    row.name, verdict(row.review), row.atd_confidence === null ? t("queue.no_confidence") : t("queue.confidence_label", { value: row.atd_confidence.toFixed(2) }),
+    row.atd_class ? t("queue.class_label", { name: row.atd_class }) : "", probabilities(row) ?? "",
+    row.complete ? t("queue.complete") : t("queue.received", { share: received(row) }), t("queue.seen", { time: time(row.seen_utc_s ?? row.first_frame_utc_s) }),
+    row.looks > 1 ? t("queue.looks", { count: row.looks }) : "", row.advised ? t("queue.advised") : "",
+    row.authenticated === false ? t("queue.unauthenticated") : "",
   ].filter(Boolean).join(", ");
 }
 
 /** Class of the detector; a structure has a frame. */
 function classMark(row) {
   if (!row.atd_class) return null;
-  const title = probabilities(row) ?? "class of the detector";
+  const title = probabilities(row) ?? t("queue.class");
   return h("span", { class: row.atd_class === "structure" ? "class structure" : "class", title, text: row.atd_class });
 }
 
 function marks(row) {
   const list = [];
   if (row.authenticated === false) list.push(h("span", { class: "mark bad unauthenticated", title: authentication(row) }, "⚠"));
-  if (row.looks > 1) list.push(h("span", { class: "mark", title: `${row.looks} looks at one position` }, `×${row.looks}`));
-  if (row.advised) list.push(h("span", { class: "mark", title: "Comment from the shore site" }, "✉"));
-  if (row.open_requests > 0) list.push(h("span", { class: "mark", title: "Request in progress" }, "⟳"));
+  if (row.looks > 1) list.push(h("span", { class: "mark", title: t("queue.looks", { count: row.looks }) }, `×${row.looks}`));
+  if (row.advised) list.push(h("span", { class: "mark", title: t("queue.advised") }, "✉"));
+  if (row.open_requests > 0) list.push(h("span", { class: "mark", title: t("queue.open_request") }, "⟳"));
   if (row.delivery?.vehicle === "confirmed" && ["delivered", "none"].includes(row.delivery?.shore)) {
-    list.push(h("span", { class: "mark good", title: "The decision is at the shore site and on the vehicle" }, "✓"));
+    list.push(h("span", { class: "mark good", title: t("queue.delivered") }, "✓"));
   }
   if ([row.delivery?.vehicle, row.delivery?.shore].some((step) => step === "refused" || step === "expired")) {
-    list.push(h("span", { class: "mark bad", title: "The decision was not delivered" }, "!"));
+    list.push(h("span", { class: "mark bad", title: t("queue.not_delivered") }, "!"));
   }
   return list;
 }
@@ -136,7 +137,7 @@ function marks(row) {
 function queueRow(row, index, count, selected) {
   const image = row.has_picture
     ? h("img", { src: row.thumbnail, alt: "", decoding: "async" })
-    : h("span", { class: "nothing", text: "no image yet" });
+    : h("span", { class: "nothing", text: t("queue.no_image") });
   return h("div", {
     id: `row-${index}`, class: "row", role: "option", "aria-selected": String(selected), "aria-posinset": index + 1, "aria-setsize": count,
     "aria-label": rowLabel(row), data: { id: row.id, index: String(index), review: row.review },
@@ -145,15 +146,15 @@ function queueRow(row, index, count, selected) {
   h("div", { class: "words" },
     h("div", { class: "first" },
       h("b", { text: row.name }),
-      h("span", { class: `badge ${row.review}` }, h("span", { text: symbol(row.review) }), ` ${verdict(row.review)}`)),
+      h("span", { class: `badge ${row.review}` }, h("span", { text: symbol(row.review) }), h("span", { class: "verdict", text: ` ${verdict(row.review)}` }))),
     h("div", { class: "second number" },
-      h("span", { text: `ATD ${row.atd_confidence === null ? DASH : row.atd_confidence.toFixed(2)}` }),
-      meter((row.atd_confidence ?? 0) * 50, "confidence of the detector, 0 to 2", "atd"),
+      h("span", { title: t("queue.confidence"), text: t("queue.detector", { value: row.atd_confidence === null ? DASH : row.atd_confidence.toFixed(2) }) }),
+      meter((row.atd_confidence ?? 0) * 50, t("queue.confidence"), "atd"),
       h("span", { class: "share", text: received(row) }),
-      meter(row.percent_received ?? 0, "received", row.complete ? "whole" : "part")),
+      meter(row.percent_received ?? 0, t("queue.received_title"), row.complete ? "whole" : "part")),
     h("div", { class: "third muted number" },
-      h("span", { text: time(row.seen_utc_s ?? row.first_frame_utc_s) }),
-      h("span", { text: quantity(row.range_m, "m", 0) }),
+      h("span", { class: "time", text: time(row.seen_utc_s ?? row.first_frame_utc_s) }),
+      h("span", { class: "range", text: quantity(row.range_m, "m", 0) }),
       classMark(row),
       h("span", { class: "marks" }, marks(row)))));
 }
@@ -167,20 +168,30 @@ export class Queue {
     this.refreshAgain = false;
     this.space = h("div", { class: "space", role: "presentation" });
     this.list = h("div", {
-      id: "queue", class: "list", role: "listbox", tabindex: 0, "aria-label": "Review queue",
+      id: "queue", class: "list", role: "listbox", tabindex: 0, "aria-label": t("queue.title"),
       on: { scroll: () => this.draw(), click: (event) => this.#clicked(event) },
     }, this.space);
-    this.empty = h("p", { class: "empty muted", text: "No contact matches. A contact appears when its first frame is received." });
+    this.empty = h("p", { class: "empty muted", text: t("queue.empty") });
     this.element = h("div", { class: "listbox" }, this.list, this.empty);
-    new ResizeObserver(() => { this.#measureRow(); this.draw(); }).observe(this.list);
+    new ResizeObserver(() => this.#resized()).observe(this.list);
     listen("contact", ({ contact, new: isNew }) => this.#updateContact(contact, isNew));
-    listen("theme", () => { this.#measureRow(); this.draw(); });
+    listen("theme", () => this.#resized());
+  }
+
+  /** Keep the displayed contact visible when direction or size of the list change. */
+  #resized() {
+    const before = [this.horizontal, this.rowSize];
+    this.#measureRow();
+    if (before[0] !== this.horizontal || before[1] !== this.rowSize) {
+      this.#setLength();
+      this.#scrollTo(this.selectedIndex);
+    } else this.draw();
   }
 
   /** Show the contacts of a filter, from the first one. */
   async show(query) {
     this.rows.query = query;
-    this.list.scrollTop = 0;
+    this.#scroll = 0;
     this.selectedIndex = 0;
     await this.refresh();
   }
@@ -203,13 +214,13 @@ export class Queue {
   }
 
   async #reload() {
-    const top = this.rows.at(Math.floor(this.list.scrollTop / this.rowHeight));
+    const top = this.rows.at(Math.floor(this.#scroll / this.rowSize));
     const [first, last] = this.#visibleRange();
     const response = await this.rows.refresh(first, last);
     if (response === null) return;
     Object.assign(state, { total: response.total, unreviewed: response.unreviewed });
     emit("counts", response);
-    if (top && this.list.scrollTop > 0) this.#keepScrollPosition(top);
+    if (top && this.#scroll > 0) this.#keepScrollPosition(top);
     const index = this.rows.indexOf(state.selected);
     if (index >= 0) this.selectedIndex = index;
     this.#redraw();
@@ -219,9 +230,9 @@ export class Queue {
   #keepScrollPosition(top) {
     const index = this.rows.indexOf(top.id);
     if (index < 0) return;
-    const within = this.list.scrollTop % this.rowHeight;
-    this.#setHeight();
-    this.list.scrollTop = index * this.rowHeight + within;
+    const within = this.#scroll % this.rowSize;
+    this.#setLength();
+    this.#scroll = index * this.rowSize + within;
   }
 
   #updateContact(row, isNew) {
@@ -243,25 +254,39 @@ export class Queue {
     this.drawn.set(index, fresh);
   }
 
+  /** Read direction and size of the rows from the style: a list, or a film strip. */
   #measureRow() {
-    this.rowHeight = parseFloat(getComputedStyle(document.documentElement).fontSize) * 5.4;
+    const style = getComputedStyle(this.list);
+    this.horizontal = style.getPropertyValue("--direction").trim() === "row";
+    this.rowSize = parseFloat(style.getPropertyValue("--row")) * parseFloat(getComputedStyle(document.documentElement).fontSize);
+    this.list.setAttribute("aria-orientation", this.horizontal ? "horizontal" : "vertical");
     for (const [index, element] of this.drawn) this.#place(element, index);
   }
 
+  get #scroll() { return this.horizontal ? this.list.scrollLeft : this.list.scrollTop; }
+  set #scroll(value) { this.list[this.horizontal ? "scrollLeft" : "scrollTop"] = value; }
+  get #length() { return this.horizontal ? this.list.clientWidth : this.list.clientHeight; }
+
+  /** Set a size along the direction of the list, and remove the one across. */
+  #setSize(element, size_px) {
+    element.style.width = this.horizontal ? `${size_px}px` : "";
+    element.style.height = this.horizontal ? "" : `${size_px}px`;
+  }
+
   #place(element, index) {
-    element.style.transform = `translateY(${index * this.rowHeight}px)`;
-    element.style.height = `${this.rowHeight}px`;
+    element.style.transform = `translate${this.horizontal ? "X" : "Y"}(${index * this.rowSize}px)`;
+    this.#setSize(element, this.rowSize);
   }
 
   #visibleRange() {
-    if (!this.rowHeight) this.#measureRow();
-    const first = Math.floor(this.list.scrollTop / this.rowHeight) - MARGIN_ROWS;
-    const count = Math.ceil((this.list.clientHeight || 600) / this.rowHeight) + 2 * MARGIN_ROWS;
+    if (!this.rowSize) this.#measureRow();
+    const first = Math.floor(this.#scroll / this.rowSize) - MARGIN_ROWS;
+    const count = Math.ceil((this.#length || 600) / this.rowSize) + 2 * MARGIN_ROWS;
     return [Math.max(0, first), Math.max(0, first + count)];
   }
 
-  #setHeight() {
-    this.space.style.height = `${this.rows.matching * this.rowHeight}px`;
+  #setLength() {
+    this.#setSize(this.space, this.rows.matching * this.rowSize);
   }
 
   #redraw() {
@@ -272,7 +297,7 @@ export class Queue {
 
   /** Draw the visible rows, and remove the others. */
   draw() {
-    this.#setHeight();
+    this.#setLength();
     this.empty.classList.toggle("hidden", this.rows.matching > 0);
     const [first, end] = this.#visibleRange();
     const last = Math.min(end, this.rows.matching - 1);
@@ -354,10 +379,9 @@ export class Queue {
   }
 
   #scrollTo(index) {
-    const top = index * this.rowHeight;
-    const height = this.list.clientHeight;
-    if (top < this.list.scrollTop) this.list.scrollTop = top;
-    else if (top + this.rowHeight > this.list.scrollTop + height) this.list.scrollTop = top + this.rowHeight - height;
+    const start = index * this.rowSize;
+    if (start < this.#scroll) this.#scroll = start;
+    else if (start + this.rowSize > this.#scroll + this.#length) this.#scroll = start + this.rowSize - this.#length;
     this.draw();
   }
 }

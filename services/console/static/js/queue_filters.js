@@ -1,42 +1,64 @@
 // Filter and order of the review queue.
 
 import { fill, h, labelled } from "./dom.js";
+import { symbol, verdict } from "./format.js";
+import { opener } from "./layout.js";
 import { setting, state } from "./state.js";
+import { t } from "./texts.js";
 
-const REVIEWS = [["unreviewed", "to do"], ["", "all"], ["mine_like", "▲ mine"], ["not_mine_like", "○ not"], ["unsure", "? unsure"]];
-const SORTS = [
-  ["arrived desc", "newest first"], ["confidence desc", "ATD confidence"], ["received desc", "most received"], ["received asc", "least received"],
-  ["updated desc", "last updated"], ["range asc", "nearest first"], ["vehicle asc", "vehicle"], ["name asc", "name"], ["review asc", "verdict"],
-];
+const REVIEWS = ["unreviewed", "", "mine_like", "not_mine_like", "unsure"];
+const SORTS = ["arrived desc", "confidence desc", "received desc", "received asc", "updated desc", "range asc", "vehicle asc", "name asc", "review asc"];
+const CONFIDENCES = ["", "0.5", "1", "1.5"];
+
+/** Button of a verdict: its symbol, named for screen readers. */
+function reviewChip(value, chosen, handler) {
+  const text = { unreviewed: t("queue_filters.unreviewed"), "": t("queue_filters.all") }[value];
+  const label = text ?? verdict(value);
+  return h("button", {
+    type: "button", data: { review: value }, "aria-pressed": String(chosen), "aria-label": label, title: label, text: text ?? symbol(value), on: { click: handler },
+  });
+}
 
 export class QueueFilters {
   constructor(changed) {
     this.changed = changed;
     this.review = setting("review") ?? "unreviewed";
-    this.chips = REVIEWS.map(([value, text]) => h("button", {
-      type: "button", data: { review: value }, "aria-pressed": String(value === this.review), text, on: { click: () => this.setReview(value) },
-    }));
-    this.search = h("input", { type: "search", id: "search", placeholder: "search  /", "aria-label": "Search names, classes and remarks (/)", maxlength: 80, on: { input: () => changed() } });
-    this.sort = h("select", { id: "sort", "aria-label": "Sort", on: { change: () => { setting("sort", this.sort.value); changed(); } } },
-      SORTS.map(([value, text]) => h("option", { value, text })));
+    this.chips = REVIEWS.map((value) => reviewChip(value, value === this.review, () => this.setReview(value)));
+    this.search = h("input", { type: "search", id: "search", placeholder: t("queue_filters.search"), "aria-label": t("queue_filters.search_label"), maxlength: 80, on: { input: () => changed() } });
+    this.sort = h("select", { id: "sort", on: { change: () => { setting("sort", this.sort.value); changed(); } } },
+      SORTS.map((value) => h("option", { value, text: t(`queue_filters.sort.${value.replace(" ", "_")}`) })));
     this.sort.value = setting("sort") ?? "arrived desc";
     if (!this.sort.value) this.sort.value = "arrived desc";
-    this.vehicle = h("select", { id: "vehicle", "aria-label": "Vehicle", on: { change: () => changed() } }, h("option", { value: "", text: "all vehicles" }));
-    this.confidence = h("select", { id: "confidence", "aria-label": "Detector confidence", on: { change: () => changed() } },
-      [["", "any confidence"], ["0.5", "ATD ≥ 0.5"], ["1", "ATD ≥ 1.0"], ["1.5", "ATD ≥ 1.5"]].map(([value, text]) => h("option", { value, text })));
+    this.vehicle = h("select", { id: "vehicle", on: { change: () => changed() } }, this.#allVehicles());
+    this.confidence = h("select", { id: "confidence", on: { change: () => changed() } },
+      CONFIDENCES.map((value) => h("option", { value, text: value ? t("queue_filters.confidence_at_least", { value }) : t("queue_filters.any_confidence") })));
     this.completeOnly = h("input", { type: "checkbox", id: "whole", on: { change: () => changed() } });
     this.summary = h("span", { class: "number", "aria-live": "polite" });
-    this.element = h("form", { class: "filters", role: "search", "aria-label": "Filter", on: { submit: (event) => event.preventDefault() } },
-      h("div", { class: "chips", role: "group", "aria-label": "Verdict" }, this.chips),
-      h("div", { class: "fields" }, this.search, this.sort, this.vehicle, this.confidence),
-      h("div", { class: "sum" }, this.summary, labelled("", this.completeOnly, { class: "whole" })));
-    this.completeOnly.after(" complete only");
+    const more = h("button", { type: "button", class: "filter-button", "aria-label": t("queue_filters.more"), title: t("queue_filters.more"), text: "⚙" });
+    this.element = h("form", { class: "filters", role: "search", "aria-label": t("queue_filters.title"), on: { submit: (event) => event.preventDefault() } },
+      h("div", { class: "chips", role: "group", "aria-label": t("queue_filters.verdict") }, this.chips), this.search,
+      h("div", { class: "fields" },
+        labelled(t("queue_filters.sort"), this.sort), labelled(t("queue_filters.vehicle"), this.vehicle), labelled(t("queue_filters.confidence"), this.confidence),
+        h("label", { class: "whole" }, this.completeOnly, ` ${t("queue_filters.complete")}`)),
+      h("div", { class: "sum" }, this.summary, more));
+    this.menu = opener(more, this.element);
+  }
+
+  #allVehicles() {
+    return h("option", { value: "", text: t("queue_filters.all_vehicles") });
   }
 
   setReview(value) {
     this.review = setting("review", value);
     for (const chip of this.chips) chip.setAttribute("aria-pressed", String(chip.dataset.review === value));
     this.changed();
+  }
+
+  /** Focus the search field, which may be in the closed menu. */
+  openSearch() {
+    if (!this.search.checkVisibility()) this.menu.open();
+    this.search.focus();
+    this.search.select();
   }
 
   get query() {
@@ -49,10 +71,10 @@ export class QueueFilters {
 
   /** Update the counts and the list of vehicles. */
   update({ matching, vehicles }) {
-    this.summary.textContent = `${matching} of ${state.total} shown`;
+    this.summary.textContent = t("queue_filters.summary", { matching, total: state.total });
     if (vehicles.join() === [...this.vehicle.options].slice(1).map((one) => one.value).join()) return;
     const chosen = this.vehicle.value;
-    fill(this.vehicle, h("option", { value: "", text: "all vehicles" }), vehicles.map((name) => h("option", { value: name, text: name })));
+    fill(this.vehicle, this.#allVehicles(), vehicles.map((name) => h("option", { value: name, text: name })));
     this.vehicle.value = vehicles.includes(chosen) ? chosen : "";
   }
 }
