@@ -280,6 +280,11 @@ def alive(platform: str, service: str) -> str:
     return _of(platform, f"alive/{_name('service', service)}")
 
 
+def alive_all(platform: str) -> str:
+    """Liveliness tokens of every service of one platform."""
+    return _of(platform, "alive/*")
+
+
 def alive_everywhere() -> str:
     """Liveliness tokens of every service of every platform."""
     return f"{ROOT}/*/alive/*"

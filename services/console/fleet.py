@@ -8,28 +8,35 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 from sonarpost.detection.difficulty import RELIABLE_PD, unreliable_text
 from sonarpost.messages import AcousticFrame, QueueState
+from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.monitoring.fleet import FleetTracker, ServiceStatus
 from sonarpost.review.positions import distance_m
+from sonarpost.services.console.chain import SERVICE_STALE_S, HeardVehicle, RouterState, chain_links
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.serialisers import Json
 
 PACKETS_KEPT = 20
 MAX_VEHICLES = 200
-SERVICE_STALE_S = 15.0
 DETECTOR = "atd_stub"
 """Service whose health has the difficulty of the seabed."""
 
 
 @dataclass
 class _Link:
-    """Received frames of one vehicle; times of the monotonic clock. Packets: (number, frames, bad frames)."""
+    """Received frames of one vehicle; times of the monotonic clock. Packets: (number, frames, bad frames).
+
+    `airtime_s` is the nominal air time of all received packets, `unknown_rates` the number of packets without a rate.
+    """
 
     frame: AcousticFrame
     received_s: float
+    packet_count: int = 0
+    airtime_s: float = 0.0
+    unknown_rates: int = 0
     packets: deque[tuple[int, int, int]] = field(default_factory=lambda: deque(maxlen=PACKETS_KEPT))
     frames_at_s: deque[float] = field(default_factory=lambda: deque(maxlen=500))
 
@@ -67,6 +74,10 @@ class FleetMonitor:
             bad = (quality.bad_frames if quality else None) or 0
             if link.packets and link.packets[-1][0] == frame.packet:
                 link.packets.pop()
+            else:
+                link.packet_count += 1
+                link.unknown_rates += frame.rate is None
+                link.airtime_s += 0.0 if frame.rate is None else RATES[frame.rate].airtime_s
             link.packets.append((frame.packet, frames, bad))
 
     def set_queue(self, state: QueueState, now_s: float | None = None) -> None:
@@ -136,6 +147,25 @@ class FleetMonitor:
         images = [image.model_dump() for image in state.images]
         return {**body, "age_s": age_s, "stale": age_s > self._stale_s, "images": images}
 
+    def heard_vehicles(self, now_s: float | None = None) -> list[HeardVehicle]:
+        """Return the vehicles with a received frame."""
+        now = time.monotonic() if now_s is None else now_s
+        with self._lock:
+            return [HeardVehicle(name, max(0.0, now - link.received_s)) for name, link in sorted(self._links.items())]
+
+    def uplink_json(self, vehicle_id: str) -> Json | None:
+        """Return the air time of a vehicle's received packets since the start; None without a frame."""
+        with self._lock:
+            link = self._links.get(vehicle_id)
+            if link is None:
+                return None
+            return {
+                "packets": link.packet_count,
+                "packets_of_unknown_rate": link.unknown_rates,
+                "airtime_s": round(link.airtime_s, 1),
+                "time_utc_s": link.frame.time_utc_s,
+            }
+
     def service_list(self) -> list[Json]:
         """Return the state of all services."""
         return [_service_json(status) for status in self.services.state(time.monotonic()).services]
@@ -166,7 +196,11 @@ def _frame_quality(vehicle_id: str, frame: AcousticFrame) -> Json:
 def _service_json(status: ServiceStatus) -> Json:
     health = status.health
     stale = status.age_s is None or status.age_s > SERVICE_STALE_S
-    state = "silent" if health is None or (stale and health.state != "stopping") else health.state
+    state: str = "silent"
+    if health is None:
+        state = "starting" if status.alive else "silent"
+    elif not stale or health.state == "stopping":
+        state = health.state
     return {
         "platform_id": status.platform,
         "service": status.service,
@@ -205,8 +239,14 @@ def _gauge(gauges: Mapping[str, float], name: str, highest: float) -> float | No
     return value if value is not None and 0.0 <= value <= highest else None
 
 
-def fleet_json(monitor: FleetMonitor, db: sqlite3.Connection, config: ConsoleConfig, now_utc_s: float) -> Json:
-    """Return the state of services and vehicles, with the position of each vehicle at its last contact."""
+def fleet_json(
+    monitor: FleetMonitor,
+    db: sqlite3.Connection,
+    config: ConsoleConfig,
+    router: RouterState | None,
+    now_utc_s: float,
+) -> Json:
+    """Return the state of services, vehicles and chain, with the position of each vehicle at its last contact."""
     positions = {
         row["vehicle_id"]: row
         for row in db.execute(
@@ -240,4 +280,19 @@ def fleet_json(monitor: FleetMonitor, db: sqlite3.Connection, config: ConsoleCon
                 "open_orders": open_requests.get(name, 0),
             }
         )
-    return {"now_utc_s": now_utc_s, "services": [*monitor.service_list()], "vehicles": [*vehicles]}
+    links = chain_links(
+        config.role,
+        router,
+        monitor.services.state(time.monotonic()).services,
+        monitor.heard_vehicles(),
+        sorted(set(config.vehicles.values())),
+        now_utc_s=now_utc_s,
+        vehicle_stale_s=config.vehicle_stale_s,
+    )
+    return {
+        "now_utc_s": now_utc_s,
+        "listening_since_utc_s": router and router.listening_since_utc_s,
+        "chain": [asdict(link) for link in links],
+        "services": [*monitor.service_list()],
+        "vehicles": [*vehicles],
+    }

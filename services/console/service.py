@@ -34,6 +34,7 @@ from sonarpost.messages import (
 )
 from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, UnitOfWork
+from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.events import RateLimiter
 from sonarpost.services.console.fleet import frame_event
@@ -51,6 +52,7 @@ ADVICE_PRIORITY = 2
 DECISION_PRIORITY = 2
 C2 = "c2"
 UPDATE_INTERVAL_S = 1.0
+TOKENS_TIMEOUT_S = 1.0
 FRAME_EVENT_INTERVAL_S = 0.2
 CATCH_UP_BATCH = 50
 SHORE_DELIVERY_MARGIN_S = 2.0
@@ -86,6 +88,9 @@ class ConsoleService(Service[ConsoleConfig]):
         self.state.on_unsent = self._wake.set
         self._frame_events = RateLimiter(FRAME_EVENT_INTERVAL_S)
         self._send_error = ""
+        self.state.router = RouterState(
+            platform_id=platform.id, reached=False, changed_utc_s=time.time(), detail=", ".join(platform.router)
+        )
         self._retention = Retention(self._apply_retention, self.stopping)
 
     @property
@@ -186,8 +191,8 @@ class ConsoleService(Service[ConsoleConfig]):
 
     # Subscriptions
 
-    def on_start(self) -> None:
-        """Start the web server, the subscriptions and the threads.
+    def before_session(self) -> None:
+        """Start the web server and the threads, so that the page is served without a router.
 
         Raises:
             PortError: The address cannot be bound.
@@ -198,6 +203,15 @@ class ConsoleService(Service[ConsoleConfig]):
         self._server = WebServer(self._app.asgi, self.config.host, self.config.port, tls, limits)
         if not self._users.all():
             log.warning("No users: add one with `sonarpost console user add NAME --role operator --config FILE`")
+        self._server.start()
+        self.start_thread(self._send_loop, "send")
+        self.start_thread(self._update_loop, "update")
+        self.start_thread(self._retention.run, "retention")
+        if not self._on_vessel and self.config.out_dir is not None:
+            self.start_thread(self._catch_up, "catch-up")
+
+    def on_start(self) -> None:
+        """Declare the subscriptions."""
         if self._on_vessel:
             vessel = self.platform.id
             self._subscribe(keys.acoustic_rx(vessel), AcousticFrame, self._on_frame)
@@ -209,12 +223,6 @@ class ConsoleService(Service[ConsoleConfig]):
         # A shore site subscribes to its own health only: the health of all vessels would load their radio links.
         health = keys.health_everywhere() if self._on_vessel else keys.health_all(self.platform.id)
         self.session.declare_subscriber(health, self._on_health)
-        self._server.start()
-        self.start_thread(self._send_loop, "send")
-        self.start_thread(self._update_loop, "update")
-        self.start_thread(self._retention.run, "retention")
-        if not self._on_vessel and self.config.out_dir is not None:
-            self.start_thread(self._catch_up, "catch-up")
 
     def _subscribe(self, key: str, record_type: type[R], apply: Callable[[R], object]) -> None:
         def on_sample(sample: zenoh.Sample) -> None:
@@ -263,14 +271,50 @@ class ConsoleService(Service[ConsoleConfig]):
     def _update_loop(self) -> None:
         """Publish the fleet state once a second, and fail if the web server has stopped."""
         while not self.stopping.wait(UPDATE_INTERVAL_S):
-            if self._server is not None and not self._server.running:
+            if self._server is not None and not self._server.running and not self.stopping.is_set():
                 raise RuntimeError("the web server has stopped")
-            # The console does not read liveliness tokens: silent services are removed by their age.
-            self.state.fleet.services.set_alive(None, time.monotonic())
+            self._update_router_state()
             try:
                 self.state.events.publish("fleet", self.state.fleet_state())
             except DeliveryError as error:
                 log.error("Fleet state not published", extra=kv(reason=str(error)))
+
+    def _update_router_state(self) -> None:
+        """Observe the connection to the router, and the liveliness tokens of this platform's services."""
+        before = self.state.router
+        assert before is not None
+        router = self.state.router = before.changed(time.time(), reached=self.is_router_reached)
+        if router.reached != before.reached:
+            fields = kv(router=router.detail)
+            if router.reached:
+                log.info("Zenoh router reached", extra=fields)
+            else:
+                log.error("Connection to the Zenoh router lost, reconnecting", extra=fields)
+        tokens = self._tokens() if router.reached else None
+        self.state.fleet.services.set_alive(tokens, time.monotonic())
+        if not router.reached:
+            # A session without a router does not publish: the own health is stored here.
+            try:
+                own = wire.encode(self.health())
+            except DeliveryError as error:
+                log.warning("Own health not shown", extra=kv(reason=str(error)))
+                return
+            self.state.fleet.services.add(keys.health(self.platform.id, self.NAME), own, time.monotonic())
+
+    def _tokens(self) -> list[str] | None:
+        """Return the liveliness tokens of this platform's services; None if the router does not reply.
+
+        Tokens of other platforms would be queried over their radio links.
+        """
+        try:
+            replies = self.session.liveliness().get(keys.alive_all(self.platform.id), timeout=TOKENS_TIMEOUT_S)
+            tokens = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        except zenoh.ZError as error:
+            if not self.stopping.is_set():
+                log.warning("Liveliness tokens not received", extra=kv(error=str(error)))
+            return None
+        # The own token is one of them, unless the router did not reply.
+        return tokens or None
 
     def _catch_up(self) -> None:
         """Store the records that c2 accepted while the console was stopped."""
@@ -286,23 +330,23 @@ class ConsoleService(Service[ConsoleConfig]):
 
     # Stop and health
 
-    def on_stop(self) -> None:
-        """Stop the web server."""
+    def stop(self) -> None:
+        """Stop the web server, which runs also without a session, then the service; close the databases."""
+        self.stopping.set()
         self._wake.set()
         self._retention.wake()
         self._app.stop()
         if self._server is not None:
             self._server.stop()
-
-    def stop(self) -> None:
-        """Stop the service, and close the databases afterwards."""
         super().stop()
         self._database.close()
         self._users.close()
 
     def degraded_reason(self) -> str:
-        """Return why records cannot be queued, or old images not be removed; empty if they can."""
-        return self._send_error or self._retention.error
+        """Return why records are not queued or not received, or old images not removed; empty if they are."""
+        router = self.state.router
+        no_router = "" if router is None or router.reached else f"router {router.detail} not reached"
+        return self._send_error or no_router or self._retention.error
 
     def warning(self) -> str:
         """Return a warning if there are no users."""

@@ -11,6 +11,7 @@ from sonarpost import wire
 from sonarpost.messages import Advice, Command, CommandKind, Decision, DownlinkState, ReconstructedImage, TaskingState
 from sonarpost.review.costs import NEW_IMAGE_KINDS, request_cost
 from sonarpost.review.measurement import Line, measure_line
+from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.events import EventHub
 from sonarpost.services.console.fleet import FleetMonitor, fleet_json
@@ -62,6 +63,7 @@ class ConsoleState:
 
     Attributes:
         clock: UTC seconds.
+        router: Connection to the router; None for a console without a network.
         on_unsent: Called after an action has stored a record to send.
     """
 
@@ -71,6 +73,7 @@ class ConsoleState:
         self.events = EventHub()
         self.fleet = FleetMonitor(config.vehicle_stale_s)
         self.clock = clock
+        self.router: RouterState | None = None
         self.on_unsent: Callable[[], None] = lambda: None
 
     # Records from other services
@@ -290,7 +293,7 @@ class ConsoleState:
     def fleet_state(self) -> Json:
         """Return the present state of services and vehicles."""
         with self.database.read() as db:
-            return fleet_json(self.fleet, db, self.config, self.clock())
+            return fleet_json(self.fleet, db, self.config, self.router, self.clock())
 
     # Operators' actions
 

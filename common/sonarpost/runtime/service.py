@@ -163,6 +163,9 @@ class Service(ABC, Generic[C]):
             reason: None if the consumer accepted the record, else its reason for refusing it.
         """
 
+    def before_session(self) -> None:
+        """Start what needs no router; called before the session opens, which can take any time."""
+
     def on_start(self) -> None:
         """Start the service's own inputs; called after the session has opened."""
 
@@ -184,18 +187,25 @@ class Service(ABC, Generic[C]):
     # Start and stop
 
     @property
+    def is_router_reached(self) -> bool:
+        """Whether the session is open and connected to a router; a router that hangs counts for the lease of 3 s."""
+        session = self._session
+        return session is not None and not session.is_closed() and bool(session.info.routers_zid())
+
+    @property
     def session(self) -> zenoh.Session:
         """The open Zenoh session."""
         assert self._session is not None
         return self._session
 
     def start(self) -> bool:
-        """Open the session and start all threads.
+        """Open the session and start all threads; waits until a router is reached.
 
         Returns:
             False if the service was stopped before it reached a router.
         """
         endpoints = self.platform.router
+        self.before_session()
         self._manager.starting(f"waiting for the router {', '.join(endpoints)}")
         self._session = open_with_retry(endpoints, self.stopping, self.platform.tls)
         if self._session is None:
@@ -237,8 +247,9 @@ class Service(ABC, Generic[C]):
             for part in (self._inbox, self._outbox):
                 if part is not None:
                     part.close()
-            for thread in self._threads:
-                thread.join(timeout=1.0)
+        for thread in self._threads:
+            thread.join(timeout=1.0)
+        if self._session is not None:
             self._session.close()
         self.store.close()
         self._flush_interval_logs(stopping=True)

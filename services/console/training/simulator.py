@@ -25,6 +25,7 @@ from sonarpost.messages import (
 )
 from sonarpost.modem.micromodem import RATES
 from sonarpost.review.costs import NEW_IMAGE_KINDS
+from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.fleet import DETECTOR, frame_event
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.training.contacts import (
@@ -118,13 +119,21 @@ class TrainingSimulator:
             self._thread.join(timeout=5.0)
 
     def _run(self) -> None:
+        now_utc_s = time.time()
+        self._state.router = RouterState(
+            platform_id=VESSEL,
+            reached=True,
+            changed_utc_s=now_utc_s,
+            listening_since_utc_s=now_utc_s,
+            detail="simulated",
+        )
         next_packet_s = time.monotonic()
         while not self._stop.wait(UPDATE_INTERVAL_S):
             now_s = time.monotonic()
             if now_s >= next_packet_s:
                 next_packet_s = now_s + self._interval_s
                 self.receive_packet(time.time())
-                self._update_health(time.time())
+            self._update_health(time.time())
             self.accept_records(time.time())
             self.advance_downlink(time.time())
             self._state.events.publish("fleet", self._state.fleet_state())

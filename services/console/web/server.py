@@ -24,7 +24,7 @@ from sonarpost.config import TlsConfig
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.logs import kv
 from sonarpost.review.rendering import MAPS
-from sonarpost.services.console.fleet import SERVICE_STALE_S
+from sonarpost.services.console.chain import SERVICE_STALE_S
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.requests import REQUEST_KINDS
 from sonarpost.services.console.store.users import MAX_PASSWORD, MIN_PASSWORD, Users

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -9,11 +10,12 @@ from typing import Any
 import httpx2
 import pytest
 import zenoh
-from builders.common import eventually, publish_once
+from builders.common import eventually, free_port, publish_once
 from builders.console import PASSWORD, Browser, EventReader, image_record
 
 from sonarpost import keys, wire
 from sonarpost.archive.image_files import write_image
+from sonarpost.bus.session import client_config, router_config
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import (
     AcousticFrame,
@@ -322,3 +324,107 @@ def test_delivery_to_shore_with_the_real_relay(runner, start, client, platform, 
     c2 = runner.peer("shore-1", "c2", {keys.shore_inbox_all(): Relayed})
     eventually(lambda: anna.contact(ID)["contact"]["delivery"]["shore"] == "delivered", what="delivery to shore")
     assert keys.contact_decision(VESSEL) in [envelope.key for envelope in c2.received]
+
+
+@pytest.fixture
+def restartable_router():
+    """A router that a test stops and starts; the endpoint of `router` is not used."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    sessions: list[zenoh.Session] = []
+
+    class Router:
+        def __init__(self) -> None:
+            self.endpoint = endpoint
+
+        def start(self) -> None:
+            sessions.append(zenoh.open(router_config([endpoint])))
+
+        def stop(self) -> None:
+            sessions.pop().close()
+
+    yield Router()
+    for session in sessions:
+        session.close()
+
+
+def chain(browser: Browser) -> dict[str, str]:
+    return {link["place"]: link["state"] for link in browser.get("/api/fleet").json()["chain"]}
+
+
+def service_states(browser: Browser) -> dict[str, str]:
+    return {one["service"]: one["state"] for one in browser.get("/api/fleet").json()["services"]}
+
+
+def test_page_is_served_without_a_router_and_records_arrive_when_it_comes(platform, restartable_router, log_in):
+    settings = platform(VESSEL).model_copy(update={"router": (restartable_router.endpoint,)})
+    console = ConsoleService(settings, ConsoleConfig(port=0))
+    console.state.store_image(image_record("0001"))
+    starting = threading.Thread(target=console.start)
+    starting.start()
+    try:
+        eventually(lambda: console.address != "", what="web server")
+        anna = log_in(console, "anna", "operator")
+        # A contact on the disk is shown, and a decision on it is stored and queued.
+        [row] = anna.get("/api/contacts").json()["items"]
+        assert anna.decide(row["id"]).status_code == 201
+        eventually(lambda: console.store.outbox_depth() == 2, what="queued decision")
+        assert chain(anna)["router"] == "lost"
+        eventually(lambda: service_states(anna).get("console") == "degraded", what="own health")
+        assert anna.get("/api/fleet").json()["listening_since_utc_s"] is None
+
+        restartable_router.start()
+        eventually(lambda: chain(anna)["router"] == "ok", what="router")
+        with zenoh.open(client_config([restartable_router.endpoint])) as client:
+            put(client, keys.image_reconstructed(VESSEL), image())
+            eventually(lambda: anna.get("/api/contacts").json()["total"] == 2, what="image")
+        eventually(lambda: service_states(anna)["console"] == "ok", what="own health")
+    finally:
+        console.stop()
+        starting.join()
+
+
+def test_lost_router_is_shown_within_10_s_and_found_again(platform, runner, restartable_router, log_in):
+    restartable_router.start()
+    settings = platform(VESSEL).model_copy(update={"router": (restartable_router.endpoint,)})
+    console = runner.start(ConsoleService(settings, ConsoleConfig(port=0)))
+    anna = log_in(console, "anna", "operator")
+    eventually(lambda: chain(anna)["router"] == "ok", what="router")
+    eventually(lambda: service_states(anna).get("console") == "ok", what="own health")
+    restartable_router.stop()
+    eventually(lambda: chain(anna)["router"] == "lost", timeout_s=10, what="loss of the router")
+    eventually(lambda: service_states(anna)["console"] == "degraded", timeout_s=10, what="own health")
+    assert chain(anna)["modem"] == "unknown"
+    restartable_router.start()
+    eventually(lambda: chain(anna)["router"] == "ok", what="router")
+    # The subscriptions are valid again.
+    with zenoh.open(client_config([restartable_router.endpoint])) as client:
+
+        def is_stored() -> bool:
+            put(client, keys.image_reconstructed(VESSEL), image())
+            return anna.get("/api/contacts").json()["total"] == 1
+
+        eventually(is_stored, what="image")
+
+
+def test_service_that_ends_is_shown_by_its_place(runner, start, log_in):
+    modem = runner.peer(VESSEL, "op_modem")
+    console = start()
+    anna = log_in(console, "anna", "observer")
+    eventually(lambda: chain(anna)["modem"] == "ok", what="modem")
+    # A killed process publishes no last health: its token ends with its session.
+    modem.session.close()
+    eventually(lambda: chain(anna)["modem"] == "lost", timeout_s=10, what="loss of op_modem")
+
+
+def test_service_that_does_not_reach_a_router_stops(platform, restartable_router):
+    settings = platform(VESSEL).model_copy(update={"router": (restartable_router.endpoint,)})
+    console = ConsoleService(settings, ConsoleConfig(port=0))
+    starting = threading.Thread(target=console.start)
+    starting.start()
+    eventually(lambda: console.address != "", what="web server")
+    address = console.address
+    console.stop()
+    starting.join(timeout=10)
+    assert not starting.is_alive()
+    with pytest.raises(httpx2.ConnectError):
+        httpx2.get(address)
