@@ -16,6 +16,14 @@ from sonarpost.messages import Latitude, Longitude, PlatformId
 from sonarpost.runtime.retention import MaxBytes, RetentionConfig
 
 HostName = Annotated[str, Field(pattern=r"^[A-Za-z0-9.:\[\]_-]{1,253}$")]
+ClassNames = Annotated[tuple[Annotated[str, Field(min_length=1, max_length=60)], ...], Field(max_length=200)]
+ClassGroups = Annotated[
+    dict[
+        Annotated[str, Field(min_length=1, max_length=20)],
+        Annotated[tuple[Annotated[str, Field(min_length=1, max_length=36)], ...], Field(max_length=100)],
+    ],
+    Field(max_length=20),
+]
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 
 
@@ -41,7 +49,9 @@ class ConsoleConfig(RetentionConfig):
         session_s: A session ends after this time without use.
         session_max_s: Maximum duration of a session.
         vehicle_stale_s: A vehicle is stale after this time without a frame.
-        classes: Proposed classes of mine-like objects.
+        take_back_s: A decision is sent after this time, so that the operator can take it back without air time.
+        classes: Proposed classes of objects: a list, or a table of groups, for example
+            `{ MILCO = ["manta", "rockan"], NOMBO = ["rock"] }`.
         vessel_lat_deg: Latitude of the vessel for the map, together with `vessel_lon_deg`.
         vessel_lon_deg: Longitude of the vessel.
         ring_m: Radii of the range rings on the map.
@@ -69,7 +79,8 @@ class ConsoleConfig(RetentionConfig):
     session_s: Annotated[float, Field(gt=0, le=604800)] = 4 * 3600.0
     session_max_s: Annotated[float, Field(gt=0, le=604800)] = 24 * 3600.0
     vehicle_stale_s: Annotated[float, Field(gt=0, le=86400)] = 120.0
-    classes: tuple[Annotated[str, Field(min_length=1, max_length=60)], ...] = ("manta", "rockan", "cylinder", "sphere")
+    take_back_s: Annotated[float, Field(ge=0, le=60)] = 8.0
+    classes: ClassNames | ClassGroups = ("manta", "rockan", "cylinder", "sphere")
     vessel_lat_deg: Latitude | None = None
     vessel_lon_deg: Longitude | None = None
     ring_m: tuple[Annotated[float, Field(gt=0, le=100000)], ...] = (100.0, 200.0, 500.0)
@@ -95,6 +106,12 @@ class ConsoleConfig(RetentionConfig):
             raise ConfigError("[console]", "", "no web server installed", expected)
         if self.tls and platform.tls is None:
             raise ConfigError("[console]", "tls", "true", "a certificate in [platform] tls")
+
+    def class_groups(self) -> dict[str, list[str]]:
+        """Return the proposed classes by group, as decisions state them: `MILCO > manta`. A list has the group ""."""
+        if not isinstance(self.classes, dict):
+            return {"": list(self.classes)}
+        return {group: [group, *(f"{group} > {kind}" for kind in kinds)] for group, kinds in self.classes.items()}
 
     def vehicle_name(self, address: int) -> str:
         """Return the name of the vehicle with a modem address."""

@@ -51,6 +51,7 @@ COMMAND_PRIORITY = 1
 ADVICE_PRIORITY = 2
 DECISION_PRIORITY = 2
 C2 = "c2"
+OP_MODEM = "op_modem"
 UPDATE_INTERVAL_S = 1.0
 TOKENS_TIMEOUT_S = 1.0
 FRAME_EVENT_INTERVAL_S = 0.2
@@ -159,6 +160,8 @@ class ConsoleService(Service[ConsoleConfig]):
         record, vessel, site = item.record, item.vessel_id, self.config.site
         if isinstance(record, Decision):
             for consumer in self.config.decision_consumers:
+                if consumer == OP_MODEM and not item.to_vehicle:
+                    continue
                 effects.send(keys.contact_decision(vessel), consumer, record, priority=DECISION_PRIORITY)
             effects.count("decisions_made")
         elif isinstance(record, Advice):

@@ -44,15 +44,23 @@ from sonarpost.services.console.store.serialisers import (
 FRAME_HEADER_BYTES = 13
 """Header of a frame in the format of the paper; a v1 header is shorter."""
 
+LAST_DECISION_S = 12 * 3600.0
+"""Age of the oldest decision that an operator undoes without naming it: one watch."""
+
 
 @dataclass(frozen=True, slots=True)
 class UnsentRecord:
-    """A stored record that is not yet in the service's outbox."""
+    """A stored record that is not yet in the service's outbox.
+
+    Attributes:
+        to_vehicle: Whether a decision is sent to the vehicle; false for one that a disputed contact does not follow.
+    """
 
     table: Table
     record_id: str
     vessel_id: str
     record: Decision | Command | Advice
+    to_vehicle: bool = True
 
 
 class ConsoleState:
@@ -301,31 +309,56 @@ class ConsoleState:
         """Store a decision to send; return it with its contact.
 
         Raises:
-            ConflictError: Another decision was stored after the contact was displayed.
-            BadInputError: The displayed image is not a version of this contact.
-        """
-        with self.database.transaction() as db:
-            decision_id = decisions.add_decision(db, contact_id, entered, actor, self.clock(), self._delivery_states())
-        decision = self._publish_action("decision", contact_id, decision_id)
-        return {"decision": decision, "contact": self._contact_json(contact_id)}
-
-    def undo(self, contact_id: str, decision_id: str, revision: int, actor: Actor) -> Json:
-        """Store a decision that undoes another one; return it with its contact.
-
-        Raises:
-            ConflictError: See `decide`.
-            BadInputError: `decision_id` is not the valid decision.
+            ConflictError, BadInputError: See `add_decision`.
         """
         states = self._delivery_states()
         with self.database.transaction() as db:
-            new_id = decisions.undo_decision(db, contact_id, decision_id, revision, actor, self.clock(), states)
+            stored = decisions.add_decision(db, contact_id, entered, actor, self.clock(), states)
+        decision = self._publish_action("decision", contact_id, stored.decision_id)
+        for user in stored.notified:
+            self.events.publish("notice", {"user": user})
+        return {"decision": decision, "contact": self._contact_json(contact_id)}
+
+    def undo(self, contact_id: str, decision_id: str, displayed: DisplayedImage, actor: Actor) -> Json:
+        """Store a record that withdraws an own decision; return it with its contact.
+
+        Raises:
+            BadInputError: See `undo_decision`.
+        """
+        states = self._delivery_states()
+        with self.database.transaction() as db:
+            new_id = decisions.undo_decision(db, contact_id, decision_id, displayed, actor, self.clock(), states)
+        self._publish("decision", decision_id)
         decision = self._publish_action("decision", contact_id, new_id)
         return {"decision": decision, "contact": self._contact_json(contact_id)}
+
+    def last_decision(self, user: str) -> Json:
+        """Return the last decision of a user that can be undone, with its contact; both None if there is none."""
+        with self.database.read() as db:
+            row = decisions.last_own_decision(db, user, self.clock() - LAST_DECISION_S)
+        if row is None:
+            return {"decision": None, "contact": None}
+        return {"decision": RECORD_JSON["decision"](row), "contact": self._contact_json(row["contact_id"])}
+
+    def notices(self, user: str) -> list[Json]:
+        """Return the open notices of a user about disputed and overruled decisions."""
+        with self.database.read() as db:
+            return decisions.list_notices(db, user)
+
+    def acknowledge_notice(self, notice_id: int, actor: Actor) -> None:
+        """Mark a notice as acknowledged.
+
+        Raises:
+            NotFoundError: The user has no such notice.
+        """
+        with self.database.transaction() as db:
+            decisions.acknowledge_notice(db, notice_id, actor, self.clock())
+        self.events.publish("notice", {"user": actor.user})
 
     def _delivery_states(self) -> DeliveryStates:
         consumers = self.config.decision_consumers
         shore, vehicle = ("waiting" if name in consumers else "none" for name in ("relay", "op_modem"))
-        return DeliveryStates(shore, vehicle)
+        return DeliveryStates(shore, vehicle, self.config.take_back_s)
 
     def add_request(self, contact_id: str, kind: CommandKind, airtime_s: float | None, actor: Actor) -> Json:
         """Store a request to send; return it.
@@ -365,16 +398,21 @@ class ConsoleState:
     # Sending
 
     def unsent_records(self) -> list[UnsentRecord]:
-        """Return the stored records that are not yet in the outbox, oldest first."""
+        """Return the stored records that are not yet in the outbox, oldest first.
+
+        A decision is returned after its take-back time, and cannot be taken back unsent from then on.
+        """
         found: list[UnsentRecord] = []
-        with self.database.read() as db:
+        with self.database.transaction() as db:
+            decisions.release_decisions(db, self.clock(), self.config.take_back_s)
             for table, record_type in RECORD_TYPES.items():
-                rows = db.execute(
-                    f"SELECT {ID_COLUMN[table]} AS id, vessel_id, payload FROM {table} WHERE sent = 0 ORDER BY seq"  # noqa: S608
-                )
+                condition = "sent = 0 AND send_after_utc_s IS NULL" if table == "decision" else "sent = 0"
+                rows = db.execute(f"SELECT * FROM {table} WHERE {condition} ORDER BY seq")  # noqa: S608  constants only
                 for row in rows:
-                    record = wire.decode(record_type, bytes(row["payload"]), f"{table} {row['id']}")
-                    found.append(UnsentRecord(table, row["id"], row["vessel_id"], record))
+                    record_id = row[ID_COLUMN[table]]
+                    record = wire.decode(record_type, bytes(row["payload"]), f"{table} {record_id}")
+                    to_vehicle = table != "decision" or row["vehicle"] != "disputed"
+                    found.append(UnsentRecord(table, record_id, row["vessel_id"], record, to_vehicle))
         return found
 
     def mark_sent(self, item: UnsentRecord) -> None:

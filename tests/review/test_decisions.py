@@ -83,8 +83,9 @@ def test_mine_like_against_not_mine_like_is_disputed_and_mine_like_counts() -> N
     assert [d.decision_id for d in review_result(decisions).standing] == ["d-1", "d-2"]
 
 
-def test_unsure_disputes_nothing() -> None:
-    assert state(decision("d-1", "mine_like"), decision("d-2", "unsure", "ben")) == ("unsure", "d-2")
+def test_unsure_disputes_mine_like_only() -> None:
+    assert state(decision("d-1", "mine_like"), decision("d-2", "unsure", "ben")) == ("disputed", "d-1")
+    assert state(decision("d-1", "not_mine_like"), decision("d-2", "unsure", "ben")) == ("unsure", "d-2")
 
 
 def test_dispute_ends_when_an_operator_agrees_or_withdraws() -> None:

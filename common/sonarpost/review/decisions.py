@@ -4,8 +4,8 @@
    verdict is that of the decision before, for receivers that act on the latest verdict alone.
 2. A decision overrules the decisions that it names (`Decision.overrules`), unless it is withdrawn.
 3. Of the others, the latest of each operator stands.
-4. The latest standing decision counts. If one operator's verdict is mine-like and another's is not mine-like, the
-   contact is disputed, and the latest mine-like decision counts.
+4. The latest standing decision counts. If one operator's verdict is mine-like and another's is not mine-like or
+   unsure, the contact is disputed, and the latest mine-like decision counts.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def review_result(decisions: Sequence[Decision]) -> ReviewResult:
     mine_like = [d for d in standing if d.verdict == "mine_like"]
     state: ReviewState = "unreviewed"
     counting: Decision | None = None
-    if {"mine_like", "not_mine_like"} <= verdicts:
+    if mine_like and len(verdicts) > 1:
         state, counting = "disputed", mine_like[-1]
     elif standing:
         counting = standing[-1]

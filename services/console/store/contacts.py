@@ -53,13 +53,14 @@ class ContactFilter(BaseModel):
     """Filter, order and page of a contact list, as in a query string; None or empty means no restriction.
 
     Attributes:
+        review: State of the contact; `mine_like` includes disputed contacts, `reviewed` all with a decision.
         min_confidence: Minimum confidence of the detector, 0 to 2.
         text: Part of a name, class or remark; `q` in a query string.
     """
 
     model_config = ConfigDict(frozen=True, populate_by_name=True, allow_inf_nan=False)
 
-    review: Literal["unreviewed", "mine_like", "not_mine_like", "unsure", "reviewed"] | None = None
+    review: Literal["unreviewed", "mine_like", "not_mine_like", "unsure", "disputed", "reviewed"] | None = None
     vehicle: Annotated[str, Field(max_length=40)] = ""
     vessel: Annotated[str, Field(max_length=40)] = ""
     min_confidence: Annotated[float, Field(ge=0, le=2)] | None = None
@@ -75,10 +76,11 @@ class ContactFilter(BaseModel):
         """Return the SQL condition, which contains only constants, and its parameters."""
         conditions: list[str] = []
         values: list[object] = []
-        if self.review == "reviewed":
-            conditions.append("c.review <> 'unreviewed'")
+        states = {"reviewed": "c.review <> 'unreviewed'", "mine_like": "c.review IN ('mine_like', 'disputed')"}
+        if self.review in states:
+            conditions.append(states[self.review])
         for condition, value in (
-            ("c.review = ?", None if self.review == "reviewed" else self.review),
+            ("c.review = ?", None if self.review in states else self.review),
             ("c.vehicle_id = ?", self.vehicle or None),
             ("c.vessel_id = ?", self.vessel or None),
             ("c.group_id = ?", self.group or None),

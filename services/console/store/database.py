@@ -75,7 +75,7 @@ CREATE TABLE IF NOT EXISTS decision (
     decided_utc_s REAL NOT NULL, sha256 TEXT, layer TEXT, undoes TEXT, undone INTEGER NOT NULL DEFAULT 0,
     elsewhere INTEGER NOT NULL DEFAULT 0, shore TEXT NOT NULL, vehicle TEXT NOT NULL, reason TEXT NOT NULL DEFAULT '',
     times_sent INTEGER NOT NULL DEFAULT 0, relayed_utc_s REAL, changed_utc_s REAL NOT NULL,
-    payload BLOB NOT NULL, sent INTEGER NOT NULL);
+    payload BLOB NOT NULL, sent INTEGER NOT NULL, send_after_utc_s REAL, overrules TEXT NOT NULL DEFAULT '[]');
 CREATE INDEX IF NOT EXISTS decision_contact ON decision (contact_id, seq);
 CREATE INDEX IF NOT EXISTS decision_unsent ON decision (seq) WHERE sent = 0;
 CREATE INDEX IF NOT EXISTS decision_relayed ON decision (seq) WHERE shore = 'relay';
@@ -107,6 +107,15 @@ CREATE TRIGGER IF NOT EXISTS audit_is_not_changed BEFORE UPDATE ON audit
 CREATE TRIGGER IF NOT EXISTS audit_is_not_deleted BEFORE DELETE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit is only added to'); END;
 """
+
+_NOTICE_SCHEMA = """
+CREATE TABLE IF NOT EXISTS notice (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, user TEXT NOT NULL, kind TEXT NOT NULL, contact_id TEXT NOT NULL,
+    decision_id TEXT NOT NULL, by_decision_id TEXT NOT NULL, acknowledged_utc_s REAL);
+CREATE INDEX IF NOT EXISTS notice_open ON notice (user, id) WHERE acknowledged_utc_s IS NULL;
+CREATE INDEX IF NOT EXISTS decision_operator ON decision (operator, seq);
+"""
+"""Tables and indexes that databases of version 0.2 do not have."""
 
 
 class SqliteFile:
@@ -185,6 +194,12 @@ class Database(SqliteFile):
                     db.execute(f"ALTER TABLE contact ADD COLUMN {name} REAL")
             if "removed" not in {row["name"] for row in db.execute("PRAGMA table_info(version)")}:
                 db.execute("ALTER TABLE version ADD COLUMN removed INTEGER NOT NULL DEFAULT 0")
+            columns = {row["name"] for row in db.execute("PRAGMA table_info(decision)")}
+            for name, column_type in (("send_after_utc_s", "REAL"), ("overrules", "TEXT NOT NULL DEFAULT '[]'")):
+                if name not in columns:
+                    db.execute(f"ALTER TABLE decision ADD COLUMN {name} {column_type}")
+            for statement in _NOTICE_SCHEMA.strip().split(";")[:-1]:
+                db.execute(statement)
 
 
 def insert_row(db: sqlite3.Connection, table: str, values: Mapping[str, object]) -> int:

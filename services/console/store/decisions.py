@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import uuid
 from collections.abc import Mapping
@@ -11,7 +12,13 @@ from typing import NamedTuple
 from sonarpost import wire
 from sonarpost.errors import BadInputError, SonarpostError
 from sonarpost.messages import Decision, DownlinkState, Verdict
-from sonarpost.services.console.store.contacts import find_contact, find_contact_of_image, find_version
+from sonarpost.review.decisions import review_result, withdrawn_decision
+from sonarpost.services.console.store.contacts import (
+    NotFoundError,
+    find_contact,
+    find_contact_of_image,
+    find_version,
+)
 from sonarpost.services.console.store.database import (
     Actor,
     DisplayedImage,
@@ -44,6 +51,8 @@ class DecisionInput:
     Attributes:
         confidence: 0 to 1; None if not stated.
         mlo_class: Class of mine-like object; None if not stated.
+        remark: Free text; with `overrules` the reason.
+        overrules: Whether the decision replaces those of other operators with another verdict.
     """
 
     revision: int
@@ -52,13 +61,28 @@ class DecisionInput:
     confidence: float | None
     mlo_class: str | None
     remark: str
+    overrules: bool = False
 
 
 class DeliveryStates(NamedTuple):
-    """Initial delivery state of a decision to shore site and vehicle; `none` without a configured consumer."""
+    """Initial delivery of a decision.
+
+    Attributes:
+        shore: State of the delivery to the shore site; `none` without a configured consumer.
+        vehicle: State of the delivery to the vehicle; `none` without a configured consumer.
+        take_back_s: Time for which the decision is kept before it is sent.
+    """
 
     shore: str
     vehicle: str
+    take_back_s: float = 0.0
+
+
+class StoredDecision(NamedTuple):
+    """Identifier of a new decision, and the other operators who receive a notice about it."""
+
+    decision_id: str
+    notified: tuple[str, ...]
 
 
 def add_decision(
@@ -68,61 +92,149 @@ def add_decision(
     actor: Actor,
     now_utc_s: float,
     delivery: DeliveryStates,
-) -> str:
-    """Store a decision of this console; return its identifier.
+) -> StoredDecision:
+    """Store a decision of this console.
+
+    A decision that differs from the standing one of another operator is stored beside it; see `review_result`. With
+    `entered.overrules` it replaces the differing ones.
 
     Raises:
-        ConflictError: Another decision was stored after the contact was displayed.
-        BadInputError: The displayed image is not a version of this contact.
+        ConflictError: The decision overrules others, and one was stored after the contact was displayed.
+        BadInputError: The displayed image is not a version of this contact, or there is no decision to overrule.
     """
-    row = _check_revision(db, contact_id, entered.revision)
+    row = _check_revision(db, contact_id, entered.revision) if entered.overrules else find_contact(db, contact_id)
     _check_displayed_image(db, contact_id, entered.displayed)
+    others = [
+        one
+        for one in review_result(_records(db, contact_id)).standing
+        if one.operator != actor.user and one.verdict != entered.verdict
+    ]
+    if entered.overrules and not others:
+        raise BadInputError("decision", "overrules", "true", "a contact with another verdict of another operator")
     content: Json = {
         "verdict": entered.verdict,
         "confidence": entered.confidence,
         "mlo_class": entered.mlo_class,
         "remark": entered.remark,
+        "overrules": tuple(one.decision_id for one in others) if entered.overrules else (),
     }
     record = _add_own_decision(db, row, content, entered.displayed, actor, now_utc_s, delivery)
     detail = record.model_dump(include={"decision_id", "verdict", "confidence", "mlo_class", "remark"})
-    detail["revision"] = row["revision"]
-    add_audit_entry(db, contact_id, actor, "decide", now_utc_s, entered.displayed, detail)
-    return record.decision_id
+    detail["revision"] = entered.revision
+    kind = "overrules" if entered.overrules else "disputes"
+    if others and (entered.overrules or find_contact(db, contact_id)["review"] == "disputed"):
+        detail[kind] = [one.model_dump(include={"decision_id", "operator", "verdict"}) for one in others]
+        for one in others:
+            notice: Json = {"user": one.operator, "kind": "overruled" if entered.overrules else "disputed"}
+            notice |= {"contact_id": contact_id, "decision_id": one.decision_id, "by_decision_id": record.decision_id}
+            insert_row(db, "notice", notice)
+    action = "overrule" if entered.overrules else "decide"
+    add_audit_entry(db, contact_id, actor, action, now_utc_s, entered.displayed, detail)
+    return StoredDecision(record.decision_id, tuple(one.operator for one in others) if kind in detail else ())
 
 
 def undo_decision(
     db: sqlite3.Connection,
     contact_id: str,
     decision_id: str,
-    revision: int,
+    displayed: DisplayedImage,
     actor: Actor,
     now_utc_s: float,
     delivery: DeliveryStates,
 ) -> str:
-    """Undo the valid decision with a new one, which restores the verdict before it; return the new identifier.
+    """Withdraw an own decision with a new record, which repeats the verdict that counts then; return its identifier.
 
-    If there was no decision before, the new record has the verdict `unsure`: records have no verdict `unreviewed`.
+    Without another decision the new record has the verdict `unsure`: records have no verdict `unreviewed`. If the
+    withdrawn decision is still kept for its take-back time, neither of both records is sent.
 
     Raises:
-        ConflictError: Another decision was stored after the contact was displayed.
-        BadInputError: `decision_id` is not the valid decision.
+        BadInputError: `decision_id` is not a standing decision of the user at this console, or `displayed` is not a
+            version of this contact.
     """
-    row = _check_revision(db, contact_id, revision)
-    if row["effective"] != decision_id:
-        raise BadInputError("undo", "decision_id", decision_id, f"the valid decision, {row['effective']}")
+    row = find_contact(db, contact_id)
+    if displayed.version is not None:
+        _check_displayed_image(db, contact_id, displayed)
     undone = find_record(db, "decision", decision_id)
-    assert undone is not None
-    db.execute("UPDATE decision SET undone = 1 WHERE decision_id = ?", (decision_id,))
-    previous = _valid_decision(db, contact_id)
+    records = _records(db, contact_id)
+    standing = {one.decision_id for one in review_result(records).standing}
+    own = undone is not None and undone["operator"] == actor.user and not undone["elsewhere"]
+    if undone is None or not own or decision_id not in standing:
+        raise BadInputError("undo", "decision_id", decision_id, f"a standing decision of {actor.user} at this console")
+    kept = undone["send_after_utc_s"] is not None and now_utc_s < undone["send_after_utc_s"]
+    # A later record of another operator may depend on this one: then both records are sent.
+    kept = kept and not undone["sent"] and row["last_decision"] == decision_id
+    previous = review_result([one for one in records if one.decision_id != decision_id]).counting
     content: Json = {"verdict": "unsure"}
     if previous is not None:
-        content = {name: previous[name] for name in ("verdict", "confidence", "mlo_class")}
-    content["remark"] = f"withdraws decision {decision_id}"
-    displayed = DisplayedImage(undone["version"], undone["sha256"], undone["layer"])
-    record = _add_own_decision(db, row, content, displayed, actor, now_utc_s, delivery, undoes=decision_id)
-    detail = {"decision_id": record.decision_id, "undoes": decision_id, "verdict": record.verdict, "revision": revision}
+        content = previous.model_dump(include={"verdict", "confidence", "mlo_class"})
+    content |= {"remark": f"withdraws decision {decision_id}", "withdraws": decision_id}
+    states = delivery._replace(take_back_s=0.0)
+    record = _add_own_decision(db, row, content, displayed, actor, now_utc_s, states)
+    if kept:
+        db.execute(
+            "UPDATE decision SET shore = iif(shore = 'none', shore, 'withdrawn'), sent = 1, send_after_utc_s = NULL,"
+            " vehicle = iif(vehicle = 'none', vehicle, 'withdrawn'), changed_utc_s = ? WHERE decision_id IN (?, ?)",
+            (now_utc_s, decision_id, record.decision_id),
+        )
+    detail = {"decision_id": record.decision_id, "undoes": decision_id, "verdict": record.verdict, "sent": not kept}
     add_audit_entry(db, contact_id, actor, "undo", now_utc_s, displayed, detail)
     return record.decision_id
+
+
+def release_decisions(db: sqlite3.Connection, now_utc_s: float, take_back_s: float) -> None:
+    """End the take-back time of decisions; a decision that is released can be sent.
+
+    A time that is further ahead than `take_back_s` results from a clock that was set back, and has ended too.
+    """
+    db.execute(
+        "UPDATE decision SET send_after_utc_s = NULL WHERE sent = 0 AND send_after_utc_s IS NOT NULL"
+        " AND (send_after_utc_s <= ? OR send_after_utc_s > ?)",
+        (now_utc_s, now_utc_s + take_back_s),
+    )
+
+
+def last_own_decision(db: sqlite3.Connection, user: str, since_utc_s: float) -> sqlite3.Row | None:
+    """Return the last standing decision that a user made at this console since a time; None if there is none."""
+    rows = db.execute(
+        "SELECT * FROM decision WHERE operator = ? AND elsewhere = 0 AND undone = 0 AND undoes IS NULL"
+        " AND contact_id <> '' AND decided_utc_s >= ? ORDER BY seq DESC",
+        (user, since_utc_s),
+    )
+    for row in rows.fetchall():
+        standing = review_result(_records(db, row["contact_id"])).standing
+        if any(one.decision_id == row["decision_id"] for one in standing):
+            found: sqlite3.Row = row
+            return found
+    return None
+
+
+def list_notices(db: sqlite3.Connection, user: str) -> list[Json]:
+    """Return the notices that a user has not acknowledged and that still apply, oldest first."""
+    rows = db.execute(
+        "SELECT n.id, n.kind, n.contact_id, c.name, d.verdict AS own_verdict, b.operator, b.verdict, b.remark,"
+        " b.decided_utc_s FROM notice n JOIN contact c ON c.id = n.contact_id"
+        " JOIN decision d ON d.decision_id = n.decision_id JOIN decision b ON b.decision_id = n.by_decision_id"
+        " WHERE n.user = ? AND n.acknowledged_utc_s IS NULL AND b.undone = 0 AND d.undone = 0"
+        " AND (n.kind = 'overruled' OR c.review = 'disputed') ORDER BY n.id",
+        (user,),
+    )
+    return [dict(row) for row in rows]
+
+
+def acknowledge_notice(db: sqlite3.Connection, notice_id: int, actor: Actor, now_utc_s: float) -> None:
+    """Mark a notice as acknowledged.
+
+    Raises:
+        NotFoundError: The user has no such notice.
+    """
+    row = None
+    if notice_id < 2**63:  # larger numbers exceed the integers of SQLite
+        row = db.execute("SELECT * FROM notice WHERE id = ? AND user = ?", (notice_id, actor.user)).fetchone()
+    if row is None:
+        raise NotFoundError("notice", "id", notice_id, f"a notice of {actor.user}")
+    db.execute("UPDATE notice SET acknowledged_utc_s = ? WHERE id = ?", (now_utc_s, notice_id))
+    detail = {"kind": row["kind"], "decision_id": row["by_decision_id"]}
+    add_audit_entry(db, row["contact_id"], actor, "acknowledge", now_utc_s, DisplayedImage(), detail)
 
 
 def store_received_decision(
@@ -236,15 +348,17 @@ def _add_own_decision(
     actor: Actor,
     now_utc_s: float,
     delivery: DeliveryStates,
-    *,
-    undoes: str | None = None,
 ) -> Decision:
     """Store a decision on the contact of a row, and update the contact."""
     names = {name: row[name] for name in ("vessel_id", "vehicle_id", "image_id")}
     fields = {"decision_id": f"d-{uuid.uuid4().hex}", "operator": actor.user, "decided_utc_s": now_utc_s}
     version = displayed.version or row["version"]
     record = Decision.model_validate({**names, **fields, **content, "image_version": version})
-    _insert(db, row["id"], record, displayed, now_utc_s, delivery, undoes=undoes)
+    counting = review_result([*_records(db, row["id"]), record]).counting
+    # The vehicle acts on the latest verdict that it receives: a differing verdict of a disputed contact is not sent.
+    if counting is not None and counting.verdict != record.verdict and delivery.vehicle != "none":
+        delivery = delivery._replace(vehicle="disputed")
+    _insert(db, row["id"], record, displayed, now_utc_s, delivery)
     _update_contact(db, row["id"], now_utc_s)
     return record
 
@@ -257,39 +371,40 @@ def _insert(
     now_utc_s: float,
     delivery: DeliveryStates,
     *,
-    undoes: str | None = None,
     received: bool = False,
 ) -> None:
+    sent = received or {delivery.shore, delivery.vehicle} <= {"none", "disputed"}
     values: Json = {
-        **record.model_dump(exclude={"image_version"}),
+        **record.model_dump(exclude={"image_version", "withdraws", "overrules"}),
+        "overrules": json.dumps(record.overrules),
         "contact_id": contact_id,
         "version": record.image_version,
         "sha256": displayed.sha256,
         "layer": displayed.layer,
-        "undoes": undoes,
+        "undoes": withdrawn_decision(record),
         "elsewhere": int(received),
         "shore": delivery.shore,
         "vehicle": delivery.vehicle,
         "changed_utc_s": now_utc_s,
         "payload": wire.encode(record),
-        "sent": int(received or delivery == DeliveryStates("none", "none")),
+        "sent": int(sent),
+        "send_after_utc_s": now_utc_s + delivery.take_back_s if delivery.take_back_s and not sent else None,
     }
     insert_row(db, "decision", values)
 
 
-def _valid_decision(db: sqlite3.Connection, contact_id: str) -> sqlite3.Row | None:
-    """Return the latest decision that is not undone and does not undo another."""
-    row: sqlite3.Row | None = db.execute(
-        "SELECT * FROM decision WHERE contact_id = ? AND undone = 0 AND undoes IS NULL"
-        " ORDER BY decided_utc_s DESC, seq DESC LIMIT 1",
-        (contact_id,),
-    ).fetchone()
-    return row
+def _records(db: sqlite3.Connection, contact_id: str) -> list[Decision]:
+    """Return the decisions on a contact, oldest first."""
+    rows = db.execute("SELECT payload FROM decision WHERE contact_id = ? ORDER BY decided_utc_s, seq", (contact_id,))
+    return [wire.decode(Decision, bytes(row["payload"]), f"decision on {contact_id}") for row in rows]
 
 
 def _update_contact(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> None:
-    """Update the columns of a contact that depend on its decisions."""
-    valid = _valid_decision(db, contact_id)
+    """Update the columns that depend on the decisions on a contact."""
+    result = review_result(_records(db, contact_id))
+    counting = result.counting
+    for decision_id in result.withdrawn:
+        db.execute("UPDATE decision SET undone = 1 WHERE decision_id = ?", (decision_id,))
     last = db.execute(
         "SELECT decision_id, COUNT(*) OVER () AS number FROM decision WHERE contact_id = ? ORDER BY seq DESC LIMIT 1",
         (contact_id,),
@@ -298,13 +413,13 @@ def _update_contact(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -
         "UPDATE contact SET review = ?, mlo_class = ?, confidence = ?, decided_by = ?, decided_utc_s = ?,"
         " effective = ?, remark = ?, last_decision = ?, revision = ?, updated_utc_s = ? WHERE id = ?",
         (
-            "unreviewed" if valid is None else valid["verdict"],
-            valid and valid["mlo_class"],
-            valid and valid["confidence"],
-            valid and valid["operator"],
-            valid and valid["decided_utc_s"],
-            valid and valid["decision_id"],
-            "" if valid is None else valid["remark"],
+            result.state,
+            counting and counting.mlo_class,
+            counting and counting.confidence,
+            counting and counting.operator,
+            counting and counting.decided_utc_s,
+            counting and counting.decision_id,
+            "" if counting is None else counting.remark,
             last and last["decision_id"],
             last["number"] if last else 0,
             now_utc_s,

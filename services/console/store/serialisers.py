@@ -70,6 +70,8 @@ def decision_json(row: sqlite3.Row) -> Json:
     return {
         **_select(row, _DECISION_COLUMNS),
         "undone": bool(row["undone"]),
+        "overrules": json.loads(row["overrules"]),
+        "take_back_utc_s": row["send_after_utc_s"],
         "elsewhere": bool(row["elsewhere"]),
         "delivery": _select(row, _DELIVERY_COLUMNS),
     }

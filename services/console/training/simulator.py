@@ -283,9 +283,10 @@ class TrainingSimulator:
         """Acknowledge decisions and requests as the relay and op_modem would."""
         for item in self._state.unsent_records():
             self._state.mark_sent(item)
-            if isinstance(item.record, (Decision, Command)):
-                for consumer in ("relay", "op_modem") if isinstance(item.record, Decision) else ("op_modem",):
-                    self._state.apply_acknowledgement(item.table, item.record_id, consumer, None)
+            if isinstance(item.record, Decision):
+                self._state.apply_acknowledgement(item.table, item.record_id, "relay", None)
+            if isinstance(item.record, (Decision, Command)) and item.to_vehicle:
+                self._state.apply_acknowledgement(item.table, item.record_id, "op_modem", None)
                 steps: list[tuple[float, DownlinkStep]] = [(now_utc_s + 4.0, "sent"), (now_utc_s + 10.0, "confirmed")]
                 self._downlink.append(_DownlinkRecord(item.record, steps))
 

@@ -1,4 +1,4 @@
-"""Routes of contacts: lists, details, images, decisions, measurements, requests and comments."""
+"""Routes of contacts: lists, details, images, measurements, requests and comments."""
 
 from __future__ import annotations
 
@@ -17,38 +17,27 @@ from sonarpost.review.measurement import Line, MeasurementKind
 from sonarpost.review.rendering import LAYERS, MAPS
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import ContactFilter, NotFoundError
-from sonarpost.services.console.store.database import DisplayedImage, Permission
-from sonarpost.services.console.store.decisions import DecisionInput
+from sonarpost.services.console.store.database import Permission
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call, RequestBody
 
-_Version = Annotated[int, Field(ge=1, le=2**31)]
-_Layer = Annotated[str, Field(max_length=20)]
+Version = Annotated[int, Field(ge=1, le=2**31)]
+Layer = Annotated[str, Field(max_length=20)]
 _Point = tuple[Annotated[float, Field(ge=0, le=4096)], Annotated[float, Field(ge=0, le=4096)]]
 
 
-class _AdviceBody(RequestBody):
-    version: _Version
+class AdviceBody(RequestBody):
+    """Fields of a comment, and of a decision."""
+
+    version: Version
     verdict: Verdict | None = None
     confidence: Annotated[float, Field(ge=0, le=1)] | None = None
     mlo_class: Annotated[str, Field(min_length=1, max_length=60)] | None = None
     remark: Annotated[str, Field(max_length=2000)] = ""
 
 
-class _DecisionBody(_AdviceBody):
-    verdict: Verdict
-    revision: Annotated[int, Field(ge=0)]
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-    layer: _Layer = "raw"
-
-
-class _UndoBody(RequestBody):
-    revision: Annotated[int, Field(ge=0)]
-    decision_id: Annotated[str, Field(max_length=64)]
-
-
 class _MeasureBody(RequestBody):
-    version: _Version
-    layer: _Layer = "raw"
+    version: Version
+    layer: Layer = "raw"
     kind: MeasurementKind
     start: Annotated[_Point, Field(alias="from")]
     to: _Point
@@ -92,17 +81,18 @@ class ContactRoutes:
             Route(
                 "/api/contacts", read(lambda call: JSONResponse(state.list_contacts(call.parse_query(ContactFilter))))
             ),
-            Route(contact, read(lambda call: JSONResponse(state.contact_detail(_id(call))))),
-            Route(contact + "/costs", read(lambda call: JSONResponse({"costs": state.request_costs(_id(call))}))),
+            Route(contact, read(lambda call: JSONResponse(state.contact_detail(contact_id(call))))),
+            Route(contact + "/costs", read(self._costs)),
             Route(version + "/picture.png", read(self._image)),
             Route(version + "/mask.png", read(self._mask)),
             Route(version + "/thumbnail.png", read(self._thumbnail)),
-            write(contact + "/decisions", self._decide, "decide"),
-            write(contact + "/undo", self._undo, "decide"),
             write(contact + "/measure", self._measure, "measure"),
             write(contact + "/requests", self._add_request, "request"),
             write(contact + "/advice", self._add_advice, "advise"),
         ]
+
+    def _costs(self, call: Call) -> Response:
+        return JSONResponse({"costs": self._state.request_costs(contact_id(call))})
 
     # Images
 
@@ -144,34 +134,24 @@ class ContactRoutes:
         return self._png_response(call, draw)
 
     def _png_response(self, call: Call, draw: Callable[[ReconstructedImage], bytes]) -> Response:
-        image = self._state.image(_id(call), int(call.request.path_params["version"]))
-        headers = {"Cache-Control": "private, max-age=86400, immutable"}
+        image = self._state.image(contact_id(call), int(call.request.path_params["version"]))
+        headers = {"Cache-Control": "private, max-age=86400, immutable", "X-Image-SHA256": image.picture_sha256}
         return Response(draw(image), media_type="image/png", headers=headers)
 
     # Actions
 
-    def _decide(self, call: Call) -> Response:
-        body = call.parse_body(_DecisionBody)
-        displayed = DisplayedImage(body.version, body.sha256, body.layer)
-        entered = DecisionInput(body.revision, displayed, body.verdict, body.confidence, body.mlo_class, body.remark)
-        return JSONResponse(self._state.decide(_id(call), entered, call.actor), 201)
-
-    def _undo(self, call: Call) -> Response:
-        body = call.parse_body(_UndoBody)
-        return JSONResponse(self._state.undo(_id(call), body.decision_id, body.revision, call.actor), 201)
-
     def _measure(self, call: Call) -> Response:
         body = call.parse_body(_MeasureBody)
         line = Line(body.version, body.layer, body.kind, body.start, body.to)
-        return JSONResponse(self._state.measure(_id(call), line, call.actor, keep=body.keep))
+        return JSONResponse(self._state.measure(contact_id(call), line, call.actor, keep=body.keep))
 
     def _add_request(self, call: Call) -> Response:
         body = call.parse_body(_RequestBody)
-        return JSONResponse(self._state.add_request(_id(call), body.kind, body.airtime_s, call.actor), 201)
+        return JSONResponse(self._state.add_request(contact_id(call), body.kind, body.airtime_s, call.actor), 201)
 
     def _add_advice(self, call: Call) -> Response:
-        body = call.parse_body(_AdviceBody)
-        image = self._state.image(_id(call), body.version)
+        body = call.parse_body(AdviceBody)
+        image = self._state.image(contact_id(call), body.version)
         record = Advice(
             **body.model_dump(exclude={"version"}),
             advice_id=f"a-{uuid.uuid4().hex}",
@@ -182,8 +162,9 @@ class ContactRoutes:
             author=call.actor.user,
             advised_utc_s=self._state.clock(),
         )
-        return JSONResponse(self._state.add_advice(_id(call), record, call.actor), 201)
+        return JSONResponse(self._state.add_advice(contact_id(call), record, call.actor), 201)
 
 
-def _id(call: Call) -> str:
+def contact_id(call: Call) -> str:
+    """Return the contact identifier in the path of a request."""
     return str(call.request.path_params["id"])

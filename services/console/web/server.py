@@ -44,6 +44,7 @@ from sonarpost.services.console.web.connections import (
     TrustedProxies,
 )
 from sonarpost.services.console.web.contact_routes import ContactRoutes
+from sonarpost.services.console.web.decision_routes import DecisionRoutes
 from sonarpost.services.console.web.event_stream import EventStream
 from sonarpost.services.console.web.export_routes import ExportRoutes
 from sonarpost.services.console.web.map_routes import MapRoutes
@@ -74,6 +75,7 @@ class ConsoleApp:
             Route("/api/info", access.endpoint(self._info)),
             *sessions.routes(access),
             *ContactRoutes(state).routes(access),
+            *DecisionRoutes(state).routes(access),
             *self._map.routes(access),
             *self._exports.routes(access),
             *self._stream.routes(access),
@@ -99,7 +101,8 @@ class ConsoleApp:
                 "version": version("sonarpost"),
                 "training": self._training,
                 "now_utc_s": self._state.clock(),
-                "classes": list(config.classes),
+                "classes": [{"group": name, "classes": found} for name, found in config.class_groups().items()],
+                "take_back_s": config.take_back_s,
                 "maps": list(MAPS),
                 "requests": list(REQUEST_KINDS),
                 "password_characters": [MIN_PASSWORD, MAX_PASSWORD],

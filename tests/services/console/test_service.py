@@ -63,7 +63,7 @@ def log_in() -> Iterator[Callable[..., Browser]]:
 def start(runner, platform):
     def make(**options: Any) -> ConsoleService:
         role = options.get("role", "vessel")
-        config = ConsoleConfig(port=0, **options)
+        config = ConsoleConfig(**{"port": 0, "take_back_s": 0, **options})
         return runner.start(ConsoleService(platform(VESSEL if role == "vessel" else "shore-1"), config))
 
     return make
