@@ -16,6 +16,7 @@ from sonarpost.export.cot import cot_events
 from sonarpost.export.kml import kml_bytes
 from sonarpost.export.tables import csv_bytes, geojson_bytes
 from sonarpost.messages import Contact, Decision, Pixels, ReconstructedImage
+from sonarpost.review.measured_size import SIZE_FIELDS
 
 FIRST_UTC_S = 1476262801.25
 
@@ -109,9 +110,33 @@ def classified_mission(out_dir: Path) -> Path:
     )
 
 
-MISSIONS = {"mission": mission, "authenticated": authenticated_mission, "classified": classified_mission}
-NEWER: Final = {"mission": ("authenticated", "p_mine_like", "p_other_object"), "classified": ()}
-NEWER["authenticated"] = NEWER["mission"][1:]
+def reviewed_mission(out_dir: Path) -> Path:
+    """Write a contact whose decision is withdrawn, a disputed one, and one whose dispute is settled."""
+    later = {"decided_utc_s": FIRST_UTC_S + 700}
+    return store(
+        out_dir,
+        image("0001"),
+        decision("0001", decision_id="d-1", operator="anna"),
+        decision("0001", decision_id="d-2", operator="anna", verdict="unsure", withdraws="d-1", **later),
+        image("0002", {"lat_deg": 41.5261}),
+        decision("0002", decision_id="d-3", operator="anna", mlo_class="manta"),
+        decision("0002", decision_id="d-4", operator="ben", verdict="not_mine_like", **later),
+        image("0003", {"lat_deg": 41.5271}),
+        decision("0003", decision_id="d-5", operator="anna"),
+        decision("0003", decision_id="d-6", operator="ben", verdict="not_mine_like", overrules=("d-5",), **later),
+    )
+
+
+MISSIONS = {
+    "mission": mission,
+    "authenticated": authenticated_mission,
+    "classified": classified_mission,
+    "reviewed": reviewed_mission,
+}
+NEWER: Final[dict[str, tuple[str, ...]]] = {"reviewed": ()}
+NEWER["classified"] = ("withdrawn_by", *(f"measured_{name}" for name in SIZE_FIELDS))
+NEWER["authenticated"] = ("p_mine_like", "p_other_object", *NEWER["classified"])
+NEWER["mission"] = ("authenticated", *NEWER["authenticated"])
 """The last properties of contacts, which the golden files of a mission do not have because they are older."""
 
 

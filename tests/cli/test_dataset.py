@@ -139,7 +139,7 @@ def test_disputed_contacts_are_included_on_request(archive):
     out, document = export(archive, "--include-disputed")
     check_coco(out, document)
     _, annotation = by_name(document)["0004"]
-    assert (annotation["verdict"], annotation["disputed"], annotation["operators"]) == ("not_mine_like", True, 2)
+    assert (annotation["verdict"], annotation["disputed"], annotation["operators"]) == ("mine_like", True, 2)
 
 
 def test_json_prints_the_counts(archive, capsys):

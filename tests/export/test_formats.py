@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import re
@@ -23,6 +24,7 @@ from builders.exports import (
     golden_files,
     image,
     mission,
+    reviewed_mission,
     store,
 )
 from hypothesis import HealthCheck, given, settings
@@ -33,9 +35,18 @@ from sonarpost.archive.image_files import side_car
 from sonarpost.export.contacts import ContactSet, ExportContact, SideCar, load_contacts
 from sonarpost.export.cot import CotOptions, cot_event, cot_events, cot_type
 from sonarpost.export.kml import kml_bytes, kmz_bytes, write_kml, write_kmz
-from sonarpost.export.tables import COLUMNS, csv_bytes, geojson, geojson_bytes, write_csv, write_geojson
+from sonarpost.export.tables import (
+    COLUMNS,
+    contact_properties,
+    csv_bytes,
+    geojson,
+    geojson_bytes,
+    write_csv,
+    write_geojson,
+)
 from sonarpost.export.text import csv_text, html_text, probabilities_text, xml_text
 from sonarpost.messages import Decision, Pixels
+from sonarpost.review.measured_size import MeasuredSize
 
 GOLDEN = GOLDEN_FOLDER / "export"
 KML = "{http://www.opengis.net/kml/2.2}"
@@ -66,7 +77,7 @@ def test_output_equals_golden_file(contacts: ContactSet, name: str) -> None:
 @pytest.mark.parametrize("kind", ["geojson", "kml", "csv", "cot"])
 def test_every_export_states_class_and_probabilities(tmp_path: Path, kind: str) -> None:
     name = f"classified.{kind}"
-    output = golden_files("classified", load_contacts(classified_mission(tmp_path)))[name]
+    output = as_of_golden_file(name, golden_files("classified", load_contacts(classified_mission(tmp_path)))[name])
     assert output == (GOLDEN / name).read_bytes()
     marks = {
         "geojson": (b'"atd_class": "structure"', b'"p_mine_like": 0.85,', b'"p_other_object": 0.1'),
@@ -100,15 +111,58 @@ def test_percentages_add_up_to_100(p_mine_like: float | None, p_other_object: fl
 @pytest.mark.parametrize("kind", ["geojson", "kml", "csv", "cot"])
 def test_every_export_marks_unauthenticated_contacts(tmp_path: Path, kind: str) -> None:
     name = f"authenticated.{kind}"
-    output = golden_files("authenticated", load_contacts(authenticated_mission(tmp_path)))[name]
-    assert as_of_golden_file(name, output) == (GOLDEN / name).read_bytes()
+    output = as_of_golden_file(
+        name, golden_files("authenticated", load_contacts(authenticated_mission(tmp_path)))[name]
+    )
+    assert output == (GOLDEN / name).read_bytes()
     marks = {
         "geojson": b'"authenticated": false',
         "kml": b"<name>uuv-1/0002 (unauthenticated)</name>",
-        "csv": b",false,,\r\n",
+        "csv": b",false\r\n",
         "cot": b"Unauthenticated: any modem in range",
     }
     assert output.count(marks[kind]) == 1
+
+
+@pytest.mark.parametrize("kind", ["geojson", "kml", "csv", "cot"])
+def test_every_export_states_withdrawn_disputed_and_settled_decisions(tmp_path: Path, kind: str) -> None:
+    name = f"reviewed.{kind}"
+    output = golden_files("reviewed", load_contacts(reviewed_mission(tmp_path)))[name]
+    assert output == (GOLDEN / name).read_bytes()
+    marks = {
+        "geojson": (b'"review": "unreviewed"', b'"withdrawn_by": "anna"', b'"review": "disputed"'),
+        "kml": (b"#unreviewed<", b'<Data name="withdrawn_by">\n      <value>anna<', b"Disputed (1)", b"#disputed<"),
+        "csv": (b",unreviewed,", b",anna,,,,,,,,\r\n", b",disputed,manta,"),
+        "cot": (
+            b"Sonar contact, not reviewed.",
+            b"Decision withdrawn by anna.",
+            b"Disputed, counts as mine-like.",
+            b"Verdicts: anna mine-like, ben not mine-like.",
+        ),
+    }
+    for mark in marks[kind]:
+        assert output.count(mark) == 1, mark
+    assert b"unsure<" not in output.replace(b'Style id="unsure"', b"")
+
+
+def test_withdrawal_of_an_older_console_is_not_exported_as_unsure(tmp_path: Path) -> None:
+    later = {"decided_utc_s": FIRST_UTC_S + 700, "verdict": "unsure"}
+    store(tmp_path, image(), decision(), decision(decision_id="d-2", remark="withdraws decision d-1", **later))
+    (contact,) = load_contacts(tmp_path).contacts
+    assert (contact.review, contact.withdrawn_by, cot_type(contact)) == ("unreviewed", "A. Operator", "b-m-p-s-m")
+    assert contact_properties(contact)["operator"] is None
+
+
+def test_every_export_states_the_measurements_of_operators() -> None:
+    measured = {"length_m": 1.2345, "length_sigma_m": 0.06, "height_m": 0.5, "height_sigma_m": 0.125}
+    (contact,) = single(image(contact={"length_m": 2.5})).contacts
+    contacts = ContactSet((dataclasses.replace(contact, size=MeasuredSize(**measured)),), (), ())
+    properties = geojson(contacts)["features"][0]["properties"]  # type: ignore[index]
+    assert (properties["length_m"], properties["measured_length_m"]) == (2.5, 1.234)
+    assert (properties["measured_height_sigma_m"], properties["measured_width_m"]) == (0.125, None)
+    assert csv_bytes(contacts).endswith(b",1.234,0.06,,,,,0.5,0.125\r\n")
+    assert b'<Data name="measured_height_m">\n      <value>0.5<' in kml_bytes(contacts)
+    assert "Measured: L 1.23 ± 0.06 m, H 0.50 ± 0.12 m." in cot_event(contacts.contacts[0], NOW_UTC_S).decode()
 
 
 def test_images_of_earlier_versions_have_no_statement_about_authentication_and_despeckling(

@@ -1,7 +1,7 @@
 """Training data: contacts with an operator's verdict in COCO format (https://cocodataset.org/#format-data).
 
-The latest verdict of each operator counts. Of these, the latest is the label. A contact is disputed if one operator's
-verdict is mine-like and another's is not.
+The label is the verdict of the decision that counts (`sonarpost.review.decisions`). A contact is disputed if one
+operator's verdict is mine-like and another's is not mine-like.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class LabelledImage:
 
     Attributes:
         contact: The contact; it has a side-car, decisions and an image.
-        decision: The latest decision, mine-like or not.
+        decision: The decision that counts, mine-like or not.
         is_disputed: Whether operators disagree.
         operators: Number of operators with a verdict, mine-like or not.
         pixels: Shape (rows, columns), uint8.
@@ -66,20 +66,18 @@ class LabelledImage:
 
 
 def latest_verdicts(contact: ExportContact) -> list[Decision]:
-    """Return the latest decision of each operator, oldest first, without those that are unsure."""
-    latest = {decision.operator: decision for decision in contact.decisions}
-    return [d for d in contact.decisions if latest[d.operator] is d and d.verdict != "unsure"]
+    """Return the decisions that stand, one of each operator, oldest first, without those that are unsure."""
+    return [d for d in contact.result.standing if d.verdict != "unsure"]
 
 
 def label_state(contact: ExportContact) -> LabelState:
     """Return whether a contact has a label, or why it has none. `disputed` ones have a label that is in doubt."""
-    if contact.decision is None:
-        return "unreviewed"
-    if contact.decision.verdict == "unsure":
-        return "unsure"
+    state = contact.review
+    if state in ("unreviewed", "unsure"):
+        return state
     if contact.image_path is None:
         return "without_image"
-    return "disputed" if len({d.verdict for d in latest_verdicts(contact)}) > 1 else "labelled"
+    return "disputed" if state == "disputed" else "labelled"
 
 
 def load_labelled_image(contact: ExportContact) -> LabelledImage:

@@ -1,8 +1,8 @@
 """Contacts with their images and decisions, read from the c2 service's folder (`out_dir/{vessel}`).
 
 A contact is identified by vessel, vehicle, image identifier and the second of its first frame. The image identifier
-alone is not unique: a vehicle whose store was deleted starts its numbering again. The highest image version and the
-latest decision count.
+alone is not unique: a vehicle whose store was deleted starts its numbering again. The highest image version counts,
+and the decision of `sonarpost.review.decisions`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ from sonarpost.messages import (
     Sha256,
     Text,
     Time,
-    Verdict,
 )
+from sonarpost.review.decisions import ReviewResult, ReviewState, review_result
+from sonarpost.review.measured_size import MeasuredSize
 from sonarpost.wire import first_error
 
 MAX_FILE_BYTES: Final = 1 << 20
@@ -40,7 +41,6 @@ MAX_FILE_BYTES: Final = 1 << 20
 
 DECISIONS: Final = "decisions"
 
-ReviewState = Verdict | Literal["unreviewed"]
 R = TypeVar("R", bound=Record)
 Seconds = TypeVar("Seconds", int, float)
 
@@ -93,11 +93,13 @@ class ExportContact:
         image: Side-car of the latest version of its image.
         decisions: All decisions about it, oldest first.
         image_path: PNG of that version; None if the file is missing or only the contact record was received.
+        size: Size as operators measured it; empty at the shore site, which receives no measurements.
     """
 
     image: SideCar
     decisions: tuple[Decision, ...]
     image_path: Path | None
+    size: MeasuredSize = MeasuredSize()
 
     @property
     def uid(self) -> str:
@@ -110,14 +112,27 @@ class ExportContact:
         return f"{self.image.vehicle_id}/{self.image.image_id}"
 
     @property
+    def result(self) -> ReviewResult:
+        """Result of the decisions."""
+        return review_result(self.decisions)
+
+    @property
     def decision(self) -> Decision | None:
-        """Latest decision; None before the first one."""
-        return self.decisions[-1] if self.decisions else None
+        """Decision that counts; None without one."""
+        return self.result.counting
 
     @property
     def review(self) -> ReviewState:
-        """Latest verdict, or `unreviewed`."""
-        return self.decision.verdict if self.decision else "unreviewed"
+        """State of the contact."""
+        return self.result.state
+
+    @property
+    def withdrawn_by(self) -> str | None:
+        """Operator who withdrew the last decision; None if a decision counts or there was none."""
+        result = self.result
+        if not result.is_withdrawn:
+            return None
+        return next(d.operator for d in reversed(self.decisions) if d.decision_id in result.withdrawals)
 
     @property
     def position(self) -> tuple[float, float] | None:

@@ -1,7 +1,7 @@
 """Cursor-on-Target events of contacts, version 2.0 of the event schema.
 
 A contact without a decision is a spot on the map (`b-m-p-s-m`). Only an operator's decision makes it a mine or a bottom
-return. The types correspond to the MIL-STD-2525 functions S*U-WM (sea mine) and S*U-NB (bottom return, non-mine bottom
+return. A disputed contact counts as mine-like. The types correspond to the MIL-STD-2525 functions S*U-WM (sea mine) and S*U-NB (bottom return, non-mine bottom
 object).
 """
 
@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from typing import Final, Literal
 from xml.etree import ElementTree as ET
 
-from sonarpost.export.contacts import ContactSet, ExportContact, ReviewState
+from sonarpost.export.contacts import ContactSet, ExportContact
 from sonarpost.export.tables import DEGREE_DECIMALS
-from sonarpost.export.text import probabilities_text, utc_text, xml_text
+from sonarpost.export.text import VERDICT_WORDS, probabilities_text, utc_text, xml_text
+from sonarpost.review.decisions import ReviewState
 
 SPOT: Final = "b-m-p-s-m"
 SEA_MINE: Final = "U-W-M"
@@ -44,6 +45,7 @@ _TITLES: Final[Mapping[ReviewState, str]] = {
     "mine_like": "Mine-like",
     "not_mine_like": "Not mine-like",
     "unsure": "Sonar contact, operator unsure",
+    "disputed": "Disputed, counts as mine-like",
 }
 
 
@@ -172,6 +174,13 @@ def _remarks(contact: ExportContact) -> str:
             parts.append(f"Detector's confidence {record.atd_confidence:.2f} of 2.")
     if image.missing_fraction > 0:
         parts.append(f"{100 * image.missing_fraction:.0f} % of the picture is missing.")
+    if contact.size.text:
+        parts.append(f"Measured: {contact.size.text}.")
+    if contact.withdrawn_by is not None:
+        parts.append(f"Decision withdrawn by {contact.withdrawn_by}.")
+    if contact.review == "disputed":
+        verdicts = (f"{d.operator} {VERDICT_WORDS[d.verdict]}" for d in contact.result.standing)
+        parts.append(f"Verdicts: {', '.join(verdicts)}.")
     if decision is not None:
         confidence = "" if decision.confidence is None else f", confidence {decision.confidence:.2f}"
         parts.append(f"Decided {utc_text(decision.decided_utc_s)} by {decision.operator}{confidence}.")

@@ -20,10 +20,11 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 from sonarpost.errors import BadInputError
-from sonarpost.export.contacts import ContactSet, ExportContact, ReviewState
+from sonarpost.export.contacts import ContactSet, ExportContact
 from sonarpost.export.tables import DEGREE_DECIMALS, Value, contact_properties
 from sonarpost.export.text import html_text, utc_text, xml_text
 from sonarpost.files import write_atomically
+from sonarpost.review.decisions import ReviewState
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.image_files import encode_png, read_image
 
@@ -33,8 +34,10 @@ COLOURS: Final[Mapping[ReviewState, str]] = {
     "mine_like": "#e00000",
     "not_mine_like": "#00a000",
     "unsure": "#ff8c00",
+    "disputed": "#c000c0",
 }
 FOLDERS: Final[Mapping[ReviewState, str]] = {
+    "disputed": "Disputed",
     "mine_like": "Mine-like",
     "unsure": "Unsure",
     "unreviewed": "Not reviewed",
@@ -111,7 +114,7 @@ def add_kmz(
             images[contact.uid] = overlay = _overlay(contact, pixels)
             if overlay is not None:
                 _add_image(archive, f"overlays/{contact.uid}.png", _heading_up(contact, pixels))
-        for review, colour in COLOURS.items():
+        for review, colour in _styles(contacts).items():
             _add_file(archive, f"icons/{review}.png", _icon_png(review, colour))
         _add_file(archive, "doc.kml", _document(contacts, images, icons=True))
     return tuple(problems)
@@ -165,7 +168,7 @@ def _document(contacts: ContactSet, images: Mapping[str, _Overlay | None], *, ic
     _child(document, "name", "sonarpost contacts")
     unlocated = len(contacts.unlocated)
     _child(document, "description", f"{len(contacts.located)} contacts; {unlocated} more without a position")
-    for review, colour in COLOURS.items():
+    for review, colour in _styles(contacts).items():
         _add_style(document, review, colour, icons=icons)
     for review, title in FOLDERS.items():
         reviewed = [contact for contact in contacts.located if contact.review == review]
@@ -191,6 +194,12 @@ def _add_style(document: ET.Element, review: ReviewState, colour: str, *, icons:
         _child(icon_style, "color", f"ff{colour[5:7]}{colour[3:5]}{colour[1:3]}")
     # Without a BalloonStyle, readers add a link to a web service to every balloon.
     _child(_child(style, "BalloonStyle"), "text", "<h3>$[name]</h3>$[description]")
+
+
+def _styles(contacts: ContactSet) -> dict[ReviewState, str]:
+    """Return the colours of the verdicts, that of disputed contacts only if there are any."""
+    disputed = any(contact.review == "disputed" for contact in contacts.located)
+    return {review: colour for review, colour in COLOURS.items() if review != "disputed" or disputed}
 
 
 def _add_placemark(folder: ET.Element, contact: ExportContact, *, has_image: bool) -> None:
@@ -306,6 +315,10 @@ def _icon_png(review: ReviewState, colour: str) -> bytes:
             draw.ellipse((low, low, high, high), colour, "black", 2)
         case "unsure":
             draw.polygon([(middle, low), (high, high), (low, high)], colour, "black", 2)
+        case "disputed":
+            draw.polygon([(middle, low), (high, middle), (middle, high), (low, middle)], colour, "black", 2)
+            draw.line([(middle, low + 7), (middle, high - 11)], "white", 4)
+            draw.line([(middle, high - 9), (middle, high - 6)], "white", 4)
         case "unreviewed":
             draw.rectangle((low, low, high, high), colour, "black", 2)
     return encode_png(image)

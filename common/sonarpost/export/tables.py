@@ -12,6 +12,7 @@ from typing import Final
 from sonarpost.export.contacts import ContactSet, ExportContact
 from sonarpost.export.text import csv_text, utc_text, xml_text
 from sonarpost.files import write_atomically
+from sonarpost.review.measured_size import SIZE_FIELDS
 
 Value = str | int | float | bool | None
 
@@ -35,8 +36,18 @@ def _from_record(name: str) -> Callable[[ExportContact], Value]:
 
 
 def _from_decision(name: str) -> Callable[[ExportContact], Value]:
-    """Return a function that reads a field of the latest decision; None if there is no decision."""
+    """Return a function that reads a field of the decision that counts; None if there is none."""
     return lambda contact: getattr(contact.decision, name, None)
+
+
+def _from_size(name: str) -> Callable[[ExportContact], Value]:
+    """Return a function that reads a measurement of operators, rounded to 1 mm; None if it was not measured."""
+
+    def read(contact: ExportContact) -> Value:
+        value: float | None = getattr(contact.size, name)
+        return None if value is None else round(value, 3)
+
+    return read
 
 
 _PROPERTIES: Final[Mapping[str, Callable[[ExportContact], Value]]] = {
@@ -83,6 +94,8 @@ _PROPERTIES: Final[Mapping[str, Callable[[ExportContact], Value]]] = {
     "authenticated": lambda c: c.image.authenticated,
     "p_mine_like": _from_record("p_mine_like"),
     "p_other_object": _from_record("p_other_object"),
+    "withdrawn_by": lambda c: c.withdrawn_by,
+    **{f"measured_{name}": _from_size(name) for name in SIZE_FIELDS},
 }
 
 COLUMNS: Final = tuple(_PROPERTIES)

@@ -4,8 +4,19 @@ from __future__ import annotations
 
 import html
 import re
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Final
+
+from sonarpost.review.decisions import ReviewState
+
+VERDICT_WORDS: Final[Mapping[ReviewState, str]] = {
+    "unreviewed": "unreviewed",
+    "mine_like": "mine-like",
+    "not_mine_like": "not mine-like",
+    "unsure": "unsure",
+    "disputed": "disputed",
+}
 
 REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
 
