@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Final, Literal, TypeVar
@@ -99,7 +99,7 @@ class ExportContact:
     image: SideCar
     decisions: tuple[Decision, ...]
     image_path: Path | None
-    size: MeasuredSize = MeasuredSize()
+    size: MeasuredSize = field(default_factory=MeasuredSize)
 
     @property
     def uid(self) -> str:

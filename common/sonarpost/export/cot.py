@@ -1,8 +1,8 @@
 """Cursor-on-Target events of contacts, version 2.0 of the event schema.
 
 A contact without a decision is a spot on the map (`b-m-p-s-m`). Only an operator's decision makes it a mine or a bottom
-return. A disputed contact counts as mine-like. The types correspond to the MIL-STD-2525 functions S*U-WM (sea mine) and S*U-NB (bottom return, non-mine bottom
-object).
+return. A disputed contact counts as mine-like. The types correspond to the MIL-STD-2525 functions S*U-WM (sea mine) and
+S*U-NB (bottom return, non-mine bottom object).
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def _add_detail(event: ET.Element, contact: ExportContact) -> None:
 
 def _remarks(contact: ExportContact) -> str:
     """Return the remarks for the operator of the receiving program, with the free text last."""
-    image, record, decision = contact.image, contact.image.contact, contact.decision
+    image, record = contact.image, contact.image.contact
     parts = [f"{_TITLES[contact.review]}."]
     if image.authenticated is False:
         parts.append(UNAUTHENTICATED)
@@ -176,6 +176,12 @@ def _remarks(contact: ExportContact) -> str:
         parts.append(f"{100 * image.missing_fraction:.0f} % of the picture is missing.")
     if contact.size.text:
         parts.append(f"Measured: {contact.size.text}.")
+    return " ".join([*parts, *_decision_remarks(contact)])
+
+
+def _decision_remarks(contact: ExportContact) -> list[str]:
+    parts: list[str] = []
+    decision = contact.decision
     if contact.withdrawn_by is not None:
         parts.append(f"Decision withdrawn by {contact.withdrawn_by}.")
     if contact.review == "disputed":
@@ -184,8 +190,8 @@ def _remarks(contact: ExportContact) -> str:
     if decision is not None:
         confidence = "" if decision.confidence is None else f", confidence {decision.confidence:.2f}"
         parts.append(f"Decided {utc_text(decision.decided_utc_s)} by {decision.operator}{confidence}.")
-        if decision.image_version < image.version:
+        if decision.image_version < contact.image.version:
             parts.append(f"The picture has grown since: version {decision.image_version} was looked at.")
         parts += [f"Class: {text}." for text in (decision.mlo_class,) if text]
         parts += [f"Remark: {text}" for text in (decision.remark,) if text]
-    return " ".join(parts)
+    return parts
