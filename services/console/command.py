@@ -7,6 +7,7 @@ import getpass
 import secrets
 import sys
 import tempfile
+import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from datetime import UTC, datetime
@@ -20,7 +21,7 @@ from sonarpost.keys import SHORE
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.database import DATABASE_NAME, ROLES, Database
-from sonarpost.services.console.store.users import FILE_NAME, Users
+from sonarpost.services.console.store.users import FILE_NAME, LINK_S, Users, login_link
 from sonarpost.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--state", type=Path, metavar="DIR", help="folder for the training data (default: none)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the simulation (default: 1)")
     parser.add_argument("--interval", type=float, default=6.0, metavar="S", help="time between packets (default: 6)")
+    parser.add_argument("--open", action="store_true", help="open the log-in link in the default browser")
     parser.add_argument("--password", help="password of the users of --training or --view (default: random)")
     actions = parser.add_subparsers(metavar="ACTION", required=False)
     user = actions.add_parser("user", help="manage the users of a console")
@@ -49,6 +51,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     for name, run_action, summary in (
         ("add", _add, "add a user, or change the role of a user"),
         ("passwd", _set_password, "change a password"),
+        ("link", _link, "print a link that logs a user in once, within 10 minutes"),
         ("rm", _remove, "remove a user"),
         ("ls", _list, "list the users"),
     ):
@@ -74,9 +77,12 @@ def run(parsed: argparse.Namespace) -> int:
         PortError: The address cannot be bound.
     """
     if hasattr(parsed, "run_action"):
-        folder: Path = parsed.state_dir or load(parsed.config, "console", ConsoleConfig, {})[0].state_dir
+        folder, config = parsed.state_dir, ConsoleConfig()
+        if parsed.config is not None:
+            platform, config = load(parsed.config, "console", ConsoleConfig, {})
+            folder = platform.state_dir
         with closing(Users(folder / FILE_NAME)) as users:
-            parsed.run_action(parsed, users)
+            parsed.run_action(parsed, users, config)
         return 0
     if parsed.view is not None:
         return _run_view(parsed)
@@ -99,23 +105,29 @@ def _read_password(parsed: argparse.Namespace) -> str:
     return password
 
 
-def _add(parsed: argparse.Namespace, users: Users) -> None:
+def _add(parsed: argparse.Namespace, users: Users, _config: ConsoleConfig) -> None:
     users.add(parsed.name, parsed.role, _read_password(parsed))
     print(f"user {parsed.name} added with the role {parsed.role}")
 
 
-def _set_password(parsed: argparse.Namespace, users: Users) -> None:
+def _set_password(parsed: argparse.Namespace, users: Users, _config: ConsoleConfig) -> None:
     users.set_password(parsed.name, _read_password(parsed))
     print(f"password of {parsed.name} changed")
 
 
-def _remove(parsed: argparse.Namespace, users: Users) -> None:
+def _remove(parsed: argparse.Namespace, users: Users, _config: ConsoleConfig) -> None:
     if not users.remove(parsed.name):
         raise ConfigError("console", "name", parsed.name, "a user; `sonarpost console user ls` lists them")
     print(f"user {parsed.name} removed")
 
 
-def _list(_parsed: argparse.Namespace, users: Users) -> None:
+def _link(parsed: argparse.Namespace, users: Users, config: ConsoleConfig) -> None:
+    host = f"[{config.host}]" if ":" in config.host else config.host
+    address = f"{'https' if config.tls else 'http'}://{host}:{config.port}/"
+    print(login_link(address, users.make_login_link(parsed.name)))
+
+
+def _list(_parsed: argparse.Namespace, users: Users, _config: ConsoleConfig) -> None:
     for user in users.all():
         changed = datetime.fromtimestamp(user.changed_utc_s, UTC)
         print(f"{user.name:<24} {user.role:<10} password of {changed:%Y-%m-%d}")
@@ -188,13 +200,19 @@ def _serve(
             users.add(name, role, password)
         app = ConsoleApp(state, users, platform_id, training=parsed.training is not None)
         server = _server(app, state.config, parsed.port)
+        # Of the users of a training, the operator.
+        name = next((name for name, role in accounts if role == "operator"), accounts[0][0])
+        link = login_link(server.address, users.make_login_link(name))
         print(f"{server.address}  user: {' or '.join(name for name, _ in accounts)}  password: {password}")
+        print(f"log-in link of {name}, valid once, for {LINK_S / 60:.0f} minutes: {link}")
         print(note, flush=True)
         stop = stack.enter_context(stop_on_signals())
         server.start()
         stack.callback(server.stop)
         stack.callback(app.stop)
         start()
+        if parsed.open:
+            webbrowser.open(link)
         while server.running and not stop.wait(0.5):
             pass
 

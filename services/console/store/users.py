@@ -1,4 +1,4 @@
-"""Users of the console with their password hashes, sessions and known browsers. One SQLite file."""
+"""Users of the console with password hashes, log-in links, sessions, known browsers and settings. One SQLite file."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import secrets
 import sqlite3
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from sonarpost.errors import BadInputError
 from sonarpost.services.console.store.database import ROLES, Role, SqliteFile
@@ -26,6 +27,13 @@ MAX_SESSIONS_OF_USER = 10
 MAX_DEVICES_OF_USER = 20
 DEVICE_S = 90 * 86400.0
 """A browser is known for this time after its last log-in."""
+LINK_S = 600.0
+"""A log-in link is valid for this time."""
+MAX_LINKS_OF_USER = 5
+_LINK_KEPT_S = 86400.0
+"""A used or expired link is known for this time, so that its user sees the reason for the refusal."""
+
+LinkState = Literal["valid", "used", "expired", "unknown"]
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}")
 _SCHEMA = """
@@ -38,6 +46,11 @@ CREATE TABLE IF NOT EXISTS session (
 CREATE TABLE IF NOT EXISTS device (
     token_sha256 BLOB NOT NULL, name TEXT NOT NULL, used_utc_s REAL NOT NULL,
     PRIMARY KEY (token_sha256, name)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS link (
+    token_sha256 BLOB PRIMARY KEY, name TEXT NOT NULL, made_utc_s REAL NOT NULL, used INTEGER NOT NULL DEFAULT 0)
+    WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS setting (
+    user TEXT NOT NULL, name TEXT NOT NULL, value TEXT NOT NULL, PRIMARY KEY (user, name)) WITHOUT ROWID;
 """
 _PARALLEL_COLUMN = "ALTER TABLE user ADD COLUMN parallel INTEGER NOT NULL DEFAULT 1"
 """Hashes of version 0.2.0 and before have p = 1; they are replaced at the next log-in."""
@@ -136,10 +149,13 @@ class Users(SqliteFile):
             )
             kept = b"" if keep is None else _token_hash(keep)
             db.execute("DELETE FROM session WHERE name = ? AND token_sha256 <> ?", (name, kept))
+            db.execute("DELETE FROM link WHERE name = ?", (name,))
 
     def remove(self, name: str) -> bool:
-        """Remove a user with sessions and known browsers; return whether the user existed."""
+        """Remove a user with sessions, known browsers, links and settings; return whether the user existed."""
         with self.transaction() as db:
+            db.execute("DELETE FROM link WHERE name = ?", (name,))
+            db.execute("DELETE FROM setting WHERE user = ?", (name,))
             db.execute("DELETE FROM device WHERE name = ?", (name,))
             db.execute("DELETE FROM session WHERE name = ?", (name,))
             return db.execute("DELETE FROM user WHERE name = ?", (name,)).rowcount > 0
@@ -221,6 +237,54 @@ class Users(SqliteFile):
             _delete_oldest(db, "device", name, MAX_DEVICES_OF_USER)
         return token
 
+    # Log-in links
+
+    def make_login_link(self, name: str) -> str:
+        """Return the token of a link that logs a user in once, within `LINK_S`. Only its hash is stored.
+
+        A user has at most `MAX_LINKS_OF_USER` links; another one ends the oldest. A new password ends all of them.
+
+        Raises:
+            BadInputError: The user does not exist.
+        """
+        if self.find(name) is None:
+            raise BadInputError("user", "name", name, "a user; `sonarpost console user ls` lists them")
+        token, now = secrets.token_urlsafe(32), self._clock()
+        with self.transaction() as db:
+            db.execute("DELETE FROM link WHERE made_utc_s < ?", (now - LINK_S - _LINK_KEPT_S,))
+            db.execute(
+                "INSERT INTO link (token_sha256, name, made_utc_s) VALUES (?, ?, ?)", (_token_hash(token), name, now)
+            )
+            _delete_oldest(db, "link", name, MAX_LINKS_OF_USER, "made_utc_s")
+        return token
+
+    def use_login_link(self, token: str) -> tuple[LinkState, str]:
+        """Use up a log-in link; return its state before, and the user's name, which is empty for an unknown link."""
+        digest = _token_hash(token)
+        with self.transaction() as db:
+            row = db.execute("SELECT name, made_utc_s, used FROM link WHERE token_sha256 = ?", (digest,)).fetchone()
+            if row is None:
+                return "unknown", ""
+            name, made_utc_s, used = row
+            db.execute("UPDATE link SET used = 1 WHERE token_sha256 = ?", (digest,))
+        if used:
+            return "used", name
+        return ("valid" if 0 <= self._clock() - made_utc_s <= LINK_S else "expired"), name
+
+    # Settings
+
+    def settings(self, name: str) -> dict[str, str]:
+        """Return the settings of a user."""
+        with self.read() as db:
+            return dict(db.execute("SELECT name, value FROM setting WHERE user = ?", (name,)).fetchall())
+
+    def store_settings(self, name: str, values: Mapping[str, str]) -> None:
+        """Store settings of a user; those that are not in `values` remain."""
+        with self.transaction() as db:
+            db.executemany(
+                "INSERT OR REPLACE INTO setting VALUES (?, ?, ?)", [(name, *item) for item in values.items()]
+            )
+
     # Sessions
 
     def start_session(self, name: str) -> Session:
@@ -268,17 +332,27 @@ class Users(SqliteFile):
         return now - self._session_s, now - self._session_max_s
 
 
-def _delete_oldest(db: sqlite3.Connection, table: str, name: str, kept: int) -> None:
-    """Delete a user's rows of a table except the most recently used ones."""
+def _delete_oldest(db: sqlite3.Connection, table: str, name: str, kept: int, time_column: str = "used_utc_s") -> None:
+    """Delete a user's rows of a table except the newest ones by a column."""
     db.execute(
         f"DELETE FROM {table} WHERE name = ? AND token_sha256 NOT IN ("  # noqa: S608  constants only
-        f"SELECT token_sha256 FROM {table} WHERE name = ? ORDER BY used_utc_s DESC LIMIT ?)",
+        f"SELECT token_sha256 FROM {table} WHERE name = ? ORDER BY {time_column} DESC LIMIT ?)",
         (name, name, kept),
     )
 
 
 def _token_hash(token: str) -> bytes:
     return hashlib.sha256(token.encode("utf-8", "surrogatepass")).digest()
+
+
+def login_link(address: str, token: str) -> str:
+    """Return the log-in link of a token. Browsers do not send the part after `#`, so that no log contains the token.
+
+    Args:
+        address: URL of the console, with a final slash.
+        token: Token of `Users.make_login_link`.
+    """
+    return f"{address}login#{token}"
 
 
 def is_equal_secret(given: str, expected: str) -> bool:

@@ -73,6 +73,10 @@ class LoginLimiter:
         """Return the buckets of a password change; an unattended page could be used to guess the password."""
         return {("session", token): RATE_OF_SOURCE}
 
+    def buckets_of_link(self, address: str) -> Mapping[tuple[str, ...], Rate]:
+        """Return the buckets of a log-in link from a network address, or group of addresses."""
+        return {("link at address", address): RATE_OF_ADDRESS}
+
     @contextmanager
     def attempt(self, buckets: Mapping[tuple[str, ...], Rate], *, known: bool) -> Iterator[Callable[[], None]]:
         """Charge an attempt and limit the number of checks. Yields a function that refunds the attempt.
@@ -83,7 +87,7 @@ class LoginLimiter:
         wait_s = self._charge(buckets)
         if wait_s > 0:
             seconds = int(wait_s) + 1
-            message = f"too many wrong passwords: try again in {seconds} s"
+            message = f"too many failed attempts: try again in {seconds} s"
             raise ApiError(429, "too_many", message, headers={"Retry-After": str(seconds)})
         if not self._checks[known].acquire(blocking=False):
             self._refund(buckets)

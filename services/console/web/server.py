@@ -49,6 +49,7 @@ from sonarpost.services.console.web.event_stream import EventStream
 from sonarpost.services.console.web.export_routes import ExportRoutes
 from sonarpost.services.console.web.map_routes import MapRoutes
 from sonarpost.services.console.web.session_routes import SessionRoutes
+from sonarpost.services.console.web.settings_routes import SettingsRoutes
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +75,7 @@ class ConsoleApp:
         routes = [
             Route("/api/info", access.endpoint(self._info)),
             *sessions.routes(access),
+            *SettingsRoutes(users).routes(access),
             *ContactRoutes(state).routes(access),
             *DecisionRoutes(state).routes(access),
             *self._map.routes(access),

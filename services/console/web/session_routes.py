@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 from typing import Final
 
+from pydantic import Field
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from sonarpost.logs import kv
 from sonarpost.services.console.store.database import PERMISSIONS, Actor, Side
 from sonarpost.services.console.store.serialisers import Json
-from sonarpost.services.console.store.users import DEVICE_S, MAX_PASSWORD, MIN_PASSWORD, Session, Users
+from sonarpost.services.console.store.users import DEVICE_S, LINK_S, MAX_PASSWORD, MIN_PASSWORD, Session, Users
 from sonarpost.services.console.web.access import COOKIE, AccessControl, ApiError, Call, RequestBody
 from sonarpost.services.console.web.connections import address_group
 from sonarpost.services.console.web.login_limiter import LoginLimiter
@@ -19,6 +20,11 @@ from sonarpost.services.console.web.login_limiter import LoginLimiter
 log = logging.getLogger(__name__)
 
 LOGIN: Final = "/api/login"
+_LINK_PROBLEMS: Final = {
+    "unknown": ("link_unknown", "this log-in link is not valid"),
+    "used": ("link_used", "this log-in link was used before; it is valid once"),
+    "expired": ("link_expired", f"this log-in link has expired; it is valid for {LINK_S / 60:.0f} minutes"),
+}
 DEVICE_COOKIE: Final = "sonarpost_device"
 """Identifies a browser in which a user has logged in before; it grants nothing but an own limit of wrong passwords."""
 
@@ -26,6 +32,10 @@ DEVICE_COOKIE: Final = "sonarpost_device"
 class _LoginBody(RequestBody):
     user: str
     password: str
+
+
+class _LinkBody(RequestBody):
+    token: str = Field(min_length=1, max_length=100)
 
 
 class _PasswordBody(RequestBody):
@@ -52,6 +62,7 @@ class SessionRoutes:
         """Return the routes."""
         return [
             Route(LOGIN, access.endpoint(self._login, needs_session=False), methods=["POST"]),
+            Route("/api/login-link", access.endpoint(self._login_link, needs_session=False), methods=["POST"]),
             Route("/api/session", access.endpoint(self._session)),
             Route("/api/logout", access.endpoint(self._logout), methods=["POST"]),
             Route("/api/password", access.endpoint(self._password), methods=["POST"]),
@@ -67,11 +78,27 @@ class SessionRoutes:
                 log.warning("Log-in refused", extra=kv(user=body.user[:40], address=call.address))
                 raise ApiError(401, "wrong_login", "wrong user name or password")
             refund()
-        session = self._users.start_session(body.user)
+        device = self._users.add_device(body.user, device)
+        response = self._log_in(call, body.user)
+        self._set_cookie(response, DEVICE_COOKIE, device, LOGIN, DEVICE_S)
+        return response
+
+    def _login_link(self, call: Call) -> Response:
+        body = call.parse_body(_LinkBody)
+        with self._limiter.attempt(self._limiter.buckets_of_link(address_group(call.address)), known=False) as refund:
+            state, name = self._users.use_login_link(body.token)
+            if state != "valid":
+                log.warning("Log-in link refused", extra=kv(user=name, state=state, address=call.address))
+                raise ApiError(401, *_LINK_PROBLEMS[state])
+            refund()
+        return self._log_in(call, name)
+
+    def _log_in(self, call: Call, name: str) -> Response:
+        """Start a session, and return its response with the cookie."""
+        session = self._users.start_session(name)
         log.info("User logged in", extra=kv(user=session.name, role=session.role, address=call.address))
         response = JSONResponse(self._session_json(session))
         self._set_cookie(response, COOKIE, session.token, "/", self._max_age_s)
-        self._set_cookie(response, DEVICE_COOKIE, self._users.add_device(session.name, device), LOGIN, DEVICE_S)
         return response
 
     def _set_cookie(self, response: Response, name: str, value: str, path: str, max_age_s: float) -> None:

@@ -101,6 +101,7 @@ def show_folder(command):
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             url, _, user = process.stdout.readline().split()[:3]
+            assert f"{url}login#" in process.stdout.readline()
             assert "1 contacts in" in process.stdout.readline()
             with httpx2.Client(base_url=url, timeout=20) as client:
                 browser = Browser(client)

@@ -86,7 +86,7 @@ def test_error_is_displayed_at_its_field(served):
         fill(visit, "not it at all", NEW, NEW)
         visit.wait("#old-problem:has-text('not your present')")
     fill(visit, PASSWORD, NEW, NEW)
-    visit.wait("#problem:has-text('too many wrong passwords: try again in')")
+    visit.wait("#problem:has-text('too many failed attempts: try again in')")
     assert served.users.verify_password("anna", PASSWORD)
 
 

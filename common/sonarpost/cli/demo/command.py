@@ -78,8 +78,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--keep", action="store_true", help="keep services and routers running until Ctrl-C")
     parser.add_argument(
-        "--console", action="store_true", help="like --keep, and serve the operator's page: user and password are shown"
+        "--console", action="store_true", help="like --keep, and serve the operator's page: a log-in link is shown"
     )
+    parser.add_argument("--open", action="store_true", help="with --console: open the page in the default browser")
     parser.add_argument(
         "--threshold", type=float, metavar="CONFIDENCE", help="minimum confidence of a contact, 0 to 2 (default: 0.3)"
     )
@@ -149,7 +150,7 @@ def _run_chain(
             watcher.wait_until_started(chain.check)
         console.print(routers_line(settings), highlight=False, soft_wrap=True)
         if page is not None:
-            page.show(console)
+            page.show(console, opened=parsed.open)
         _follow(chain, watcher, files, console)
         outcome = evaluate(settings, watcher.snippets, watcher.contact_of_image, time.monotonic() - started_s)
         results = Console(stderr=True)  # printed with --quiet as well

@@ -1,0 +1,67 @@
+"""Settings of users: stored for each user, limited in names and size."""
+
+from __future__ import annotations
+
+import sqlite3
+
+import pytest
+from builders.console import PASSWORD
+
+from sonarpost.services.console.store.users import FILE_NAME, Users
+from sonarpost.services.console.web.settings_routes import MAX_VALUE, SETTINGS
+
+
+def test_settings_follow_the_user_and_no_other(console):
+    here, there, another = console.browser("anna"), console.browser("anna"), console.browser("bo")
+    assert here.get("/api/settings").json() == {"names": list(SETTINGS), "settings": {}}
+    assert here.post("/api/settings", {"settings": {"theme": "night", "language": "de"}}).status_code == 204
+    assert here.post("/api/settings", {"settings": {"theme": "day"}}).status_code == 204
+    assert there.get("/api/settings").json()["settings"] == {"theme": "day", "language": "de"}
+    assert another.get("/api/settings").json()["settings"] == {}
+    console.users.remove("anna")
+    assert console.users.settings("anna") == {}
+
+
+@pytest.mark.parametrize(
+    ("body", "field"),
+    [
+        ({}, "settings"),
+        ({"settings": {"colour": "red"}}, "settings.colour"),
+        ({"settings": {"theme": 1}}, "settings.theme"),
+        ({"settings": {"keys": "x" * (MAX_VALUE + 1)}}, "settings.keys"),
+        ({"settings": {str(number): "" for number in range(len(SETTINGS) + 1)}}, "settings"),
+        ({"settings": {}, "user": "bo"}, "user"),
+    ],
+)
+def test_invalid_settings_are_refused(console, body, field):
+    anna = console.browser("anna")
+    answer = anna.post("/api/settings", body)
+    assert (answer.status_code, answer.json()["error"]["field"]) == (400, field)
+    assert anna.get("/api/settings").json()["settings"] == {}
+
+
+def test_largest_settings_are_accepted(console):
+    largest = dict.fromkeys(SETTINGS, "x" * MAX_VALUE)
+    anna = console.browser("anna")
+    assert anna.post("/api/settings", {"settings": largest}).status_code == 204
+    assert anna.get("/api/settings").json()["settings"] == largest
+
+
+def test_settings_need_a_session_and_the_token_of_the_page(console):
+    assert console.browser().get("/api/settings").status_code == 401
+    answer = console.browser("anna").post("/api/settings", {"settings": {}}, **{"X-CSRF-Token": "wrong"})
+    assert answer.status_code == 403
+
+
+def test_users_file_of_an_earlier_version_opens(tmp_path):
+    users = Users(tmp_path / FILE_NAME)
+    users.add("anna", "operator", PASSWORD)
+    users.close()
+    with sqlite3.connect(tmp_path / FILE_NAME) as db:
+        db.execute("DROP TABLE link")
+        db.execute("DROP TABLE setting")
+    users = Users(tmp_path / FILE_NAME)
+    users.store_settings("anna", {"theme": "night"})
+    assert users.settings("anna") == {"theme": "night"}
+    assert users.use_login_link(users.make_login_link("anna")) == ("valid", "anna")
+    users.close()
