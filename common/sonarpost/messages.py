@@ -334,7 +334,7 @@ class ReceivedImage(Record):
         missing_halves: Halves (in the sense of the paper) of which no byte arrived.
         complete: Everything arrived that the vehicle has planned to send so far.
         bytes_received: Bytes of the stream that arrived.
-        bytes_total: Length of the stream; 0 if not known.
+        bytes_total: Length of the stream that the vehicle has planned to send so far; 0 if not known.
         frames_received: Acoustic frames used; 0 if the wire format does not count them.
         conflicts: Frames that contradict others of this image.
         first_frame_utc_s: Arrival of the first frame, by the vessel's clock.
@@ -390,15 +390,16 @@ class ReconstructedImage(Record):
         model: Identity of the codebook or model; empty if none was needed.
         picture: The pixels; missing ones are black.
         picture_sha256: Digest of the pixels (`data`): equal for the same image on every platform.
-        complete: The whole stream arrived.
+        complete: Everything arrived that the vehicle has planned to send so far, and no pixel is missing. A later
+            version can have more bytes, for example after a request for more detail.
         missing_fraction: Fraction of the pixels that is missing.
         missing_mask: One bit a pixel, row by row without padding, most significant bit first: pixel n is bit 7 - n mod
             8 of byte n // 8. 1 where nothing was received or what was received cannot be right; empty if nothing is
             missing.
         missing_halves: Halves (in the sense of the paper) that did not arrive.
         bytes_received: Bytes of the stream that arrived.
-        bytes_total: Length of the stream; 0 if not known.
-        frames_received: Acoustic frames used.
+        bytes_total: Length of the stream that the vehicle has planned to send so far; 0 if not known.
+        frames_received: Acoustic frames used; 0 if the wire format does not count them.
         first_frame_utc_s: Arrival of the first frame, by the vessel's clock.
         last_frame_utc_s: Arrival of the last frame.
         notes: Remarks for the operator about this image.

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 from sonarpost import wire
 from sonarpost.messages import Advice, Command, CommandKind, Decision, DownlinkState, ReconstructedImage, TaskingState
-from sonarpost.review.costs import NEW_IMAGE_KINDS, request_cost
+from sonarpost.review.costs import NEW_IMAGE_KINDS, RequestCost, request_cost
 from sonarpost.review.measurement import Line, measure_line
 from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.events import EventHub
 from sonarpost.services.console.fleet import FleetMonitor, fleet_json
-from sonarpost.services.console.store import contacts, decisions, requests
+from sonarpost.services.console.store import contacts, decisions, request_results, requests
 from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter, NotFoundError
 from sonarpost.services.console.store.database import (
     ID_COLUMN,
@@ -29,6 +30,7 @@ from sonarpost.services.console.store.database import (
     insert_row,
 )
 from sonarpost.services.console.store.decisions import DecisionInput, DeliveryStates
+from sonarpost.services.console.store.related_images import related_images_json
 from sonarpost.services.console.store.retention import remove_images
 from sonarpost.services.console.store.serialisers import (
     RECORD_JSON,
@@ -46,6 +48,10 @@ FRAME_HEADER_BYTES = 13
 
 LAST_DECISION_S = 12 * 3600.0
 """Age of the oldest decision that an operator undoes without naming it: one watch."""
+
+
+OP_MODEM = "op_modem"
+"""Service that transmits requests to vehicles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +107,7 @@ class ConsoleState:
         return len(stored)
 
     def _store_images(self, images: Sequence[ReconstructedImage]) -> list[tuple[str, bool]]:
-        """Return contact identifier, and whether the contact is new, of each new version."""
+        """Return the identifier of each changed contact, and whether it is new."""
         now, new_versions = self.clock(), []
         with self.database.transaction() as db:
             for image in images:
@@ -112,7 +118,12 @@ class ConsoleState:
                 contact_id, is_new_contact = stored
                 if is_new_contact:
                     decisions.attach_waiting_records(db, contact_id, now)
-                new_versions.append(stored)
+                own, *others = request_results.contacts_with_requests(db, contact_id)
+                for changed in (own, *others):
+                    request_results.update_results(db, changed, now)
+                # An image that answers a request is a layer of its contact.
+                new_versions.append((own, is_new_contact and own == contact_id))
+                new_versions += [(other, False) for other in others]
         return new_versions
 
     def store_decision(self, record: Decision) -> bool:
@@ -234,16 +245,19 @@ class ConsoleState:
                 "SELECT id, body FROM measurement WHERE contact_id = ? ORDER BY id", (contact_id,)
             )
             audit = db.execute("SELECT * FROM audit WHERE contact_id = ? ORDER BY seq", (contact_id,))
+            refine_base = contacts.find_contact(db, contact_id)["refine_base"]
             return {
                 "contact": contact,
                 "record": contact_record_json(decode_image(versions[-1])),
-                "versions": [version_json(row) for row in versions],
+                "versions": [version_json(row, refine_base) for row in versions],
+                "related": related_images_json(db, contact_id),
                 "decisions": list_records(db, "decision", contact_id),
                 "advice": list_records(db, "advice", contact_id),
                 "requests": list_records(db, "request", contact_id),
                 "measurements": [{**json.loads(row["body"]), "id": row["id"]} for row in measurements],
                 "group": looks,
                 "audit": [audit_json(row) for row in audit],
+                "costs": self.request_costs(contact_id),
             }
 
     def _contact_json(self, contact_id: str) -> Json:
@@ -262,30 +276,24 @@ class ConsoleState:
 
     def request_costs(self, contact_id: str) -> list[Json]:
         """Return the cost of each kind of request for a contact."""
+        found: list[Json] = []
         with self.database.read() as db:
             row = contacts.find_contact(db, contact_id)
-            first = contacts.find_version(db, contact_id, 1)
+            now, has_downlink = self.clock(), self._has_downlink
+            obstacles = {
+                kind: requests.find_obstacle(db, row, kind, now, has_downlink=has_downlink)
+                for kind in requests.REQUEST_KINDS
+            }
         vehicle_id = row["vehicle_id"]
         rate = self.fleet.uplink_rate(vehicle_id, self.config.assumed_rate)
-        # A new image has about the length of this image's first version, before more detail was requested.
-        new_image_bytes = (0 if first is None else decode_image(first).bytes_total) or row["bytes_total"]
-        found: list[Json] = []
-        for kind in requests.REQUEST_KINDS:
-            reason = requests.unavailable_reason(row, kind)
-            cost = request_cost(
-                kind,
-                downlink_rate=self.config.downlink_rate,
-                uplink_rate=rate,
-                bytes_received=0 if kind in NEW_IMAGE_KINDS else row["bytes_received"],
-                bytes_total=new_image_bytes if kind in NEW_IMAGE_KINDS else row["bytes_total"],
-                loss=self.fleet.frame_loss(vehicle_id),
-                overhead_bytes=FRAME_HEADER_BYTES,
-            )
+        for kind, obstacle in obstacles.items():
+            cost = self._request_cost(row, kind)
             found.append(
                 {
                     "kind": kind,
-                    "available": not reason,
-                    "reason": reason,
+                    "available": obstacle is None,
+                    "reason": obstacle.text if obstacle else "",
+                    "reason_code": obstacle and obstacle.code,
                     "downlink_s": cost.downlink_s,
                     "uplink_s": cost.uplink_s,
                     "airtime_s": cost.airtime_s,
@@ -297,6 +305,32 @@ class ConsoleState:
                 }
             )
         return found
+
+    @property
+    def _has_downlink(self) -> bool:
+        """Whether requests reach a vehicle: through op_modem, or from a shore site through c2."""
+        return self.config.role == "shore" or OP_MODEM in self.config.command_consumers
+
+    def _request_cost(self, row: sqlite3.Row, kind: CommandKind) -> RequestCost:
+        """Return the cost of a kind of request for a contact."""
+        is_new_image = kind in NEW_IMAGE_KINDS
+        bytes_total = self._first_stream_bytes(row) if is_new_image else row["bytes_total"]
+        return request_cost(
+            kind,
+            downlink_rate=self.config.downlink_rate,
+            uplink_rate=self.fleet.uplink_rate(row["vehicle_id"], self.config.assumed_rate),
+            bytes_received=0 if is_new_image else row["bytes_received"],
+            bytes_total=bytes_total,
+            loss=self.fleet.frame_loss(row["vehicle_id"]),
+            overhead_bytes=FRAME_HEADER_BYTES,
+        )
+
+    def _first_stream_bytes(self, row: sqlite3.Row) -> int:
+        """Return the length of a contact's stream before more detail was requested: that of a new image is similar."""
+        with self.database.read() as db:
+            versions = db.execute("SELECT * FROM version WHERE contact_id = ? ORDER BY version LIMIT 20", (row["id"],))
+            lengths = (decode_image(version).bytes_total for version in versions)
+            return next((length for length in lengths if length), row["bytes_total"])
 
     def fleet_state(self) -> Json:
         """Return the present state of services and vehicles."""
@@ -366,8 +400,20 @@ class ConsoleState:
         Raises:
             BadInputError: The request is not possible, or one of this kind is in progress.
         """
+        now = self.clock()
         with self.database.transaction() as db:
-            command_id = requests.add_request(db, contact_id, kind, airtime_s, actor, self.clock())
+            row = contacts.find_contact(db, contact_id)
+            command_id = requests.add_request(
+                db,
+                contact_id,
+                kind,
+                airtime_s,
+                actor,
+                now,
+                cost=self._request_cost(row, kind),
+                wait_s=self.fleet.queue_wait_s(row["vehicle_id"], now),
+                has_downlink=self._has_downlink,
+            )
         return self._publish_action("request", contact_id, command_id)
 
     def add_advice(self, contact_id: str, record: Advice, actor: Actor) -> Json:

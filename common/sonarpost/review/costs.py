@@ -47,6 +47,11 @@ def airtime_of_frames(frames: int, rate: int) -> float:
     return math.ceil(frames / RATES[rate].frames) * RATES[rate].airtime_s
 
 
+def least_airtime_s(payload_bytes: int, rate: int) -> float:
+    """Return the air time in seconds of a payload that shares full packets of a rate with other data."""
+    return payload_bytes / RATES[rate].packet_bytes * RATES[rate].airtime_s
+
+
 def request_cost(
     kind: str,
     *,

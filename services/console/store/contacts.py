@@ -15,6 +15,7 @@ from sonarpost.export.contacts import contact_uid, match_start_time
 from sonarpost.messages import ReconstructedImage
 from sonarpost.review.positions import Look, nearest_group, vehicle_position
 from sonarpost.services.console.store.database import insert_row
+from sonarpost.services.console.store.related_images import link_related_images
 from sonarpost.services.console.store.serialisers import CONTACT_QUERY, Json, contact_json, percent_received
 
 Sort = Literal["arrived", "updated", "confidence", "vehicle", "received", "review", "name", "range"]
@@ -74,7 +75,7 @@ class ContactFilter(BaseModel):
 
     def where(self) -> tuple[str, list[object]]:
         """Return the SQL condition, which contains only constants, and its parameters."""
-        conditions: list[str] = []
+        conditions = ["c.parent IS NULL"]
         values: list[object] = []
         states = {"reviewed": "c.review <> 'unreviewed'", "mine_like": "c.review IN ('mine_like', 'disputed')"}
         if self.review in states:
@@ -95,7 +96,7 @@ class ContactFilter(BaseModel):
             columns = ("name", "mlo_class", "atd_class", "remark")
             conditions.append("(" + " OR ".join(f"c.{column} LIKE ? ESCAPE '\\'" for column in columns) + ")")
             values += [pattern] * len(columns)
-        return " AND ".join(conditions) or "1", values
+        return " AND ".join(conditions), values
 
 
 class NotFoundError(BadInputError):
@@ -135,6 +136,7 @@ def store_image(
     known = db.execute("SELECT version FROM contact WHERE id = ?", (contact_id,)).fetchone()
     if known is None or known["version"] <= image.version:
         _update_contact(db, contact_id, image, now_utc_s)
+        link_related_images(db, contact_id, image)
         _assign_group(db, contact_id, radius_m)
     db.execute("UPDATE contact SET versions = versions + 1 WHERE id = ?", (contact_id,))
     return contact_id, known is None
@@ -182,12 +184,12 @@ def _update_contact(db: sqlite3.Connection, contact_id: str, image: Reconstructe
 def _assign_group(db: sqlite3.Connection, contact_id: str, radius_m: float) -> None:
     """Assign a contact with a position and without a group to the nearest group, or to a new one."""
     row = db.execute(
-        "SELECT group_id, lat_deg, lon_deg, position_sigma_m, vehicle_id, seen_utc_s FROM contact WHERE id = ?",
+        "SELECT group_id, parent, lat_deg, lon_deg, position_sigma_m, vehicle_id, seen_utc_s FROM contact WHERE id = ?",
         (contact_id,),
     ).fetchone()
-    if row["group_id"] is not None or row["lat_deg"] is None or row["lon_deg"] is None:
+    if row["group_id"] is not None or row["parent"] is not None or row["lat_deg"] is None or row["lon_deg"] is None:
         return
-    look = Look("", *tuple(row)[1:])
+    look = Look("", *tuple(row)[2:])
     # The index on latitude limits the search. Degrees of longitude depend on the latitude.
     limit_deg = 4.0 * radius_m / _METRES_PER_DEGREE
     nearby = db.execute(
@@ -232,9 +234,9 @@ def list_versions(db: sqlite3.Connection, query: ContactFilter, limit: int) -> l
 
 
 def count_contacts(db: sqlite3.Connection) -> ContactCounts:
-    """Count the contacts."""
-    total = db.execute("SELECT COUNT(*) FROM contact").fetchone()[0]
-    unreviewed = db.execute("SELECT COUNT(*) FROM contact WHERE review = 'unreviewed'").fetchone()[0]
+    """Count the contacts, without the images that answer requests about them."""
+    total = db.execute("SELECT COUNT(*) FROM contact WHERE parent IS NULL").fetchone()[0]
+    unreviewed = db.execute("SELECT COUNT(*) FROM contact WHERE review = 'unreviewed' AND parent IS NULL").fetchone()[0]
     return ContactCounts(total, unreviewed)
 
 

@@ -49,7 +49,8 @@ CREATE TABLE IF NOT EXISTS contact (
     last_frame_utc_s REAL NOT NULL, arrived_utc_s REAL NOT NULL, updated_utc_s REAL NOT NULL,
     complete INTEGER NOT NULL, percent REAL NOT NULL, bytes_received INTEGER NOT NULL, bytes_total INTEGER NOT NULL,
     codec TEXT NOT NULL, has_picture INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL,
-    group_id TEXT, authenticated INTEGER, despeckle_strength REAL, p_mine_like REAL, p_other_object REAL
+    group_id TEXT, authenticated INTEGER, despeckle_strength REAL, p_mine_like REAL, p_other_object REAL,
+    parent TEXT, relation TEXT
 ) WITHOUT ROWID;
 CREATE UNIQUE INDEX IF NOT EXISTS contact_image ON contact (vessel_id, vehicle_id, image_id, first_s);
 CREATE INDEX IF NOT EXISTS contact_updated ON contact (updated_utc_s, id);
@@ -83,7 +84,9 @@ CREATE TABLE IF NOT EXISTS request (
     seq INTEGER PRIMARY KEY AUTOINCREMENT, command_id TEXT NOT NULL UNIQUE, contact_id TEXT NOT NULL,
     vessel_id TEXT NOT NULL, kind TEXT NOT NULL, user TEXT NOT NULL, asked_utc_s REAL NOT NULL, airtime_s REAL,
     state TEXT NOT NULL, times_sent INTEGER NOT NULL DEFAULT 0, reason TEXT NOT NULL DEFAULT '',
-    changed_utc_s REAL NOT NULL, payload BLOB NOT NULL, sent INTEGER NOT NULL);
+    changed_utc_s REAL NOT NULL, payload BLOB NOT NULL, sent INTEGER NOT NULL, base_version INTEGER,
+    base_bytes INTEGER, base_total INTEGER, bytes_wanted INTEGER, earliest_utc_s REAL, expected_utc_s REAL,
+    late_utc_s REAL, arrived_utc_s REAL, result_contact TEXT, result_version INTEGER, result_bytes INTEGER);
 CREATE INDEX IF NOT EXISTS request_contact ON request (contact_id, seq);
 CREATE INDEX IF NOT EXISTS request_unsent ON request (seq) WHERE sent = 0;
 CREATE TABLE IF NOT EXISTS advice (
@@ -116,6 +119,39 @@ CREATE INDEX IF NOT EXISTS notice_open ON notice (user, id) WHERE acknowledged_u
 CREATE INDEX IF NOT EXISTS decision_operator ON decision (operator, seq);
 """
 """Tables and indexes that databases of version 0.2 do not have."""
+
+
+_ADDED_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
+    "contact": {
+        "authenticated": "INTEGER",
+        "despeckle_strength": "REAL",
+        "p_mine_like": "REAL",
+        "p_other_object": "REAL",
+        "parent": "TEXT",
+        "relation": "TEXT",
+    },
+    "version": {"removed": "INTEGER NOT NULL DEFAULT 0"},
+    "decision": {"send_after_utc_s": "REAL", "overrules": "TEXT NOT NULL DEFAULT '[]'"},
+    "request": {
+        "base_version": "INTEGER",
+        "base_bytes": "INTEGER",
+        "base_total": "INTEGER",
+        "bytes_wanted": "INTEGER",
+        "earliest_utc_s": "REAL",
+        "expected_utc_s": "REAL",
+        "late_utc_s": "REAL",
+        "arrived_utc_s": "REAL",
+        "result_contact": "TEXT",
+        "result_version": "INTEGER",
+        "result_bytes": "INTEGER",
+    },
+}
+"""Columns that databases of earlier versions lack, by table."""
+
+_ADDED_INDEXES: Final = (
+    "CREATE INDEX IF NOT EXISTS contact_seen ON contact (vehicle_id, seen_utc_s)",
+    "CREATE INDEX IF NOT EXISTS contact_parent ON contact (parent)",
+)
 
 
 class SqliteFile:
@@ -186,19 +222,12 @@ class Database(SqliteFile):
     def __init__(self, path: Path) -> None:
         super().__init__(path, _SCHEMA, SCHEMA_VERSION)
         with self.transaction() as db:
-            columns = {row["name"] for row in db.execute("PRAGMA table_info(contact)")}
-            if "authenticated" not in columns:  # a database of version 0.1 or 0.2
-                db.execute("ALTER TABLE contact ADD COLUMN authenticated INTEGER")
-            for name in ("despeckle_strength", "p_mine_like", "p_other_object"):
-                if name not in columns:
-                    db.execute(f"ALTER TABLE contact ADD COLUMN {name} REAL")
-            if "removed" not in {row["name"] for row in db.execute("PRAGMA table_info(version)")}:
-                db.execute("ALTER TABLE version ADD COLUMN removed INTEGER NOT NULL DEFAULT 0")
-            columns = {row["name"] for row in db.execute("PRAGMA table_info(decision)")}
-            for name, column_type in (("send_after_utc_s", "REAL"), ("overrules", "TEXT NOT NULL DEFAULT '[]'")):
-                if name not in columns:
-                    db.execute(f"ALTER TABLE decision ADD COLUMN {name} {column_type}")
-            for statement in _NOTICE_SCHEMA.strip().split(";")[:-1]:
+            for table, columns in _ADDED_COLUMNS.items():
+                known = {row["name"] for row in db.execute(f"PRAGMA table_info({table})")}
+                for name, kind in columns.items():
+                    if name not in known:
+                        db.execute(f"ALTER TABLE {table} ADD COLUMN {name} {kind}")
+            for statement in (*_NOTICE_SCHEMA.strip().split(";")[:-1], *_ADDED_INDEXES):
                 db.execute(statement)
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sqlite3
 import uuid
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, Literal
 
 from sonarpost import wire
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Advice, Command, CommandKind, DownlinkState, TaskingState
+from sonarpost.review.costs import NEW_IMAGE_KINDS, RequestCost
 from sonarpost.services.console.store.contacts import find_contact, find_contact_of_image
 from sonarpost.services.console.store.database import (
     Actor,
@@ -19,6 +21,7 @@ from sonarpost.services.console.store.database import (
     find_record,
     insert_row,
 )
+from sonarpost.services.console.store.request_results import request_columns
 from sonarpost.services.console.store.serialisers import Json
 
 REQUEST_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider", "original")
@@ -36,20 +39,107 @@ _STATE_ORDER: Final = {
 }
 
 
-def unavailable_reason(row: sqlite3.Row, kind: str) -> str:
-    """Return why a kind of request is not possible for a contact; empty if it is."""
-    if kind == "revisit" and (row["lat_deg"] is None or row["lon_deg"] is None):
-        return "the position of the contact is unknown"
-    if kind == "resend" and row["complete"]:
-        return "the image is complete"
-    if kind == "refine" and not default_registry().is_embedded(row["codec"]):
-        return f"the codec {row['codec']} cannot add detail" if row["codec"] else "no part of the image was received"
-    if kind == "original" and not row["codec"]:
-        return "no part of the image was received"
-    if kind == "original" and not row["despeckle_strength"]:
-        known = row["despeckle_strength"] is not None
-        return "the image is not despeckled" if known else "the stream of the image states no despeckling"
-    return ""
+REFUSAL_VALID_S: Final = 86_400.0
+"""Time for which a kind that a vehicle does not support is not offered again."""
+
+_UNSUPPORTED: Final = "unsupported"
+"""Reason of a vehicle without a consumer for a kind of command, as op_modem states it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Obstacle:
+    """Why a kind of request is not possible.
+
+    Attributes:
+        code: Name of the reason, for translation.
+        text: The reason in English.
+    """
+
+    code: Literal[
+        "no_downlink",
+        "unsupported",
+        "no_position",
+        "complete",
+        "fixed_codec",
+        "no_image",
+        "not_despeckled",
+        "despeckling_unknown",
+        "here",
+        "related",
+    ]
+    text: str
+
+
+def find_obstacle(
+    db: sqlite3.Connection, row: sqlite3.Row, kind: CommandKind, now_utc_s: float, *, has_downlink: bool
+) -> Obstacle | None:
+    """Return why a kind of request is not possible for a contact; None if it is.
+
+    Args:
+        db: Connection.
+        row: The contact.
+        kind: Kind of the request.
+        now_utc_s: Present time.
+        has_downlink: Whether this console can send requests to vehicles.
+    """
+    codec, despeckling = row["codec"], row["despeckle_strength"]
+    is_unsupported = _is_unsupported(db, row["vehicle_id"], kind, now_utc_s)
+    has_no_position = row["lat_deg"] is None or row["lon_deg"] is None
+    is_here = kind in NEW_IMAGE_KINDS and _is_here(db, row["id"], kind)
+    obstacles: tuple[tuple[bool, Obstacle], ...] = (
+        (not has_downlink, Obstacle("no_downlink", "this vessel sends no requests: no downlink is configured")),
+        (is_unsupported, Obstacle("unsupported", f"{row['vehicle_id']} cannot do this")),
+        (
+            kind == "revisit" and has_no_position,
+            Obstacle("no_position", "the position of the contact is unknown"),
+        ),
+        (kind == "resend" and bool(row["complete"]), Obstacle("complete", "the image is complete")),
+        (
+            kind in ("refine", "original") and not codec,
+            Obstacle("no_image", "no part of the image was received"),
+        ),
+        (
+            kind == "refine" and not default_registry().is_embedded(codec),
+            Obstacle("fixed_codec", f"the codec {codec} cannot add detail"),
+        ),
+        (
+            kind == "original" and despeckling is None,
+            Obstacle("despeckling_unknown", "the stream of the image states no despeckling"),
+        ),
+        (kind == "original" and not despeckling, Obstacle("not_despeckled", "the image is not despeckled")),
+        (is_here, Obstacle("here", "this image is complete")),
+        (
+            kind in NEW_IMAGE_KINDS and row["parent"] is not None,
+            Obstacle("related", "a request about the contact of this image"),
+        ),
+    )
+    return next((obstacle for applies, obstacle in obstacles if applies), None)
+
+
+def _is_unsupported(db: sqlite3.Connection, vehicle_id: str, kind: CommandKind, now_utc_s: float) -> bool:
+    """Return whether the latest answer of a vehicle to this kind is a recent refusal as unsupported."""
+    row = db.execute(
+        "SELECT r.state, r.reason, r.changed_utc_s FROM request r JOIN contact c ON c.id = r.contact_id"
+        " WHERE c.vehicle_id = ? AND r.kind = ? AND (r.state = 'confirmed' OR (r.state = 'refused' AND r.reason = ?))"
+        " ORDER BY r.changed_utc_s DESC LIMIT 1",
+        (vehicle_id, kind, _UNSUPPORTED),
+    ).fetchone()
+    return row is not None and row["state"] == "refused" and now_utc_s - row["changed_utc_s"] < REFUSAL_VALID_S
+
+
+def _is_here(db: sqlite3.Connection, contact_id: str, kind: CommandKind) -> bool:
+    sql = "SELECT 1 FROM contact WHERE parent = ? AND relation = ? AND complete"
+    return db.execute(sql, (contact_id, kind)).fetchone() is not None
+
+
+def is_pending(row: sqlite3.Row, now_utc_s: float) -> bool:
+    """Return whether a request waits for its result: delivered or on its way, not answered and not late."""
+    if row["arrived_utc_s"] is not None:
+        return False
+    if row["state"] in ("waiting", "asked", "sent"):
+        return True
+    is_late = row["late_utc_s"] is None or now_utc_s > row["late_utc_s"]
+    return row["state"] in ("confirmed", "delivered") and not is_late
 
 
 def add_request(
@@ -59,22 +149,32 @@ def add_request(
     airtime_s: float | None,
     actor: Actor,
     now_utc_s: float,
+    *,
+    cost: RequestCost,
+    wait_s: float | None,
+    has_downlink: bool,
 ) -> str:
     """Store a request; return its identifier.
 
-    `airtime_s` is the displayed estimate, for the audit.
+    Args:
+        db: Connection in a transaction.
+        contact_id: The contact.
+        kind: Kind of the request.
+        airtime_s: The displayed estimate, for the audit.
+        actor: The user.
+        now_utc_s: Present time.
+        cost: The present estimate.
+        wait_s: Time that the vehicle needs for its present queue; None if unknown.
+        has_downlink: Whether this console can send requests to vehicles.
 
     Raises:
-        BadInputError: The request is not possible, or one of this kind is in progress.
+        BadInputError: The request is not possible, or one of this kind has no result yet.
     """
     row = find_contact(db, contact_id)
-    if reason := unavailable_reason(row, kind):
-        raise BadInputError("request", "kind", kind, f"another kind: {reason}")
-    in_progress = db.execute(
-        "SELECT 1 FROM request WHERE contact_id = ? AND kind = ? AND state IN ('waiting', 'asked', 'sent')",
-        (contact_id, kind),
-    ).fetchone()
-    if in_progress is not None:
+    if obstacle := find_obstacle(db, row, kind, now_utc_s, has_downlink=has_downlink):
+        raise BadInputError("request", "kind", kind, f"another kind: {obstacle.text}")
+    earlier = db.execute("SELECT * FROM request WHERE contact_id = ? AND kind = ?", (contact_id, kind))
+    if any(is_pending(request, now_utc_s) for request in earlier):
         raise BadInputError("request", "kind", kind, "a kind without a request in progress")
     has_position = kind == "revisit"
     record = Command(
@@ -99,6 +199,7 @@ def add_request(
         "changed_utc_s": now_utc_s,
         "payload": wire.encode(record),
         "sent": 0,
+        **request_columns(db, row, kind, cost, wait_s, now_utc_s),
     }
     insert_row(db, "request", values)
     detail = {"command_id": record.command_id, "kind": kind, "airtime_s": airtime_s}

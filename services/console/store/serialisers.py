@@ -6,21 +6,27 @@ import json
 import sqlite3
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from typing import Final
+from typing import Final, Literal
 
 from sonarpost import wire
 from sonarpost.messages import ReconstructedImage
-from sonarpost.review.costs import airtime_of_frames
+from sonarpost.review.costs import airtime_of_frames, least_airtime_s
 from sonarpost.review.rendering import LAYERS
+from sonarpost.review.resolution import CODEBOOK_CODECS, sharp_to_m
 from sonarpost.services.console.store.database import Table
 
 Json = dict[str, object]
+Stage = Literal["record", "preview", "part", "sent", "refined"]
 
 CONTACT_QUERY: Final = """
 SELECT c.*, d.shore AS d_shore, d.vehicle AS d_vehicle, d.reason AS d_reason, d.times_sent AS d_times_sent,
     d.changed_utc_s AS d_changed_utc_s,
     (SELECT COUNT(*) FROM contact g WHERE g.group_id = c.group_id) AS looks,
-    (SELECT COUNT(*) FROM request r WHERE r.contact_id = c.id AND r.state IN ('waiting', 'asked', 'sent')) AS asking
+    (SELECT COUNT(*) FROM request r WHERE r.contact_id = c.id AND r.arrived_utc_s IS NULL
+        AND r.state NOT IN ('refused', 'expired')
+        AND COALESCE(r.late_utc_s, r.asked_utc_s + 86400) > CAST(strftime('%s') AS REAL)) AS asking,
+    (SELECT MIN(MAX(r.base_bytes, r.base_total)) FROM request r
+        WHERE r.contact_id = c.id AND r.kind = 'refine') AS refine_base
 FROM contact c LEFT JOIN decision d ON d.decision_id = c.last_decision
 """
 """Start of every query for rows of `contact_json`."""
@@ -34,12 +40,15 @@ _DELIVERY_COLUMNS: Final = "shore vehicle reason times_sent changed_utc_s"
 _DECISION_COLUMNS: Final = (
     "decision_id verdict confidence mlo_class remark operator decided_utc_s version sha256 layer undoes"
 )
-_REQUEST_COLUMNS: Final = "command_id kind user asked_utc_s airtime_s state times_sent reason changed_utc_s"
+_REQUEST_COLUMNS: Final = (
+    "command_id kind user asked_utc_s airtime_s state times_sent reason changed_utc_s bytes_wanted earliest_utc_s"
+    " expected_utc_s late_utc_s arrived_utc_s"
+)
 _ADVICE_COLUMNS: Final = "advice_id version verdict confidence mlo_class remark author advised_utc_s"
 _AUDIT_COLUMNS: Final = "seq utc_s user role address action version sha256 layer"
 _VERSION_FIELDS: Final = (
-    "version codec model complete missing_fraction bytes_received bytes_total frames_received first_frame_utc_s"
-    " last_frame_utc_s authenticated despeckle_strength"
+    "version codec model complete missing_fraction bytes_received bytes_total first_frame_utc_s last_frame_utc_s"
+    " authenticated despeckle_strength"
 )
 
 
@@ -53,7 +62,14 @@ def contact_json(row: sqlite3.Row) -> Json:
     return {
         **_select(row, _CONTACT_COLUMNS),
         "complete": bool(row["complete"]),
-        "percent_received": row["percent"],
+        "percent_received": row["percent"] if row["complete"] or row["bytes_total"] else None,
+        "stage": stage_of(
+            complete=bool(row["complete"]),
+            has_picture=bool(row["has_picture"]),
+            bytes_received=row["bytes_received"],
+            bytes_total=row["bytes_total"],
+            refine_base=row["refine_base"],
+        ),
         "has_picture": bool(row["has_picture"]),
         "thumbnail": f"/api/contacts/{row['id']}/versions/{row['version']}/thumbnail.png",
         "group": row["group_id"] if grouped else None,
@@ -79,7 +95,10 @@ def decision_json(row: sqlite3.Row) -> Json:
 
 def request_json(row: sqlite3.Row) -> Json:
     """Return a request."""
-    return _select(row, _REQUEST_COLUMNS)
+    result: Json | None = None
+    if row["result_contact"] is not None:
+        result = {"id": row["result_contact"], "version": row["result_version"], "bytes": row["result_bytes"]}
+    return {**_select(row, _REQUEST_COLUMNS), "result": result}
 
 
 def advice_json(row: sqlite3.Row) -> Json:
@@ -106,8 +125,27 @@ def audit_json(row: sqlite3.Row) -> Json:
     return {**_select(row, _AUDIT_COLUMNS), "detail": json.loads(row["detail"])}
 
 
+def stage_of(
+    *, complete: bool, has_picture: bool, bytes_received: int, bytes_total: int, refine_base: int | None
+) -> Stage:
+    """Return how far the transmission of an image has come.
+
+    Args:
+        complete: Everything arrived that the vehicle has planned to send so far.
+        has_picture: Whether a part of the image arrived.
+        bytes_received: Received bytes of the stream.
+        bytes_total: Announced length of the stream; 0 if unknown.
+        refine_base: Length of the stream at the first request for more detail; None without such a request.
+    """
+    if not has_picture:
+        return "record"
+    if not complete:
+        return "part" if bytes_total else "preview"
+    return "sent" if refine_base is None or bytes_received <= refine_base else "refined"
+
+
 def percent_received(image: ReconstructedImage) -> float:
-    """Return the received part of the announced stream in percent."""
+    """Return the received part of the announced stream in percent; 0 if its length is unknown."""
     if image.complete:
         return 100.0
     if image.bytes_total:
@@ -120,11 +158,24 @@ def decode_image(row: sqlite3.Row) -> ReconstructedImage:
     return wire.decode(ReconstructedImage, bytes(row["payload"]), f"contact {row['contact_id']}")
 
 
-def version_json(row: sqlite3.Row) -> Json:
-    """Return an image version."""
-    image, rate = decode_image(row), row["rate"]
+def _airtime(image: ReconstructedImage, rate: int | None) -> Json:
+    """Return the air time of an image.
+
+    A wire format that does not count frames puts several images and messages into one. Their bytes then give the least
+    air time.
+    """
+    if rate is None or not (image.frames_received or image.bytes_received):
+        return {"airtime_s": None, "airtime_is": None}
+    if image.frames_received:
+        return {"airtime_s": airtime_of_frames(image.frames_received, rate), "airtime_is": "estimated"}
+    return {"airtime_s": least_airtime_s(image.bytes_received, rate), "airtime_is": "at_least"}
+
+
+def version_json(row: sqlite3.Row, refine_base: int | None = None) -> Json:
+    """Return an image version; `refine_base`: see `stage_of`."""
+    image = decode_image(row)
     contact = image.contact
-    airtime_s = None if rate is None else airtime_of_frames(image.frames_received, int(rate))
+    percent = percent_received(image) if image.complete or image.bytes_total else None
     return {
         **{name: getattr(image, name) for name in _VERSION_FIELDS.split()},
         "received_utc_s": row["received_utc_s"],
@@ -132,14 +183,22 @@ def version_json(row: sqlite3.Row) -> Json:
         "width_px": image.picture.width_px,
         "bits": image.picture.bits,
         "sha256": image.picture_sha256,
-        "percent_received": percent_received(image),
+        "percent_received": percent,
+        "stage": stage_of(
+            complete=image.complete,
+            has_picture=bool(image.codec),
+            bytes_received=image.bytes_received,
+            bytes_total=image.bytes_total,
+            refine_base=refine_base,
+        ),
+        "frames_received": image.frames_received or None,
+        "sharp_to_m": sharp_to_m(image),
         "missing_halves": list(image.missing_halves),
-        "airtime_s": airtime_s,
-        "airtime_is": None if airtime_s is None else "estimated",
+        **_airtime(image, row["rate"]),
         "pixel_along_m": contact.pixel_along_m if contact else None,
         "pixel_across_m": contact.pixel_across_m if contact else None,
         "notes": list(image.notes),
-        "guessed_fraction": 0.0,
+        "texture": "codebook" if image.codec in CODEBOOK_CODECS else None,
         "layers": [asdict(layer) for layer in LAYERS],
     }
 

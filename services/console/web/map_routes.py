@@ -64,11 +64,13 @@ def map_json(state: ConsoleState) -> Json:
             " c.group_id, c.vehicle_lat_deg, c.vehicle_lon_deg,"
             " COALESCE(c.seen_utc_s, c.first_frame_utc_s) AS at_utc_s,"
             " COUNT(*) OVER (PARTITION BY COALESCE(c.group_id, c.id)) AS looks"
-            " FROM contact c WHERE c.lat_deg IS NOT NULL AND c.lon_deg IS NOT NULL"
+            " FROM contact c WHERE c.parent IS NULL AND c.lat_deg IS NOT NULL AND c.lon_deg IS NOT NULL"
             " ORDER BY at_utc_s DESC LIMIT ?",
             (MAX_CONTACTS,),
         ).fetchall()
-        unlocated = db.execute("SELECT COUNT(*) FROM contact WHERE lat_deg IS NULL OR lon_deg IS NULL").fetchone()[0]
+        unlocated = db.execute(
+            "SELECT COUNT(*) FROM contact WHERE parent IS NULL AND (lat_deg IS NULL OR lon_deg IS NULL)"
+        ).fetchone()[0]
     config = state.config
     frame = None
     if config.vessel_lat_deg is not None and config.vessel_lon_deg is not None:

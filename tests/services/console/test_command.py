@@ -164,30 +164,32 @@ def test_training_sends_a_new_image_once(kind, console):
     simulator.load_backlog(1)
     anna = console.browser("anna")
 
-    def rows() -> dict[str, dict[str, object]]:
-        return {row["image_id"]: row for row in anna.get("/api/contacts").json()["items"]}
-
-    def ask(image_id: str, expected: int = 201) -> None:
-        assert anna.post(f"/api/contacts/{rows()[image_id]['id']}/requests", {"kind": kind}).status_code == expected
+    def ask(contact_id: str, expected: int = 201) -> None:
+        assert anna.post(f"/api/contacts/{contact_id}/requests", {"kind": kind}).status_code == expected
         now = time.time()
         simulator.accept_records(now)
         simulator.advance_downlink(now + 11.0)
         for _ in range(10):
             simulator.receive_packet(time.time())
 
-    (first,) = rows()
-    ask(first)
-    assert set(rows()) == {first, "ZZZZ"}
-    known, new = (console.state.image(str(rows()[name]["id"]), 1) for name in (first, "ZZZZ"))
+    [contact] = anna.get("/api/contacts").json()["items"]
+    ask(contact["id"])
+    assert anna.get("/api/contacts").json()["total"] == 1  # a layer of its contact
+    detail = anna.contact(contact["id"])
+    [related] = detail["related"]
+    assert (related["relation"], related["image_id"]) == (kind, "ZZZZ")
+    known, new = (console.state.image(contact_id, 1) for contact_id in (contact["id"], related["id"]))
     scale = 2 if kind == "wider" else 1
     assert new.contact.pixel_along_m == scale * known.contact.pixel_along_m
     assert new.contact.pixel_across_m == scale * known.contact.pixel_across_m
     assert (known.despeckle_strength, new.despeckle_strength) == (1.0, 1.0 if kind == "wider" else 0.0)
-    assert rows()["ZZZZ"]["complete"]
-    ask(first)  # a repeated request
-    # An expanded image cannot be expanded, and the console refuses the other request.
-    ask("ZZZZ", expected=201 if kind == "wider" else 400)
-    assert set(rows()) == {first, "ZZZZ"}
+    version = related["versions"][-1]
+    assert (version["complete"], version["stage"]) == (True, "sent")
+    [request] = detail["requests"]
+    assert request["result"] == {"id": related["id"], "version": version["version"], "bytes": version["bytes_received"]}
+    assert request["arrived_utc_s"] is not None
+    ask(contact["id"], expected=400)  # the image is here
+    ask(related["id"], expected=400)
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from builders.console import image_record
+from builders.console import FIRST_UTC_S, image_record
 
 from sonarpost.messages import Command
 
@@ -12,8 +12,9 @@ STRENGTHS = {"0001": 1.0, "0002": 0.0625, "0003": 0.0, "0004": None}
 
 @pytest.fixture
 def contact_ids(console):
-    for image_id, strength in STRENGTHS.items():
-        console.state.store_image(image_record(image_id).model_copy(update={"despeckle_strength": strength}))
+    for number, (image_id, strength) in enumerate(STRENGTHS.items()):
+        record = image_record(image_id, time_utc_s=FIRST_UTC_S - number)
+        console.state.store_image(record.model_copy(update={"despeckle_strength": strength}))
     rows = console.browser("watch").get("/api/contacts").json()["items"]
     return {row["image_id"]: row["id"] for row in rows}
 

@@ -96,8 +96,11 @@ class AssembledImage:
 
     @property
     def complete(self) -> bool:
-        """Whether everything arrived that the sender has planned so far."""
-        return self.end > 0 and self.stream.prefix_bytes >= self.end
+        """Whether everything arrived that the sender has planned so far.
+
+        A byte beyond `end` proves that the plan has grown; its new end is then unknown.
+        """
+        return self.end > 0 and self.stream.prefix_bytes == self.end
 
     def next_update(self) -> ImageUpdate | None:
         """Return the next update, None if there is nothing new to report."""
@@ -116,7 +119,7 @@ class AssembledImage:
             missing=(),
             complete=self.complete,
             received_bytes=len(stream),
-            total_bytes=len(stream) if self.complete else 0,
+            total_bytes=self.end if len(stream) <= self.end else 0,
             frames=0,
             conflicts=0,
             first_frame_s=self.first_frame_s,

@@ -1,0 +1,111 @@
+"""Images that answer a request about another contact: more seabed around it, or the image without despeckling.
+
+The acoustic link does not carry the identifier of the contact that a requested image belongs to. Both images have the
+same contact record, except for image and pixel sizes, because the vehicle makes them from one detection.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from typing import Final, Literal
+
+from sonarpost.messages import Contact, ReconstructedImage
+from sonarpost.services.console.store.serialisers import Json, contact_record_json, decode_image, version_json
+
+Relation = Literal["wider", "original"]
+"""Kind of the request that the image answers."""
+
+EXPAND_FACTOR: Final = 2.0
+"""Ratio of the pixel sizes of the image of kind `wider` and of its contact."""
+SIZE_TOLERANCE: Final = 0.06
+"""Relative deviation of a ratio of pixel sizes; the link transmits them in steps of 2.5 %."""
+
+_NOT_COMPARED: Final = {"contact_id", "pixel_along_m", "pixel_across_m"}
+
+
+def relation_of(image: ReconstructedImage, parent: ReconstructedImage) -> Relation | None:
+    """Return which request about `parent` an image answers; None if it answers none.
+
+    A record without time, or without position and range, does not identify a detection.
+    """
+    record, other = image.contact, parent.contact
+    if record is None or other is None or not _is_same_detection(record, other):
+        return None
+    ratios = _size_ratios(record, other)
+    if ratios is None:
+        return None
+    if all(abs(ratio / EXPAND_FACTOR - 1.0) <= SIZE_TOLERANCE for ratio in ratios):
+        return "wider"
+    is_same_size = all(abs(ratio - 1.0) <= SIZE_TOLERANCE for ratio in ratios)
+    if is_same_size and parent.despeckle_strength and image.despeckle_strength == 0.0:
+        return "original"
+    return None
+
+
+def _is_same_detection(record: Contact, other: Contact) -> bool:
+    if record.time_utc_s is None or (record.lat_deg is None and record.ground_range_m is None):
+        return False
+    return record.model_dump(exclude=_NOT_COMPARED) == other.model_dump(exclude=_NOT_COMPARED)
+
+
+def _size_ratios(record: Contact, other: Contact) -> tuple[float, float] | None:
+    sizes = (record.pixel_along_m, record.pixel_across_m), (other.pixel_along_m, other.pixel_across_m)
+    (along_m, across_m), (other_along_m, other_across_m) = sizes
+    if along_m is None or across_m is None or not other_along_m or not other_across_m:
+        return None
+    return along_m / other_along_m, across_m / other_across_m
+
+
+def link_related_images(db: sqlite3.Connection, contact_id: str, image: ReconstructedImage) -> list[str]:
+    """Store which image answers a request about another contact; return the identifiers of the linked images.
+
+    The image can be the answer, or the contact of an answer that has arrived earlier. An image with a decision stays a
+    contact.
+    """
+    row = db.execute("SELECT * FROM contact WHERE id = ?", (contact_id,)).fetchone()
+    if row["parent"] is not None or row["seen_utc_s"] is None:
+        return []
+    linked: list[str] = []
+    others = db.execute(
+        "SELECT id, version, review FROM contact"
+        " WHERE vehicle_id = ? AND seen_utc_s = ? AND vessel_id = ? AND id <> ? AND parent IS NULL",
+        (row["vehicle_id"], row["seen_utc_s"], row["vessel_id"], contact_id),
+    ).fetchall()
+    for other in others:
+        stored = db.execute(
+            "SELECT * FROM version WHERE contact_id = ? AND version = ?", (other["id"], other["version"])
+        ).fetchone()
+        other_image = decode_image(stored)
+        if row["review"] == "unreviewed" and (relation := relation_of(image, other_image)):
+            _link(db, contact_id, other["id"], relation)
+            return [contact_id]
+        if other["review"] == "unreviewed" and (relation := relation_of(other_image, image)):
+            _link(db, other["id"], contact_id, relation)
+            linked.append(other["id"])
+    return linked
+
+
+def _link(db: sqlite3.Connection, contact_id: str, parent: str, relation: Relation) -> None:
+    db.execute(
+        "UPDATE contact SET parent = ?, relation = ?, group_id = NULL WHERE id = ?", (parent, relation, contact_id)
+    )
+
+
+def related_images_json(db: sqlite3.Connection, contact_id: str) -> list[Json]:
+    """Return the images that answer requests about a contact, the earliest first."""
+    found: list[Json] = []
+    rows = db.execute(
+        "SELECT id, relation, image_id FROM contact WHERE parent = ? ORDER BY arrived_utc_s, id", (contact_id,)
+    ).fetchall()
+    for row in rows:
+        versions = db.execute("SELECT * FROM version WHERE contact_id = ? ORDER BY version", (row["id"],)).fetchall()
+        found.append(
+            {
+                "id": row["id"],
+                "relation": row["relation"],
+                "image_id": row["image_id"],
+                "record": contact_record_json(decode_image(versions[-1])),
+                "versions": [version_json(version) for version in versions],
+            }
+        )
+    return found

@@ -1,0 +1,107 @@
+"""What the console states about the received data of an image: stage, air time, resolution, invented texture."""
+
+from __future__ import annotations
+
+import pytest
+from builders.console import image_record
+
+from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.review.resolution import detail_px, sharp_to_m
+
+ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
+
+
+def v1_record(version, received, *, complete=False):
+    """A version as the v1 link delivers it: no frames, and no length before the plan has arrived."""
+    changes = {
+        "complete": complete,
+        "bytes_received": received,
+        "bytes_total": received if complete else 0,
+        "frames_received": 0,
+    }
+    return image_record(version=version).model_copy(update=changes)
+
+
+def versions_of(console):
+    return console.browser("watch").contact(ID)["versions"]
+
+
+def test_v1_versions_name_their_bytes_and_stage(make_console):
+    console = make_console(assumed_rate=1)
+    for version, (received, complete) in enumerate([(30, False), (131, True), (200, False), (314, True)], 1):
+        console.state.store_image(v1_record(version, received, complete=complete))
+    versions = versions_of(console)
+    assert [(one["stage"], one["bytes_received"]) for one in versions] == [
+        ("preview", 30),
+        ("sent", 131),
+        ("preview", 200),
+        ("sent", 314),
+    ]
+    assert [one["percent_received"] for one in versions] == [None, 100.0, None, 100.0]
+    assert {one["frames_received"] for one in versions} == {None}
+    [row] = console.browser("watch").get("/api/contacts").json()["items"]
+    assert (row["stage"], row["percent_received"]) == ("sent", 100.0)
+
+
+def test_row_of_a_preview_has_no_percentage(console):
+    console.state.store_image(v1_record(1, 30))
+    [row] = console.browser("watch").get("/api/contacts").json()["items"]
+    assert (row["stage"], row["bytes_received"], row["percent_received"]) == ("preview", 30, None)
+
+
+def test_longer_stream_after_a_refine_request_is_refined(console):
+    console.state.store_image(v1_record(1, 314, complete=True))
+    anna = console.browser("anna")
+    assert anna.post(f"/api/contacts/{ID}/requests", {"kind": "refine"}).status_code == 201
+    console.state.store_image(v1_record(2, 629, complete=True))
+    assert [one["stage"] for one in versions_of(console)] == ["sent", "refined"]
+    assert anna.contact(ID)["contact"]["stage"] == "refined"
+
+
+def test_air_time_of_shared_frames_is_a_lower_limit(make_console):
+    console = make_console(assumed_rate=1)
+    console.state.store_image(v1_record(1, 96))
+    [version] = versions_of(console)
+    assert version["airtime_is"] == "at_least"
+    assert version["airtime_s"] == pytest.approx(96 / 192 * RATES[1].airtime_s)
+
+
+def test_air_time_of_counted_frames_is_an_estimate(make_console):
+    console = make_console(assumed_rate=1)
+    console.state.store_image(image_record())
+    [version] = versions_of(console)
+    assert (version["airtime_is"], version["airtime_s"], version["frames_received"]) == (
+        "estimated",
+        RATES[1].airtime_s,
+        1,
+    )
+
+
+def test_air_time_is_unknown_without_a_rate(console):
+    console.state.store_image(v1_record(1, 96))
+    [version] = versions_of(console)
+    assert (version["airtime_is"], version["airtime_s"]) == (None, None)
+
+
+def test_more_bytes_resolve_smaller_detail():
+    widths = [detail_px("emb", received, 80 * 140) for received in (24, 48, 131, 314, 629)]
+    assert widths == sorted(widths, reverse=True)
+    assert widths[2] == pytest.approx(3.05, abs=0.1)  # 0.0117 bytes a pixel, between rows of the table
+
+
+def test_detail_is_in_metres_of_the_larger_pixels():
+    record = image_record(total=100)  # 40 x 60 px of 0.1 m x 0.05 m
+    assert sharp_to_m(record) == pytest.approx(0.1 * detail_px("emb", 100, 2400))
+
+
+def test_resolution_of_other_codecs_is_unknown():
+    assert detail_px("vq", 100, 2400) is None
+    assert sharp_to_m(image_record(pixel_along_m=None)) is None
+
+
+@pytest.mark.parametrize(("codec", "texture"), [("vq", "codebook"), ("emb", None)])
+def test_codebook_texture_is_stated(codec, texture, console):
+    console.state.store_image(image_record().model_copy(update={"codec": codec}))
+    [version] = versions_of(console)
+    assert version["texture"] == texture
+    assert "guessed_fraction" not in version
