@@ -74,6 +74,8 @@ class MissionSpec:
         burst_frames: Mean length of a run of lost frames.
         contact_every_s: Mean time between contacts of a vehicle.
         stream_bytes: Length of an image's stream.
+        verdict_share: Share of the contacts on which the operator gives a final verdict from the preview.
+        verdict_delay_s: Time from the preview to the verdict.
         no_downlink_hours: Time from the start in which the vehicles receive nothing from the vessel.
         traffic: Messages of every vehicle.
         seed: Seed of all random draws.
@@ -88,6 +90,8 @@ class MissionSpec:
     burst_frames: float = 2.0
     contact_every_s: float = 1800.0
     stream_bytes: int = 300
+    verdict_share: float = 0.0
+    verdict_delay_s: float = 60.0
     no_downlink_hours: float = 0.0
     traffic: tuple[Traffic, ...] = DEFAULT_TRAFFIC
     seed: int = 1
@@ -99,6 +103,8 @@ class MissionSpec:
             ("loss", 0.0, 0.9),
             ("burst_frames", 1, 100),
             ("no_downlink_hours", 0, 240),
+            ("verdict_share", 0, 1),
+            ("verdict_delay_s", 0, 86400),
         ):
             value = getattr(self, name)
             if not low <= value <= high:
@@ -130,7 +136,8 @@ class MissionResult:
     Attributes:
         messages: Results by program.
         previews: Contacts of which at least the record and a coarse image arrived.
-        images: Images that arrived completely.
+        images: Images that arrived completely; `offered` without the stopped ones.
+        stopped: Images that a verdict stopped before they had arrived completely.
         unfinished_at: Offer times of incomplete images, in hours of the mission.
         left: Images and messages still queued at the end.
         expired: Messages deleted after their lifetime.
@@ -142,6 +149,7 @@ class MissionResult:
     messages: Mapping[str, TrafficResult]
     previews: TrafficResult
     images: TrafficResult
+    stopped: int
     unfinished_at: Sequence[float]
     left: int
     expired: int
@@ -215,6 +223,10 @@ class _Mission:
         self._open_images: dict[tuple[int, int], tuple[float, bytes]] = {}
         self._with_preview: set[tuple[int, int]] = set()
         self._count = 0
+        self._spec = spec
+        self._verdict_rng = np.random.default_rng([spec.seed, 2])
+        self._verdicts: list[tuple[float, tuple[int, int]]] = []
+        self.stopped = 0
 
     def offer(self, source: str, at: float, size_bytes: int) -> bytes:
         self._count += 1
@@ -243,9 +255,22 @@ class _Mission:
             if name not in self._with_preview:
                 self._with_preview.add(name)
                 self.previews.delays_s.append(now - at)
+                if self._verdict_rng.random() < self._spec.verdict_share:
+                    self._verdicts.append((now + self._spec.verdict_delay_s, name))
             if event.stream == stream:
                 self.images.delays_s.append(now - at)
                 del self._open_images[name]
+
+    def send_verdicts(self, vehicles: Sequence[_Vehicle], now: float, *, is_lost: bool) -> None:
+        """Send the verdicts that are due; each is repeated in every slot until it arrives."""
+        for due_s, name in list(self._verdicts):
+            if due_s > now or is_lost or self.channel.loses(-name[0]):
+                continue
+            self._verdicts.remove((due_s, name))
+            if name in self._open_images and vehicles[name[0] - 1].queue.stop(name[1]):
+                del self._open_images[name]
+                self.images.offered -= 1
+                self.stopped += 1
 
 
 def run_mission(spec: MissionSpec) -> MissionResult:
@@ -278,12 +303,15 @@ def run_mission(spec: MissionSpec) -> MissionResult:
                     for event in receiver.accept(vehicle.address, frame, now):
                         mission.handle(event, now)
             vehicle.queue.sent(frames, cycle_s)
-        _send_feedback(vehicles, receiver, mission.channel, now, is_lost=now < spec.no_downlink_hours * _HOUR_S)
+        is_lost = now < spec.no_downlink_hours * _HOUR_S
+        mission.send_verdicts(vehicles, now, is_lost=is_lost)
+        _send_feedback(vehicles, receiver, mission.channel, now, is_lost=is_lost)
         now = (now // cycle_s + 1) * cycle_s
     return MissionResult(
         messages=mission.messages,
         previews=mission.previews,
         images=mission.images,
+        stopped=mission.stopped,
         unfinished_at=mission.unfinished_at(),
         left=sum(len(v.queue.open_numbers()) + len(v.queue.messages.waiting) for v in vehicles),
         expired=sum(v.queue.messages.expired for v in vehicles),
@@ -322,17 +350,39 @@ def new_parser() -> argparse.ArgumentParser:
     parser.add_argument("--hours", type=float, default=default.hours, help="duration (%(default)s)")
     parser.add_argument("--loss", type=float, default=default.loss, help="share of frames lost (%(default)s)")
     parser.add_argument("--burst", type=float, default=default.burst_frames, help="mean length of a loss (%(default)s)")
+    parser.add_argument(
+        "--contact-every", type=float, default=default.contact_every_s, help="seconds between contacts (%(default)s)"
+    )
+    parser.add_argument("--stream-bytes", type=int, default=default.stream_bytes, help="of each image (%(default)s)")
+    parser.add_argument(
+        "--verdict-share", type=float, default=0.0, help="share of the contacts decided on the preview (%(default)s)"
+    )
+    parser.add_argument(
+        "--verdict-delay", type=float, default=default.verdict_delay_s, help="seconds after it (%(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=default.seed, help="seed of all random draws (%(default)s)")
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
     """Run a mission and print its results."""
-    spec = MissionSpec(args.vehicles, args.hours, args.loss, args.burst, seed=args.seed)
+    spec = MissionSpec(
+        vehicles=args.vehicles,
+        hours=args.hours,
+        loss=args.loss,
+        burst_frames=args.burst,
+        contact_every_s=args.contact_every,
+        stream_bytes=args.stream_bytes,
+        verdict_share=args.verdict_share,
+        verdict_delay_s=args.verdict_delay,
+        seed=args.seed,
+    )
     result = run_mission(spec)
     print(f"{'':12} {'offered':>8} {'arrived':>8} {'median s':>9} {'longest s':>10}")
     for name, traffic in (*result.messages.items(), ("previews", result.previews), ("images", result.images)):
         print(_line(name, traffic))
+    airtime_s = result.frames_sent / RATES[_RATE].frames * RATES[_RATE].airtime_s
+    print(f"{airtime_s:.0f} s of air time for frames of the vehicles; {result.stopped} images stopped by a verdict")
     print(f"{result.frames_sent} frames sent, {result.restarts} restarts, {result.expired} messages expired")
     print(f"{result.left} left; state {max(result.state_bytes) / 1000:.0f} kB at most")
     return 0

@@ -48,6 +48,8 @@ class UuvModemConfig(ModemServiceConfig):
         slot_s: TDMA: length of the slot.
         guard_s: TDMA: time at the end of the slot without transmission.
         mean_backoff_s: CSMA: mean of the random waits.
+        stop_on_decision: v1: whether a decision for `mine_like` or `not_mine_like` stops the rest of its image; a later
+            decision for `unsure` queues the rest again.
         queue_interval_s: Maximum time between two publications of the queue state.
         refine_consumers: v1: services that receive the commands refine, resend, expand and original.
         revisit_consumers: v1: services that receive the command revisit.
@@ -80,6 +82,7 @@ class UuvModemConfig(ModemServiceConfig):
     guard_s: Annotated[float, Field(ge=0, le=86400)] = 1.0
     mean_backoff_s: Annotated[float, Field(ge=0, le=86400)] = 10.0
     queue_interval_s: Annotated[float, Field(ge=0.05, le=3600)] = 5.0
+    stop_on_decision: bool = True
     refine_consumers: tuple[ConsumerName, ...] = ("compressor",)
     revisit_consumers: tuple[ConsumerName, ...] = ()
     decision_consumers: tuple[ConsumerName, ...] = ()

@@ -12,6 +12,7 @@ from sonarpost.link.downlink.messages import (
     DecisionMessage,
     DownlinkCommand,
     ExpandMessage,
+    MessageKind,
     OriginalMessage,
     RefineMessage,
     ResendMessage,
@@ -19,6 +20,7 @@ from sonarpost.link.downlink.messages import (
     image_of_number,
     pack,
     record_id_of,
+    unpack,
 )
 from sonarpost.link.state import from_plain
 from sonarpost.messages import Command, CommandKind, Decision
@@ -60,7 +62,7 @@ class ReceivedCommands:
     def accept(
         self, source: int, command: DownlinkCommand, image_id: str | None
     ) -> tuple[CommandOutcome, CommandRecord | None]:
-        """Return the outcome of a command, and its record if it is new and has a consumer.
+        """Return the outcome of a command, and its record if it is new and this vehicle executes it.
 
         Args:
             source: Address of the modem that sent it.
@@ -71,11 +73,24 @@ class ReceivedCommands:
         if name in self._known:
             return self._known[name], None
         received = self._record(source, command, image_id)
-        outcome = CommandOutcome.ACCEPTED if received.consumers else CommandOutcome.UNSUPPORTED
+        is_executed = bool(received.consumers) or self._is_executed_by_the_queue(command)
+        outcome = CommandOutcome.ACCEPTED if is_executed else CommandOutcome.UNSUPPORTED
         self._known[name] = outcome
         while len(self._known) > _MAX_KNOWN:
             del self._known[next(iter(self._known))]
-        return outcome, received if received.consumers else None
+        return outcome, received if is_executed else None
+
+    def _is_executed_by_the_queue(self, command: DownlinkCommand) -> bool:
+        return isinstance(command, DecisionMessage) and self._config.stop_on_decision
+
+    def is_latest_decision(self, decision: DecisionMessage) -> bool:
+        """Return whether no known decision on the same image was issued after this one: copies can arrive late."""
+        known = [unpack(content) for _, content in self._known if content[0] == MessageKind.DECISION]
+        return all(
+            other.issued_utc_s <= decision.issued_utc_s
+            for other in known
+            if isinstance(other, DecisionMessage) and other.number == decision.number
+        )
 
     def _record(self, source: int, command: DownlinkCommand, image_id: str | None) -> CommandRecord:
         record_id = record_id_of(source, command.token)

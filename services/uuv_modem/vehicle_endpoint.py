@@ -23,6 +23,7 @@ from sonarpost.link.downlink.messages import (
     CommandOutcome,
     ConfirmationMessage,
     DataMessage,
+    DecisionMessage,
     DownlinkCommand,
     RefineMessage,
     RevisitMessage,
@@ -308,11 +309,22 @@ class VehicleEndpoint:
             return
         self._effects.count("commands_received")
         log.info("Command received", extra=kv(source=source, key=received.key, outcome=outcome.name.lower()))
+        if isinstance(command, DecisionMessage) and self._config.stop_on_decision:
+            self._stop_or_resume(command, now)
         # If the queue has more of the image, it sends this itself, and the command reaches no other service.
         if isinstance(command, RefineMessage) and self.queue.refine(command.number, command.stream_bytes, now):
             return
         for consumer in received.consumers:
             self._effects.send(received.key, consumer, received.record, priority=_COMMAND_PRIORITY)
+
+    def _stop_or_resume(self, decision: DecisionMessage, now: float) -> None:
+        """Stop the image of a final verdict, and queue the rest of it again when the verdict is withdrawn."""
+        if not self._commands.is_latest_decision(decision):
+            return
+        if decision.is_final and self.queue.stop(decision.number):
+            self._effects.count("images_stopped")
+        elif not decision.is_final and self.queue.resume(decision.number, now):
+            self._effects.count("images_resumed")
 
     def _frame_rejected(self, event: FrameRejected) -> None:
         forged = self.authenticator is not None and event.reason.field == "tag"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from research.mission import MissionSpec, Traffic, run_mission
@@ -68,3 +70,14 @@ def test_same_specification_gives_the_same_result():
 def test_error_names_the_value_out_of_range(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         MissionSpec(**wrong)
+
+
+def test_verdicts_on_previews_save_air_time():
+    spec = MissionSpec(vehicles=1, hours=4.0, contact_every_s=120.0, stream_bytes=512)
+    everything = run_mission(spec)
+    result = run_mission(replace(spec, verdict_share=0.6))
+    assert result.stopped > 0.3 * everything.images.offered
+    assert result.frames_sent < 0.85 * everything.frames_sent
+    assert result.images.delivered == 1.0
+    assert result.previews.delivered == 1.0
+    assert result.left == 0

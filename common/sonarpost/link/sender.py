@@ -187,6 +187,18 @@ class ImageSender(ABC):
         """Send more of an image, up to a length of its stream (0: all); return False if the queue has no more of it."""
         return False
 
+    def stop(self, number: int) -> bool:
+        """Send nothing more of an image until a command requests it; return whether the image is stopped."""
+        return False
+
+    def resume(self, number: int, now: float) -> bool:
+        """Queue the rest of a stopped image; return whether there is a stopped image with this contact number."""
+        return False
+
+    def prioritise(self, number: int, now: float, *, first: bool) -> bool:
+        """Send the rest of an image before or after all others; return whether the queue has the image."""
+        return False
+
     @property
     def measured_loss(self) -> float | None:
         """Share of frames lost according to feedback, None while it is unknown."""

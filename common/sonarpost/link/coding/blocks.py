@@ -73,6 +73,7 @@ class OutgoingImage:
         goal: Bytes of the stream to send, if they were requested; 0 for the configured number.
         delivered: Ranges of the stream that all receivers have. A range from 0 on includes the record.
         announced: Whether the record was sent ahead of the image's group.
+        stopped: Whether nothing more of the image is sent until a command requests it.
     """
 
     number: ImageNumber
@@ -87,6 +88,7 @@ class OutgoingImage:
     goal: StreamPosition = field(default=0, metadata=PROGRESS)
     delivered: Ranges = field(default=(), metadata=PROGRESS)
     announced: bool = field(default=False, metadata=PROGRESS)
+    stopped: bool = field(default=False, metadata=PROGRESS)
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.stream) <= MAX_STREAM_BYTES or self.curve.shape != (len(self.stream) + 1,):
@@ -100,7 +102,9 @@ class OutgoingImage:
         self.sent = min(self.sent, len(self.stream))
 
     def goal_bytes(self, usual: int) -> int:
-        """Return how many bytes of the stream to send: `usual`, unless more were requested."""
+        """Return how many bytes of the stream to send: `usual`, unless more were requested or the image is stopped."""
+        if self.stopped:
+            return self.sent
         return min(len(self.stream), max(self.goal or usual, self.sent))
 
     @property

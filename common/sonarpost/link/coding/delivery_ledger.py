@@ -89,7 +89,8 @@ class FeedbackTracker:
             need = NEVER_RECEIVED
         block.reported = block.reported or need != NEVER_RECEIVED
         block.last_activity_s = now
-        block.missing[receiver] = block.source_symbols if need == NEVER_RECEIVED else need
+        # A count that is older than a reduction of the block can exceed the block.
+        block.missing[receiver] = min(need, block.source_symbols)
         if max(block.missing.get(known, block.source_symbols) for known in self.receivers) == 0:
             return True
         if need > 0:
@@ -108,7 +109,12 @@ def record_delivered(images: Mapping[int, OutgoingImage], done: Iterable[SendBlo
 
 
 def missing_start(image: OutgoingImage, config: SenderConfig, blocks: Sequence[SendBlock]) -> int | None:
-    """Return the first byte of an image that is neither delivered nor in a block, None if there is none."""
+    """Return the first byte of an image that is neither delivered nor in a block, None if there is none.
+
+    A stopped image has none.
+    """
+    if image.stopped:
+        return None
     covered: Ranges = image.delivered
     for block in blocks:
         for number, link, start, stop in block.spans:

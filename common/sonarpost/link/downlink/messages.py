@@ -164,6 +164,11 @@ class DecisionMessage(ImageCommandMessage):
         if self.verdict not in _VERDICTS:
             raise FrameError(_WHERE, "verdict", self.verdict, ", ".join(_VERDICTS))
 
+    @property
+    def is_final(self) -> bool:
+        """Whether the verdict stops the rest of the image; `unsure` queues it again."""
+        return self.verdict != "unsure"
+
 
 @dataclass(frozen=True, slots=True)
 class ConfirmationMessage:

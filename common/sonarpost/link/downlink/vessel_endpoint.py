@@ -13,8 +13,8 @@ from typing import Final
 from sonarpost.errors import FrameError
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.config import ReceiverConfig
-from sonarpost.link.downlink.commands import CommandTracker, PendingCommand
-from sonarpost.link.downlink.messages import ConfirmationMessage, DataMessage, unpack
+from sonarpost.link.downlink.commands import CommandState, CommandTracker, PendingCommand
+from sonarpost.link.downlink.messages import ConfirmationMessage, DataMessage, DecisionMessage, unpack
 from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments, segments_room
 from sonarpost.link.frames.v1.payload_objects import Feedback
@@ -192,9 +192,18 @@ class VesselEndpoint:
                     if isinstance(content, DataMessage):
                         messages.append(content.data)
                     elif isinstance(content, ConfirmationMessage):
-                        commands += self.commands.confirm(event.source, content.outcomes)
+                        confirmed = self.commands.confirm(event.source, content.outcomes)
+                        self._stop_decided_images(confirmed)
+                        commands += confirmed
                     # Other contents are commands of another vessel.
         return ReceivedContent(tuple(images), tuple(messages), tuple(commands), tuple(rejected))
+
+    def _stop_decided_images(self, confirmed: Sequence[PendingCommand]) -> None:
+        for command in confirmed:
+            if command.kind == "decision" and command.state is CommandState.CONFIRMED:
+                decision = unpack(command.message)
+                if isinstance(decision, DecisionMessage) and decision.is_final:
+                    self.v1.stop_image(command.address, decision.number)
 
     def due_address(self, now: float) -> int | None:
         """Return the modem address of the vehicle that something is due for, None for none."""

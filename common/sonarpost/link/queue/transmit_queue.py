@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
 from sonarpost.link.auth.authentication import FrameAuthenticator
-from sonarpost.link.coding.blocks import OutgoingImage
+from sonarpost.link.coding.blocks import OutgoingImage, SendBlock
 from sonarpost.link.coding.channel_capacity import LossChannel, RateSelector
 from sonarpost.link.coding.redundancy_plan import copies, quality_curve
 from sonarpost.link.config import QueueConfig, SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
+from sonarpost.link.frames.v1.frame import SymbolKind
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, Feedback, RefineRequest
-from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.frames.v1.sender import FIRST_URGENCY, LAST_URGENCY, V1Sender
 from sonarpost.link.queue.messages import FILLER_PRIORITY, MessageQueue
 from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket, RateNumber, SentImage
 from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
@@ -187,6 +188,18 @@ class TransmitQueue(ImageSender):
             return False
         return self.sender.refine(RefineRequest(number, goal), now)
 
+    def stop(self, number: int) -> bool:
+        """Send nothing more of an image; see `ImageSender.stop`."""
+        return self.sender.stop(number)
+
+    def resume(self, number: int, now: float) -> bool:
+        """Queue the rest of a stopped image; see `ImageSender.resume`."""
+        return self.sender.resume(number, now)
+
+    def prioritise(self, number: int, now: float, *, first: bool) -> bool:
+        """Send the rest of an image before or after all others; see `ImageSender.prioritise`."""
+        return self.sender.prioritise(number, now, first=first)
+
     def add_message(
         self, message_id: str, source: str, data: bytes, now: float, *, priority: int = 4, lifetime_s: float = 3600.0
     ) -> bool:
@@ -294,7 +307,12 @@ class TransmitQueue(ImageSender):
     def open_numbers(self) -> set[int]:
         """Return the contact numbers of the images of which something is still to be sent."""
         waiting = {image.number for image in self.sender.waiting}
-        return waiting | {n for block in self.sender.blocks if block.left > 0 for n in block.contacts}
+        return waiting | {n for block in self.sender.blocks if block.left > 0 for n in self._live_contacts(block)}
+
+    def _live_contacts(self, block: SendBlock) -> list[int]:
+        """Return the contact numbers of a block without those of stopped images, which it still holds."""
+        kept = self.sender.kept
+        return [n for n in block.contacts if n not in kept or not kept[n].stopped]
 
     def expected(self, now: float) -> list[ExpectedDelivery]:
         """Return when each image is expected to be sent, the first to end first.
@@ -314,10 +332,18 @@ class TransmitQueue(ImageSender):
             previews[image.number] = now + ahead * frame_s
         open_blocks = [b for b in self.sender.blocks if b.left > 0]
         for block in open_blocks:
-            for number in block.contacts:
-                frames_of[number] += block.left / len(block.contacts)
-        total = ahead + sum(b.left for b in open_blocks)
-        done = dict.fromkeys(frames_of, now + total * frame_s)
+            live = self._live_contacts(block)
+            for number in live:
+                frames_of[number] += block.left / len(live)
+        total = ahead
+        done: dict[int, float] = {}
+        for first, last in ((True, False), (False, False), (False, True)):
+            level = [b for b in open_blocks if (b.urgency == FIRST_URGENCY, b.urgency == LAST_URGENCY) == (first, last)]
+            total += sum(b.left for b in level)
+            for block in sorted(level, key=lambda b: b.kind != SymbolKind.PREVIEW):
+                is_preview = block.kind == SymbolKind.PREVIEW
+                ends = dict.fromkeys(block.contacts, now + total * frame_s)
+                done = {**ends, **done} if is_preview else {**done, **ends}
         announced = {image.number for image in self.sender.waiting if image.announced}
         for image in self.sender.waiting:
             frames_of[image.number] = self._planned_frames(len(image.stream))

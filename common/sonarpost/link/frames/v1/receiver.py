@@ -60,6 +60,7 @@ class AssembledImage:
         version: Of the last update, 0 before the first.
         reported: Bytes before the first gap, and completeness, at the last update.
         order: Rises with every frame that contributes to an image of this source.
+        stopped: Whether the vehicle has confirmed that it sends nothing more of it; until more arrives.
     """
 
     source: int
@@ -73,6 +74,7 @@ class AssembledImage:
     version: Count = 0
     reported: tuple[int, bool] = (-1, False)
     order: Count = 0
+    stopped: bool = False
 
     def belongs(self, preview: Preview) -> bool:
         """Whether a preview is of this contact, and not of another one with the same number."""
@@ -89,6 +91,7 @@ class AssembledImage:
 
     def add_piece(self, piece: StreamPiece, now: float, *, final: bool) -> None:
         """Add a piece of the stream that has the link of this contact."""
+        self.stopped = self.stopped and not piece.data
         self.stream.write(piece.start, piece.data)
         if final:
             self.end = max(self.end, piece.stop)
@@ -258,7 +261,8 @@ class PeerState:
             del self.images[without_record[0]]
         while len(self.images) >= config.max_contacts:
             # Complete ones first: the others hold bytes of complete blocks, which the sender does not repeat.
-            complete = next((n for n, i in self.images.items() if i.contact is not None and i.complete), None)
+            ended = (n for n, i in self.images.items() if i.contact is not None and (i.complete or i.stopped))
+            complete = next(ended, None)
             del self.images[next(iter(self.images)) if complete is None else complete]
         image = self.images[number] = AssembledImage(self.address, number, now, now)
         return image
@@ -459,7 +463,14 @@ class V1Receiver:
     @property
     def incomplete_images(self) -> int:
         """Number of known images of which not everything has arrived that their senders have planned so far."""
-        return sum(not image.complete for peer in self._sources.values() for image in peer.images.values())
+        images = [image for peer in self._sources.values() for image in peer.images.values()]
+        return sum(not (image.complete or image.stopped) for image in images)
+
+    def stop_image(self, source: int, number: int) -> None:
+        """Treat an image as ended at what has arrived, because its sender has confirmed to send no more of it."""
+        peer = self._sources.get(source)
+        if peer is not None and number in peer.images:
+            peer.images[number].stopped = True
 
     def repeat_updates(self, since_s: float) -> list[ImageUpdate]:
         """Return the content of all images that received a frame at `since_s` or later, as their next version."""

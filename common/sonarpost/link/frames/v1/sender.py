@@ -12,6 +12,7 @@ from typing import Annotated, Final
 
 from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.coding.block_reduction import reduced_block
 from sonarpost.link.coding.blocks import (
     BlockBuilder,
     OutgoingImage,
@@ -59,6 +60,10 @@ _MAX_SYMBOL_FACTOR: Final = 4
 _NO_FEEDBACK_CAUTION: Final = -2.5
 """Argument `caution` of `symbols_to_send` for a block without feedback: 2.5 standard deviations above the average."""
 _ANY_PRIORITY: Final = -(2**31)
+FIRST_URGENCY: Final = 1e3
+"""Urgency of the blocks of an image that a command has moved to the front."""
+LAST_URGENCY: Final = 1e-3
+"""Urgency of the blocks of an image that a command has moved to the end."""
 
 
 @dataclass(eq=False)
@@ -273,7 +278,8 @@ class V1Sender:
             image.added_s = min(image.added_s, now)  # later only after the clock was set back
         while self.waiting:
             limit = group_limit(self.config, symbol_bytes)
-            due = len(self.waiting) >= limit or now - self.waiting[0].added_s >= self.config.group_delay_s
+            oldest_s = min(image.added_s for image in self.waiting)
+            due = len(self.waiting) >= limit or now - oldest_s >= self.config.group_delay_s
             group = self.waiting[:limit]
             if not due or not self._may_begin(group):
                 return
@@ -284,7 +290,9 @@ class V1Sender:
 
     def _may_begin(self, group: Sequence[OutgoingImage]) -> bool:
         previews = sum(1 for b in self.blocks if b.kind == SymbolKind.PREVIEW and b.left > 0)
-        details = sum(1 for b in self.blocks if b.kind != SymbolKind.PREVIEW and b.left > 0)
+        details = sum(
+            1 for b in self.blocks if b.kind != SymbolKind.PREVIEW and b.left > 0 and b.urgency != LAST_URGENCY
+        )
         if max(previews, details) >= self.config.depth:
             return False
         # A group that does not even fit an empty window need not wait.
@@ -391,10 +399,7 @@ class V1Sender:
         open_blocks = [b for b in self.blocks if b.left > 0 and b.symbol_bytes <= max_bytes]
         if not open_blocks:
             return None
-        # Requested symbols complete something, so they precede the others; the oldest block goes first.
-        block = min(
-            open_blocks, key=lambda b: (not b.is_fresh_preview, not b.reported, 0.0 if b.reported else b.progress)
-        )
+        block = min(open_blocks, key=_order_of_sending)
         symbol = block.next_symbol()
         if block.left <= 0 and not self.config.feedback:
             self._retire(block)
@@ -453,6 +458,7 @@ class V1Sender:
         self._resume_retired(feedback)
         self.blocks, done = self.state.tracker.apply(feedback, self.blocks, self.config, now, receiver)
         record_delivered(self.kept, done)
+        self._drop_stopped()
 
     def _resume_retired(self, feedback: Feedback) -> None:
         """Continue blocks that were sent before the first feedback, if a receiver has some of their symbols."""
@@ -470,6 +476,7 @@ class V1Sender:
         image = self.kept.get(request.number)
         if image is None:
             raise FrameError("acoustic link v1", "contact number", request.number, "a contact that was sent recently")
+        image.stopped = False
         image.goal = max(image.goal, image.sent, min(request.stream_bytes, len(image.stream)))
         if any(waiting.number == image.number for waiting in self.waiting):
             return True
@@ -479,6 +486,74 @@ class V1Sender:
                 block.planned = self._planned_without_feedback(block)
         self.blocks += made
         return bool(made)
+
+    def stop(self, number: int) -> bool:
+        """Send nothing more of an image until a command requests it; return whether the image is kept.
+
+        Blocks that other images share are sent on without it where that ends sooner.
+        """
+        image = self.kept.get(number)
+        if image is None:
+            return False
+        image.stopped = True
+        self.waiting = [other for other in self.waiting if other.number != number]
+        self._drop_stopped()
+        return True
+
+    def resume(self, number: int, now: float) -> bool:
+        """Queue the rest of a stopped image; return False if the image is not stopped."""
+        image = self.kept.get(number)
+        if image is None or not image.stopped:
+            return False
+        image.stopped = False
+        if image.sent:
+            self.refine(RefineRequest(number, image.goal_bytes(self.config.stream_bytes)), now)
+        else:
+            self.waiting.append(image)
+        return True
+
+    def prioritise(self, number: int, now: float, *, first: bool) -> bool:
+        """Send the rest of an image before or after everything else; return whether the image is kept.
+
+        An image that shares a block continues in a block of its own, if that ends sooner than the shared one.
+        """
+        image = self.kept.get(number)
+        if image is None:
+            return False
+        self.resume(number, now)
+        has_numbers = self._free_numbers() >= numbers_needed([image], self.config, self.symbol_bytes)
+        if image in self.waiting:
+            self.waiting.remove(image)
+            if first and has_numbers:
+                self.blocks += self._builder(now).group([image])
+            else:
+                self.waiting.insert(0 if first else len(self.waiting), image)
+        elif has_numbers and self._leave_shared_blocks({number}):
+            self.refine(RefineRequest(number, image.goal_bytes(self.config.stream_bytes)), now)
+        for block in self.blocks:
+            if number in block.contacts and block.kind != SymbolKind.PREVIEW:
+                block.urgency = FIRST_URGENCY if first else LAST_URGENCY
+        return True
+
+    def _drop_stopped(self) -> None:
+        """Leave out stopped images from the blocks that are being sent."""
+        stopped = {number for number, image in self.kept.items() if image.stopped}
+        if stopped:
+            self._reduce_blocks(self.blocks, stopped)
+
+    def _leave_shared_blocks(self, numbers: set[int]) -> bool:
+        """Leave out images from the blocks that they share with others; return whether there was such a block."""
+        return self._reduce_blocks([b for b in self.blocks if not numbers.issuperset(b.contacts)], numbers)
+
+    def _reduce_blocks(self, blocks: Sequence[SendBlock], dropped: set[int]) -> bool:
+        reduced = {block.number: made for block in blocks if (made := reduced_block(block, dropped, self.config.worst))}
+        for block in [b for b in blocks if b.number in reduced]:
+            for number, link, start, _ in block.spans:
+                image = self.kept.get(number)
+                if number in dropped and image is not None and image.link == link:
+                    image.sent = min(image.sent, start)
+        self.blocks = [reduced.get(block.number, block) for block in self.blocks]
+        return bool(reduced)
 
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`."""
@@ -517,3 +592,17 @@ class V1Sender:
         self.retired = [block for block in blocks if block.retired]
         self.state, self.may_repair = state, True
         return reader.errors
+
+
+def _order_of_sending(block: SendBlock) -> tuple[bool, bool, bool, bool, float]:
+    """Return the sort key of a block: the smallest goes next, of equal ones the oldest.
+
+    Requested symbols complete something, so they precede the others.
+    """
+    return (
+        block.urgency == LAST_URGENCY,
+        not block.is_fresh_preview,
+        block.urgency != FIRST_URGENCY,
+        not block.reported,
+        0.0 if block.reported else block.progress,
+    )

@@ -1,0 +1,180 @@
+"""A verdict stops the rest of an image: the vehicle's and the vessel's endpoints with a channel between them."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+from builders.records import encoded_image
+
+from sonarpost.config import PlatformConfig
+from sonarpost.delivery.store import Store
+from sonarpost.link.downlink.commands import CommandState
+from sonarpost.messages import Decision, Verdict
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.vessel_endpoint import VesselLink
+from sonarpost.services.uuv_modem.config import UuvModemConfig
+from sonarpost.services.uuv_modem.vehicle_endpoint import VehicleEndpoint
+
+PACKET_S = 6.1
+STREAM_BYTES = 600
+
+
+class Link:
+    """Both ends of a channel without loss, and a clock. The vessel sends after each packet of the vehicle."""
+
+    def __init__(self, store: Store, **config: object) -> None:
+        self.store = store
+        self.config = UuvModemConfig(port="unused", group_delay_s=0.0, stream_bytes=STREAM_BYTES, **config)
+        self.vehicle = VehicleEndpoint(PlatformConfig(id="uuv-1"), self.config, store)
+        self.vessel = VesselLink("vessel-1", OpModemConfig(port="unused", vehicles={"3": "uuv-1"}))
+        self.now = 1e9
+        self.received: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()
+
+    def add(self, *numbers: int) -> None:
+        with self.vehicle.step():
+            self.vehicle.queue.sender.expect_feedback(expected=True)
+            for number in numbers:
+                self.vehicle.add(encoded_image(number, STREAM_BYTES), self.now)
+
+    def decide(self, number: int, verdict: Verdict, issued_s: float | None = None) -> str:
+        decision = Decision(
+            decision_id=f"d-{self.now}-{number}-{verdict}",
+            vessel_id="vessel-1",
+            vehicle_id="uuv-1",
+            image_id=f"{number:04}",
+            image_version=1,
+            verdict=verdict,
+            operator="op",
+            decided_utc_s=self.now if issued_s is None else issued_s,
+        )
+        command = self.vessel.add(decision, self.now)
+        assert command is not None
+        return decision.decision_id
+
+    def run(self, packets: int) -> int:
+        """Exchange packets, at most so many of the vehicle; return how many it sent."""
+        sent = 0
+        for _ in range(packets):
+            self.now += PACKET_S
+            with self.vehicle.step():
+                packet = self.vehicle.next_packet(self.now)
+                if packet is not None:
+                    self.vehicle.packet_sent(packet.frames, PACKET_S)
+                    sent += 1
+            for frame in packet.frames if packet else ():
+                for image in self.vessel.endpoint.accept(3, frame, self.now).images:
+                    self.received[image.image_id] = len(image.stream)
+            answer = self.vessel.endpoint.next_packet(3, 32, self.now)
+            if answer is not None:
+                self.vessel.endpoint.sent(answer, self.now)
+                with self.vehicle.step():
+                    for frame in answer.frames:
+                        self.vehicle.receive(1, frame, self.now)
+            with self.vehicle.step():
+                effects = self.vehicle.take_changes()
+            self.counts.update(effects.counts)
+            with self.store.transaction() as tx:
+                effects.write(tx)
+        return sent
+
+    def run_until_previewed(self, images: int) -> None:
+        for _ in range(50):
+            self.run(1)
+            if len(self.received) == images:
+                return
+        pytest.fail("no previews")
+
+    def state_of(self, record_id: str) -> CommandState:
+        command = self.vessel.commands.find("decision", record_id)
+        assert command is not None
+        return command.state
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = Store(tmp_path / "uuv_modem.db")
+    yield store
+    store.close()
+
+
+def test_final_verdicts_stop_their_images_and_are_confirmed(store):
+    link = Link(store)
+    link.add(1, 2, 3)
+    link.run_until_previewed(3)
+    decisions = [link.decide(1, "not_mine_like"), link.decide(2, "mine_like"), link.decide(3, "unsure")]
+    link.run(60)
+    assert [link.state_of(each) for each in decisions] == [CommandState.CONFIRMED] * 3
+    assert link.counts["images_stopped"] == 2
+    assert link.received["0001"] < 200
+    assert link.received["0002"] < 200
+    assert link.received["0003"] == STREAM_BYTES
+    assert link.vessel.endpoint.incomplete_images == 0
+    assert link.vessel.endpoint.feedback_open == 0
+    with link.vehicle.step():
+        assert link.vehicle.queue_state(link.now).images == ()
+
+
+def test_vessel_does_not_wait_for_a_stopped_image_of_a_group_of_its_own(store):
+    link = Link(store)
+    link.add(1)
+    link.run_until_previewed(1)
+    link.decide(1, "not_mine_like")
+    link.run(60)
+    assert link.received["0001"] < 200
+    assert link.vessel.endpoint.incomplete_images == 0
+    assert link.vessel.endpoint.feedback_open == 0
+    assert link.run(100) == 0
+
+
+def test_withdrawn_verdict_queues_the_rest_again(store):
+    link = Link(store)
+    link.add(1, 2)
+    link.run_until_previewed(2)
+    link.decide(1, "not_mine_like")
+    link.run(40)
+    assert link.received["0001"] < 200
+    link.decide(1, "unsure")
+    link.run(60)
+    assert link.counts["images_resumed"] == 1
+    assert link.received["0001"] == STREAM_BYTES
+    assert link.vessel.endpoint.incomplete_images == 0
+
+
+def test_late_copy_of_a_withdrawn_verdict_stops_nothing(store):
+    link = Link(store)
+    link.add(1, 2)
+    link.run_until_previewed(2)
+    link.decide(1, "unsure")
+    link.run(2)
+    link.decide(1, "not_mine_like", issued_s=link.now - 600.0)
+    link.run(60)
+    assert link.counts["images_stopped"] == 0
+    assert link.received["0001"] == STREAM_BYTES
+
+
+def test_option_switches_the_stop_off(store):
+    link = Link(store, stop_on_decision=False)
+    link.add(1)
+    link.run_until_previewed(1)
+    decision = link.decide(1, "not_mine_like")
+    link.run(60)
+    assert link.state_of(decision) is CommandState.REFUSED
+    assert link.received["0001"] == STREAM_BYTES
+
+
+def test_stop_survives_a_restart(store):
+    link = Link(store)
+    link.add(1, 2)
+    link.run_until_previewed(2)
+    link.decide(1, "not_mine_like")
+    link.run(3)
+    link.vehicle = VehicleEndpoint(PlatformConfig(id="uuv-1"), link.config, store)
+    parts = link.vessel.parts()
+    link.vessel = VesselLink("vessel-1", OpModemConfig(port="unused", vehicles={"3": "uuv-1"}))
+    assert not link.vessel.restore(parts)
+    link.run(60)
+    assert link.received["0001"] < 200
+    assert link.received["0002"] == STREAM_BYTES
+    assert link.vessel.endpoint.incomplete_images == 0
