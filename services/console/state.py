@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 import time
 from collections.abc import Callable, Sequence
@@ -11,12 +10,12 @@ from dataclasses import asdict, dataclass
 from sonarpost import wire
 from sonarpost.messages import Advice, Command, CommandKind, Decision, DownlinkState, ReconstructedImage, TaskingState
 from sonarpost.review.costs import NEW_IMAGE_KINDS, RequestCost, request_cost
-from sonarpost.review.measurement import Line, measure_line
+from sonarpost.review.measurement import Line, measure_line, summary
 from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.events import EventHub
 from sonarpost.services.console.fleet import FleetMonitor, fleet_json
-from sonarpost.services.console.store import contacts, decisions, request_results, requests
+from sonarpost.services.console.store import contacts, decisions, measurements, request_results, requests
 from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter, NotFoundError
 from sonarpost.services.console.store.database import (
     ID_COLUMN,
@@ -25,11 +24,10 @@ from sonarpost.services.console.store.database import (
     Database,
     DisplayedImage,
     Table,
-    add_audit_entry,
     find_record,
-    insert_row,
 )
 from sonarpost.services.console.store.decisions import DecisionInput, DeliveryStates
+from sonarpost.services.console.store.measurements import NOT_WITHDRAWN
 from sonarpost.services.console.store.related_images import related_images_json
 from sonarpost.services.console.store.retention import remove_images
 from sonarpost.services.console.store.serialisers import (
@@ -241,9 +239,7 @@ class ConsoleState:
             looks: object = []
             if contact["group"] is not None:
                 looks = contacts.list_contacts(db, ContactFilter(group=str(contact["group"])))["items"]
-            measurements = db.execute(
-                "SELECT id, body FROM measurement WHERE contact_id = ? ORDER BY id", (contact_id,)
-            )
+            measured = measurements.list_measurements(db, contact_id)
             audit = db.execute("SELECT * FROM audit WHERE contact_id = ? ORDER BY seq", (contact_id,))
             refine_base = contacts.find_contact(db, contact_id)["refine_base"]
             return {
@@ -254,7 +250,8 @@ class ConsoleState:
                 "decisions": list_records(db, "decision", contact_id),
                 "advice": list_records(db, "advice", contact_id),
                 "requests": list_records(db, "request", contact_id),
-                "measurements": [{**json.loads(row["body"]), "id": row["id"]} for row in measurements],
+                "measurements": measured,
+                "size": summary(measured),
                 "group": looks,
                 "audit": [audit_json(row) for row in audit],
                 "costs": self.request_costs(contact_id),
@@ -433,13 +430,22 @@ class ConsoleState:
         now = self.clock()
         body = {**measure_line(image, line), "user": actor.user, "utc_s": now}
         if not keep:
-            return {"id": None, **body}
+            return {"id": None, **body, **NOT_WITHDRAWN}
+        displayed = DisplayedImage(line.version, image.picture_sha256, line.layer)
         with self.database.transaction() as db:
-            row = {"contact_id": contact_id, "utc_s": now, "body": json.dumps(body)}
-            measurement_id = insert_row(db, "measurement", row)
-            displayed = DisplayedImage(line.version, image.picture_sha256, line.layer)
-            add_audit_entry(db, contact_id, actor, "measure", now, displayed, body)
-        return {"id": measurement_id, **body}
+            measurement_id = measurements.add_measurement(db, contact_id, body, displayed, actor, now)
+        return {"id": measurement_id, **body, **NOT_WITHDRAWN}
+
+    def withdraw_measurement(self, contact_id: str, measurement_id: int, actor: Actor) -> Json:
+        """Withdraw a stored measurement; return it.
+
+        Raises:
+            NotFoundError: The contact has no such measurement, or it is withdrawn.
+        """
+        if measurement_id >= 2**31:  # larger numbers exceed the integers of SQLite
+            raise NotFoundError("measurement", "id", measurement_id, f"a measurement of {contact_id}")
+        with self.database.transaction() as db:
+            return measurements.withdraw_measurement(db, contact_id, measurement_id, actor, self.clock())
 
     # Sending
 

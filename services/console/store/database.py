@@ -98,7 +98,8 @@ CREATE TABLE IF NOT EXISTS advice (
 CREATE INDEX IF NOT EXISTS advice_contact ON advice (contact_id, seq);
 CREATE INDEX IF NOT EXISTS advice_unsent ON advice (seq) WHERE sent = 0;
 CREATE TABLE IF NOT EXISTS measurement (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, contact_id TEXT NOT NULL, utc_s REAL NOT NULL, body TEXT NOT NULL);
+    id INTEGER PRIMARY KEY AUTOINCREMENT, contact_id TEXT NOT NULL, utc_s REAL NOT NULL, body TEXT NOT NULL,
+    withdrawn_by TEXT, withdrawn_utc_s REAL);
 CREATE INDEX IF NOT EXISTS measurement_contact ON measurement (contact_id, id);
 CREATE TABLE IF NOT EXISTS audit (
     seq INTEGER PRIMARY KEY AUTOINCREMENT, contact_id TEXT NOT NULL, utc_s REAL NOT NULL, user TEXT NOT NULL,
@@ -131,6 +132,7 @@ _ADDED_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
         "relation": "TEXT",
     },
     "version": {"removed": "INTEGER NOT NULL DEFAULT 0"},
+    "measurement": {"withdrawn_by": "TEXT", "withdrawn_utc_s": "REAL"},
     "decision": {"send_after_utc_s": "REAL", "overrules": "TEXT NOT NULL DEFAULT '[]'"},
     "request": {
         "base_version": "INTEGER",

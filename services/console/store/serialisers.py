@@ -11,6 +11,8 @@ from typing import Final, Literal
 from sonarpost import wire
 from sonarpost.messages import ReconstructedImage
 from sonarpost.review.costs import airtime_of_frames, least_airtime_s
+from sonarpost.review.edge_blur import edge_sigma_px
+from sonarpost.review.image_geometry import contact_box, contact_mark, range_axis
 from sonarpost.review.rendering import LAYERS
 from sonarpost.review.resolution import CODEBOOK_CODECS, sharp_to_m
 from sonarpost.services.console.store.database import Table
@@ -176,6 +178,7 @@ def version_json(row: sqlite3.Row, refine_base: int | None = None) -> Json:
     image = decode_image(row)
     contact = image.contact
     percent = percent_received(image) if image.complete or image.bytes_total else None
+    size = image.picture.height_px, image.picture.width_px
     return {
         **{name: getattr(image, name) for name in _VERSION_FIELDS.split()},
         "received_utc_s": row["received_utc_s"],
@@ -197,10 +200,20 @@ def version_json(row: sqlite3.Row, refine_base: int | None = None) -> Json:
         **_airtime(image, row["rate"]),
         "pixel_along_m": contact.pixel_along_m if contact else None,
         "pixel_across_m": contact.pixel_across_m if contact else None,
+        "range_axis": range_axis(contact),
+        **_mark_json(image),
+        "edge_sigma_px": edge_sigma_px(image.codec, image.bytes_received, size[0] * size[1]) if image.codec else None,
         "notes": list(image.notes),
         "texture": "codebook" if image.codec in CODEBOOK_CODECS else None,
         "layers": [asdict(layer) for layer in LAYERS],
     }
+
+
+def _mark_json(image: ReconstructedImage) -> Json:
+    """Return the place of the contact in an image, and the box that contains it; null where unknown."""
+    size = image.picture.height_px, image.picture.width_px
+    mark, box = contact_mark(image.contact, *size), contact_box(image.contact, *size)
+    return {"mark": None if mark is None else asdict(mark), "box": None if box is None else asdict(box)}
 
 
 def contact_record_json(image: ReconstructedImage) -> Json | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -202,7 +203,7 @@ def cut_snippet(survey: Survey, target: TruthObject, look: int = 0, scale: int =
         scale: Ground per pixel in units of the survey's; pixels are means.
     """
     height, width = scale * HEIGHT_PX, scale * WIDTH_PX
-    centre = min(max(target.ping + 7 * look, height // 2), len(survey.pings) - height // 2)
+    centre = min(max(target.ping + 2 * look, height // 2), len(survey.pings) - height // 2)
     middle = target.sample_index - WIDTH_PX // 3 + WIDTH_PX // 2
     rows = []
     for ping in survey.pings[centre - height // 2 : centre + height // 2]:
@@ -223,7 +224,8 @@ def _contact(survey: Survey, target: TruthObject, vehicle: str, draws: random.Ra
     confidence = draws.gauss(1.35 if target.is_mine_like else 0.8, 0.3)
     shadow_m = None
     if ping.altitude_m is not None and ping.altitude_m > target.height_m:
-        shadow_m = target.height_m * target.ground_range_m / (ping.altitude_m - target.height_m)
+        slant_m = math.hypot(target.ground_range_m, ping.altitude_m)
+        shadow_m = target.height_m * slant_m / (ping.altitude_m - target.height_m)
     return Contact(
         contact_id=f"training-{number}",
         vehicle_id=vehicle,

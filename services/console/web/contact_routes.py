@@ -87,6 +87,7 @@ class ContactRoutes:
             Route(version + "/mask.png", read(self._mask)),
             Route(version + "/thumbnail.png", read(self._thumbnail)),
             write(contact + "/measure", self._measure, "measure"),
+            write(contact + "/measure/{measurement:int}/withdraw", self._withdraw_measurement, "measure"),
             write(contact + "/requests", self._add_request, "request"),
             write(contact + "/advice", self._add_advice, "advise"),
         ]
@@ -144,6 +145,11 @@ class ContactRoutes:
         body = call.parse_body(_MeasureBody)
         line = Line(body.version, body.layer, body.kind, body.start, body.to)
         return JSONResponse(self._state.measure(contact_id(call), line, call.actor, keep=body.keep))
+
+    def _withdraw_measurement(self, call: Call) -> Response:
+        call.parse_body(RequestBody)
+        measurement_id = int(call.request.path_params["measurement"])
+        return JSONResponse(self._state.withdraw_measurement(contact_id(call), measurement_id, call.actor))
 
     def _add_request(self, call: Call) -> Response:
         body = call.parse_body(_RequestBody)

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import io
 import math
+import sqlite3
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from builders.console import image_record
 from PIL import Image
 
+from sonarpost.detection.snippets import cut_snippet
 from sonarpost.messages import Contact
 from sonarpost.review import rendering
+from sonarpost.review.image_geometry import contact_box, contact_mark, range_axis
 from sonarpost.review.measurement import NotMeasurableError, height_from_shadow, measure_length
+from sonarpost.services.console.store.database import Database
+from sonarpost.services.console.store.measurements import list_measurements
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.survey import Side
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 VERSION = f"/api/contacts/{ID}/versions/1"
@@ -105,7 +113,9 @@ def test_height_from_shadow_with_uncertainty(anna):
     assert found["value_m"] == pytest.approx(2.0)
     assert found["height_m"] == pytest.approx(2.0 * 5 / 15)
     assert found["height_inputs"] == {"shadow_m": 2.0, "altitude_m": 5.0, "slant_range_m": 13.0}
-    assert 0 < found["sigma_m"] < 0.1
+    assert found["metres"] == "slant"
+    # 40 x 60 px of 200 bytes; clicks, blur and 2.5 % of the pixel size.
+    assert found["sigma_m"] == pytest.approx(math.hypot(0.05 * math.sqrt(2) * math.hypot(0.7, 0.58), 0.05), rel=0.01)
     assert 0 < found["height_sigma_m"] < 0.1
     assert found["id"] is None
     assert anna.contact(ID)["measurements"] == []
@@ -124,7 +134,7 @@ def test_stored_measurement_is_in_the_audit(anna):
     ("changes", "field"),
     [
         ({"layer": "enhanced"}, "layer"),
-        ({"to": [38.0, 50.0]}, "line"),
+        ({"kind": "length", "to": [38.0, 50.0]}, "line"),
         ({"to": [10.0, 10.0]}, "to"),
         ({"to": [10.0, 60.5]}, "to"),
         ({"layer": "grain"}, "layer"),
@@ -154,16 +164,137 @@ def test_height_needs_altitude_and_range():
     assert slant == ground
 
 
+FAR = {"contact_id": "c", "vehicle_id": "v", "pixel_along_m": 0.1, "pixel_across_m": 0.05, "channel": "port"}
+
+
 def test_length_uncertainty_equals_a_monte_carlo_simulation():
-    contact = Contact(contact_id="c", vehicle_id="v", pixel_along_m=0.1, pixel_across_m=0.05)
+    contact = Contact(**FAR, altitude_m=5.0, ground_range_m=12.0)
     missing = np.zeros((200, 200), np.bool_)
-    length = measure_length(contact, missing, (50, 50), (90, 130))
+    length = measure_length(contact, missing, (50, 50), (90, 130), 2.0)
     rng = np.random.default_rng(1)
-    clicks = rng.normal(0, 0.7, (20_000, 4))
-    scale = rng.normal(1, 0.025, 20_000)
-    lengths = scale * np.hypot((40 + clicks[:, 0] - clicks[:, 1]) * 0.1, (80 + clicks[:, 2] - clicks[:, 3]) * 0.05)
-    assert length.sigma_m == pytest.approx(lengths.std(), rel=0.05)
+    count = 40_000
+    ends = np.array([50, 50, 90, 130]) + rng.normal(0, math.hypot(0.7, 2.0), (count, 4))
+    scale = rng.normal(1, 0.025, count)
+    altitude_m = rng.normal(5.0, 0.25, count)
+    # The contact is between columns 50 and 100, at slant range 13 m.
+    offset_m = rng.normal(0, math.hypot(50 * 0.05, 0.1) / math.sqrt(12), count)
+    slant_m = (13.0 + offset_m)[:, None] + scale[:, None] * (ends[:, 1::2] - 75.5) * 0.05
+    across_m = np.diff(np.sqrt(slant_m**2 - altitude_m[:, None] ** 2), axis=1)[:, 0]
+    lengths = np.hypot(scale * (ends[:, 2] - ends[:, 0]) * 0.1, across_m)
+    assert length.metres == "ground"
+    assert length.value_m == pytest.approx(lengths.mean(), rel=0.02)
+    assert length.sigma_m == pytest.approx(lengths.std(), rel=0.1)
     assert math.hypot(length.along_m, length.across_m) == pytest.approx(length.value_m)
+
+
+def test_across_track_length_is_converted_to_the_ground():
+    missing = np.zeros((40, 60), np.bool_)
+    # Slant range 5 m at 4 m of altitude: 0.05 m of slant range are about 0.083 m of ground range.
+    near = Contact(**FAR, altitude_m=4.0, ground_range_m=3.0)
+    column = contact_mark(near, 40, 60).column
+    length = measure_length(near, missing, (20, column), (20, column + 20))
+    assert length.value_m == pytest.approx(math.sqrt(6.0**2 - 4.0**2) - 3.0)
+    along = measure_length(near, missing, (10, 20), (30, 20))
+    assert (along.value_m, along.range_sigma_m) == (pytest.approx(2.0), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "metres", "range_sigma_m"),
+    [
+        ({}, "slant", 0.2),
+        ({"altitude_m": 4.0}, "slant", 0.2),
+        # In the water column: at slant range 4.1 m, nearer than 1.05 x (4 + 0.25) m.
+        ({"altitude_m": 4.0, "slant_range_m": 4.1}, "slant", 0.2),
+        ({"channel": None}, "unknown", 0.2),
+    ],
+)
+def test_length_that_is_not_converted_has_a_larger_uncertainty(changes, metres, range_sigma_m):
+    missing = np.zeros((40, 60), np.bool_)
+    length = measure_length(Contact(**{**FAR, **changes}), missing, (20, 20), (20, 40))
+    assert (length.value_m, length.metres) == (pytest.approx(1.0), metres)
+    assert length.range_sigma_m == pytest.approx(range_sigma_m)
+
+
+def test_range_of_square_pixels_is_unknown():
+    missing = np.zeros((40, 60), np.bool_)
+    square = Contact(**{**FAR, "pixel_along_m": 0.05}, altitude_m=5.0, ground_range_m=12.0)
+    assert (range_axis(square), range_axis(Contact(**FAR)), range_axis(None)) == (None, "slant", None)
+    length = measure_length(square, missing, (20, 20), (20, 40))
+    ground = measure_length(Contact(**FAR, altitude_m=5.0, ground_range_m=12.0), missing, (20, 20), (20, 40))
+    assert length.value_m == pytest.approx(1.0)
+    assert length.range_sigma_m == pytest.approx(ground.value_m - 1.0)
+    height = height_from_shadow(square, measure_length(square, missing, (20, 20), (20, 40), to_ground=False))
+    assert height.sigma_m > 1.0 * 5 / (12 + 1) - 1.0 * 5 / (13 + 1)
+
+
+def test_shadow_lies_across_the_track(anna):
+    found = measure(anna, to=[14.0, 50.0]).json()
+    assert (found["to"], found["along_m"]) == ([10.0, 50.0], 0.0)
+
+
+@pytest.mark.parametrize("range_m", [1.0, 2.0, 6.0, 20.0])
+@pytest.mark.parametrize("shadow_samples", [0, 30, 200])
+def test_mark_and_box_contain_the_contact_of_a_snippet(range_m, shadow_samples):
+    simulated = simulate_survey(SurveySpec(seed=1, pings=200, samples=512, targets=1, clutter=0))
+    across_m = 30.0 / 512
+    sample = round(range_m / across_m)
+    cut = cut_snippet(simulated.survey, detection_at(sample, shadow_samples), 80, 140)
+    contact = Contact(**{**FAR, "pixel_across_m": across_m}, slant_range_m=(sample + 0.5) * across_m)
+    mark, box = contact_mark(contact, *cut.image.shape), contact_box(contact, *cut.image.shape)
+    assert mark.row == 100 - cut.first_ping_index + 0.5
+    assert mark.columns[0] - 0.5 <= sample - cut.first_sample + 0.5 <= mark.columns[1] + 0.5
+    assert box.columns[0] <= sample - cut.first_sample <= box.columns[1]
+    assert box.rows == (pytest.approx(30.5), pytest.approx(50.5))
+
+
+def test_mark_is_unknown_without_range_or_pixel_size():
+    assert contact_mark(None, 40, 60) is None
+    assert contact_mark(Contact(**FAR), 40, 60) is None
+    assert contact_box(Contact(**{**FAR, "pixel_along_m": None}, slant_range_m=9.0), 40, 60) is None
+
+
+def test_version_states_mark_box_and_range_axis(anna):
+    [version] = anna.contact(ID)["versions"]
+    assert version["range_axis"] == "slant"
+    assert version["mark"] == {"row": 20.5, "column": 23.0, "columns": [15.5, 30.5], "range_m": 13.0}
+    assert version["box"] == {"rows": [10.5, 30.5], "columns": [0.0, 50.5]}
+    assert version["edge_sigma_px"] == pytest.approx(0.58)
+
+
+def detection_at(sample, shadow_samples):
+    return SimpleNamespace(ping_index=100, sample=sample, shadow_samples=shadow_samples, side=Side.PORT)
+
+
+def test_withdrawn_measurement_is_stored_and_does_not_count(anna):
+    kept = [measure(anna, **{"from": [10.0, 10.0], "to": [10.0, end]}, keep=True).json() for end in (30.0, 50.0)]
+    size = anna.contact(ID)["size"]
+    assert size["shadow"] == {"value_m": 2.0, "sigma_m": kept[1]["sigma_m"], "measurement": kept[1]["id"]}
+    assert size["height"]["value_m"] == kept[1]["height_m"]
+    assert (size["length"], size["width"]) == (None, None)
+    path = f"/api/contacts/{ID}/measure/{kept[1]['id']}/withdraw"
+    withdrawn = anna.post(path, {}).json()
+    assert (withdrawn["id"], withdrawn["withdrawn_by"]) == (kept[1]["id"], "anna")
+    detail = anna.contact(ID)
+    assert [one["withdrawn_by"] for one in detail["measurements"]] == [None, "anna"]
+    assert detail["size"]["shadow"]["measurement"] == kept[0]["id"]
+    entry = detail["audit"][-1]
+    assert (entry["action"], entry["user"], entry["detail"]["id"]) == ("withdraw", "anna", kept[1]["id"])
+    assert anna.post(path, {}).status_code == 404
+    assert anna.post(f"/api/contacts/{ID}/measure/{2**70}/withdraw", {}).status_code == 404
+
+
+def test_database_without_withdrawals_is_migrated(tmp_path):
+    path = tmp_path / "console-review.db"
+    Database(path).close()
+    with sqlite3.connect(path) as db:
+        db.execute("ALTER TABLE measurement DROP COLUMN withdrawn_by")
+        db.execute("ALTER TABLE measurement DROP COLUMN withdrawn_utc_s")
+        db.execute("INSERT INTO measurement (contact_id, utc_s, body) VALUES ('c', 0, '{}')")
+    database = Database(path)
+    with database.read() as db:
+        [found] = list_measurements(db, "c")
+    database.close()
+    assert (found["withdrawn_by"], found["withdrawn_utc_s"]) == (None, None)
 
 
 def test_line_over_one_missing_pixel_is_rejected():
