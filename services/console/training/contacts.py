@@ -53,6 +53,7 @@ class SimulatedContact:
         versions: Received states of the image, in the order of arrival.
         codec: Codec of the image.
         snippet: Original pixels, shape (80, 140).
+        target: The object at the centre.
         expanded_snippet: Pixels of twice the ground in each direction, same shape; None for an expanded image.
     """
 
@@ -61,6 +62,7 @@ class SimulatedContact:
     versions: tuple[ImageVersion, ...]
     codec: Codec
     snippet: Snippet
+    target: TruthObject
     expanded_snippet: Snippet | None = None
 
     def expanded(self, image_id: str) -> SimulatedContact | None:
@@ -157,7 +159,9 @@ def simulated_contacts(seed: int, first_utc_s: float) -> Iterator[SimulatedConta
                 contact = _contact(simulated.survey, target, vehicle, draws, len(made))
                 snippet, expanded = (cut_snippet(simulated.survey, target, look, scale) for scale in (1, 2))
                 versions = _versions(codec, snippet, incomplete=draws.random() < 0.5)
-                made.append(SimulatedContact(contact, format_image_id(len(made)), versions, codec, snippet, expanded))
+                made.append(
+                    SimulatedContact(contact, format_image_id(len(made)), versions, codec, snippet, target, expanded)
+                )
                 yield made[-1]
     yield from _repeated_contacts(made, draws)
 

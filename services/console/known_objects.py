@@ -1,0 +1,88 @@
+"""Contacts whose object is known: those of training, and the sealed contacts of the calibrated watch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sonarpost.messages import CommandKind, ReconstructedImage
+from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.store import requests, truth
+from sonarpost.services.console.store.contacts import find_contact
+from sonarpost.services.console.store.database import Actor
+from sonarpost.services.console.store.serialisers import Json
+from sonarpost.services.console.store.truth import Truth
+
+
+@dataclass(frozen=True, slots=True)
+class SealedRequest:
+    """A request for a sealed contact without an answer.
+
+    Attributes:
+        contact_id: The contact.
+        command_id: The request.
+        kind: Kind of request.
+        age_s: Time since the request.
+        airtime_s: Displayed estimate of its air time; None if unknown.
+    """
+
+    contact_id: str
+    command_id: str
+    kind: CommandKind
+    age_s: float
+    airtime_s: float | None
+
+
+class KnownObjects:
+    """Stores contacts with known objects, reveals the objects after decisions, and reads the score.
+
+    Args:
+        state: State of the console.
+    """
+
+    def __init__(self, state: ConsoleState) -> None:
+        self._state = state
+
+    def store_image(self, record: ReconstructedImage, known: Truth) -> str | None:
+        """Store the first image version of a contact with its object; return its identifier, None if it is stored."""
+        return self._state.store_known_image(record, known)
+
+    def sealed_requests(self) -> list[SealedRequest]:
+        """Return the requests for sealed contacts that have no answer."""
+        now = self._state.clock()
+        with self._state.database.read() as db:
+            rows = db.execute(
+                "SELECT r.contact_id, r.command_id, r.kind, r.asked_utc_s, r.airtime_s FROM request r"
+                " JOIN truth t ON t.contact_id = r.contact_id"
+                " WHERE t.sealed = 1 AND r.state IN ('waiting', 'asked', 'sent') ORDER BY r.seq"
+            ).fetchall()
+        return [SealedRequest(row[0], row[1], row[2], max(0.0, now - row[3]), row[4]) for row in rows]
+
+    def advance_request(self, request: SealedRequest, step: str) -> None:
+        """Set the delivery state of a request for a sealed contact."""
+        with self._state.database.transaction() as db:
+            changed = requests.update_request_state(db, request.command_id, step, "", 1, self._state.clock())
+        if changed is not None:
+            self._state.publish_request(request.contact_id, request.command_id)
+
+    def newest_image(self, contact_id: str) -> ReconstructedImage:
+        """Return the newest image version of a contact."""
+        with self._state.database.read() as db:
+            version = find_contact(db, contact_id)["version"]
+        return self._state.image(contact_id, version)
+
+    def reveal(self) -> None:
+        """Publish the objects of contacts whose decision can no longer be taken back, as events `truth`."""
+        with self._state.database.read() as db:
+            if not truth.has_unrevealed(db):
+                return
+        with self._state.database.transaction() as db:
+            found = truth.newly_revealed(db, self._state.clock())
+        for one in found:
+            self._state.events.publish("truth", one)
+            self._state.publish_contact(str(one["contact_id"]))
+
+    def score_sheet(self, actor: Actor) -> Json:
+        """Return the scores that a user may see: experts those of all operators, others their own."""
+        operator = None if actor.role == "expert" else actor.user
+        with self._state.database.read() as db:
+            return truth.score_sheet(db, operator, self._state.clock())

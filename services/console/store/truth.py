@@ -1,0 +1,120 @@
+"""Known objects of contacts: all contacts of training, and sealed contacts of the calibrated watch.
+
+The table `truth` states what a contact shows. The page receives it after a decision, when the operator can no longer
+take the decision back. The score counts the first such decision of each operator on each contact.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import asdict, dataclass
+from typing import Final
+
+from sonarpost.review.scoring import ScoredDecision, score, score_by_bytes
+from sonarpost.services.console.store.database import insert_row
+from sonarpost.services.console.store.decisions import GRACE_S
+from sonarpost.services.console.store.serialisers import Json
+
+MAX_LISTED: Final = 500
+"""Contacts in the list of a score sheet: the most recently decided ones."""
+
+_SCORED: Final = """
+SELECT d.contact_id, d.operator, d.verdict, d.shown_s, d.decided_utc_s, d.bytes_received, c.name, t.is_mine_like,
+    t.label, MIN(d.seq)
+FROM truth t JOIN decision d ON d.contact_id = t.contact_id JOIN contact c ON c.id = d.contact_id
+LEFT JOIN decision u ON u.undoes = d.decision_id
+WHERE d.undoes IS NULL AND d.decided_utc_s <= ?
+    AND (u.decision_id IS NULL OR u.decided_utc_s - d.decided_utc_s > ?)
+GROUP BY d.contact_id, d.operator ORDER BY d.decided_utc_s DESC
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What a contact shows.
+
+    Attributes:
+        is_mine_like: Whether the object is mine-like.
+        label: Name of the object, for example "cylinder".
+        sealed: Whether the contact was added by the calibrated watch.
+    """
+
+    is_mine_like: bool
+    label: str
+    sealed: bool
+
+
+def add_truth(db: sqlite3.Connection, contact_id: str, truth: Truth, now_utc_s: float) -> None:
+    """Store the object of a contact; a known one is not changed."""
+    if db.execute("SELECT 1 FROM truth WHERE contact_id = ?", (contact_id,)).fetchone() is None:
+        insert_row(db, "truth", {"contact_id": contact_id, **asdict(truth), "added_utc_s": now_utc_s})
+
+
+def is_sealed(db: sqlite3.Connection, contact_id: str) -> bool:
+    """Return whether a contact was added by the calibrated watch."""
+    row = db.execute("SELECT sealed FROM truth WHERE contact_id = ?", (contact_id,)).fetchone()
+    return row is not None and bool(row["sealed"])
+
+
+def truth_json(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> Json | None:
+    """Return the object of a contact; None before a decision that can no longer be taken back."""
+    row = db.execute("SELECT * FROM truth WHERE contact_id = ?", (contact_id,)).fetchone()
+    if row is None:
+        return None
+    decided = db.execute(
+        "SELECT MIN(d.decided_utc_s) FROM decision d LEFT JOIN decision u ON u.undoes = d.decision_id"
+        " WHERE d.contact_id = ? AND d.undoes IS NULL"
+        " AND (u.decision_id IS NULL OR u.decided_utc_s - d.decided_utc_s > ?)",
+        (contact_id, GRACE_S),
+    ).fetchone()[0]
+    if decided is None or now_utc_s < decided + GRACE_S:
+        return None
+    return {"is_mine_like": bool(row["is_mine_like"]), "label": row["label"], "sealed": bool(row["sealed"])}
+
+
+def has_unrevealed(db: sqlite3.Connection) -> bool:
+    """Return whether a contact with a decision has an object that was not published."""
+    sql = "SELECT 1 FROM truth t JOIN decision d USING (contact_id) WHERE t.revealed = 0 LIMIT 1"
+    return db.execute(sql).fetchone() is not None
+
+
+def newly_revealed(db: sqlite3.Connection, now_utc_s: float) -> list[Json]:
+    """Mark the objects that may be shown since the last call; return them with the decision."""
+    rows = db.execute(
+        f"SELECT * FROM ({_SCORED}) WHERE contact_id IN (SELECT contact_id FROM truth WHERE revealed = 0)",
+        (now_utc_s - GRACE_S, GRACE_S),
+    ).fetchall()
+    db.executemany("UPDATE truth SET revealed = 1 WHERE contact_id = ?", [(row["contact_id"],) for row in rows])
+    db.executemany("UPDATE contact SET sealed = 2 WHERE sealed = 1 AND id = ?", [(row["contact_id"],) for row in rows])
+    return [_decided_json(row) for row in rows]
+
+
+def score_sheet(db: sqlite3.Connection, operator: str | None, now_utc_s: float) -> Json:
+    """Return the scores of all operators, or of one.
+
+    Args:
+        db: Connection for reading.
+        operator: Name of the operator; None for all.
+        now_utc_s: Current time.
+    """
+    rows = db.execute(_SCORED, (now_utc_s - GRACE_S, GRACE_S)).fetchall()
+    if operator is not None:
+        rows = [row for row in rows if row["operator"] == operator]
+    operators: list[Json] = []
+    for name in sorted({row["operator"] for row in rows}):
+        decisions = [_scored(row) for row in rows if row["operator"] == name]
+        groups = [
+            {"above_bytes": low, "up_to_bytes": high, **asdict(one)} for low, high, one in score_by_bytes(decisions)
+        ]
+        operators.append({"operator": name, **asdict(score(decisions)), "by_bytes": groups})
+    return {"operators": operators, "decisions": [_decided_json(row) for row in rows[:MAX_LISTED]]}
+
+
+def _scored(row: sqlite3.Row) -> ScoredDecision:
+    is_mine_like = bool(row["is_mine_like"])
+    return ScoredDecision(row["operator"], row["verdict"], is_mine_like, row["bytes_received"], row["shown_s"])
+
+
+def _decided_json(row: sqlite3.Row) -> Json:
+    names = ("contact_id", "name", "operator", "verdict", "label", "bytes_received", "shown_s", "decided_utc_s")
+    return {**{name: row[name] for name in names}, "is_mine_like": bool(row["is_mine_like"])}

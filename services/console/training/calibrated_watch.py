@@ -1,0 +1,142 @@
+"""Calibrated watch: sealed contacts with known objects among those of the vehicles, to measure Pd and false alarms.
+
+A sealed contact looks like one of a vehicle until an operator has decided. Then the page marks it, and lists omit it.
+Its decisions and requests are never sent: the watch answers the requests itself.
+"""
+
+from __future__ import annotations
+
+import heapq
+import logging
+import random
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from sonarpost.errors import SonarpostError
+from sonarpost.link.frames.paper.frame import format_image_id
+from sonarpost.logs import kv
+from sonarpost.messages import ReconstructedImage
+from sonarpost.review.positions import destination
+from sonarpost.services.console.known_objects import KnownObjects, SealedRequest
+from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.store.truth import Truth
+from sonarpost.services.console.training import sealed_images
+
+log = logging.getLogger(__name__)
+
+DELAY_S: Final = (20.0, 180.0)
+"""Shortest and longest time between a contact of a vehicle and the sealed contact that imitates it."""
+DISTANCE_M: Final = (40.0, 150.0)
+"""Shortest and longest distance between both, so that they do not form one object."""
+MAX_WAITING: Final = 50
+IMAGE_ID_STEPS: Final = (5, 400)
+STEP_S: Final = 1.0
+ACCEPTED_S: Final = 2.0
+"""Time until a request is shown as sent."""
+UNANSWERED_AIRTIME_S: Final = 30.0
+"""Time until the answer to a request whose cost is unknown."""
+
+
+class CalibratedWatch:
+    """Adds sealed contacts to the queue of a vessel's console.
+
+    Args:
+        state: State of the console.
+        share: Sealed contacts for each contact of a vehicle, 0 to 1.
+        draws: Random draws; by default from the operating system, so that they cannot be predicted.
+        count: Called with "sealed_contacts" for each added contact.
+    """
+
+    def __init__(
+        self,
+        state: ConsoleState,
+        share: float,
+        draws: random.Random | None = None,
+        count: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._state = state
+        self._known = KnownObjects(state)
+        self._share = share
+        self._draws = random.SystemRandom() if draws is None else draws
+        self._count = count
+        self._lock = threading.Lock()
+        self._waiting: list[tuple[float, int, ReconstructedImage]] = []
+        self._number = 0
+        self._snippets: dict[str, npt.NDArray[np.uint8]] = {}
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="calibrated-watch", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread that adds contacts and answers requests."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the thread."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(timeout=5.0)
+
+    def contact_arrived(self, image: ReconstructedImage, now_s: float) -> None:
+        """Choose by chance whether a sealed contact imitates a new contact of a vehicle; `now_s` is monotonic."""
+        if self._draws.random() >= self._share or not sealed_images.can_imitate(image):
+            return
+        with self._lock:
+            if len(self._waiting) < MAX_WAITING:
+                self._number += 1
+                heapq.heappush(self._waiting, (now_s + self._draws.uniform(*DELAY_S), self._number, image))
+
+    def _run(self) -> None:
+        while not self._stop.wait(STEP_S):
+            try:
+                self.step(time.monotonic())
+            except SonarpostError as error:
+                log.error("Sealed contact not added", extra=kv(reason=str(error)))
+
+    def step(self, now_s: float) -> None:
+        """Add the sealed contacts that are due, and answer requests; `now_s` is monotonic."""
+        while True:
+            with self._lock:
+                if not self._waiting or self._waiting[0][0] > now_s:
+                    break
+                _, _, reference = heapq.heappop(self._waiting)
+            self._add(reference)
+        for request in self._known.sealed_requests():
+            self._answer(request)
+        self._known.reveal()
+
+    def _add(self, reference: ReconstructedImage) -> None:
+        # The images of a survey have the pixel size of their reference, which may change between vehicles.
+        known = next(sealed_images.known_objects(reference, self._draws), None)
+        contact = reference.contact
+        if known is None or contact is None or contact.lat_deg is None or contact.lon_deg is None:
+            log.info("No sealed contact: the detector finds no object in the simulated survey")
+            return
+        position = destination(
+            contact.lat_deg, contact.lon_deg, self._draws.uniform(0.0, 360.0), self._draws.uniform(*DISTANCE_M)
+        )
+        image_id = format_image_id(int(reference.image_id, 36) + self._draws.randint(*IMAGE_ID_STEPS))
+        record = sealed_images.sealed_record(known, reference, image_id, position, self._state.clock())
+        truth = Truth(known.target.is_mine_like, known.target.kind.value.replace("_", " "), sealed=True)
+        contact_id = self._known.store_image(record, truth)
+        if contact_id is not None:
+            self._snippets[contact_id] = known.snippet
+            self._count("sealed_contacts")
+
+    def _answer(self, request: SealedRequest) -> None:
+        """Advance a request as vehicle and link would."""
+        limit_s = UNANSWERED_AIRTIME_S if request.airtime_s is None else request.airtime_s
+        if request.age_s < ACCEPTED_S:
+            return
+        self._known.advance_request(request, "sent" if request.age_s < limit_s else "confirmed")
+        snippet = self._snippets.get(request.contact_id)
+        if request.age_s < limit_s or request.kind != "refine" or snippet is None:
+            return
+        newest = self._known.newest_image(request.contact_id)
+        total = 2 * newest.bytes_total
+        refined = sealed_images.next_version(newest, snippet, newest.version + 1, total, total, self._state.clock())
+        self._state.store_image(refined)
