@@ -52,6 +52,8 @@ class ConsoleConfig(RetentionConfig):
         take_back_s: A decision is sent after this time, so that the operator can take it back without air time.
         classes: Proposed classes of objects: a list, or a table of groups, for example
             `{ MILCO = ["manta", "rockan"], NOMBO = ["rock"] }`.
+        calibration_share: On a vessel: sealed contacts with known objects for each contact of a vehicle, to measure the
+            operators' Pd and false alarms; 0 for none. Decisions and requests about them are never sent.
         vessel_lat_deg: Latitude of the vessel for the map, together with `vessel_lon_deg`.
         vessel_lon_deg: Longitude of the vessel.
         ring_m: Radii of the range rings on the map.
@@ -81,6 +83,7 @@ class ConsoleConfig(RetentionConfig):
     vehicle_stale_s: Annotated[float, Field(gt=0, le=86400)] = 120.0
     take_back_s: Annotated[float, Field(ge=0, le=60)] = 8.0
     classes: ClassNames | ClassGroups = ("manta", "rockan", "cylinder", "sphere")
+    calibration_share: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     vessel_lat_deg: Latitude | None = None
     vessel_lon_deg: Longitude | None = None
     ring_m: tuple[Annotated[float, Field(gt=0, le=100000)], ...] = (100.0, 200.0, 500.0)
@@ -91,6 +94,8 @@ class ConsoleConfig(RetentionConfig):
     def _is_consistent(self) -> ConsoleConfig:
         if self.host not in LOCAL_HOSTS and not (self.tls or self.insecure):
             raise ValueError(f"tls = true for host {self.host}: passwords are sent over this connection")
+        if self.calibration_share > 0 and self.role != "vessel":
+            raise ValueError("calibration_share on a vessel only: no decision is made at a shore site")
         if (self.vessel_lat_deg is None) != (self.vessel_lon_deg is None):
             raise ValueError("vessel_lat_deg and vessel_lon_deg together")
         return self

@@ -252,7 +252,7 @@ def fleet_json(
         for row in db.execute(
             "SELECT vehicle_id, vehicle_lat_deg, vehicle_lon_deg,"
             " MAX(COALESCE(seen_utc_s, first_frame_utc_s)) AS seen_utc_s"
-            " FROM contact WHERE vehicle_lat_deg IS NOT NULL GROUP BY vehicle_id"
+            " FROM contact WHERE sealed = 0 AND vehicle_lat_deg IS NOT NULL GROUP BY vehicle_id"
         )
     }
     open_requests = dict(

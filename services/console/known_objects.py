@@ -10,7 +10,6 @@ from sonarpost.services.console.store import requests, truth
 from sonarpost.services.console.store.contacts import find_contact
 from sonarpost.services.console.store.database import Actor
 from sonarpost.services.console.store.serialisers import Json
-from sonarpost.services.console.store.truth import Truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +41,6 @@ class KnownObjects:
     def __init__(self, state: ConsoleState) -> None:
         self._state = state
 
-    def store_image(self, record: ReconstructedImage, known: Truth) -> str | None:
-        """Store the first image version of a contact with its object; return its identifier, None if it is stored."""
-        return self._state.store_known_image(record, known)
-
     def sealed_requests(self) -> list[SealedRequest]:
         """Return the requests for sealed contacts that have no answer."""
         now = self._state.clock()
@@ -62,7 +57,7 @@ class KnownObjects:
         with self._state.database.transaction() as db:
             changed = requests.update_request_state(db, request.command_id, step, "", 1, self._state.clock())
         if changed is not None:
-            self._state.publish_request(request.contact_id, request.command_id)
+            self._state.publish_contact(request.contact_id)
 
     def newest_image(self, contact_id: str) -> ReconstructedImage:
         """Return the newest image version of a contact."""
@@ -76,7 +71,7 @@ class KnownObjects:
             if not truth.has_unrevealed(db):
                 return
         with self._state.database.transaction() as db:
-            found = truth.newly_revealed(db, self._state.clock())
+            found = truth.newly_revealed(db, self._state.clock(), self._state.config.take_back_s)
         for one in found:
             self._state.events.publish("truth", one)
             self._state.publish_contact(str(one["contact_id"]))
@@ -85,4 +80,4 @@ class KnownObjects:
         """Return the scores that a user may see: experts those of all operators, others their own."""
         operator = None if actor.role == "expert" else actor.user
         with self._state.database.read() as db:
-            return truth.score_sheet(db, operator, self._state.clock())
+            return truth.score_sheet(db, operator, self._state.clock(), self._state.config.take_back_s)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 import zenoh
@@ -44,6 +44,9 @@ from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.web.connections import ConnectionLimits, TrustedProxies
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 from sonarpost.sonar.image_files import read_image
+
+if TYPE_CHECKING:
+    from sonarpost.services.console.training.calibrated_watch import CalibratedWatch
 
 log = logging.getLogger(__name__)
 
@@ -93,6 +96,12 @@ class ConsoleService(Service[ConsoleConfig]):
             platform_id=platform.id, reached=False, changed_utc_s=time.time(), detail=", ".join(platform.router)
         )
         self._retention = Retention(self._apply_retention, self.stopping)
+        self._watch: CalibratedWatch | None = None
+        if config.calibration_share > 0:
+            # Imported lazily: it loads the simulation and the detector.
+            from sonarpost.services.console.training import calibrated_watch  # noqa: PLC0415
+
+            self._watch = calibrated_watch.CalibratedWatch(self.state, config.calibration_share, count=self.count)
 
     @property
     def address(self) -> str:
@@ -125,7 +134,10 @@ class ConsoleService(Service[ConsoleConfig]):
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Store a record. A repeated record changes nothing."""
         if isinstance(record, ReconstructedImage):
-            effects.count("images_taken" if self.state.store_image(record) else "images_repeated")
+            is_new = self.state.store_image(record)
+            effects.count("images_taken" if is_new else "images_repeated")
+            if is_new and record.version == 1 and self._watch is not None:
+                self._watch.contact_arrived(record, time.monotonic())
         elif isinstance(record, Decision):
             effects.count("decisions_taken" if self.state.store_decision(record) else "decisions_repeated")
         else:
@@ -210,6 +222,8 @@ class ConsoleService(Service[ConsoleConfig]):
         self.start_thread(self._send_loop, "send")
         self.start_thread(self._update_loop, "update")
         self.start_thread(self._retention.run, "retention")
+        if self._watch is not None:
+            self._watch.start()
         if not self._on_vessel and self.config.out_dir is not None:
             self.start_thread(self._catch_up, "catch-up")
 
@@ -338,6 +352,8 @@ class ConsoleService(Service[ConsoleConfig]):
         self.stopping.set()
         self._wake.set()
         self._retention.wake()
+        if self._watch is not None:
+            self._watch.stop()
         self._app.stop()
         if self._server is not None:
             self._server.stop()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sqlite3
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from types import MappingProxyType
 
 from sonarpost import wire
 from sonarpost.messages import Advice, Command, CommandKind, Decision, DownlinkState, ReconstructedImage, TaskingState
@@ -16,6 +17,7 @@ from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.events import EventHub
 from sonarpost.services.console.fleet import FleetMonitor, fleet_json
 from sonarpost.services.console.store import contacts, decisions, measurements, request_results, requests
+from sonarpost.services.console.store import truth as known_truth
 from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter, NotFoundError
 from sonarpost.services.console.store.database import (
     ID_COLUMN,
@@ -40,6 +42,7 @@ from sonarpost.services.console.store.serialisers import (
     list_records,
     version_json,
 )
+from sonarpost.services.console.store.truth import Truth
 
 FRAME_HEADER_BYTES = 13
 """Header of a frame in the format of the paper; a v1 header is shorter."""
@@ -90,21 +93,30 @@ class ConsoleState:
 
     # Records from other services
 
-    def store_image(self, image: ReconstructedImage) -> bool:
-        """Store an image version; return whether it is new."""
-        stored = self._store_images([image])
+    def store_image(self, image: ReconstructedImage, truth: Truth | None = None) -> bool:
+        """Store an image version, and its object if it is known; return whether the version is new."""
+        stored = self._store_images([image], {} if truth is None else {image.image_id: truth})
         for contact_id, is_new_contact in stored:
-            self._publish_contact(contact_id, new=is_new_contact)
+            self.publish_contact(contact_id, new=is_new_contact)
         return bool(stored)
 
-    def store_images(self, images: Sequence[ReconstructedImage]) -> int:
-        """Store several image versions in one transaction; return how many are new. Pages reload all data."""
-        stored = self._store_images(images)
+    def store_images(
+        self, images: Sequence[ReconstructedImage], truths: Mapping[str, Truth] = MappingProxyType({})
+    ) -> int:
+        """Store several image versions in one transaction; return how many are new. Pages reload all data.
+
+        Args:
+            images: The image versions.
+            truths: Known objects by image identifier.
+        """
+        stored = self._store_images(images, truths)
         if stored:
             self.events.publish("reset", {})
         return len(stored)
 
-    def _store_images(self, images: Sequence[ReconstructedImage]) -> list[tuple[str, bool]]:
+    def _store_images(
+        self, images: Sequence[ReconstructedImage], truths: Mapping[str, Truth]
+    ) -> list[tuple[str, bool]]:
         """Return the identifier of each changed contact, and whether it is new."""
         now, new_versions = self.clock(), []
         with self.database.transaction() as db:
@@ -116,6 +128,8 @@ class ConsoleState:
                 contact_id, is_new_contact = stored
                 if is_new_contact:
                     decisions.attach_waiting_records(db, contact_id, now)
+                    if image.image_id in truths:
+                        known_truth.add_truth(db, contact_id, truths[image.image_id], now)
                 own, *others = request_results.contacts_with_requests(db, contact_id)
                 for changed in (own, *others):
                     request_results.update_results(db, changed, now)
@@ -131,7 +145,7 @@ class ConsoleState:
             at_shore = self.config.role == "shore"
             contact_id = decisions.store_received_decision(db, record, self.clock(), at_shore=at_shore)
         if contact_id is not None:
-            self._publish_contact(contact_id)
+            self.publish_contact(contact_id)
             self._publish("decision", record.decision_id)
         return not known
 
@@ -140,7 +154,7 @@ class ConsoleState:
         with self.database.transaction() as db:
             contact_id = requests.store_received_advice(db, record)
         if contact_id is not None:
-            self._publish_contact(contact_id)
+            self.publish_contact(contact_id)
             self._publish("advice", record.advice_id)
 
     def apply_downlink_state(self, state: DownlinkState) -> None:
@@ -155,7 +169,7 @@ class ConsoleState:
             self._publish("decision", state.record_id)
         elif contact_id is not None:
             self._publish("request", state.record_id)
-            self._publish_contact(contact_id)
+            self.publish_contact(contact_id)
 
     def apply_tasking_state(self, state: TaskingState) -> None:
         """Update the delivery of a request or comment to a vessel."""
@@ -178,7 +192,7 @@ class ConsoleState:
                 contact_id = requests.refuse_advice(db, record_id, reason)
         if contact_id:
             self._publish(table, record_id)
-            self._publish_contact(contact_id)
+            self.publish_contact(contact_id)
 
     def mark_delivered_to_shore(self, before_utc_s: float) -> None:
         """Mark decisions that the relay stored before a time as delivered to shore."""
@@ -192,7 +206,8 @@ class ConsoleState:
 
     # Events
 
-    def _publish_contact(self, contact_id: str, *, new: bool = False) -> None:
+    def publish_contact(self, contact_id: str, *, new: bool = False) -> None:
+        """Publish a contact after a change."""
         event = {"contact": self._contact_json(contact_id), "new": new, **asdict(self.counts())}
         self.events.publish("contact", event)
 
@@ -209,7 +224,7 @@ class ConsoleState:
     def _publish_action(self, table: Table, contact_id: str, record_id: str) -> Json:
         """Publish a new decision, request or comment of this console; return it."""
         self.on_unsent()
-        self._publish_contact(contact_id)
+        self.publish_contact(contact_id)
         return self._publish(table, record_id)
 
     # Queries
@@ -240,6 +255,7 @@ class ConsoleState:
             if contact["group"] is not None:
                 looks = contacts.list_contacts(db, ContactFilter(group=str(contact["group"])))["items"]
             measured = measurements.list_measurements(db, contact_id)
+            truth = known_truth.truth_json(db, contact_id, self.clock(), self.config.take_back_s)
             audit = db.execute("SELECT * FROM audit WHERE contact_id = ? ORDER BY seq", (contact_id,))
             refine_base = contacts.find_contact(db, contact_id)["refine_base"]
             return {
@@ -253,6 +269,7 @@ class ConsoleState:
                 "measurements": measured,
                 "size": summary(measured),
                 "group": looks,
+                "truth": truth,
                 "audit": [audit_json(row) for row in audit],
                 "costs": self.request_costs(contact_id),
             }
@@ -342,8 +359,8 @@ class ConsoleState:
         Raises:
             ConflictError, BadInputError: See `add_decision`.
         """
-        states = self._delivery_states()
         with self.database.transaction() as db:
+            states = self._delivery_states(db, contact_id)
             stored = decisions.add_decision(db, contact_id, entered, actor, self.clock(), states)
         decision = self._publish_action("decision", contact_id, stored.decision_id)
         for user in stored.notified:
@@ -356,8 +373,8 @@ class ConsoleState:
         Raises:
             BadInputError: See `undo_decision`.
         """
-        states = self._delivery_states()
         with self.database.transaction() as db:
+            states = self._delivery_states(db, contact_id)
             new_id = decisions.undo_decision(db, contact_id, decision_id, displayed, actor, self.clock(), states)
         self._publish("decision", decision_id)
         decision = self._publish_action("decision", contact_id, new_id)
@@ -386,8 +403,9 @@ class ConsoleState:
             decisions.acknowledge_notice(db, notice_id, actor, self.clock())
         self.events.publish("notice", {"user": actor.user})
 
-    def _delivery_states(self) -> DeliveryStates:
-        consumers = self.config.decision_consumers
+    def _delivery_states(self, db: sqlite3.Connection, contact_id: str) -> DeliveryStates:
+        """Return the initial delivery of a decision; one on a sealed contact is never sent."""
+        consumers = () if known_truth.is_sealed(db, contact_id) else self.config.decision_consumers
         shore, vehicle = ("waiting" if name in consumers else "none" for name in ("relay", "op_modem"))
         return DeliveryStates(shore, vehicle, self.config.take_back_s)
 
@@ -411,6 +429,8 @@ class ConsoleState:
                 wait_s=self.fleet.queue_wait_s(row["vehicle_id"], now),
                 has_downlink=self._has_downlink,
             )
+            if known_truth.is_sealed(db, contact_id):
+                db.execute("UPDATE request SET sent = 1 WHERE command_id = ?", (command_id,))
         return self._publish_action("request", contact_id, command_id)
 
     def add_advice(self, contact_id: str, record: Advice, actor: Actor) -> Json:

@@ -16,7 +16,7 @@ from sonarpost.messages import ReconstructedImage
 from sonarpost.review.positions import Look, nearest_group, vehicle_position
 from sonarpost.services.console.store.database import insert_row
 from sonarpost.services.console.store.related_images import link_related_images
-from sonarpost.services.console.store.serialisers import CONTACT_QUERY, Json, contact_json, percent_received
+from sonarpost.services.console.store.serialisers import CONTACT_QUERY, LISTED, Json, contact_json, percent_received
 
 Sort = Literal["arrived", "updated", "confidence", "vehicle", "received", "review", "name", "range"]
 SORT_COLUMNS: Final[Mapping[Sort, str]] = {
@@ -75,7 +75,7 @@ class ContactFilter(BaseModel):
 
     def where(self) -> tuple[str, list[object]]:
         """Return the SQL condition, which contains only constants, and its parameters."""
-        conditions = ["c.parent IS NULL"]
+        conditions = [LISTED]
         values: list[object] = []
         states = {"reviewed": "c.review <> 'unreviewed'", "mine_like": "c.review IN ('mine_like', 'disputed')"}
         if self.review in states:
@@ -226,17 +226,18 @@ def list_contacts(db: sqlite3.Connection, query: ContactFilter) -> Json:
 def list_versions(db: sqlite3.Connection, query: ContactFilter, limit: int) -> list[tuple[str, int]]:
     """Return identifier and newest version of the filtered contacts, by the time of their first frame."""
     condition, values = query.where()
-    rows = db.execute(
-        f"SELECT c.id, c.version FROM contact c WHERE {condition} ORDER BY c.first_frame_utc_s, c.id LIMIT ?",  # noqa: S608
-        (*values, limit),
-    )
+    order = "ORDER BY c.first_frame_utc_s, c.id LIMIT ?"
+    # Nothing about a sealed contact leaves the console.
+    sql = f"SELECT c.id, c.version FROM contact c WHERE c.sealed = 0 AND {condition} {order}"  # noqa: S608
+    rows = db.execute(sql, (*values, limit))
     return [(str(row["id"]), int(row["version"])) for row in rows]
 
 
 def count_contacts(db: sqlite3.Connection) -> ContactCounts:
-    """Count the contacts, without the images that answer requests about them."""
-    total = db.execute("SELECT COUNT(*) FROM contact WHERE parent IS NULL").fetchone()[0]
-    unreviewed = db.execute("SELECT COUNT(*) FROM contact WHERE review = 'unreviewed' AND parent IS NULL").fetchone()[0]
+    """Count the contacts in lists."""
+    total = db.execute(f"SELECT COUNT(*) FROM contact c WHERE {LISTED}").fetchone()[0]  # noqa: S608  constants only
+    sql = f"SELECT COUNT(*) FROM contact c WHERE {LISTED} AND review = 'unreviewed'"  # noqa: S608
+    unreviewed = db.execute(sql).fetchone()[0]
     return ContactCounts(total, unreviewed)
 
 

@@ -50,7 +50,7 @@ CREATE TABLE IF NOT EXISTS contact (
     complete INTEGER NOT NULL, percent REAL NOT NULL, bytes_received INTEGER NOT NULL, bytes_total INTEGER NOT NULL,
     codec TEXT NOT NULL, has_picture INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL,
     group_id TEXT, authenticated INTEGER, despeckle_strength REAL, p_mine_like REAL, p_other_object REAL,
-    parent TEXT, relation TEXT
+    parent TEXT, relation TEXT, sealed INTEGER NOT NULL DEFAULT 0
 ) WITHOUT ROWID;
 CREATE UNIQUE INDEX IF NOT EXISTS contact_image ON contact (vessel_id, vehicle_id, image_id, first_s);
 CREATE INDEX IF NOT EXISTS contact_updated ON contact (updated_utc_s, id);
@@ -76,7 +76,8 @@ CREATE TABLE IF NOT EXISTS decision (
     decided_utc_s REAL NOT NULL, sha256 TEXT, layer TEXT, undoes TEXT, undone INTEGER NOT NULL DEFAULT 0,
     elsewhere INTEGER NOT NULL DEFAULT 0, shore TEXT NOT NULL, vehicle TEXT NOT NULL, reason TEXT NOT NULL DEFAULT '',
     times_sent INTEGER NOT NULL DEFAULT 0, relayed_utc_s REAL, changed_utc_s REAL NOT NULL,
-    payload BLOB NOT NULL, sent INTEGER NOT NULL, send_after_utc_s REAL, overrules TEXT NOT NULL DEFAULT '[]');
+    payload BLOB NOT NULL, sent INTEGER NOT NULL, send_after_utc_s REAL, overrules TEXT NOT NULL DEFAULT '[]',
+    shown_s REAL, bytes_received INTEGER);
 CREATE INDEX IF NOT EXISTS decision_contact ON decision (contact_id, seq);
 CREATE INDEX IF NOT EXISTS decision_unsent ON decision (seq) WHERE sent = 0;
 CREATE INDEX IF NOT EXISTS decision_relayed ON decision (seq) WHERE shore = 'relay';
@@ -112,7 +113,10 @@ CREATE TRIGGER IF NOT EXISTS audit_is_not_deleted BEFORE DELETE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit is only added to'); END;
 """
 
-_NOTICE_SCHEMA = """
+_LATER_SCHEMA = """
+CREATE TABLE IF NOT EXISTS truth (
+    contact_id TEXT PRIMARY KEY, is_mine_like INTEGER NOT NULL, label TEXT NOT NULL, sealed INTEGER NOT NULL,
+    revealed_utc_s REAL, added_utc_s REAL NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS notice (
     id INTEGER PRIMARY KEY AUTOINCREMENT, user TEXT NOT NULL, kind TEXT NOT NULL, contact_id TEXT NOT NULL,
     decision_id TEXT NOT NULL, by_decision_id TEXT NOT NULL, acknowledged_utc_s REAL);
@@ -130,10 +134,16 @@ _ADDED_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
         "p_other_object": "REAL",
         "parent": "TEXT",
         "relation": "TEXT",
+        "sealed": "INTEGER NOT NULL DEFAULT 0",
     },
     "version": {"removed": "INTEGER NOT NULL DEFAULT 0"},
     "measurement": {"withdrawn_by": "TEXT", "withdrawn_utc_s": "REAL"},
-    "decision": {"send_after_utc_s": "REAL", "overrules": "TEXT NOT NULL DEFAULT '[]'"},
+    "decision": {
+        "send_after_utc_s": "REAL",
+        "overrules": "TEXT NOT NULL DEFAULT '[]'",
+        "shown_s": "REAL",
+        "bytes_received": "INTEGER",
+    },
     "request": {
         "base_version": "INTEGER",
         "base_bytes": "INTEGER",
@@ -229,7 +239,7 @@ class Database(SqliteFile):
                 for name, kind in columns.items():
                     if name not in known:
                         db.execute(f"ALTER TABLE {table} ADD COLUMN {name} {kind}")
-            for statement in (*_NOTICE_SCHEMA.strip().split(";")[:-1], *_ADDED_INDEXES):
+            for statement in (*_LATER_SCHEMA.strip().split(";")[:-1], *_ADDED_INDEXES):
                 db.execute(statement)
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from sonarpost import wire
 from sonarpost.errors import BadInputError, SonarpostError
-from sonarpost.messages import Decision, DownlinkState, Verdict
+from sonarpost.messages import Decision, DownlinkState, ReconstructedImage, Verdict
 from sonarpost.review.decisions import review_result, withdrawn_decision
 from sonarpost.services.console.store.contacts import (
     NotFoundError,
@@ -53,6 +53,7 @@ class DecisionInput:
         mlo_class: Class of mine-like object; None if not stated.
         remark: Free text; with `overrules` the reason.
         overrules: Whether the decision replaces those of other operators with another verdict.
+        shown_s: Time from the display of the image to the verdict; None if unknown.
     """
 
     revision: int
@@ -62,6 +63,7 @@ class DecisionInput:
     mlo_class: str | None
     remark: str
     overrules: bool = False
+    shown_s: float | None = None
 
 
 class DeliveryStates(NamedTuple):
@@ -103,7 +105,7 @@ def add_decision(
         BadInputError: The displayed image is not a version of this contact, or there is no decision to overrule.
     """
     row = _check_revision(db, contact_id, entered.revision) if entered.overrules else find_contact(db, contact_id)
-    _check_displayed_image(db, contact_id, entered.displayed)
+    image = _check_displayed_image(db, contact_id, entered.displayed)
     others = [
         one
         for one in review_result(_records(db, contact_id)).standing
@@ -119,6 +121,10 @@ def add_decision(
         "overrules": tuple(one.decision_id for one in others) if entered.overrules else (),
     }
     record = _add_own_decision(db, row, content, entered.displayed, actor, now_utc_s, delivery)
+    db.execute(
+        "UPDATE decision SET shown_s = ?, bytes_received = ? WHERE decision_id = ?",
+        (entered.shown_s, image.bytes_received, record.decision_id),
+    )
     detail = record.model_dump(include={"decision_id", "verdict", "confidence", "mlo_class", "remark"})
     detail["revision"] = entered.revision
     kind = "overrules" if entered.overrules else "disputes"
@@ -331,13 +337,15 @@ def _check_revision(db: sqlite3.Connection, contact_id: str, revision: int) -> s
     return row
 
 
-def _check_displayed_image(db: sqlite3.Connection, contact_id: str, displayed: DisplayedImage) -> None:
-    """Check that the displayed image belongs to the contact, so that the audit can show it again."""
+def _check_displayed_image(db: sqlite3.Connection, contact_id: str, displayed: DisplayedImage) -> ReconstructedImage:
+    """Return the displayed image, if it belongs to the contact, so that the audit can show it again."""
     row = None if displayed.version is None else find_version(db, contact_id, displayed.version)
     if row is None:
         raise BadInputError("decision", "version", displayed.version, "a version of this contact's image")
-    if decode_image(row).picture_sha256 != displayed.sha256:
+    image = decode_image(row)
+    if image.picture_sha256 != displayed.sha256:
         raise BadInputError("decision", "sha256", displayed.sha256, f"that of version {displayed.version}")
+    return image
 
 
 def _add_own_decision(

@@ -33,6 +33,9 @@ FROM contact c LEFT JOIN decision d ON d.decision_id = c.last_decision
 """
 """Start of every query for rows of `contact_json`."""
 
+LISTED: Final = "c.parent IS NULL AND c.sealed < 2"
+"""Condition of the contacts in lists: neither the answer to a request nor a sealed contact after its decision."""
+
 _CONTACT_COLUMNS: Final = (
     "id name vessel_id vehicle_id image_id revision version review mlo_class confidence decided_by decided_utc_s"
     " atd_class atd_confidence p_mine_like p_other_object lat_deg lon_deg position_sigma_m range_m seen_utc_s"

@@ -1,7 +1,10 @@
 """Known objects of contacts: all contacts of training, and sealed contacts of the calibrated watch.
 
 The table `truth` states what a contact shows. The page receives it after a decision, when the operator can no longer
-take the decision back. The score counts the first such decision of each operator on each contact.
+take the decision back. The score counts the first such decision of each operator on
+each contact, if the operator made it before the page received the object.
+
+The column `contact.sealed` is 1 for a sealed contact, and 2 after its object was revealed: then lists omit it.
 """
 
 from __future__ import annotations
@@ -12,7 +15,6 @@ from typing import Final
 
 from sonarpost.review.scoring import ScoredDecision, score, score_by_bytes
 from sonarpost.services.console.store.database import insert_row
-from sonarpost.services.console.store.decisions import GRACE_S
 from sonarpost.services.console.store.serialisers import Json
 
 MAX_LISTED: Final = 500
@@ -23,7 +25,7 @@ SELECT d.contact_id, d.operator, d.verdict, d.shown_s, d.decided_utc_s, d.bytes_
     t.label, MIN(d.seq)
 FROM truth t JOIN decision d ON d.contact_id = t.contact_id JOIN contact c ON c.id = d.contact_id
 LEFT JOIN decision u ON u.undoes = d.decision_id
-WHERE d.undoes IS NULL AND d.decided_utc_s <= ?
+WHERE d.undoes IS NULL AND d.decided_utc_s <= ? AND d.decided_utc_s <= COALESCE(t.revealed_utc_s, d.decided_utc_s)
     AND (u.decision_id IS NULL OR u.decided_utc_s - d.decided_utc_s > ?)
 GROUP BY d.contact_id, d.operator ORDER BY d.decided_utc_s DESC
 """
@@ -48,6 +50,9 @@ def add_truth(db: sqlite3.Connection, contact_id: str, truth: Truth, now_utc_s: 
     """Store the object of a contact; a known one is not changed."""
     if db.execute("SELECT 1 FROM truth WHERE contact_id = ?", (contact_id,)).fetchone() is None:
         insert_row(db, "truth", {"contact_id": contact_id, **asdict(truth), "added_utc_s": now_utc_s})
+        if truth.sealed:
+            # A sealed contact is no look at an object of the survey.
+            db.execute("UPDATE contact SET sealed = 1, group_id = NULL WHERE id = ?", (contact_id,))
 
 
 def is_sealed(db: sqlite3.Connection, contact_id: str) -> bool:
@@ -56,7 +61,7 @@ def is_sealed(db: sqlite3.Connection, contact_id: str) -> bool:
     return row is not None and bool(row["sealed"])
 
 
-def truth_json(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> Json | None:
+def truth_json(db: sqlite3.Connection, contact_id: str, now_utc_s: float, take_back_s: float) -> Json | None:
     """Return the object of a contact; None before a decision that can no longer be taken back."""
     row = db.execute("SELECT * FROM truth WHERE contact_id = ?", (contact_id,)).fetchone()
     if row is None:
@@ -65,39 +70,39 @@ def truth_json(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> Jso
         "SELECT MIN(d.decided_utc_s) FROM decision d LEFT JOIN decision u ON u.undoes = d.decision_id"
         " WHERE d.contact_id = ? AND d.undoes IS NULL"
         " AND (u.decision_id IS NULL OR u.decided_utc_s - d.decided_utc_s > ?)",
-        (contact_id, GRACE_S),
+        (contact_id, take_back_s),
     ).fetchone()[0]
-    if decided is None or now_utc_s < decided + GRACE_S:
+    if decided is None or now_utc_s < decided + take_back_s:
         return None
     return {"is_mine_like": bool(row["is_mine_like"]), "label": row["label"], "sealed": bool(row["sealed"])}
 
 
 def has_unrevealed(db: sqlite3.Connection) -> bool:
     """Return whether a contact with a decision has an object that was not published."""
-    sql = "SELECT 1 FROM truth t JOIN decision d USING (contact_id) WHERE t.revealed = 0 LIMIT 1"
+    sql = "SELECT 1 FROM truth t JOIN decision d USING (contact_id) WHERE t.revealed_utc_s IS NULL LIMIT 1"
     return db.execute(sql).fetchone() is not None
 
 
-def newly_revealed(db: sqlite3.Connection, now_utc_s: float) -> list[Json]:
+def newly_revealed(db: sqlite3.Connection, now_utc_s: float, take_back_s: float) -> list[Json]:
     """Mark the objects that may be shown since the last call; return them with the decision."""
-    rows = db.execute(
-        f"SELECT * FROM ({_SCORED}) WHERE contact_id IN (SELECT contact_id FROM truth WHERE revealed = 0)",
-        (now_utc_s - GRACE_S, GRACE_S),
-    ).fetchall()
-    db.executemany("UPDATE truth SET revealed = 1 WHERE contact_id = ?", [(row["contact_id"],) for row in rows])
+    sql = f"SELECT * FROM ({_SCORED}) WHERE contact_id IN (SELECT contact_id FROM truth WHERE revealed_utc_s IS NULL)"  # noqa: S608
+    rows = db.execute(sql, (now_utc_s - take_back_s, take_back_s)).fetchall()
+    reveals = [(now_utc_s, row["contact_id"]) for row in rows]
+    db.executemany("UPDATE truth SET revealed_utc_s = ? WHERE contact_id = ? AND revealed_utc_s IS NULL", reveals)
     db.executemany("UPDATE contact SET sealed = 2 WHERE sealed = 1 AND id = ?", [(row["contact_id"],) for row in rows])
     return [_decided_json(row) for row in rows]
 
 
-def score_sheet(db: sqlite3.Connection, operator: str | None, now_utc_s: float) -> Json:
+def score_sheet(db: sqlite3.Connection, operator: str | None, now_utc_s: float, take_back_s: float) -> Json:
     """Return the scores of all operators, or of one.
 
     Args:
         db: Connection for reading.
         operator: Name of the operator; None for all.
         now_utc_s: Current time.
+        take_back_s: Time in which an operator can take a decision back.
     """
-    rows = db.execute(_SCORED, (now_utc_s - GRACE_S, GRACE_S)).fetchall()
+    rows = db.execute(_SCORED, (now_utc_s - take_back_s, take_back_s)).fetchall()
     if operator is not None:
         rows = [row for row in rows if row["operator"] == operator]
     operators: list[Json] = []

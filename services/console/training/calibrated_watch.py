@@ -18,14 +18,16 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.errors import SonarpostError
+from sonarpost.export.contacts import contact_uid
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.logs import kv
-from sonarpost.messages import ReconstructedImage
-from sonarpost.review.positions import destination
+from sonarpost.messages import Contact, ReconstructedImage
+from sonarpost.review.positions import destination, vehicle_position
 from sonarpost.services.console.known_objects import KnownObjects, SealedRequest
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.truth import Truth
 from sonarpost.services.console.training import sealed_images
+from sonarpost.sonar.survey import Side
 
 log = logging.getLogger(__name__)
 
@@ -113,19 +115,30 @@ class CalibratedWatch:
         # The images of a survey have the pixel size of their reference, which may change between vehicles.
         known = next(sealed_images.known_objects(reference, self._draws), None)
         contact = reference.contact
-        if known is None or contact is None or contact.lat_deg is None or contact.lon_deg is None:
+        if known is None or contact is None:
             log.info("No sealed contact: the detector finds no object in the simulated survey")
             return
-        position = destination(
-            contact.lat_deg, contact.lon_deg, self._draws.uniform(0.0, 360.0), self._draws.uniform(*DISTANCE_M)
-        )
+        position = self._position(contact, known)
         image_id = format_image_id(int(reference.image_id, 36) + self._draws.randint(*IMAGE_ID_STEPS))
         record = sealed_images.sealed_record(known, reference, image_id, position, self._state.clock())
         truth = Truth(known.target.is_mine_like, known.target.kind.value.replace("_", " "), sealed=True)
-        contact_id = self._known.store_image(record, truth)
-        if contact_id is not None:
-            self._snippets[contact_id] = known.snippet
+        if self._state.store_image(record, truth):
+            self._snippets[contact_uid(record)] = known.snippet
             self._count("sealed_contacts")
+
+    def _position(self, contact: Contact, known: sealed_images.KnownObject) -> tuple[float, float]:
+        """Return a position on the line of the vehicle, some distance before or after a contact."""
+        along_m = self._draws.choice((-1, 1)) * self._draws.uniform(*DISTANCE_M)
+        lat, lon = contact.lat_deg, contact.lon_deg
+        assert lat is not None
+        assert lon is not None
+        heading_deg = contact.heading_deg
+        vehicle = vehicle_position(lat, lon, heading_deg, contact.channel, contact.ground_range_m)
+        if vehicle is None or heading_deg is None:
+            return destination(lat, lon, self._draws.uniform(0.0, 360.0), abs(along_m))
+        lat, lon = destination(*vehicle, heading_deg, along_m)
+        bearing_deg = heading_deg + (90.0 if known.detection.side is Side.STARBOARD else -90.0)
+        return destination(lat, lon, bearing_deg, known.detection.ground_range_m or 0.0)
 
     def _answer(self, request: SealedRequest) -> None:
         """Advance a request as vehicle and link would."""

@@ -19,6 +19,7 @@ from sonarpost.codec.vq.codec import VqCodec
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
 from sonarpost.review.positions import destination
+from sonarpost.services.console.store.truth import Truth
 from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Survey
@@ -64,6 +65,11 @@ class SimulatedContact:
     snippet: Snippet
     target: TruthObject
     expanded_snippet: Snippet | None = None
+
+    @property
+    def truth(self) -> Truth:
+        """The object of the contact."""
+        return Truth(self.target.is_mine_like, self.target.kind.value.replace("_", " "), sealed=False)
 
     def expanded(self, image_id: str) -> SimulatedContact | None:
         """Return an image of more seabed around the contact; None if this image is already expanded.

@@ -24,7 +24,7 @@ from sonarpost.simulation.seabed.terrain import SeabedKind
 PINGS: Final = 1000
 SAMPLES: Final = 1024
 MATCH_M: Final = 1.0
-"""Maximum distance, along and across the track, of a detection from the centre of its object, beyond half its length."""
+"""Maximum distance of a detection from its object, along and across the track, beyond half the object's length."""
 
 _DETECTOR_VALUES: Final = (
     "slant_range_m",
@@ -55,7 +55,7 @@ class KnownObject:
 
 
 def can_imitate(reference: ReconstructedImage) -> bool:
-    """Return whether a sealed contact can be made like a contact: codec `emb`, contact record with pixel size and place."""
+    """Return whether a contact can be imitated: codec `emb`, and a contact record with position and pixel size."""
     contact = reference.contact
     return (
         reference.codec == EmbCodec.name

@@ -27,7 +27,9 @@ from sonarpost.modem.micromodem import RATES
 from sonarpost.review.costs import NEW_IMAGE_KINDS
 from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.fleet import DETECTOR, frame_event
+from sonarpost.services.console.known_objects import KnownObjects
 from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.store.truth import Truth
 from sonarpost.services.console.training.contacts import (
     VEHICLES,
     SimulatedContact,
@@ -77,6 +79,7 @@ class TrainingSimulator:
 
     def __init__(self, state: ConsoleState, contacts: int, seed: int = 1, interval_s: float = 6.0) -> None:
         self._state = state
+        self._known = KnownObjects(state)
         self._max_contacts = contacts
         self._interval_s = interval_s
         self._random = random.Random(seed)  # noqa: S311  not used for secrets
@@ -95,6 +98,7 @@ class TrainingSimulator:
         """Store contacts that arrived before the start."""
         start_utc_s = time.time() - 30.0 * contacts
         records: list[ReconstructedImage] = []
+        truths: dict[str, Truth] = {}
         for number in range(contacts):
             contact = next(self._source)
             self._contacts += 1
@@ -102,8 +106,9 @@ class TrainingSimulator:
             versions = range(len(contact.versions))
             self._add_to_cache(_Transfer(contact, first, len(versions)))
             records += [contact.record(VESSEL, version, first, first + 6.0 * version) for version in versions]
+            truths[contact.image_id] = contact.truth
             if len(records) >= BACKLOG_BATCH or number == contacts - 1 or self._stop.is_set():
-                self._state.store_images(records)
+                self._state.store_images(records, truths)
                 records.clear()
             if self._stop.is_set():
                 return
@@ -136,6 +141,7 @@ class TrainingSimulator:
             self._update_health(time.time())
             self.accept_records(time.time())
             self.advance_downlink(time.time())
+            self._known.reveal()
             self._state.events.publish("fleet", self._state.fleet_state())
 
     # Uplink
@@ -154,7 +160,7 @@ class TrainingSimulator:
         if transfer is None:
             return
         record = transfer.simulated.record(VESSEL, transfer.next_version, transfer.first_frame_utc_s, now_utc_s)
-        self._state.store_image(record)
+        self._state.store_image(record, transfer.simulated.truth)
         if self._packet % COMMENT_INTERVAL_PACKETS == COMMENT_INTERVAL_PACKETS - 2:
             self._state.store_advice(self._comment(record))
         transfer.next_version += 1

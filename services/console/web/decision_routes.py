@@ -24,6 +24,7 @@ class _DecisionBody(AdviceBody):
     sha256: _Digest
     layer: Layer = "raw"
     overrules: bool = False
+    shown_s: Annotated[float, Field(ge=0, le=86400)] | None = None
 
     @model_validator(mode="after")
     def _has_reason(self) -> _DecisionBody:
@@ -63,9 +64,8 @@ class DecisionRoutes:
     def _decide(self, call: Call) -> Response:
         body = call.parse_body(_DecisionBody)
         displayed = DisplayedImage(body.version, body.sha256, body.layer)
-        entered = DecisionInput(
-            body.revision, displayed, body.verdict, body.confidence, body.mlo_class, body.remark, body.overrules
-        )
+        values = body.model_dump(include={"verdict", "confidence", "mlo_class", "remark", "overrules", "shown_s"})
+        entered = DecisionInput(revision=body.revision, displayed=displayed, **values)
         return JSONResponse(self._state.decide(contact_id(call), entered, call.actor), 201)
 
     def _undo(self, call: Call) -> Response:

@@ -64,12 +64,12 @@ def map_json(state: ConsoleState) -> Json:
             " c.group_id, c.vehicle_lat_deg, c.vehicle_lon_deg,"
             " COALESCE(c.seen_utc_s, c.first_frame_utc_s) AS at_utc_s,"
             " COUNT(*) OVER (PARTITION BY COALESCE(c.group_id, c.id)) AS looks"
-            " FROM contact c WHERE c.parent IS NULL AND c.lat_deg IS NOT NULL AND c.lon_deg IS NOT NULL"
-            " ORDER BY at_utc_s DESC LIMIT ?",
+            " FROM contact c WHERE c.parent IS NULL AND c.sealed < 2"
+            " AND c.lat_deg IS NOT NULL AND c.lon_deg IS NOT NULL ORDER BY at_utc_s DESC LIMIT ?",
             (MAX_CONTACTS,),
         ).fetchall()
         unlocated = db.execute(
-            "SELECT COUNT(*) FROM contact WHERE parent IS NULL AND (lat_deg IS NULL OR lon_deg IS NULL)"
+            "SELECT COUNT(*) FROM contact WHERE parent IS NULL AND sealed < 2 AND (lat_deg IS NULL OR lon_deg IS NULL)"
         ).fetchone()[0]
     config = state.config
     frame = None

@@ -92,6 +92,7 @@ export const api = {
   request: (id, body) => request("POST", `${contactPath(id)}/requests`, body),
   advise: (id, body) => request("POST", `${contactPath(id)}/advice`, body),
   fleet: () => request("GET", "/api/fleet"),
+  score: () => request("GET", "/api/score"),
   map: () => request("GET", "/api/map"),
   export: (format, filter) => download(`/api/export/contacts.${format}?${queryString(filter)}`),
   streamError,

@@ -1,0 +1,172 @@
+"""Contacts with known objects: nothing is revealed before a decision, nothing about sealed ones is sent, the score."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from builders.console import FIRST_UTC_S, image_record
+
+from sonarpost.services.console.known_objects import KnownObjects
+from sonarpost.services.console.store.contacts import ContactFilter
+from sonarpost.services.console.store.truth import Truth
+from sonarpost.services.console.training.calibrated_watch import DELAY_S, CalibratedWatch
+
+MINE = Truth(is_mine_like=True, label="cylinder", sealed=True)
+ROCK = Truth(is_mine_like=False, label="boulder", sealed=True)
+
+
+@pytest.fixture
+def clock(console):
+    class Clock:
+        now_utc_s = FIRST_UTC_S
+
+        def __call__(self):
+            return self.now_utc_s
+
+    console.state.clock = Clock()
+    return console.state.clock
+
+
+def add(console, image_id, truth=None, **changes):
+    console.state.store_image(image_record(image_id, **changes), truth)
+    return next(
+        row["id"] for row in console.state.list_contacts(ContactFilter())["items"] if row["image_id"] == image_id
+    )
+
+
+def listed(console):
+    return {row["image_id"] for row in console.state.list_contacts(ContactFilter())["items"]}
+
+
+def test_sealed_contact_differs_in_nothing_before_the_decision(console):
+    sealed, real = add(console, "00A7", MINE), add(console, "00A8")
+    anna = console.browser("anna")
+    one, other = anna.contact(sealed), anna.contact(real)
+    assert one.keys() == other.keys()
+    assert one["truth"] is None
+    assert other["truth"] is None
+    assert one["contact"].keys() == other["contact"].keys()
+    assert "cylinder" not in str(one)
+    assert listed(console) == {"00A7", "00A8"}
+
+
+def test_object_is_revealed_after_the_take_back_time(console, clock):
+    contact_id = add(console, "00A7", MINE)
+    anna, known = console.browser("anna"), KnownObjects(console.state)
+    assert anna.decide(contact_id).status_code == 201
+    clock.now_utc_s += console.state.config.take_back_s - 0.1
+    known.reveal()
+    assert anna.contact(contact_id)["truth"] is None
+    assert anna.get("/api/score").json()["operators"] == []
+    clock.now_utc_s += 0.2
+    last = console.state.events.last
+    known.reveal()
+    assert anna.contact(contact_id)["truth"] == {"is_mine_like": True, "label": "cylinder", "sealed": True}
+    assert [event.name for event in console.state.events.events_after(last)] == ["truth", "contact"]
+    assert listed(console) == set()
+    assert console.state.counts().total == 0
+    last = console.state.events.last
+    known.reveal()
+    assert console.state.events.last == last
+
+
+def test_decision_that_was_taken_back_reveals_nothing(console, clock):
+    contact_id = add(console, "00A7", MINE)
+    anna = console.browser("anna")
+    decision = anna.decide(contact_id).json()["decision"]
+    clock.now_utc_s += 2.0
+    assert anna.post(f"/api/contacts/{contact_id}/undo", {"decision_id": decision["decision_id"]}).status_code == 201
+    clock.now_utc_s += 60.0
+    KnownObjects(console.state).reveal()
+    assert anna.contact(contact_id)["truth"] is None
+    assert anna.get("/api/score").json()["operators"] == []
+
+
+def test_nothing_about_a_sealed_contact_is_sent(console, clock):
+    sealed, real = add(console, "00A7", MINE), add(console, "00A8")
+    anna = console.browser("anna")
+    for contact_id in (sealed, real):
+        assert anna.decide(contact_id).status_code == 201
+        assert anna.post(f"/api/contacts/{contact_id}/requests", {"kind": "refine"}).status_code == 201
+    clock.now_utc_s += 60.0
+    assert {item.record.image_id for item in console.state.unsent_records()} == {"00A8"}
+    for name in ("contacts.csv", "contacts.geojson", "contacts.cot.xml"):
+        body = anna.get(f"/api/export/{name}").text
+        assert "00A8" in body
+        assert "00A7" not in body
+
+
+def test_score_by_operator_and_bytes(console, clock):
+    mine, rock = add(console, "00A7", MINE, total=60), add(console, "00A8", ROCK, total=300)
+    anna, bo, eva = (console.browser(name) for name in ("anna", "bo", "eva"))
+    anna.decide(mine, verdict="mine_like", shown_s=4.0)
+    bo.decide(mine, verdict="not_mine_like", shown_s=6.0)
+    anna.decide(rock, verdict="mine_like", shown_s=2.0)
+    clock.now_utc_s += 10.0
+    KnownObjects(console.state).reveal()
+    clock.now_utc_s += 10.0
+    # A decision after the reveal does not count.
+    bo.decide(rock, verdict="not_mine_like")
+    clock.now_utc_s += 10.0
+    sheet = eva.get("/api/score").json()
+    scores = {one["operator"]: one for one in sheet["operators"]}
+    assert scores["anna"]["detected"]["share"] == 1.0
+    assert scores["anna"]["false_alarms"]["share"] == 1.0
+    assert scores["anna"]["median_shown_s"] == 3.0
+    assert scores["bo"]["detected"]["share"] == 0.0
+    assert scores["bo"]["decided"] == 1
+    assert [(one["above_bytes"], one["up_to_bytes"]) for one in scores["anna"]["by_bytes"]] == [(32, 64), (256, 512)]
+    assert {one["operator"] for one in anna.get("/api/score").json()["operators"]} == {"anna"}
+
+
+def test_watch_adds_a_sealed_contact_of_the_kind_of_the_vehicles(console):
+    watch = CalibratedWatch(console.state, share=1.0, draws=random.Random(3))
+    reference = image_record("00A7", total=120)
+    console.state.store_image(reference)
+    watch.contact_arrived(reference, now_s=0.0)
+    watch.step(DELAY_S[0] - 1.0)
+    assert listed(console) == {"00A7"}
+    watch.step(DELAY_S[1])
+    (added,) = listed(console) - {"00A7"}
+    rows = {row["image_id"]: row for row in console.state.list_contacts(ContactFilter())["items"]}
+    record = console.state.image(str(rows[added]["id"]), 1)
+    assert (record.picture.height_px, record.picture.width_px) == (40, 60)
+    assert (record.bytes_received, record.complete, record.vehicle_id) == (120, True, "uuv-1")
+    assert record.notes == ()
+    assert record.contact is not None
+    assert record.contact.position_sigma_m == reference.contact.position_sigma_m
+    assert rows[added]["looks"] == 1
+
+
+def test_watch_answers_a_request_for_a_sealed_contact(console, clock):
+    watch = CalibratedWatch(console.state, share=1.0, draws=random.Random(3))
+    watch.contact_arrived(image_record("00A7", total=120), now_s=0.0)
+    watch.step(DELAY_S[1])
+    (row,) = console.state.list_contacts(ContactFilter())["items"]
+    anna = console.browser("anna")
+    assert anna.post(f"/api/contacts/{row['id']}/requests", {"kind": "refine", "airtime_s": 20.0}).status_code == 201
+    states = []
+    for age_s in (1.0, 5.0, 25.0):
+        clock.now_utc_s = FIRST_UTC_S + age_s
+        watch.step(DELAY_S[1])
+        states.append(anna.contact(row["id"])["requests"][0]["state"])
+    assert states == ["waiting", "sent", "confirmed"]
+    versions = anna.contact(row["id"])["versions"]
+    assert [version["bytes_received"] for version in versions] == [120, 240]
+
+
+def test_share_of_the_watch(console):
+    watch = CalibratedWatch(console.state, share=0.25, draws=random.Random(1))
+    for number in range(200):
+        watch.contact_arrived(image_record(f"{number:04d}"), now_s=float(number))
+    # 50 are expected, and no more wait.
+    assert 35 <= len(watch._waiting) <= 50
+
+
+@pytest.mark.parametrize("changes", [{"position": None}, {"pixel_along_m": None}])
+def test_contact_without_position_or_pixel_size_is_not_imitated(console, changes):
+    watch = CalibratedWatch(console.state, share=1.0, draws=random.Random(1))
+    watch.contact_arrived(image_record("00A7", **changes), now_s=0.0)
+    watch.step(1e6)
+    assert listed(console) == set()
