@@ -137,7 +137,7 @@ class SessionRoutes:
         with self._limiter.attempt(self._limiter.buckets_of_session(call.session.token), known=False) as refund:
             if not self._users.verify_password(name, body.old):
                 log.warning("Password change refused", extra=kv(user=name, address=call.address))
-                raise ApiError(403, "wrong_login", "this is not your present password", "old")
+                raise ApiError(403, "wrong_login", "this is not your current password", "old")
             refund()
             self._users.set_password(name, body.new, keep=call.session.token)
         log.info("Password changed", extra=kv(user=name, address=call.address))

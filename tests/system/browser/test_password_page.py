@@ -79,12 +79,12 @@ def test_error_is_displayed_at_its_field(served):
     assert visit.page.get_attribute("#again", "aria-invalid") is None
     visit.expect_errors("403", "429")
     fill(visit, "not it at all", NEW, NEW)
-    visit.wait("#old-problem:has-text('this is not your present password')")
+    visit.wait("#old-problem:has-text('this is not your current password')")
     assert visit.page.evaluate(FOCUSED) == "old"
     assert visit.page.input_value("#new") == NEW, "a valid field keeps its value"
     for _ in range(4):
         fill(visit, "not it at all", NEW, NEW)
-        visit.wait("#old-problem:has-text('not your present')")
+        visit.wait("#old-problem:has-text('not your current')")
     fill(visit, PASSWORD, NEW, NEW)
     visit.wait("#problem:has-text('too many failed attempts: try again in')")
     assert served.users.verify_password("anna", PASSWORD)

@@ -41,7 +41,7 @@ async function request(method, path, body) {
   }
   if (response.status === 204) return null;
   if (response.ok) return response.json().catch(() => ({}));
-  if (response.status === 401 && path !== "/api/login") location.assign("/login");
+  if (response.status === 401 && !path.startsWith("/api/login")) location.assign("/login");
   throw await errorOf(response);
 }
 
@@ -81,6 +81,9 @@ export const api = {
   login: (user, password) => request("POST", "/api/login", { user, password }),
   logout: () => request("POST", "/api/logout"),
   password: (old, replacement) => request("POST", "/api/password", { old, new: replacement }),
+  loginLink: (token) => request("POST", "/api/login-link", { token }),
+  settings: () => request("GET", "/api/settings"),
+  storeSettings: (settings) => request("POST", "/api/settings", { settings }),
   session: () => request("GET", "/api/session"),
   info: () => request("GET", "/api/info"),
   contacts: (values) => request("GET", `/api/contacts?${queryString(values)}`),

@@ -8,14 +8,17 @@ import { debounce, h, showDialog, toast } from "./dom.js";
 import { startEvents } from "./event_stream.js";
 import { FleetView } from "./fleet_view.js";
 import { Header, restoreTheme, toggleTheme, toggleTypeSize } from "./header.js";
+import { markKeys } from "./keys.js";
 import { Drawer, onSwipe } from "./layout.js";
 import { MapView } from "./map_view.js";
 import { Queue } from "./queue.js";
 import { QueueFilters } from "./queue_filters.js";
 import { openRequestDialog } from "./request_dialog.js";
+import { loadSettings } from "./settings.js";
+import { openSettings } from "./settings_dialog.js";
 import { shortcutTable, showHelp, startShortcuts } from "./shortcuts.js";
 import { emit, listen, setClock, setting, state } from "./state.js";
-import { loadLanguage } from "./texts.js";
+import { loadLanguage, translate } from "./texts.js";
 
 class App {
   constructor() {
@@ -37,7 +40,7 @@ class App {
     onSwipe(this.view.stage, () => !this.view.zoomed && !this.view.measurement.active, (step) => this.queue.move(step));
     document.getElementById("main").append(this.review, this.map.element, this.fleet.element);
     this.keys = shortcutTable({ app: this, queue: this.queue, view: this.view, decision: this.decision, map: this.map });
-    this.header = new Header({ exports: () => this.exports(), help: () => this.help() });
+    this.header = new Header({ exports: () => this.exports(), settings: () => this.settings(), help: () => this.help() });
     this.#hideWithoutContact();
     this.#addListeners();
   }
@@ -152,6 +155,7 @@ class App {
   toggleTheme() { toggleTheme(); }
   toggleTypeSize() { toggleTypeSize(); }
   help() { showHelp(this.keys); }
+  settings() { openSettings(this.keys); }
 
   escape() {
     if (this.view.measurement.active) this.view.measurement.back();
@@ -186,9 +190,13 @@ async function saveExport(button, progress, format, filter) {
 
 restoreTheme();
 try {
-  await loadLanguage(setting("language"));
   [state.session, state.info] = await Promise.all([api.session(), api.info()]);
   setToken(state.session.csrf);
+  await loadSettings(state.session.user);
+  restoreTheme();
+  markKeys();
+  await loadLanguage(setting("language"));
+  translate(document);
   setClock(state.info.now_utc_s);
   await new App().start();
 } catch (error) {

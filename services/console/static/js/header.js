@@ -9,17 +9,18 @@ import { t } from "./texts.js";
 
 export const VIEWS = [["review", "Review", "q"], ["map", "Map", "p"], ["fleet", "Link", "f"]];
 
-export function toggleTheme() {
-  const theme = document.documentElement.dataset.theme === "night" ? "day" : "night";
+export function setTheme(theme) {
   document.documentElement.dataset.theme = setting("theme", theme);
   emit("theme");
 }
 
-export function toggleTypeSize() {
-  const size = document.documentElement.dataset.type === "large" ? "normal" : "large";
+export function setTypeSize(size) {
   document.documentElement.dataset.type = setting("type", size);
   emit("theme");
 }
+
+export const toggleTheme = () => setTheme(document.documentElement.dataset.theme === "night" ? "day" : "night");
+export const toggleTypeSize = () => setTypeSize(document.documentElement.dataset.type === "large" ? "normal" : "large");
 
 export function restoreTheme() {
   const preferred = matchMedia("(prefers-color-scheme: dark)").matches ? "night" : "day";
@@ -73,6 +74,7 @@ export class Header {
       h("button", { type: "button", title: "Exports (x)", "aria-label": "Exports (x)", on: { click: actions.exports } }, "⇩"),
       h("button", { type: "button", title: "Day or night (t)", "aria-label": "Day or night theme (t)", on: { click: toggleTheme } }, "◐"),
       h("button", { type: "button", title: "Type size (z)", "aria-label": "Type size (z)", on: { click: toggleTypeSize } }, "A±"),
+      h("button", { type: "button", id: "settings", title: `${t("settings.title")} (;)`, "aria-label": `${t("settings.title")} (;)`, on: { click: actions.settings } }, "⚙"),
       h("button", { type: "button", title: "Keys (?)", "aria-label": "Keys (?)", on: { click: actions.help } }, "?"),
       accountButtons());
     const menuButton = h("button", { type: "button", class: "menu-button", "aria-label": t("layout.menu"), title: t("layout.menu"), text: "☰" });

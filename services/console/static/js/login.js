@@ -1,11 +1,31 @@
-// Log-in page.
+// Log-in page: by name and password, or by a log-in link, whose token is the part of the address after "#".
 
 import { api } from "./api.js";
 import { restoreTheme } from "./header.js";
+import { setting } from "./state.js";
+import { loadLanguage, t, translate } from "./texts.js";
+
+const LINK_PROBLEMS = ["link_unknown", "link_used", "link_expired"];
 
 restoreTheme();
+await loadLanguage(setting("language"));
+translate(document);
 const form = document.getElementById("login");
 const problem = document.getElementById("problem");
+
+/** Log in by the link, if the address is one. The token is removed from the address, and thus from the history. */
+async function useLink() {
+  const token = location.hash.slice(1);
+  if (!token) return;
+  history.replaceState(null, "", location.pathname);
+  problem.textContent = t("login.link_wait");
+  try {
+    await api.loginLink(token);
+    location.replace("/");
+  } catch (error) {
+    problem.textContent = LINK_PROBLEMS.includes(error.code) ? t(`login.${error.code}`) : error.message;
+  }
+}
 
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
@@ -23,3 +43,5 @@ form.addEventListener("submit", async (event) => {
     button.disabled = false;
   }
 });
+addEventListener("hashchange", useLink);
+await useLink();

@@ -2,11 +2,14 @@
 
 import { api, setToken } from "./api.js";
 import { accountButtons, restoreTheme } from "./header.js";
-import { state } from "./state.js";
+import { setting, state } from "./state.js";
+import { loadLanguage, t, translate } from "./texts.js";
 
 const FIELDS = ["old", "new", "again"];
 
 restoreTheme();
+await loadLanguage(setting("language"));
+translate(document);
 const form = document.getElementById("change");
 const problem = document.getElementById("problem");
 const done = document.getElementById("done");
@@ -24,9 +27,9 @@ function findErrors() {
   const [min, max] = state.info.password_characters;
   const length = [...value("new")].length; // code points, as the server counts them
   return {
-    old: value("old") ? "" : "your present password is missing",
-    new: length >= min && length <= max ? "" : `a password has ${min} to ${max} characters; this one has ${length}`,
-    again: value("again") === value("new") ? "" : "the two new passwords differ",
+    old: value("old") ? "" : t("password.old_missing"),
+    new: length >= min && length <= max ? "" : t("password.length", { min, max, count: length }),
+    again: value("again") === value("new") ? "" : t("password.differ"),
   };
 }
 
@@ -47,7 +50,7 @@ async function change() {
   try {
     await api.password(value("old"), value("new"));
     for (const name of FIELDS) form.elements[name].value = "";
-    done.textContent = "Your password is changed. This session continues; your other sessions have ended.";
+    done.textContent = t("password.done");
     done.focus();
   } catch (error) {
     const field = error.body?.error?.field;
@@ -70,7 +73,8 @@ try {
   setToken(state.session.csrf);
   form.elements.user.value = state.session.user;
   document.getElementById("platform").textContent = state.info.platform_id;
-  document.getElementById("new-hint").textContent = `${state.info.password_characters.join(" to ")} characters`;
+  const [min, max] = state.info.password_characters;
+  document.getElementById("new-hint").textContent = t("password.hint", { min, max });
   document.getElementById("bar").append(...accountButtons());
   form.querySelector("button").disabled = false;
 } catch (error) {

@@ -1,6 +1,8 @@
 // Keyboard shortcuts, in one table for the event handler and the help.
 
 import { h, showDialog } from "./dom.js";
+import { keySettings, keysOf } from "./keys.js";
+import { t } from "./texts.js";
 
 const TYPES = new Set(["text", "search", "password", ""]);
 
@@ -9,63 +11,70 @@ export function isTextField(target) {
   return target.tagName === "TEXTAREA" || target.tagName === "SELECT" || (target.tagName === "INPUT" && TYPES.has(target.type));
 }
 
-/** Table of keys: [group, [[keys, text, handler, {view, label}]]]. `view`: the only view in which the key is active. */
+/**
+ * Table of keys: [group, [[keys, name, handler, {view, label}]]].
+ *
+ * `group` and `name` are names of texts; the settings store a changed key by its `name`, which is empty for a row that
+ * the help leaves out. `view`: the only view in which the key is active. `label`: name of a text in place of the keys.
+ */
 export function shortcutTable({ app, queue, view, decision, map }) {
   const review = { view: "review" };
   const onMap = { view: "map" };
   const arrow = (rows, columns) => (event) => {
     const far = event.shiftKey ? 5 : event.altKey ? 0.2 : 1;
     if (view.measurement.active) view.measurement.move(rows * far, columns * far);
-    else if (document.activeElement?.id === "queue" && rows) queue.move(rows);
+    else if (document.activeElement?.id === "queue" && (queue.horizontal ? columns : rows)) queue.move(rows + columns);
     else view.pan(0.1 * columns, 0.1 * rows);
   };
   return [
-    ["Queue", [
-      [["j"], "next contact", () => queue.move(1), review],
-      [["k"], "previous contact", () => queue.move(-1), review],
-      [["n"], "next unreviewed contact", () => app.nextUnreviewed(), review],
-      [["o"], "next look at the same position", () => app.nextLook(), review],
-      [["/"], "search", () => app.search(), review],
-      [["l"], "only unreviewed contacts, or all", () => app.toggleReview(), review],
+    ["shortcuts.queue", [
+      [["j"], "shortcuts.queue.next", () => queue.move(1), review],
+      [["k"], "shortcuts.queue.previous", () => queue.move(-1), review],
+      [["n"], "shortcuts.queue.next_unreviewed", () => app.nextUnreviewed(), review],
+      [["o"], "shortcuts.queue.next_look", () => app.nextLook(), review],
+      [["/"], "shortcuts.queue.search", () => app.search(), review],
+      [["l"], "shortcuts.queue.unreviewed", () => app.toggleReview(), review],
     ]],
-    ["Decision", [
-      [["1"], "mine-like", () => decision.choose("mine_like"), review],
-      [["2"], "not mine-like", () => decision.choose("not_mine_like"), review],
-      [["3"], "unsure", () => decision.choose("unsure"), review],
-      [["Enter"], "send; set a measurement point", () => app.enter(), review],
-      [["g"], "confidence", () => decision.confidence.focus(), review],
-      [["w"], "write a remark (Ctrl+Enter sends)", () => decision.remark.focus(), review],
-      [["u"], "undo the last decision", () => decision.undo(), review],
-      [["r"], "request more data", () => app.request(), review],
+    ["shortcuts.decision", [
+      [["1"], "shortcuts.decision.mine_like", () => decision.choose("mine_like"), review],
+      [["2"], "shortcuts.decision.not_mine_like", () => decision.choose("not_mine_like"), review],
+      [["3"], "shortcuts.decision.unsure", () => decision.choose("unsure"), review],
+      [["Enter"], "shortcuts.decision.enter", () => app.enter(), review],
+      [["g"], "shortcuts.decision.confidence", () => app.drawer.focus(decision.confidence), review],
+      [["w"], "shortcuts.decision.remark", () => app.drawer.focus(decision.remark), review],
+      [["u"], "shortcuts.decision.undo", () => decision.undo(), review],
+      [["r"], "shortcuts.decision.request", () => app.request(), review],
     ]],
-    ["Image", [
-      [["m"], "measure: length, width, shadow", () => view.startMeasurement(), review],
-      [["+", "="], "zoom in", () => view.zoom(1.5), review],
-      [["-"], "zoom out", () => view.zoom(1 / 1.5), review],
-      [["0"], "whole image", () => view.fit(), review],
+    ["shortcuts.image", [
+      [["m"], "shortcuts.image.measure", () => view.startMeasurement(), review],
+      [["+", "="], "shortcuts.image.zoom_in", () => view.zoom(1.5), review],
+      [["-"], "shortcuts.image.zoom_out", () => view.zoom(1 / 1.5), review],
+      [["0"], "shortcuts.image.whole", () => view.fit(), review],
       [["ArrowUp"], "", arrow(-1, 0), review], [["ArrowDown"], "", arrow(1, 0), review], [["ArrowLeft"], "", arrow(0, -1), review],
-      [["ArrowRight"], "move image or point", arrow(0, 1), { view: "review", label: "arrows" }],
-      [["["], "older version", () => view.stepVersion(-1), review],
-      [["]"], "newer version", () => view.stepVersion(1), review],
-      [["e"], "raw or enhanced layer", () => view.nextLayer(), review],
-      [["s"], "side by side", () => view.nextCompare(), review],
-      [["c"], "next colour map", () => view.nextMap(1), review],
-      [[",", "."], "darker, brighter", (event) => view.changeGain(event.key === "." ? 1 : -1), review],
-      [["a"], "automatic gain", () => view.changeGain(0), review],
-      [["h"], "hatch missing areas", () => view.toggleHatch(), review],
+      [["ArrowRight"], "shortcuts.image.move", arrow(0, 1), { view: "review", label: "shortcuts.arrows" }],
+      [["["], "shortcuts.image.older", () => view.stepVersion(-1), review],
+      [["]"], "shortcuts.image.newer", () => view.stepVersion(1), review],
+      [["e"], "shortcuts.image.layer", () => view.nextLayer(), review],
+      [["s"], "shortcuts.image.compare", () => view.nextCompare(), review],
+      [["c"], "shortcuts.image.map", () => view.nextMap(1), review],
+      [[","], "shortcuts.image.darker", () => view.changeGain(-1), review],
+      [["."], "shortcuts.image.brighter", () => view.changeGain(1), review],
+      [["a"], "shortcuts.image.auto_gain", () => view.changeGain(0), review],
+      [["h"], "shortcuts.image.hatch", () => view.toggleHatch(), review],
     ]],
-    ["Map", [
-      [["j"], "next contact", () => map.move(1), onMap], [["k"], "previous contact", () => map.move(-1), onMap],
-      [["Enter"], "review the selected contact", () => map.open(), onMap],
-      [["+", "="], "zoom in", () => map.zoom(1.5), onMap], [["-"], "zoom out", () => map.zoom(1 / 1.5), onMap], [["0"], "fit all", () => map.fit(), onMap],
+    ["shortcuts.map", [
+      [["j"], "shortcuts.map.next", () => map.move(1), onMap], [["k"], "shortcuts.map.previous", () => map.move(-1), onMap],
+      [["Enter"], "shortcuts.map.open", () => map.open(), onMap],
+      [["+", "="], "shortcuts.map.zoom_in", () => map.zoom(1.5), onMap], [["-"], "shortcuts.map.zoom_out", () => map.zoom(1 / 1.5), onMap], [["0"], "shortcuts.map.fit", () => map.fit(), onMap],
       [["ArrowUp"], "", () => map.pan(0, 80), onMap], [["ArrowDown"], "", () => map.pan(0, -80), onMap],
       [["ArrowLeft"], "", () => map.pan(80, 0), onMap], [["ArrowRight"], "", () => map.pan(-80, 0), onMap],
     ]],
-    ["Everywhere", [
-      [["q"], "review", () => app.show("review"), {}], [["p"], "map", () => app.show("map"), {}], [["f"], "link and fleet", () => app.show("fleet"), {}],
-      [["x"], "exports", () => app.exports(), {}], [["t"], "day or night", () => app.toggleTheme(), {}], [["z"], "type size", () => app.toggleTypeSize(), {}],
-      [["?"], "this help", () => app.help(), {}],
-      [["Escape"], "leave a field, remove a point, end a measurement", () => app.escape(), {}],
+    ["shortcuts.all", [
+      [["q"], "shortcuts.all.review", () => app.show("review"), {}], [["p"], "shortcuts.all.view_map", () => app.show("map"), {}], [["f"], "shortcuts.all.fleet", () => app.show("fleet"), {}],
+      [["x"], "shortcuts.all.exports", () => app.exports(), {}], [["t"], "shortcuts.all.theme", () => app.toggleTheme(), {}], [["z"], "shortcuts.all.type", () => app.toggleTypeSize(), {}],
+      [[";"], "shortcuts.all.settings", () => app.settings(), {}],
+      [["?"], "shortcuts.all.help", () => app.help(), {}],
+      [["Escape"], "shortcuts.all.escape", () => app.escape(), {}],
     ]],
   ];
 }
@@ -84,15 +93,19 @@ export function startShortcuts(keys, activeView, { leave, send }) {
     // Buttons handle Enter, and sliders handle arrow keys.
     if (event.key === "Enter" && ["BUTTON", "A", "SUMMARY"].includes(event.target.tagName)) return;
     if (event.key.startsWith("Arrow") && event.target.tagName === "INPUT") return;
-    const found = actions.find(([names, , , options]) => names.includes(event.key) && (!options.view || options.view === activeView()));
+    const settings = keySettings();
+    const found = actions.find((row) => (!row[3].view || row[3].view === activeView()) && keysOf(row, settings).includes(event.key));
     if (!found) return;
     event.preventDefault();
     found[2](event);
   });
 }
 
-export function showHelp(keys) {
-  const groups = keys.map(([title, list]) => [h("h3", { text: title }), list.filter(([, text]) => text).map(([names, text, , options]) => h("div", {},
-    h("span", { text }), h("span", {}, (options.label ? [options.label] : names).map((name) => [h("kbd", { text: name }), " "]))))]);
-  return showDialog("Keys", h("div", { class: "keys" }, groups), [{ label: "Close", value: null, primary: true }]);
+/** Show the present keys. */
+export function showHelp(table) {
+  const settings = keySettings();
+  const keyNames = (row) => (row[3].label ? [t(row[3].label)] : keysOf(row, settings));
+  const groups = table.map(([title, list]) => [h("h3", { text: t(title) }), list.filter((row) => row[1] && keyNames(row).length).map((row) => h("div", {},
+    h("span", { text: t(row[1]) }), h("span", {}, keyNames(row).map((name) => [h("kbd", { text: name }), " "]))))]);
+  return showDialog(t("shortcuts.title"), [settings.off ? h("p", { text: t("shortcuts.off") }) : null, h("div", { class: "keys" }, groups)].filter(Boolean), [{ label: t("shortcuts.close"), value: null, primary: true }]);
 }

@@ -14,7 +14,7 @@ export const state = {
 
 const bus = new EventTarget();
 
-/** Send a message to all listeners: an event of the server, `online`, `select`, `view`, `theme`, `changed` or `reload`. */
+/** Send a message to all listeners: an event of the server, `online`, `select`, `view`, `theme`, `setting`, `changed` or `reload`. */
 export function emit(name, detail = {}) {
   bus.dispatchEvent(new CustomEvent(name, { detail }));
 }
@@ -30,13 +30,22 @@ export function setClock(now_utc_s) {
   if (Number.isFinite(now_utc_s)) state.offset_s = now_utc_s - Date.now() / 1000;
 }
 
-/** Read or write a setting of this browser; of this page alone if the browser stores none (private window). */
+/**
+ * Read or write a setting of this browser; of this page alone if the browser stores none (private window). Null removes it.
+ *
+ * settings.js sends the settings that the server knows, so that they follow the user.
+ */
 const pageSettings = new Map();
 export function setting(name, value) {
   const key = `sonarpost.${name}`;
   if (value !== undefined) {
-    pageSettings.set(key, String(value));
-    try { localStorage.setItem(key, value); } catch { /* stored for this page only */ }
+    if (value === null) pageSettings.delete(key);
+    else pageSettings.set(key, String(value));
+    try {
+      if (value === null) localStorage.removeItem(key);
+      else localStorage.setItem(key, value);
+    } catch { /* stored for this page only */ }
+    emit("setting", { name, value: String(value) });
   }
   if (pageSettings.has(key)) return pageSettings.get(key);
   try { return localStorage.getItem(key); } catch { return null; }

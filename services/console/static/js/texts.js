@@ -26,3 +26,8 @@ export function t(name, values = {}) {
   const text = typeof found === "string" ? found : found[rules.select(values.count)] ?? found.other;
   return text.replace(/\{(\w+)\}/g, (_, key) => String(values[key]));
 }
+
+/** Replace the texts of elements with the attribute `data-text`, the name of a text. */
+export function translate(root) {
+  for (const element of root.querySelectorAll("[data-text]")) element.textContent = t(element.dataset.text);
+}
