@@ -94,12 +94,17 @@ class ExportContact:
         decisions: All decisions about it, oldest first.
         image_path: PNG of that version; None if the file is missing or only the contact record was received.
         size: Size as operators measured it; empty at the shore site, which receives no measurements.
+        result: Result of the decisions.
     """
 
     image: SideCar
     decisions: tuple[Decision, ...]
     image_path: Path | None
     size: MeasuredSize = field(default_factory=MeasuredSize)
+    result: ReviewResult = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "result", review_result(self.decisions))
 
     @property
     def uid(self) -> str:
@@ -110,11 +115,6 @@ class ExportContact:
     def name(self) -> str:
         """Short name for maps and tables, for example uuv-1/00A7."""
         return f"{self.image.vehicle_id}/{self.image.image_id}"
-
-    @property
-    def result(self) -> ReviewResult:
-        """Result of the decisions."""
-        return review_result(self.decisions)
 
     @property
     def decision(self) -> Decision | None:

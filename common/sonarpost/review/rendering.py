@@ -1,4 +1,4 @@
-"""Rendering of images for display: layers, colour maps, thumbnails."""
+"""Rendering of images for display: layers, colour maps."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ from scipy.ndimage import median_filter
 
 Grey = npt.NDArray[np.uint8]
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
-
-THUMBNAIL_PX: Final = 96
-_HATCH_PX: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,15 +103,6 @@ def render(
     colours = np.stack([np.interp(np.arange(256), at, anchors[:, channel]) for channel in range(3)], axis=1)
     coloured: npt.NDArray[np.uint8] = colours.round().astype(np.uint8)[grey]
     return coloured
-
-
-def thumbnail(image: Grey, missing: npt.NDArray[np.bool_]) -> Grey:
-    """Return a thumbnail of at most 96 px a side, with missing areas hatched."""
-    rows, columns = np.indices(image.shape)
-    hatch = np.where((rows + columns) % _HATCH_PX < _HATCH_PX // 2, 160, 70).astype(np.uint8)
-    small = Image.fromarray(np.where(missing, hatch, image).astype(np.uint8))
-    small.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX), Image.Resampling.BILINEAR)
-    return np.asarray(small, dtype=np.uint8)
 
 
 def encode_png(pixels: npt.NDArray[np.uint8]) -> bytes:

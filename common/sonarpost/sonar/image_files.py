@@ -171,10 +171,10 @@ def png_bytes(path: Path, image: GreyImage) -> bytes:
     return encode_png(Image.fromarray(np.ascontiguousarray(image)))
 
 
-def encode_png(image: Image.Image) -> bytes:
-    """Return an image of Pillow as PNG, without dates."""
+def encode_png(image: Image.Image, compress_level: int = 6) -> bytes:
+    """Return an image of Pillow as PNG, without dates; `compress_level` is that of zlib, 1 to 9."""
     buffer = io.BytesIO()
-    image.save(buffer, format="PNG")
+    image.save(buffer, format="PNG", compress_level=compress_level)
     return buffer.getvalue()
 
 

@@ -12,7 +12,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from sonarpost.messages import Advice, CommandKind, ReconstructedImage, Verdict
-from sonarpost.review import rendering
+from sonarpost.review import rendering, true_scale
 from sonarpost.review.measurement import Line, MeasurementKind
 from sonarpost.review.rendering import LAYERS, MAPS
 from sonarpost.services.console.state import ConsoleState
@@ -130,7 +130,7 @@ class ContactRoutes:
     def _thumbnail(self, call: Call) -> Response:
         def draw(image: ReconstructedImage) -> bytes:
             grey = rendering.eight_bits(image.picture.to_array())
-            return rendering.encode_png(rendering.thumbnail(grey, image.missing()))
+            return rendering.encode_png(true_scale.thumbnail(grey, image.missing(), image.contact))
 
         return self._png_response(call, draw)
 

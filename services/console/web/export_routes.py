@@ -26,7 +26,7 @@ from sonarpost.archive.image_files import side_car
 from sonarpost.delivery.store import HANDLING_RESERVE_BYTES
 from sonarpost.export.contacts import ContactSet, ExportContact, SideCar
 from sonarpost.export.cot import cot_events
-from sonarpost.export.kml import add_kmz
+from sonarpost.export.kml import ContactImage, add_kmz
 from sonarpost.export.tables import csv_bytes, geojson_bytes
 from sonarpost.export.text import probabilities_text
 from sonarpost.messages import Decision, ReconstructedImage
@@ -152,7 +152,7 @@ class ExportRoutes:
             contacts = self._contacts(query, file)
             convert = _FORMATS[name][0]
             if convert is None:
-                add_kmz(file, contacts, lambda contact: self._pixels(contact, file))
+                add_kmz(file, contacts, lambda contact: self._image(contact, file))
             else:
                 file.write(convert(contacts))
         except BaseException:
@@ -175,12 +175,12 @@ class ExportRoutes:
                 found.append(contact)
         return ContactSet(tuple(found), (), ())
 
-    def _pixels(self, contact: ExportContact, file: IO[bytes]) -> npt.NDArray[np.uint8] | None:
+    def _image(self, contact: ExportContact, file: IO[bytes]) -> ContactImage | None:
         self._check(file)
         if not contact.image.codec:
             return None
         image = self._state.image(contact.uid, contact.image.version)
-        return rendering.eight_bits(image.picture.to_array())
+        return ContactImage(rendering.eight_bits(image.picture.to_array()), image.missing())
 
     def _check(self, file: IO[bytes]) -> None:
         """Check the size of an export and the free space between two contacts."""
