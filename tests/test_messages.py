@@ -186,7 +186,7 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "withdraws": ["", "x" * 65],
         "overrules": [("",), ("d",) * 17],
     },
-    SAMPLES["command-refine"].__class__: {
+    SAMPLES["command-to-refine"].__class__: {
         "command_id": NO_ID,
         "kind": ["", "sink"],
         "vehicle_id": NO_NAME,
@@ -195,6 +195,9 @@ OUT_OF_RANGE: dict[type[Record], dict[str, list[object]]] = {
         "lon_deg": [-180.1, 180.1, NAN],
         "issued_by": ["", "x" * 121],
         "issued_utc_s": NO_TIME,
+        "box": [(-1, 0, 4, 4), (0, 0, 33, 4), (8, 0, 8, 32), (0, 9, 8, 8)],
+        "stream_bytes": [23, 65536],
+        "place": ["", "second"],
     },
     SAMPLES["advice-full"].__class__: {
         "advice_id": NO_ID,
@@ -261,7 +264,7 @@ ANY_VALUE = {
 }
 
 EXAMPLE = {type(sample): sample for sample in reversed(SAMPLES.values())}
-EXAMPLE[Command] = Command(**(SAMPLES["command-revisit"].model_dump() | {"kind": "refine", "image_id": "00A7"}))
+EXAMPLE[Command] = Command(**(SAMPLES["command-to-revisit"].model_dump() | {"kind": "refine", "image_id": "00A7"}))
 FIELDS = [(t, name) for t in RECORD_TYPES for name in t.model_fields]
 
 
@@ -439,6 +442,11 @@ def test_error_names_the_digest_of_another_image() -> None:
         ("resend", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
         ("wider", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
         ("original", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
+        ("region", {"image_id": "0001", "stream_bytes": 192}, "box"),
+        ("region", {"image_id": "0001", "box": (4, 0, 4, 32), "stream_bytes": 192}, "box"),
+        ("region", {"image_id": "0001", "box": (0, 0, 32, 32)}, "stream_bytes"),
+        ("prioritise", {"image_id": "0001"}, "place"),
+        ("prioritise", {"place": "first"}, "image_id"),
         ("revisit", {"lon_deg": 1.0}, "lat_deg"),
         ("revisit", {"lat_deg": 1.0}, "lon_deg"),
         ("revisit", {"image_id": "0001"}, "lat_deg"),

@@ -35,11 +35,14 @@ RecordId = Annotated[str, Field(pattern=r"^[!-~]{1,64}$")]
 
 Channel = Literal["port", "starboard"]
 Verdict = Literal["mine_like", "not_mine_like", "unsure"]
-CommandKind = Literal["refine", "resend", "revisit", "wider", "original"]
+CommandKind = Literal["refine", "resend", "revisit", "wider", "original", "region", "prioritise"]
+QueuePlace = Literal["first", "last"]
+BoxStart = Annotated[int, Field(ge=0, le=31)]
+BoxEnd = Annotated[int, Field(ge=1, le=32)]
 TaskingKind = Literal["advice", "command"]
 AtdClass = Literal["mine-like", "clutter", "structure"]
 DeliveryState = Literal["waiting", "delivered", "refused"]
-DownlinkKind = Literal["refine", "resend", "revisit", "decision", "wider", "original"]
+DownlinkKind = Literal["refine", "resend", "revisit", "decision", "wider", "original", "region", "prioritise"]
 DownlinkStep = Literal["asked", "sent", "confirmed", "refused", "expired"]
 ServiceState = Literal["starting", "ok", "degraded", "stopping"]
 
@@ -49,11 +52,16 @@ MAX_OVERRULED: Final = 16
 MAX_TRANSMISSION_S: Final = 300.0
 """Longer than any transmission of a modem; a longer one in a record means damage."""
 
+MIN_REGION_BYTES: Final = 24
+"""Shortest stream of a region."""
+
 _IMAGE_OF_COMMAND: Final = {
     "refine": "the image to refine",
     "resend": "the image to resend",
     "wider": "the image to show more around",
     "original": "the image to send without despeckling",
+    "region": "the image with the region",
+    "prioritise": "the image to move in the queue",
 }
 """The image that each kind of command names, for error messages."""
 
@@ -669,13 +677,18 @@ class Command(Record):
     Attributes:
         command_id: Unique; a repeated command is recognised by it.
         kind: refine: more detail. resend: the same again. wider: more seabed around the contact, as an image of its
-            own. original: the contact without despeckling, as an image of its own. revisit: survey a position again.
+            own. original: the contact without despeckling, as an image of its own. region: a part of the image, as an
+            image of its own. prioritise: send the rest of the image before or after all others. revisit: survey a
+            position again.
         vehicle_id: Vehicle that receives it.
         image_id: Image of the request; None only for `revisit`.
         lat_deg: Position to revisit. None for the other kinds.
         lon_deg: Position to revisit. None for the other kinds.
         issued_by: Name of the person.
         issued_utc_s: Time of the command.
+        box: With `region`: top, left, bottom and right of the region in 1/32 of the sides of the image.
+        stream_bytes: With `region`: length of the stream of the region. None for the other kinds.
+        place: With `prioritise`: place in the transmit queue. None for the other kinds.
     """
 
     TYPE: ClassVar[str] = "command"
@@ -688,6 +701,9 @@ class Command(Record):
     lon_deg: Annotated[Longitude | None, Field(validate_default=True)] = None
     issued_by: Annotated[str, Field(min_length=1, max_length=120)]
     issued_utc_s: Time
+    box: Annotated[tuple[BoxStart, BoxStart, BoxEnd, BoxEnd] | None, Field(validate_default=True)] = None
+    stream_bytes: Annotated[int | None, Field(ge=MIN_REGION_BYTES, le=65535, validate_default=True)] = None
+    place: Annotated[QueuePlace | None, Field(validate_default=True)] = None
 
     @field_validator("image_id")
     @classmethod
@@ -703,6 +719,31 @@ class Command(Record):
         if degrees is None and info.data.get("kind") == "revisit":
             raise ValueError("the position to revisit")
         return degrees
+
+    @field_validator("box")
+    @classmethod
+    def _check_box(
+        cls, box: tuple[int, int, int, int] | None, info: ValidationInfo
+    ) -> tuple[int, int, int, int] | None:
+        if box is None and info.data.get("kind") == "region":
+            raise ValueError("the edges of the region")
+        if box is not None and not (box[0] < box[2] and box[1] < box[3]):
+            raise ValueError("bottom and right behind top and left")
+        return box
+
+    @field_validator("stream_bytes")
+    @classmethod
+    def _check_stream_bytes(cls, stream_bytes: int | None, info: ValidationInfo) -> int | None:
+        if stream_bytes is None and info.data.get("kind") == "region":
+            raise ValueError("the length of the region's stream")
+        return stream_bytes
+
+    @field_validator("place")
+    @classmethod
+    def _check_place(cls, place: str | None, info: ValidationInfo) -> str | None:
+        if place is None and info.data.get("kind") == "prioritise":
+            raise ValueError("first or last")
+        return place
 
 
 class Advice(Record):

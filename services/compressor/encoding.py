@@ -9,8 +9,9 @@ import numpy.typing as npt
 
 from sonarpost.codec import emb
 from sonarpost.codec.interface import Codec, ExtensibleCodec, StreamHeader
+from sonarpost.codec.region import RegionBox
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
-from sonarpost.messages import Snippet
+from sonarpost.messages import Pixels, Snippet
 
 GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
@@ -76,6 +77,15 @@ def expand(snippet: Snippet) -> Snippet | None:
         "pixel_across_m": _expanded_size(contact.pixel_across_m),
     }
     return Snippet(contact=contact.model_copy(update=sizes), picture=snippet.wide, source=snippet.source)
+
+
+def cut_region(snippet: Snippet, box: RegionBox) -> Snippet:
+    """Return a snippet of the same contact with a part of its image, in pixels of the same size."""
+    pixels = snippet.picture.to_array()
+    top, left, bottom, right = box.pixels(*pixels.shape)
+    return Snippet(
+        contact=snippet.contact, picture=Pixels.from_array(pixels[top:bottom, left:right]), source=snippet.source
+    )
 
 
 def _expanded_size(pixel_m: float | None) -> float | None:

@@ -1,4 +1,4 @@
-"""The compressor service: encodes snippets and answers refine, resend, expand and original commands."""
+"""The compressor service: encodes snippets and answers refine, resend, expand, original and region commands."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Final
 from sonarpost import keys, wire
 from sonarpost.codec.interface import Codec
 from sonarpost.codec.jit import use_code_folder
+from sonarpost.codec.region import RegionBox
 from sonarpost.codec.registry import CodecResources, default_registry, present_name
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.config import PlatformConfig
@@ -21,13 +22,20 @@ from sonarpost.messages import Command, CommandKind, EncodedImage, Record, Snipp
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.compressor.config import CompressorConfig
 from sonarpost.services.compressor.encode_cache import CachedImage, EncodeCache, entry_location
-from sonarpost.services.compressor.encoding import encode, expand, is_despeckled, refine, transmit_part
+from sonarpost.services.compressor.encoding import (
+    cut_region,
+    encode,
+    expand,
+    is_despeckled,
+    refine,
+    transmit_part,
+)
 
 log = logging.getLogger(__name__)
 
 IMAGE_IDS = MAX_NUMBER
 """Image identifiers are the image numbers of the v1 link, 1 to this."""
-_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "wider", "original")
+_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "wider", "original", "region")
 _CONSUMER = "uuv_modem"
 _NEXT_IMAGE = "next_image"
 _COMMAND_PRIORITY = 3
@@ -73,7 +81,13 @@ class CompressorService(Service[CompressorConfig]):
             self._cache.put(effects, {image_id: cached}, time.time())
 
     def _encode(
-        self, snippet: Snippet, effects: UnitOfWork, payload: bytes, codec: Codec, priority: int = 4
+        self,
+        snippet: Snippet,
+        effects: UnitOfWork,
+        payload: bytes,
+        codec: Codec,
+        priority: int = 4,
+        budget_bytes: int | None = None,
     ) -> tuple[str, CachedImage]:
         """Encode a snippet as a new image and send it; return its identifier and cache entry.
 
@@ -83,9 +97,13 @@ class CompressorService(Service[CompressorConfig]):
             payload: The snippet, encoded.
             codec: The codec, with or without despeckling.
             priority: Delivery priority.
+            budget_bytes: Maximum length of the part that is sent; None for the configured one.
         """
         started = time.perf_counter()
-        complete = encode(codec, snippet.picture.to_array(), self.config.budget_bytes, self.config.refine_bytes)
+        budget = self.config.budget_bytes if budget_bytes is None else budget_bytes
+        # A region is sent as long as the command says: the link sends up to its `stream_bytes` without a command.
+        refine_bytes = self.config.refine_bytes if budget_bytes is None else 0
+        complete = encode(codec, snippet.picture.to_array(), budget, refine_bytes)
         stream = transmit_part(codec, complete)
         number = self._next_number()
         effects.put_state(_NEXT_IMAGE, str(number % IMAGE_IDS + 1).encode())
@@ -128,6 +146,8 @@ class CompressorService(Service[CompressorConfig]):
             self._expand(image_id, cached, effects)
         elif command.kind == "original":
             self._send_original(image_id, cached, effects)
+        elif command.kind == "region":
+            self._send_region(command, cached, effects)
         else:
             self._resend(command.kind, image_id, cached, effects)
 
@@ -167,6 +187,28 @@ class CompressorService(Service[CompressorConfig]):
         self._cache.put(effects, {image_id: replace(cached, original_id=original_id), original_id: entry}, time.time())
         effects.count("images_original")
         log.info("Image without despeckling sent", extra=kv(image_id=image_id, original_id=original_id))
+
+    def _send_region(self, command: Command, cached: CachedImage, effects: UnitOfWork) -> None:
+        """Send a part of an image, coded alone with all bytes, as an image of its own."""
+        assert command.box is not None
+        assert command.stream_bytes is not None
+        image_id = command.image_id or ""
+        snippet = wire.decode(Snippet, cached.snippet, entry_location(image_id))
+        region = cut_region(snippet, RegionBox(*command.box))
+        region_id, entry = self._encode(
+            region,
+            effects,
+            wire.encode(region),
+            self._codec_without_despeckling if not self._is_despeckled(image_id, cached) else self._codec,
+            priority=_COMMAND_PRIORITY,
+            budget_bytes=command.stream_bytes,
+        )
+        self._cache.put(effects, {region_id: entry}, time.time())
+        effects.count("images_region")
+        log.info("Region sent", extra=kv(image_id=image_id, region_id=region_id, bytes=command.stream_bytes))
+
+    def _is_despeckled(self, image_id: str, cached: CachedImage) -> bool:
+        return is_despeckled(wire.decode(EncodedImage, cached.image, entry_location(image_id)).stream)
 
     def _resend(self, kind: CommandKind, image_id: str, cached: CachedImage, effects: UnitOfWork) -> None:
         """Send an image again, with a longer stream for a refine command if the codec can extend it.

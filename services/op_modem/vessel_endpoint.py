@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
+from sonarpost.codec.region import RegionBox
 from sonarpost.errors import FrameError, PayloadError
 from sonarpost.link import migration
 from sonarpost.link.auth.authentication import FrameAuthenticator
@@ -179,6 +180,13 @@ def message_of(record: Command | Decision, token: int) -> dl.DownlinkCommand:
         return dl.RevisitMessage(token, issued, record.lat_deg, record.lon_deg)
     assert record.image_id is not None
     number = dl.number_of_image(record.image_id)
+    if record.kind == "region":
+        assert record.box is not None
+        assert record.stream_bytes is not None
+        return dl.RegionMessage(token, issued, number, RegionBox(*record.box), record.stream_bytes)
+    if record.kind == "prioritise":
+        assert record.place is not None
+        return dl.PrioritiseMessage(token, issued, number, record.place)
     if record.kind == "refine":
         return dl.RefineMessage(token, issued, number)
     return _NUMBER_MESSAGES[record.kind](token, issued, number)

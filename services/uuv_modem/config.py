@@ -51,7 +51,7 @@ class UuvModemConfig(ModemServiceConfig):
         stop_on_decision: v1: whether a decision for `mine_like` or `not_mine_like` stops the rest of its image; a later
             decision for `unsure` queues the rest again.
         queue_interval_s: Maximum time between two publications of the queue state.
-        refine_consumers: v1: services that receive the commands refine, resend, expand and original.
+        refine_consumers: v1: services that receive the commands refine, resend, expand, original and region.
         revisit_consumers: v1: services that receive the command revisit.
         decision_consumers: v1: services that receive operators' decisions.
     """

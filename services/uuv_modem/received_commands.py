@@ -14,7 +14,9 @@ from sonarpost.link.downlink.messages import (
     ExpandMessage,
     MessageKind,
     OriginalMessage,
+    PrioritiseMessage,
     RefineMessage,
+    RegionMessage,
     ResendMessage,
     RevisitMessage,
     image_of_number,
@@ -33,6 +35,8 @@ _KINDS: Final[dict[type, CommandKind]] = {
     RevisitMessage: "revisit",
     ExpandMessage: "wider",
     OriginalMessage: "original",
+    RegionMessage: "region",
+    PrioritiseMessage: "prioritise",
 }
 
 
@@ -81,7 +85,9 @@ class ReceivedCommands:
         return outcome, received if is_executed else None
 
     def _is_executed_by_the_queue(self, command: DownlinkCommand) -> bool:
-        return isinstance(command, DecisionMessage) and self._config.stop_on_decision
+        return isinstance(command, PrioritiseMessage) or (
+            isinstance(command, DecisionMessage) and self._config.stop_on_decision
+        )
 
     def is_latest_decision(self, decision: DecisionMessage) -> bool:
         """Return whether no known decision on the same image was issued after this one: copies can arrive late."""
@@ -114,7 +120,9 @@ class ReceivedCommands:
         if isinstance(command, RevisitMessage):
             lat_deg, lon_deg = command.lat_deg, command.lon_deg
             consumers = self._config.revisit_consumers
-        else:
+        elif isinstance(command, PrioritiseMessage):
+            consumers = ()
+        if not isinstance(command, RevisitMessage):
             image_id = image_id or image_of_number(command.number)
         record = Command(
             command_id=record_id,
@@ -125,6 +133,9 @@ class ReceivedCommands:
             lon_deg=lon_deg,
             issued_by=f"modem {source}",
             issued_utc_s=float(command.issued_utc_s),
+            box=command.box.as_tuple() if isinstance(command, RegionMessage) else None,
+            stream_bytes=command.stream_bytes if isinstance(command, RegionMessage) else None,
+            place=command.place if isinstance(command, PrioritiseMessage) else None,
         )
         return CommandRecord(keys.command(self._platform_id, kind), record, consumers)
 

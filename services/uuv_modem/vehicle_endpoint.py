@@ -25,6 +25,7 @@ from sonarpost.link.downlink.messages import (
     DataMessage,
     DecisionMessage,
     DownlinkCommand,
+    PrioritiseMessage,
     RefineMessage,
     RevisitMessage,
     confirmations,
@@ -311,6 +312,8 @@ class VehicleEndpoint:
         log.info("Command received", extra=kv(source=source, key=received.key, outcome=outcome.name.lower()))
         if isinstance(command, DecisionMessage) and self._config.stop_on_decision:
             self._stop_or_resume(command, now)
+        if isinstance(command, PrioritiseMessage):
+            self.queue.prioritise(command.number, now, first=command.place == "first")
         # If the queue has more of the image, it sends this itself, and the command reaches no other service.
         if isinstance(command, RefineMessage) and self.queue.refine(command.number, command.stream_bytes, now):
             return

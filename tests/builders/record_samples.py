@@ -310,7 +310,7 @@ SAMPLES: dict[str, Record] = {
         operator="op",
         decided_utc_s=0.0,
     ),
-    "command-refine": Command(
+    "command-to-refine": Command(
         command_id="c-1",
         kind="refine",
         vehicle_id="uuv-1",
@@ -318,7 +318,7 @@ SAMPLES: dict[str, Record] = {
         issued_by="op",
         issued_utc_s=1476262901.0,
     ),
-    "command-revisit": Command(
+    "command-to-revisit": Command(
         command_id="c-2",
         kind="revisit",
         vehicle_id="uuv-1",
@@ -327,7 +327,7 @@ SAMPLES: dict[str, Record] = {
         issued_by="op",
         issued_utc_s=1476262902.0,
     ),
-    "command-wider": Command(
+    "command-to-expand": Command(
         command_id="c-3",
         kind="wider",
         vehicle_id="uuv-1",
@@ -335,13 +335,32 @@ SAMPLES: dict[str, Record] = {
         issued_by="op",
         issued_utc_s=1476262903.0,
     ),
-    "command-original": Command(
+    "command-without-despeckling": Command(
         command_id="c-4",
         kind="original",
         vehicle_id="uuv-1",
         image_id="00A7",
         issued_by="op",
         issued_utc_s=1476262904.0,
+    ),
+    "command-region": Command(
+        command_id="c-5",
+        kind="region",
+        vehicle_id="uuv-1",
+        image_id="00A7",
+        issued_by="op",
+        issued_utc_s=1476262905.0,
+        box=(4, 8, 20, 32),
+        stream_bytes=192,
+    ),
+    "command-prioritise": Command(
+        command_id="c-6",
+        kind="prioritise",
+        vehicle_id="uuv-1",
+        image_id="00A7",
+        issued_by="op",
+        issued_utc_s=1476262906.0,
+        place="last",
     ),
     "advice-full": Advice(
         advice_id="a-2016-10-12-1",

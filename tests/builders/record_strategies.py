@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import string
-from typing import Any
+from typing import Any, get_args
 
 from hypothesis import strategies as st
 
 from sonarpost.messages import (
+    MIN_REGION_BYTES,
     AcousticFrame,
     Advice,
     Command,
+    CommandKind,
     Contact,
     Decision,
+    DownlinkKind,
     DownlinkState,
     EncodedImage,
     Health,
@@ -21,6 +24,7 @@ from sonarpost.messages import (
     OutgoingMessage,
     Pixels,
     QueuedImage,
+    QueuePlace,
     QueueState,
     ReceivedImage,
     ReceivedMessage,
@@ -175,9 +179,14 @@ def received_images(draw: st.DrawFn) -> ReceivedImage:
     )
 
 
+_box = st.tuples(st.integers(0, 15), st.integers(0, 15), st.integers(16, 32), st.integers(16, 32))
+_region_bytes = st.integers(MIN_REGION_BYTES, 65535)
+_place = st.sampled_from(get_args(QueuePlace))
+
+
 @st.composite
 def commands(draw: st.DrawFn) -> Command:
-    kind = draw(st.sampled_from(["refine", "resend", "revisit", "wider", "original"]))
+    kind = draw(st.sampled_from(get_args(CommandKind)))
     place = kind == "revisit"
     return Command(
         command_id=draw(_record_id),
@@ -188,6 +197,9 @@ def commands(draw: st.DrawFn) -> Command:
         lon_deg=draw(_lon if place else _maybe(_lon)),
         issued_by=draw(_text(1, 120)),
         issued_utc_s=draw(_time),
+        box=draw(_box if kind == "region" else _maybe(_box)),
+        stream_bytes=draw(_region_bytes if kind == "region" else _maybe(_region_bytes)),
+        place=draw(_place if kind == "prioritise" else _maybe(_place)),
     )
 
 
@@ -300,7 +312,7 @@ STRATEGIES[DownlinkState] = st.builds(
     DownlinkState,
     vessel_id=_name,
     vehicle_id=_name,
-    kind=st.sampled_from(["refine", "resend", "revisit", "decision", "wider", "original"]),
+    kind=st.sampled_from(get_args(DownlinkKind)),
     record_id=_record_id,
     state=st.sampled_from(["asked", "sent", "confirmed", "refused", "expired"]),
     times_sent=_count,

@@ -60,16 +60,17 @@ def decision_record(decision_id: str = "d1", **changes: object) -> Decision:
     return Decision.model_validate(fields | changes)
 
 
-def command_record(kind: str, image_id: str) -> Command:
-    """Return a command of the vessel's operator for one of its images."""
-    return Command(
-        command_id=f"{kind}-{image_id}",
-        kind=kind,
-        vehicle_id="uuv-1",
-        image_id=image_id,
-        issued_by="modem 1",
-        issued_utc_s=1476262800.0,
-    )
+def command_record(kind: str, image_id: str, **changes: object) -> Command:
+    """Return a command of the vessel's operator for one of its images; `changes` override fields."""
+    fields = {
+        "command_id": f"{kind}-{image_id}",
+        "kind": kind,
+        "vehicle_id": "uuv-1",
+        "image_id": image_id,
+        "issued_by": "modem 1",
+        "issued_utc_s": 1476262800.0,
+    }
+    return Command.model_validate(fields | changes)
 
 
 def encoded_image(number: int, length: int = 300) -> EncodedImage:

@@ -10,6 +10,7 @@ from builders.common import GOLDEN_FOLDER
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sonarpost.codec.region import RegionBox
 from sonarpost.errors import FrameError
 from sonarpost.link.downlink import messages as dl
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments, parse_frame
@@ -27,6 +28,10 @@ SAMPLES: dict[str, dl.Content] = {
     ),
     "wider": dl.ExpandMessage(0x0A0B0C0D, 1_790_000_004, 7),
     "original": dl.OriginalMessage(0x0A0B0C0E, 1_790_000_005, 7),
+    "region": dl.RegionMessage(0x0A0B0C0F, 1_790_000_006, 7, RegionBox(4, 8, 20, 32), 192),
+    "region-corner": dl.RegionMessage(1, 0, 65535, RegionBox(31, 31, 32, 32), 65535),
+    "prioritise-first": dl.PrioritiseMessage(0x0A0B0C10, 1_790_000_007, 7, "first"),
+    "prioritise-last": dl.PrioritiseMessage(0x0A0B0C11, 1_790_000_008, 8, "last"),
     "data": dl.DataMessage(b"\x00status"),
 }
 
@@ -42,11 +47,21 @@ def test_golden_bytes(name: str) -> None:
 
 numbers = st.integers(1, 65535)
 heads = {"token": st.integers(0, 2**32 - 1), "issued_utc_s": st.integers(0, 2**32 - 1)}
+starts, lengths = st.integers(0, 31), st.integers(1, 32)
+boxes = st.builds(
+    lambda top, left, height, width: RegionBox(top, left, min(32, top + height), min(32, left + width)),
+    starts,
+    starts,
+    lengths,
+    lengths,
+)
 commands = st.one_of(
     st.builds(dl.RefineMessage, **heads, number=numbers, stream_bytes=st.integers(0, 65535)),
     st.builds(dl.ResendMessage, **heads, number=numbers),
     st.builds(dl.ExpandMessage, **heads, number=numbers),
     st.builds(dl.OriginalMessage, **heads, number=numbers),
+    st.builds(dl.RegionMessage, **heads, number=numbers, box=boxes, stream_bytes=st.integers(24, 65535)),
+    st.builds(dl.PrioritiseMessage, **heads, number=numbers, place=st.sampled_from(["first", "last"])),
     st.builds(
         dl.RevisitMessage,
         **heads,
@@ -100,7 +115,14 @@ def test_hostile_bytes_parse_or_raise_frame_error(data: bytes) -> None:
     ("packed", "field"),
     [
         (b"", "kind"),
-        (b"\x07", "kind"),
+        (b"\x07", "length"),
+        (b"\x07" + bytes(8) + b"\0\1" + b"\x22\x27\xf1" + b"\0\xc0", "box"),
+        (b"\x07" + bytes(8) + b"\0\1" + b"\x22\x00\x00" + b"\0\xc0", "box"),
+        (b"\x07" + bytes(8) + b"\0\1" + b"\x22\x27\xf0" + b"\0\x17", "stream_bytes"),
+        (b"\x07" + bytes(8) + b"\0\0" + b"\x22\x27\xf0" + b"\0\xc0", "number"),
+        (b"\x09" + bytes(8) + b"\0\1\2", "place"),
+        (b"\x09" + bytes(8) + b"\0\0\1", "number"),
+        (b"\x0a", "kind"),
         (b"\x01\0\0", "length"),
         (bytes(9), "kind"),
         (b"\x01" + bytes(8) + b"\0\1\0", "length"),

@@ -171,6 +171,8 @@ def test_commands_are_sent_and_confirmed(authenticated, modem_pair, begin, conso
         "c-3": command("revisit", "c-3"),
         "c-4": command("wider", "c-4"),
         "c-5": command("original", "c-5"),
+        "c-6": command("region", "c-6", box=(4, 8, 20, 32), stream_bytes=192),
+        "c-7": command("prioritise", "c-7", place="last"),
     }
     for record in sent.values():
         console.send(keys.command(VESSEL, record.kind), "op_modem", record)
@@ -186,6 +188,9 @@ def test_commands_are_sent_and_confirmed(authenticated, modem_pair, begin, conso
         assert steps[0] == "asked"
         assert set(steps[1:-1]) == {"sent"}
     by_kind = {type(found): found for found in far.commands}
+    region, moved = by_kind[dl.RegionMessage], by_kind[dl.PrioritiseMessage]
+    assert (region.box.as_tuple(), region.stream_bytes, region.number) == ((4, 8, 20, 32), 192, 7)
+    assert (moved.place, moved.number) == ("last", 7)
     for_images = (dl.RefineMessage, dl.ResendMessage, dl.ExpandMessage, dl.OriginalMessage)
     assert {by_kind[kind].number for kind in for_images} == {7}
     assert (by_kind[dl.RevisitMessage].lat_deg, by_kind[dl.RevisitMessage].lon_deg) == (41.5, -70.5)

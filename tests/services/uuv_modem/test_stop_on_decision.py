@@ -10,7 +10,7 @@ from builders.records import encoded_image
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.store import Store
 from sonarpost.link.downlink.commands import CommandState
-from sonarpost.messages import Decision, Verdict
+from sonarpost.messages import Command, Decision, Verdict
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.vessel_endpoint import VesselLink
 from sonarpost.services.uuv_modem.config import UuvModemConfig
@@ -152,6 +152,31 @@ def test_late_copy_of_a_withdrawn_verdict_stops_nothing(store):
     link.run(60)
     assert link.counts["images_stopped"] == 0
     assert link.received["0001"] == STREAM_BYTES
+
+
+def test_prioritised_image_is_completed_first(store):
+    link = Link(store)
+    link.add(1, 2, 3, 4)
+    link.run_until_previewed(4)
+    command = Command(
+        command_id="c-1",
+        kind="prioritise",
+        vehicle_id="uuv-1",
+        image_id="0003",
+        issued_by="op",
+        issued_utc_s=link.now,
+        place="first",
+    )
+    pending = link.vessel.add(command, link.now)
+    assert pending is not None
+    while link.received["0003"] < STREAM_BYTES:
+        assert link.run(1) == 1
+    assert max(link.received[name] for name in ("0001", "0002", "0004")) < STREAM_BYTES
+    link.run(60)
+    assert set(link.received.values()) == {STREAM_BYTES}
+    found = link.vessel.commands.find("prioritise", "c-1")
+    assert found is not None
+    assert found.state is CommandState.CONFIRMED
 
 
 def test_option_switches_the_stop_off(store):

@@ -12,6 +12,7 @@ from builders.records import encoded_image, outgoing_message
 from builders.v1_world import feedback_frame
 
 from sonarpost import keys, wire
+from sonarpost.codec.region import RegionBox
 from sonarpost.delivery.store import Store
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import AcousticKey, Direction
@@ -24,6 +25,7 @@ from sonarpost.link.downlink.messages import (
     ExpandMessage,
     OriginalMessage,
     RefineMessage,
+    RegionMessage,
     ResendMessage,
     RevisitMessage,
     number_of_image,
@@ -238,6 +240,7 @@ COMMANDS = [
     (RevisitMessage(3, 1002, 56.5, -5.25), "revisit", None),
     (ExpandMessage(5, 1004, 4), "wider", "0004"),
     (OriginalMessage(6, 1005, 5), "original", "0005"),
+    (RegionMessage(7, 1006, 6, RegionBox(4, 8, 20, 32), 192), "region", "0006"),
 ]
 
 
@@ -253,21 +256,24 @@ def test_commands_become_one_record_each_and_are_confirmed_each_time(vessel, sta
     def outcomes() -> list[tuple[int, CommandOutcome]]:
         return [o for m in vessel.messages() if isinstance(m, ConfirmationMessage) for o in m.outcomes]
 
-    vessel.send_messages(*commands, until=lambda: {token for token, _ in outcomes()} == {1, 2, 3, 4, 5, 6})
+    vessel.send_messages(*commands, until=lambda: {token for token, _ in outcomes()} == {1, 2, 3, 4, 5, 6, 7})
     before = outcomes().count((1, CommandOutcome.ACCEPTED))
     vessel.send_messages(commands[0], until=lambda: outcomes().count((1, CommandOutcome.ACCEPTED)) > before)
-    eventually(lambda: len(compressor.received) == 4 and len(autonomy.received) == 2)
+    eventually(lambda: len(compressor.received) == 5 and len(autonomy.received) == 2)
     assert {outcome for _, outcome in outcomes()} == {CommandOutcome.ACCEPTED}
     assert {(c.kind, c.image_id) for c in compressor.received} == {
         ("refine", "0002"),
         ("resend", "0003"),
         ("wider", "0004"),
         ("original", "0005"),
+        ("region", "0006"),
     }
+    (region,) = [c for c in compressor.received if c.kind == "region"]
+    assert (region.box, region.stream_bytes) == ((4, 8, 20, 32), 192)
     revisit, decision = sorted(autonomy.received, key=lambda r: r.TYPE)
     assert (revisit.lat_deg, revisit.lon_deg, revisit.command_id) == (56.5, -5.25, "a1-00000003")
     assert (decision.verdict, decision.mlo_class, decision.image_id) == ("mine_like", "sphere", "0002")
-    assert service.health().counters["commands_received"] == 6
+    assert service.health().counters["commands_received"] == 7
 
 
 def test_command_without_a_consumer_is_confirmed_as_unsupported(vessel, start_service):

@@ -17,7 +17,7 @@ from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.shared import Subparsers, add_router_options, add_site_option, router_of
 from sonarpost.delivery.client import deliver
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.messages import Advice, Command, Record, Verdict
+from sonarpost.messages import Advice, Command, QueuePlace, Record, Verdict
 from sonarpost.wire import first_error
 
 CONSUMER = "c2"
@@ -27,6 +27,8 @@ KINDS = {
     "expand": "wider",
     "original": "original",
     "revisit": "revisit",
+    "region": "region",
+    "prioritise": "prioritise",
     "wider": "wider",
 }
 """Kind on the command line (`wider` is the former name of `expand`) -> kind in the record."""
@@ -45,10 +47,19 @@ def add_actions(actions: Subparsers) -> None:
         choices=KINDS,
         metavar="KIND",
         help="refine (more detail), resend (lost parts), expand (more seabed around the contact), original (the image"
-        " without despeckling) or revisit",
+        " without despeckling), region (a part of the image), prioritise (move it in the transmit queue) or revisit",
     )
     command.add_argument("--lat", type=float, metavar="DEG", help="latitude to revisit")
     command.add_argument("--lon", type=float, metavar="DEG", help="longitude to revisit")
+    command.add_argument(
+        "--box",
+        type=int,
+        nargs=4,
+        metavar=("TOP", "LEFT", "BOTTOM", "RIGHT"),
+        help="edges of the region in 1/32 of the sides of the image",
+    )
+    command.add_argument("--bytes", type=int, metavar="N", help="length of the stream of the region")
+    command.add_argument("--place", choices=get_args(QueuePlace), help="place in the transmit queue")
     command.set_defaults(run=run_command)
     comment = actions.add_parser("comment", help="send an expert's comment on an image to the operator of a vessel")
     _add_common_options(comment)
@@ -117,6 +128,9 @@ def run_command(parsed: argparse.Namespace) -> int:
         "lon_deg": parsed.lon,
         "issued_by": _author(parsed),
         "issued_utc_s": time.time(),
+        "box": None if parsed.box is None else tuple(parsed.box),
+        "stream_bytes": parsed.bytes,
+        "place": parsed.place,
     }
     _send(parsed, keys.tasking_command(parsed.vessel, parsed.site), Command, fields)
     _print_accepted("command", fields["command_id"], parsed.vessel)

@@ -42,7 +42,7 @@ class PendingCommand:
     """A command and its state.
 
     Attributes:
-        kind: `refine`, `resend`, `revisit`, `wider`, `original` or `decision`.
+        kind: Kind of the record `command`, or `decision`.
         record_id: Identifier of its record.
         vehicle: Name of the vehicle.
         address: Modem address of the vehicle.

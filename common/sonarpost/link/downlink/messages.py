@@ -16,11 +16,12 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated, Final, Literal
 
-from sonarpost.errors import FrameError
+from sonarpost.codec.region import PACKED_BYTES, RegionBox
+from sonarpost.errors import BadInputError, FrameError
 from sonarpost.link.frames.paper.frame import format_image_id, is_image_id
-from sonarpost.link.frames.v1.payload_objects import MAX_NUMBER, ImageNumber, StreamPosition
+from sonarpost.link.frames.v1.payload_objects import MAX_NUMBER, MAX_STREAM_BYTES, ImageNumber, StreamPosition
 from sonarpost.link.state import Bounds, check_bounds
-from sonarpost.messages import Verdict
+from sonarpost.messages import MIN_REGION_BYTES, QueuePlace, Verdict
 
 SMALLEST_ROOM_BYTES: Final = 27
 """Length of a message in a frame of 32 bytes without a tag."""
@@ -38,6 +39,8 @@ _MAX_VERSION: Final = 255
 _HEAD = struct.Struct(">BII")
 _REFINE = struct.Struct(">HH")
 _NUMBER = struct.Struct(">H")
+_REGION = struct.Struct(f">H{PACKED_BYTES}sH")
+_PRIORITISE = struct.Struct(">HB")
 _REVISIT = struct.Struct(">ii")
 _DECISION = struct.Struct(">HBBB")
 _OUTCOME = struct.Struct(">IB")
@@ -52,7 +55,9 @@ class MessageKind(IntEnum):
     DECISION = 0x04
     EXPAND = 0x05
     ORIGINAL = 0x06
+    REGION = 0x07
     CONFIRMATION = 0x08
+    PRIORITISE = 0x09
     DATA = 0x10
 
 
@@ -63,6 +68,8 @@ _COMMANDS: Final = (
     MessageKind.DECISION,
     MessageKind.EXPAND,
     MessageKind.ORIGINAL,
+    MessageKind.REGION,
+    MessageKind.PRIORITISE,
 )
 
 
@@ -79,6 +86,7 @@ class CommandOutcome(IntEnum):
     UNSUPPORTED = 2
 
 
+_PLACES: Final[tuple[QueuePlace, ...]] = ("first", "last")
 _VERDICTS: Final[tuple[Verdict, ...]] = ("mine_like", "not_mine_like", "unsure")
 
 
@@ -128,6 +136,31 @@ class ExpandMessage(ImageCommandMessage):
 @dataclass(frozen=True, slots=True)
 class OriginalMessage(ImageCommandMessage):
     """Send the contact without despeckling, as a new image."""
+
+
+@dataclass(frozen=True, slots=True)
+class RegionMessage(ImageCommandMessage):
+    """Send a part of the image, as a new image.
+
+    Attributes:
+        box: The part.
+        stream_bytes: Length of the new image's stream.
+    """
+
+    box: RegionBox
+    stream_bytes: Annotated[int, Bounds(MIN_REGION_BYTES, MAX_STREAM_BYTES)]
+
+
+@dataclass(frozen=True, slots=True)
+class PrioritiseMessage(ImageCommandMessage):
+    """Send the rest of the image before or after all others. `place`: first or last."""
+
+    place: QueuePlace
+
+    def __post_init__(self) -> None:
+        ImageCommandMessage.__post_init__(self)
+        if self.place not in _PLACES:
+            raise FrameError(_WHERE, "place", self.place, ", ".join(_PLACES))
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,14 +225,31 @@ class DataMessage:
         _check("data", len(self.data), 1, 4095)
 
 
-_NUMBER_KINDS: Final[Mapping[type[ImageCommandMessage], MessageKind]] = {
+_IMAGE_KINDS: Final[Mapping[type[ImageCommandMessage], MessageKind]] = {
+    RefineMessage: MessageKind.REFINE,
     ResendMessage: MessageKind.RESEND,
     ExpandMessage: MessageKind.EXPAND,
     OriginalMessage: MessageKind.ORIGINAL,
+    RegionMessage: MessageKind.REGION,
+    PrioritiseMessage: MessageKind.PRIORITISE,
 }
-"""Kinds of the messages that have only the number of the contact."""
+_NUMBER_MESSAGES: Final[Mapping[MessageKind, type[ResendMessage | ExpandMessage | OriginalMessage]]] = {
+    MessageKind.RESEND: ResendMessage,
+    MessageKind.EXPAND: ExpandMessage,
+    MessageKind.ORIGINAL: OriginalMessage,
+}
+"""Messages that have only the number of the contact."""
 
-DownlinkCommand = RefineMessage | ResendMessage | RevisitMessage | DecisionMessage | ExpandMessage | OriginalMessage
+DownlinkCommand = (
+    RefineMessage
+    | ResendMessage
+    | RevisitMessage
+    | DecisionMessage
+    | ExpandMessage
+    | OriginalMessage
+    | RegionMessage
+    | PrioritiseMessage
+)
 Content = DownlinkCommand | ConfirmationMessage | DataMessage
 
 
@@ -225,10 +275,6 @@ def _packed(content: Content, room_bytes: int) -> bytes:
             return bytes([MessageKind.DATA]) + content.data
         case ConfirmationMessage():
             return bytes([MessageKind.CONFIRMATION]) + b"".join(_OUTCOME.pack(*each) for each in content.outcomes)
-        case RefineMessage():
-            return _head(MessageKind.REFINE, content) + _REFINE.pack(content.number, content.stream_bytes)
-        case ResendMessage() | ExpandMessage() | OriginalMessage():
-            return _head(_NUMBER_KINDS[type(content)], content) + _NUMBER.pack(content.number)
         case RevisitMessage():
             degrees = (round(value * _DEGREE_STEPS) for value in (content.lat_deg, content.lon_deg))
             return _head(MessageKind.REVISIT, content) + _REVISIT.pack(*degrees)
@@ -238,6 +284,22 @@ def _packed(content: Content, room_bytes: int) -> bytes:
                 content.number, min(content.version, _MAX_VERSION), _VERDICTS.index(content.verdict), confidence
             )
             return fixed + _shortened(content.mlo_class, room_bytes - len(fixed))
+        case _:
+            return _head(_IMAGE_KINDS[type(content)], content) + _image_fields(content)
+
+
+def _image_fields(
+    content: RefineMessage | ResendMessage | ExpandMessage | OriginalMessage | RegionMessage | PrioritiseMessage,
+) -> bytes:
+    match content:
+        case RefineMessage():
+            return _REFINE.pack(content.number, content.stream_bytes)
+        case RegionMessage():
+            return _REGION.pack(content.number, content.box.pack(), content.stream_bytes)
+        case PrioritiseMessage():
+            return _PRIORITISE.pack(content.number, _PLACES.index(content.place))
+        case _:
+            return _NUMBER.pack(content.number)
 
 
 def _head(kind: MessageKind, command: CommandMessage) -> bytes:
@@ -275,16 +337,16 @@ def _content(data: bytes) -> Content:
 
 
 def _command(kind: MessageKind, token: int, issued: int, body: bytes) -> DownlinkCommand:
+    if kind in _NUMBER_MESSAGES:
+        return _NUMBER_MESSAGES[kind](token, issued, *_fields(_NUMBER, body))
     match kind:
         case MessageKind.REFINE:
             number, stream_bytes = _fields(_REFINE, body)
             return RefineMessage(token, issued, number, stream_bytes)
-        case MessageKind.RESEND:
-            return ResendMessage(token, issued, *_fields(_NUMBER, body))
-        case MessageKind.EXPAND:
-            return ExpandMessage(token, issued, *_fields(_NUMBER, body))
-        case MessageKind.ORIGINAL:
-            return OriginalMessage(token, issued, *_fields(_NUMBER, body))
+        case MessageKind.REGION:
+            return _region(token, issued, body)
+        case MessageKind.PRIORITISE:
+            return _prioritise(token, issued, body)
         case MessageKind.REVISIT:
             lat, lon = _fields(_REVISIT, body)
             return RevisitMessage(token, issued, lat / _DEGREE_STEPS, lon / _DEGREE_STEPS)
@@ -299,10 +361,31 @@ def _command(kind: MessageKind, token: int, issued: int, body: bytes) -> Downlin
     return DecisionMessage(token, issued, number, version, _VERDICTS[verdict], probability, mlo_class)
 
 
+def _prioritise(token: int, issued: int, body: bytes) -> PrioritiseMessage:
+    number, place = _fields(_PRIORITISE, body)
+    if place >= len(_PLACES):
+        raise FrameError(_WHERE, "place", place, f"0..{len(_PLACES) - 1}")
+    return PrioritiseMessage(token, issued, number, _PLACES[place])
+
+
+def _region(token: int, issued: int, body: bytes) -> RegionMessage:
+    _check_length(_REGION, body)
+    number, packed, stream_bytes = _REGION.unpack(body)
+    try:
+        box = RegionBox.unpack(packed)
+    except BadInputError as error:
+        raise FrameError(_WHERE, "box", packed, error.expected) from error
+    return RegionMessage(token, issued, number, box, stream_bytes)
+
+
 def _fields(layout: struct.Struct, body: bytes) -> tuple[int, ...]:
+    _check_length(layout, body)
+    return layout.unpack(body)
+
+
+def _check_length(layout: struct.Struct, body: bytes) -> None:
     if len(body) != layout.size:
         raise FrameError(_WHERE, "length", len(body), f"{layout.size} bytes after the head")
-    return layout.unpack(body)
 
 
 def _confirmation(body: bytes) -> ConfirmationMessage:
