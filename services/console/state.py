@@ -264,6 +264,7 @@ class ConsoleState:
                 "versions": [version_json(row, refine_base) for row in versions],
                 "related": related_images_json(db, contact_id),
                 "decisions": list_records(db, "decision", contact_id),
+                "standing": decisions.standing_decisions(db, contact_id),
                 "advice": list_records(db, "advice", contact_id),
                 "requests": list_records(db, "request", contact_id),
                 "measurements": measured,

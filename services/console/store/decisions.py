@@ -162,7 +162,7 @@ def undo_decision(
         _check_displayed_image(db, contact_id, displayed)
     undone = find_record(db, "decision", decision_id)
     records = _records(db, contact_id)
-    standing = {one.decision_id for one in review_result(records).standing}
+    standing = standing_decisions(db, contact_id)
     own = undone is not None and undone["operator"] == actor.user and not undone["elsewhere"]
     if undone is None or not own or decision_id not in standing:
         raise BadInputError("undo", "decision_id", decision_id, f"a standing decision of {actor.user} at this console")
@@ -199,6 +199,11 @@ def release_decisions(db: sqlite3.Connection, now_utc_s: float, take_back_s: flo
     )
 
 
+def standing_decisions(db: sqlite3.Connection, contact_id: str) -> list[str]:
+    """Return the identifiers of the decisions on a contact that stand, oldest first; see `review_result`."""
+    return [one.decision_id for one in review_result(_records(db, contact_id)).standing]
+
+
 def last_own_decision(db: sqlite3.Connection, user: str, since_utc_s: float) -> sqlite3.Row | None:
     """Return the last standing decision that a user made at this console since a time; None if there is none."""
     rows = db.execute(
@@ -207,8 +212,7 @@ def last_own_decision(db: sqlite3.Connection, user: str, since_utc_s: float) -> 
         (user, since_utc_s),
     )
     for row in rows.fetchall():
-        standing = review_result(_records(db, row["contact_id"])).standing
-        if any(one.decision_id == row["decision_id"] for one in standing):
+        if row["decision_id"] in standing_decisions(db, row["contact_id"]):
             found: sqlite3.Row = row
             return found
     return None

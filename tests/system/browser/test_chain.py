@@ -79,7 +79,9 @@ def test_contact_is_received_measured_and_decided(
     runner.start(RelayService(platform("vessel-1"), RelayConfig()))
     users = Users(tmp_path / "state" / "vessel-1" / FILE_NAME)
     users.add("anna", "operator", "correct horse battery")
-    console = runner.start(ConsoleService(platform("vessel-1"), ConsoleConfig(port=0, vehicles=VEHICLES, take_back_s=0)))
+    console = runner.start(
+        ConsoleService(platform("vessel-1"), ConsoleConfig(port=0, vehicles=VEHICLES, take_back_s=0))
+    )
     decompressor = {"out_dir": tmp_path / "out", "image_consumers": ("relay", "console")}
     runner.start(DecompressorService(platform("vessel-1"), DecompressorConfig(**decompressor)))
     op_modem = {"port": modem_pair.port(modem_pair.VESSEL), "vehicles": VEHICLES, "retry_s": 0.5, "holdoff_s": 0.05}

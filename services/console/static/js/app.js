@@ -1,7 +1,9 @@
 // The page: assembles the views, and keeps the displayed contact up to date.
 
 import { api, setToken } from "./api.js";
+import { ActionQueue } from "./actions.js";
 import { ContactDetails } from "./contact_details.js";
+import { ContactLoader } from "./contact_loader.js";
 import { ContactView } from "./contact_view.js";
 import { DecisionForm } from "./decision_form.js";
 import { debounce, h, showDialog, toast } from "./dom.js";
@@ -18,12 +20,20 @@ import { loadSettings } from "./settings.js";
 import { openSettings } from "./settings_dialog.js";
 import { shortcutTable, showHelp, startShortcuts } from "./shortcuts.js";
 import { emit, listen, setClock, setting, state } from "./state.js";
-import { loadLanguage, translate } from "./texts.js";
+import { StatusLine } from "./status_line.js";
+import { loadLanguage, t, translate } from "./texts.js";
+
+const PREFETCHED_ROWS = 3;
 
 class App {
   constructor() {
     this.view = new ContactView();
-    this.decision = new DecisionForm(this.view);
+    this.loader = new ContactLoader((detail) => this.view.prepare(detail));
+    this.actions = new ActionQueue();
+    this.goal = null; // identifier of the contact that is being loaded for display
+    this.supersede = () => {}; // ends waiting for the goal
+    this.status = new StatusLine(() => this.undo());
+    this.decision = new DecisionForm(this.view, this.status, (name, hold) => this.#pressed(name, hold));
     this.details = new ContactDetails();
     this.queue = new Queue();
     this.filters = new QueueFilters(debounce(() => this.queue.show(this.filters.query), 120));
@@ -33,9 +43,9 @@ class App {
     this.activeView = "review";
     this.requestNumber = 0; // last request for a contact
     this.displayedNumber = 0; // request whose response is displayed
-    this.panel = h("div", { class: "panel", role: "region", "aria-label": "Decision" }, this.decision.element, this.details.element);
+    this.panel = h("div", { class: "panel", role: "region", "aria-label": t("app.decision") }, this.decision.element, this.details.element);
     this.drawer = new Drawer(this.panel);
-    this.review = h("section", { class: "review", "aria-label": "Review" },
+    this.review = h("section", { class: "review", "aria-label": t("app.review") },
       h("div", { class: "side" }, this.filters.element, this.queue.element), this.view.element, this.panel);
     onSwipe(this.view.stage, () => !this.view.zoomed && !this.view.measurement.active, (step) => this.queue.move(step));
     document.getElementById("main").append(this.review, this.map.element, this.fleet.element);
@@ -47,17 +57,24 @@ class App {
 
   #addListeners() {
     const reloadSoon = debounce(() => this.load(), 5, 50);
-    startShortcuts(this.keys, () => this.activeView, { leave: () => this.escape(), send: () => this.decision.submit() });
+    startShortcuts(this.keys, () => this.activeView, { leave: () => this.escape(), send: () => this.submit() });
     listen("counts", (response) => {
       this.filters.update(response);
       // Display the first contact if none is selected.
-      if (state.selected === null && response.matching > 0) queueMicrotask(() => this.queue.choose(0));
+      if (state.selected === null && response.matching > 0) queueMicrotask(() => this.queue.move(1));
     });
-    listen("select", ({ id }) => this.select(id));
+    listen("select", ({ id, name }) => this.select(id, name));
+    listen("move", ({ step }) => this.#go((id) => this.queue.rowAfter(id, step)));
     listen("view", ({ name }) => this.show(name));
-    listen("contact", ({ contact }) => { if (contact.id === state.selected) reloadSoon(); });
-    for (const name of ["decision", "request", "advice", "changed"]) listen(name, ({ id }) => { if (id === state.selected) reloadSoon(); });
-    listen("reload", () => this.reload());
+    const changed = (id) => {
+      this.loader.forget(id);
+      if (id === state.selected) reloadSoon();
+    };
+    listen("contact", ({ contact }) => changed(contact.id));
+    for (const name of ["decision", "request", "advice", "changed"]) listen(name, ({ id }) => changed(id));
+    // Without events, what was loaded in advance can be old.
+    listen("online", () => this.loader.clear());
+    listen("reload", () => { this.loader.clear(); this.reload(); });
     listen("theme", () => this.view.redraw());
     listen("session", () => location.assign("/login"));
   }
@@ -65,8 +82,9 @@ class App {
   async start() {
     this.show("review");
     const requested = decodeURIComponent(location.hash.slice(1));
+    if (requested) this.select(requested);
     await Promise.all([
-      requested ? this.select(requested) : null,
+      this.status.start(),
       this.queue.show(this.filters.query),
       api.fleet().then((fleet) => emit("fleet", fleet)),
     ]);
@@ -87,11 +105,67 @@ class App {
     for (const part of [this.view.element, this.panel]) part.classList.toggle("hidden", state.selected === null);
   }
 
-  async select(id) {
+  select(id, name = id) {
+    this.#go(() => ({ id, name }));
+  }
+
+  /** Display the contact that `find(id)` returns for the displayed one. A step that follows at once replaces it. */
+  #go(find) {
+    if (this.actions.empty) this.supersede();
+    this.actions.add(() => this.#open(find));
+  }
+
+  /**
+   * Load a contact with its image, then change row, heading, form and image in one animation frame.
+   *
+   * Returns whether the contact is displayed. If it could not be loaded, nothing changes, and waiting actions are
+   * dropped: they were meant for this contact.
+   */
+  async #open(find) {
+    let row = null;
+    try {
+      row = await find(this.goal ?? state.selected);
+      if (row === null || row.id === state.selected) {
+        this.#endLoading();
+        return row !== null;
+      }
+      this.goal = row.id;
+      this.view.showLoading(row.name);
+      const superseded = new Promise((resolve) => { this.supersede = () => resolve(null); });
+      const loaded = await Promise.race([this.loader.load(row.id), superseded]);
+      if (loaded === null) return false;
+      await nextFrame();
+      this.#display(loaded);
+      return true;
+    } catch (error) {
+      this.#endLoading();
+      const dropped = this.actions.clear();
+      toast([t("app.not_loaded", { name: row?.name ?? t("app.next_contact"), reason: error.message }), dropped ? t("app.dropped", { count: dropped }) : ""].join(" "), { bad: true });
+      return false;
+    }
+  }
+
+  #endLoading() {
+    this.goal = null;
+    this.supersede = () => {};
+    this.view.showLoading(null);
+  }
+
+  #display({ detail, prepared, stale = false }) {
+    const { id } = detail.contact;
+    this.#endLoading();
     state.selected = id;
-    history.replaceState(null, "", `#${encodeURIComponent(id)}`);
+    this.requestNumber += 1;
+    this.displayedNumber = this.requestNumber;
+    this.detail = detail;
+    this.#hideWithoutContact();
+    this.view.commit(prepared);
+    this.decision.show(detail);
+    this.details.show(detail);
     this.queue.mark(id);
-    await this.load();
+    history.replaceState(null, "", `#${encodeURIComponent(id)}`);
+    if (state.online) this.loader.prefetch(this.queue.following(id, PREFETCHED_ROWS).map((row) => row.id));
+    if (stale) this.load();
   }
 
   /** Update the displayed contact. */
@@ -100,8 +174,11 @@ class App {
     if (id === null) return;
     const number = (this.requestNumber += 1);
     let detail;
+    let prepared;
     try {
       detail = await api.contact(id);
+      prepared = await this.view.prepare(detail);
+      await nextFrame();
     } catch (error) {
       if (error.status === 404) { state.selected = null; this.#hideWithoutContact(); }
       // Without a response, the request is repeated while the contact is selected.
@@ -113,11 +190,9 @@ class App {
     if (id !== state.selected || number < this.displayedNumber) return;
     this.displayedNumber = number;
     this.detail = detail;
-    this.#hideWithoutContact();
+    this.view.commit(prepared);
     this.decision.show(detail);
     this.details.show(detail);
-    await this.view.show(detail);
-    this.decision.show(detail);
   }
 
   show(name) {
@@ -129,14 +204,63 @@ class App {
     if (name === "review") { this.queue.draw(); this.view.redraw(); this.queue.list.focus(); }
   }
 
-  async nextUnreviewed() {
-    if (!(await this.queue.nextUnreviewed())) toast("There are no other unreviewed contacts.");
+  nextUnreviewed() {
+    this.#go((id) => this.#nextUnreviewed(id));
+  }
+
+  async #nextUnreviewed(id) {
+    const row = await this.queue.nextUnreviewed(id, this.decision.sending);
+    if (!row) toast(t("app.no_unreviewed"));
+    return row;
+  }
+
+  /** Send a verdict on the displayed contact, and display the next one without a decision. */
+  decide(name) {
+    if (this.decision.isComment) this.choose(name);
+    else this.actions.add(() => this.#decide(() => this.decision.decide(name)));
+  }
+
+  /** Select a verdict, which Enter sends with class and remark. */
+  choose(name) {
+    this.actions.add(() => this.decision.select(name));
+  }
+
+  submit() {
+    this.actions.add(() => this.#decide(() => this.decision.submit()));
+  }
+
+  async #decide(send) {
+    if (send()) await this.#open((id) => this.#nextUnreviewed(id));
+  }
+
+  /** A verdict button (`name`), or the send button (null). */
+  #pressed(name, hold) {
+    if (name === null) this.submit();
+    else if (hold) this.choose(name);
+    else this.decide(name);
+  }
+
+  /** Undo the last decision of the user, and display its contact. */
+  undo() {
+    this.actions.add(async () => {
+      await this.decision.settled();
+      let last;
+      try {
+        last = await api.lastDecision();
+      } catch (error) {
+        toast(error.message, { bad: true });
+        return;
+      }
+      if (!last.decision) toast(t("app.nothing_to_undo"));
+      else if (await this.#open(() => last.contact)) await this.decision.undo(last.decision);
+    });
   }
 
   nextLook() {
     const group = this.detail?.group ?? [];
-    if (group.length < 2) { toast("There is only one look at this position."); return; }
-    this.select(group[(group.findIndex((row) => row.id === state.selected) + 1) % group.length].id);
+    if (group.length < 2) { toast(t("app.one_look")); return; }
+    const next = group[(group.findIndex((row) => row.id === state.selected) + 1) % group.length];
+    this.select(next.id, next.name);
   }
 
   search() { this.filters.openSearch(); }
@@ -145,7 +269,7 @@ class App {
 
   enter() {
     if (this.view.measurement.active) this.view.measurement.setPoint().then((stored) => stored?.id && this.load());
-    else this.decision.submit();
+    else this.submit();
   }
 
   async request() {
@@ -163,26 +287,29 @@ class App {
   }
 
   async exports() {
-    const formats = [["geojson", "GeoJSON, for GIS"], ["kmz", "KMZ, for Google Earth, with images"], ["csv", "CSV, for spreadsheets"], ["cot.xml", "Cursor-on-Target, for TAK"]];
+    const formats = [["geojson", t("app.geojson")], ["kmz", t("app.kmz")], ["csv", t("app.csv")], ["cot.xml", t("app.cot")]];
     const filter = this.filters.query;
     const progress = h("p", { class: "progress", role: "status" });
     const links = formats.map(([format, text]) => h("button", { type: "button", text, data: { export: format }, on: { click: (event) => saveExport(event.target, progress, format, filter) } }));
-    const report = this.detail ? h("a", { href: api.reportUrl(this.detail.contact.id), target: "_blank", rel: "noopener", text: `Printable report of ${this.detail.contact.name}` }) : null;
-    await showDialog("Exports", [h("p", { text: `Contacts of the queue filter: ${this.queue.rows.matching}.` }), h("div", { class: "exports" }, links, report), progress], [{ label: "Close", value: null, primary: true }]);
+    const report = this.detail ? h("a", { href: api.reportUrl(this.detail.contact.id), target: "_blank", rel: "noopener", text: t("app.report", { name: this.detail.contact.name }) }) : null;
+    await showDialog(t("app.exports"), [h("p", { text: t("app.export_contacts", { count: this.queue.rows.matching }) }), h("div", { class: "exports" }, links, report), progress], [{ label: t("app.close"), value: null, primary: true }]);
   }
 }
+
+/** The next animation frame; at once in a page that is not visible, which has none. */
+const nextFrame = () => new Promise((resolve) => { if (document.hidden) resolve(); else requestAnimationFrame(resolve); });
 
 /** Save an export as a file; the button is disabled until the server has prepared it. */
 async function saveExport(button, progress, format, filter) {
   button.disabled = true;
-  progress.textContent = "The server prepares the file …";
+  progress.textContent = t("app.preparing");
   try {
     const url = URL.createObjectURL(await api.export(format, filter));
     h("a", { href: url, download: `contacts.${format}` }).click();
     setTimeout(() => URL.revokeObjectURL(url), 60000);
-    progress.textContent = `contacts.${format} is saved.`;
+    progress.textContent = t("app.saved", { file: `contacts.${format}` });
   } catch (error) {
-    progress.textContent = `No export: ${error.message}`;
+    progress.textContent = t("app.no_export", { reason: error.message });
   } finally {
     button.disabled = false;
   }

@@ -13,6 +13,15 @@ import { setting, state } from "./state.js";
 import { t } from "./texts.js";
 
 const GAIN_STEP = 5;
+const CACHED_IMAGES = 20;
+
+/** Second image of a comparison: [version, layer], or null. `choice` has version number, layer and comparison. */
+function secondImage({ versions }, { version, layer, compare }) {
+  const shown = versions.find((one) => one.version === version);
+  if (compare === "versions" && versions.length > 1) return [versions.find((one) => one.version !== version), "raw"];
+  const other = compare === "layers" ? shown?.layers.find((one) => one.name !== layer) : null;
+  return other ? [shown, other.name] : null;
+}
 
 export class ContactView {
   constructor() {
@@ -22,8 +31,9 @@ export class ContactView {
     this.layer = "raw";
     this.compare = "off";
     this.autoGain = true;
-    this.loadNumber = 0;
-    this.cache = new Map();
+    this.changes = 0; // number of selections and displayed contacts
+    this.target = null; // selected choice whose images are being loaded
+    this.cache = new Map(); // key of an image → promise
     this.display = { map: setting("map") in MAPS ? setting("map") : "grey", low: 0, high: 100, gamma: 1, hatch: true };
     this.#build();
     this.measurement = new MeasurementTool(() => this.#displayed(), () => this.#drawLines());
@@ -38,7 +48,8 @@ export class ContactView {
     this.heading = h("div", { class: "heading", role: "group", tabindex: 0, "aria-label": t("contact_view.heading") });
     this.tools = h("div", { class: "tools", role: "toolbar", "aria-label": "Image" });
     this.placeholder = h("p", { class: "placeholder" });
-    this.stage = h("div", { class: "stage" }, this.canvases, this.placeholder);
+    this.loading = h("p", { class: "loading-name", role: "status" });
+    this.stage = h("div", { class: "stage" }, this.canvases, this.placeholder, this.loading);
     this.versions = h("div", { class: "versions", role: "toolbar", "aria-label": "Versions of the image" });
     this.strip = h("div", { class: "strip", role: "region", tabindex: 0, "aria-label": "Data integrity of this image" });
     this.element = h("section", { class: "contact", "aria-label": "Contact" }, this.heading, toolbarWithMore(this.tools), this.stage,
@@ -55,117 +66,141 @@ export class ContactView {
     return { id: this.detail?.contact.id, version: this.version, layer: this.layer, scale: view.scale, image: view.image };
   }
 
-  /** Display a contact, or update the displayed one. */
-  async show(detail) {
+  /** Identifier, version, layer and digest of the image on the canvas; null without an image. */
+  get drawn() { return this.views[0].image?.source ?? null; }
+
+  /**
+   * Load the images to display of a contact: newest version and raw layer, or what is selected of the displayed contact.
+   *
+   * Returns the argument of `commit`.
+   */
+  async prepare(detail) {
+    const same = detail.contact.id === this.detail?.contact.id;
+    const newest = detail.versions.at(-1)?.version ?? null;
+    const choice = same ? this.#choice() : { version: newest, layer: "raw", follow: true, compare: this.compare };
+    // The image does not change during a measurement.
+    if (same && this.follow && !this.measurement.active) choice.version = newest;
+    return { detail, choice, changes: this.changes, images: await this.#load(detail, choice) };
+  }
+
+  /** Display a prepared contact: heading, image, versions and strip in one step. */
+  commit({ detail, choice, changes, images }) {
     const other = detail.contact.id !== this.detail?.contact.id;
     this.detail = detail;
-    const newest = detail.versions.at(-1)?.version ?? null;
     if (other) {
-      this.follow = true;
-      this.layer = "raw";
       this.autoGain = true;
-      this.cache.clear();
       this.measurement.stop();
       Object.assign(this.views[0].viewport, defaultViewport());
+    } else if (changes !== this.changes) {
+      // The operator has selected another image in the meantime.
+      this.#renderText();
+      return;
     }
-    // The image does not change during a measurement.
-    if (other || (this.follow && !this.measurement.active)) this.version = newest;
-    this.#renderText();
-    await this.#loadImages();
+    this.changes += 1;
+    this.#draw(choice, images);
+  }
+
+  #choice() { return { version: this.version, layer: this.layer, follow: this.follow, compare: this.compare, ...this.target }; }
+
+  /** Select version, layer or comparison; the display changes when the images are loaded. */
+  async #select(selected) {
+    const { detail } = this;
+    const choice = { ...this.#choice(), ...selected };
+    this.target = choice;
+    const number = (this.changes += 1);
+    try {
+      const images = await this.#load(detail, choice);
+      if (number === this.changes) this.#draw(choice, images);
+    } catch (error) {
+      if (number === this.changes) this.target = null;
+      toast(error.message, { bad: true });
+    }
   }
 
   /** Display the version with a number. */
   async showVersion(number) {
     const newest = this.detail?.versions.at(-1)?.version;
     if (!this.detail?.versions.some((one) => one.version === number)) return;
-    this.version = number;
-    this.follow = number === newest;
     this.measurement.stop();
-    this.#renderText();
-    await this.#loadImages();
+    await this.#select({ version: number, follow: number === newest });
   }
 
   async stepVersion(step) {
-    const index = this.detail?.versions.findIndex((one) => one.version === this.version) ?? -1;
-    const version = this.detail?.versions[index + step];
-    if (version) await this.showVersion(version.version);
+    const { version } = this.#choice();
+    const index = this.detail?.versions.findIndex((one) => one.version === version) ?? -1;
+    const next = this.detail?.versions[index + step];
+    if (next) await this.showVersion(next.version);
   }
 
   async showLayer(name) {
-    if (!this.shown?.layers.some((one) => one.name === name)) return;
-    this.layer = name;
-    if (!this.shownLayer.measurable && this.measurement.active) this.measurement.stop();
-    this.#renderText();
-    await this.#loadImages();
+    const layer = this.shown?.layers.find((one) => one.name === name);
+    if (!layer) return;
+    if (!layer.measurable && this.measurement.active) this.measurement.stop();
+    await this.#select({ layer: name });
   }
 
   async nextLayer() {
     const names = this.shown?.layers.map((one) => one.name) ?? [];
-    if (names.length) await this.showLayer(names[(names.indexOf(this.layer) + 1) % names.length]);
+    if (names.length) await this.showLayer(names[(names.indexOf(this.#choice().layer) + 1) % names.length]);
   }
 
   /** Select the next mode of comparison that has a second image. */
   async nextCompare() {
     if (!this.detail) return;
     const modes = Object.keys(COMPARE);
-    do this.compare = modes[(modes.indexOf(this.compare) + 1) % modes.length];
-    while (this.compare !== "off" && !this.comparedImage());
-    this.#renderText();
-    await this.#loadImages();
+    const choice = this.#choice();
+    do choice.compare = modes[(modes.indexOf(choice.compare) + 1) % modes.length];
+    while (choice.compare !== "off" && !secondImage(this.detail, choice));
+    await this.#select({ compare: choice.compare });
   }
 
-  /** Second image to display: [version, layer], or null. */
-  comparedImage() {
-    const { versions } = this.detail;
-    if (this.compare === "versions" && versions.length > 1) {
-      const first = versions.find((one) => one.version !== this.version);
-      return [first, "raw"];
-    }
-    if (this.compare === "layers" && this.shown) {
-      const other = this.shown.layers.find((one) => one.name !== this.layer);
-      return other ? [this.shown, other.name] : null;
-    }
-    return null;
-  }
+  /** Second image of the display: [version, layer], or null. */
+  comparedImage() { return secondImage(this.detail, this); }
 
-  async #load(version, layer) {
-    const { id } = this.detail.contact;
-    const key = `${id} ${version.version} ${layer}`;
+  #image(detail, [version, layer]) {
+    const { id } = detail.contact;
+    const key = `${id} ${version.version} ${layer} ${version.sha256}`;
     if (!this.cache.has(key)) {
-      if (this.cache.size > 12) this.cache.delete(this.cache.keys().next().value);
+      if (this.cache.size >= CACHED_IMAGES) this.cache.delete(this.cache.keys().next().value);
       const synthesised = version.layers.find((one) => one.name === layer)?.synthesised;
-      this.cache.set(key, loadImage(
+      const image = loadImage(
+        { id, version: version.version, layer, sha256: version.sha256 },
         api.imageUrl(id, version.version, layer),
         version.missing_fraction > 0 ? api.maskUrl(id, version.version, "missing", layer) : null,
         version.guessed_fraction > 0 && !synthesised ? api.maskUrl(id, version.version, "guessed", layer) : null,
-      ));
+      );
+      image.catch(() => this.cache.delete(key));
+      this.cache.set(key, image);
     }
-    try {
-      return await this.cache.get(key);
-    } catch (error) {
-      this.cache.delete(key);
-      throw error;
-    }
+    return this.cache.get(key);
   }
 
-  async #loadImages() {
-    const number = (this.loadNumber += 1);
-    const second = this.shown ? this.comparedImage() : null;
-    const requested = [this.shown ? [this.shown, this.layer] : null, second];
-    this.canvases[0].classList.toggle("hidden", !requested[0]);
-    this.canvases[1].classList.toggle("hidden", !requested[1]);
-    this.placeholder.textContent = this.shown && this.detail.contact.has_picture ? "" : "Only the contact record has been received so far. The image follows.";
-    try {
-      const images = await Promise.all(requested.map((one) => one && this.#load(...one)));
-      if (number !== this.loadNumber) return;
-      if (this.autoGain && images[0]) [this.display.low, this.display.high] = autoRange(images[0]);
-      images.forEach((image, index) => image && this.#showOn(this.views[index], image, ...requested[index]));
-      this.canvases[0].dataset.shows = this.shown ? `${this.detail.contact.id} ${this.version} ${this.layer}` : "";
-      this.#drawTools();
-      this.#drawLines();
-    } catch (error) {
-      if (number === this.loadNumber) toast(error.message, { bad: true });
-    }
+  /** Load the images of a choice; null for a canvas without an image. */
+  #load(detail, choice) {
+    const shown = detail.versions.find((one) => one.version === choice.version);
+    const requested = [shown ? [shown, choice.layer] : null, secondImage(detail, choice)];
+    return Promise.all(requested.map(async (one) => one && { image: await this.#image(detail, one), version: one[0], layer: one[1] }));
+  }
+
+  #draw(choice, images) {
+    Object.assign(this, choice);
+    this.target = null;
+    this.canvases.forEach((canvas, index) => canvas.classList.toggle("hidden", !images[index]));
+    this.placeholder.textContent = this.shown && this.detail.contact.has_picture ? "" : t("contact_view.no_image");
+    if (this.autoGain && images[0]) [this.display.low, this.display.high] = autoRange(images[0].image);
+    this.views.forEach((view, index) => {
+      if (images[index]) this.#showOn(view, images[index].image, images[index].version, images[index].layer);
+      else view.show(null, {});
+    });
+    this.canvases[0].dataset.shows = this.drawn ? `${this.drawn.id} ${this.drawn.version} ${this.drawn.layer}` : "";
+    this.#renderText();
+    this.#drawLines();
+  }
+
+  /** Dim the image while another contact is loaded; null ends it. */
+  showLoading(name) {
+    this.stage.classList.toggle("loading", name !== null);
+    this.loading.textContent = name === null ? "" : t("contact_view.loading", { name });
   }
 
   #showOn(view, image, version, layer) {

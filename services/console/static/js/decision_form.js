@@ -1,20 +1,25 @@
-// The decision form: verdict, confidence, class and remark; undo; conflicts with other operators.
+// The decision form: verdict, confidence, class and remark, and the state of the decision.
 
 import { api } from "./api.js";
-import { fill, h, labelled, showDialog, toast } from "./dom.js";
+import { ClassField } from "./class_field.js";
+import { fill, h, labelled, toast } from "./dom.js";
+import { Drafts } from "./drafts.js";
 import { percent, shoreState, symbol, time, vehicleState, verdict } from "./format.js";
+import { OverruleForm } from "./overrule.js";
 import { emit, state } from "./state.js";
+import { t } from "./texts.js";
 
 const VERDICTS = [["mine_like", "1"], ["not_mine_like", "2"], ["unsure", "3"]];
 
 const SHORE_STEPS = ["waiting", "relay", "delivered"];
 const VEHICLE_STEPS = ["waiting", "asked", "sent", "confirmed"];
+const NOT_SENT = ["none", "withdrawn", "disputed"];
 
 /** Progress bar of a delivery. */
 function progress(name, steps, step, [text, tone]) {
   const index = steps.indexOf(step);
   const dots = steps.map((_, i) => {
-    const failed = index < 0 && step !== "none" && i === 0;
+    const failed = index < 0 && !NOT_SENT.includes(step) && i === 0;
     return h("i", { class: failed ? "failed" : i <= index ? (index === steps.length - 1 ? "end" : "done") : "" });
   });
   return h("li", {}, h("span", { text: name }), h("span", { class: "steps", "aria-hidden": "true" }, dots), h("span", { class: tone, text }));
@@ -24,25 +29,27 @@ function progress(name, steps, step, [text, tone]) {
 export function deliveryProgress(delivery) {
   if (!delivery) return null;
   return [
-    h("ul", { class: "progress", "aria-label": "Delivery" },
-      progress("shore site", SHORE_STEPS, delivery.shore, shoreState(delivery)),
-      progress("vehicle", VEHICLE_STEPS, delivery.vehicle, vehicleState(delivery))),
+    h("ul", { class: "progress", "aria-label": t("decision_form.delivery") },
+      progress(t("decision_form.shore"), SHORE_STEPS, delivery.shore, shoreState(delivery)),
+      progress(t("decision_form.vehicle"), VEHICLE_STEPS, delivery.vehicle, vehicleState(delivery))),
     delivery.reason ? h("p", { class: "bad", text: delivery.reason }) : null,
   ];
 }
 
+const confidenceText = (confidence) => (confidence === null ? null : t("decision_form.confidence_of", { value: percent(100 * confidence) }));
+
 /** Verdict, class and confidence as text. */
 export function decisionText(one) {
-  return [verdict(one.verdict), one.mlo_class, one.confidence === null ? null : `${percent(100 * one.confidence)} confidence`].filter(Boolean).join(", ");
+  return [verdict(one.verdict), one.mlo_class, confidenceText(one.confidence)].filter(Boolean).join(", ");
 }
 
 export class DecisionForm {
-  /** `view`: the contact view, which displays the image. */
-  constructor(view) {
-    this.view = view;
-    this.drafts = new Map(); // contact → unsent input, kept while other contacts are displayed
+  /** `view`: the contact view, which displays the image. `status`: the line at the foot. `choose(verdict, hold)`: a button was used. */
+  constructor(view, status, choose) {
+    Object.assign(this, { view, status, onChoose: choose });
+    this.drafts = new Drafts(state.session.user);
     this.detail = null;
-    this.sending = false;
+    this.posts = new Map(); // contact → promise of its last request
     this.element = h("div", { class: "decision" });
     this.#build();
   }
@@ -52,30 +59,32 @@ export class DecisionForm {
 
   #build() {
     this.buttons = VERDICTS.map(([name, key]) => h("button", {
-      type: "button", class: name, "aria-pressed": "false", data: { verdict: name }, on: { click: () => this.choose(name) },
+      type: "button", class: name, "aria-pressed": "false", data: { verdict: name }, on: { click: (event) => this.onChoose(name, event.shiftKey) },
     }, h("span", { text: symbol(name), "aria-hidden": "true" }), verdict(name), h("kbd", { text: key })));
-    this.confidence = h("input", { type: "range", min: 0, max: 100, step: 5, id: "decision-confidence", "aria-label": "confidence (g)", on: { input: () => this.#updateDraft() } });
+    this.confidence = h("input", { type: "range", min: 0, max: 100, step: 5, id: "decision-confidence", "aria-label": t("decision_form.confidence_label"), on: { input: () => this.#updateDraft({ confidence: Number(this.confidence.value) / 100 }) } });
     this.confidenceText = h("output", { for: "decision-confidence", class: "number" });
-    this.mloClass = h("input", { id: "mlo-class", list: "classes", maxlength: 60, autocomplete: "off", on: { input: () => this.#updateDraft() } });
+    this.clearConfidence = h("button", { type: "button", class: "clear", text: "×", "aria-label": t("decision_form.clear_confidence"), title: t("decision_form.clear_confidence"), on: { click: () => this.#updateDraft({ confidence: null }) } });
+    this.mloClass = new ClassField(() => this.#updateDraft());
     this.remark = h("textarea", { id: "remark", rows: 2, maxlength: 2000, on: { input: () => this.#updateDraft() } });
-    this.send = h("button", { type: "submit", class: "primary", id: "send" });
-    this.undoButton = h("button", { type: "button", id: "undo", on: { click: () => this.undo() } }, "undo ", h("kbd", { text: "u" }));
-    this.current = h("div", { class: "now", "aria-live": "polite" });
-    this.form = h("form", { on: { submit: (event) => { event.preventDefault(); this.submit(); } } },
+    this.send = h("button", { type: "button", class: "primary", id: "send", on: { click: () => this.onChoose(null, false) } });
+    this.undoButton = h("button", { type: "button", id: "undo", text: t("decision_form.undo"), title: t("decision_form.undo_title"), on: { click: () => this.undo(this.#ownDecision()) } });
+    this.current = h("div", { class: "now", role: "group", tabindex: 0, "aria-live": "polite", "aria-label": t("decision_form.state") });
+    this.overrule = new OverruleForm((name, reason) => this.#overrule(name, reason));
+    this.form = h("form", { on: { submit: (event) => event.preventDefault() } },
       h("fieldset", { id: "decide" },
-        h("legend", { text: this.isComment ? "Your comment for the vessel" : "Your decision" }),
-        h("div", { class: "verdicts in-bar", role: "group", "aria-label": "Verdict" }, this.buttons),
-        h("label", {}, h("span", {}, "confidence: ", this.confidenceText), this.confidence),
-        labelled("class", this.mloClass), h("datalist", { id: "classes" }, state.info.classes.map((name) => h("option", { value: name }))),
-        labelled("remark", this.remark),
+        h("legend", { text: t(this.isComment ? "decision_form.comment" : "decision_form.decision") }),
+        h("div", { class: "verdicts in-bar", role: "group", "aria-label": t("decision_form.verdict") }, this.buttons),
+        h("div", { class: "confidence" }, h("label", {}, h("span", {}, t("decision_form.confidence"), " ", this.confidenceText), this.confidence), this.clearConfidence),
+        this.mloClass.element,
+        labelled(t("decision_form.remark"), this.remark),
         h("div", { class: "send in-bar" }, this.send, this.isComment ? null : this.undoButton)));
-    this.element.append(this.current, this.form);
+    this.element.append(this.current, this.form, this.overrule.element);
   }
 
-  #draft() {
-    const { id } = this.detail.contact;
-    if (!this.drafts.has(id)) this.drafts.set(id, { verdict: null, confidence: null, mlo_class: "", remark: "", revision: null });
-    return this.drafts.get(id);
+  /** The standing decision of the user on the displayed contact. */
+  #ownDecision() {
+    const { decisions, standing } = this.detail;
+    return decisions.find((one) => standing.includes(one.decision_id) && one.operator === state.session.user && !one.elsewhere) ?? null;
   }
 
   show(detail) {
@@ -84,124 +93,133 @@ export class DecisionForm {
   }
 
   #render() {
-    const draft = this.#draft();
-    const { contact, decisions } = this.detail;
+    const { contact, decisions, standing } = this.detail;
+    const draft = this.drafts.get(contact.id);
     for (const button of this.buttons) button.setAttribute("aria-pressed", String(button.dataset.verdict === draft.verdict));
-    this.confidence.value = draft.confidence === null ? 50 : Math.round(100 * draft.confidence);
-    this.confidence.setAttribute("aria-valuetext", draft.confidence === null ? "not stated" : `${this.confidence.value} per cent`);
-    this.confidenceText.textContent = draft.confidence === null ? "not stated" : percent(100 * draft.confidence);
-    if (this.mloClass.value !== draft.mlo_class) this.mloClass.value = draft.mlo_class;
+    const unset = draft.confidence === null;
+    const text = unset ? t("decision_form.not_given") : percent(100 * draft.confidence);
+    this.confidence.value = unset ? 50 : Math.round(100 * draft.confidence);
+    this.confidence.classList.toggle("unset", unset);
+    this.confidence.setAttribute("aria-valuetext", text);
+    this.confidenceText.textContent = text;
+    this.clearConfidence.disabled = unset;
+    this.mloClass.value = draft.mlo_class;
     if (this.remark.value !== draft.remark) this.remark.value = draft.remark;
-    const ready = this.allowed && draft.verdict !== null && !this.sending && contact.has_picture;
-    this.send.disabled = !ready;
-    fill(this.send, draft.verdict === null ? "choose 1, 2 or 3" : `send “${verdict(draft.verdict)}” `, draft.verdict === null ? null : h("kbd", { text: "Enter" }));
+    this.send.disabled = !this.allowed || draft.verdict === null || !contact.has_picture;
+    fill(this.send, draft.verdict === null ? t("decision_form.choose") : [`${t("decision_form.send", { verdict: verdict(draft.verdict) })} `, h("kbd", { text: "Enter" })]);
     this.form.querySelector("fieldset").disabled = !this.allowed;
-    const [last] = decisions.filter((one) => !one.undone && one.undoes === null);
-    this.undoButton.disabled = !this.allowed || !last || last.elsewhere;
-    this.#renderCurrent(last, draft);
+    this.undoButton.disabled = !this.allowed || !this.#ownDecision();
+    this.#renderCurrent(decisions.find((one) => standing.includes(one.decision_id) && (contact.review !== "disputed" || one.verdict === "mine_like")));
+    this.overrule.show(this.detail, this.allowed && !this.isComment);
   }
 
-  #renderCurrent(last, draft) {
+  #renderCurrent(counting) {
     const { contact, decisions } = this.detail;
-    const changed = draft.verdict !== null && draft.revision !== contact.revision;
     fill(this.current,
       h("p", {}, h("span", { class: `badge ${contact.review}` }, `${symbol(contact.review)} ${verdict(contact.review)}`),
-        last ? ` ${[last.mlo_class, last.confidence === null ? null : `${percent(100 * last.confidence)} confidence`].filter(Boolean).join(", ")}` : ""),
-      last ? h("p", { class: "number", text: `${last.operator}, ${time(last.decided_utc_s)}, on version ${last.version} (${last.layer ?? "raw"})` }) : h("p", { class: "muted", text: "No decision yet." }),
-      last?.remark ? h("p", { class: "remark", text: `“${last.remark}”` }) : null,
-      decisions.length ? deliveryProgress(decisions[0].delivery) : null,
-      changed ? h("p", { class: "stale", text: "Another decision was made since you chose. You will be asked before yours replaces it." }) : null,
-      this.allowed ? null : h("p", { class: "stale", text: this.isComment ? "Your role may not comment." : "Your role may not decide." }));
+        counting ? ` ${[counting.mlo_class, confidenceText(counting.confidence)].filter(Boolean).join(", ")}` : ""),
+      counting
+        ? h("p", { class: "number", text: t("decision_form.decided", { operator: counting.operator, time: time(counting.decided_utc_s), version: counting.version, layer: counting.layer ?? "raw" }) })
+        : h("p", { class: "muted", text: t("decision_form.no_decision") }),
+      this.allowed ? null : h("p", { class: "stale", text: this.#refusal() }),
+      counting?.remark ? h("p", { class: "remark", text: `“${counting.remark}”` }) : null,
+      decisions.length ? deliveryProgress(decisions[0].delivery) : null);
   }
 
-  #updateDraft() {
-    const draft = this.#draft();
-    if (document.activeElement === this.confidence) draft.confidence = Number(this.confidence.value) / 100;
-    draft.mlo_class = this.mloClass.value;
-    draft.remark = this.remark.value;
+  #refusal() { return t(this.isComment ? "decision_form.may_not_comment" : "decision_form.may_not_decide"); }
+
+  #updateDraft(fields = {}) {
+    this.drafts.change(this.detail.contact.id, { mlo_class: this.mloClass.value, remark: this.remark.value, ...fields });
     this.#render();
   }
 
-  /** Choose a verdict; the second key, Enter, sends it. */
-  choose(name) {
+  /** Select a verdict; Enter sends it. */
+  select(name) {
     if (!this.detail) return;
     if (!this.allowed) {
-      toast(this.isComment ? "Your role may not comment." : "Your role may not decide.", { bad: true });
+      toast(this.#refusal(), { bad: true });
       return;
     }
-    const draft = this.#draft();
-    draft.verdict = name;
-    // A decision of another operator after this moment is a conflict.
-    draft.revision = this.detail.contact.revision;
+    this.#updateDraft({ verdict: name });
+  }
+
+  /** Send the selected verdict; returns as `decide`. */
+  submit() {
+    const name = this.detail && this.drafts.get(this.detail.contact.id).verdict;
+    return name ? this.decide(name) : false;
+  }
+
+  /**
+   * Send a decision on the drawn image, with class, confidence and remark of the draft.
+   *
+   * Returns whether it was sent and another contact can follow. The request continues.
+   */
+  decide(name) {
+    if (!this.detail) return false;
+    const { contact } = this.detail;
+    if (!this.allowed) {
+      toast(this.#refusal(), { bad: true });
+      return false;
+    }
+    const image = this.view.drawn;
+    if (!contact.has_picture || image?.id !== contact.id) {
+      toast(t("decision_form.no_image", { name: contact.name }), { bad: true });
+      return false;
+    }
+    this.drafts.change(contact.id, { verdict: name });
+    const draft = this.drafts.get(contact.id);
+    const body = { version: image.version, verdict: name, confidence: draft.confidence, mlo_class: draft.mlo_class.trim() || null, remark: draft.remark.trim() };
+    const drawn = { revision: contact.revision, sha256: image.sha256, layer: image.layer };
+    this.#post(contact, () => (this.isComment ? api.advise(contact.id, body) : api.decide(contact.id, { ...body, ...drawn })), draft);
+    if (this.form.contains(document.activeElement)) document.getElementById("queue").focus();
     this.#render();
-    if (!this.send.disabled) this.send.focus();
+    // A verdict that differs from the displayed one of another operator keeps the contact on the screen.
+    return !this.isComment && !this.overrule.others.some((one) => one.verdict !== name);
   }
 
-  #body(draft, revision) {
-    const { version, sha256 } = this.view.shown;
-    const body = { version, verdict: draft.verdict, confidence: draft.confidence, mlo_class: draft.mlo_class.trim() || null, remark: draft.remark.trim() };
-    return this.isComment ? body : { ...body, revision, sha256, layer: this.view.layer };
-  }
-
-  async submit() {
-    const draft = this.#draft();
-    if (this.send.disabled || !this.view.shown) return;
-    await this.#post(draft, draft.revision);
-  }
-
-  async #post(draft, revision) {
-    const { id, name } = this.detail.contact;
-    this.sending = true;
-    this.#render();
-    try {
-      if (this.isComment) await api.advise(id, this.#body(draft, revision));
-      else await api.decide(id, this.#body(draft, revision));
-      this.drafts.delete(id);
-      toast(this.isComment ? `${name}: comment sent` : `${name}: ${verdict(draft.verdict)}. Undo with u.`);
-      this.element.closest(".review")?.querySelector("#queue")?.focus();
+  /** Requests of one contact are sent in their order. The draft is removed, unless it was changed after it was sent. */
+  #post(contact, request, draft = null) {
+    const { id } = contact;
+    const post = Promise.resolve(this.posts.get(id)).then(request).then((stored) => {
+      if (JSON.stringify(this.drafts.get(id)) === JSON.stringify(draft)) this.drafts.remove(id);
+      if (stored.decision) this.status.sent(stored.contact, stored.decision);
+      else toast(t("decision_form.comment_sent", { name: contact.name }));
+    }, (error) => this.status.failed(contact, error.message)).finally(() => {
+      if (this.posts.get(id) === post) this.posts.delete(id);
+      if (this.detail.contact.id === id) this.#render();
       emit("changed", { id });
-    } catch (error) {
-      if (error.code === "conflict") await this.#resolveConflict(draft, error.body);
-      else toast(error.message, { bad: true });
-    } finally {
-      this.sending = false;
-      this.#render();
-    }
+    });
+    this.posts.set(id, post);
   }
 
-  /** Show both decisions side by side. Only an explicit choice replaces the other one. */
-  async #resolveConflict(draft, { contact, decision }) {
-    emit("changed", { id: contact.id });
-    const theirs = decision === null
-      ? [h("h3", { text: "Changed" }), h("p", { text: "A previous decision was undone." })]
-      : [h("h3", { text: decision.operator }), h("p", {}, h("span", { class: `badge ${decision.verdict}` }, `${symbol(decision.verdict)} ${verdict(decision.verdict)}`)),
-        h("p", { text: decisionText(decision) }), h("p", { class: "number", text: time(decision.decided_utc_s) }), decision.remark ? h("p", { text: `“${decision.remark}”` }) : null];
-    const mine = [h("h3", { text: "You" }), h("p", {}, h("span", { class: `badge ${draft.verdict}` }, `${symbol(draft.verdict)} ${verdict(draft.verdict)}`)),
-      h("p", { text: decisionText({ ...draft, mlo_class: draft.mlo_class || null }) }), draft.remark ? h("p", { text: `“${draft.remark}”` }) : null];
-    const choice = await showDialog(`${contact.name}: another operator has decided`, [
-      h("p", { text: "Your decision has not been sent." }), h("div", { class: "versus" }, h("div", {}, theirs), h("div", {}, mine)),
-    ], [
-      { label: "Keep theirs", value: "theirs", primary: true },
-      { label: `Replace it with “${verdict(draft.verdict)}”`, value: "mine" },
-      { label: "Decide later", value: "later" },
-    ]);
-    if (choice === "theirs") this.drafts.delete(contact.id);
-    if (choice === "mine" && this.detail.contact.id === contact.id) await this.#post(draft, contact.revision);
-    else if (choice === "mine") toast("Another contact is displayed now; nothing was sent.", { bad: true });
-  }
+  /** Identifiers of contacts whose decision is being sent. */
+  get sending() { return [...this.posts.keys()]; }
 
-  async undo() {
-    const [last] = this.detail?.decisions.filter((one) => !one.undone && one.undoes === null) ?? [];
-    if (!last || this.undoButton.disabled) {
-      toast("There is no decision of this console to undo.", { bad: true });
+  /** Wait until all requests have been answered. */
+  async settled() { await Promise.all(this.posts.values()); }
+
+  #overrule(name, reason) {
+    const { contact } = this.detail;
+    const image = this.view.drawn;
+    if (image?.id !== contact.id) {
+      toast(t("decision_form.no_image", { name: contact.name }), { bad: true });
       return;
     }
+    const body = { version: image.version, sha256: image.sha256, layer: image.layer, revision: contact.revision, verdict: name, confidence: null, mlo_class: null, remark: reason, overrules: true };
+    this.#post(contact, () => api.decide(contact.id, body));
+  }
+
+  /** Withdraw an own decision on the displayed contact. */
+  async undo(decision) {
+    const { contact } = this.detail;
+    const image = this.view.drawn;
+    const { version = null, sha256 = null, layer = null } = image?.id === contact.id ? image : {};
     try {
-      await api.undo(this.detail.contact.id, { revision: this.detail.contact.revision, decision_id: last.decision_id });
-      toast(`${this.detail.contact.name}: “${verdict(last.verdict)}” is undone; shore site and vehicle are notified.`);
+      const undone = await api.undo(contact.id, { decision_id: decision.decision_id, version, sha256, layer });
+      this.status.withdrawn(undone.contact, undone.decision);
     } catch (error) {
       toast(error.message, { bad: true });
     }
-    emit("changed", { id: this.detail.contact.id });
+    emit("changed", { id: contact.id });
   }
 }

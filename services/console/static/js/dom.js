@@ -27,13 +27,10 @@ export function fill(element, ...children) {
   return element;
 }
 
-/** Show a message for some seconds, an error longer. */
+/** Show a message in the line at the foot for some seconds, an error longer. It replaces the previous message. */
 export function toast(message, { bad = false } = {}) {
-  const container = document.getElementById("toasts");
-  for (const old of container.children) if (old.textContent === message) old.remove();
-  const note = h("p", { class: bad ? "bad" : "", text: message });
-  container.append(note);
-  while (container.children.length > 4) container.firstElementChild.remove();
+  const note = h("p", { class: bad ? "bad" : "", text: message, title: message });
+  fill(document.getElementById("toasts"), note);
   setTimeout(() => note.remove(), bad ? 9000 : 4500);
 }
 

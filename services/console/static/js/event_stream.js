@@ -4,7 +4,7 @@ import { api } from "./api.js";
 import { toast } from "./dom.js";
 import { emit, setClock, state } from "./state.js";
 
-const NAMES = ["contact", "frame", "decision", "request", "advice", "fleet", "session", "clock", "truth"];
+const NAMES = ["contact", "frame", "decision", "request", "advice", "notice", "fleet", "session", "clock", "truth"];
 const SILENT_MS = 12000; // the server sends its time every 5 s
 const RETRY_MS = 2000;
 

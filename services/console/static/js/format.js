@@ -3,8 +3,8 @@
 import { t } from "./texts.js";
 
 export const DASH = "–";
-const VERDICTS = ["mine_like", "not_mine_like", "unsure", "unreviewed"];
-const SYMBOLS = { mine_like: "▲", not_mine_like: "○", unsure: "?", unreviewed: "◆" };
+const VERDICTS = ["mine_like", "not_mine_like", "unsure", "disputed", "unreviewed"];
+const SYMBOLS = { mine_like: "▲", not_mine_like: "○", unsure: "?", disputed: "≠", unreviewed: "◆" };
 
 const known = (value) => value !== null && value !== undefined && Number.isFinite(value);
 
@@ -90,7 +90,7 @@ export function position(lat_deg, lon_deg) {
 export function shoreState(delivery) {
   const texts = {
     waiting: ["waiting on this vessel", ""], relay: ["at the relay", ""], delivered: ["at the shore site", "good"],
-    refused: ["refused by the shore site", "bad"], none: ["no shore site configured", ""],
+    refused: ["refused by the shore site", "bad"], withdrawn: [t("format.withdrawn"), ""], none: ["no shore site configured", ""],
   };
   return texts[delivery?.shore] ?? [DASH, ""];
 }
@@ -100,7 +100,7 @@ export function vehicleState(delivery) {
   const times = delivery?.times_sent ? `, sent ${delivery.times_sent}×` : "";
   const texts = {
     waiting: ["waiting on this vessel", ""], asked: ["waiting for the modem", ""], sent: [`not confirmed${times}`, ""],
-    confirmed: [`on the vehicle${times}`, "good"], refused: ["refused by the vehicle", "bad"],
+    confirmed: [`on the vehicle${times}`, "good"], withdrawn: [t("format.withdrawn"), ""], disputed: [t("format.disputed"), ""], refused: ["refused by the vehicle", "bad"],
     expired: [`not confirmed in time${times}`, "bad"], none: ["no acoustic link configured", ""],
   };
   return texts[delivery?.vehicle] ?? [DASH, ""];

@@ -1,8 +1,16 @@
 // Images and masks of the server, gain and colour maps.
 
-async function loadGrey(url) {
-  const response = await fetch(url, { credentials: "same-origin" });
-  if (!response.ok) throw new Error(`The image was not loaded: the server returned status ${response.status}.`);
+import { t } from "./texts.js";
+
+/** Load an image; `cache` as in `fetch`. Its digest is null for a mask. */
+async function loadGrey(url, cache = "default") {
+  let response;
+  try {
+    response = await fetch(url, { credentials: "same-origin", cache });
+  } catch {
+    throw new Error(t("image_data.no_connection"));
+  }
+  if (!response.ok) throw new Error(t("image_data.status", { status: response.status }));
   const bitmap = await createImageBitmap(await response.blob(), { colorSpaceConversion: "none", premultiplyAlpha: "none" });
   const canvas = new OffscreenCanvas(bitmap.width, bitmap.height);
   const context = canvas.getContext("2d", { willReadFrequently: true });
@@ -10,18 +18,27 @@ async function loadGrey(url) {
   const { data } = context.getImageData(0, 0, bitmap.width, bitmap.height);
   const levels = new Uint8Array(bitmap.width * bitmap.height);
   for (let i = 0; i < levels.length; i += 1) levels[i] = data[4 * i];
-  return { width: bitmap.width, height: bitmap.height, levels };
+  return { width: bitmap.width, height: bitmap.height, levels, sha256: response.headers.get("X-Image-SHA256") };
+}
+
+/** Load an image with a digest. The browser's cache can hold one from before the server removed its pixels. */
+async function loadWithDigest(url, sha256) {
+  let image = await loadGrey(url);
+  if (image.sha256 !== sha256) image = await loadGrey(url, "reload");
+  if (image.sha256 !== sha256) throw new Error(t("image_data.other_digest"));
+  return image;
 }
 
 /**
  * Load one layer of an image version. An empty mask has no URL (null).
  *
- * Returns `{width, height, levels, missing, guessed}`: grey levels 0…255 and two masks, rows along-track, columns across-track.
+ * `source`: `{id, version, layer, sha256}` of the image; the server's response must have this digest.
+ * Returns `{width, height, levels, missing, guessed, source}`: grey levels 0…255 and two masks, rows along-track, columns across-track.
  */
-export async function loadImage(imageUrl, missingUrl, guessedUrl) {
-  const [image, missing, guessed] = await Promise.all([imageUrl, missingUrl, guessedUrl].map((url) => url && loadGrey(url)));
+export async function loadImage(source, imageUrl, missingUrl, guessedUrl) {
+  const [image, missing, guessed] = await Promise.all([loadWithDigest(imageUrl, source.sha256), ...[missingUrl, guessedUrl].map((url) => url && loadGrey(url))]);
   const none = () => new Uint8Array(image.levels.length);
-  return { ...image, missing: missing?.levels ?? none(), guessed: guessed?.levels ?? none() };
+  return { ...image, source: Object.freeze(source), missing: missing?.levels ?? none(), guessed: guessed?.levels ?? none() };
 }
 
 const toByte = (value) => Math.max(0, Math.min(255, Math.round(value)));

@@ -43,7 +43,7 @@ export class ImageView {
   }
 
   /** `synthesised`: the whole layer is not measurable, and is marked by a frame. */
-  show(image, { scale, nadir, title, synthesised }) {
+  show(image, { scale = null, nadir = null, title = "", synthesised = false }) {
     Object.assign(this, { image, scale, nadir, title, synthesised });
     this.missing = image && maskCanvas(image.missing, image.width, image.height);
     this.guessed = image && maskCanvas(image.guessed, image.width, image.height);

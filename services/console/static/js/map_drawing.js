@@ -3,7 +3,7 @@
 import { niceStep, symbol } from "./format.js";
 import { state } from "./state.js";
 
-const TONES = { mine_like: "mine", not_mine_like: "not", unsure: "unsure", unreviewed: "accent" };
+const TONES = { mine_like: "mine", not_mine_like: "not", unsure: "unsure", disputed: "mine", unreviewed: "accent" };
 const metresText = (value) => (value >= 1000 ? `${value / 1000} km` : `${value} m`);
 
 /** Text with an outline, legible on every background. */

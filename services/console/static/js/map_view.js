@@ -16,7 +16,7 @@ export class MapView {
     this.canvas = h("canvas", { tabindex: 0, role: "img", "aria-label": "Map of contacts in local metres" });
     this.card = h("div", { "aria-live": "polite" });
     this.element = h("section", { class: "map hidden", "aria-label": "Map" }, this.canvas, h("aside", { class: "legend", tabindex: 0, "aria-label": "Legend" },
-      h("h2", { text: "Map" }), h("ul", {}, ["unreviewed", "mine_like", "not_mine_like", "unsure"].map((name) => h("li", {}, h("span", { class: `sample ${name}`, text: symbol(name) }), verdict(name)))),
+      h("h2", { text: "Map" }), h("ul", {}, ["unreviewed", "mine_like", "disputed", "not_mine_like", "unsure"].map((name) => h("li", {}, h("span", { class: `sample ${name}`, text: symbol(name) }), verdict(name)))),
       h("p", { class: "muted" }, h("kbd", { text: "j" }), " ", h("kbd", { text: "k" }), " next, previous · ", h("kbd", { text: "Enter" }), " review · ", h("kbd", { text: "+" }), " ", h("kbd", { text: "-" }), " ", h("kbd", { text: "0" }), " zoom · arrows move"),
       this.card));
     this.tiles = new MapTiles(() => this.draw());

@@ -237,6 +237,7 @@ export class Queue {
 
   #updateContact(row, isNew) {
     const matches = !this.rows.query.review || this.rows.query.review === row.review
+      || (this.rows.query.review === "mine_like" && row.review === "disputed")
       || (this.rows.query.review === "reviewed" && row.review !== "unreviewed");
     const known = this.rows.replace(row);
     if (known) {
@@ -327,55 +328,57 @@ export class Queue {
     else this.list.removeAttribute("aria-activedescendant");
   }
 
-  /** Mark the displayed contact. */
+  /** Mark the displayed contact, and scroll to it. */
   mark(id) {
-    for (const element of this.drawn.values()) element.setAttribute("aria-selected", String(element.dataset.id === id));
     const index = this.rows.indexOf(id);
-    if (index >= 0) this.selectedIndex = index;
+    if (index >= 0) {
+      this.selectedIndex = index;
+      this.#scrollTo(index);
+    }
+    for (const element of this.drawn.values()) element.setAttribute("aria-selected", String(element.dataset.id === id));
     this.#updateActiveRow();
   }
 
   #clicked(event) {
     const element = event.target.closest("[data-id]");
-    if (element) this.choose(Number(element.dataset.index));
+    const row = element && this.rows.at(Number(element.dataset.index));
+    if (row) emit("select", row);
   }
 
-  /** Move the selection by `step` rows. If the selected contact has left the list, its successor is the next one. */
-  async move(step) {
-    const index = this.rows.indexOf(state.selected);
-    const removed = index < 0 && state.selected !== null;
-    const from = index >= 0 ? index : this.selectedIndex;
-    await this.choose(removed && step > 0 ? from + step - 1 : state.selected === null ? 0 : from + step);
+  /** Move the selection by `step` rows. */
+  move(step) {
+    emit("move", { step });
   }
 
-  /** Display the contact at an index, and scroll to it. */
-  async choose(requested) {
-    if (this.rows.matching === 0) return;
+  /** Row `step` rows after a contact; null in an empty list. The successor of a contact that has left the list is the next one. */
+  async rowAfter(id, step) {
+    const known = this.rows.indexOf(id);
+    if (known >= 0) return this.#row(known + step);
+    return this.#row(id === null ? 0 : this.selectedIndex + (step > 0 ? step - 1 : step));
+  }
+
+  async #row(requested) {
+    if (this.rows.matching === 0) return null;
     const index = Math.max(0, Math.min(this.rows.matching - 1, requested));
     await this.rows.ensure(index, index);
-    const row = this.rows.at(index);
-    if (!row) return;
-    this.selectedIndex = index;
-    this.#scrollTo(index);
-    emit("select", { id: row.id });
+    return this.rows.at(index) ?? null;
   }
 
-  /** Display the next contact without a decision: of the loaded rows below, else the first one of the queue. */
-  async nextUnreviewed() {
-    const [first, last] = [this.rows.indexOf(state.selected) + 1, this.rows.matching];
-    for (let index = first; index < last && this.rows.at(index); index += 1) {
-      if (this.rows.at(index).review === "unreviewed") {
-        await this.choose(index);
-        return true;
-      }
+  /** Loaded rows after a contact. */
+  following(id, count) {
+    const index = this.rows.indexOf(id);
+    return index < 0 ? [] : Array.from({ length: count }, (_, i) => this.rows.at(index + 1 + i)).filter(Boolean);
+  }
+
+  /** Next row without a decision: of the loaded rows below a contact, else the first one of the queue; null if there is none. */
+  async nextUnreviewed(id, excluded = []) {
+    const open = (row) => row.review === "unreviewed" && row.id !== id && !excluded.includes(row.id);
+    const known = this.rows.indexOf(id);
+    for (let index = known >= 0 ? known + 1 : this.selectedIndex; index < this.rows.matching && this.rows.at(index); index += 1) {
+      if (open(this.rows.at(index))) return this.rows.at(index);
     }
-    const { items } = await api.contacts({ ...this.rows.query, review: "unreviewed", offset: 0, limit: 2 });
-    const next = items.find((row) => row.id !== state.selected);
-    if (!next) return false;
-    const index = this.rows.indexOf(next.id);
-    if (index >= 0) await this.choose(index);
-    else emit("select", { id: next.id });
-    return true;
+    const { items } = await api.contacts({ ...this.rows.query, review: "unreviewed", offset: 0, limit: excluded.length + 2 });
+    return items.find(open) ?? null;
   }
 
   #scrollTo(index) {

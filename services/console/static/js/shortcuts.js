@@ -36,13 +36,16 @@ export function shortcutTable({ app, queue, view, decision, map }) {
       [["l"], "shortcuts.queue.unreviewed", () => app.toggleReview(), review],
     ]],
     ["shortcuts.decision", [
-      [["1"], "shortcuts.decision.mine_like", () => decision.choose("mine_like"), review],
-      [["2"], "shortcuts.decision.not_mine_like", () => decision.choose("not_mine_like"), review],
-      [["3"], "shortcuts.decision.unsure", () => decision.choose("unsure"), review],
-      [["Enter"], "shortcuts.decision.enter", () => app.enter(), review],
+      [["1"], "shortcuts.decision.mine_like", () => app.decide("mine_like"), review],
+      [["2"], "shortcuts.decision.not_mine_like", () => app.decide("not_mine_like"), review],
+      [["3"], "shortcuts.decision.unsure", () => app.decide("unsure"), review],
+      [["Shift+1"], "", () => app.choose("mine_like"), review], [["Shift+2"], "", () => app.choose("not_mine_like"), review],
+      [["Shift+3"], "shortcuts.select", () => app.choose("unsure"), { view: "review", label: "shortcuts.shift" }],
+      [["Enter"], "shortcuts.enter", () => app.enter(), review],
+      [["y"], "shortcuts.class", () => app.drawer.focus(decision.mloClass.choice), review],
       [["g"], "shortcuts.decision.confidence", () => app.drawer.focus(decision.confidence), review],
       [["w"], "shortcuts.decision.remark", () => app.drawer.focus(decision.remark), review],
-      [["u"], "shortcuts.decision.undo", () => decision.undo(), review],
+      [["u"], "shortcuts.undo", () => app.undo(), review],
       [["r"], "shortcuts.decision.request", () => app.request(), review],
     ]],
     ["shortcuts.image", [
@@ -93,8 +96,11 @@ export function startShortcuts(keys, activeView, { leave, send }) {
     // Buttons handle Enter, and sliders handle arrow keys.
     if (event.key === "Enter" && ["BUTTON", "A", "SUMMARY"].includes(event.target.tagName)) return;
     if (event.key.startsWith("Arrow") && event.target.tagName === "INPUT") return;
+    // With Shift, a digit key has another character, which depends on the keyboard layout.
+    const digit = /^Digit([0-9])$/.exec(event.code)?.[1];
+    const key = event.shiftKey && digit && event.key !== digit ? `Shift+${digit}` : event.key;
     const settings = keySettings();
-    const found = actions.find((row) => (!row[3].view || row[3].view === activeView()) && keysOf(row, settings).includes(event.key));
+    const found = actions.find((row) => (!row[3].view || row[3].view === activeView()) && keysOf(row, settings).includes(key));
     if (!found) return;
     event.preventDefault();
     found[2](event);

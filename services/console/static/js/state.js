@@ -8,13 +8,13 @@ export const state = {
   offset_s: 0, // clock of the server minus clock of this computer
   total: 0,
   unreviewed: 0,
-  selected: null, // identifier of the displayed contact
+  selected: null, // identifier of the displayed contact: row, heading, form and image
   fleet: null,
 };
 
 const bus = new EventTarget();
 
-/** Send a message to all listeners: an event of the server, `online`, `select`, `view`, `theme`, `setting`, `changed` or `reload`. */
+/** Send a message to all listeners: an event of the server, `online`, `select`, `move`, `view`, `theme`, `setting`, `changed` or `reload`. */
 export function emit(name, detail = {}) {
   bus.dispatchEvent(new CustomEvent(name, { detail }));
 }

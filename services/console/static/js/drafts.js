@@ -1,0 +1,33 @@
+// Unsent input of the decision form, by contact. This browser keeps it over a reload and the end of a session.
+
+const MAX_DRAFTS = 50;
+const EMPTY = { verdict: null, confidence: null, mlo_class: "", remark: "" };
+
+export class Drafts {
+  /** `user`: the drafts of each user are separate. */
+  constructor(user) {
+    this.key = `sonarpost.drafts.${user}`;
+    this.drafts = new Map();
+    try { this.drafts = new Map(JSON.parse(localStorage.getItem(this.key) ?? "[]")); } catch { /* kept for this page only */ }
+  }
+
+  get(id) { return { ...EMPTY, ...this.drafts.get(id) }; }
+
+  /** Change fields of a draft. A draft without input is removed, and the oldest one of more than 50. */
+  change(id, fields) {
+    const draft = { ...this.get(id), ...fields };
+    this.drafts.delete(id);
+    if (Object.keys(EMPTY).some((name) => draft[name] !== EMPTY[name])) this.drafts.set(id, draft);
+    if (this.drafts.size > MAX_DRAFTS) this.drafts.delete(this.drafts.keys().next().value);
+    this.#store();
+  }
+
+  remove(id) {
+    this.drafts.delete(id);
+    this.#store();
+  }
+
+  #store() {
+    try { localStorage.setItem(this.key, JSON.stringify([...this.drafts])); } catch { /* kept for this page only */ }
+  }
+}

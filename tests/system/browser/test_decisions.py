@@ -1,0 +1,416 @@
+"""Decisions on the page: change of contact, one-key verdicts, undo, disputes, drafts."""
+
+from __future__ import annotations
+
+import pytest
+from builders.common import eventually
+from builders.console import image_record
+
+from sonarpost.services.console.store.contacts import ContactFilter
+
+VERDICTS = ("mine_like", "not_mine_like", "unsure")
+LATENCY_S = 0.4
+
+# Records the image on the canvas at each decision, and differences between row, heading, form and image in any frame.
+OBSERVE = """() => {
+  window.decided = [];
+  window.gaps = [];
+  window.shown = [];
+  const real = window.fetch;
+  const drawn = () => document.querySelector('.stage canvas').dataset.shows?.split(' ')[0];
+  window.fetch = (path, options) => {
+    if (options?.method === 'POST' && path.endsWith('/decisions')) {
+      window.decided.push([drawn(), decodeURIComponent(path.split('/')[3]), JSON.parse(options.body)]);
+    }
+    return real(path, options);
+  };
+  const sample = () => {
+    const id = drawn();
+    const image = id?.split('.').at(-1);
+    const name = document.querySelector('.heading h2')?.textContent;
+    const row = document.querySelector('.row[aria-selected=true]')?.dataset.id;
+    const link = decodeURIComponent(location.hash.slice(1));
+    const form = document.getElementById('remark').value;
+    if (id && window.shown.at(-1) !== id) window.shown.push(id);
+    const wrong = [name?.endsWith('/' + image), row === id || row === undefined, link === id, form === '' || form.endsWith(image)];
+    if (id && !wrong.every(Boolean)) window.gaps.push([id, name, row, link, form]);
+    requestAnimationFrame(sample);
+  };
+  requestAnimationFrame(sample);
+}"""
+
+
+def add_contacts(served, count):
+    served.state.store_images(
+        [image_record(f"{number:04d}", seed=10 * number, position=None) for number in range(count)]
+    )
+
+
+def ids(served):
+    return {row["image_id"]: row["id"] for row in served.state.list_contacts(ContactFilter(limit=500))["items"]}
+
+
+def decisions(served, image_id):
+    return served.state.contact_detail(ids(served)[image_id])["decisions"]
+
+
+def row(image_id):
+    return f'.row[data-id*=".{image_id}"]'
+
+
+def delay(visit, seconds=LATENCY_S):
+    """Add a latency to each response of the server."""
+    visit.page.evaluate(
+        """ms => {
+          const real = window.fetch;
+          window.fetch = async (...all) => {
+            await new Promise(done => setTimeout(done, ms / 2));
+            const response = await real(...all);
+            await new Promise(done => setTimeout(done, ms / 2));
+            return response;
+          };
+        }""",
+        1000 * seconds,
+    )
+
+
+def open_slow_page(served, count):
+    """A page on the last contact of several, by name, with latency and observation."""
+    add_contacts(served, count)
+    visit = served.visit()
+    visit.press("l")  # all contacts: decided ones stay in the list
+    visit.page.select_option("#sort", "name asc")
+    visit.page.evaluate("document.getElementById('queue').focus()")
+    visit.until("() => document.querySelector('.row[data-index=\"0\"]')?.dataset.id.endsWith('.0000')")
+    visit.page.evaluate("document.querySelector('.row[data-index=\"0\"]').click()")
+    visit.wait_for_contact("0000")
+    visit.page.evaluate("document.getElementById('queue').focus()")
+    delay(visit)
+    visit.page.evaluate(OBSERVE)
+    return visit
+
+
+def open_page(served, user="anna", image_id="0000"):
+    visit = served.visit(user, path=f"#{ids(served)[image_id]}")
+    visit.wait_for_contact(image_id)
+    visit.page.evaluate("document.getElementById('queue').focus()")
+    return visit
+
+
+def test_fast_decisions_go_to_the_contact_whose_image_is_drawn(served):
+    visit = open_slow_page(served, 52)
+    sent = [VERDICTS[number % 3] for number in range(50)]
+    for verdict in sent:
+        visit.press(str(1 + VERDICTS.index(verdict)))
+        visit.page.wait_for_timeout(40)
+    visit.until("() => window.decided.length === 50")
+    decided = visit.page.evaluate("window.decided")
+    assert [drawn for drawn, _, _ in decided] == [posted for _, posted, _ in decided]
+    assert [body["verdict"] for _, _, body in decided] == sent
+    assert len({posted for _, posted, _ in decided}) == 50
+    stored = served.state
+    eventually(lambda: stored.counts().unreviewed == 2, what="50 decisions")
+    for _, contact_id, body in decided:
+        detail = stored.contact_detail(contact_id)
+        [decision] = detail["decisions"]
+        assert (decision["verdict"], decision["sha256"]) == (body["verdict"], detail["versions"][0]["sha256"])
+    assert visit.page.evaluate("window.gaps") == []
+
+
+def test_keys_during_a_change_of_contact_are_applied_after_it(served):
+    visit = open_slow_page(served, 8)
+    visit.press("1", "j", "2", "j", "3")
+    visit.until("() => window.decided.length === 3")
+    # Each verdict displays the next contact; j leaves one out.
+    decided = visit.page.evaluate("window.decided.map(([drawn, id, body]) => [drawn, id.slice(-4), body.verdict])")
+    assert [[drawn[-4:], *rest] for drawn, *rest in decided] == [
+        ["0000", "0000", "mine_like"],
+        ["0002", "0002", "not_mine_like"],
+        ["0004", "0004", "unsure"],
+    ]
+    visit.wait_for_contact("0005")
+    assert visit.page.evaluate("window.gaps") == []
+
+
+def test_name_row_form_and_image_change_in_one_frame(served):
+    add_contacts(served, 12)
+    # Each contact has its own draft, so that the form shows to which contact it belongs.
+    drafts = [[contact_id, {"remark": f"remark on {image_id}"}] for image_id, contact_id in ids(served).items()]
+    visit = open_page(served, image_id="0011")
+    visit.page.evaluate("drafts => localStorage.setItem('sonarpost.drafts.anna', JSON.stringify(drafts))", drafts)
+    visit.page.reload()
+    visit.wait_for_contact("0011")
+    visit.page.evaluate("document.getElementById('queue').focus()")
+    delay(visit)
+    visit.page.evaluate(OBSERVE)
+    visit.press("j")
+    visit.wait(".stage.loading .loading-name >> text=loading")
+    # While it is loaded, all of the old contact is displayed.
+    assert visit.text(".heading h2").endswith("0011")
+    visit.until("() => !document.querySelector('.stage.loading')")
+    for _ in range(4):
+        visit.press("j")
+        visit.page.wait_for_timeout(150)
+    visit.page.locator(row("0005")).click()
+    visit.wait_for_contact("0005")
+    assert visit.page.input_value("#remark") == "remark on 0005"
+    assert visit.page.evaluate("window.gaps") == []
+    assert len(visit.page.evaluate("window.shown")) >= 3
+
+
+def test_thirty_contacts_need_thirty_keys(served):
+    add_contacts(served, 30)
+    visit = served.visit()
+    visit.wait_for_contact("0029")
+    for number in reversed(range(30)):
+        visit.wait_for_contact(f"{number:04d}")
+        visit.press("1")
+    eventually(lambda: served.state.counts().unreviewed == 0, what="30 decisions")
+    visit.wait("#toasts >> text=No other unreviewed contacts")
+    assert served.state.list_contacts(ContactFilter(review="mine_like"))["matching"] == 30
+
+
+def test_contact_that_cannot_be_loaded_leaves_the_old_one(served):
+    add_contacts(served, 6)
+    visit = served.visit()
+    visit.expect_errors("Failed to load resource", "ERR_", "net::")
+    visit.wait_for_contact("0005")
+    served.stop()
+    visit.wait("#offline")
+    visit.press("j", "1")
+    visit.wait("#toasts .bad >> text=uuv-1/0004 could not be loaded")
+    assert "1 key after it was ignored" in visit.text("#toasts")
+    assert visit.text(".heading h2").endswith("0005")
+    assert visit.page.locator(".row[aria-selected=true]").get_attribute("data-id").endswith(".0005")
+    assert visit.page.evaluate("document.querySelector('canvas').dataset.shows").endswith(".0005 1 raw")
+    assert visit.page.locator(".stage.loading").count() == 0
+    # A verdict on the old contact is not lost: the form keeps it.
+    visit.press("2")
+    visit.wait("#result .bad >> text=uuv-1/0005 was not sent")
+    served.restart()
+    visit.until("() => !document.getElementById('offline')")
+    assert decisions(served, "0004") == decisions(served, "0005") == []
+    visit.wait("#send:enabled")
+    visit.press("Enter")
+    visit.wait("#result >> text=uuv-1/0005")
+    eventually(lambda: len(decisions(served, "0005")) == 1, what="the decision")
+    assert decisions(served, "0005")[0]["verdict"] == "not_mine_like"
+
+
+def test_decision_and_undo_from_any_contact(served):
+    add_contacts(served, 4)
+    visit = served.visit()
+    visit.wait_for_contact("0003")
+    visit.press("2")
+    visit.wait("#result >> text=uuv-1/0003 ○ not mine-like")
+    assert "take back" in visit.text("#take-back")
+    visit.wait_for_contact("0002")
+    visit.press("j")
+    visit.wait_for_contact("0001")
+    visit.press("u")
+    visit.wait_for_contact("0003")
+    visit.wait("#result >> text=taken back before sending")
+    withdrawal, first = decisions(served, "0003")
+    assert (withdrawal["undoes"], first["undone"]) == (first["decision_id"], True)
+    # The audit has the image that the undo displayed.
+    entry = served.state.contact_detail(ids(served)["0003"])["audit"][-1]
+    assert (entry["action"], entry["version"], entry["sha256"]) == ("undo", 1, first["sha256"])
+    assert served.state.unsent_records() == []
+    visit.wait(".now .badge.unreviewed")
+    visit.press("u")
+    visit.wait("#toasts >> text=No decision of yours")
+
+
+def test_take_back_time_ends_and_survives_a_reload(serve):
+    served = serve(take_back_s=3)
+    add_contacts(served, 2)
+    visit = served.visit()
+    visit.wait_for_contact("0001")
+    visit.press("1")
+    visit.wait("#take-back >> text=take back")
+    visit.page.reload()
+    visit.wait("#take-back >> text=take back")
+    visit.wait("#take-back >> text=undo")
+    eventually(lambda: len(served.state.unsent_records()) == 1, what="the released decision")
+    visit.page.locator("#take-back").click()
+    visit.wait("#result >> text=undone")
+    assert [item.record.verdict for item in served.state.unsent_records()] == ["mine_like", "unsure"]
+
+
+def test_verdict_key_sends_class_confidence_and_remark(serve):
+    served = serve(classes={"MILCO": ["manta"], "NOMBO": ["rock", "debris"]})
+    add_contacts(served, 4)
+    visit = served.visit()
+    visit.wait_for_contact("0003")
+    assert visit.text(".confidence label") == "Confidence: not given"
+    visit.press("y")
+    assert visit.page.evaluate("document.activeElement.id") == "class-choice"
+    visit.page.select_option("#class-choice", "NOMBO > rock")
+    assert visit.page.input_value("#mlo-class") == "NOMBO > rock"
+    visit.press("Escape", "g", "End", "w")
+    visit.page.keyboard.type("flat, no shadow")
+    visit.press("Escape", "2")
+    visit.wait("#result >> text=uuv-1/0003")
+    [decision] = decisions(served, "0003")
+    assert (decision["verdict"], decision["mlo_class"], decision["confidence"], decision["remark"]) == (
+        "not_mine_like",
+        "NOMBO > rock",
+        1.0,
+        "flat, no shadow",
+    )
+    # With Shift the verdict is selected only; Enter in the class field sends nothing.
+    visit.wait_for_contact("0002")
+    visit.press("Shift+Digit3")
+    visit.page.locator("#mlo-class").fill("tyre")
+    visit.press("Enter")
+    visit.page.wait_for_timeout(200)
+    assert decisions(served, "0002") == []
+    assert visit.text("#send").startswith("Send “unsure”")
+    visit.press("Escape", "Enter")
+    visit.wait("#result >> text=uuv-1/0002 ? unsure")
+    [decision] = decisions(served, "0002")
+    assert (decision["verdict"], decision["mlo_class"], decision["confidence"]) == ("unsure", "tyre", None)
+    # The buttons do the same.
+    visit.wait_for_contact("0001")
+    visit.page.locator(".verdicts .mine_like").click()
+    visit.wait_for_contact("0000")
+    assert [one["verdict"] for one in decisions(served, "0001")] == ["mine_like"]
+
+
+def test_form_does_not_move(served):
+    add_contacts(served, 4)
+    served.state.store_image(image_record("0003", 2, seed=1))
+    visit = served.visit()
+    visit.wait_for_contact("0003")
+    boxes = [".verdicts .mine_like", ".verdicts .unsure", "#remark", "#send", ".stage", ".heading"]
+
+    def positions():
+        return [visit.page.locator(one).bounding_box() for one in boxes]
+
+    first = positions()
+    visit.press("w")
+    visit.page.keyboard.type("a remark of some length, so that the state has as many lines as it can have " * 3)
+    assert positions() == first
+    visit.press("Escape", "1")
+    visit.wait_for_contact("0002")
+    visit.wait("#result >> text=uuv-1/0003")
+    assert positions()[:4] == first[:4]
+    visit.press("u")
+    visit.wait_for_contact("0003")
+    assert positions() == first
+    visit.press("1")
+    visit.wait_for_contact("0002")
+    visit.press("l")
+    visit.page.locator(row("0003")).click()
+    visit.wait(".now .badge.mine_like")
+    assert positions() == first
+
+
+def test_differing_verdicts_are_both_kept(served):
+    add_contacts(served, 3)
+    anna, bo = open_page(served, "anna"), open_page(served, "bo")
+    # The second operator does not see the decision of the first one before the key.
+    bo.page.route("**/events*", lambda route: route.abort())
+    anna.press("1")
+    anna.wait("#result >> text=uuv-1/0000 ▲")
+    bo.press("2", "Enter", "Enter")
+    bo.wait("#result >> text=disputed")
+    bo.expect_errors("net::", "Failed to load")
+    assert [one["verdict"] for one in decisions(served, "0000")] == ["not_mine_like", "mine_like"]
+    anna.wait("#notices >> text=1 decision of yours")
+    # Both see the image beside both verdicts; no button has the focus, and Enter changes nothing.
+    for visit in (anna, bo):
+        visit.page.goto(served.address + "#" + ids(served)["0000"])
+        visit.page.reload()
+        visit.wait_for_contact("0000")
+        visit.wait(".now .badge.disputed")
+        visit.wait(".overrule.disputed li:nth-child(2)")
+        assert visit.page.locator("dialog").count() == 0
+        visit.press("Enter", "Enter")
+        visit.page.wait_for_timeout(150)
+    assert len(decisions(served, "0000")) == 2
+    assert served.state.contact_detail(ids(served)["0000"])["contact"]["review"] == "disputed"
+    # Settled with a reason.
+    button = bo.page.locator("[data-overrule=not_mine_like]")
+    assert button.is_disabled()
+    bo.page.fill("#overrule-reason", "boulder, seen on the second pass")
+    bo.press("Enter")
+    assert len(decisions(served, "0000")) == 2
+    button.click()
+    bo.wait(".now .badge.not_mine_like")
+    latest = decisions(served, "0000")[0]
+    assert (latest["operator"], latest["remark"]) == ("bo", "boulder, seen on the second pass")
+    # The overruled operator receives a notice, which stays after a reload, until it is acknowledged.
+    anna.page.reload()
+    anna.wait("#notices >> text=1 decision of yours")
+    anna.page.locator("#notices").click()
+    anna.wait("dialog >> text=boulder, seen on the second pass")
+    anna.page.locator("dialog [data-acknowledge]").click()
+    anna.until("() => !document.querySelector('dialog [data-acknowledge]')")
+    anna.press("Escape")
+    anna.until("() => document.getElementById('notices').classList.contains('hidden')")
+
+
+def test_undo_never_takes_back_the_decision_of_another_operator(served):
+    add_contacts(served, 2)
+    bo = open_page(served, "bo", "0000")
+    bo.press("1")
+    bo.wait("#result >> text=uuv-1/0000")
+    anna = open_page(served, "anna", "0000")
+    anna.wait(".now .badge.mine_like")
+    assert anna.page.locator("#undo").is_disabled()
+    anna.press("u")
+    anna.wait("#toasts >> text=No decision of yours")
+    assert len(decisions(served, "0000")) == 1
+    anna.wait(".overrule >> text=Overrule bo")
+
+
+def test_drafts_survive_reload_and_the_end_of_the_session(served):
+    add_contacts(served, 3)
+    visit = open_page(served, image_id="0001")
+    visit.press("w")
+    visit.page.keyboard.type("possible cylinder")
+    visit.press("Escape", "g", "ArrowRight", "Shift+Digit1")
+    visit.wait("#send:enabled")
+    visit.page.reload()
+    visit.wait_for_contact("0001")
+    assert visit.page.input_value("#remark") == "possible cylinder"
+    # Another session of the same user in this browser.
+    visit.page.context.clear_cookies()
+    token = served.users.start_session("anna").token
+    visit.page.context.add_cookies([{"name": "sonarpost_session", "value": token, "url": served.address}])
+    visit.page.reload()
+    visit.wait_for_contact("0001")
+    visit.wait("#send:enabled")
+    visit.page.evaluate("document.getElementById('queue').focus()")
+    visit.press("Enter")
+    visit.wait("#result >> text=uuv-1/0001 ▲")
+    [decision] = decisions(served, "0001")
+    assert (decision["confidence"], decision["remark"]) == (0.55, "possible cylinder")
+    visit.until("() => localStorage.getItem('sonarpost.drafts.anna') === '[]'")
+    # The number of drafts is bounded.
+    visit.page.evaluate(
+        """async () => {
+          const { Drafts } = await import('/static/js/drafts.js');
+          const drafts = new Drafts('anna');
+          for (let i = 0; i < 70; i += 1) drafts.change(`c${i}`, { remark: 'x' });
+        }"""
+    )
+    stored = visit.page.evaluate("JSON.parse(localStorage.getItem('sonarpost.drafts.anna')).map(([id]) => id)")
+    assert stored == [f"c{number}" for number in range(20, 70)]
+
+
+@pytest.mark.parametrize("size", [(1366, 768), (1920, 1080), (390, 844)])
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_line_at_the_foot_covers_nothing(served, size, theme):
+    add_contacts(served, 2)
+    visit = served.visit(viewport={"width": size[0], "height": size[1]}, color_scheme=theme)
+    visit.wait_for_contact("0001")
+    visit.press("1")
+    visit.wait("#result >> text=uuv-1/0001")
+    visit.wait_for_contact("0000")
+    foot, main = (visit.page.locator(one).bounding_box() for one in ("#foot", "#main"))
+    assert main["y"] + main["height"] <= foot["y"] + 0.5
+    assert foot["y"] + foot["height"] <= size[1] + 0.5
+    button = visit.page.locator("#take-back").bounding_box()
+    assert button["x"] + button["width"] <= size[0]
