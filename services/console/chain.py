@@ -179,3 +179,22 @@ def _behind_lost_places(links: list[ChainLink]) -> list[ChainLink]:
         return "router" in lost or (link.place == "vehicle" and "modem" in lost)
 
     return [replace(link, state="unknown", reason="", detail="") if is_hidden(link) else link for link in links]
+
+
+class ChainHistory:
+    """Adds the time from which a place has its state, where the place itself does not state it."""
+
+    def __init__(self) -> None:
+        self._states: dict[tuple[Place, str], tuple[PlaceState, float]] = {}
+
+    def with_times(self, links: Sequence[ChainLink], now_utc_s: float) -> list[ChainLink]:
+        """Return the links with `since_utc_s`; call it with every observation, from one thread at a time."""
+        states: dict[tuple[Place, str], tuple[PlaceState, float]] = {}
+        timed: list[ChainLink] = []
+        for link in links:
+            state, since = self._states.get((link.place, link.name), (None, now_utc_s))
+            since = since if state == link.state else now_utc_s
+            states[(link.place, link.name)] = (link.state, since)
+            timed.append(link if link.since_utc_s is not None else replace(link, since_utc_s=since))
+        self._states = states
+        return timed

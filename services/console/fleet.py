@@ -15,7 +15,7 @@ from sonarpost.messages import AcousticFrame, QueueState
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.monitoring.fleet import FleetTracker, ServiceStatus
 from sonarpost.review.positions import distance_m
-from sonarpost.services.console.chain import SERVICE_STALE_S, HeardVehicle, RouterState, chain_links
+from sonarpost.services.console.chain import SERVICE_STALE_S, ChainHistory, HeardVehicle, RouterState, chain_links
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.serialisers import Json
 
@@ -55,6 +55,7 @@ class FleetMonitor:
 
     def __init__(self, stale_s: float) -> None:
         self.services = FleetTracker()
+        self.chain_history = ChainHistory()
         self._stale_s = stale_s
         self._lock = threading.Lock()
         self._links: dict[str, _Link] = {}
@@ -246,7 +247,10 @@ def fleet_json(
     router: RouterState | None,
     now_utc_s: float,
 ) -> Json:
-    """Return the state of services, vehicles and chain, with the position of each vehicle at its last contact."""
+    """Return the state of services, vehicles and chain, with the position of each vehicle at its last contact.
+
+    The connection of the database, which one thread has at a time, also protects the history of the chain.
+    """
     positions = {
         row["vehicle_id"]: row
         for row in db.execute(
@@ -292,7 +296,7 @@ def fleet_json(
     return {
         "now_utc_s": now_utc_s,
         "listening_since_utc_s": router and router.listening_since_utc_s,
-        "chain": [asdict(link) for link in links],
+        "chain": [asdict(link) for link in monitor.chain_history.with_times(links, now_utc_s)],
         "services": [*monitor.service_list()],
         "vehicles": [*vehicles],
     }

@@ -48,6 +48,7 @@ from sonarpost.services.console.web.decision_routes import DecisionRoutes
 from sonarpost.services.console.web.event_stream import EventStream
 from sonarpost.services.console.web.export_routes import ExportRoutes
 from sonarpost.services.console.web.map_routes import MapRoutes
+from sonarpost.services.console.web.mission_routes import MissionRoutes
 from sonarpost.services.console.web.score_routes import ScoreRoutes
 from sonarpost.services.console.web.session_routes import SessionRoutes
 from sonarpost.services.console.web.settings_routes import SettingsRoutes
@@ -80,6 +81,7 @@ class ConsoleApp:
             *ContactRoutes(state).routes(access),
             *DecisionRoutes(state).routes(access),
             *self._map.routes(access),
+            *MissionRoutes(state).routes(access),
             *ScoreRoutes(state).routes(access),
             *self._exports.routes(access),
             *self._stream.routes(access),

@@ -9,7 +9,7 @@ import pytest
 
 from sonarpost.messages import Health
 from sonarpost.monitoring.fleet import ServiceStatus
-from sonarpost.services.console.chain import ChainLink, HeardVehicle, RouterState, chain_links
+from sonarpost.services.console.chain import ChainHistory, ChainLink, HeardVehicle, RouterState, chain_links
 
 VESSEL = "vessel-1"
 NOW_S = 10_000.0
@@ -133,3 +133,12 @@ def test_shore_site_and_console_without_a_network():
     c2 = ServiceStatus("vessel-1", "c2", status("c2").health, 1.0, True)
     assert list(links((c2,), side="shore")) == ["server", "router", "c2"]
     assert list(links((), (), router=None)) == ["server"]
+
+
+def test_time_of_a_state_is_that_of_its_first_observation():
+    history = ChainHistory()
+    ok, lost = ChainLink("modem", "op_modem", "ok"), ChainLink("modem", "op_modem", "lost", "no_modem")
+    own_time = replace(lost, since_utc_s=5.0)
+    observed = [(ok, 10.0), (ok, 20.0), (lost, 30.0), (lost, 40.0), (own_time, 50.0), (ok, 60.0)]
+    times = [history.with_times([link], now)[0].since_utc_s for link, now in observed]
+    assert times == [10.0, 10.0, 30.0, 30.0, 5.0, 60.0]

@@ -99,6 +99,7 @@ export const api = {
   advise: (id, body) => request("POST", `${contactPath(id)}/advice`, body),
   fleet: () => request("GET", "/api/fleet"),
   score: () => request("GET", "/api/score"),
+  mission: () => request("GET", "/api/mission"),
   map: () => request("GET", "/api/map"),
   export: (format, filter) => download(`/api/export/contacts.${format}?${queryString(filter)}`),
   streamError,

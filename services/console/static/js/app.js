@@ -7,12 +7,14 @@ import { ContactLoader } from "./contact_loader.js";
 import { ContactView } from "./contact_view.js";
 import { DecisionForm } from "./decision_form.js";
 import { debounce, h, showDialog, toast } from "./dom.js";
+import { EmptyView } from "./empty_view.js";
 import { startEvents } from "./event_stream.js";
 import { FleetView } from "./fleet_view.js";
 import { Header, restoreTheme, toggleTheme, toggleTypeSize } from "./header.js";
 import { markKeys } from "./keys.js";
 import { Drawer, onSwipe } from "./layout.js";
 import { MapView } from "./map_view.js";
+import { MissionView } from "./mission_view.js";
 import { Queue } from "./queue.js";
 import { QueueFilters } from "./queue_filters.js";
 import { openRequestDialog } from "./request_dialog.js";
@@ -40,15 +42,17 @@ class App {
     listen("fleet", (fleet) => { state.fleet = fleet; }); // first listener: the others read the state
     this.map = new MapView();
     this.fleet = new FleetView();
+    this.mission = new MissionView();
+    this.empty = new EmptyView();
     this.activeView = "review";
     this.requestNumber = 0; // last request for a contact
     this.displayedNumber = 0; // request whose response is displayed
     this.panel = h("div", { class: "panel", role: "region", "aria-label": t("app.decision") }, this.decision.element, this.details.element);
     this.drawer = new Drawer(this.panel);
     this.review = h("section", { class: "review", "aria-label": t("app.review") },
-      h("div", { class: "side" }, this.filters.element, this.queue.element), this.view.element, this.panel);
+      h("div", { class: "side" }, this.filters.element, this.queue.element), this.view.element, this.panel, this.empty.element);
     onSwipe(this.view.stage, () => !this.view.zoomed && !this.view.measurement.active, (step) => this.queue.move(step));
-    document.getElementById("main").append(this.review, this.map.element, this.fleet.element);
+    document.getElementById("main").append(this.review, this.map.element, this.fleet.element, this.mission.element);
     this.keys = shortcutTable({ app: this, queue: this.queue, view: this.view, decision: this.decision, map: this.map });
     this.header = new Header({ exports: () => this.exports(), settings: () => this.settings(), help: () => this.help() });
     this.#hideWithoutContact();
@@ -197,10 +201,11 @@ class App {
 
   show(name) {
     this.activeView = name;
-    for (const [one, element] of [["review", this.review], ["map", this.map.element], ["fleet", this.fleet.element]]) element.classList.toggle("hidden", one !== name);
+    for (const [one, element] of [["review", this.review], ["map", this.map.element], ["fleet", this.fleet.element], ["mission", this.mission.element]]) element.classList.toggle("hidden", one !== name);
     this.header.setView(name);
     if (name === "map") { this.map.load().catch((error) => toast(error.message, { bad: true })); this.map.canvas.focus(); }
     if (name === "fleet") { this.fleet.render(); this.fleet.element.focus(); }
+    if (name === "mission") { this.mission.load(); this.mission.element.focus(); }
     if (name === "review") { this.queue.draw(); this.view.redraw(); this.queue.list.focus(); }
   }
 

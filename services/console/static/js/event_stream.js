@@ -1,11 +1,10 @@
 // The event stream of the server, and the state of its connection.
 
 import { api } from "./api.js";
-import { toast } from "./dom.js";
 import { emit, setClock, state } from "./state.js";
 
 const NAMES = ["contact", "frame", "decision", "request", "advice", "notice", "fleet", "session", "clock", "truth"];
-const SILENT_MS = 12000; // the server sends its time every 5 s
+const SILENT_MS = 10000; // the server sends its time every 5 s
 const RETRY_MS = 2000;
 
 let source = null;
@@ -18,15 +17,17 @@ let retry_ms = RETRY_MS;
 function received(event) {
   state.last_event_ms = performance.now();
   if (event.lastEventId) lastId = event.lastEventId;
-  if (!state.online) {
-    state.online = true;
-    emit("online");
-  }
+  if (state.online) return;
+  state.online = true;
+  state.refused = "";
+  emit("online");
 }
 
-function lost() {
-  if (!state.online) return;
+/** No events arrive: without connection, or because the server refuses the stream (`refused`: its reason). */
+function lost(refused = "") {
+  if (!state.online && state.refused === refused) return;
   state.online = false;
+  state.refused = refused;
   emit("online");
 }
 
@@ -55,30 +56,38 @@ function open() {
   source.addEventListener("error", () => {
     // The browser reconnects unless it received an error response, for example from a proxy.
     reload = true;
-    lost();
+    if (source.readyState === EventSource.CLOSED) explain();
+    else lost();
   });
 }
 
-/** Reopen a stream that is silent or closed. If the server refuses it, show the reason and wait as long as it says. */
+/** Ask the server why it refuses the stream; returns whether it does, and waits as long as it says. */
+async function explain() {
+  if (checking) return true;
+  checking = true;
+  const error = await api.streamError(streamUrl());
+  checking = false;
+  opened_ms = performance.now();
+  if (error === null) {
+    lost();
+    return false;
+  }
+  if (error.status === 401) emit("session");
+  lost(error.message);
+  retry_ms = Math.max(RETRY_MS, 1000 * error.retry_after_s);
+  return true;
+}
+
+/** Reopen a stream that is silent or closed. */
 async function check() {
   if (checking) return;
   const now_ms = performance.now();
   const silent = now_ms - Math.max(state.last_event_ms, opened_ms) > Math.max(SILENT_MS, retry_ms);
   const closed = source.readyState === EventSource.CLOSED && now_ms - opened_ms > retry_ms;
-  if (silent) lost();
+  if (silent && !closed) lost();
   if (!silent && !closed) return;
   reload = true;
-  checking = true;
-  const error = closed ? await api.streamError(streamUrl()) : null;
-  checking = false;
-  if (error === null) {
-    open();
-    return;
-  }
-  if (error.status === 401) emit("session");
-  else toast(`No live updates: ${error.message}`, { bad: true });
-  retry_ms = Math.max(RETRY_MS, 1000 * error.retry_after_s);
-  opened_ms = performance.now();
+  if (!(closed && (await explain()))) open();
 }
 
 export function startEvents() {
@@ -86,5 +95,5 @@ export function startEvents() {
   open();
   setInterval(check, 1000);
   addEventListener("online", () => { reload = true; open(); });
-  addEventListener("offline", lost);
+  addEventListener("offline", () => lost());
 }

@@ -1,5 +1,6 @@
 // The review queue. Only visible rows have elements, and only some pages of rows are loaded.
 
+import { hasAlert } from "./alerts.js";
 import { api } from "./api.js";
 import { h } from "./dom.js";
 import { DASH, authentication, probabilities, quantity, received, symbol, time, verdict } from "./format.js";
@@ -139,7 +140,7 @@ function queueRow(row, index, count, selected) {
     ? h("img", { src: row.thumbnail, alt: "", decoding: "async" })
     : h("span", { class: "nothing", text: t("queue.no_image") });
   return h("div", {
-    id: `row-${index}`, class: "row", role: "option", "aria-selected": String(selected), "aria-posinset": index + 1, "aria-setsize": count,
+    id: `row-${index}`, class: hasAlert(row.id) ? "row alert" : "row", role: "option", "aria-selected": String(selected), "aria-posinset": index + 1, "aria-setsize": count,
     "aria-label": rowLabel(row), data: { id: row.id, index: String(index), review: row.review },
   },
   h("div", { class: "thumb" }, image),
@@ -176,6 +177,7 @@ export class Queue {
     new ResizeObserver(() => this.#resized()).observe(this.list);
     listen("contact", ({ contact, new: isNew }) => this.#updateContact(contact, isNew));
     listen("theme", () => this.#resized());
+    listen("alerts", () => { for (const element of this.drawn.values()) element.classList.toggle("alert", hasAlert(element.dataset.id)); });
   }
 
   /** Keep the displayed contact visible when direction or size of the list change. */

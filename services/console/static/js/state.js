@@ -4,6 +4,7 @@ export const state = {
   session: null,
   info: null,
   online: true,
+  refused: "", // why the server refuses the event stream
   last_event_ms: 0, // performance.now() of the last event of the server
   offset_s: 0, // clock of the server minus clock of this computer
   total: 0,

@@ -1,0 +1,208 @@
+"""The chain of places, its banners, and the alerts, in a real browser."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from builders.common import eventually
+from builders.console import image_record
+
+from sonarpost import keys, wire
+from sonarpost.messages import AcousticFrame, Health
+from sonarpost.services.console.chain import RouterState
+
+VESSEL = "vessel-1"
+
+
+def report(served, service, state="ok", detail="", **gauges):
+    health = Health(
+        platform_id=VESSEL,
+        service=service,
+        time_utc_s=time.time(),
+        started_utc_s=time.time(),
+        state=state,
+        detail=detail,
+        counters={},
+        gauges=gauges,
+    )
+    served.state.fleet.services.add(keys.health(VESSEL, service), wire.encode(health), time.monotonic())
+
+
+def receive_frame(served, vehicle="uuv-1", age_s=0.0):
+    frame = AcousticFrame(
+        direction="rx",
+        platform_id=VESSEL,
+        time_utc_s=time.time() - age_s,
+        source=3,
+        destination=1,
+        rate=1,
+        packet=1,
+        frame_number=1,
+        frame_count=1,
+        data=b"x",
+    )
+    served.state.fleet.add_frame(vehicle, frame, time.monotonic() - age_s)
+
+
+def publish(served):
+    eventually(lambda: served.state.events.subscriber_count == 1, what="event stream")
+    served.state.events.publish("fleet", served.state.fleet_state())
+
+
+@pytest.fixture
+def vessel(served):
+    """A console whose places all work."""
+    now = time.time()
+    served.state.router = RouterState(
+        platform_id=VESSEL,
+        reached=True,
+        changed_utc_s=now - 600,
+        listening_since_utc_s=now - 600,
+        detail="tcp/127.0.0.1",
+    )
+    for service in ("console", "decompressor", "op_modem"):
+        report(served, service, modem_ready=1.0)
+    receive_frame(served)
+    return served
+
+
+def place(name, state):
+    return f'#chain .place[data-place="{name}"][data-state="{state}"]'
+
+
+def test_each_lost_place_is_named_in_the_chain_and_in_a_banner(vessel):
+    visit = vessel.visit(viewport={"width": 1920, "height": 1080})
+    for name in ("browser", "server", "router", "modem", "vehicle"):
+        visit.wait(place(name, "ok"))
+    assert visit.page.locator("#banners p").count() == 0
+    assert visit.text("#chain summary").split()[-4:-1] == ["●", "uuv-1", visit.text("#chain .age").split()[0]]
+    # The modem is unplugged.
+    report(vessel, "op_modem", "degraded", "/dev/ttyUSB0: device reports readiness to read", modem_ready=0.0)
+    publish(vessel)
+    visit.wait(place("modem", "lost"))
+    visit.wait(place("vehicle", "unknown"))
+    assert "the modem does not reply: /dev/ttyUSB0" in visit.text("#fault")
+    # The router hides all that is behind it.
+    vessel.state.router = vessel.state.router.changed(time.time(), reached=False)
+    publish(vessel)
+    visit.wait(place("router", "lost"))
+    visit.wait(place("modem", "unknown"))
+    since = time.strftime("%H:%M UTC", time.gmtime(vessel.state.router.changed_utc_s))
+    assert visit.text("#fault").startswith(f"No images can arrive since {since}: the router is not reached")
+    assert visit.page.get_attribute("#bar", "data-worst") == "lost"
+    # All places work again.
+    vessel.state.router = vessel.state.router.changed(time.time(), reached=True)
+    report(vessel, "op_modem", modem_ready=1.0)
+    publish(vessel)
+    visit.wait(place("modem", "ok"))
+    visit.until("() => !document.getElementById('fault')")
+
+
+def test_silent_vehicle_is_named(vessel):
+    receive_frame(vessel, "uuv-2", age_s=121.0)
+    visit = vessel.visit()
+    visit.wait(place("vehicle", "degraded"))
+    assert "no frames from uuv-2" in visit.text("#fault")
+    visit.page.click("#chain summary")
+    details = visit.text("#chain .places")
+    assert "uuv-1" in details
+    assert "no frames from uuv-2" in details
+    visit.press("Escape")
+    visit.until("() => !document.getElementById('chain').open")
+
+
+def test_lost_server_is_named_by_the_page(vessel):
+    visit = vessel.visit()
+    visit.expect_errors("Failed to load resource", "ERR_", "net::")
+    visit.wait(place("server", "ok"))
+    vessel.stop()
+    visit.wait(place("server", "lost"), timeout=10_000)
+    assert "No connection to the console's server since" in visit.text("#offline")
+    visit.wait(place("router", "unknown"))
+    vessel.restart()
+    visit.wait(place("server", "ok"))
+
+
+def test_page_whose_stream_is_refused_states_the_reason(vessel, monkeypatch):
+    monkeypatch.setattr("sonarpost.services.console.web.event_stream.MAX_STREAMS_OF_USER", 1)
+    first = vessel.visit()
+    first.wait(place("browser", "ok"))
+    second = vessel.visit()
+    second.expect_errors("429")
+    second.wait(place("browser", "degraded"))
+    banner = second.text("#offline")
+    assert "anna has 1 open pages" in banner
+    assert "No connection" not in banner
+    # The server is reached: it has refused the stream.
+    assert second.page.locator(place("server", "lost")).count() == 0
+
+
+FAKES = """() => {
+  window.tones = 0;
+  window.notes = [];
+  const parameter = { value: 0, setValueAtTime() {} };
+  window.AudioContext = class {
+    state = "running"; currentTime = 0; destination = {};
+    createGain() { return { gain: parameter, connect() {} }; }
+    createOscillator() { return { frequency: parameter, connect() {}, start() { window.tones += 1; }, stop() {} }; }
+  };
+  window.Notification = class {
+    static permission = "default";
+    static async requestPermission() { this.permission = "granted"; return "granted"; }
+    constructor(title, options) { window.notes.push([title, options.body]); }
+    close() {}
+  };
+}"""
+
+ALERTED = '.row.alert[data-id*=".{}"]'
+
+
+def test_alert_for_an_arriving_contact_above_the_threshold(vessel):
+    vessel.state.store_image(image_record("0001", atd_confidence=1.9))
+    visit = vessel.visit()
+    visit.page.evaluate(FAKES)
+    visit.wait_for_contact("0001")
+    eventually(lambda: vessel.state.events.subscriber_count == 1, what="event stream")
+    # Alerts are off by default.
+    vessel.state.store_image(image_record("0002", atd_confidence=1.9))
+    visit.wait('.row[data-id*=".0002"]')
+    assert visit.page.evaluate("[window.tones, window.notes.length]") == [0, 0]
+    visit.page.click("#alerts")
+    visit.page.check("#alerts-on")
+    visit.page.fill("#alerts-threshold", "1.2")
+    visit.press("Enter")
+    visit.until("() => document.getElementById('alerts').title.includes('1.2')")
+
+    vessel.state.store_image(image_record("0003", atd_confidence=1.1))
+    visit.wait('.row[data-id*=".0003"]')
+    vessel.state.store_image(image_record("0004", atd_confidence=1.25))
+    visit.wait(ALERTED.format("0004"))
+    assert visit.page.locator(".row.alert").count() == 1
+    assert visit.page.evaluate("window.tones") == 1
+    assert visit.page.evaluate("window.notes") == [["New contact uuv-1/0004", "Detector 1.25 of 2"]]
+    assert visit.page.title().startswith("1 alert · (4)")
+    # Neither another version nor a repeated event alerts again.
+    vessel.state.store_image(image_record("0004", 2, atd_confidence=1.25))
+    vessel.state._publish_contact(next(iter_ids(vessel, "0004")), new=True)
+    # The confidence of a contact can arrive after its first frame.
+    vessel.state.store_image(image_record("0005", atd_confidence=None))
+    vessel.state.store_image(image_record("0005", 2, atd_confidence=2.0))
+    visit.wait(ALERTED.format("0005"))
+    assert visit.page.evaluate("[window.tones, window.notes.length]") == [2, 2]
+    assert visit.page.title().startswith("2 alerts · ")
+    # An alert ends when its contact is opened.
+    visit.page.click('.row[data-id*=".0004"]')
+    visit.wait_for_contact("0004")
+    assert visit.page.title().startswith("1 alert · ")
+    # A reload does not alert.
+    visit.page.add_init_script(f"({FAKES})()")
+    visit.page.reload()
+    visit.wait('.row[data-id*=".0005"]')
+    assert visit.page.evaluate("[window.tones, document.querySelectorAll('.row.alert').length]") == [0, 0]
+
+
+def iter_ids(served, image_id):
+    with served.state.database.read() as db:
+        rows = db.execute("SELECT id FROM contact WHERE image_id = ?", (image_id,)).fetchall()
+    return (row["id"] for row in rows)
