@@ -129,7 +129,7 @@ def test_page_whose_stream_is_refused_states_the_reason(vessel, monkeypatch):
     first = vessel.visit()
     first.wait(place("browser", "ok"))
     second = vessel.visit()
-    second.expect_errors("429")
+    second.expect_errors("429", "establish a connection")
     second.wait(place("browser", "degraded"))
     banner = second.text("#offline")
     assert "anna has 1 open pages" in banner
