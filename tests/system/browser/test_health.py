@@ -170,8 +170,8 @@ def test_alert_for_an_arriving_contact_above_the_threshold(vessel):
     assert visit.page.evaluate("[window.tones, window.notes.length]") == [0, 0]
     visit.page.click("#alerts")
     visit.page.check("#alerts-on")
-    visit.page.fill("#alerts-threshold", "1.2")
-    visit.press("Enter")
+    visit.page.select_option("#alerts-threshold", "1.2")
+    visit.page.click('dialog [data-action="save"]')
     visit.until("() => document.getElementById('alerts').title.includes('1.2')")
 
     vessel.state.store_image(image_record("0003", atd_confidence=1.1))

@@ -5,7 +5,8 @@ import { h, labelled, showDialog } from "./dom.js";
 import { emit, listen, setting, state } from "./state.js";
 import { t } from "./texts.js";
 
-const DEFAULT_THRESHOLD = 1.5;
+const DEFAULT_THRESHOLD = "1.5";
+const THRESHOLDS = Array.from({ length: 21 }, (_, tenths) => (tenths / 10).toFixed(1)); // 0 to 2
 const TONE_HZ = 880;
 const TONE_S = 0.18;
 const TONES = 3;
@@ -88,7 +89,8 @@ async function showSettings(draw) {
   const on = checkbox("on", isOn());
   const sound = checkbox("sound", isChosen("sound"));
   const notification = checkbox("notify", isChosen("notify"));
-  const level = h("input", { type: "number", id: "alerts-threshold", min: 0, max: 2, step: 0.1, value: String(threshold()) });
+  const level = h("select", { id: "alerts-threshold" }, THRESHOLDS.map((value) => h("option", { value, text: value })));
+  level.value = threshold().toFixed(1);
   const test = h("button", { type: "button", text: t("alerts.test"), on: { click: playTone } });
   const body = h("div", { class: "alert-settings" },
     labelled(t("alerts.on"), on), labelled(t("alerts.threshold"), level), labelled(t("alerts.sound"), sound), test,
@@ -97,25 +99,24 @@ async function showSettings(draw) {
     { label: t("alerts.save"), value: "save", primary: true }, { label: t("alerts.cancel"), value: null },
   ]);
   if (chosen !== "save") return;
-  const entered = level.valueAsNumber;
-  setting("alerts.threshold", Number.isFinite(entered) ? Math.min(2, Math.max(0, entered)) : DEFAULT_THRESHOLD);
+  setting("alerts.threshold", level.value);
   setting("alerts.on", on.checked);
   setting("alerts.sound", sound.checked);
   setting("alerts.notify", notification.checked);
   if (on.checked && sound.checked) audioOutput();
+  draw();
   // The browser asks the user for the permission.
   if (on.checked && notification.checked && "Notification" in window) await Notification.requestPermission();
-  draw();
 }
 
 /** Start to judge the contacts that arrive; returns the button for the header. */
 export function alertButton() {
   const count = h("span", { class: "alert-count number" });
-  const bell = h("span", { "aria-hidden": "true" });
+  const bell = h("span", { class: "bell", "aria-hidden": "true" });
   const button = h("button", { type: "button", id: "alerts", on: { click: () => showSettings(draw) } }, bell, count);
   const draw = () => {
     const label = isOn() ? t("alerts.button", { confidence: threshold().toFixed(1), count: unseen.size }) : t("alerts.button_off");
-    bell.textContent = isOn() ? "🔔" : "🔕";
+    bell.classList.toggle("off", !isOn());
     button.title = label;
     button.setAttribute("aria-label", label);
     count.textContent = unseen.size ? String(unseen.size) : "";

@@ -18,7 +18,7 @@ export function chainLinks() {
   const page = { place: "browser", name: "", state: state.refused ? "degraded" : "ok", reason: state.refused ? "refused" : "", detail: state.refused, since_utc_s: heard_utc_s, heard_utc_s };
   const server = links.find((link) => link.place === "server") ?? { place: "server", name: "console", detail: "" };
   const others = links.filter((link) => link.place !== "server");
-  if (state.online) return [page, { state: "ok", ...server }, ...others];
+  if (state.online) return [page, { state: "ok", ...server, heard_utc_s }, ...others];
   const stopped = state.refused ? { state: "unknown" } : { state: "lost", reason: "no_connection" };
   return [page, { ...server, ...stopped, since_utc_s: heard_utc_s, heard_utc_s }, ...others];
 }
@@ -73,7 +73,9 @@ export class Chain {
     this.summary.setAttribute("aria-label", label);
     // The decoder is in the details unless it has a fault: the header has little space.
     const shown = links.filter((link) => link.place !== "decoder" || ["lost", "degraded"].includes(link.state));
-    fill(this.summary, shown.map((link) => h("span", { class: `place ${TONES[link.state]}`, data: { place: link.place, state: link.state } },
+    // A narrow header has space for one place: the fault, or the last one.
+    const key = fault ?? shown.at(-1);
+    fill(this.summary, shown.map((link) => h("span", { class: `place ${TONES[link.state]}${link === key ? " key-place" : ""}`, data: { place: link.place, state: link.state } },
       h("span", { "aria-hidden": "true", text: SYMBOLS[link.state] }),
       h("span", { class: "name", text: ` ${placeName(link)}` }),
       link.place === "vehicle" && link.heard_utc_s ? h("span", { class: "age", text: ` ${duration(now() - link.heard_utc_s)}` }) : null)));

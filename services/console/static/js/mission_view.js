@@ -23,9 +23,9 @@ function svg(tag, attributes, ...children) {
 
 /** Bars of the contacts in each hour; the largest one has the whole height. */
 export function histogram(hours) {
-  const highest = Math.max(1, ...hours.map((one) => one.contacts));
+  const highest = Math.max(...hours.map((one) => one.contacts));
   const bars = hours.map((one, index) => {
-    const height = (CHART_HEIGHT * one.contacts) / highest;
+    const height = highest ? (CHART_HEIGHT * one.contacts) / highest : 0;
     const title = svg("title", {});
     title.textContent = t("mission.hour", { time: time(one.start_utc_s).slice(0, 5), count: one.contacts });
     return svg("rect", { x: index * BAR_WIDTH + 1, y: CHART_HEIGHT - height, width: BAR_WIDTH - 2, height }, title);
@@ -84,8 +84,8 @@ function queueFacts(queue) {
 
 function seabedFact(seabed) {
   if (seabed === null) return fact(t("mission.seabed"), null);
-  const text = t("mission.pd", { pd: percent(100 * seabed.expected_pd) });
-  return fact(t("mission.seabed"), h("span", { class: seabed.warning ? "bad" : "", text: seabed.warning ? `${text}. ${seabed.warning}` : text }), seabed.time_utc_s);
+  const text = seabed.warning || t("mission.pd", { pd: percent(100 * seabed.expected_pd) });
+  return fact(t("mission.seabed"), h("span", { class: seabed.warning ? "bad" : "", text }), seabed.time_utc_s);
 }
 
 function vehicleCard(one) {
