@@ -47,6 +47,7 @@ from sonarpost.services.console.web.contact_routes import ContactRoutes
 from sonarpost.services.console.web.decision_routes import DecisionRoutes
 from sonarpost.services.console.web.event_stream import EventStream
 from sonarpost.services.console.web.export_routes import ExportRoutes
+from sonarpost.services.console.web.installation_routes import installation_routes
 from sonarpost.services.console.web.map_routes import MapRoutes
 from sonarpost.services.console.web.mission_routes import MissionRoutes
 from sonarpost.services.console.web.score_routes import ScoreRoutes
@@ -88,6 +89,7 @@ class ConsoleApp:
             Route("/", _page_endpoint(access, "index.html")),
             Route("/password", _page_endpoint(access, "password.html")),
             Route("/login", lambda _: page(STATIC / "login.html")),
+            *installation_routes(STATIC),
             Mount("/static", StaticFolder(directory=STATIC)),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: routing_error})

@@ -11,6 +11,7 @@ import { EmptyView } from "./empty_view.js";
 import { startEvents } from "./event_stream.js";
 import { FleetView } from "./fleet_view.js";
 import { Header, restoreTheme, toggleTheme, toggleTypeSize } from "./header.js";
+import { registerServiceWorker } from "./installation.js";
 import { markKeys } from "./keys.js";
 import { Drawer, onSwipe } from "./layout.js";
 import { MapView } from "./map_view.js";
@@ -331,6 +332,7 @@ try {
   translate(document);
   setClock(state.info.now_utc_s);
   await new App().start();
+  registerServiceWorker();
 } catch (error) {
   if (error.status !== 401) toast(error.message, { bad: true });
   if (!("status" in error)) throw error;

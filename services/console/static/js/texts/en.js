@@ -419,4 +419,9 @@ export default {
   "fleet.column.last_report": "Last report",
   "fleet.column.detail": "Detail",
   "fleet.frame": "{time}  {vehicle}  {bytes}  rate {rate}  {snr}",
+  // offline.html
+  "offline.title": "No connection",
+  "offline.server": "No response from the console's server",
+  "offline.check": "Check the network, and whether the console runs on that host. Contacts and decisions are stored there, not in this browser.",
+  "offline.again": "Try again",
 };

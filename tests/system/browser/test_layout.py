@@ -1,0 +1,268 @@
+"""The page at all sizes: share of the image, nothing cut off, film strip, drawer, menus, swipe, accessibility (axe-core)."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from builders.console import image_record
+
+pytestmark = pytest.mark.parametrize("browser", ["chromium"], indirect=True)
+
+SIZES = {
+    "1920x1080": (1920, 1080, 1),
+    "1366x768": (1366, 768, 1),
+    "1024x768": (1024, 768, 1),
+    "768x1024": (768, 1024, 1),
+    "390x844": (390, 844, 1),
+    "1366x768 at 200 %": (683, 384, 2),
+}
+REFLOW = {"320 px wide": (320, 568, 1), "1280x1024 at 400 %": (320, 256, 4)}
+THEMES = ("day", "night")
+MIN_SHARE = 0.45
+
+OUTSIDE = """() => {
+  const scrolls = element => {
+    for (let e = element.parentElement; e && e !== document.body; e = e.parentElement) {
+      const { overflowX, overflowY } = getComputedStyle(e);
+      if (/auto|scroll/.test(overflowX + overflowY)) return true;
+    }
+    return false;
+  };
+  return [...document.querySelectorAll('button, a, input, select, textarea, canvas')].filter(element => {
+    if (!element.checkVisibility({ visibilityProperty: true }) || element.closest('.skip') || scrolls(element)) return false;
+    const box = element.getBoundingClientRect();
+    return box.left < -1 || box.top < -1 || box.right > innerWidth + 1 || box.bottom > innerHeight + 1;
+  }).map(element => element.outerHTML.slice(0, 100));
+}"""
+
+COVERED = """() => [...document.querySelectorAll('button, a.button, select, input')].filter(element => {
+  if (!element.checkVisibility({ visibilityProperty: true }) || element.closest('.skip')) return false;
+  const box = element.getBoundingClientRect();
+  const [x, y] = [box.left + box.width / 2, box.top + box.height / 2];
+  if (x < 0 || y < 0 || x > innerWidth || y > innerHeight) return false;
+  for (let e = element.parentElement; e; e = e.parentElement) {
+    const clip = e.getBoundingClientRect();
+    if (getComputedStyle(e).overflow !== 'visible' && (x < clip.left || x > clip.right || y < clip.top || y > clip.bottom)) return false;
+  }
+  const top = document.elementFromPoint(x, y);
+  return !(element.contains(top) || top?.contains(element));
+}).map(element => element.outerHTML.slice(0, 100))"""
+
+CUT_OFF = """() => [...document.querySelectorAll('button, h1, h2, .pill, .count, .sum, .row b')].filter(element =>
+  element.checkVisibility({ visibilityProperty: true }) && element.scrollWidth > element.clientWidth + 1
+  && element.clientWidth > 0 && getComputedStyle(element).display !== 'inline').map(element => element.outerHTML.slice(0, 100))"""
+
+
+def options(size, **more):
+    width, height, scale = {**SIZES, **REFLOW}[size]
+    return {"viewport": {"width": width, "height": height}, "device_scale_factor": scale, **more}
+
+
+def visit_at(served, size, theme="day", contacts=6, **more):
+    for number in range(contacts):
+        record = image_record(f"000{number}", seed=10 * number, atd_confidence=0.3 * number, missing_rows=10)
+        served.state.store_image(record)
+    served.state.store_image(image_record(f"000{contacts - 1}", version=2, seed=1))
+    visit = served.visit(**options(size, color_scheme="dark" if theme == "night" else "light", **more))
+    visit.wait_for_contact(f"000{contacts - 1}")
+    return visit
+
+
+def share_of_the_image(visit):
+    box = visit.page.locator(".stage canvas").first.bounding_box()
+    size = visit.page.viewport_size
+    return box["width"] * box["height"] / (size["width"] * size["height"])
+
+
+def settle(visit):
+    """Wait for two frames, in which the observers of sizes are called."""
+    visit.page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def check_layout(visit):
+    settle(visit)
+    page = visit.page
+    assert page.evaluate(
+        "[document.documentElement.scrollWidth - innerWidth, document.body.scrollWidth - innerWidth]"
+    ) == [0, 0]
+    assert page.evaluate(OUTSIDE) == []
+    assert page.evaluate(COVERED) == []
+    assert page.evaluate(CUT_OFF) == []
+
+
+@pytest.mark.parametrize("theme", THEMES)
+@pytest.mark.parametrize("size", SIZES)
+def test_image_has_at_least_45_per_cent_of_the_screen(served, size, theme):
+    visit = visit_at(served, size, theme)
+    check_layout(visit)
+    assert share_of_the_image(visit) >= MIN_SHARE
+    assert (
+        visit.page.evaluate("getComputedStyle(document.querySelector('.stage')).backgroundColor") == "rgb(10, 13, 16)"
+    )
+    # Large type selects another layout.
+    visit.press("z")
+    check_layout(visit)
+
+
+@pytest.mark.parametrize("size", [*SIZES, *REFLOW])
+def test_all_views_fit(served, size):
+    visit = visit_at(served, size)
+    for key in ("p", "f", "q"):
+        visit.press(key)
+        check_layout(visit)
+    for key in ("?", ";", "x", "r"):
+        visit.press(key)
+        visit.wait("dialog[open]")
+        check_layout(visit)
+        box = visit.page.locator("dialog").bounding_box()
+        assert box["width"] <= visit.page.viewport_size["width"]
+        visit.press("Escape")
+        visit.page.locator("dialog").wait_for(state="detached")
+
+
+def test_text_of_twice_the_size_is_not_cut_off(served):
+    visit = visit_at(served, "1366x768")
+    visit.page.evaluate("document.documentElement.style.setProperty('--type', '34px')")
+    check_layout(visit)
+    assert visit.page.locator(".verdicts button").count() == 3
+    visit.press("2")
+    visit.wait('.verdicts [data-verdict="not_mine_like"]')
+
+
+@pytest.mark.parametrize("size", ["1024x768", "390x844", "1366x768 at 200 %", "1280x1024 at 400 %"])
+def test_every_part_is_reached_with_the_keyboard(served, size):
+    visit = visit_at(served, size)
+    page = visit.page
+    # The drawer opens for the field of a key, and closes with Escape.
+    visit.press("w")
+    assert page.evaluate("document.activeElement.id") == "remark"
+    check_layout(visit)
+    visit.press("Escape")
+    page.locator("#remark").wait_for(state="hidden")
+    # The filters.
+    visit.press("/")
+    assert page.evaluate("document.activeElement.id") == "search"
+    page.keyboard.type("0003")
+    visit.wait_for_contact("0005")
+    visit.until("() => document.querySelector('.filters .sum').textContent.startsWith('1 of')")
+    visit.press("Escape")
+    page.locator("#search").wait_for(state="hidden")
+    # All tools that do not fit, and the menu of the header.
+    for button, inside in ((".toolbar .more", '[data-tool="measure"]'), (".menu-button", "#to-password")):
+        if not page.locator(button).is_visible():
+            continue
+        page.focus(button)
+        visit.press("Enter")
+        page.locator(inside).wait_for(state="visible")
+        check_layout(visit)
+        reached = []
+        for _ in range(30):
+            visit.press("Tab")
+            reached.append(page.evaluate("inside => document.activeElement?.matches(inside)", inside))
+            if reached[-1]:
+                break
+        assert reached[-1]
+        visit.press("Escape")
+        page.locator(inside).wait_for(state="hidden")
+        assert page.evaluate("button => document.activeElement.matches(button)", button)
+
+
+def test_film_strip_is_virtual_and_moves_with_the_arrows(served):
+    for number in range(300):
+        served.state.store_image(image_record(f"{number:04d}", seed=1))
+    visit = served.visit(**options("1024x768"))
+    visit.wait_for_contact("0299")
+    assert visit.page.locator("#queue").get_attribute("aria-orientation") == "horizontal"
+    assert visit.page.locator(".row").count() < 40
+    visit.page.focus("#queue")
+    visit.press("ArrowRight")
+    visit.wait_for_contact("0298")
+    visit.press("ArrowLeft")
+    visit.wait_for_contact("0299")
+    rows = visit.page.locator("#queue").bounding_box()
+    # The strip scrolls to the displayed contact, also when a wider window turns it into a list.
+    for number in range(298, 288, -1):
+        visit.press("j")
+        visit.wait_for_contact(f"{number:04d}")
+    box = visit.page.locator('.row[aria-selected="true"]').bounding_box()
+    assert rows["x"] <= box["x"] <= rows["x"] + rows["width"] - box["width"] + 1
+    visit.page.set_viewport_size({"width": 1366, "height": 768})
+    visit.until("() => document.querySelector('#queue').ariaOrientation === 'vertical'")
+    rows = visit.page.locator("#queue").bounding_box()
+    box = visit.page.locator('.row[aria-selected="true"]').bounding_box()
+    assert rows["y"] <= box["y"] <= rows["y"] + rows["height"] - box["height"] + 1
+
+
+SWIPE = """([from, to]) => {
+  const canvas = document.querySelector('.stage canvas');
+  const box = canvas.getBoundingClientRect();
+  const send = (type, across) => canvas.dispatchEvent(new PointerEvent(type, {
+    bubbles: true, pointerId: 7, pointerType: 'touch', isPrimary: true,
+    clientX: box.left + across * box.width, clientY: box.top + box.height / 2,
+  }));
+  send('pointerdown', from); send('pointermove', (from + to) / 2); send('pointerup', to);
+}"""
+
+
+def test_swipe_displays_the_next_and_the_previous_contact(served):
+    visit = visit_at(served, "390x844", has_touch=True)
+    swipe = lambda *path: visit.page.evaluate(SWIPE, path)  # noqa: E731
+    swipe(0.8, 0.2)
+    visit.wait_for_contact("0004")
+    swipe(0.2, 0.8)
+    visit.wait_for_contact("0005")
+    swipe(0.5, 0.45)  # too short
+    # No swipe in an enlarged image, and during a measurement.
+    visit.press("+")
+    swipe(0.8, 0.2)
+    visit.press("0", "m")
+    swipe(0.8, 0.2)
+    visit.press("Escape", "Escape")
+    settle(visit)
+    assert visit.text(".heading h2").endswith("0005")
+    swipe(0.8, 0.2)
+    visit.wait_for_contact("0004")
+
+
+def axe_violations(visit):
+    found = find_spec("axe_playwright_python")
+    assert found is not None, "axe-core is missing: make setup"
+    visit.page.evaluate((Path(found.origin).parent / "axe.min.js").read_text(encoding="utf-8"))
+    result = visit.page.evaluate("() => axe.run(document, { resultTypes: ['violations'] })")
+    assert len(result["passes"]) > 5
+    return [(one["id"], [node["html"][:120] for node in one["nodes"]]) for one in result["violations"]]
+
+
+@pytest.mark.parametrize("theme", THEMES)
+@pytest.mark.parametrize("size", [*SIZES, "320 px wide"])
+def test_axe_finds_no_violation(served, size, theme):
+    visit = visit_at(served, size, theme)
+    page = visit.page
+    found = {"review": axe_violations(visit)}
+    for name, button in (
+        ("filters", ".filter-button"),
+        ("tools", ".toolbar .more"),
+        ("menu", ".menu-button"),
+        ("drawer", ".drawer-button"),
+    ):
+        if page.locator(button).is_visible():
+            page.click(button)
+            found[name] = axe_violations(visit)
+            visit.press("Escape")
+    for key in ("?", ";", "r", "x"):
+        visit.press(key)
+        visit.wait("dialog[open]")
+        found[key] = axe_violations(visit)
+        visit.press("Escape")
+    for key in ("p", "f"):
+        visit.press(key)
+        settle(visit)
+        found[key] = axe_violations(visit)
+    contact_id = page.evaluate("decodeURIComponent(location.hash.slice(1))")
+    for path in ("password", f"report/{contact_id}", "login"):
+        page.goto(served.address + path)
+        page.wait_for_load_state("networkidle")
+        found[path] = axe_violations(visit)
+    assert {name: violations for name, violations in found.items() if violations} == {}
