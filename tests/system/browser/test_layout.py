@@ -1,4 +1,4 @@
-"""The page at all sizes: share of the image, nothing cut off, film strip, drawer, menus, swipe, accessibility (axe-core)."""
+"""The page at all sizes: share of the image, nothing cut off, film strip, drawer, menus, swipe, and axe-core."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ OUTSIDE = """() => {
     return false;
   };
   return [...document.querySelectorAll('button, a, input, select, textarea, canvas')].filter(element => {
-    if (!element.checkVisibility({ visibilityProperty: true }) || element.closest('.skip') || scrolls(element)) return false;
+    if (!element.checkVisibility({ visibilityProperty: true })) return false;
+    if (element.closest('.skip') || scrolls(element)) return false;
     const box = element.getBoundingClientRect();
     return box.left < -1 || box.top < -1 || box.right > innerWidth + 1 || box.bottom > innerHeight + 1;
   }).map(element => element.outerHTML.slice(0, 100));
@@ -44,7 +45,8 @@ COVERED = """() => [...document.querySelectorAll('button, a.button, select, inpu
   if (x < 0 || y < 0 || x > innerWidth || y > innerHeight) return false;
   for (let e = element.parentElement; e; e = e.parentElement) {
     const clip = e.getBoundingClientRect();
-    if (getComputedStyle(e).overflow !== 'visible' && (x < clip.left || x > clip.right || y < clip.top || y > clip.bottom)) return false;
+    const outside = x < clip.left || x > clip.right || y < clip.top || y > clip.bottom;
+    if (outside && getComputedStyle(e).overflow !== 'visible') return false;
   }
   const top = document.elementFromPoint(x, y);
   return !(element.contains(top) || top?.contains(element));

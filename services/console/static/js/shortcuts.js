@@ -97,11 +97,13 @@ export function startShortcuts(keys, activeView, { leave, send }) {
     // Buttons handle Enter, and sliders handle arrow keys.
     if (event.key === "Enter" && ["BUTTON", "A", "SUMMARY"].includes(event.target.tagName)) return;
     if (event.key.startsWith("Arrow") && event.target.tagName === "INPUT") return;
-    // With Shift, a digit key has another character, which depends on the keyboard layout.
+    // With Shift, a digit key has another character, which depends on the keyboard layout: "/" is Shift+7 on a German one.
     const digit = /^Digit([0-9])$/.exec(event.code)?.[1];
-    const key = event.shiftKey && digit && event.key !== digit ? `Shift+${digit}` : event.key;
+    const shifted = event.shiftKey && digit && event.key !== digit ? `Shift+${digit}` : null;
     const settings = keySettings();
-    const found = actions.find((row) => (!row[3].view || row[3].view === activeView()) && keysOf(row, settings).includes(key));
+    const active = actions.filter((row) => !row[3].view || row[3].view === activeView());
+    const rowOf = (key) => active.find((row) => keysOf(row, settings).includes(key));
+    const found = (shifted && rowOf(shifted)) ?? rowOf(event.key);
     if (!found) return;
     event.preventDefault();
     found[2](event);
