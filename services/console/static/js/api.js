@@ -89,6 +89,7 @@ export const api = {
   contacts: (values) => request("GET", `/api/contacts?${queryString(values)}`),
   contact: (id) => request("GET", contactPath(id)),
   measure: (id, body) => request("POST", `${contactPath(id)}/measure`, body),
+  withdrawMeasurement: (id, measurement) => request("POST", `${contactPath(id)}/measure/${measurement}/withdraw`),
   decide: (id, body) => request("POST", `${contactPath(id)}/decisions`, body),
   lastDecision: () => request("GET", "/api/decisions/last"),
   notices: () => request("GET", "/api/notices"),

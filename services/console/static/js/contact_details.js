@@ -31,7 +31,7 @@ function requestList(requests) {
 }
 
 function measurementList(measurements) {
-  return h("ul", {}, measurements.map((one) => h("li", {},
+  return h("ul", {}, measurements.map((one) => h("li", { class: one.withdrawn_utc_s === null ? "" : "undone" },
     h("p", {}, h("b", { text: measurementLine(one).text })),
     one.height_inputs ? h("p", { class: "muted number", text: `height = shadow × altitude / (slant range + shadow), with ${quantity(one.height_inputs.altitude_m, "m")} and ${quantity(one.height_inputs.slant_range_m, "m")}` }) : null,
     one.note ? h("p", { class: "muted", text: one.note }) : null,

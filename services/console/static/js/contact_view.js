@@ -4,15 +4,21 @@ import { api } from "./api.js";
 import { h, fill, toast } from "./dom.js";
 import { DASH, position, probabilities, quantity, received, time } from "./format.js";
 import { MAPS, autoRange, loadImage } from "./image_data.js";
-import { COMPARE, drawHint, drawTools, drawVersions, startMouse } from "./image_toolbar.js";
+import { ImageLevels } from "./image_levels.js";
+import { startPointer } from "./image_pointer.js";
+import { ORIENTATIONS } from "./image_projection.js";
+import { COMPARE_MODES, drawTools, drawVersions } from "./image_toolbar.js";
 import { ImageView, defaultViewport } from "./image_view.js";
 import { integrityStrip } from "./integrity_strip.js";
 import { toolbarWithMore } from "./layout.js";
+import { Loupe } from "./loupe.js";
 import { MeasurementTool, measurementLine } from "./measurement.js";
-import { setting, state } from "./state.js";
+import { drawSizePanel } from "./size_panel.js";
+import { emit, setting, state } from "./state.js";
 import { t } from "./texts.js";
 
 const GAIN_STEP = 5;
+const GAMMA_STEP = 1.15;
 const CACHED_IMAGES = 20;
 
 /** Second image of a comparison: [version, layer], or null. `choice` has version number, layer and comparison. */
@@ -34,25 +40,31 @@ export class ContactView {
     this.changes = 0; // number of selections and displayed contacts
     this.target = null; // selected choice whose images are being loaded
     this.cache = new Map(); // key of an image → promise
-    this.display = { map: setting("map") in MAPS ? setting("map") : "grey", low: 0, high: 100, gamma: 1, hatch: true };
+    this.display = { map: setting("map") in MAPS ? setting("map") : "grey", low: 0, high: 100, gamma: 1, hatch: true, smooth: null, grid: setting("grid") !== "off", ground: setting("ground") === "on", orientation: setting("orientation") ?? "nadir" };
+    this.loupeOn = false; // also without a measurement
     this.#build();
     this.measurement = new MeasurementTool(() => this.#displayed(), () => this.#drawLines());
-    startMouse(this);
+    startPointer(this);
   }
 
   #build() {
     const viewport = defaultViewport();
-    this.canvases = ["Image of the contact", "Compared image"].map((label) => h("canvas", { role: "img", "aria-label": label }));
+    this.canvases = [t("image.label"), t("image.compared")].map((label) => h("canvas", { role: "img", "aria-label": label }));
     this.views = this.canvases.map((canvas) => new ImageView(canvas, viewport));
     for (const view of this.views) view.display = this.display;
     this.heading = h("div", { class: "heading", role: "group", tabindex: 0, "aria-label": t("contact_view.heading") });
-    this.tools = h("div", { class: "tools", role: "toolbar", "aria-label": "Image" });
+    this.tools = h("div", { class: "tools", role: "toolbar", "aria-label": t("tools.group") });
     this.placeholder = h("p", { class: "placeholder" });
     this.loading = h("p", { class: "loading-name", role: "status" });
-    this.stage = h("div", { class: "stage" }, this.canvases, this.placeholder, this.loading);
+    this.loupe = new Loupe(this.views[0], () => this.loupeOn || this.measurement.active);
+    this.levels = new ImageLevels((name, value) => this.setLevel(name, value));
+    this.options = h("div", { class: "tools", role: "toolbar", "aria-label": t("tools.options") });
+    this.displayPanel = h("div", { class: "display hidden" }, this.options, this.levels.element);
+    this.sizes = h("div", { class: "size-panel", role: "region", "aria-label": t("measure.panel") });
+    this.stage = h("div", { class: "stage" }, this.canvases, this.placeholder, this.loupe.element, this.displayPanel, this.loading);
     this.versions = h("div", { class: "versions", role: "toolbar", "aria-label": "Versions of the image" });
     this.strip = h("div", { class: "strip", role: "region", tabindex: 0, "aria-label": "Data integrity of this image" });
-    this.element = h("section", { class: "contact", "aria-label": "Contact" }, this.heading, toolbarWithMore(this.tools), this.stage,
+    this.element = h("section", { class: "contact", "aria-label": "Contact" }, this.heading, toolbarWithMore(this.tools), this.stage, this.sizes,
       h("div", { class: "contact-foot" }, this.versions, this.strip));
   }
 
@@ -63,7 +75,7 @@ export class ContactView {
 
   #displayed() {
     const view = this.views[0];
-    return { id: this.detail?.contact.id, version: this.version, layer: this.layer, scale: view.scale, image: view.image };
+    return { id: this.detail?.contact.id, version: this.version, layer: this.layer, image: view.image, projection: view.projection };
   }
 
   /** Identifier, version, layer and digest of the image on the canvas; null without an image. */
@@ -147,9 +159,8 @@ export class ContactView {
   /** Select the next mode of comparison that has a second image. */
   async nextCompare() {
     if (!this.detail) return;
-    const modes = Object.keys(COMPARE);
     const choice = this.#choice();
-    do choice.compare = modes[(modes.indexOf(choice.compare) + 1) % modes.length];
+    do choice.compare = COMPARE_MODES[(COMPARE_MODES.indexOf(choice.compare) + 1) % COMPARE_MODES.length];
     while (choice.compare !== "off" && !secondImage(this.detail, choice));
     await this.#select({ compare: choice.compare });
   }
@@ -212,36 +223,66 @@ export class ContactView {
     } : null;
     const title = `version ${version.version} · ${layer}${version.complete ? "" : ` · ${received(version)} received`}`;
     const synthesised = version.layers.find((one) => one.name === layer)?.synthesised ?? false;
-    view.show(image, { scale, nadir: this.detail.record?.nadir_side ?? null, title, synthesised });
+    const record = this.detail.record ?? {};
+    // A layer may have more pixels than the image; the mark is in pixels of the image.
+    const same = version.width_px === image.width && version.height_px === image.height;
+    const geometry = {
+      scale, range_axis: version.range_axis, mark: same ? version.mark : null, box: same ? version.box : null,
+      altitude_m: record.altitude_m ?? null, heading_deg: record.heading_deg ?? null, side: record.channel ?? null,
+    };
+    view.show(image, { geometry, title, synthesised });
   }
 
   #drawLines() {
-    const stored = (this.detail?.measurements ?? []).filter((one) => one.version === this.version && one.layer === this.layer).map(measurementLine);
+    const current = Object.values(this.detail?.size ?? {}).map((one) => one?.measurement);
+    const stored = (this.detail?.measurements ?? []).filter((one) => current.includes(one.id) && one.version === this.version && one.layer === this.layer).map(measurementLine);
     this.views[0].lines = [...(this.measurement.active ? [] : stored), ...this.measurement.lines()];
     this.views[0].crosshair = this.measurement.active && !this.measurement.result ? this.measurement.crosshair : null;
     this.views[0].draw();
     this.canvases[0].classList.toggle("measures", this.measurement.active);
-    this.#drawHint();
+    this.showLoupe(this.measurement.active && !this.measurement.result ? this.measurement.crosshair : null);
+    drawSizePanel(this, this.sizes);
   }
 
-  /** Start a measurement, or the next kind of measurement; show the reason if it is locked. */
-  startMeasurement() {
+  /** Show the loupe at [row, column], or hide it (null). */
+  showLoupe(point) { this.loupe.show(point); }
+
+  /** Measure a kind, or the next one; show the reason if measurements are locked. */
+  startMeasurement(kind = null) {
     const reason = this.measurementLock();
     if (reason) {
-      toast(`Measurement is locked: ${reason}`, { bad: true });
+      toast(t("measure.locked", { reason }), { bad: true });
       return;
     }
-    this.measurement.next();
+    if (kind) this.measurement.start(kind);
+    else this.measurement.next();
     this.#drawTools();
     this.canvases[0].focus();
   }
 
+  async keepMeasurement() {
+    const stored = await this.measurement.keep();
+    if (stored) emit("changed", { id: this.detail.contact.id });
+  }
+
+  /** Withdraw a stored measurement; it stays in the list of measurements and in the audit. */
+  async withdraw(measurement) {
+    const { id } = this.detail.contact;
+    try {
+      await api.withdrawMeasurement(id, measurement);
+      toast(t("measure.withdrawn"));
+      emit("changed", { id });
+    } catch (error) {
+      toast(error.message, { bad: true });
+    }
+  }
+
   /** Reason why measurements are locked; empty if they are not. */
   measurementLock() {
-    if (!this.shown) return "no image was received";
-    if (!state.session.may.measure) return "your role may not measure";
-    if (!this.shownLayer?.measurable) return this.shownLayer?.reason || `the layer ${this.layer} is synthetic`;
-    if (!this.views[0].scale) return "the pixel size is unknown";
+    if (!this.shown) return t("measure.no_image");
+    if (!state.session.may.measure) return t("measure.no_permission");
+    if (!this.shownLayer?.measurable) return this.shownLayer?.reason || t("measure.synthetic", { layer: this.layer });
+    if (!this.views[0].scale) return t("measure.no_scale");
     return "";
   }
 
@@ -256,20 +297,84 @@ export class ContactView {
   }
 
   pan(across, along) {
-    const { zoom } = this.views[0].viewport;
-    this.views[0].pan(across / zoom, along / zoom);
+    this.views[0].pan(across, along);
     this.redrawAll();
   }
 
   /** Make the image brighter (1) or darker (-1); 0 selects automatic gain. */
   changeGain(step) {
-    this.autoGain = step === 0;
-    if (this.autoGain) {
+    if (step === 0) {
+      this.autoGain = true;
       const { image } = this.views[0];
       if (image) [this.display.low, this.display.high] = autoRange(image);
       this.display.gamma = 1;
-    } else this.display.high = Math.max(this.display.low + GAIN_STEP, Math.min(100 + 10 * GAIN_STEP, this.display.high - step * GAIN_STEP));
+      this.#applyColours();
+    } else this.setLevel("high", this.display.high - step * GAIN_STEP);
+  }
+
+  /** Raise (1) or lower (-1) the black point. */
+  changeBlack(step) { this.setLevel("low", this.display.low + step * GAIN_STEP); }
+
+  /** Raise (1) or lower (-1) gamma: brighter or darker shadows. */
+  changeGamma(step) { this.setLevel("gamma", this.display.gamma * GAMMA_STEP ** step); }
+
+  /** Set black point or white point in percent, or gamma. */
+  setLevel(name, value) {
+    this.autoGain = false;
+    const { display } = this;
+    if (name === "gamma") display.gamma = Math.max(0.3, Math.min(3, value));
+    else if (name === "low") display.low = Math.max(0, Math.min(display.high - GAIN_STEP, value));
+    else display.high = Math.max(display.low + GAIN_STEP, Math.min(100 + 10 * GAIN_STEP, value));
     this.#applyColours();
+  }
+
+  /** Show or hide the options of the display: gaps, grid, ranges, orientation, black point, white point, gamma. */
+  toggleDisplayPanel() {
+    this.displayPanel.classList.toggle("hidden");
+    this.#drawTools();
+  }
+
+  toggleGrid() {
+    this.display.grid = !this.display.grid;
+    setting("grid", this.display.grid ? "on" : "off");
+    this.#applyColours();
+  }
+
+  toggleSmooth() {
+    this.display.smooth = !this.views[0].smooth;
+    this.#applyColours();
+  }
+
+  /** Display slant range or ground range. */
+  toggleGround() {
+    if (!this.views[0].projection?.convertible) {
+      toast(t("image.no_ground"), { bad: true });
+      return;
+    }
+    this.display.ground = !this.display.ground;
+    setting("ground", this.display.ground ? "on" : "off");
+    this.#applyColours();
+  }
+
+  setOrientation(name) {
+    this.display.orientation = name;
+    setting("orientation", name);
+    this.#applyColours();
+  }
+
+  nextOrientation() {
+    const { projection } = this.views[0];
+    if (!projection) return;
+    let index = ORIENTATIONS.indexOf(projection.orientation);
+    do index = (index + 1) % ORIENTATIONS.length;
+    while (!projection.orientable(ORIENTATIONS[index]));
+    this.setOrientation(ORIENTATIONS[index]);
+  }
+
+  toggleLoupe() {
+    this.loupeOn = !this.loupeOn;
+    if (!this.loupeOn && !this.measurement.active) this.showLoupe(null);
+    this.#drawTools();
   }
 
   nextMap(step = 1) {
@@ -315,9 +420,5 @@ export class ContactView {
 
   #drawTools() {
     if (this.detail) drawTools(this);
-  }
-
-  #drawHint() {
-    drawHint(this);
   }
 }

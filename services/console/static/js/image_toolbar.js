@@ -1,50 +1,86 @@
-// Toolbar, version buttons, measurement hint and mouse operation of the image.
+// Toolbar and version buttons of the image.
 
 import { api } from "./api.js";
 import { fill, h } from "./dom.js";
 import { received, time } from "./format.js";
-import { KINDS } from "./measurement.js";
 import { MAPS } from "./image_data.js";
+import { ORIENTATIONS } from "./image_projection.js";
+import { t } from "./texts.js";
 
-export const COMPARE = { off: "one image", versions: "first and newest", layers: "raw and enhanced" };
+export const COMPARE_MODES = ["off", "versions", "layers"];
 
 function button(label, key, handler, { text = label, ...props } = {}) {
   return h("button", { type: "button", title: `${label} (${key})`, "aria-label": `${label} (${key})`, on: { click: handler }, ...props }, text, " ", h("kbd", { text: key }));
 }
 
-/** Draw the toolbar; the focused button keeps the focus. */
-export function drawTools(view) {
+/** A button that is pressed or not. */
+function toggle(tool, key, pressed, handler, props = {}) {
+  return button(t(`tools.${tool}_title`), key, handler, { text: t(`tools.${tool}`), "aria-pressed": String(pressed), data: { tool }, ...props });
+}
+
+/** A menu; a name in `disabled` cannot be selected. */
+function menu(tool, key, names, value, changed, disabled = []) {
+  const element = h("select", { "aria-label": `${t(`tools.${tool}`)} (${key})`, data: { tool }, on: { change: (event) => changed(event.target.value) } },
+    names.map((name) => h("option", { value: name, text: t(`tools.${tool}_${name}`), disabled: disabled.includes(name) })));
+  element.value = value;
+  return h("span", { class: "set" }, element, h("kbd", { text: key }));
+}
+
+/** Fill a toolbar after a change of `drawn`: new buttons would close an open menu and lose a click. The focus is kept. */
+function refill(element, drawn, children) {
+  const key = JSON.stringify(drawn);
+  if (element.dataset.drawn === key) return;
+  element.dataset.drawn = key;
   const focused = document.activeElement?.dataset?.tool;
+  fill(element, children());
+  if (focused) element.querySelector(`[data-tool="${CSS.escape(focused)}"]`)?.focus();
+}
+
+/** Draw the toolbar and the options of the display. */
+export function drawTools(view) {
   const locked = view.measurementLock();
   const compared = view.compare !== "off" && view.shown !== null && view.comparedImage() !== null;
-  // New buttons would close an open menu and lose a click. They are created only after a change.
-  const drawn = JSON.stringify([view.shown?.layers, view.layer, view.display, view.autoGain, view.compare, compared, locked, view.measurement.active]);
-  if (view.tools.dataset.drawn === drawn) return;
-  view.tools.dataset.drawn = drawn;
-  const layers = (view.shown?.layers ?? []).map((one) => h("button", {
-    type: "button", "aria-pressed": String(one.name === view.layer), title: one.reason || "received pixels", data: { tool: `layer-${one.name}` },
-    on: { click: () => view.showLayer(one.name) }, text: one.synthesised ? `${one.name} ✱` : one.name,
-  }));
-  const maps = h("select", { "aria-label": "Colour map (c)", data: { tool: "map" }, on: { change: (event) => view.setMap(event.target.value) } },
-    Object.keys(MAPS).map((name) => h("option", { value: name, text: name })));
-  maps.value = view.display.map;
-  fill(view.tools,
-    h("span", { class: "set", role: "group", "aria-label": "Layer (e)" }, layers, h("kbd", { text: "e" })),
-    h("span", { class: "set" }, maps, h("kbd", { text: "c" })),
-    h("span", { class: "set", role: "group", "aria-label": "Gain" },
-      button("darker", ",", () => view.changeGain(-1), { text: "☾", data: { tool: "darker" } }),
-      button("automatic gain", "a", () => view.changeGain(0), { text: "auto", "aria-pressed": String(view.autoGain), data: { tool: "auto" } }),
-      button("brighter", ".", () => view.changeGain(1), { text: "☀", data: { tool: "brighter" } })),
-    h("span", { class: "set", role: "group", "aria-label": "Zoom" },
-      button("zoom out", "-", () => view.zoom(1 / 1.5), { text: "", data: { tool: "out" } }),
-      button("whole image", "0", () => view.fit(), { text: "fit", data: { tool: "fit" } }),
-      button("zoom in", "+", () => view.zoom(1.5), { text: "", data: { tool: "in" } })),
-    button("hatch missing areas", "h", () => view.toggleHatch(), { text: "hatch", "aria-pressed": String(view.display.hatch), data: { tool: "hatch" } }),
-    button(`side by side: ${COMPARE[view.compare]}`, "s", () => view.nextCompare(), { text: compared ? COMPARE[view.compare] : "compare", "aria-pressed": String(compared), data: { tool: "compare" } }),
-    button(locked ? `measurement is locked: ${locked}` : "measure", "m", () => view.startMeasurement(), {
-      text: locked ? "measure locked" : "measure", "aria-pressed": String(view.measurement.active), "aria-disabled": locked ? "true" : null, class: locked ? "locked" : "", data: { tool: "measure" },
-    }));
-  if (focused) view.tools.querySelector(`[data-tool="${CSS.escape(focused)}"]`)?.focus();
+  const open = !view.displayPanel.classList.contains("hidden");
+  const { display } = view;
+  refill(view.tools, [view.shown?.layers, view.layer, display.map, open, view.autoGain, view.compare, compared, locked, view.measurement.active], () => [
+    h("span", { class: "set", role: "group", "aria-label": `${t("tools.layer")} (e)` }, (view.shown?.layers ?? []).map((one) => h("button", {
+      type: "button", "aria-pressed": String(one.name === view.layer), title: one.reason || t("tools.received_pixels"), data: { tool: `layer-${one.name}` },
+      on: { click: () => view.showLayer(one.name) }, text: one.synthesised ? `${one.name} ✱` : one.name,
+    })), h("kbd", { text: "e" })),
+    menu("map", "c", Object.keys(MAPS), display.map, (name) => view.setMap(name)),
+    h("span", { class: "set", role: "group", "aria-label": t("tools.gain") },
+      button(t("tools.darker"), ",", () => view.changeGain(-1), { text: "−", data: { tool: "darker" } }),
+      button(t("tools.auto_title"), "a", () => view.changeGain(0), { text: t("tools.auto"), "aria-pressed": String(view.autoGain), data: { tool: "auto" } }),
+      button(t("tools.brighter"), ".", () => view.changeGain(1), { text: "+", data: { tool: "brighter" } })),
+    h("span", { class: "set", role: "group", "aria-label": t("tools.zoom") },
+      button(t("tools.out"), "-", () => view.zoom(1 / 1.5), { text: "", data: { tool: "out" } }),
+      button(t("tools.fit_title"), "0", () => view.fit(), { text: t("tools.fit"), data: { tool: "fit" } }),
+      button(t("tools.in"), "+", () => view.zoom(1.5), { text: "", data: { tool: "in" } })),
+    toggle("display", "i", open, () => view.toggleDisplayPanel(), { "aria-expanded": String(open), "aria-pressed": null }),
+    button(t("tools.compare_title", { mode: t(`tools.compare_${view.compare}`) }), "s", () => view.nextCompare(), {
+      text: compared ? t(`tools.compare_${view.compare}`) : t("tools.compare"), "aria-pressed": String(compared), data: { tool: "compare" } }),
+    button(locked ? t("tools.measure_locked_title", { reason: locked }) : t("tools.measure"), "m", () => view.startMeasurement(), {
+      text: locked ? t("tools.measure_locked") : t("tools.measure"), "aria-pressed": String(view.measurement.active), "aria-disabled": locked ? "true" : null, class: locked ? "locked" : "", data: { tool: "measure" },
+    }),
+  ]);
+  drawOptions(view);
+  view.levels.update(display);
+}
+
+function drawOptions(view) {
+  const { display } = view;
+  const { projection, smooth } = view.views[0];
+  const orientation = projection?.orientation ?? "nadir";
+  const ground = projection?.convertible ?? false;
+  const disabled = ORIENTATIONS.filter((name) => name !== "nadir" && !projection?.orientable(name));
+  refill(view.options, [display.hatch, display.grid, display.ground, orientation, smooth, ground, disabled, view.loupeOn], () => [
+    toggle("hatch", "h", display.hatch, () => view.toggleHatch()),
+    toggle("grid", "#", display.grid, () => view.toggleGrid()),
+    toggle("smooth", "d", smooth, () => view.toggleSmooth()),
+    toggle("ground", "b", display.ground && ground, () => view.toggleGround(), ground ? {} : { "aria-disabled": "true", class: "locked" }),
+    menu("view", "v", ORIENTATIONS, orientation, (name) => view.setOrientation(name), disabled),
+    toggle("loupe", "'", view.loupeOn, () => view.toggleLoupe()),
+  ]);
 }
 
 /** Draw a button for each of the last eight versions. */
@@ -58,42 +94,4 @@ export function drawVersions(view) {
   versions.length ? h("kbd", { text: "]" }) : null,
   newest && view.version !== newest ? h("span", { class: "stale", text: `Version ${newest} is newer than the displayed one.` }) : null);
   view.versions.querySelector('[aria-pressed="true"]')?.scrollIntoView({ block: "nearest", inline: "nearest" });
-}
-
-/** Draw the instruction for the next step of a measurement. */
-export function drawHint(view) {
-  const existing = view.stage.querySelector(".hint");
-  existing?.remove();
-  if (!view.measurement.active) return;
-  const text = view.measurement.result ? "Enter keeps it, Esc discards it" : view.measurement.from ? "second end: click, or arrows and Enter" : "first end: click, or arrows (Shift: 5 px) and Enter";
-  view.stage.append(h("p", { class: "hint", role: "status" }, h("b", { text: view.measurement.kind }), ` — ${text}; `, h("kbd", { text: "m" }), ` ${KINDS.at(-1) === view.measurement.kind ? "ends" : "next kind"}`));
-}
-
-/** Zoom with the wheel, move by dragging, set a measurement point with a click. */
-export function startMouse(view) {
-  const canvas = view.canvases[0];
-  canvas.tabIndex = 0;
-  let dragStart = null;
-  for (const [index, one] of view.canvases.entries()) {
-    one.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      view.views[index].zoom(event.deltaY < 0 ? 1.25 : 0.8, event.offsetX, event.offsetY);
-      view.redrawAll();
-    }, { passive: false });
-    one.addEventListener("pointerdown", (event) => {
-      if (index === 0 && view.measurement.active) {
-        view.measurement.moveTo(view.views[0].pixelAt(event.offsetX, event.offsetY));
-        view.measurement.setPoint();
-      } else dragStart = [event.clientX, event.clientY];
-    });
-    one.addEventListener("pointermove", (event) => {
-      if (index === 0 && view.measurement.active && !view.measurement.result) view.measurement.moveTo(view.views[0].pixelAt(event.offsetX, event.offsetY));
-      if (!dragStart || !view.views[index].image) return;
-      view.views[index].drag(event.clientX - dragStart[0], event.clientY - dragStart[1]);
-      dragStart = [event.clientX, event.clientY];
-      view.redrawAll();
-    });
-    one.addEventListener("dblclick", () => view.fit());
-  }
-  addEventListener("pointerup", () => { dragStart = null; });
 }

@@ -1,10 +1,12 @@
-// An image on a canvas: true proportions, scales in metres, nadir side, hatched missing areas, measurements.
+// An image on a canvas: true proportions, slant or ground range, orientation, hatched missing areas, overlays.
 
-import { niceStep } from "./format.js";
 import { colourTable, colourise, maskCanvas } from "./image_data.js";
+import { MARGIN, axesOf, captionOf, drawAxes, drawCaption, drawCrosshair, drawLabel, drawLine, drawLines, drawMark, drawNorth } from "./image_overlays.js";
+import { Projection } from "./image_projection.js";
+import { t } from "./texts.js";
 
-const MARGIN = { left: 62, top: 26, right: 14, bottom: 42 };
 const MAX_ZOOM = 64;
+export const LOUPE_ZOOM = 4;
 
 /** Default viewport, shared by images side by side. The centre is in fractions of the image's sides. */
 export const defaultViewport = () => ({ zoom: 1, across: 0.5, along: 0.5 });
@@ -33,78 +35,108 @@ export class ImageView {
     this.canvas = canvas;
     this.viewport = viewport;
     this.image = null;
-    this.scale = null; // {along_m, across_m} of a pixel; null if unknown
-    this.display = { map: "grey", low: 0, high: 100, gamma: 1, hatch: true };
-    this.lines = []; // measurements: {from: [row, column], to, text, colour}
+    this.projection = null;
+    this.display = { map: "grey", low: 0, high: 100, gamma: 1, hatch: true, smooth: null, grid: true, ground: false, orientation: "nadir" };
+    this.lines = []; // measurements: {from: [row, column], to, label, colour, profile}
     this.crosshair = null; // [row, column] of the measurement crosshair
     this.title = "";
-    this.nadir = null;
     new ResizeObserver(() => this.draw()).observe(canvas);
   }
 
-  /** `synthesised`: the whole layer is not measurable, and is marked by a frame. */
-  show(image, { scale = null, nadir = null, title = "", synthesised = false }) {
-    Object.assign(this, { image, scale, nadir, title, synthesised });
-    this.missing = image && maskCanvas(image.missing, image.width, image.height);
-    this.guessed = image && maskCanvas(image.guessed, image.width, image.height);
+  get scale() { return this.projection?.scale ?? null; }
+
+  /** Whether pixels are interpolated: by default, where they are not square. */
+  get smooth() {
+    const { along, across } = this.projection ?? { along: 1, across: 1 };
+    return this.display.smooth ?? Math.abs(along / across - 1) > 0.01;
+  }
+
+  /**
+   * `geometry`: see `Projection`. `synthesised`: the whole layer is not measurable, and is marked by a frame.
+   */
+  show(image, { geometry = {}, title = "", synthesised = false }) {
+    Object.assign(this, { image, title, synthesised });
+    this.projection = image && new Projection(image, geometry);
     this.applyColours();
   }
 
-  /** Apply gain and colour map of `display`. */
+  /** Apply projection, gain and colour map of `display`. */
   applyColours() {
-    const { map, low, high, gamma } = this.display;
-    this.coloured = this.image && colourise(this.image, colourTable(map, low, high, gamma));
+    if (this.image) {
+      const { map, low, high, gamma } = this.display;
+      this.projection.select(this.display);
+      const drawn = this.projection.resample(this.image, this.smooth);
+      this.coloured = colourise(drawn, colourTable(map, low, high, gamma));
+      this.missing = maskCanvas(drawn.missing, drawn.width, drawn.height);
+      this.guessed = maskCanvas(drawn.guessed, drawn.width, drawn.height);
+    }
     this.draw();
   }
 
-  /** Size of an image pixel (across, along) and the upper left corner of the image, in CSS pixels. */
+  /** Pixels per metre (`unit`), and functions between metres of the plane, image pixels and the canvas in CSS pixels. */
   #geometry() {
-    const box = { width: this.canvas.clientWidth - MARGIN.left - MARGIN.right, height: this.canvas.clientHeight - MARGIN.top - MARGIN.bottom };
-    const across = this.scale?.across_m ?? 1;
-    const along = this.scale?.along_m ?? 1;
-    const size = { width: this.image.width * across, height: this.image.height * along };
-    const fit = Math.min(box.width / size.width, box.height / size.height);
+    const box = { width: Math.max(1, this.canvas.clientWidth - MARGIN.left - MARGIN.right), height: Math.max(1, this.canvas.clientHeight - MARGIN.top - MARGIN.bottom) };
+    const { projection } = this;
+    const [width, height] = projection.extent;
+    const [a, b, c, d] = projection.matrix;
+    const fit = Math.min(box.width / (Math.abs(a) * width + Math.abs(c) * height), box.height / (Math.abs(b) * width + Math.abs(d) * height));
     const unit = fit * this.viewport.zoom;
-    const x = MARGIN.left + box.width / 2 - this.viewport.across * size.width * unit;
-    const y = MARGIN.top + box.height / 2 - this.viewport.along * size.height * unit;
-    return { box, x, y, across: across * unit, along: along * unit };
+    const centre = [this.viewport.across * width, this.viewport.along * height];
+    const [x0, y0] = [MARGIN.left + box.width / 2, MARGIN.top + box.height / 2];
+    const screen = ([x, y]) => {
+      const [dx, dy] = [(x - centre[0]) * unit, (y - centre[1]) * unit];
+      return [x0 + a * dx + c * dy, y0 + b * dx + d * dy];
+    };
+    const plane = ([x, y]) => {
+      const [dx, dy] = [(x - x0) / unit, (y - y0) / unit];
+      return [centre[0] + a * dx + b * dy, centre[1] + c * dx + d * dy];
+    };
+    const clip = (context) => { context.beginPath(); context.rect(MARGIN.left, MARGIN.top, box.width, box.height); context.clip(); };
+    return { box, unit, screen, plane, clip, toCanvas: (point) => screen(projection.toPlane(point)) };
   }
 
   /** [row, column] at a point of the canvas in CSS pixels. */
-  pixelAt(x, y) {
-    const g = this.#geometry();
-    return [(y - g.y) / g.along, (x - g.x) / g.across];
-  }
+  pixelAt(x, y) { return this.projection.fromPlane(this.#geometry().plane([x, y])); }
 
-  #toCanvas([row, column]) {
-    const g = this.#geometry();
-    return [g.x + column * g.across, g.y + row * g.along];
+  /** Point of the canvas in CSS pixels of [row, column]. */
+  canvasAt(point) { return this.#geometry().toCanvas(point); }
+
+  /** Rows and columns of a movement on the screen, in the orientation of the view. */
+  turned(rows, columns) {
+    const [a, b, c, d] = this.projection.matrix;
+    return [c * columns + d * rows, a * columns + b * rows];
   }
 
   /** Zoom by a factor about the point (x, y), or about the centre of the viewport. */
   zoom(factor, x = null, y = null) {
     if (!this.image) return;
-    const before = x === null ? null : this.pixelAt(x, y);
+    const before = x === null ? null : this.#geometry().plane([x, y]);
     this.viewport.zoom = Math.max(1, Math.min(MAX_ZOOM, this.viewport.zoom * factor));
     if (before) {
-      const after = this.pixelAt(x, y);
-      this.pan((before[1] - after[1]) / this.image.width, (before[0] - after[0]) / this.image.height);
+      const after = this.#geometry().plane([x, y]);
+      this.#move(before[0] - after[0], before[1] - after[1]);
     }
     if (this.viewport.zoom === 1) Object.assign(this.viewport, defaultViewport());
   }
 
-  /** Move by fractions of the image's sides. */
-  pan(across, along) {
+  /** Move the centre by metres of the plane. */
+  #move(across, along) {
     if (this.viewport.zoom === 1) return;
-    this.viewport.across = Math.max(0, Math.min(1, this.viewport.across + across));
-    this.viewport.along = Math.max(0, Math.min(1, this.viewport.along + along));
+    const [width, height] = this.projection.extent;
+    this.viewport.across = Math.max(0, Math.min(1, this.viewport.across + across / width));
+    this.viewport.along = Math.max(0, Math.min(1, this.viewport.along + along / height));
   }
 
-  /** Move by CSS pixels. */
+  /** Move the image by CSS pixels. */
   drag(dx, dy) {
+    if (!this.image) return;
     const g = this.#geometry();
-    this.pan(-dx / (g.across * this.image.width), -dy / (g.along * this.image.height));
+    const [from, to] = [g.plane([0, 0]), g.plane([dx, dy])];
+    this.#move(from[0] - to[0], from[1] - to[1]);
   }
+
+  /** Move the view by fractions of the canvas. */
+  pan(across, along) { this.drag(-across * this.canvas.clientWidth, -along * this.canvas.clientHeight); }
 
   draw() {
     const ratio = devicePixelRatio || 1;
@@ -114,39 +146,60 @@ export class ImageView {
     this.canvas.height = Math.round(height * ratio);
     const context = this.canvas.getContext("2d");
     context.scale(ratio, ratio);
-    const style = getComputedStyle(this.canvas);
-    const colour = { text: style.color, line: style.borderTopColor, font: style.fontFamily };
-    context.font = `${Math.max(12, 0.78 * parseFloat(style.fontSize))}px ${colour.font}`;
     if (!this.image) return;
-    this.#drawImage(context);
-    this.#drawScales(context, colour);
-    this.#drawLines(context);
+    const style = getComputedStyle(this.canvas);
+    const colour = { text: style.color, line: style.borderTopColor };
+    context.font = `${Math.max(12, 0.78 * parseFloat(style.fontSize))}px ${style.fontFamily}`;
+    const g = this.#geometry();
+    this.#drawImage(context, g);
+    drawAxes(context, this, g, colour);
+    drawCaption(context, this, g, colour);
+    const mark = drawMark(context, this, g);
+    drawNorth(context, this, g);
+    drawLines(context, this, g);
+    if (this.crosshair) drawCrosshair(context, g.toCanvas(this.crosshair));
+    this.#describe(mark);
   }
 
-  #drawImage(context) {
-    const g = this.#geometry();
-    const [width, height] = [this.image.width * g.across, this.image.height * g.along];
+  /** What is drawn, for screen readers: axes, nadir and contact. */
+  #describe(mark) {
+    const axes = axesOf(this.projection);
+    this.canvas.setAttribute("aria-description", [captionOf(this.projection), axes.across.name, axes.along.name, mark ? t("image.marked") : ""].filter(Boolean).join("; "));
+    this.canvas.dataset.mark = mark ? JSON.stringify(mark) : "";
+    this.canvas.dataset.extent = JSON.stringify(this.projection.extent.map((metres) => Number(metres.toFixed(3))));
+  }
+
+  #drawImage(context, g) {
     context.save();
-    context.beginPath();
-    context.rect(MARGIN.left, MARGIN.top, g.box.width, g.box.height);
-    context.clip();
-    context.imageSmoothingEnabled = false;
-    context.drawImage(this.coloured, g.x, g.y, width, height);
+    g.clip(context);
+    this.#paint(context, this.coloured, g);
     if (this.display.hatch) {
-      this.#drawMask(context, this.missing, hatch, g, width, height);
-      if (!this.synthesised) this.#drawMask(context, this.guessed, dots, g, width, height);
+      this.#drawMask(context, this.missing, hatch, g);
+      if (!this.synthesised) this.#drawMask(context, this.guessed, dots, g);
     }
-    if (this.synthesised) this.#drawFrame(context, g, width, height);
+    if (this.synthesised) this.#drawFrame(context, g);
+    context.restore();
+  }
+
+  /** Paint a canvas of the image's pixels in the projection. */
+  #paint(context, pixels, g, smooth = this.smooth) {
+    const [width, height] = this.projection.extent;
+    const [a, b, c, d] = this.projection.matrix;
+    const [x, y] = g.screen([0, 0]);
+    context.save();
+    context.transform(a * g.unit, b * g.unit, c * g.unit, d * g.unit, x, y);
+    context.imageSmoothingEnabled = smooth;
+    context.imageSmoothingQuality = "high";
+    context.drawImage(pixels, 0, 0, width, height);
     context.restore();
   }
 
   /** Draw a pattern over a mask, in screen pixels: it does not change with the zoom. */
-  #drawMask(context, mask, draw, g, width, height) {
+  #drawMask(context, mask, draw, g) {
     if (!mask) return;
     const layer = new OffscreenCanvas(this.canvas.clientWidth, this.canvas.clientHeight);
     const paint = layer.getContext("2d");
-    paint.imageSmoothingEnabled = false;
-    paint.drawImage(mask, g.x, g.y, width, height);
+    this.#paint(paint, mask, g, false);
     paint.globalCompositeOperation = "source-in";
     paint.fillStyle = pattern(paint, draw);
     paint.fillRect(0, 0, layer.width, layer.height);
@@ -154,9 +207,12 @@ export class ImageView {
   }
 
   /** Mark a synthesised layer with a frame and text: dots would cover the whole image. */
-  #drawFrame(context, g, width, height) {
-    const [left, top] = [Math.max(g.x, MARGIN.left), Math.max(g.y, MARGIN.top)];
-    const [right, bottom] = [Math.min(g.x + width, MARGIN.left + g.box.width), Math.min(g.y + height, MARGIN.top + g.box.height)];
+  #drawFrame(context, g) {
+    const [width, height] = this.projection.extent;
+    const corners = [[0, 0], [width, height], [0, height], [width, 0]].map(g.screen);
+    const limit = (axis, low, high) => [Math.max(low, Math.min(...corners.map((one) => one[axis]))), Math.min(high, Math.max(...corners.map((one) => one[axis])))];
+    const [left, right] = limit(0, MARGIN.left, MARGIN.left + g.box.width);
+    const [top, bottom] = limit(1, MARGIN.top, MARGIN.top + g.box.height);
     for (const [colour, dash] of [["#000000", []], ["#52e0ff", [8, 8]]]) {
       context.strokeStyle = colour;
       context.lineWidth = 4;
@@ -164,91 +220,23 @@ export class ImageView {
       context.strokeRect(left + 2, top + 2, right - left - 4, bottom - top - 4);
     }
     context.setLineDash([]);
-    this.#drawLabel(context, "NOT MEASURED", (left + right) / 2, bottom - 18, "#52e0ff");
+    drawLabel(context, t("image.not_measured"), (left + right) / 2, bottom - 18, "#52e0ff");
   }
 
-  #drawScales(context, colour) {
+  /** Draw the surroundings of [row, column], enlarged, on another canvas, with measurements. */
+  drawLoupe(canvas, point) {
+    const ratio = devicePixelRatio || 1;
+    const size = canvas.clientWidth;
+    canvas.width = Math.round(size * ratio);
+    canvas.height = canvas.width;
+    const context = canvas.getContext("2d");
     const g = this.#geometry();
-    const [right, bottom] = [MARGIN.left + g.box.width, MARGIN.top + g.box.height];
-    context.strokeStyle = colour.line;
-    context.fillStyle = colour.text;
-    context.strokeRect(MARGIN.left - 0.5, MARGIN.top - 0.5, g.box.width + 1, g.box.height + 1);
-    const unit = this.scale ? "m" : "px";
-    const drawAxis = (pixel, from, length, corner, axis) => {
-      const metre = pixel / (this.scale ? axis.size : 1);
-      const step = niceStep(length / metre, axis.lines);
-      const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
-      for (let value = Math.ceil((from - corner) / metre / step - 1e-9) * step; corner + value * metre <= from + length + 0.5; value += step) {
-        if (value >= -1e-9 && value <= axis.max + 1e-9) axis.draw(corner + value * metre, Math.abs(value).toFixed(digits));
-      }
-    };
-    context.textAlign = "center";
-    context.textBaseline = "top";
-    drawAxis(g.across, MARGIN.left, g.box.width, g.x, {
-      size: this.scale?.across_m, lines: g.box.width / 70, max: this.image.width * (this.scale?.across_m ?? 1),
-      draw: (x, text) => { context.fillRect(x - 0.5, bottom, 1, 5); context.fillText(text, x, bottom + 6); },
-    });
-    context.fillText(`across-track, ${unit}`, (MARGIN.left + right) / 2, bottom + 23);
-    context.textAlign = "right";
-    context.textBaseline = "middle";
-    drawAxis(g.along, MARGIN.top, g.box.height, g.y, {
-      size: this.scale?.along_m, lines: g.box.height / 50, max: this.image.height * (this.scale?.along_m ?? 1),
-      draw: (y, text) => { context.fillRect(MARGIN.left - 6, y - 0.5, 5, 1); context.fillText(text, MARGIN.left - 9, y); },
-    });
-    context.save();
-    context.translate(11, (MARGIN.top + bottom) / 2);
-    context.rotate(-Math.PI / 2);
-    context.textAlign = "center";
-    context.fillText(`along-track, ${unit}`, 0, 0);
-    context.restore();
-    context.textAlign = "left";
-    context.fillText(this.nadir === "left" ? "◀ nadir" : "nadir side unknown", MARGIN.left, MARGIN.top - 13);
-    context.textAlign = "right";
-    const available = g.box.width - context.measureText("nadir side unknown").width;
-    context.fillText(context.measureText(this.title).width < available ? this.title : this.title.split(" · ").slice(0, 2).join(" · "), right, MARGIN.top - 13);
-  }
-
-  #drawLines(context) {
-    for (const line of this.lines) {
-      const [x0, y0] = this.#toCanvas(line.from);
-      const [x1, y1] = this.#toCanvas(line.to);
-      for (const [colour, width] of [["#000000", 5], [line.colour, 2.2]]) {
-        context.strokeStyle = colour;
-        context.lineWidth = width;
-        context.beginPath();
-        context.moveTo(x0, y0);
-        context.lineTo(x1, y1);
-        const length = Math.hypot(x1 - x0, y1 - y0) || 1;
-        const [tx, ty] = [(-(y1 - y0) / length) * 7, ((x1 - x0) / length) * 7];
-        for (const [x, y] of [[x0, y0], [x1, y1]]) { context.moveTo(x - tx, y - ty); context.lineTo(x + tx, y + ty); }
-        context.stroke();
-      }
-      this.#drawLabel(context, line.text, (x0 + x1) / 2, Math.max(MARGIN.top + 12, Math.min(y0, y1) - 14), line.colour);
-    }
-    if (this.crosshair) this.#drawCrosshair(context);
-  }
-
-  #drawLabel(context, text, x, y, colour) {
-    context.textAlign = "center";
-    context.textBaseline = "middle";
-    const width = context.measureText(text).width + 10;
-    context.fillStyle = "#000000d0";
-    context.fillRect(x - width / 2, y - 10, width, 20);
-    context.fillStyle = colour;
-    context.fillText(text, x, y);
-  }
-
-  #drawCrosshair(context) {
-    const [x, y] = this.#toCanvas(this.crosshair);
-    for (const [colour, width] of [["#000000", 4], ["#ffffff", 1.5]]) {
-      context.strokeStyle = colour;
-      context.lineWidth = width;
-      context.beginPath();
-      for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-        context.moveTo(x + 4 * dx, y + 4 * dy);
-        context.lineTo(x + 16 * dx, y + 16 * dy);
-      }
-      context.stroke();
-    }
+    const [x, y] = g.toCanvas(point);
+    context.setTransform(ratio * LOUPE_ZOOM, 0, 0, ratio * LOUPE_ZOOM, canvas.width / 2 - ratio * LOUPE_ZOOM * x, canvas.height / 2 - ratio * LOUPE_ZOOM * y);
+    this.#paint(context, this.coloured, g);
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    const enlarged = (one) => g.toCanvas(one).map((value, axis) => size / 2 + LOUPE_ZOOM * (value - [x, y][axis]));
+    for (const line of this.lines) drawLine(context, enlarged(line.from), enlarged(line.to), line.colour);
+    drawCrosshair(context, [size / 2, size / 2]);
   }
 }

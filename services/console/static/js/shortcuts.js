@@ -22,7 +22,7 @@ export function shortcutTable({ app, queue, view, decision, map }) {
   const onMap = { view: "map" };
   const arrow = (rows, columns) => (event) => {
     const far = event.shiftKey ? 5 : event.altKey ? 0.2 : 1;
-    if (view.measurement.active) view.measurement.move(rows * far, columns * far);
+    if (view.measurement.active) view.measurement.move(...view.views[0].turned(rows * far, columns * far));
     else if (document.activeElement?.id === "queue" && (queue.horizontal ? columns : rows)) queue.move(rows + columns);
     else view.pan(0.1 * columns, 0.1 * rows);
   };
@@ -50,6 +50,9 @@ export function shortcutTable({ app, queue, view, decision, map }) {
     ]],
     ["shortcuts.image", [
       [["m"], "shortcuts.image.measure", () => view.startMeasurement(), review],
+      [["4"], "keys.length", () => view.startMeasurement("length"), review],
+      [["5"], "keys.width", () => view.startMeasurement("width"), review],
+      [["6"], "keys.shadow", () => view.startMeasurement("shadow"), review],
       [["+", "="], "shortcuts.image.zoom_in", () => view.zoom(1.5), review],
       [["-"], "shortcuts.image.zoom_out", () => view.zoom(1 / 1.5), review],
       [["0"], "shortcuts.image.whole", () => view.fit(), review],
@@ -64,6 +67,16 @@ export function shortcutTable({ app, queue, view, decision, map }) {
       [["."], "shortcuts.image.brighter", () => view.changeGain(1), review],
       [["a"], "shortcuts.image.auto_gain", () => view.changeGain(0), review],
       [["h"], "shortcuts.image.hatch", () => view.toggleHatch(), review],
+      [["<"], "keys.black_down", () => view.changeBlack(-1), review],
+      [[">"], "keys.black_up", () => view.changeBlack(1), review],
+      [["("], "keys.gamma_down", () => view.changeGamma(-1), review],
+      [[")"], "keys.gamma_up", () => view.changeGamma(1), review],
+      [["i"], "keys.display", () => view.toggleDisplayPanel(), review],
+      [["#"], "keys.grid", () => view.toggleGrid(), review],
+      [["d"], "keys.smooth", () => view.toggleSmooth(), review],
+      [["b"], "keys.ground", () => view.toggleGround(), review],
+      [["v"], "keys.view", () => view.nextOrientation(), review],
+      [["'"], "keys.loupe", () => view.toggleLoupe(), review],
     ]],
     ["shortcuts.map", [
       [["j"], "shortcuts.map.next", () => map.move(1), onMap], [["k"], "shortcuts.map.previous", () => map.move(-1), onMap],
