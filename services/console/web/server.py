@@ -108,6 +108,7 @@ class ConsoleApp:
                 "platform_id": self._platform_id,
                 "version": version("sonarpost"),
                 "training": self._training,
+                "known_objects": self._training or config.calibration_share > 0,
                 "now_utc_s": self._state.clock(),
                 "classes": [{"group": name, "classes": found} for name, found in config.class_groups().items()],
                 "take_back_s": config.take_back_s,

@@ -13,6 +13,7 @@ import { FleetView } from "./fleet_view.js";
 import { Header, restoreTheme, toggleTheme, toggleTypeSize } from "./header.js";
 import { registerServiceWorker } from "./installation.js";
 import { markKeys } from "./keys.js";
+import { KnownObject } from "./known_object.js";
 import { Drawer, onSwipe } from "./layout.js";
 import { MapView } from "./map_view.js";
 import { MissionView } from "./mission_view.js";
@@ -38,6 +39,7 @@ class App {
     this.status = new StatusLine(() => this.undo());
     this.decision = new DecisionForm(this.view, this.status, (name, hold) => this.#pressed(name, hold));
     this.details = new ContactDetails();
+    this.known = new KnownObject();
     this.queue = new Queue();
     this.filters = new QueueFilters(debounce(() => this.queue.show(this.filters.query), 120));
     listen("fleet", (fleet) => { state.fleet = fleet; }); // first listener: the others read the state
@@ -48,7 +50,7 @@ class App {
     this.activeView = "review";
     this.requestNumber = 0; // last request for a contact
     this.displayedNumber = 0; // request whose response is displayed
-    this.panel = h("div", { class: "panel", role: "region", "aria-label": t("app.decision") }, this.decision.element, this.details.element);
+    this.panel = h("div", { class: "panel", role: "region", "aria-label": t("app.decision") }, this.decision.element, this.known.element, this.details.element);
     this.drawer = new Drawer(this.panel);
     this.review = h("section", { class: "review", "aria-label": t("app.review") },
       h("div", { class: "side" }, this.filters.element, this.queue.element), this.view.element, this.panel, this.empty.element);
@@ -166,6 +168,7 @@ class App {
     this.#hideWithoutContact();
     this.view.commit(prepared);
     this.decision.show(detail);
+    this.known.show(detail);
     this.details.show(detail);
     this.queue.mark(id);
     history.replaceState(null, "", `#${encodeURIComponent(id)}`);
@@ -197,6 +200,7 @@ class App {
     this.detail = detail;
     this.view.commit(prepared);
     this.decision.show(detail);
+    this.known.show(detail);
     this.details.show(detail);
   }
 

@@ -85,9 +85,10 @@ export class ContactDetails {
   }
 
   #render({ contact, record, advice, requests, measurements, group, audit, decisions }) {
-    const part = (name, title, count, make) => (count > 0 ? section(name, title, count, make(), this.open.get(name) ?? true) : null);
+    const part = (name, title, count, make, open = true) => (count > 0 ? section(name, title, count, make(), this.open.get(name) ?? open) : null);
     fill(this.element,
-      part("advice", "Comments from the shore site", advice.length, () => commentList(advice)),
+      // Before the decision, comments are folded, so that they do not influence it.
+      part("advice", "Comments from the shore site", advice.length, () => commentList(advice), contact.review !== "unreviewed"),
       part("requests", "Requests", requests.length, () => requestList(requests)),
       part("measurements", "Measurements", measurements.length, () => measurementList(measurements)),
       part("looks", "Other looks at this position", contact.looks - 1, () => lookList(group, contact.id)),

@@ -88,6 +88,7 @@ export class DecisionForm {
   }
 
   show(detail) {
+    if (detail.contact.id !== this.detail?.contact.id) this.displayed_ms = performance.now();
     this.detail = detail;
     this.#render();
   }
@@ -169,7 +170,7 @@ export class DecisionForm {
     this.drafts.change(contact.id, { verdict: name });
     const draft = this.drafts.get(contact.id);
     const body = { version: image.version, verdict: name, confidence: draft.confidence, mlo_class: draft.mlo_class.trim() || null, remark: draft.remark.trim() };
-    const drawn = { revision: contact.revision, sha256: image.sha256, layer: image.layer };
+    const drawn = { revision: contact.revision, sha256: image.sha256, layer: image.layer, shown_s: Math.min(86400, (performance.now() - this.displayed_ms) / 1000) };
     this.#post(contact, () => (this.isComment ? api.advise(contact.id, body) : api.decide(contact.id, { ...body, ...drawn })), draft);
     if (this.form.contains(document.activeElement)) document.getElementById("queue").focus();
     this.#render();

@@ -85,7 +85,7 @@ export default {
   "score.wrong": "wrong",
   "score.undecided": "not decided",
   "score.close": "Close",
-  "score.line": "{name}: the object is {label}. {result}.",
+  "score.line": "object: {label}, {result}",
   "score.known": "Known object",
   "score.sealed": "Calibration contact: it was not sent by a vehicle, and nothing about it was sent.",
   // shortcuts.js

@@ -1,0 +1,90 @@
+"""Training and calibrated watch in the page: object after the decision, score, comments folded before the decision."""
+
+from __future__ import annotations
+
+from builders.console import FIRST_UTC_S, image_record
+
+from sonarpost.messages import Advice
+from sonarpost.services.console.known_objects import KnownObjects
+from sonarpost.services.console.store.truth import Truth
+
+
+def add(served, image_id, truth, **changes):
+    served.state.store_image(image_record(image_id, **changes), truth)
+
+
+def reveal(served):
+    """End the take-back time of all decisions, and reveal objects."""
+    now = served.state.clock()
+    served.state.clock = lambda: now + 60.0
+    KnownObjects(served.state).reveal()
+
+
+def test_object_is_shown_after_the_decision_and_counted_in_the_score(serve):
+    served = serve(calibration_share=0.1)
+    add(served, "00A7", Truth(is_mine_like=True, label="practice mine", sealed=False))
+    add(served, "00A8", Truth(is_mine_like=False, label="boulder", sealed=False), position=(56.01, -5.0))
+    visit = served.visit()
+    visit.page.click('.row[data-id*=".00A7"]')
+    visit.wait_for_contact("00A7")
+    assert not visit.page.is_visible(".known")
+    visit.press("1")
+    visit.wait_for_contact("00A8")
+    visit.press("1")
+    visit.until("() => document.querySelector('#unreviewed b').textContent === '0'")
+    assert "practice mine" not in visit.page.content()
+    reveal(served)
+    visit.wait("#truth .bad, #truth.bad, #truth.good")
+    visit.page.click("#score")
+    visit.wait("dialog .score")
+    table = visit.text("dialog")
+    assert "practice mine" in table
+    assert "boulder" in table
+    assert "correct" in table
+    assert "wrong" in table
+    visit.page.click("dialog tbody button >> text=00A7")
+    visit.wait_for_contact("00A7")
+    visit.wait(".known >> text=practice mine")
+
+
+def test_time_of_display_is_sent_with_the_decision(served):
+    add(served, "00A7", Truth(is_mine_like=True, label="practice mine", sealed=False))
+    visit = served.visit()
+    visit.wait_for_contact("00A7")
+    visit.page.wait_for_timeout(700)
+    visit.press("1")
+    visit.until("() => document.querySelector('#unreviewed b').textContent === '0'")
+    reveal(served)
+    with served.state.database.read() as db:
+        shown_s = db.execute("SELECT shown_s FROM decision").fetchone()[0]
+    assert 0.7 <= shown_s < 60
+
+
+def test_comments_are_folded_before_the_decision(served):
+    add(served, "00A7", None)
+    advice = Advice(
+        advice_id="a-1",
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        image_id="00A7",
+        image_version=1,
+        verdict="mine_like",
+        remark="straight edge",
+        author="eva",
+        advised_utc_s=FIRST_UTC_S + 10,
+    )
+    served.state.store_advice(advice)
+    visit = served.visit()
+    visit.wait_for_contact("00A7")
+    folded = '.details [data-name="advice"]'
+    visit.wait(folded)
+    assert visit.page.get_attribute(folded, "open") is None
+    visit.press("2")
+    visit.wait(f"{folded}[open]")
+
+
+def test_score_is_absent_without_known_objects(served):
+    add(served, "00A7", None)
+    visit = served.visit()
+    visit.wait_for_contact("00A7")
+    assert not visit.page.is_visible("#score")
