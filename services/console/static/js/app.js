@@ -28,6 +28,7 @@ import { StatusLine } from "./status_line.js";
 import { loadLanguage, t, translate } from "./texts.js";
 
 const PREFETCHED_ROWS = 3;
+const FAILURE_MS = 1000; // a verdict key in this time after a failed change of contact was meant for the other contact
 
 class App {
   constructor() {
@@ -35,6 +36,7 @@ class App {
     this.loader = new ContactLoader((detail) => this.view.prepare(detail));
     this.actions = new ActionQueue();
     this.goal = null; // identifier of the contact that is being loaded for display
+    this.failure = { text: "", dropped: 0, time_ms: -Infinity }; // last contact that could not be loaded
     this.supersede = () => {}; // ends waiting for the goal
     this.status = new StatusLine(() => this.undo());
     this.decision = new DecisionForm(this.view, this.status, (name, hold) => this.#pressed(name, hold));
@@ -68,7 +70,7 @@ class App {
     listen("counts", (response) => {
       this.filters.update(response);
       // Display the first contact if none is selected.
-      if (state.selected === null && response.matching > 0) queueMicrotask(() => this.queue.move(1));
+      if (state.selected === null && this.goal === null && response.matching > 0) queueMicrotask(() => this.queue.move(1));
     });
     listen("select", ({ id, name }) => this.select(id, name));
     listen("move", ({ step }) => this.#go((id) => this.queue.rowAfter(id, step)));
@@ -146,10 +148,19 @@ class App {
       return true;
     } catch (error) {
       this.#endLoading();
-      const dropped = this.actions.clear();
-      toast([t("app.not_loaded", { name: row?.name ?? t("app.next_contact"), reason: error.message }), dropped ? t("app.dropped", { count: dropped }) : ""].join(" "), { bad: true });
+      this.failure = { text: t("app.not_loaded", { name: row?.name ?? t("app.next_contact"), reason: error.message }), dropped: 0, time_ms: performance.now() };
+      this.#drop(this.actions.clear());
+      // The address of the page can name an unknown contact.
+      if (state.selected === null && error.status === 404 && this.queue.rows.matching > 0) queueMicrotask(() => this.queue.move(1));
       return false;
     }
+  }
+
+  /** Report keys that were meant for a contact that could not be loaded. */
+  #drop(count) {
+    this.failure.dropped += count;
+    const { text, dropped } = this.failure;
+    toast(dropped ? `${text} ${t("app.dropped", { count: dropped })}` : text, { bad: true });
   }
 
   #endLoading() {
@@ -226,7 +237,8 @@ class App {
 
   /** Send a verdict on the displayed contact, and display the next one without a decision. */
   decide(name) {
-    if (this.decision.isComment) this.choose(name);
+    if (performance.now() - this.failure.time_ms < FAILURE_MS) this.#drop(1);
+    else if (this.decision.isComment) this.choose(name);
     else this.actions.add(() => this.#decide(() => this.decision.decide(name)));
   }
 
