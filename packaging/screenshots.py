@@ -142,9 +142,13 @@ def decision(scene: Scene) -> None:
     )
     scene.state.store_advice(advice)
     with scene.page(LARGE, "night", contact_id) as page:
-        press(page, "1", "g", "ArrowRight", *["ArrowRight"] * 5, "w")
+        press(page, "Shift+Digit1", "g", "ArrowRight", *["ArrowRight"] * 5, "w")
         page.keyboard.type("highlight and shadow agree")
         page.keyboard.press("Control+Enter")
+        page.wait_for_selector("#result >> text=mine-like")
+        page.evaluate("id => { location.hash = ''; location.replace(`/#${encodeURIComponent(id)}`); }", contact_id)
+        page.reload()
+        page.wait_for_function("id => document.querySelector('canvas')?.dataset.shows?.includes(id)", arg=contact_id)
         page.wait_for_selector(".progress >> text=on the vehicle")
         page.wait_for_selector('.progress >> text="at the shore site"')
         press(page, "s")
@@ -169,14 +173,13 @@ def request(scene: Scene) -> None:
 
 
 def conflict(scene: Scene) -> None:
-    """Day theme, large: a conflict with another operator."""
+    """Day theme, large: a contact that two operators dispute."""
     contact_id = scene.contact(complete=True, index=4)
     with scene.page(LARGE, "day", contact_id) as page:
-        press(page, "1")
         scene.decide(contact_id, "not_mine_like", 0.8, None, "a boulder; no man-made edge")
-        page.wait_for_selector(".now >> text=Another decision was made")
-        press(page, "Enter")
-        page.wait_for_selector("dialog .versus")
+        page.wait_for_selector(".overrule")
+        press(page, "1")
+        page.wait_for_selector(".overrule.disputed li")
         save(page, "conflict-day-1920")
 
 

@@ -22,7 +22,7 @@ def test_password_change_with_the_keyboard(served):
     visit, elsewhere, another = served.visit("anna"), served.visit("anna"), served.visit("bo")
     visit.wait_for_contact("00A7")
     # The page opens in a new tab, so that an unsent remark is kept.
-    visit.press("1", "w")
+    visit.press("Shift+Digit1", "w")
     visit.page.keyboard.type("half a remark")
     visit.press("Escape")
     visit.page.focus("#bar nav button:last-child")
