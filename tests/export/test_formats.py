@@ -260,7 +260,8 @@ def test_kmz_contains_all_referenced_files(contacts: ContactSet) -> None:
     assert len([n for n in named if n and n.startswith("pictures/")]) == 4
     assert "http" not in text.replace("http://www.opengis.net/kml/2.2", "")
     for name in archive.namelist()[:-1]:
-        assert Image.open(io.BytesIO(archive.read(name))).format == "PNG"
+        kind = "JPEG" if name.startswith("pictures/") else "PNG"
+        assert Image.open(io.BytesIO(archive.read(name))).format == kind
 
 
 def test_unreadable_image_is_omitted_from_kmz(contacts: ContactSet) -> None:
@@ -318,8 +319,21 @@ def test_sixteen_bit_image_is_scaled_to_eight(tmp_path: Path) -> None:
     pixels = np.array([[0, 500, 1000]], np.uint16)
     data, _ = kmz_bytes(load_contacts(store(tmp_path, image(picture=Pixels.from_array(pixels)))))
     archive = zipfile.ZipFile(io.BytesIO(data))
-    (name,) = (n for n in archive.namelist() if n.startswith("pictures/"))
+    (name,) = (n for n in archive.namelist() if n.startswith("overlays/"))
     assert np.asarray(Image.open(io.BytesIO(archive.read(name)))).tolist() == [[0, 127, 255]]
+
+
+def test_image_in_a_balloon_has_the_shape_of_the_seabed(tmp_path: Path) -> None:
+    # 16 x 24 px of 0.25 m x 0.125 m: 4 m along, 3 m across the track.
+    black = Pixels.from_array(np.zeros((16, 24), np.uint8))
+    data, _ = kmz_bytes(load_contacts(store(tmp_path, image(picture=black), decision())))
+    archive = zipfile.ZipFile(io.BytesIO(data))
+    (name,) = (n for n in archive.namelist() if n.startswith("pictures/"))
+    picture = np.asarray(Image.open(io.BytesIO(archive.read(name))).convert("L"))
+    # The strip with the scale bar below the image is white.
+    height = int(np.argmax(picture[:, 5] > 250))
+    assert (height, picture.shape[1]) == pytest.approx((240, 180), abs=3)
+    assert picture.shape[0] > height + 15
 
 
 # Cursor-on-Target

@@ -1,39 +1,30 @@
-"""Routes of exports, and of the printable report of a contact."""
+"""Routes of exports."""
 
 from __future__ import annotations
 
-import base64
 import errno
-import html
 import os
 import shutil
-import sqlite3
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
-from typing import IO, Final
+from dataclasses import dataclass
+from typing import IO, Final, Literal
 
-import numpy as np
-import numpy.typing as npt
-from starlette.responses import Response, StreamingResponse
+from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
-from sonarpost import wire
-from sonarpost.archive.image_files import side_car
 from sonarpost.delivery.store import HANDLING_RESERVE_BYTES
-from sonarpost.export.contacts import ContactSet, ExportContact, SideCar
+from sonarpost.export.contacts import ContactSet, ExportContact
 from sonarpost.export.cot import cot_events
 from sonarpost.export.kml import ContactImage, add_kmz
 from sonarpost.export.tables import csv_bytes, geojson_bytes
-from sonarpost.export.text import probabilities_text
-from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review import rendering
 from sonarpost.services.console.state import ConsoleState
-from sonarpost.services.console.store.contacts import ContactFilter, find_version, list_versions
-from sonarpost.services.console.store.serialisers import Json, decode_image
+from sonarpost.services.console.store.contacts import ContactFilter, list_versions
+from sonarpost.services.console.store.exports import find_export_contact, list_measurements, picture_lines
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call
 
 MAX_CONTACTS: Final = 5000
@@ -58,34 +49,61 @@ _FORMATS: Final[Mapping[str, tuple[Callable[[ContactSet], bytes] | None, str]]] 
 }
 
 
+@dataclass
+class ExportProgress:
+    """Progress of one export.
+
+    Attributes:
+        name: Name of the file.
+        state: Waiting for another export, writing the file, or sending it.
+        done: Contacts in the file.
+        total: Contacts of the filter; None before they are counted.
+        size_bytes: Size of the file.
+        cancelled: Whether the user cancelled it.
+    """
+
+    name: str
+    state: Literal["waiting", "writing", "sending"] = "waiting"
+    done: int = 0
+    total: int | None = None
+    size_bytes: int = 0
+    cancelled: bool = False
+
+
 class _ExportQueue:
     """Limits exports: one runs at a time, and each user has at most one."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._users: set[str] = set()
+        self._exports: dict[str, ExportProgress] = {}
         self.worker = threading.Lock()
 
-    def enter(self, user: str) -> None:
-        """Add an export of a user.
+    def enter(self, user: str, name: str) -> ExportProgress:
+        """Add an export of a user; return its progress.
 
         Raises:
             ApiError: 429 if the user has one already; 503 if the queue is full.
         """
         headers = {"Retry-After": str(RETRY_S)}
         with self._lock:
-            if user in self._users:
+            if user in self._exports:
                 message = f"an export of {user} is not finished: try again in {RETRY_S} s"
                 raise ApiError(429, "too_many", message, headers=headers)
-            if len(self._users) >= MAX_EXPORTS:
+            if len(self._exports) >= MAX_EXPORTS:
                 message = f"{MAX_EXPORTS} exports are not finished: try again in {RETRY_S} s"
                 raise ApiError(503, "busy", message, headers=headers)
-            self._users.add(user)
+            self._exports[user] = progress = ExportProgress(name)
+        return progress
+
+    def find(self, user: str) -> ExportProgress | None:
+        """Return the progress of a user's export; None without one."""
+        with self._lock:
+            return self._exports.get(user)
 
     def leave(self, user: str) -> None:
         """Remove the export of a user."""
         with self._lock:
-            self._users.discard(user)
+            self._exports.pop(user, None)
 
 
 class _TemporaryFileResponse(StreamingResponse):
@@ -108,10 +126,10 @@ class _TemporaryFileResponse(StreamingResponse):
 
 
 class ExportRoutes:
-    """Routes of exports and reports.
+    """Routes of exports.
 
     An export is written to a temporary file without a name in the folder of the database: the operating system
-    deletes it when the process ends, also after a crash.
+    deletes it when the process ends, also after a crash. The file lives as long as the request that created it.
     """
 
     def __init__(self, state: ConsoleState) -> None:
@@ -122,13 +140,26 @@ class ExportRoutes:
     def routes(self, access: AccessControl) -> list[Route]:
         """Return the routes."""
         return [
+            Route("/api/export", access.endpoint(self._progress), methods=["GET"]),
+            Route("/api/export/cancel", access.endpoint(self._cancel), methods=["POST"]),
             Route("/api/export/{name}", access.endpoint(self._export), methods=["GET"]),
-            Route("/report/{id}", access.endpoint(self._report)),
         ]
 
     def stop(self) -> None:
         """End the running export, so that the process can stop."""
         self._stopped = True
+
+    def _progress(self, call: Call) -> Response:
+        progress = self._queue.find(call.actor.user)
+        fields = ("name", "state", "done", "total", "size_bytes")
+        body = None if progress is None else {field: getattr(progress, field) for field in fields}
+        return JSONResponse({"export": body})
+
+    def _cancel(self, call: Call) -> Response:
+        progress = self._queue.find(call.actor.user)
+        if progress is not None:
+            progress.cancelled = True
+        return JSONResponse({"cancelled": progress is not None})
 
     def _export(self, call: Call) -> Response:
         name = str(call.request.path_params["name"])
@@ -136,191 +167,72 @@ class ExportRoutes:
             raise ApiError(404, "not_found", "one of " + ", ".join(_FORMATS))
         query, user = call.parse_query(ContactFilter), call.actor.user
         headers = {"Content-Disposition": f'attachment; filename="{name}"', "Content-Type": _FORMATS[name][1]}
-        self._queue.enter(user)
+        progress = self._queue.enter(user, name)
         try:
             with self._queue.worker:
-                file = self._write(name, query)
+                progress.state = "writing"
+                file = self._write(name, query, progress)
         except BaseException:
             self._queue.leave(user)
             raise
+        progress.state = "sending"
         return _TemporaryFileResponse(file, lambda: self._queue.leave(user), headers)
 
-    def _write(self, name: str, query: ContactFilter) -> IO[bytes]:
+    def _write(self, name: str, query: ContactFilter, progress: ExportProgress) -> IO[bytes]:
         """Write an export to a temporary file, and return the file."""
         file: IO[bytes] = tempfile.TemporaryFile(dir=self._state.database.path.parent)  # noqa: SIM115  closed below
         try:
-            contacts = self._contacts(query, file)
             convert = _FORMATS[name][0]
+            contacts = self._contacts(query, file, progress, counts=convert is not None)
             if convert is None:
-                add_kmz(file, contacts, lambda contact: self._image(contact, file))
+                add_kmz(file, contacts, lambda contact: self._image(contact, file, progress))
             else:
                 file.write(convert(contacts))
+            progress.size_bytes = file.tell()
         except BaseException:
             file.close()
             raise
         return file
 
-    def _contacts(self, query: ContactFilter, file: IO[bytes]) -> ContactSet:
+    def _contacts(self, query: ContactFilter, file: IO[bytes], progress: ExportProgress, *, counts: bool) -> ContactSet:
+        """Read the contacts; `counts` is whether reading them is the main part of the work."""
         with self._state.database.read() as db:
             versions = list_versions(db, query, MAX_CONTACTS + 1)
         if len(versions) > MAX_CONTACTS:
             raise ApiError(413, "too_large", f"more than {MAX_CONTACTS} contacts: select fewer in the queue")
+        progress.total = len(versions)
         found: list[ExportContact] = []
         for contact_id, version in versions:
-            self._check(file)
+            self._check(file, progress)
             # Other requests use the database between two contacts.
             with self._state.database.read() as db:
-                contact = _export_contact(db, contact_id, version)
+                contact = find_export_contact(db, contact_id, version)
             if contact is not None:
                 found.append(contact)
-        return ContactSet(tuple(found), (), ())
+            progress.done += counts
+        contacts = ContactSet(tuple(found), (), ())
+        if not counts:
+            progress.total = len(contacts.located)  # only these have an image in a KMZ
+        return contacts
 
-    def _image(self, contact: ExportContact, file: IO[bytes]) -> ContactImage | None:
-        self._check(file)
+    def _image(self, contact: ExportContact, file: IO[bytes], progress: ExportProgress) -> ContactImage | None:
+        self._check(file, progress)
+        progress.done += 1
         if not contact.image.codec:
             return None
         image = self._state.image(contact.uid, contact.image.version)
-        return ContactImage(rendering.eight_bits(image.picture.to_array()), image.missing())
+        with self._state.database.read() as db:
+            lines = picture_lines(list_measurements(db, contact.uid))
+        return ContactImage(rendering.eight_bits(image.picture.to_array()), image.missing(), lines)
 
-    def _check(self, file: IO[bytes]) -> None:
-        """Check the size of an export and the free space between two contacts."""
+    def _check(self, file: IO[bytes], progress: ExportProgress) -> None:
+        """Check for a cancellation, the size of an export and the free space between two contacts."""
+        progress.size_bytes = file.tell()
+        if progress.cancelled:
+            raise ApiError(409, "cancelled", "the export was cancelled")
         if self._stopped:
             raise ApiError(503, "busy", "the console is stopping")
-        if file.tell() > MAX_BYTES:
+        if progress.size_bytes > MAX_BYTES:
             raise ApiError(413, "too_large", f"more than {MAX_BYTES >> 20} MiB: select fewer contacts in the queue")
         if shutil.disk_usage(self._state.database.path.parent).free < HANDLING_RESERVE_BYTES:
             raise OSError(errno.ENOSPC, "the disk reserve is reached")
-
-    def _report(self, call: Call) -> Response:
-        contact_id = str(call.request.path_params["id"])
-        detail = self._state.contact_detail(contact_id)
-        contact = detail["contact"]
-        assert isinstance(contact, dict)
-        image = self._state.image(contact_id, int(contact["version"]))
-        headers = {"Content-Disposition": f'inline; filename="{contact["name"].replace("/", "-")}.html"'}
-        text = report_html(detail, image, time.time())
-        return Response(text, media_type="text/html; charset=utf-8", headers=headers)
-
-
-def _export_contact(db: sqlite3.Connection, contact_id: str, version: int) -> ExportContact | None:
-    """Return a contact; None if the version was deleted in the meantime."""
-    row = find_version(db, contact_id, version)
-    if row is None:
-        return None
-    rows = db.execute(
-        "SELECT payload FROM decision WHERE contact_id = ? ORDER BY decided_utc_s, seq", (contact_id,)
-    ).fetchall()
-    decisions = tuple(wire.decode(Decision, bytes(row["payload"]), "decision") for row in rows)
-    return ExportContact(SideCar.model_validate(side_car(decode_image(row))), decisions, None)
-
-
-# Report
-
-
-_LENGTHS: Final = (
-    ("Ground range", "ground_range_m"),
-    ("Altitude of the vehicle", "altitude_m"),
-    ("Depth of the vehicle", "depth_m"),
-    ("Length (detector)", "length_m"),
-    ("Width (detector)", "width_m"),
-    ("Shadow (detector)", "shadow_m"),
-    ("Height (detector)", "height_m"),
-)
-
-
-_AUTHENTICATION: Final[Mapping[bool | None, str]] = {
-    True: "authenticated",
-    False: "UNAUTHENTICATED: any modem in range can have forged this contact",
-    None: "",
-}
-
-
-def _despeckling_text(strength: float | None) -> str:
-    if strength is None:
-        return ""
-    return f"despeckled, strength {strength:.2f}" if strength > 0 else "not despeckled"
-
-
-def report_html(detail: Json, image: ReconstructedImage, now_utc_s: float) -> str:
-    """Return a page about a contact for printing on one or two sheets. Text of operators is escaped.
-
-    Args:
-        detail: Result of `ConsoleState.contact_detail`.
-        image: Image version to show.
-        now_utc_s: Time of the report.
-    """
-    contact, record = detail["contact"], detail["record"] or {}
-    assert isinstance(contact, dict)
-    assert isinstance(record, dict)
-    png = rendering.encode_png(rendering.eight_bits(image.picture.to_array()))
-    name = html.escape(str(contact["name"]))
-    lat, lon = contact["lat_deg"], contact["lon_deg"]
-    facts = [
-        ("Verdict", contact["review"]),
-        ("Class", contact["mlo_class"]),
-        ("Confidence of the operator", contact["confidence"]),
-        ("Decided by", contact["decided_by"]),
-        ("Decided", _time_text(contact["decided_utc_s"])),
-        ("Latitude, longitude (WGS 84)", "" if lat is None or lon is None else f"{lat:.7f}, {lon:.7f}"),
-        ("Standard deviation of the position, m", contact["position_sigma_m"]),
-        ("Class of the detector", contact["atd_class"]),
-        ("Probabilities of the detector", probabilities_text(contact["p_mine_like"], contact["p_other_object"])),
-        ("Confidence of the detector, 0 to 2", contact["atd_confidence"]),
-        ("Detected", _time_text(contact["seen_utc_s"])),
-        *((f"{label}, m", record.get(key)) for label, key in _LENGTHS),
-        ("Codec", image.codec),
-        ("Despeckling", _despeckling_text(image.despeckle_strength)),
-        ("Version of the image", image.version),
-        ("Received", f"{image.bytes_received} of {image.bytes_total} bytes, {contact['percent_received']} %"),
-        ("Area not received", f"{100 * float(image.missing().mean()):.1f} % (black in the image)"),
-        ("SHA-256 of the pixels", image.picture_sha256),
-        ("Acoustic frames", _AUTHENTICATION[image.authenticated]),
-    ]
-    return (
-        "<!DOCTYPE html>\n<html lang='en'><head><meta charset='utf-8'>"
-        f"<title>{name}</title><link rel='icon' href='/static/icon.svg'>"
-        "<link rel='stylesheet' href='/static/report.css'></head><body class='report'>"
-        f"<header><h1>Contact {name}</h1>"
-        f"<p>Vessel {html.escape(str(contact['vessel_id']))}, report of {_time_text(now_utc_s)}</p></header>"
-        f"<figure><img alt='Sonar image of contact {name}'"
-        f" src='data:image/png;base64,{base64.b64encode(png).decode()}'>"
-        f"<figcaption>{_scale_text(record, image)}</figcaption></figure>"
-        f"<dl>{''.join(f'<dt>{html.escape(label)}</dt><dd>{_value_html(value)}</dd>' for label, value in facts)}</dl>"
-        f"{_table('Measurements', detail['measurements'], ('kind', 'value_m', 'sigma_m', 'height_m', 'user'))}"
-        f"{_table('Decisions', detail['decisions'], ('operator', 'verdict', 'confidence', 'mlo_class', 'remark'))}"
-        f"{_table('Comments', detail['advice'], ('author', 'verdict', 'confidence', 'mlo_class', 'remark'))}"
-        f"{_table('Audit', detail['audit'], ('user', 'role', 'action', 'version', 'layer'))}"
-        "</body></html>\n"
-    )
-
-
-def _value_html(value: object) -> str:
-    if value is None or value == "":
-        return '<span class="missing">unknown</span>'
-    return html.escape(f"{value:.4g}" if isinstance(value, float) else str(value))
-
-
-def _time_text(utc_s: object) -> str:
-    return "" if not isinstance(utc_s, float) else f"{datetime.fromtimestamp(utc_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
-
-
-def _scale_text(record: Json, image: ReconstructedImage) -> str:
-    along, across = record.get("pixel_along_m"), record.get("pixel_across_m")
-    size = f"{image.picture.width_px} × {image.picture.height_px} px"
-    if not isinstance(along, float) or not isinstance(across, float):
-        return f"{size}, scale unknown; raw, as received"
-    metres = f"{image.picture.height_px * along:.1f} m along × {image.picture.width_px * across:.1f} m across the track"
-    return f"{size}, {metres}; raw, as received; nadir {record.get('nadir_side') or 'side unknown'}"
-
-
-def _table(title: str, items: object, columns: tuple[str, ...]) -> str:
-    assert isinstance(items, list)
-    if not items:
-        return f"<h2>{title}</h2><p>none</p>"
-    head = "".join(f"<th>{column.replace('_', ' ')}</th>" for column in ("time", *columns))
-    rows = ""
-    for item in items:
-        time_column = next(name for name in ("utc_s", "decided_utc_s", "advised_utc_s") if name in item)
-        cells = "".join(f"<td>{_value_html(item.get(column))}</td>" for column in columns)
-        rows += f"<tr><td>{_time_text(item[time_column])}</td>{cells}</tr>"
-    return f"<h2>{title}</h2><table><tr>{head}</tr>{rows}</table>"

@@ -51,6 +51,7 @@ from sonarpost.services.console.web.installation_routes import installation_rout
 from sonarpost.services.console.web.map_routes import MapRoutes
 from sonarpost.services.console.web.mission_routes import MissionRoutes
 from sonarpost.services.console.web.score_routes import ScoreRoutes
+from sonarpost.services.console.web.report_routes import ReportRoutes
 from sonarpost.services.console.web.session_routes import SessionRoutes
 from sonarpost.services.console.web.settings_routes import SettingsRoutes
 
@@ -85,6 +86,7 @@ class ConsoleApp:
             *MissionRoutes(state).routes(access),
             *ScoreRoutes(state).routes(access),
             *self._exports.routes(access),
+            *ReportRoutes(state, training=training).routes(access),
             *self._stream.routes(access),
             Route("/", _page_endpoint(access, "index.html")),
             Route("/password", _page_endpoint(access, "password.html")),

@@ -31,7 +31,7 @@ def test_lists_and_versions_state_the_authentication(watcher):
 @pytest.mark.parametrize(
     ("name", "mark"),
     [
-        ("contacts.csv", b",false,,\r\n"),
+        ("contacts.csv", b",false" + b"," * 11 + b"\r\n"),
         ("contacts.geojson", b'"authenticated": false'),
         ("contacts.cot.xml", b"Unauthenticated: any modem in range"),
     ],

@@ -57,8 +57,8 @@ def test_report_shows_known_and_unknown_values(console):
     anna.decide(ID)
     page = anna.get(f"/report/{ID}").text
     assert "data:image/png;base64," in page
-    assert "25.0 % (black in the image)" in page
-    assert '<dt>Altitude of the vehicle, m</dt><dd><span class="missing">unknown</span></dd>' in page
+    assert "25.0 % (hatched in the image)" in page
+    assert '<dt>Altitude of the vehicle</dt><dd><span class="missing">unknown</span></dd>' in page
     assert "clean edge" in page
     assert "style=" not in page
 
@@ -140,7 +140,7 @@ def test_aborted_download_ends_the_export(console, client_of):
     for _ in range(3):
         with watch.stream("GET", "/api/export/contacts.kmz") as answer:
             codes = [answer.status_code]
-        eventually(lambda: console.app._exports._queue._users == set(), what="end of the export")
+        eventually(lambda: console.app._exports._queue._exports == {}, what="end of the export")
         assert codes == [200]
 
 

@@ -9,6 +9,7 @@ import { DecisionForm } from "./decision_form.js";
 import { debounce, h, showDialog, toast } from "./dom.js";
 import { EmptyView } from "./empty_view.js";
 import { startEvents } from "./event_stream.js";
+import { openExportDialog } from "./export_dialog.js";
 import { FleetView } from "./fleet_view.js";
 import { Header, restoreTheme, toggleTheme, toggleTypeSize } from "./header.js";
 import { registerServiceWorker } from "./installation.js";
@@ -308,34 +309,11 @@ class App {
     else (this.activeView === "map" ? this.map.canvas : this.queue.list).focus();
   }
 
-  async exports() {
-    const formats = [["geojson", t("app.geojson")], ["kmz", t("app.kmz")], ["csv", t("app.csv")], ["cot.xml", t("app.cot")]];
-    const filter = this.filters.query;
-    const progress = h("p", { class: "progress", role: "status" });
-    const links = formats.map(([format, text]) => h("button", { type: "button", text, data: { export: format }, on: { click: (event) => saveExport(event.target, progress, format, filter) } }));
-    const report = this.detail ? h("a", { href: api.reportUrl(this.detail.contact.id), target: "_blank", rel: "noopener", text: t("app.report", { name: this.detail.contact.name }) }) : null;
-    await showDialog(t("app.exports"), [h("p", { text: t("app.export_contacts", { count: this.queue.rows.matching }) }), h("div", { class: "exports" }, links, report), progress], [{ label: t("app.close"), value: null, primary: true }]);
-  }
+  exports() { return openExportDialog(this.filters.query, this.queue.rows.matching, this.detail?.contact ?? null); }
 }
 
 /** The next animation frame; at once in a page that is not visible, which has none. */
 const nextFrame = () => new Promise((resolve) => { if (document.hidden) resolve(); else requestAnimationFrame(resolve); });
-
-/** Save an export as a file; the button is disabled until the server has prepared it. */
-async function saveExport(button, progress, format, filter) {
-  button.disabled = true;
-  progress.textContent = t("app.preparing");
-  try {
-    const url = URL.createObjectURL(await api.export(format, filter));
-    h("a", { href: url, download: `contacts.${format}` }).click();
-    setTimeout(() => URL.revokeObjectURL(url), 60000);
-    progress.textContent = t("app.saved", { file: `contacts.${format}` });
-  } catch (error) {
-    progress.textContent = t("app.no_export", { reason: error.message });
-  } finally {
-    button.disabled = false;
-  }
-}
 
 restoreTheme();
 try {
