@@ -8,7 +8,7 @@ from sonarpost.review.measured_size import MeasuredSize, measured_size
 
 
 def body(kind: str, value_m: float, **fields: Any) -> dict[str, object]:
-    return {"kind": kind, "value_m": value_m, "sigma_m": 0.1, "height_m": None, "height_sigma_m": None, **fields}
+    return {"id": 1, "kind": kind, "value_m": value_m, "sigma_m": 0.1, "height_m": None, "height_sigma_m": None, **fields}
 
 
 def test_latest_measurement_of_each_quantity_counts() -> None:
@@ -18,8 +18,8 @@ def test_latest_measurement_of_each_quantity_counts() -> None:
 
 
 def test_withdrawn_measurement_does_not_count() -> None:
-    assert measured_size([body("length", 2.0), body("length", 9.0, withdrawn=True)]).length_m == 2.0
-    assert measured_size([body("length", 9.0, withdrawn=True)]) == MeasuredSize()
+    assert measured_size([body("length", 2.0), body("length", 9.0, withdrawn_utc_s=1.0)]).length_m == 2.0
+    assert measured_size([body("length", 9.0, withdrawn_utc_s=1.0)]) == MeasuredSize()
 
 
 def test_height_is_that_of_the_latest_shadow() -> None:

@@ -25,6 +25,7 @@ from sonarpost.export.tables import DEGREE_DECIMALS, Value, contact_properties
 from sonarpost.export.text import VERDICT_WORDS, html_text, utc_text, xml_text
 from sonarpost.files import write_atomically
 from sonarpost.review.decisions import ReviewState
+from sonarpost.review.image_geometry import contact_mark
 from sonarpost.review.true_scale import (
     PictureLine,
     draw_lines,
@@ -325,8 +326,10 @@ def _balloon_jpeg(
     image = true_image(pixels, missing, *pixel_size_m(record), _BALLOON_PX)
     verdict = VERDICT_WORDS[contact.review].upper()
     strip = scale_strip(image.pixels.shape[1], _BALLOON_PX, image.px_per_m, north_in_image(record), verdict)
+    mark = contact_mark(record, *pixels.shape)
+    place = None if mark is None else (mark.row, mark.column)
     buffer = io.BytesIO()
-    picture = Image.fromarray(np.vstack([draw_lines(image, lines), strip]))
+    picture = Image.fromarray(np.vstack([draw_lines(image, lines, place), strip]))
     picture.save(buffer, format="JPEG", quality=_BALLOON_QUALITY)
     return buffer.getvalue()
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Final
 
-_KINDS: Final = ("length", "width", "shadow")
+from sonarpost.review.measurement import summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,20 +51,11 @@ class MeasuredSize:
 SIZE_FIELDS: Final = tuple(field.name for field in fields(MeasuredSize))
 
 
-def measured_size(measurements: Iterable[Mapping[str, object]]) -> MeasuredSize:
-    """Return the size from the stored measurements of a contact; withdrawn ones are excluded.
-
-    Args:
-        measurements: Bodies of `measure_line`, oldest first; `withdrawn` is true for a withdrawn one.
-    """
-    found: dict[str, float] = {}
-    for body in measurements:
-        kind = body["kind"]
-        if body.get("withdrawn") or kind not in _KINDS:
-            continue
-        values = {f"{kind}_m": body["value_m"], f"{kind}_sigma_m": body["sigma_m"]}
-        if kind == "shadow":
-            values |= {"height_m": body["height_m"], "height_sigma_m": body["height_sigma_m"]}
-            found = {name: value for name, value in found.items() if not name.startswith("height")}
-        found |= {name: value for name, value in values.items() if isinstance(value, float)}
-    return MeasuredSize(**found)
+def measured_size(measurements: Sequence[Mapping[str, object]]) -> MeasuredSize:
+    """Return the size from the stored measurements of a contact, oldest first; see `summary`."""
+    values: dict[str, float] = {}
+    for kind, found in summary(measurements).items():
+        for name, value in (("m", found and found["value_m"]), ("sigma_m", found and found["sigma_m"])):
+            if isinstance(value, float):
+                values[f"{kind}_{name}"] = value
+    return MeasuredSize(**values)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 from collections.abc import Iterable
 
@@ -13,6 +12,7 @@ from sonarpost.messages import Decision
 from sonarpost.review.measured_size import measured_size
 from sonarpost.review.true_scale import PictureLine
 from sonarpost.services.console.store.contacts import find_version
+from sonarpost.services.console.store.measurements import list_measurements
 from sonarpost.services.console.store.serialisers import Json, decode_image
 
 _LETTERS = {"length": "L", "width": "W", "shadow": "shadow"}
@@ -31,19 +31,18 @@ def find_export_contact(db: sqlite3.Connection, contact_id: str, version: int) -
     return ExportContact(SideCar.model_validate(side_car(decode_image(row))), decisions, None, size)
 
 
-def list_measurements(db: sqlite3.Connection, contact_id: str) -> list[Json]:
-    """Return the stored measurements of a contact, oldest first."""
-    rows = db.execute("SELECT body FROM measurement WHERE contact_id = ? ORDER BY id", (contact_id,))
-    return [json.loads(row["body"]) for row in rows]
-
-
 def picture_lines(measurements: Iterable[Json]) -> tuple[PictureLine, ...]:
     """Return the measured lines to draw; withdrawn ones are excluded."""
     found = []
     for body in measurements:
         start, end = body["from"], body["to"]
         kind = str(body["kind"])
-        if body.get("withdrawn") or kind not in _LETTERS or not isinstance(start, list) or not isinstance(end, list):
+        if (
+            body.get("withdrawn_utc_s") is not None
+            or kind not in _LETTERS
+            or not isinstance(start, list)
+            or not isinstance(end, list)
+        ):
             continue
         text = f"{_LETTERS[kind]} {body['value_m']:.2f} ± {body['sigma_m']:.2f} m"
         found.append(PictureLine(kind, (start[0], start[1]), (end[0], end[1]), text))

@@ -24,7 +24,8 @@ from sonarpost.export.tables import csv_bytes, geojson_bytes
 from sonarpost.review import rendering
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import ContactFilter, list_versions
-from sonarpost.services.console.store.exports import find_export_contact, list_measurements, picture_lines
+from sonarpost.services.console.store.exports import find_export_contact, picture_lines
+from sonarpost.services.console.store.measurements import list_measurements
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call
 
 MAX_CONTACTS: Final = 5000

@@ -15,6 +15,7 @@ from sonarpost.export.contacts import ExportContact
 from sonarpost.export.text import VERDICT_WORDS, probabilities_text
 from sonarpost.messages import Contact, ReconstructedImage
 from sonarpost.review import rendering
+from sonarpost.review.image_geometry import contact_mark
 from sonarpost.review.true_scale import (
     PictureLine,
     auto_gain,
@@ -108,7 +109,9 @@ def _figure(given: ReportContact) -> str:
     grey, missing = rendering.eight_bits(image.picture.to_array()), image.missing()
     scaled = true_image(grey, missing, *pixel_size_m(record), PICTURE_PX)
     strip = scale_strip(scaled.pixels.shape[1], PICTURE_PX, scaled.px_per_m, north_in_image(record))
-    png = rendering.encode_png(np.vstack([draw_lines(scaled, given.lines), strip]))
+    mark = contact_mark(record, *grey.shape)
+    place = None if mark is None else (mark.row, mark.column)
+    png = rendering.encode_png(np.vstack([draw_lines(scaled, given.lines, place), strip]))
     low, high = auto_gain(grey, missing)
     caption = [_scale_text(image), f"automatic gain {low:.0f} to {high:.0f} % (98 % of the received pixels)"]
     if record is not None and record.channel is not None:
@@ -295,7 +298,7 @@ def _cell(item: Json, name: str) -> str:
         value = "withdrawn" if item.get("undoes") else VERDICT_WORDS.get(value) if value else ""  # type: ignore[call-overload]
         value = f"{value} (taken back)" if item.get("undone") else value
     text = "" if value is None else f"{value:.2f}" if isinstance(value, float) else str(value)
-    mark = " class='withdrawn'" if item.get("withdrawn") or item.get("undone") else ""
+    mark = " class='withdrawn'" if item.get("withdrawn_utc_s") or item.get("undone") else ""
     return f"<td{mark}>{html.escape(text)}</td>"
 
 

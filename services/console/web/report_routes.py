@@ -9,7 +9,8 @@ from starlette.routing import Route
 
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import ContactFilter, NotFoundError, list_versions
-from sonarpost.services.console.store.exports import find_export_contact, list_measurements, picture_lines
+from sonarpost.services.console.store.exports import find_export_contact, picture_lines
+from sonarpost.services.console.store.measurements import list_measurements
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call
 from sonarpost.services.console.web.report import ReportContact, report_html
 

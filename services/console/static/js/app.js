@@ -6,7 +6,7 @@ import { ContactDetails } from "./contact_details.js";
 import { ContactLoader } from "./contact_loader.js";
 import { ContactView } from "./contact_view.js";
 import { DecisionForm } from "./decision_form.js";
-import { debounce, h, showDialog, toast } from "./dom.js";
+import { debounce, h, toast } from "./dom.js";
 import { EmptyView } from "./empty_view.js";
 import { startEvents } from "./event_stream.js";
 import { openExportDialog } from "./export_dialog.js";

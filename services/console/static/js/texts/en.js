@@ -195,7 +195,6 @@ export default {
   "app.no_unreviewed": "No other unreviewed contacts",
   "app.nothing_to_undo": "No decision of yours in the last 12 hours to undo",
   "app.one_look": "There is only one look at this position.",
-  "app.close": "Close",
   // shortcuts.js: decisions
   "shortcuts.select": "select a verdict without sending it",
   "shortcuts.shift": "Shift + 1 2 3",
