@@ -37,13 +37,10 @@ def picture_lines(measurements: Iterable[Json]) -> tuple[PictureLine, ...]:
     for body in measurements:
         start, end = body["from"], body["to"]
         kind = str(body["kind"])
-        if (
-            body.get("withdrawn_utc_s") is not None
-            or kind not in _LETTERS
-            or not isinstance(start, list)
-            or not isinstance(end, list)
-        ):
+        if body["withdrawn_utc_s"] is not None:
             continue
-        text = f"{_LETTERS[kind]} {body['value_m']:.2f} ± {body['sigma_m']:.2f} m"
+        assert isinstance(start, list)
+        assert isinstance(end, list)
+        text = f"{_LETTERS.get(kind, kind)} {body['value_m']:.2f} ± {body['sigma_m']:.2f} m"
         found.append(PictureLine(kind, (start[0], start[1]), (end[0], end[1]), text))
     return tuple(found)
