@@ -27,9 +27,9 @@ def field(visit, action):
 def test_settings_follow_the_user_to_another_computer(served):
     here = open_page(served)
     here.press(";")
-    here.page.get_by_label("Theme").select_option("night")
-    here.page.get_by_label("Type size").select_option("large")
-    here.page.get_by_label("Language").select_option("de")
+    here.page.locator(".settings select").nth(1).select_option("night")
+    here.page.locator(".settings select").nth(2).select_option("large")
+    here.page.locator(".settings select").nth(0).select_option("de")
     here.until("() => document.documentElement.lang === 'de'")
     assert served.users.settings("anna")["language"] == "de"
     # Another computer, with another cache.
