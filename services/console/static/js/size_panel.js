@@ -14,6 +14,7 @@ export function drawSizePanel(view, element) {
   const drawn = JSON.stringify([size, measurement.kind, measurement.from !== null, measurement.result, locked]);
   if (element.dataset.drawn === drawn) return;
   element.dataset.drawn = drawn;
+  element.classList.toggle("used", Object.values(size).some((value) => value));
   const focused = document.activeElement?.dataset?.size;
   const fields = KINDS.map((kind) => {
     const value = size[kind];
