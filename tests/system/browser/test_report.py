@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import os
 import re
 import threading
 from pathlib import Path
@@ -15,6 +16,10 @@ from builders.console import image_record
 from PIL import Image
 from playwright.sync_api import Page
 
+from sonarpost.messages import Pixels
+from sonarpost.review.rendering import eight_bits
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.survey_detection import detect_in_survey
 from sonarpost.services.console.web.export_routes import ExportRoutes
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
@@ -112,3 +117,28 @@ def test_cancelled_export_ends_on_the_server(served, held):
     held.set()
     with visit.page.expect_download():
         visit.page.locator("dialog [data-export=csv]").click()
+
+
+@pytest.mark.realdata
+def test_report_of_a_real_contact_is_one_page_in_true_metres(served, data_dir):
+    path = data_dir / "surveys" / "scotsman-iver2.xtf"
+    snippet = detect_in_survey(path, "0" * 64, "uuv-1", AtdStubConfig()).snippets[0]
+    record = snippet.contact
+    assert record.pixel_along_m is not None
+    assert record.pixel_across_m is not None
+    # The recording has pixels of about 4 : 1; drawn as they are, they distort by that.
+    assert record.pixel_along_m > 2 * record.pixel_across_m
+    picture = Pixels.from_array(eight_bits(snippet.picture.to_array()))
+    image = image_record("00A7").model_copy(
+        update={"contact": record, "picture": picture, "picture_sha256": picture.sha256}
+    )
+    served.state.store_image(image)
+    served.console.browser("anna").decide(ID)
+    report = served.visit("bo", path=f"report/{ID}").page
+    height, width = drawn_shape(report)
+    metres = picture.height_px * record.pixel_along_m, picture.width_px * record.pixel_across_m
+    assert height / width == pytest.approx(metres[0] / metres[1], rel=0.02)
+    assert_pages(report, 1)
+    folder = os.environ.get("SONARPOST_REPORT_FOLDER")
+    if folder and report.context.browser.browser_type.name == "chromium":
+        report.pdf(path=f"{folder}/report.pdf", prefer_css_page_size=True)
