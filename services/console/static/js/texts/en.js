@@ -214,7 +214,7 @@ export default {
   "decision_form.clear_confidence": "Confidence not given",
   "decision_form.not_given": "not given",
   "decision_form.remark": "Remark",
-  "decision_form.choose": "Shift + 1 2 3 selects",
+  "decision_form.choose": "Send",
   "decision_form.send": "Send “{verdict}”",
   "decision_form.undo": "Undo",
   "decision_form.undo_title": "Undo your decision on this contact",
