@@ -225,7 +225,7 @@ def test_decision_and_undo_from_any_contact(served):
 
 
 def test_take_back_time_ends_and_survives_a_reload(serve):
-    served = serve(take_back_s=3)
+    served = serve(take_back_s=12)
     add_contacts(served, 2)
     visit = served.visit()
     visit.wait_for_contact("0001")

@@ -144,9 +144,10 @@ export class DecisionForm {
     this.#updateDraft({ verdict: name });
   }
 
-  /** Send the selected verdict; returns as `decide`. */
+  /** Send the selected verdict, unless one is being sent; returns as `decide`. */
   submit() {
-    const name = this.detail && this.drafts.get(this.detail.contact.id).verdict;
+    const id = this.detail?.contact.id;
+    const name = this.posts.has(id) ? null : this.detail && this.drafts.get(id).verdict;
     return name ? this.decide(name) : false;
   }
 
