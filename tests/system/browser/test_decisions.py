@@ -32,8 +32,10 @@ OBSERVE = """() => {
     const link = decodeURIComponent(location.hash.slice(1));
     const form = document.getElementById('remark').value;
     if (id && window.shown.at(-1) !== id) window.shown.push(id);
-    const wrong = [name?.endsWith('/' + image), row === id || row === undefined, link === id, form === '' || form.endsWith(image)];
-    if (id && !wrong.every(Boolean)) window.gaps.push([id, name, row, link, form]);
+    const agree = [
+      name?.endsWith('/' + image), row === id || row === undefined, link === id, form === '' || form.endsWith(image),
+    ];
+    if (id && !agree.every(Boolean)) window.gaps.push([id, name, row, link, form]);
     requestAnimationFrame(sample);
   };
   requestAnimationFrame(sample);
