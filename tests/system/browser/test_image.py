@@ -152,7 +152,7 @@ def test_gamma_black_point_and_white_point_change_the_pixels(served):
     def grey():
         return visit.page.evaluate(GREY, point)[0]
 
-    visit.press("i")
+    visit.press("I")
     visit.wait("#level-gamma", state="visible")
 
     def level(name, value):

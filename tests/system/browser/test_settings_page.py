@@ -55,22 +55,22 @@ def test_key_is_changed_and_a_used_key_is_refused_by_name(served):
     assert field(visit, "queue.next").input_value() == "j"
     # The same key in another view is not a conflict.
     field(visit, "queue.next").focus()
-    visit.press("b")
-    assert field(visit, "queue.next").input_value() == "b"
+    visit.press("$")
+    assert field(visit, "queue.next").input_value() == "$"
     assert visit.text("dialog [role=alert]") == ""
     visit.press("Escape", "j")
-    visit.press("b")
+    visit.press("$")
     visit.wait_for_contact("0001")
     # The help shows the present key, and buttons do not show default keys.
     visit.press("?")
-    assert "next contact\nb" in visit.text("dialog .keys").replace("\n\n", "\n")
+    assert "next contact\n$" in visit.text("dialog .keys").replace("\n\n", "\n")
     visit.press("Escape")
     assert visit.page.locator(".verdicts kbd").first.is_hidden()
     visit.page.reload()
     visit.wait_for_contact("0001")
     visit.press("k")
     visit.wait_for_contact("0002")
-    visit.press("b")
+    visit.press("$")
     visit.wait_for_contact("0001")
     visit.press(";")
     visit.page.click("#keys-reset")

@@ -56,7 +56,7 @@ export function drawTools(view) {
       button(t("tools.out"), "-", () => view.zoom(1 / 1.5), { text: "", data: { tool: "out" } }),
       button(t("tools.fit_title"), "0", () => view.fit(), { text: t("tools.fit"), data: { tool: "fit" } }),
       button(t("tools.in"), "+", () => view.zoom(1.5), { text: "", data: { tool: "in" } })),
-    toggle("display", "i", open, () => view.toggleDisplayPanel(), { "aria-expanded": String(open), "aria-pressed": null }),
+    toggle("display", "I", open, () => view.toggleDisplayPanel(), { "aria-expanded": String(open), "aria-pressed": null }),
     button(t("tools.compare_title", { mode: t(`tools.compare_${view.compare}`) }), "s", () => view.nextCompare(), {
       text: compared ? t(`tools.compare_${view.compare}`) : t("tools.compare"), "aria-pressed": String(compared), data: { tool: "compare" } }),
     button(locked ? t("tools.measure_locked_title", { reason: locked }) : t("tools.measure"), "m", () => view.startMeasurement(), {

@@ -71,7 +71,7 @@ export function shortcutTable({ app, queue, view, decision, map }) {
       [[">"], "keys.black_up", () => view.changeBlack(1), review],
       [["("], "keys.gamma_down", () => view.changeGamma(-1), review],
       [[")"], "keys.gamma_up", () => view.changeGamma(1), review],
-      [["i"], "keys.display", () => view.toggleDisplayPanel(), review],
+      [["I"], "keys.display", () => view.toggleDisplayPanel(), review],
       [["#"], "keys.grid", () => view.toggleGrid(), review],
       [["d"], "keys.smooth", () => view.toggleSmooth(), review],
       [["b"], "keys.ground", () => view.toggleGround(), review],
