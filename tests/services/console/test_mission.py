@@ -142,7 +142,9 @@ def test_median_time_of_operators_is_to_the_first_verdict(mission):
         assert anna.decide(contact_id(mission, f"000{number}")).status_code == 201
     mission.set_time(NOW_S + 1000.0)
     last = bo.decide(contact_id(mission, "0000"), verdict="unsure").json()["decision"]
-    body = {"revision": 2, "decision_id": last["decision_id"]}
+    detail = bo.contact(contact_id(mission, "0000"))
+    shown = {name: detail["versions"][-1][name] for name in ("version", "sha256")}
+    body = {"decision_id": last["decision_id"], **shown, "layer": "raw"}
     undone = bo.post(f"/api/contacts/{contact_id(mission, '0000')}/undo", body)
     assert undone.status_code == 201
     by_name = {one["operator"]: one for one in progress(mission)["operators"]}

@@ -184,7 +184,7 @@ def test_alert_for_an_arriving_contact_above_the_threshold(vessel):
     assert visit.page.title().startswith("1 alert · (4)")
     # Neither another version nor a repeated event alerts again.
     vessel.state.store_image(image_record("0004", 2, atd_confidence=1.25))
-    vessel.state._publish_contact(next(iter_ids(vessel, "0004")), new=True)
+    vessel.state.publish_contact(next(iter_ids(vessel, "0004")), new=True)
     # The confidence of a contact can arrive after its first frame.
     vessel.state.store_image(image_record("0005", atd_confidence=None))
     vessel.state.store_image(image_record("0005", 2, atd_confidence=2.0))
