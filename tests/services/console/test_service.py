@@ -423,6 +423,7 @@ def test_service_that_does_not_reach_a_router_stops(platform, restartable_router
     starting.start()
     eventually(lambda: console.address != "", what="web server")
     address = console.address
+    assert httpx2.get(f"{address}login", timeout=20).status_code == 200
     console.stop()
     starting.join(timeout=10)
     assert not starting.is_alive()
