@@ -62,7 +62,7 @@ def test_mission_page_shows_progress_by_vehicle_and_operator(served):
     visit.wait_for_contact("0003")
     visit.press("1")
     eventually(lambda: served.state.counts().unreviewed == 3, what="decision")
-    visit.press("i")
+    visit.press("Shift+M")
     visit.wait('.mission article[aria-label="uuv-1"]')
     card = visit.text('.mission article[aria-label="uuv-1"]')
     assert "Surveyed area\nnot reported" in card

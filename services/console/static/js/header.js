@@ -8,7 +8,7 @@ import { opener } from "./layout.js";
 import { emit, listen, setting, state } from "./state.js";
 import { t } from "./texts.js";
 
-const VIEWS = [["review", "q"], ["map", "p"], ["fleet", "f"], ["mission", "i"]];
+const VIEWS = [["review", "q"], ["map", "p"], ["fleet", "f"], ["mission", "M"]];
 
 export function setTheme(theme) {
   document.documentElement.dataset.theme = setting("theme", theme);

@@ -87,7 +87,7 @@ export function shortcutTable({ app, queue, view, decision, map }) {
     ]],
     ["shortcuts.all", [
       [["q"], "shortcuts.all.review", () => app.show("review"), {}], [["p"], "shortcuts.all.view_map", () => app.show("map"), {}], [["f"], "shortcuts.all.fleet", () => app.show("fleet"), {}],
-      [["i"], "shortcuts.all.mission", () => app.show("mission"), {}],
+      [["M"], "shortcuts.all.mission", () => app.show("mission"), {}],
       [["x"], "shortcuts.all.exports", () => app.exports(), {}], [["t"], "shortcuts.all.theme", () => app.toggleTheme(), {}], [["z"], "shortcuts.all.type", () => app.toggleTypeSize(), {}],
       [[";"], "shortcuts.all.settings", () => app.settings(), {}],
       [["?"], "shortcuts.all.help", () => app.help(), {}],
