@@ -46,6 +46,8 @@ class ConsoleConfig(RetentionConfig):
         downlink_rate: Micro-Modem rate of the vessel, as in `[op_modem]`; for cost estimates.
         assumed_rate: Rate of vehicles before their first frame; for cost estimates.
         group_radius_m: Distance limit of looks at one object, for accurate positions.
+        mission_gap_s: Contacts at one place whose detection times differ by more are of different missions: not looks
+            at one object, but earlier contacts at this place.
         session_s: A session ends after this time without use.
         session_max_s: Maximum duration of a session.
         vehicle_stale_s: A vehicle is stale after this time without a frame.
@@ -78,6 +80,7 @@ class ConsoleConfig(RetentionConfig):
     downlink_rate: Annotated[int, Field(ge=0, le=6)] = 0
     assumed_rate: Annotated[int, Field(ge=0, le=6)] | None = None
     group_radius_m: Annotated[float, Field(gt=0, le=1000)] = 8.0
+    mission_gap_s: Annotated[float, Field(gt=60, le=1e8)] = 6 * 3600.0
     session_s: Annotated[float, Field(gt=0, le=604800)] = 4 * 3600.0
     session_max_s: Annotated[float, Field(gt=0, le=604800)] = 24 * 3600.0
     vehicle_stale_s: Annotated[float, Field(gt=0, le=86400)] = 120.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
 
@@ -12,11 +12,20 @@ from sonarpost import wire
 from sonarpost.messages import Advice, Command, CommandKind, Decision, DownlinkState, ReconstructedImage, TaskingState
 from sonarpost.review.costs import NEW_IMAGE_KINDS, RequestCost, request_cost
 from sonarpost.review.measurement import Line, measure_line, summary
+from sonarpost.review.objects import AssociationRule
 from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.events import EventHub
 from sonarpost.services.console.fleet import FleetMonitor, fleet_json
-from sonarpost.services.console.store import contacts, decisions, measurements, request_results, requests
+from sonarpost.services.console.store import (
+    association,
+    contacts,
+    decisions,
+    measurements,
+    objects,
+    request_results,
+    requests,
+)
 from sonarpost.services.console.store import truth as known_truth
 from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter, NotFoundError
 from sonarpost.services.console.store.database import (
@@ -79,6 +88,7 @@ class ConsoleState:
     Attributes:
         clock: UTC seconds.
         router: Connection to the router; None for a console without a network.
+        rule: Limits of the association of looks.
         on_unsent: Called after an action has stored a record to send.
     """
 
@@ -87,6 +97,7 @@ class ConsoleState:
         self.database = database
         self.events = EventHub()
         self.fleet = FleetMonitor(config.vehicle_stale_s)
+        self.rule = AssociationRule(config.group_radius_m, config.mission_gap_s)
         self.clock = clock
         self.router: RouterState | None = None
         self.on_unsent: Callable[[], None] = lambda: None
@@ -122,10 +133,10 @@ class ConsoleState:
         with self.database.transaction() as db:
             for image in images:
                 rate = self.fleet.uplink_rate(image.vehicle_id, self.config.assumed_rate)
-                stored = contacts.store_image(db, image, rate, now, self.config.group_radius_m)
+                stored = contacts.store_image(db, image, rate, now, self.rule)
                 if stored is None:
                     continue
-                contact_id, is_new_contact = stored
+                contact_id, is_new_contact = stored.contact_id, stored.is_new_contact
                 if is_new_contact:
                     decisions.attach_waiting_records(db, contact_id, now)
                     if image.image_id in truths:
@@ -135,7 +146,7 @@ class ConsoleState:
                     request_results.update_results(db, changed, now)
                 # An image that answers a request is a layer of its contact.
                 new_versions.append((own, is_new_contact and own == contact_id))
-                new_versions += [(other, False) for other in others]
+                new_versions += [(other, False) for other in (*others, *sorted(stored.changed))]
         return new_versions
 
     def store_decision(self, record: Decision) -> bool:
@@ -146,6 +157,7 @@ class ConsoleState:
             contact_id = decisions.store_received_decision(db, record, self.clock(), at_shore=at_shore)
         if contact_id is not None:
             self.publish_contact(contact_id)
+            self._publish_other_looks(contact_id)
             self._publish("decision", record.decision_id)
         return not known
 
@@ -211,6 +223,17 @@ class ConsoleState:
         event = {"contact": self._contact_json(contact_id), "new": new, **asdict(self.counts())}
         self.events.publish("contact", event)
 
+    def publish_contacts(self, contact_ids: Iterable[str]) -> None:
+        """Publish contacts that have changed."""
+        for contact_id in sorted(contact_ids):
+            self.publish_contact(contact_id)
+
+    def _publish_other_looks(self, contact_id: str) -> None:
+        """Publish the other looks of a contact's object: their state depends on its verdict."""
+        with self.database.read() as db:
+            others = association.other_looks(db, contact_id)
+        self.publish_contacts(others)
+
     def _publish(self, table: Table, record_id: str) -> Json:
         """Publish a decision, request or comment; return it."""
         with self.database.read() as db:
@@ -256,6 +279,7 @@ class ConsoleState:
                 looks = contacts.list_contacts(db, ContactFilter(group=str(contact["group"])))["items"]
             measured = measurements.list_measurements(db, contact_id)
             truth = known_truth.truth_json(db, contact_id, self.clock(), self.config.take_back_s)
+            earlier = association.earlier_contacts(db, contact_id, self.rule)
             audit = db.execute("SELECT * FROM audit WHERE contact_id = ? ORDER BY seq", (contact_id,))
             refine_base = contacts.find_contact(db, contact_id)["refine_base"]
             return {
@@ -271,6 +295,7 @@ class ConsoleState:
                 "size": summary(measured),
                 "group": looks,
                 "truth": truth,
+                "earlier": [contact_json(contacts.find_contact(db, one)) for one in earlier],
                 "audit": [audit_json(row) for row in audit],
                 "costs": self.request_costs(contact_id),
             }
@@ -364,6 +389,7 @@ class ConsoleState:
             states = self._delivery_states(db, contact_id)
             stored = decisions.add_decision(db, contact_id, entered, actor, self.clock(), states)
         decision = self._publish_action("decision", contact_id, stored.decision_id)
+        self._publish_other_looks(contact_id)
         for user in stored.notified:
             self.events.publish("notice", {"user": user})
         return {"decision": decision, "contact": self._contact_json(contact_id)}
@@ -371,15 +397,70 @@ class ConsoleState:
     def undo(self, contact_id: str, decision_id: str, displayed: DisplayedImage, actor: Actor) -> Json:
         """Store a record that withdraws an own decision; return it with its contact.
 
+        If the decision is one of several on an object, the others are withdrawn too.
+
         Raises:
             BadInputError: See `undo_decision`.
         """
         with self.database.transaction() as db:
             states = self._delivery_states(db, contact_id)
             new_id = decisions.undo_decision(db, contact_id, decision_id, displayed, actor, self.clock(), states)
+            others = objects.undo_rest(db, decision_id, actor, self.clock(), lambda one: self._delivery_states(db, one))
         self._publish("decision", decision_id)
+        for other_id, other_decision in others:
+            self._publish_action("decision", other_id, other_decision)
         decision = self._publish_action("decision", contact_id, new_id)
+        self._publish_other_looks(contact_id)
         return {"decision": decision, "contact": self._contact_json(contact_id)}
+
+    def object_detail(self, object_id: str) -> Json:
+        """Return an object with its looks."""
+        with self.database.read() as db:
+            return objects.object_json(db, object_id, self.rule)
+
+    def decide_object(self, object_id: str, entered: Mapping[str, DecisionInput], actor: Actor) -> Json:
+        """Store one verdict on several looks of an object in one transaction; return the decisions and the object.
+
+        Raises:
+            BadInputError: See `objects.decide_object`.
+        """
+        with self.database.transaction() as db:
+            stored = objects.decide_object(
+                db, object_id, entered, actor, self.clock(), lambda one: self._delivery_states(db, one)
+            )
+        made = [self._publish_action("decision", contact_id, one.decision_id) for contact_id, one in stored]
+        for user in sorted({user for _, one in stored for user in one.notified}):
+            self.events.publish("notice", {"user": user})
+        self._publish_other_looks(stored[0][0])
+        with self.database.read() as db:
+            # A sealed contact is not listed after its decision.
+            remaining = (
+                objects.object_json(db, object_id, self.rule) if association.looks_of_object(db, object_id) else None
+            )
+        return {"decisions": made, "object": remaining}
+
+    def split_look(self, object_id: str, contact_id: str, actor: Actor) -> Json:
+        """Separate a look from its object; return the object.
+
+        Raises:
+            BadInputError: See `objects.split_look`.
+        """
+        with self.database.transaction() as db:
+            changed = objects.split_look(db, object_id, contact_id, self.rule, actor, self.clock())
+        self.publish_contacts(changed)
+        return self.object_detail(object_id)
+
+    def merge_objects(self, object_id: str, contact_id: str, actor: Actor) -> Json:
+        """Join the object of a contact with an object; return the joined object.
+
+        Raises:
+            BadInputError: See `objects.merge_objects`.
+        """
+        with self.database.transaction() as db:
+            changed = objects.merge_objects(db, object_id, contact_id, self.rule, actor, self.clock())
+            joined = association.object_of(db, contact_id)
+        self.publish_contacts(changed)
+        return self.object_detail(joined)
 
     def last_decision(self, user: str) -> Json:
         """Return the last decision of a user that can be undone, with its contact; both None if there is none."""

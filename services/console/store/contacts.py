@@ -1,4 +1,4 @@
-"""Contacts and their image versions in the database: insertion, queries, grouping by position."""
+"""Contacts and their image versions in the database: insertion and queries."""
 
 from __future__ import annotations
 
@@ -13,10 +13,18 @@ from sonarpost import wire
 from sonarpost.errors import BadInputError
 from sonarpost.export.contacts import contact_uid, match_start_time
 from sonarpost.messages import ReconstructedImage
-from sonarpost.review.positions import Look, nearest_group, vehicle_position
-from sonarpost.services.console.store.database import insert_row
+from sonarpost.review.objects import AssociationRule
+from sonarpost.review.positions import vehicle_position
+from sonarpost.services.console.store.association import assign_objects
 from sonarpost.services.console.store.related_images import link_related_images
-from sonarpost.services.console.store.serialisers import CONTACT_QUERY, LISTED, Json, contact_json, percent_received
+from sonarpost.services.console.store.serialisers import (
+    CONTACT_QUERY,
+    LISTED,
+    NEWER_DETAIL,
+    Json,
+    contact_json,
+    percent_received,
+)
 
 Sort = Literal["arrived", "updated", "confidence", "vehicle", "received", "review", "name", "range"]
 SORT_COLUMNS: Final[Mapping[Sort, str]] = {
@@ -29,7 +37,6 @@ SORT_COLUMNS: Final[Mapping[Sort, str]] = {
     "name": "name",
     "range": "range_m",
 }
-_METRES_PER_DEGREE: Final = 111_000.0
 _RECORD_COLUMNS: Final = (
     "atd_class",
     "atd_confidence",
@@ -38,7 +45,11 @@ _RECORD_COLUMNS: Final = (
     "lat_deg",
     "lon_deg",
     "position_sigma_m",
+    "length_m",
+    "width_m",
+    "height_m",
 )
+_PLACE_COLUMNS: Final = "group_id, parent, lat_deg, lon_deg, position_sigma_m, seen_utc_s, length_m, width_m, height_m"
 _IMAGE_COLUMNS: Final = (
     "version",
     "codec",
@@ -50,18 +61,32 @@ _IMAGE_COLUMNS: Final = (
 )
 
 
+REVIEW_CONDITIONS: Final[Mapping[str, str]] = {
+    "reviewed": "c.review <> 'unreviewed'",
+    "mine_like": "c.review IN ('mine_like', 'disputed')",
+    "to_do": "(c.review = 'unreviewed' OR c.contradictory = 1)",
+    "newer_detail": NEWER_DETAIL,
+}
+"""SQL conditions of the values of `review` that are more than one state."""
+
+
 class ContactFilter(BaseModel):
     """Filter, order and page of a contact list, as in a query string; None or empty means no restriction.
 
     Attributes:
-        review: State of the contact; `mine_like` includes disputed contacts, `reviewed` all with a decision.
+        review: State of the contact; `mine_like` includes disputed contacts, `reviewed` all with a decision. `to_do`:
+            without a decision, disputed, or with contradictory verdicts on its object. `newer_detail`: decided on less
+            than has arrived.
         min_confidence: Minimum confidence of the detector, 0 to 2.
         text: Part of a name, class or remark; `q` in a query string.
     """
 
     model_config = ConfigDict(frozen=True, populate_by_name=True, allow_inf_nan=False)
 
-    review: Literal["unreviewed", "mine_like", "not_mine_like", "unsure", "disputed", "reviewed"] | None = None
+    review: (
+        Literal["to_do", "unreviewed", "mine_like", "not_mine_like", "unsure", "disputed", "reviewed", "newer_detail"]
+        | None
+    ) = None
     vehicle: Annotated[str, Field(max_length=40)] = ""
     vessel: Annotated[str, Field(max_length=40)] = ""
     min_confidence: Annotated[float, Field(ge=0, le=2)] | None = None
@@ -77,11 +102,11 @@ class ContactFilter(BaseModel):
         """Return the SQL condition, which contains only constants, and its parameters."""
         conditions = [LISTED]
         values: list[object] = []
-        states = {"reviewed": "c.review <> 'unreviewed'", "mine_like": "c.review IN ('mine_like', 'disputed')"}
-        if self.review in states:
-            conditions.append(states[self.review])
+        special = REVIEW_CONDITIONS.get(self.review or "")
+        if special is not None:
+            conditions.append(special)
         for condition, value in (
-            ("c.review = ?", None if self.review in states else self.review),
+            ("c.review = ?", self.review if special is None else None),
             ("c.vehicle_id = ?", self.vehicle or None),
             ("c.vessel_id = ?", self.vessel or None),
             ("c.group_id = ?", self.group or None),
@@ -111,20 +136,35 @@ class ContactCounts:
     unreviewed: int
 
 
+@dataclass(frozen=True, slots=True)
+class StoredImage:
+    """Result of storing an image version.
+
+    Attributes:
+        contact_id: Its contact.
+        is_new_contact: Whether the contact is new.
+        changed: Other contacts whose object has changed.
+    """
+
+    contact_id: str
+    is_new_contact: bool
+    changed: frozenset[str] = frozenset()
+
+
 def store_image(
-    db: sqlite3.Connection, image: ReconstructedImage, rate: int | None, now_utc_s: float, radius_m: float
-) -> tuple[str, bool] | None:
-    """Store an image version and update its contact.
+    db: sqlite3.Connection, image: ReconstructedImage, rate: int | None, now_utc_s: float, rule: AssociationRule
+) -> StoredImage | None:
+    """Store an image version, update its contact, and assign the contact to an object.
 
     Args:
         db: Connection in a transaction.
         image: The record.
         rate: Latest Micro-Modem rate of the vehicle; None if unknown.
         now_utc_s: Time of arrival.
-        radius_m: Distance limit for grouping; see `review.positions.group_distance_limit_m`.
+        rule: Limits of the association of looks.
 
     Returns:
-        The contact identifier, and whether the contact is new; None if the version is already stored.
+        None if the version is already stored.
     """
     contact_id = contact_uid(image)
     added = db.execute(
@@ -133,13 +173,16 @@ def store_image(
     )
     if added.rowcount == 0:
         return None
-    known = db.execute("SELECT version FROM contact WHERE id = ?", (contact_id,)).fetchone()
+    known = db.execute(f"SELECT version, {_PLACE_COLUMNS} FROM contact WHERE id = ?", (contact_id,)).fetchone()  # noqa: S608
+    changed: set[str] = set()
     if known is None or known["version"] <= image.version:
         _update_contact(db, contact_id, image, now_utc_s)
         link_related_images(db, contact_id, image)
-        _assign_group(db, contact_id, radius_m)
+        place = db.execute(f"SELECT {_PLACE_COLUMNS} FROM contact WHERE id = ?", (contact_id,)).fetchone()  # noqa: S608
+        if known is None or tuple(known)[1:] != tuple(place):
+            changed = assign_objects(db, [contact_id], rule)
     db.execute("UPDATE contact SET versions = versions + 1 WHERE id = ?", (contact_id,))
-    return contact_id, known is None
+    return StoredImage(contact_id, known is None, frozenset(changed - {contact_id}))
 
 
 def _update_contact(db: sqlite3.Connection, contact_id: str, image: ReconstructedImage, now_utc_s: float) -> None:
@@ -181,33 +224,12 @@ def _update_contact(db: sqlite3.Connection, contact_id: str, image: Reconstructe
     )
 
 
-def _assign_group(db: sqlite3.Connection, contact_id: str, radius_m: float) -> None:
-    """Assign a contact with a position and without a group to the nearest group, or to a new one."""
-    row = db.execute(
-        "SELECT group_id, parent, lat_deg, lon_deg, position_sigma_m, vehicle_id, seen_utc_s FROM contact WHERE id = ?",
-        (contact_id,),
-    ).fetchone()
-    if row["group_id"] is not None or row["parent"] is not None or row["lat_deg"] is None or row["lon_deg"] is None:
-        return
-    look = Look("", *tuple(row)[2:])
-    # The index on latitude limits the search. Degrees of longitude depend on the latitude.
-    limit_deg = 4.0 * radius_m / _METRES_PER_DEGREE
-    nearby = db.execute(
-        "SELECT 'g' || id, lat_deg, lon_deg, sigma_m, vehicle_id, seen_utc_s FROM look_group"
-        " WHERE lat_deg BETWEEN ? AND ?",
-        (look.lat_deg - limit_deg, look.lat_deg + limit_deg),
-    )
-    group = nearest_group(look, (Look(*first) for first in nearby), radius_m)
-    if group is None:
-        values = {name: value for name, value in asdict(look).items() if name != "group"}
-        group = f"g{insert_row(db, 'look_group', values)}"
-    db.execute("UPDATE contact SET group_id = ? WHERE id = ?", (group, contact_id))
-
-
 def list_contacts(db: sqlite3.Connection, query: ContactFilter) -> Json:
     """Return a page of the contacts, and the counts of all contacts."""
     condition, values = query.where()
-    order = f"ORDER BY c.{SORT_COLUMNS[query.sort]} {query.order}, c.id {query.order}"
+    # In the order of arrival, contacts whose verdicts contradict each other come first.
+    first = "c.contradictory DESC, " if query.sort == "arrived" else ""
+    order = f"ORDER BY {first}c.{SORT_COLUMNS[query.sort]} {query.order}, c.id {query.order}"
     # The inner query finds the page in an index, so that the sub-queries of the outer one run for these rows only.
     page = f"SELECT c.id FROM contact c WHERE {condition} {order} LIMIT ? OFFSET ?"  # noqa: S608  constants only
     rows = db.execute(f"{CONTACT_QUERY} WHERE c.id IN ({page}) {order}", (*values, query.limit, query.offset))

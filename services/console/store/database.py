@@ -37,6 +37,23 @@ RECORD_TYPES: Final[dict[Table, type[Decision] | type[Command] | type[Advice]]] 
 DATABASE_NAME: Final = "console-review.db"
 SCHEMA_VERSION = 1
 
+CONTRADICTORY: Final = (
+    "COALESCE(MAX(g.review = 'disputed') OR (MAX(g.review = 'mine_like') AND MAX(g.review = 'not_mine_like')), 0)"
+)
+"""SQL aggregate over the looks `g` of an object: verdicts on one look, or on several, contradict each other."""
+
+_OBJECT_SCHEMA: Final = (
+    "CREATE INDEX IF NOT EXISTS contact_place ON contact (lat_deg, lon_deg)",
+    "CREATE INDEX IF NOT EXISTS contact_contradictory ON contact (contradictory, arrived_utc_s, id)",
+    "CREATE TABLE IF NOT EXISTS object (id INTEGER PRIMARY KEY AUTOINCREMENT)",
+    """CREATE TABLE IF NOT EXISTS look_pair (
+    a TEXT NOT NULL, b TEXT NOT NULL, joined INTEGER NOT NULL, PRIMARY KEY (a, b)) WITHOUT ROWID""",
+    "CREATE INDEX IF NOT EXISTS look_pair_b ON look_pair (b)",
+    "CREATE INDEX IF NOT EXISTS decision_batch ON decision (batch) WHERE batch IS NOT NULL",
+)
+"""`object` only issues identifiers. `look_pair`: looks that a person joined or separated. `decision.batch` is common to
+the decisions that one verdict on an object made."""
+
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS contact (
     id TEXT PRIMARY KEY, vessel_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
@@ -50,7 +67,8 @@ CREATE TABLE IF NOT EXISTS contact (
     complete INTEGER NOT NULL, percent REAL NOT NULL, bytes_received INTEGER NOT NULL, bytes_total INTEGER NOT NULL,
     codec TEXT NOT NULL, has_picture INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL,
     group_id TEXT, authenticated INTEGER, despeckle_strength REAL, p_mine_like REAL, p_other_object REAL,
-    parent TEXT, relation TEXT, sealed INTEGER NOT NULL DEFAULT 0
+    parent TEXT, relation TEXT, sealed INTEGER NOT NULL DEFAULT 0, length_m REAL, width_m REAL, height_m REAL,
+    contradictory INTEGER NOT NULL DEFAULT 0, decided_version INTEGER, decided_bytes INTEGER
 ) WITHOUT ROWID;
 CREATE UNIQUE INDEX IF NOT EXISTS contact_image ON contact (vessel_id, vehicle_id, image_id, first_s);
 CREATE INDEX IF NOT EXISTS contact_updated ON contact (updated_utc_s, id);
@@ -62,10 +80,6 @@ CREATE INDEX IF NOT EXISTS contact_review ON contact (review, id);
 CREATE INDEX IF NOT EXISTS contact_name ON contact (name, id);
 CREATE INDEX IF NOT EXISTS contact_range ON contact (range_m, id);
 CREATE INDEX IF NOT EXISTS contact_group ON contact (group_id);
-CREATE TABLE IF NOT EXISTS look_group (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, lat_deg REAL NOT NULL, lon_deg REAL NOT NULL, sigma_m REAL,
-    vehicle_id TEXT NOT NULL, seen_utc_s REAL);
-CREATE INDEX IF NOT EXISTS look_group_place ON look_group (lat_deg, lon_deg);
 CREATE TABLE IF NOT EXISTS version (
     contact_id TEXT NOT NULL, version INTEGER NOT NULL, received_utc_s REAL NOT NULL, rate INTEGER,
     payload BLOB NOT NULL, removed INTEGER NOT NULL DEFAULT 0, PRIMARY KEY (contact_id, version)) WITHOUT ROWID;
@@ -77,7 +91,7 @@ CREATE TABLE IF NOT EXISTS decision (
     elsewhere INTEGER NOT NULL DEFAULT 0, shore TEXT NOT NULL, vehicle TEXT NOT NULL, reason TEXT NOT NULL DEFAULT '',
     times_sent INTEGER NOT NULL DEFAULT 0, relayed_utc_s REAL, changed_utc_s REAL NOT NULL,
     payload BLOB NOT NULL, sent INTEGER NOT NULL, send_after_utc_s REAL, overrules TEXT NOT NULL DEFAULT '[]',
-    shown_s REAL, bytes_received INTEGER);
+    shown_s REAL, bytes_received INTEGER, batch TEXT);
 CREATE INDEX IF NOT EXISTS decision_contact ON decision (contact_id, seq);
 CREATE INDEX IF NOT EXISTS decision_unsent ON decision (seq) WHERE sent = 0;
 CREATE INDEX IF NOT EXISTS decision_relayed ON decision (seq) WHERE shore = 'relay';
@@ -135,6 +149,12 @@ _ADDED_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
         "parent": "TEXT",
         "relation": "TEXT",
         "sealed": "INTEGER NOT NULL DEFAULT 0",
+        "length_m": "REAL",
+        "width_m": "REAL",
+        "height_m": "REAL",
+        "contradictory": "INTEGER NOT NULL DEFAULT 0",
+        "decided_version": "INTEGER",
+        "decided_bytes": "INTEGER",
     },
     "version": {"removed": "INTEGER NOT NULL DEFAULT 0"},
     "measurement": {"withdrawn_by": "TEXT", "withdrawn_utc_s": "REAL"},
@@ -143,6 +163,7 @@ _ADDED_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
         "overrules": "TEXT NOT NULL DEFAULT '[]'",
         "shown_s": "REAL",
         "bytes_received": "INTEGER",
+        "batch": "TEXT",
     },
     "request": {
         "base_version": "INTEGER",
@@ -239,8 +260,22 @@ class Database(SqliteFile):
                 for name, kind in columns.items():
                     if name not in known:
                         db.execute(f"ALTER TABLE {table} ADD COLUMN {name} {kind}")
-            for statement in (*_LATER_SCHEMA.strip().split(";")[:-1], *_ADDED_INDEXES):
+            for statement in (*_LATER_SCHEMA.strip().split(";")[:-1], *_ADDED_INDEXES, *_OBJECT_SCHEMA):
                 db.execute(statement)
+            _migrate_groups(db)
+
+
+def _migrate_groups(db: sqlite3.Connection) -> None:
+    """Make objects of the groups of version 0.2 or earlier, with the same identifiers."""
+    if db.execute("SELECT 1 FROM sqlite_master WHERE name = 'look_group'").fetchone() is None:
+        return
+    db.execute("INSERT OR IGNORE INTO object (id) SELECT MAX(id) FROM look_group HAVING MAX(id) IS NOT NULL")
+    db.execute("DROP TABLE look_group")
+    db.execute(
+        "UPDATE contact SET decided_version = (SELECT version FROM decision WHERE decision_id = effective),"  # noqa: S608
+        f" contradictory = (SELECT {CONTRADICTORY} FROM contact g"
+        " WHERE g.id = contact.id OR g.group_id = contact.group_id)"
+    )
 
 
 def insert_row(db: sqlite3.Connection, table: str, values: Mapping[str, object]) -> int:

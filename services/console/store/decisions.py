@@ -13,6 +13,7 @@ from sonarpost import wire
 from sonarpost.errors import BadInputError, SonarpostError
 from sonarpost.messages import Decision, DownlinkState, ReconstructedImage, Verdict
 from sonarpost.review.decisions import review_result, withdrawn_decision
+from sonarpost.services.console.store.association import update_decided_on
 from sonarpost.services.console.store.contacts import (
     NotFoundError,
     find_contact,
@@ -438,3 +439,4 @@ def _update_contact(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -
             contact_id,
         ),
     )
+    update_decided_on(db, contact_id)

@@ -20,17 +20,23 @@ from sonarpost.services.console.store.database import Table
 Json = dict[str, object]
 Stage = Literal["record", "preview", "part", "sent", "refined"]
 
-CONTACT_QUERY: Final = """
-SELECT c.*, d.shore AS d_shore, d.vehicle AS d_vehicle, d.reason AS d_reason, d.times_sent AS d_times_sent,
+NEWER_DETAIL: Final = (
+    "(c.version > c.decided_version AND (c.decided_bytes IS NULL OR c.bytes_received > c.decided_bytes))"
+)
+"""SQL condition: the decision was made on fewer bytes than the newest version has."""
+
+CONTACT_QUERY: Final = f"""
+SELECT c.*, {NEWER_DETAIL} AS newer_detail,
+    d.shore AS d_shore, d.vehicle AS d_vehicle, d.reason AS d_reason, d.times_sent AS d_times_sent,
     d.changed_utc_s AS d_changed_utc_s,
-    (SELECT COUNT(*) FROM contact g WHERE g.group_id = c.group_id) AS looks,
+    (SELECT COUNT(*) FROM contact g WHERE g.group_id = c.group_id AND g.sealed < 2) AS looks,
     (SELECT COUNT(*) FROM request r WHERE r.contact_id = c.id AND r.arrived_utc_s IS NULL
         AND r.state NOT IN ('refused', 'expired')
         AND COALESCE(r.late_utc_s, r.asked_utc_s + 86400) > CAST(strftime('%s') AS REAL)) AS asking,
     (SELECT MIN(MAX(r.base_bytes, r.base_total)) FROM request r
         WHERE r.contact_id = c.id AND r.kind = 'refine') AS refine_base
 FROM contact c LEFT JOIN decision d ON d.decision_id = c.last_decision
-"""
+"""  # noqa: S608  constants only
 """Start of every query for rows of `contact_json`."""
 
 LISTED: Final = "c.parent IS NULL AND c.sealed < 2"
@@ -64,6 +70,7 @@ def _select(row: sqlite3.Row, columns: str, prefix: str = "") -> Json:
 def contact_json(row: sqlite3.Row) -> Json:
     """Return a contact as in lists."""
     grouped = (row["looks"] or 0) > 1
+    decided_on, bytes_decided = row["decided_version"], row["decided_bytes"]
     return {
         **_select(row, _CONTACT_COLUMNS),
         "complete": bool(row["complete"]),
@@ -79,6 +86,10 @@ def contact_json(row: sqlite3.Row) -> Json:
         "thumbnail": f"/api/contacts/{row['id']}/versions/{row['version']}/thumbnail.png",
         "group": row["group_id"] if grouped else None,
         "looks": row["looks"] if grouped else 1,
+        "object": row["group_id"],
+        "contradictory": bool(row["contradictory"]),
+        "decided_on": None if decided_on is None else {"version": decided_on, "bytes": bytes_decided},
+        "newer_detail": bool(row["newer_detail"]),
         "advised": bool(row["advised"]),
         "delivery": None if row["d_shore"] is None else _select(row, _DELIVERY_COLUMNS, "d_"),
         "open_requests": row["asking"],

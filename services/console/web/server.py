@@ -51,6 +51,7 @@ from sonarpost.services.console.web.installation_routes import installation_rout
 from sonarpost.services.console.web.map_routes import MapRoutes
 from sonarpost.services.console.web.mission_routes import MissionRoutes
 from sonarpost.services.console.web.report_routes import ReportRoutes
+from sonarpost.services.console.web.object_routes import ObjectRoutes
 from sonarpost.services.console.web.score_routes import ScoreRoutes
 from sonarpost.services.console.web.session_routes import SessionRoutes
 from sonarpost.services.console.web.settings_routes import SettingsRoutes
@@ -82,6 +83,7 @@ class ConsoleApp:
             *SettingsRoutes(users).routes(access),
             *ContactRoutes(state).routes(access),
             *DecisionRoutes(state).routes(access),
+            *ObjectRoutes(state).routes(access),
             *self._map.routes(access),
             *MissionRoutes(state).routes(access),
             *ScoreRoutes(state).routes(access),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sqlite3
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from itertools import count
 
 import pytest
@@ -14,7 +13,6 @@ from hypothesis import strategies as st
 
 from sonarpost.errors import DeliveryError
 from sonarpost.messages import Advice, Decision, DownlinkState
-from sonarpost.review.positions import Look, nearest_group
 from sonarpost.services.console.store.contacts import ContactFilter
 from sonarpost.services.console.store.database import Actor, DisplayedImage
 from sonarpost.services.console.store.decisions import DecisionInput
@@ -103,20 +101,6 @@ def test_looks_at_one_object_are_grouped(console):
     assert (rows["0001"]["looks"], rows["0003"]["looks"], rows["0003"]["group"]) == (2, 1, None)
     detail = watch.get(f"/api/contacts/{rows['0001']['id']}").json()
     assert {row["image_id"] for row in detail["group"]} == {"0001", "0002"}
-
-
-def test_looks_of_one_pass_have_a_smaller_distance_limit():
-    first = Look("g1", 56.0, -5.0, 7.0, "uuv-1", 1000.0)
-    north_m = 1 / 111_320
-    other = Look("", 56.0 + 12 * north_m, -5.0, 7.0, "uuv-1", 1010.0)
-    assert nearest_group(other, [first], 8.0) is None
-    assert nearest_group(replace(other, seen_utc_s=1500.0), [first], 8.0) == "g1"
-    assert nearest_group(replace(other, vehicle_id="uuv-2"), [first], 8.0) == "g1"
-    assert nearest_group(replace(other, lat_deg=56.0 + north_m), [first], 8.0) == "g1"
-    closer = replace(first, group="g2", lat_deg=56.0 + 10 * north_m)
-    assert nearest_group(replace(other, seen_utc_s=1500.0), [first, closer], 8.0) == "g2"
-    far = replace(first, lat_deg=56.0 + 50 * north_m, sigma_m=500.0, seen_utc_s=None)
-    assert nearest_group(other, [far], 8.0) is None
 
 
 def test_decision_is_stored_with_the_displayed_image(make_console):

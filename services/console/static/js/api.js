@@ -72,6 +72,7 @@ async function streamError(path) {
 }
 
 const contactPath = (id) => `/api/contacts/${encodeURIComponent(id)}`;
+const objectPath = (id) => `/api/objects/${encodeURIComponent(id)}`;
 const queryString = (values) => {
   const parts = Object.entries(values).filter(([, value]) => value !== "" && value !== null && value !== undefined);
   return new URLSearchParams(parts).toString();
@@ -95,6 +96,10 @@ export const api = {
   notices: () => request("GET", "/api/notices"),
   acknowledge: (notice) => request("POST", `/api/notices/${notice}/acknowledge`),
   undo: (id, body) => request("POST", `${contactPath(id)}/undo`, body),
+  object: (id) => request("GET", objectPath(id)),
+  decideObject: (id, body) => request("POST", `${objectPath(id)}/decisions`, body),
+  splitLook: (id, contact) => request("POST", `${objectPath(id)}/split`, { contact }),
+  mergeObjects: (id, contact) => request("POST", `${objectPath(id)}/merge`, { contact }),
   costs: (id) => request("GET", `${contactPath(id)}/costs`),
   request: (id, body) => request("POST", `${contactPath(id)}/requests`, body),
   advise: (id, body) => request("POST", `${contactPath(id)}/advice`, body),

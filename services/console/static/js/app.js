@@ -18,6 +18,7 @@ import { KnownObject } from "./known_object.js";
 import { Drawer, onSwipe } from "./layout.js";
 import { MapView } from "./map_view.js";
 import { MissionView } from "./mission_view.js";
+import { openObject, watchObject } from "./object_view.js";
 import { Queue } from "./queue.js";
 import { QueueFilters } from "./queue_filters.js";
 import { openRequestDialog } from "./request_dialog.js";
@@ -62,6 +63,7 @@ class App {
     this.keys = shortcutTable({ app: this, queue: this.queue, view: this.view, decision: this.decision, map: this.map });
     this.header = new Header({ exports: () => this.exports(), settings: () => this.settings(), help: () => this.help() });
     this.#hideWithoutContact();
+    watchObject();
     this.#addListeners();
   }
 
@@ -286,9 +288,13 @@ class App {
     this.select(next.id, next.name);
   }
 
+  openObject() {
+    if (this.detail) openObject(this.detail.contact);
+  }
+
   search() { this.filters.openSearch(); }
 
-  toggleReview() { this.filters.setReview(this.filters.review === "unreviewed" ? "" : "unreviewed"); }
+  toggleReview() { this.filters.setReview(this.filters.review === "to_do" ? "" : "to_do"); }
 
   enter() {
     if (this.view.measurement.active) this.view.measurement.setPoint().then((stored) => stored?.id && this.load());

@@ -5,7 +5,9 @@ import { decisionText } from "./decision_form.js";
 import { fill, h } from "./dom.js";
 import { DASH, authentication, duration, position, probabilities, quantity, received, requestKind, time, verdict } from "./format.js";
 import { measurementLine } from "./measurement.js";
+import { openObject } from "./object_view.js";
 import { emit } from "./state.js";
+import { t } from "./texts.js";
 
 const section = (name, title, count, children, open = true) => h("details", { data: { name }, open },
   h("summary", { text: count ? `${title} (${count})` : title }), children);
@@ -42,7 +44,7 @@ function lookList(group, id) {
   return h("ul", {}, group.filter((row) => row.id !== id).map((row) => h("li", {},
     h("button", { type: "button", class: "look", on: { click: () => emit("select", { id: row.id }) } },
       row.has_picture ? h("img", { src: row.thumbnail, alt: "" }) : null,
-      h("span", {}, h("b", { text: row.name }), ` ${verdict(row.review)}, ${received(row)} received, ${time(row.seen_utc_s ?? row.first_frame_utc_s)}`)))));
+      h("span", {}, h("b", { text: row.name }), ` ${verdict(row.review)}, ${received(row)} received, ${time(row.seen_utc_s ?? row.first_frame_utc_s, { date: true })}`)))));
 }
 
 function decisionList(decisions) {
@@ -84,14 +86,16 @@ export class ContactDetails {
     if (focused) this.element.querySelector(`details[data-name="${CSS.escape(focused)}"] > summary`)?.focus();
   }
 
-  #render({ contact, record, advice, requests, measurements, group, audit, decisions }) {
+  #render({ contact, record, advice, requests, measurements, group, earlier, audit, decisions }) {
     const part = (name, title, count, make, open = true) => (count > 0 ? section(name, title, count, make(), this.open.get(name) ?? open) : null);
     fill(this.element,
       // Before the decision, comments are folded, so that they do not influence it.
       part("advice", "Comments from the shore site", advice.length, () => commentList(advice), contact.review !== "unreviewed"),
       part("requests", "Requests", requests.length, () => requestList(requests)),
       part("measurements", "Measurements", measurements.length, () => measurementList(measurements)),
-      part("looks", "Other looks at this position", contact.looks - 1, () => lookList(group, contact.id)),
+      part("looks", "Other looks at this position", contact.looks - 1, () => [
+        h("button", { type: "button", on: { click: () => openObject(contact) } }, `${t("object.key")} `, h("kbd", { text: "O" })), lookList(group, contact.id)]),
+      part("earlier", t("object.earlier"), earlier.length, () => lookList(earlier, contact.id)),
       decisions.length > 1 ? section("decisions", "Decisions", decisions.length, decisionList(decisions), this.open.get("decisions") ?? false) : null,
       section("record", "Contact record", 0, recordFacts(contact, record), this.open.get("record")),
       section("audit", "Audit", audit.length, auditList(audit), this.open.get("audit")),

@@ -4,6 +4,7 @@ import { hasAlert } from "./alerts.js";
 import { api } from "./api.js";
 import { h } from "./dom.js";
 import { DASH, authentication, probabilities, quantity, received, symbol, time, verdict } from "./format.js";
+import { decidedOnLess } from "./object_view.js";
 import { emit, listen, state } from "./state.js";
 import { t } from "./texts.js";
 
@@ -107,7 +108,7 @@ function rowLabel(row) {
     row.name, verdict(row.review), row.atd_confidence === null ? t("queue.no_confidence") : t("queue.confidence_label", { value: row.atd_confidence.toFixed(2) }),
     row.atd_class ? t("queue.class_label", { name: row.atd_class }) : "", probabilities(row) ?? "",
     row.complete ? t("queue.complete") : t("queue.received", { share: received(row) }), t("queue.seen", { time: time(row.seen_utc_s ?? row.first_frame_utc_s) }),
-    row.looks > 1 ? t("queue.looks", { count: row.looks }) : "", row.advised ? t("queue.advised") : "",
+    row.looks > 1 ? t("queue.looks", { count: row.looks }) : "", row.contradictory ? t("object.contradictory") : "", decidedOnLess(row) ?? "", row.advised ? t("queue.advised") : "",
     row.authenticated === false ? t("queue.unauthenticated") : "",
   ].filter(Boolean).join(", ");
 }
@@ -123,6 +124,7 @@ function marks(row) {
   const list = [];
   if (row.authenticated === false) list.push(h("span", { class: "mark bad unauthenticated", title: authentication(row) }, "⚠"));
   if (row.looks > 1) list.push(h("span", { class: "mark", title: t("queue.looks", { count: row.looks }) }, `×${row.looks}`));
+  if (row.contradictory) list.push(h("span", { class: "mark contradiction", title: t("object.contradictory") }, "▲○"));
   if (row.advised) list.push(h("span", { class: "mark", title: t("queue.advised") }, "✉"));
   if (row.open_requests > 0) list.push(h("span", { class: "mark", title: t("queue.open_request") }, "⟳"));
   if (row.delivery?.vehicle === "confirmed" && ["delivered", "none"].includes(row.delivery?.shore)) {
@@ -155,7 +157,7 @@ function queueRow(row, index, count, selected) {
       meter(row.percent_received ?? 0, t("queue.received_title"), row.complete ? "whole" : "part")),
     h("div", { class: "third muted number" },
       h("span", { class: "time", text: time(row.seen_utc_s ?? row.first_frame_utc_s) }),
-      h("span", { class: "range", text: quantity(row.range_m, "m", 0) }),
+      row.newer_detail ? h("span", { class: "newer", title: t("object.newer"), text: decidedOnLess(row) }) : h("span", { class: "range", text: quantity(row.range_m, "m", 0) }),
       classMark(row),
       h("span", { class: "marks" }, marks(row)))));
 }
@@ -240,13 +242,17 @@ export class Queue {
   #updateContact(row, isNew) {
     const matches = !this.rows.query.review || this.rows.query.review === row.review
       || (this.rows.query.review === "mine_like" && row.review === "disputed")
+      || (this.rows.query.review === "to_do" && (row.review === "unreviewed" || row.contradictory))
+      || (this.rows.query.review === "newer_detail" && row.newer_detail)
       || (this.rows.query.review === "reviewed" && row.review !== "unreviewed");
+    // Contradictory contacts come first.
+    const moves = this.rows.at(this.rows.indexOf(row.id))?.contradictory !== row.contradictory;
     const known = this.rows.replace(row);
     if (known) {
       const element = this.drawn.get(this.rows.indexOf(row.id));
       if (element) this.#replace(this.rows.indexOf(row.id), row, element);
     }
-    if (isNew || known !== matches || !["arrived", "name", "vehicle"].includes(this.rows.query.sort)) this.refresh();
+    if (isNew || moves || known !== matches || !["arrived", "name", "vehicle"].includes(this.rows.query.sort)) this.refresh();
   }
 
   #replace(index, row, element) {

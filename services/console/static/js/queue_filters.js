@@ -6,23 +6,23 @@ import { opener } from "./layout.js";
 import { setting, state } from "./state.js";
 import { t } from "./texts.js";
 
-const REVIEWS = ["unreviewed", "", "mine_like", "not_mine_like", "unsure"];
+const REVIEWS = ["to_do", "", "mine_like", "not_mine_like", "unsure", "newer_detail"];
 const SORTS = ["arrived desc", "confidence desc", "received desc", "received asc", "updated desc", "range asc", "vehicle asc", "name asc", "review asc"];
 const CONFIDENCES = ["", "0.5", "1", "1.5"];
 
 /** Button of a verdict: its symbol, named for screen readers. */
 function reviewChip(value, chosen, handler) {
-  const text = { unreviewed: t("queue_filters.unreviewed"), "": t("queue_filters.all") }[value];
-  const label = text ?? verdict(value);
+  const text = { to_do: t("queue_filters.unreviewed"), "": t("queue_filters.all") }[value];
+  const label = value === "newer_detail" ? t("object.filter") : text ?? verdict(value);
   return h("button", {
-    type: "button", data: { review: value }, "aria-pressed": String(chosen), "aria-label": label, title: label, text: text ?? symbol(value), on: { click: handler },
+    type: "button", data: { review: value }, "aria-pressed": String(chosen), "aria-label": label, title: label, text: value === "newer_detail" ? "+B" : text ?? symbol(value), on: { click: handler },
   });
 }
 
 export class QueueFilters {
   constructor(changed) {
     this.changed = changed;
-    this.review = setting("review") ?? "unreviewed";
+    this.review = setting("review") ?? "to_do";
     this.chips = REVIEWS.map((value) => reviewChip(value, value === this.review, () => this.setReview(value)));
     this.search = h("input", { type: "search", id: "search", placeholder: t("queue_filters.search"), "aria-label": t("queue_filters.search_label"), maxlength: 80, on: { input: () => changed() } });
     this.sort = h("select", { id: "sort", on: { change: () => { setting("sort", this.sort.value); changed(); } } },

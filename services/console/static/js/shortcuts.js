@@ -32,6 +32,7 @@ export function shortcutTable({ app, queue, view, decision, map }) {
       [["k"], "shortcuts.queue.previous", () => queue.move(-1), review],
       [["n"], "shortcuts.queue.next_unreviewed", () => app.nextUnreviewed(), review],
       [["o"], "shortcuts.queue.next_look", () => app.nextLook(), review],
+      [["O"], "object.key", () => app.openObject(), review],
       [["/"], "shortcuts.queue.search", () => app.search(), review],
       [["l"], "shortcuts.queue.unreviewed", () => app.toggleReview(), review],
     ]],

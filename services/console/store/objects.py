@@ -1,0 +1,237 @@
+"""Objects with all their looks: data for the page, one verdict for all looks, and changes by a person."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from statistics import fmean, stdev
+from typing import Any, Final
+
+from sonarpost.errors import BadInputError
+from sonarpost.messages import Contact
+from sonarpost.review.objects import AssociationRule, Look, fuse_positions
+from sonarpost.review.positions import LocalFrame, destination
+from sonarpost.services.console.store.association import (
+    find_look,
+    join_looks,
+    looks_near,
+    looks_of_object,
+    object_of,
+    separate_look,
+)
+from sonarpost.services.console.store.contacts import NotFoundError, find_contact, find_version
+from sonarpost.services.console.store.database import Actor, DisplayedImage, add_audit_entry
+from sonarpost.services.console.store.decisions import (
+    DecisionInput,
+    DeliveryStates,
+    StoredDecision,
+    add_decision,
+    standing_decisions,
+    undo_decision,
+)
+from sonarpost.services.console.store.serialisers import Json, contact_json, decode_image
+
+MAX_OBJECT_LOOKS: Final = 50
+"""Maximum number of looks of an object that a person joins, that is displayed, and that one verdict decides."""
+
+MAX_JOIN_M: Final = 1000.0
+"""Maximum distance of two objects that a person joins."""
+
+NEARBY_M: Final = 100.0
+"""Distance of other objects that are offered for joining."""
+
+MAX_NEARBY: Final = 6
+
+
+def aspect_deg(record: Contact) -> float | None:
+    """Return the true bearing from an object to the vehicle that recorded it; None if heading or side are unknown."""
+    if record.heading_deg is None or record.channel is None:
+        return None
+    # An object to starboard sees the vehicle on the opposite bearing, to port of the heading.
+    return (record.heading_deg + (-90.0 if record.channel == "starboard" else 90.0)) % 360.0
+
+
+def object_json(db: sqlite3.Connection, object_id: str, rule: AssociationRule) -> Json:
+    """Return an object with its looks, ordered by aspect.
+
+    Raises:
+        NotFoundError: There is no such object.
+    """
+    looks = _looks(db, object_id)
+    items = [_look_json(db, look) for look in looks[:MAX_OBJECT_LOOKS]]
+    items.sort(key=lambda item: (item["aspect_deg"] is None, item["aspect_deg"], item["seen_utc_s"] or 0.0))
+    frame = LocalFrame(looks[0].lat_deg, looks[0].lon_deg)
+    points = frame.to_local([look.lat_deg for look in looks], [look.lon_deg for look in looks])
+    fused = fuse_positions(looks, points, rule)
+    bearing_deg = math.degrees(math.atan2(fused.x_m, fused.y_m))
+    lat_deg, lon_deg = destination(frame.lat_deg, frame.lon_deg, bearing_deg, math.hypot(fused.x_m, fused.y_m))
+    sized = [(look.length_m, look.width_m) for look in looks if look.length_m is not None and look.width_m is not None]
+    return {
+        "id": object_id,
+        "number_of_looks": len(looks),
+        "looks": items,
+        "lat_deg": lat_deg,
+        "lon_deg": lon_deg,
+        # The scatter of the looks widens a standard deviation that is too small to explain it.
+        "position_sigma_m": None if fused.sigma_m is None else fused.sigma_m * fused.scatter,
+        "vehicles": sorted({look.vehicle_id for look in looks}),
+        "length_m": _extent_json([max(pair) for pair in sized]),
+        "width_m": _extent_json([min(pair) for pair in sized]),
+        "height_m": _extent_json([look.height_m for look in looks if look.height_m is not None]),
+        "contradictory": any(item["contact"]["contradictory"] for item in items),
+        "nearby": _nearby(db, object_id, looks[0]),
+    }
+
+
+def _looks(db: sqlite3.Connection, object_id: str) -> list[Look]:
+    looks = looks_of_object(db, object_id)
+    if not looks:
+        raise NotFoundError("object", "id", object_id, "an object")
+    return looks
+
+
+def _look_json(db: sqlite3.Connection, look: Look) -> dict[str, Any]:
+    row = find_contact(db, look.contact_id)
+    newest = find_version(db, look.contact_id, row["version"])
+    assert newest is not None
+    image = decode_image(newest)
+    record = image.contact
+    names = ("heading_deg", "channel", "pixel_along_m", "pixel_across_m", "length_m", "width_m", "height_m")
+    return {
+        "contact": contact_json(row),
+        "sha256": image.picture_sha256,
+        "has_missing": image.missing_fraction > 0,
+        "seen_utc_s": look.seen_utc_s,
+        "aspect_deg": None if record is None else aspect_deg(record),
+        **{name: getattr(record, name, None) for name in names},
+    }
+
+
+def _extent_json(values_m: Sequence[float]) -> Json | None:
+    """Return the mean of an extent, with the standard deviation of the mean; None without a value."""
+    if not values_m:
+        return None
+    sigma_m = stdev(values_m) / math.sqrt(len(values_m)) if len(values_m) > 1 else None
+    return {"value": fmean(values_m), "sigma": sigma_m, "looks": len(values_m)}
+
+
+def _nearby(db: sqlite3.Connection, object_id: str, look: Look) -> list[Json]:
+    """Return the nearest look of each other object nearby, nearest first."""
+    others = looks_near(db, look, NEARBY_M)
+    points = LocalFrame(look.lat_deg, look.lon_deg).to_local([o.lat_deg for o in others], [o.lon_deg for o in others])
+    found: list[Json] = []
+    seen = {object_id}
+    for other, point in sorted(
+        zip(others, points, strict=True), key=lambda one: (math.hypot(*one[1]), one[0].contact_id)
+    ):
+        other_object = object_of(db, other.contact_id)
+        if other_object in seen:
+            continue
+        seen.add(other_object)
+        found.append({"contact": contact_json(find_contact(db, other.contact_id)), "distance_m": math.hypot(*point)})
+        if len(found) == MAX_NEARBY:
+            break
+    return found
+
+
+def split_look(
+    db: sqlite3.Connection, object_id: str, contact_id: str, rule: AssociationRule, actor: Actor, now_utc_s: float
+) -> set[str]:
+    """Separate a look from the other looks of its object for good; return the changed contacts.
+
+    Raises:
+        NotFoundError: There is no such object.
+        BadInputError: The contact is not a look of this object, or its only one.
+    """
+    others = {look.contact_id for look in _looks(db, object_id)} - {contact_id}
+    if object_of(db, contact_id) != object_id or not others:
+        raise BadInputError("split", "contact", contact_id, f"one of several looks of object {object_id}")
+    changed = separate_look(db, contact_id, others, rule)
+    detail: Json = {"object": object_id, "looks": sorted(others), "new_object": object_of(db, contact_id)}
+    add_audit_entry(db, contact_id, actor, "split", now_utc_s, DisplayedImage(), detail)
+    return changed
+
+
+def merge_objects(
+    db: sqlite3.Connection, object_id: str, contact_id: str, rule: AssociationRule, actor: Actor, now_utc_s: float
+) -> set[str]:
+    """Join the object of a contact with an object for good; return the changed contacts.
+
+    Raises:
+        NotFoundError: There is no such object or contact.
+        BadInputError: The contact has no position or is a look of the object, or a limit is exceeded.
+    """
+    ones = _looks(db, object_id)
+    other_id = object_of(db, str(find_contact(db, contact_id)["id"]))
+    look = find_look(db, contact_id)
+    if look is None or other_id in ("", object_id):
+        raise BadInputError("merge", "contact", contact_id, "a contact with a position, of another object")
+    others = _looks(db, other_id)
+    if len(ones) + len(others) > MAX_OBJECT_LOOKS:
+        raise BadInputError("merge", "contact", contact_id, f"at most {MAX_OBJECT_LOOKS} looks together")
+    apart_m = math.hypot(*LocalFrame(ones[0].lat_deg, ones[0].lon_deg).to_local([look.lat_deg], [look.lon_deg])[0])
+    if apart_m > MAX_JOIN_M:
+        raise BadInputError("merge", "contact", contact_id, f"a contact within {MAX_JOIN_M:.0f} m")
+    changed = join_looks(db, [one.contact_id for one in ones], [other.contact_id for other in others], rule)
+    detail: Json = {"object": object_id, "merged_object": other_id, "looks": sorted(o.contact_id for o in others)}
+    add_audit_entry(db, contact_id, actor, "merge", now_utc_s, DisplayedImage(), detail)
+    return changed
+
+
+def decide_object(
+    db: sqlite3.Connection,
+    object_id: str,
+    entered: Mapping[str, DecisionInput],
+    actor: Actor,
+    now_utc_s: float,
+    delivery: Callable[[str], DeliveryStates],
+) -> list[tuple[str, StoredDecision]]:
+    """Store one verdict as a decision on each of several looks; return contact and decision of each.
+
+    The decisions have a common `batch`, so that one undo withdraws all of them.
+
+    Args:
+        db: Connection in a transaction.
+        object_id: The object.
+        entered: Contact -> decision, with the image that was displayed.
+        actor: The operator.
+        now_utc_s: Time of the decision.
+        delivery: Returns the initial delivery for a contact.
+
+    Raises:
+        NotFoundError: There is no such object.
+        BadInputError: A contact is not a look of the object, or a displayed image is not a version of its contact.
+    """
+    known = {look.contact_id for look in _looks(db, object_id)}
+    stored: list[tuple[str, StoredDecision]] = []
+    for contact_id, decision in entered.items():
+        if contact_id not in known:
+            raise BadInputError("decision", "looks", contact_id, f"a look of object {object_id}")
+        stored.append((contact_id, add_decision(db, contact_id, decision, actor, now_utc_s, delivery(contact_id))))
+    batch = f"b-{uuid.uuid4().hex}"
+    db.executemany("UPDATE decision SET batch = ? WHERE decision_id = ?", [(batch, s.decision_id) for _, s in stored])
+    return stored
+
+
+def undo_rest(
+    db: sqlite3.Connection, decision_id: str, actor: Actor, now_utc_s: float, delivery: Callable[[str], DeliveryStates]
+) -> list[tuple[str, str]]:
+    """Withdraw the other decisions that were made with a decision and still stand.
+
+    Returns:
+        Contact and new decision of each.
+    """
+    rows = db.execute(
+        "SELECT o.contact_id, o.decision_id FROM decision d"
+        " JOIN decision o ON o.batch = d.batch WHERE d.decision_id = ? AND o.decision_id <> ? ORDER BY o.seq",
+        (decision_id, decision_id),
+    ).fetchall()
+    undone: list[tuple[str, str]] = []
+    for contact_id, other_id in rows:
+        if other_id in standing_decisions(db, contact_id):
+            # No image of this contact is displayed during the undo.
+            new_id = undo_decision(db, contact_id, other_id, DisplayedImage(), actor, now_utc_s, delivery(contact_id))
+            undone.append((contact_id, new_id))
+    return undone

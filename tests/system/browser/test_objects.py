@@ -1,0 +1,145 @@
+"""The object panel: looks north-up side by side, one verdict, split and join; marks and filter of the queue."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from builders.console import FIRST_UTC_S, image_record
+
+from sonarpost.messages import Pixels
+from sonarpost.review.positions import destination
+
+TWO_TILES = "() => document.querySelectorAll('dialog.object canvas[data-shows]').length === 2"
+BRIGHTEST = """id => {
+  const canvas = document.querySelector(`dialog.object [data-id="${id}"] canvas`);
+  const { data, width } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  let sum = 0, x = 0, y = 0;
+  for (let i = 0; i < data.length; i += 4) {
+    // White pixels, without the labels near the edges.
+    const [column, row] = [(i / 4) % width, Math.floor(i / 4 / width)];
+    const edge = 0.15 * width;
+    if (data[i] < 250 || data[i + 2] < 250) continue;
+    if (Math.min(column, row, width - column, canvas.height - row) < edge) continue;
+    sum += 1; x += column - width / 2; y += canvas.height / 2 - row;
+  }
+  return [x / sum / width, y / sum / width];
+}"""
+
+
+def look(image_id, *, heading_deg, channel, vehicle="uuv-1", north_m=0.0, **fields):
+    """An image with one bright square: behind the centre in range, and ahead of it along the track."""
+    record = image_record(
+        image_id,
+        position=destination(56.0, -5.0, 0.0, north_m),
+        vehicle=vehicle,
+        heading_deg=heading_deg,
+        channel=channel,
+        pixel_along_m=0.1,
+        pixel_across_m=0.1,
+        **fields,
+    )
+    pixels = np.full((60, 60), 60, np.uint8)
+    pixels[::2] = 50
+    pixels[36:46, 38:48] = 255
+    picture = Pixels.from_array(pixels)
+    return record.model_copy(update={"picture": picture, "picture_sha256": picture.sha256})
+
+
+def store_two_looks(served):
+    served.state.store_image(look("0001", heading_deg=0.0, channel="starboard"))
+    served.state.store_image(look("0002", heading_deg=90.0, channel="port", vehicle="uuv-2", north_m=1.0))
+    served.state.store_image(look("0003", heading_deg=0.0, channel="port", vehicle="uuv-1", north_m=40.0))
+
+
+def identifier(served, image_id):
+    with served.state.database.read() as db:
+        return db.execute("SELECT id FROM contact WHERE image_id = ?", (image_id,)).fetchone()[0]
+
+
+def review(served, image_id):
+    return served.state.contact_detail(identifier(served, image_id))["contact"]["review"]
+
+
+def open_panel(served, **options):
+    """Select the first look and open its object."""
+    visit = served.visit(**options)
+    visit.page.click(f".row[data-id='{identifier(served, '0001')}']")
+    visit.wait_for_contact("0001")
+    visit.page.keyboard.press("Shift+O")
+    visit.until(TWO_TILES)
+    return visit
+
+
+def test_looks_are_drawn_north_up_and_not_mirrored(served):
+    store_two_looks(served)
+    visit = open_panel(served)
+    # The square is 1.1 m ahead of the centre along the track and 1.3 m further in range.
+    # Heading north, to starboard: further is east. Heading east, to port: ahead is east, further is north.
+    for image_id, (east_m, north_m) in (("0001", (1.3, 1.1)), ("0002", (1.1, 1.3))):
+        extent_m = float(visit.page.get_attribute("dialog.object", "data-scale"))
+        assert extent_m == pytest.approx(6.0)
+        x, y = visit.page.evaluate(BRIGHTEST, identifier(served, image_id))
+        assert (x * extent_m, y * extent_m) == pytest.approx((east_m, north_m), abs=0.15)
+    # Ordered by aspect: from the south (180°), from the west (270°).
+    order = visit.page.eval_on_selector_all(".tile", "tiles => tiles.map(tile => tile.dataset.id)")
+    assert order == [identifier(served, "0002"), identifier(served, "0001")]
+    assert visit.text(".aspects") == "Not seen from 280° to 170°"
+
+
+def test_one_verdict_for_all_looks(served):
+    store_two_looks(served)
+    visit = open_panel(served)
+    assert "for all 2 looks" in visit.text(".object-decision label")
+    visit.press("1")
+    visit.until("() => document.querySelectorAll('.tile .badge.mine_like').length === 2")
+    assert [review(served, one) for one in ("0001", "0002", "0003")] == ["mine_like", "mine_like", "unreviewed"]
+    # Without the box, a verdict applies to the selected look, and `o` selects another one.
+    visit.page.uncheck("#all-looks")
+    visit.press("o", "2")
+    visit.wait(".tile .badge.not_mine_like")
+    visit.wait(".contradiction")
+    assert [review(served, one) for one in ("0001", "0002")] == ["mine_like", "not_mine_like"]
+    visit.press("Escape")
+    visit.until("() => document.querySelectorAll('.row .mark.contradiction').length === 2")
+
+
+def test_separate_and_join_looks(served):
+    store_two_looks(served)
+    visit = open_panel(served)
+    visit.page.click(f"[data-id='{identifier(served, '0002')}'] .split")
+    visit.until("() => document.querySelectorAll('.tile').length === 1")
+    assert "Object, 1 look" in visit.text("#object-title")
+    visit.page.click(f"[data-merge='{identifier(served, '0003')}']")
+    visit.until(TWO_TILES)
+    assert visit.page.locator(f".tile[data-id='{identifier(served, '0003')}']").count() == 1
+    visit.page.click(f".tile[data-id='{identifier(served, '0003')}'] .image")
+    visit.wait_for_contact("0003")
+    assert visit.page.locator("dialog").count() == 0
+
+
+def test_observer_sees_the_object_only(served):
+    store_two_looks(served)
+    visit = open_panel(served, user="watch")
+    assert visit.page.locator(".split, [data-merge]").count() == 0
+    assert visit.page.locator(".object-decision button:enabled").count() == 0
+
+
+def test_decided_on_less_than_has_arrived(served):
+    served.state.store_image(image_record("0001", missing_rows=20))
+    visit = served.visit()
+    visit.wait_for_contact("0001")
+    contact = served.state.contact_detail(identifier(served, "0001"))
+    served.console.browser("bo").decide(contact["contact"]["id"], verdict="not_mine_like")
+    served.state.store_image(image_record("0001", version=2))
+    visit.page.click("[data-review='newer_detail']")
+    visit.until("() => document.querySelector('.row .newer')?.textContent === '○ on 100 B – 200 B are here'")  # noqa: RUF001
+
+
+def test_earlier_contacts_at_the_place(served):
+    served.state.store_image(image_record("0001", first_utc_s=FIRST_UTC_S - 3 * 86400.0))
+    served.state.store_image(image_record("0002"))
+    visit = served.visit()
+    visit.page.click(f".row[data-id='{identifier(served, '0002')}']")
+    visit.wait_for_contact("0002")
+    visit.wait("details[data-name=earlier]")
+    assert "uuv-1/0001" in visit.text("details[data-name=earlier]")
