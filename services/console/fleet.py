@@ -100,6 +100,17 @@ class FleetMonitor:
             link = self._links.get(vehicle_id)
             return None if link is None else link.loss()
 
+    def queue(self, vehicle_id: str) -> QueueState | None:
+        """Return the transmit queue of a vehicle; None if no recent one is known."""
+        with self._lock:
+            state, received_s = self._queues.get(vehicle_id, (None, 0.0))
+            return state if time.monotonic() - received_s <= self._stale_s else None
+
+    def vehicle_names(self) -> list[str]:
+        """Return the names of the vehicles of which frames or a transmit queue are known."""
+        with self._lock:
+            return sorted({*self._links, *self._queues})
+
     def queue_wait_s(self, vehicle_id: str, now_utc_s: float) -> float | None:
         """Return the time that the vehicle needs to send its present queue; None if unknown."""
         with self._lock:

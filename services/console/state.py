@@ -18,6 +18,7 @@ from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.events import EventHub
 from sonarpost.services.console.fleet import FleetMonitor, fleet_json
 from sonarpost.services.console.store import (
+    air_time,
     association,
     contacts,
     decisions,
@@ -351,10 +352,12 @@ class ConsoleState:
         """Whether requests reach a vehicle: through op_modem, or from a shore site through c2."""
         return self.config.role == "shore" or OP_MODEM in self.config.command_consumers
 
-    def _request_cost(self, row: sqlite3.Row, kind: CommandKind) -> RequestCost:
-        """Return the cost of a kind of request for a contact."""
-        is_new_image = kind in NEW_IMAGE_KINDS
+    def _request_cost(self, row: sqlite3.Row, kind: CommandKind, stream_bytes: object = None) -> RequestCost:
+        """Return the cost of a kind of request for a contact; `stream_bytes` is the length of a region's stream."""
+        is_new_image = kind in (*NEW_IMAGE_KINDS, "region")
         bytes_total = self._first_stream_bytes(row) if is_new_image else row["bytes_total"]
+        if isinstance(stream_bytes, int):
+            bytes_total = stream_bytes
         return request_cost(
             kind,
             downlink_rate=self.config.downlink_rate,
@@ -372,6 +375,19 @@ class ConsoleState:
             lengths = (decode_image(version).bytes_total for version in versions)
             return next((length for length in lengths if length), row["bytes_total"])
 
+    def _uplink_rate(self, vehicle_id: str) -> int | None:
+        return self.fleet.uplink_rate(vehicle_id, self.config.assumed_rate)
+
+    def air_time(self) -> Json:
+        """Return the images that vehicles still send, with cost and gain, and the air time that verdicts gave back."""
+        now = self.clock()
+        with self.database.read() as db:
+            vehicles = [
+                air_time.vehicle_json(db, name, self.fleet.queue(name), self._uplink_rate(name), now)
+                for name in self.fleet.vehicle_names()
+            ]
+            return {"vehicles": vehicles, "given_back": air_time.given_back_json(db)}
+
     def fleet_state(self) -> Json:
         """Return the present state of services and vehicles."""
         with self.database.read() as db:
@@ -388,6 +404,10 @@ class ConsoleState:
         with self.database.transaction() as db:
             states = self._delivery_states(db, contact_id)
             stored = decisions.add_decision(db, contact_id, entered, actor, self.clock(), states)
+            if entered.verdict in air_time.FINAL and states.vehicle != "none":
+                vehicle_id = contacts.find_contact(db, contact_id)["vehicle_id"]
+                queue, rate = self.fleet.queue(vehicle_id), self._uplink_rate(vehicle_id)
+                air_time.store_given_back(db, stored.decision_id, contact_id, queue, rate, self.clock())
         decision = self._publish_action("decision", contact_id, stored.decision_id)
         self._publish_other_looks(contact_id)
         for user in stored.notified:
@@ -491,8 +511,15 @@ class ConsoleState:
         shore, vehicle = ("waiting" if name in consumers else "none" for name in ("relay", "op_modem"))
         return DeliveryStates(shore, vehicle, self.config.take_back_s)
 
-    def add_request(self, contact_id: str, kind: CommandKind, airtime_s: float | None, actor: Actor) -> Json:
-        """Store a request to send; return it.
+    def add_request(
+        self,
+        contact_id: str,
+        kind: CommandKind,
+        airtime_s: float | None,
+        actor: Actor,
+        arguments: Mapping[str, object] | None = None,
+    ) -> Json:
+        """Store a request to send; return it. `arguments` are further fields of the command.
 
         Raises:
             BadInputError: The request is not possible, or one of this kind is in progress.
@@ -507,7 +534,8 @@ class ConsoleState:
                 airtime_s,
                 actor,
                 now,
-                cost=self._request_cost(row, kind),
+                cost=self._request_cost(row, kind, (arguments or {}).get("stream_bytes")),
+                arguments=arguments or {},
                 wait_s=self.fleet.queue_wait_s(row["vehicle_id"], now),
                 has_downlink=self._has_downlink,
             )

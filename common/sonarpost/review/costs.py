@@ -78,10 +78,9 @@ def request_cost(
         overhead_bytes: Header bytes in each frame.
     """
     downlink_s = RATES[downlink_rate].airtime_s
-    if kind == "revisit":
-        return RequestCost(
-            downlink_s, 0.0, 0, 0, f"one packet down at rate {downlink_rate}; the result is a new contact"
-        )
+    if kind in ("revisit", "prioritise"):
+        result = "the result is a new contact" if kind == "revisit" else "the images are sent in another order"
+        return RequestCost(downlink_s, 0.0, 0, 0, f"one packet down at rate {downlink_rate}; {result}")
     if uplink_rate is None:
         return RequestCost(downlink_s, None, None, None, "rate of the vehicle unknown: no frame received")
     if bytes_total == 0:
@@ -92,7 +91,7 @@ def request_cost(
     packets = packets_for(math.ceil(wanted_bytes / (1 - loss)), uplink_rate, overhead_bytes)
     size = (
         f"a new image of {total_bytes} bytes"
-        if kind in NEW_IMAGE_KINDS
+        if kind in (*NEW_IMAGE_KINDS, "region")
         else f"{wanted_bytes} of {total_bytes} bytes missing"
     )
     basis = f"latest rate {uplink_rate}, {size}"

@@ -136,6 +136,9 @@ CREATE TABLE IF NOT EXISTS notice (
     decision_id TEXT NOT NULL, by_decision_id TEXT NOT NULL, acknowledged_utc_s REAL);
 CREATE INDEX IF NOT EXISTS notice_open ON notice (user, id) WHERE acknowledged_utc_s IS NULL;
 CREATE INDEX IF NOT EXISTS decision_operator ON decision (operator, seq);
+CREATE TABLE IF NOT EXISTS given_back (
+    decision_id TEXT PRIMARY KEY, contact_id TEXT NOT NULL, bytes_left INTEGER NOT NULL, seconds REAL NOT NULL,
+    basis TEXT NOT NULL) WITHOUT ROWID;
 """
 """Tables and indexes that databases of version 0.2 do not have."""
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 import sqlite3
 from typing import Final, Literal
 
-from sonarpost.messages import Contact, ReconstructedImage
+from sonarpost import wire
+from sonarpost.codec.region import RegionBox
+from sonarpost.messages import Command, Contact, ReconstructedImage
 from sonarpost.services.console.store.serialisers import Json, contact_record_json, decode_image, version_json
 
-Relation = Literal["wider", "original"]
+Relation = Literal["wider", "original", "region"]
 """Kind of the request that the image answers."""
 
 EXPAND_FACTOR: Final = 2.0
@@ -39,6 +41,12 @@ def relation_of(image: ReconstructedImage, parent: ReconstructedImage) -> Relati
     is_same_size = all(abs(ratio - 1.0) <= SIZE_TOLERANCE for ratio in ratios)
     if is_same_size and parent.despeckle_strength and image.despeckle_strength == 0.0:
         return "original"
+    (height_px, width_px), (whole_height_px, whole_width_px) = (
+        (each.picture.height_px, each.picture.width_px) for each in (image, parent)
+    )
+    is_part = height_px <= whole_height_px and width_px <= whole_width_px
+    if is_same_size and is_part and (height_px, width_px) != (whole_height_px, whole_width_px):
+        return "region"
     return None
 
 
@@ -106,6 +114,19 @@ def related_images_json(db: sqlite3.Connection, contact_id: str) -> list[Json]:
                 "image_id": row["image_id"],
                 "record": contact_record_json(decode_image(versions[-1])),
                 "versions": [version_json(version) for version in versions],
+                "place_px": _place_of_region(db, contact_id, row["id"]) if row["relation"] == "region" else None,
             }
         )
     return found
+
+
+def _place_of_region(db: sqlite3.Connection, contact_id: str, region_id: str) -> list[int] | None:
+    """Return first row and column, last row + 1 and column + 1 of a region in its contact; None if unknown."""
+    request = db.execute(
+        "SELECT payload FROM request WHERE contact_id = ? AND result_contact = ?", (contact_id, region_id)
+    ).fetchone()
+    if request is None:
+        return None
+    command = wire.decode(Command, bytes(request["payload"]), f"request about {contact_id}")
+    whole = db.execute("SELECT height_px, width_px FROM contact WHERE id = ?", (contact_id,)).fetchone()
+    return None if command.box is None else [*RegionBox(*command.box).pixels(whole["height_px"], whole["width_px"])]

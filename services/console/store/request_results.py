@@ -7,6 +7,9 @@ import statistics
 from dataclasses import asdict, dataclass
 from typing import Final
 
+from sonarpost import wire
+from sonarpost.codec.region import RegionBox
+from sonarpost.messages import Command
 from sonarpost.review.costs import NEW_IMAGE_KINDS, RequestCost
 from sonarpost.services.console.store.serialisers import Json
 
@@ -41,7 +44,7 @@ def expected_times(
 
     The result of a `revisit` depends on the track of the vehicle: it has no expected time.
     """
-    if kind == "revisit":
+    if kind in ("revisit", "prioritise"):
         return ExpectedTimes()
     if cost.airtime_s is None:
         return ExpectedTimes(late_utc_s=now_utc_s + UNKNOWN_COST_LATE_S)
@@ -128,6 +131,10 @@ def _result_of(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite3.Ro
     kind, base_bytes = request["kind"], request["base_bytes"] or 0
     if kind == "revisit":
         return _revisit_result(db, request, contact)
+    if kind == "prioritise":
+        return None
+    if kind == "region":
+        return _region_result(db, request, contact)
     if kind in NEW_IMAGE_KINDS:
         row = db.execute(
             "SELECT id, version, bytes_received, complete FROM contact WHERE parent = ? AND relation = ?"
@@ -143,6 +150,20 @@ def _result_of(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite3.Ro
         # Bytes up to the length announced at the time of the request were coming without it.
         is_whole = is_whole and contact["bytes_received"] > max(base_bytes, request["base_total"] or 0)
     return _Result(contact["id"], contact["version"], more_bytes, is_whole) if more_bytes > 0 or is_whole else None
+
+
+def _region_result(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite3.Row) -> _Result | None:
+    """Return the first image of the size of the requested region that answers no other request."""
+    command = wire.decode(Command, bytes(request["payload"]), f"request {request['command_id']}")
+    assert command.box is not None
+    top, left, bottom, right = RegionBox(*command.box).pixels(contact["height_px"], contact["width_px"])
+    row = db.execute(
+        "SELECT id, version, bytes_received, complete FROM contact WHERE parent = ? AND relation = 'region'"
+        " AND height_px = ? AND width_px = ? AND arrived_utc_s >= ? AND id NOT IN (SELECT result_contact FROM request"
+        " WHERE result_contact IS NOT NULL AND command_id <> ?) ORDER BY arrived_utc_s LIMIT 1",
+        (contact["id"], bottom - top, right - left, request["asked_utc_s"], request["command_id"]),
+    ).fetchone()
+    return None if row is None else _Result(row["id"], row["version"], row["bytes_received"], bool(row["complete"]))
 
 
 def _revisit_result(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite3.Row) -> _Result | None:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import sqlite3
 import uuid
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
+
+from pydantic import ValidationError
 
 from sonarpost import wire
 from sonarpost.codec.registry import default_registry
@@ -23,6 +26,7 @@ from sonarpost.services.console.store.database import (
 )
 from sonarpost.services.console.store.request_results import request_columns
 from sonarpost.services.console.store.serialisers import Json
+from sonarpost.wire import first_error
 
 REQUEST_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider", "original")
 """Kinds in the order of the page. `wider` is displayed as "expand", `original` as "unfiltered image"."""
@@ -153,6 +157,7 @@ def add_request(
     cost: RequestCost,
     wait_s: float | None,
     has_downlink: bool,
+    arguments: Mapping[str, object],
 ) -> str:
     """Store a request; return its identifier.
 
@@ -166,6 +171,7 @@ def add_request(
         cost: The present estimate.
         wait_s: Time that the vehicle needs for its present queue; None if unknown.
         has_downlink: Whether this console can send requests to vehicles.
+        arguments: Further fields of the command: `box` and `stream_bytes`, or `place`.
 
     Raises:
         BadInputError: The request is not possible, or one of this kind has no result yet.
@@ -174,19 +180,23 @@ def add_request(
     if obstacle := find_obstacle(db, row, kind, now_utc_s, has_downlink=has_downlink):
         raise BadInputError("request", "kind", kind, f"another kind: {obstacle.text}")
     earlier = db.execute("SELECT * FROM request WHERE contact_id = ? AND kind = ?", (contact_id, kind))
-    if any(is_pending(request, now_utc_s) for request in earlier):
+    if kind != "region" and any(is_pending(request, now_utc_s) for request in earlier):
         raise BadInputError("request", "kind", kind, "a kind without a request in progress")
     has_position = kind == "revisit"
-    record = Command(
-        command_id=f"c-{uuid.uuid4().hex}",
-        kind=kind,
-        vehicle_id=row["vehicle_id"],
-        image_id=row["image_id"],
-        lat_deg=row["lat_deg"] if has_position else None,
-        lon_deg=row["lon_deg"] if has_position else None,
-        issued_by=actor.user,
-        issued_utc_s=now_utc_s,
-    )
+    fields = {
+        "command_id": f"c-{uuid.uuid4().hex}",
+        "kind": kind,
+        "vehicle_id": row["vehicle_id"],
+        "image_id": row["image_id"],
+        "lat_deg": row["lat_deg"] if has_position else None,
+        "lon_deg": row["lon_deg"] if has_position else None,
+        "issued_by": actor.user,
+        "issued_utc_s": now_utc_s,
+    }
+    try:
+        record = Command.model_validate({**fields, **arguments})
+    except ValidationError as error:
+        raise BadInputError("request", *first_error(error)) from error
     values: Json = {
         "command_id": record.command_id,
         "contact_id": contact_id,
@@ -202,7 +212,7 @@ def add_request(
         **request_columns(db, row, kind, cost, wait_s, now_utc_s),
     }
     insert_row(db, "request", values)
-    detail = {"command_id": record.command_id, "kind": kind, "airtime_s": airtime_s}
+    detail = {"command_id": record.command_id, "kind": kind, "airtime_s": airtime_s, **arguments}
     add_audit_entry(db, contact_id, actor, "request", now_utc_s, DisplayedImage(row["version"]), detail)
     return record.command_id
 

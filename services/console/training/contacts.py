@@ -14,6 +14,7 @@ import numpy.typing as npt
 from sonarpost.codec import emb
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import Codec, DecodedImage, StreamHeader
+from sonarpost.codec.region import RegionBox
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.codec import VqCodec
 from sonarpost.link.frames.paper.frame import format_image_id
@@ -102,6 +103,20 @@ class SimulatedContact:
             return None
         codec = EmbCodec(strength=0.0)
         return replace(self, image_id=image_id, versions=_versions(codec, self.snippet, incomplete=False), codec=codec)
+
+    def region(self, image_id: str, box: RegionBox, stream_bytes: int) -> SimulatedContact:
+        """Return an image of a part of the contact.
+
+        Args:
+            image_id: Identifier of the new image.
+            box: The part.
+            stream_bytes: Length of the stream, for a codec with a budget.
+        """
+        top, left, bottom, right = box.pixels(*self.snippet.shape)
+        part = self.snippet[top:bottom, left:right]
+        stream = self.codec.encode(part, stream_bytes if isinstance(self.codec, EmbCodec) else None)
+        version = ImageVersion(len(stream), len(stream), 1, self.codec.decode(stream))
+        return replace(self, image_id=image_id, versions=(version,), snippet=part, expanded_snippet=None)
 
     def with_next_version(self, *, refine: bool) -> SimulatedContact:
         """Return the contact with one more, complete version; with `refine`, of a stream of twice the length."""

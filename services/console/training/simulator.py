@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from sonarpost import keys, wire
+from sonarpost.codec.region import RegionBox
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.messages import (
     AcousticFrame,
@@ -90,6 +91,8 @@ class TrainingSimulator:
         self._cache: dict[str, _Transfer] = {}
         # Identifiers of the new images that commands have requested, by kind and image of the command.
         self._requested: dict[tuple[str, str], str] = {}
+        self._requested_images = 0
+        self._stopped: dict[str, _Transfer] = {}
         self._downlink: list[_DownlinkRecord] = []
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="training", daemon=True)
@@ -180,11 +183,19 @@ class TrainingSimulator:
         requested = command.kind, image_id
         # A repeated command for a new image sends this image again.
         cached = self._cache.get(self._requested.get(requested, image_id))
+        if command.kind == "prioritise":
+            self._prioritise(command)
+            return
         if cached is None or command.kind == "revisit":
             return
+        if command.kind == "region":
+            assert command.box is not None
+            assert command.stream_bytes is not None
+            part = cached.simulated.region(self._new_image_id(), RegionBox(*command.box), command.stream_bytes)
+            self._transfers.append(_Transfer(part, now_utc_s))
+            return
         if command.kind in NEW_IMAGE_KINDS and requested not in self._requested:
-            # Identifiers of requested images count down from the last one, those of contacts count up.
-            new_id = format_image_id(-1 - len(self._requested))
+            new_id = self._new_image_id()
             simulated = cached.simulated
             new = simulated.expanded(new_id) if command.kind == "wider" else simulated.unfiltered(new_id)
             if new is not None:
@@ -193,6 +204,25 @@ class TrainingSimulator:
             return
         refined = cached.simulated.with_next_version(refine=command.kind == "refine")
         self._transfers.append(_Transfer(refined, cached.first_frame_utc_s, len(refined.versions) - 1))
+
+    def _new_image_id(self) -> str:
+        """Return the identifier of a requested image: they count down from the last one, those of contacts up."""
+        self._requested_images += 1
+        return format_image_id(-self._requested_images)
+
+    def _prioritise(self, command: Command) -> None:
+        for transfer in [t for t in self._transfers if t.simulated.image_id == command.image_id]:
+            self._transfers.remove(transfer)
+            self._transfers.insert(0 if command.place == "first" else len(self._transfers), transfer)
+
+    def _stop_or_resume(self, decision: Decision) -> None:
+        """Stop the image of a final verdict, or queue the rest of it after a withdrawal, as a vehicle does."""
+        if decision.verdict != "unsure":
+            for transfer in [t for t in self._transfers if t.simulated.image_id == decision.image_id]:
+                self._transfers.remove(transfer)
+                self._stopped[decision.image_id] = transfer
+        elif decision.image_id in self._stopped:
+            self._transfers.append(self._stopped.pop(decision.image_id))
 
     def _comment(self, record: ReconstructedImage) -> Advice:
         """Return a comment of a simulated expert at the shore site."""
@@ -306,6 +336,8 @@ class TrainingSimulator:
                 self._downlink.remove(item)
                 if isinstance(item.record, Command):
                     self._execute_command(item.record, now_utc_s)
+                else:
+                    self._stop_or_resume(item.record)
 
 
 def _downlink_state(record: Decision | Command, step: DownlinkStep, now_utc_s: float) -> DownlinkState:

@@ -11,7 +11,16 @@ from pydantic import BaseModel, Field
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from sonarpost.messages import Advice, CommandKind, ReconstructedImage, Verdict
+from sonarpost.messages import (
+    MIN_REGION_BYTES,
+    Advice,
+    BoxEnd,
+    BoxStart,
+    CommandKind,
+    QueuePlace,
+    ReconstructedImage,
+    Verdict,
+)
 from sonarpost.review import rendering, true_scale
 from sonarpost.review.measurement import Line, MeasurementKind
 from sonarpost.review.rendering import LAYERS, MAPS
@@ -19,6 +28,9 @@ from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import ContactFilter, NotFoundError
 from sonarpost.services.console.store.database import Permission
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call, RequestBody
+
+MAX_REGION_BYTES = 512
+"""Longest stream of a region: what a vehicle sends of an image without a further command by default."""
 
 Version = Annotated[int, Field(ge=1, le=2**31)]
 Layer = Annotated[str, Field(max_length=20)]
@@ -47,6 +59,9 @@ class _MeasureBody(RequestBody):
 class _RequestBody(RequestBody):
     kind: CommandKind
     airtime_s: Annotated[float, Field(ge=0, le=1e6)] | None = None
+    box: tuple[BoxStart, BoxStart, BoxEnd, BoxEnd] | None = None
+    stream_bytes: Annotated[int, Field(ge=MIN_REGION_BYTES, le=MAX_REGION_BYTES)] | None = None
+    place: QueuePlace | None = None
 
 
 class _ImageQuery(BaseModel):
@@ -153,7 +168,9 @@ class ContactRoutes:
 
     def _add_request(self, call: Call) -> Response:
         body = call.parse_body(_RequestBody)
-        return JSONResponse(self._state.add_request(contact_id(call), body.kind, body.airtime_s, call.actor), 201)
+        arguments = body.model_dump(include={"box", "stream_bytes", "place"}, exclude_none=True)
+        found = self._state.add_request(contact_id(call), body.kind, body.airtime_s, call.actor, arguments)
+        return JSONResponse(found, 201)
 
     def _add_advice(self, call: Call) -> Response:
         body = call.parse_body(AdviceBody)

@@ -36,6 +36,7 @@ from sonarpost.services.console.web.access import (
     SecurityMiddleware,
     error_response,
 )
+from sonarpost.services.console.web.airtime_routes import AirTimeRoutes
 from sonarpost.services.console.web.connections import (
     CHECK_INTERVAL_S,
     ConnectionDeadlines,
@@ -82,6 +83,7 @@ class ConsoleApp:
             *sessions.routes(access),
             *SettingsRoutes(users).routes(access),
             *ContactRoutes(state).routes(access),
+            *AirTimeRoutes(state).routes(access),
             *DecisionRoutes(state).routes(access),
             *ObjectRoutes(state).routes(access),
             *self._map.routes(access),
