@@ -103,6 +103,7 @@ export const api = {
   costs: (id) => request("GET", `${contactPath(id)}/costs`),
   request: (id, body) => request("POST", `${contactPath(id)}/requests`, body),
   advise: (id, body) => request("POST", `${contactPath(id)}/advice`, body),
+  airTime: () => request("GET", "/api/airtime"),
   fleet: () => request("GET", "/api/fleet"),
   score: () => request("GET", "/api/score"),
   mission: () => request("GET", "/api/mission"),

@@ -21,6 +21,7 @@ import { MissionView } from "./mission_view.js";
 import { openObject, watchObject } from "./object_view.js";
 import { Queue } from "./queue.js";
 import { QueueFilters } from "./queue_filters.js";
+import { startRegion } from "./region_request.js";
 import { openRequestDialog } from "./request_dialog.js";
 import { loadSettings } from "./settings.js";
 import { openSettings } from "./settings_dialog.js";
@@ -86,6 +87,7 @@ class App {
     for (const name of ["decision", "request", "advice", "changed"]) listen(name, ({ id }) => changed(id));
     // Without events, what was loaded in advance can be old.
     listen("online", () => this.loader.clear());
+    listen("region", () => this.region());
     listen("reload", () => { this.loader.clear(); this.reload(); });
     listen("theme", () => this.view.redraw());
     listen("session", () => location.assign("/login"));
@@ -300,6 +302,8 @@ class App {
     if (this.view.measurement.active) this.view.measurement.setPoint().then((stored) => stored?.id && this.load());
     else this.submit();
   }
+
+  region() { if (this.detail) startRegion(this.view, this.detail); }
 
   async request() {
     if (this.detail) await openRequestDialog(this.detail.contact);

@@ -1,6 +1,7 @@
 // Link and fleet: present state of vehicles and services, with the age of each value.
 
 import { age, date } from "./ages.js";
+import { AirTimePanel } from "./airtime_panel.js";
 import { fill, h } from "./dom.js";
 import { DASH, bytes, duration, percent, position, quantity, time } from "./format.js";
 import { listen, now, state } from "./state.js";
@@ -92,11 +93,12 @@ export class FleetView {
     this.services = h("tbody", {});
     this.frameList = h("ol", { class: "frames number", "aria-label": t("fleet.received") });
     this.frames = [];
+    this.airTime = new AirTimePanel();
     this.element = h("section", { class: "fleet hidden", tabindex: 0, "aria-label": t("fleet.title") },
       h("div", {}, h("h2", { text: t("fleet.vehicles") }), this.vehicles),
       h("div", {}, h("h2", { text: t("fleet.services") }),
         h("table", {}, h("thead", {}, h("tr", {}, ["platform", "service", "state", "last_report", "detail"].map((name) => h("th", { scope: "col", text: t(`fleet.column.${name}`) })))), this.services),
-        h("h2", { text: t("fleet.received") }), this.frameList));
+        this.airTime.element, h("h2", { text: t("fleet.received") }), this.frameList));
     listen("fleet", () => this.render());
     listen("frame", (frame) => { this.frames = [frame, ...this.frames].slice(0, MAX_FRAMES); });
     setInterval(() => this.render(), 1000);

@@ -5,6 +5,7 @@ import { fill, h } from "./dom.js";
 import { received, time } from "./format.js";
 import { MAPS } from "./image_data.js";
 import { ORIENTATIONS } from "./image_projection.js";
+import { emit } from "./state.js";
 import { t } from "./texts.js";
 
 export const COMPARE_MODES = ["off", "versions", "layers"];
@@ -79,6 +80,7 @@ function drawOptions(view) {
     toggle("smooth", "d", smooth, () => view.toggleSmooth()),
     toggle("ground", "b", display.ground && ground, () => view.toggleGround(), ground ? {} : { "aria-disabled": "true", class: "locked" }),
     menu("view", "v", ORIENTATIONS, orientation, (name) => view.setOrientation(name), disabled),
+    h("button", { type: "button", title: `${t("region_request.key")} (7)`, data: { tool: "region" }, on: { click: () => emit("region") } }, t("region_request.button"), " ", h("kbd", { text: "7" })),
     toggle("loupe", "'", view.loupeOn, () => view.toggleLoupe()),
   ]);
 }

@@ -54,6 +54,7 @@ export function shortcutTable({ app, queue, view, decision, map }) {
       [["4"], "keys.length", () => view.startMeasurement("length"), review],
       [["5"], "keys.width", () => view.startMeasurement("width"), review],
       [["6"], "keys.shadow", () => view.startMeasurement("shadow"), review],
+      [["7"], "region_request.key", () => app.region(), review],
       [["+", "="], "shortcuts.image.zoom_in", () => view.zoom(1.5), review],
       [["-"], "shortcuts.image.zoom_out", () => view.zoom(1 / 1.5), review],
       [["0"], "shortcuts.image.whole", () => view.fit(), review],
