@@ -8,7 +8,7 @@ expected entropy of the verdict after it is
 
 and the gain of the bytes that are left is H(p, d'(received)) - H(p, d'(received + left)). d'(b) = sqrt(2) *
 Phi^-1(AUC(b)) is that of the binormal model. AUC(b) is the recognition of targets in images of 80 x 80 px decoded from
-b bytes, codec emb with the default grain: docs/research/codecs.md, "Recognition" (`python -m research.recognition`). The
+b bytes, codec emb, default grain: docs/research/codecs.md, "Recognition" (`python -m research.recognition`). The
 measured differences above 64 bytes are within the intervals, so the gain of a second there is small.
 """
 

@@ -180,7 +180,7 @@ def add_request(
     if obstacle := find_obstacle(db, row, kind, now_utc_s, has_downlink=has_downlink):
         raise BadInputError("request", "kind", kind, f"another kind: {obstacle.text}")
     earlier = db.execute("SELECT * FROM request WHERE contact_id = ? AND kind = ?", (contact_id, kind))
-    if kind != "region" and any(is_pending(request, now_utc_s) for request in earlier):
+    if kind not in ("region", "prioritise") and any(is_pending(request, now_utc_s) for request in earlier):
         raise BadInputError("request", "kind", kind, "a kind without a request in progress")
     has_position = kind == "revisit"
     fields = {

@@ -63,9 +63,9 @@ def test_box_on_the_image_requests_a_region(served):
     layer.wait_for()
     box = layer.bounding_box()
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    page.mouse.move(middle[0] - 20, middle[1] - 20)
+    page.mouse.move(middle[0] - 60, middle[1] - 60)
     page.mouse.down()
-    page.mouse.move(middle[0] + 20, middle[1] + 20)
+    page.mouse.move(middle[0] + 60, middle[1] + 60)
     page.mouse.up()
     page.get_by_role("dialog").get_by_text("smallest detail").wait_for()
     page.get_by_role("button", name="Send request").click()
