@@ -34,6 +34,7 @@ _EMB_TABLE: Final = (
 )
 """(bytes a pixel, smallest detail in pixels)."""
 _LEAST_DETAIL_PX: Final = 1.0
+_TILE_LIMIT: Final = 0.015
 
 
 def detail_px(codec: str, bytes_received: int, pixels: int) -> float | None:
@@ -51,6 +52,18 @@ def detail_px(codec: str, bytes_received: int, pixels: int) -> float | None:
     densities, widths = zip(*_EMB_TABLE, strict=True)
     width = float(np.interp(math.log(bytes_received / pixels), np.log(densities), widths))
     return max(_LEAST_DETAIL_PX, width)
+
+
+def codebook_edge_px(total_bytes: int, pixels: int) -> int:
+    """Return how far an edge can be displaced in an image of codebook entries, in pixels: the side of a tile.
+
+    The codebooks have tiles of 10 px (0.0175 bytes a pixel and more) and of 20 px (0.0125 bytes a pixel and less).
+
+    Args:
+        total_bytes: Length of the stream.
+        pixels: Number of pixels of the image.
+    """
+    return 10 if total_bytes / max(1, pixels) > _TILE_LIMIT else 20
 
 
 def sharp_to_m(image: ReconstructedImage) -> float | None:

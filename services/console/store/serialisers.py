@@ -14,7 +14,7 @@ from sonarpost.review.costs import airtime_of_frames, least_airtime_s
 from sonarpost.review.edge_blur import edge_sigma_px
 from sonarpost.review.image_geometry import contact_box, contact_mark, range_axis
 from sonarpost.review.rendering import LAYERS
-from sonarpost.review.resolution import CODEBOOK_CODECS, sharp_to_m
+from sonarpost.review.resolution import CODEBOOK_CODECS, codebook_edge_px, sharp_to_m
 from sonarpost.services.console.store.database import Table
 
 Json = dict[str, object]
@@ -191,6 +191,8 @@ def version_json(row: sqlite3.Row, refine_base: int | None = None) -> Json:
     """Return an image version; `refine_base`: see `stage_of`."""
     image = decode_image(row)
     contact = image.contact
+    has_codebook = image.codec in CODEBOOK_CODECS
+    pixels = image.picture.height_px * image.picture.width_px
     percent = percent_received(image) if image.complete or image.bytes_total else None
     size = image.picture.height_px, image.picture.width_px
     return {
@@ -218,7 +220,10 @@ def version_json(row: sqlite3.Row, refine_base: int | None = None) -> Json:
         **_mark_json(image),
         "edge_sigma_px": edge_sigma_px(image.codec, image.bytes_received, size[0] * size[1]) if image.codec else None,
         "notes": list(image.notes),
-        "texture": "codebook" if image.codec in CODEBOOK_CODECS else None,
+        "texture": "codebook" if has_codebook else None,
+        "texture_edge_px": codebook_edge_px(image.bytes_total or image.bytes_received, pixels)
+        if has_codebook
+        else None,
         "layers": [asdict(layer) for layer in LAYERS],
     }
 

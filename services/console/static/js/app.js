@@ -22,6 +22,7 @@ import { openObject, watchObject } from "./object_view.js";
 import { Queue } from "./queue.js";
 import { QueueFilters } from "./queue_filters.js";
 import { startRegion } from "./region_request.js";
+import { RequestButtons } from "./request_buttons.js";
 import { openRequestDialog } from "./request_dialog.js";
 import { loadSettings } from "./settings.js";
 import { openSettings } from "./settings_dialog.js";
@@ -45,6 +46,7 @@ class App {
     this.decision = new DecisionForm(this.view, this.status, (name, hold) => this.#pressed(name, hold));
     this.details = new ContactDetails();
     this.known = new KnownObject();
+    this.requests = new RequestButtons(() => this.request());
     this.queue = new Queue();
     this.filters = new QueueFilters(debounce(() => this.queue.show(this.filters.query), 120));
     listen("fleet", (fleet) => { state.fleet = fleet; }); // first listener: the others read the state
@@ -55,7 +57,7 @@ class App {
     this.activeView = "review";
     this.requestNumber = 0; // last request for a contact
     this.displayedNumber = 0; // request whose response is displayed
-    this.panel = h("div", { class: "panel", role: "region", "aria-label": t("app.decision") }, this.decision.element, this.known.element, this.details.element);
+    this.panel = h("div", { class: "panel", role: "region", "aria-label": t("app.decision") }, this.decision.element, this.requests.element, this.known.element, this.details.element);
     this.drawer = new Drawer(this.panel);
     this.review = h("section", { class: "review", "aria-label": t("app.review") },
       h("div", { class: "side" }, this.filters.element, this.queue.element), this.view.element, this.panel, this.empty.element);
@@ -186,6 +188,7 @@ class App {
     this.decision.show(detail);
     this.known.show(detail);
     this.details.show(detail);
+    this.requests.show(detail);
     this.queue.mark(id);
     history.replaceState(null, "", `#${encodeURIComponent(id)}`);
     if (state.online) this.loader.prefetch(this.queue.following(id, PREFETCHED_ROWS).map((row) => row.id));
@@ -218,6 +221,7 @@ class App {
     this.decision.show(detail);
     this.known.show(detail);
     this.details.show(detail);
+    this.requests.show(detail);
   }
 
   show(name) {

@@ -3,10 +3,11 @@
 import { api } from "./api.js";
 import { decisionText } from "./decision_form.js";
 import { fill, h } from "./dom.js";
-import { DASH, authentication, duration, position, probabilities, quantity, received, requestKind, time, verdict } from "./format.js";
+import { DASH, authentication, layerName, position, probabilities, quantity, received, time, verdict } from "./format.js";
 import { measurementLine } from "./measurement.js";
 import { openObject } from "./object_view.js";
-import { emit } from "./state.js";
+import { requestState, requestTitle } from "./request_state.js";
+import { emit, now } from "./state.js";
 import { t } from "./texts.js";
 
 const section = (name, title, count, children, open = true) => h("details", { data: { name }, open },
@@ -14,37 +15,33 @@ const section = (name, title, count, children, open = true) => h("details", { da
 
 function commentList(advice) {
   return h("ul", {}, advice.map((one) => h("li", { class: "advice" },
-    h("p", {}, h("b", { text: one.author }), ` ${time(one.advised_utc_s)}, on version ${one.version}`),
+    h("p", {}, h("b", { text: one.author }), ` ${t("contact_details.on_version", { time: time(one.advised_utc_s), version: one.version })}`),
     one.verdict || one.mlo_class ? h("p", {}, h("b", { text: one.verdict ? decisionText(one) : one.mlo_class })) : null,
     one.remark ? h("p", { text: one.remark }) : null,
-    one.delivery ? h("p", { class: "muted", text: `to the vessel: ${one.delivery.state} ${one.delivery.reason}` }) : null)));
+    one.delivery ? h("p", { class: "muted", text: t("contact_details.to_vessel", { state: t(`contact_details.delivery.${one.delivery.state}`), reason: one.delivery.reason }) }) : null)));
 }
 
-const REQUEST_STATES = {
-  waiting: "waiting on this platform", asked: "waiting for the modem", sent: "sent, not confirmed", confirmed: "on the vehicle",
-  refused: "refused", expired: "not confirmed in time", delivered: "on the vessel",
-};
-
-function requestList(requests) {
-  return h("ul", {}, requests.map((one) => h("li", {},
-    h("p", {}, h("b", { text: requestKind(one.kind) }), ` ${time(one.asked_utc_s)} by ${one.user}, ${one.airtime_s === null ? "cost unknown" : `≈ ${duration(one.airtime_s)} of air time`}`),
-    h("p", { class: ["refused", "expired"].includes(one.state) ? "bad" : one.state === "confirmed" ? "good" : "" },
-      `${REQUEST_STATES[one.state] ?? one.state}${one.times_sent ? `, sent ${one.times_sent}×` : ""}${one.reason ? `: ${one.reason}` : ""}`))));
+function requestList(requests, vehicle) {
+  return h("ul", {}, requests.map((one) => {
+    const { kind, detail } = requestTitle(one);
+    const { text, tone } = requestState(one, vehicle, now());
+    return h("li", {}, h("p", {}, h("b", { text: kind }), ` ${detail}`), h("p", { class: tone, text }));
+  }));
 }
 
 function measurementList(measurements) {
   return h("ul", {}, measurements.map((one) => h("li", { class: one.withdrawn_utc_s === null ? "" : "undone" },
     h("p", {}, h("b", { text: measurementLine(one).text })),
-    one.height_inputs ? h("p", { class: "muted number", text: `height = shadow × altitude / (slant range + shadow), with ${quantity(one.height_inputs.altitude_m, "m")} and ${quantity(one.height_inputs.slant_range_m, "m")}` }) : null,
+    one.height_inputs ? h("p", { class: "muted number", text: t("contact_details.height_formula", { altitude: quantity(one.height_inputs.altitude_m, "m"), range: quantity(one.height_inputs.slant_range_m, "m") }) }) : null,
     one.note ? h("p", { class: "muted", text: one.note }) : null,
-    h("p", { class: "muted", text: `${one.user}, ${time(one.utc_s)}, version ${one.version}, ${one.layer}` }))));
+    h("p", { class: "muted", text: t("contact_details.measured_by", { user: one.user, time: time(one.utc_s), version: one.version, layer: layerName(null, one.layer) }) }))));
 }
 
 function lookList(group, id) {
   return h("ul", {}, group.filter((row) => row.id !== id).map((row) => h("li", {},
     h("button", { type: "button", class: "look", on: { click: () => emit("select", { id: row.id }) } },
       row.has_picture ? h("img", { src: row.thumbnail, alt: "" }) : null,
-      h("span", {}, h("b", { text: row.name }), ` ${verdict(row.review)}, ${received(row)} received, ${time(row.seen_utc_s ?? row.first_frame_utc_s, { date: true })}`)))));
+      h("span", {}, h("b", { text: row.name }), ` ${verdict(row.review)}, ${received(row)}, ${time(row.seen_utc_s ?? row.first_frame_utc_s, { date: true })}`)))));
 }
 
 function decisionList(decisions) {
@@ -57,20 +54,20 @@ function recordFacts(contact, record) {
   const r = record ?? {};
   const rows = [
     ["position", position(contact.lat_deg, contact.lon_deg)], ["detected", time(contact.seen_utc_s, { date: true })],
-    ["detector", [contact.atd_class, contact.atd_confidence === null ? null : `${contact.atd_confidence.toFixed(2)} of 2`].filter(Boolean).join(", ") || DASH],
+    ["detector", [contact.atd_class, contact.atd_confidence === null ? null : t("contact_details.of_two", { value: contact.atd_confidence.toFixed(2) })].filter(Boolean).join(", ") || DASH],
     ...(probabilities(contact) ? [["probabilities", probabilities(contact)]] : []),
-    ["size (detector)", [quantity(r.length_m, "m"), quantity(r.width_m, "m")].join(" × ")], ["shadow, height (detector)", `${quantity(r.shadow_m, "m")}, ${quantity(r.height_m, "m")}`],
-    ["slant, ground range", `${quantity(r.slant_range_m, "m")}, ${quantity(r.ground_range_m, "m")}`], ["altitude, depth", `${quantity(r.altitude_m, "m")}, ${quantity(r.depth_m, "m")}`],
-    ["heading, speed", `${quantity(r.heading_deg, "°", 0)}, ${quantity(r.speed_mps, "m/s")}`], ["side", r.channel ?? DASH], ["pixel along × across", `${quantity(r.pixel_along_m, "m", 3)} × ${quantity(r.pixel_across_m, "m", 3)}`],
-    ["line, ping", `${r.line_name ?? DASH}, ${r.ping_number ?? DASH}`], ["sonar", r.sonar_id ?? DASH], ["acoustic frames", authentication(contact) ?? DASH], ["identifier", contact.id],
+    ["size", [quantity(r.length_m, "m"), quantity(r.width_m, "m")].join(" × ")], ["shadow", `${quantity(r.shadow_m, "m")}, ${quantity(r.height_m, "m")}`],
+    ["range", `${quantity(r.slant_range_m, "m")}, ${quantity(r.ground_range_m, "m")}`], ["altitude", `${quantity(r.altitude_m, "m")}, ${quantity(r.depth_m, "m")}`],
+    ["heading", `${quantity(r.heading_deg, "°", 0)}, ${quantity(r.speed_mps, "m/s")}`], ["side", r.channel ?? DASH], ["pixel", `${quantity(r.pixel_along_m, "m", 3)} × ${quantity(r.pixel_across_m, "m", 3)}`],
+    ["line", `${r.line_name ?? DASH}, ${r.ping_number ?? DASH}`], ["sonar", r.sonar_id ?? DASH], ["frames", authentication(contact) ?? DASH], ["id", contact.id],
   ];
-  return h("dl", { class: "facts number" }, rows.map(([name, value]) => [h("dt", { text: name }), h("dd", { text: value })]));
+  return h("dl", { class: "facts number" }, rows.map(([name, value]) => [h("dt", { text: t(`contact_details.fact.${name}`) }), h("dd", { text: value })]));
 }
 
 function auditList(audit) {
   return h("ul", {}, audit.slice().reverse().map((one) => h("li", {},
     h("p", {}, h("b", { text: `${one.action}` }), ` ${time(one.utc_s, { date: true })}, ${one.user} (${one.role}), ${one.address}`),
-    one.version === null ? null : h("p", { class: "muted" }, `displayed: version ${one.version}, ${one.layer ?? "raw"}, `, h("code", { text: (one.sha256 ?? "").slice(0, 12) })))));
+    one.version === null ? null : h("p", { class: "muted" }, `${t("contact_details.displayed", { version: one.version, layer: layerName(null, one.layer ?? "raw") })} `, h("code", { text: (one.sha256 ?? "").slice(0, 12) })))));
 }
 
 export class ContactDetails {
@@ -90,15 +87,15 @@ export class ContactDetails {
     const part = (name, title, count, make, open = true) => (count > 0 ? section(name, title, count, make(), this.open.get(name) ?? open) : null);
     fill(this.element,
       // Before the decision, comments are folded, so that they do not influence it.
-      part("advice", "Comments from the shore site", advice.length, () => commentList(advice), contact.review !== "unreviewed"),
-      part("requests", "Requests", requests.length, () => requestList(requests)),
-      part("measurements", "Measurements", measurements.length, () => measurementList(measurements)),
-      part("looks", "Other looks at this position", contact.looks - 1, () => [
+      part("advice", t("contact_details.comments"), advice.length, () => commentList(advice), contact.review !== "unreviewed"),
+      part("requests", t("contact_details.requests"), requests.length, () => requestList(requests, contact.vehicle_id)),
+      part("measurements", t("contact_details.measurements"), measurements.length, () => measurementList(measurements)),
+      part("looks", t("contact_details.looks"), contact.looks - 1, () => [
         h("button", { type: "button", on: { click: () => openObject(contact) } }, `${t("object.key")} `, h("kbd", { text: "O" })), lookList(group, contact.id)]),
       part("earlier", t("object.earlier"), earlier.length, () => lookList(earlier, contact.id)),
-      decisions.length > 1 ? section("decisions", "Decisions", decisions.length, decisionList(decisions), this.open.get("decisions") ?? false) : null,
-      section("record", "Contact record", 0, recordFacts(contact, record), this.open.get("record")),
-      section("audit", "Audit", audit.length, auditList(audit), this.open.get("audit")),
-      h("p", {}, h("a", { href: api.reportUrl(contact.id), target: "_blank", rel: "noopener" }, "printable report")));
+      decisions.length > 1 ? section("decisions", t("contact_details.decisions"), decisions.length, decisionList(decisions), this.open.get("decisions") ?? false) : null,
+      section("record", t("contact_details.record"), 0, recordFacts(contact, record), this.open.get("record")),
+      section("audit", t("contact_details.audit"), audit.length, auditList(audit), this.open.get("audit")),
+      h("p", {}, h("a", { href: api.reportUrl(contact.id), target: "_blank", rel: "noopener" }, t("contact_details.report"))));
   }
 }

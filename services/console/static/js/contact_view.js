@@ -2,29 +2,33 @@
 
 import { api } from "./api.js";
 import { h, fill, toast } from "./dom.js";
-import { DASH, position, probabilities, quantity, received, time } from "./format.js";
+import { DASH, layerName, position, probabilities, quantity, received, time } from "./format.js";
 import { MAPS, autoRange, loadImage } from "./image_data.js";
 import { ImageLevels } from "./image_levels.js";
 import { startPointer } from "./image_pointer.js";
 import { ORIENTATIONS } from "./image_projection.js";
-import { COMPARE_MODES, drawTools, drawVersions } from "./image_toolbar.js";
+import { COMPARE_MODES, drawTools } from "./image_toolbar.js";
 import { ImageView, defaultViewport } from "./image_view.js";
 import { integrityStrip } from "./integrity_strip.js";
 import { toolbarWithMore } from "./layout.js";
 import { Loupe } from "./loupe.js";
+import { continuesOut, outlineOf, relatedLayers, relatedVersion } from "./related_images.js";
 import { MeasurementTool, measurementLine } from "./measurement.js";
 import { drawSizePanel } from "./size_panel.js";
 import { emit, setting, state } from "./state.js";
 import { t } from "./texts.js";
+import { drawVersions } from "./versions_bar.js";
 
 const GAIN_STEP = 5;
 const GAMMA_STEP = 1.15;
 const CACHED_IMAGES = 20;
 
 /** Second image of a comparison: [version, layer], or null. `choice` has version number, layer and comparison. */
-function secondImage({ versions }, { version, layer, compare }) {
+function secondImage(detail, { version, layer, compare }) {
+  const { versions } = detail;
   const shown = versions.find((one) => one.version === version);
   if (compare === "versions" && versions.length > 1) return [versions.find((one) => one.version !== version), "raw"];
+  if (relatedVersion(detail, layer)) return null;
   const other = compare === "layers" ? shown?.layers.find((one) => one.name !== layer) : null;
   return other ? [shown, other.name] : null;
 }
@@ -62,14 +66,16 @@ export class ContactView {
     this.displayPanel = h("div", { class: "display hidden" }, this.options, this.levels.element);
     this.sizes = h("div", { class: "size-panel", role: "region", "aria-label": t("measure.panel") });
     this.stage = h("div", { class: "stage" }, this.canvases, this.placeholder, this.loupe.element, this.displayPanel, this.loading);
-    this.versions = h("div", { class: "versions", role: "toolbar", "aria-label": "Versions of the image" });
-    this.strip = h("div", { class: "strip", role: "region", tabindex: 0, "aria-label": "Data integrity of this image" });
-    this.element = h("section", { class: "contact", "aria-label": "Contact" }, this.heading, toolbarWithMore(this.tools), this.stage, this.sizes,
+    this.versions = h("div", { class: "versions", role: "toolbar", "aria-label": t("versions_bar.title") });
+    this.strip = h("div", { class: "strip", role: "region", tabindex: 0, "aria-label": t("integrity_strip.title") });
+    this.element = h("section", { class: "contact", "aria-label": t("contact_view.contact") }, this.heading, toolbarWithMore(this.tools), this.stage, this.sizes,
       h("div", { class: "contact-foot" }, this.versions, this.strip));
   }
 
   get shown() { return this.detail?.versions.find((one) => one.version === this.version) ?? null; }
-  get shownLayer() { return this.shown?.layers.find((one) => one.name === this.layer) ?? null; }
+  /** Layers of the displayed version, and the images that answer requests about the contact. */
+  get layers() { return this.shown ? [...this.shown.layers, ...relatedLayers(this.detail)] : []; }
+  get shownLayer() { return this.layers.find((one) => one.name === this.layer) ?? null; }
 
   get zoomed() { return this.views[0].viewport.zoom > 1; }
 
@@ -78,8 +84,16 @@ export class ContactView {
     return { id: this.detail?.contact.id, version: this.version, layer: this.layer, image: view.image, projection: view.projection };
   }
 
-  /** Identifier, version, layer and digest of the image on the canvas; null without an image. */
-  get drawn() { return this.views[0].image?.source ?? null; }
+  /**
+   * Identifier, version, layer and digest of the image on the canvas; null without an image.
+   *
+   * A layer that is an image of its own belongs to the displayed version of the contact.
+   */
+  get drawn() {
+    const source = this.views[0].image?.source ?? null;
+    if (!source || source.id === this.detail.contact.id) return source;
+    return { id: this.detail.contact.id, version: this.version, layer: this.layer, sha256: this.shown.sha256 };
+  }
 
   /**
    * Load the images to display of a contact: newest version and raw layer, or what is selected of the displayed contact.
@@ -145,14 +159,16 @@ export class ContactView {
   }
 
   async showLayer(name) {
-    const layer = this.shown?.layers.find((one) => one.name === name);
+    const layer = this.layers.find((one) => one.name === name);
     if (!layer) return;
+    // The wider image shows other seabed: the viewport of one image does not fit the other.
+    if (name === "wider" || this.layer === "wider") Object.assign(this.views[0].viewport, defaultViewport());
     if (!layer.measurable && this.measurement.active) this.measurement.stop();
     await this.#select({ layer: name });
   }
 
   async nextLayer() {
-    const names = this.shown?.layers.map((one) => one.name) ?? [];
+    const names = this.layers.map((one) => one.name);
     if (names.length) await this.showLayer(names[(names.indexOf(this.#choice().layer) + 1) % names.length]);
   }
 
@@ -169,16 +185,14 @@ export class ContactView {
   comparedImage() { return secondImage(this.detail, this); }
 
   #image(detail, [version, layer]) {
-    const { id } = detail.contact;
+    const id = version.contact_id ?? detail.contact.id;
     const key = `${id} ${version.version} ${layer} ${version.sha256}`;
     if (!this.cache.has(key)) {
       if (this.cache.size >= CACHED_IMAGES) this.cache.delete(this.cache.keys().next().value);
-      const synthesised = version.layers.find((one) => one.name === layer)?.synthesised;
       const image = loadImage(
         { id, version: version.version, layer, sha256: version.sha256 },
         api.imageUrl(id, version.version, layer),
         version.missing_fraction > 0 ? api.maskUrl(id, version.version, "missing", layer) : null,
-        version.guessed_fraction > 0 && !synthesised ? api.maskUrl(id, version.version, "guessed", layer) : null,
       );
       image.catch(() => this.cache.delete(key));
       this.cache.set(key, image);
@@ -189,7 +203,8 @@ export class ContactView {
   /** Load the images of a choice; null for a canvas without an image. */
   #load(detail, choice) {
     const shown = detail.versions.find((one) => one.version === choice.version);
-    const requested = [shown ? [shown, choice.layer] : null, secondImage(detail, choice)];
+    const related = relatedVersion(detail, choice.layer);
+    const requested = [related ? [related, "raw"] : shown ? [shown, choice.layer] : null, secondImage(detail, choice)];
     return Promise.all(requested.map(async (one) => one && { image: await this.#image(detail, one), version: one[0], layer: one[1] }));
   }
 
@@ -221,7 +236,7 @@ export class ContactView {
       along_m: (version.pixel_along_m * version.height_px) / image.height,
       across_m: (version.pixel_across_m * version.width_px) / image.width,
     } : null;
-    const title = `version ${version.version} · ${layer}${version.complete ? "" : ` · ${received(version)} received`}`;
+    const title = `version ${version.version} · ${layerName(version, version.contact_id ? this.layer : layer)}${version.complete ? "" : ` · ${received(version)}`}`;
     const synthesised = version.layers.find((one) => one.name === layer)?.synthesised ?? false;
     const record = this.detail.record ?? {};
     // A layer may have more pixels than the image; the mark is in pixels of the image.
@@ -236,7 +251,9 @@ export class ContactView {
   #drawLines() {
     const current = Object.values(this.detail?.size ?? {}).map((one) => one?.measurement);
     const stored = (this.detail?.measurements ?? []).filter((one) => current.includes(one.id) && one.version === this.version && one.layer === this.layer).map(measurementLine);
-    this.views[0].lines = [...(this.measurement.active ? [] : stored), ...this.measurement.lines()];
+    const related = relatedVersion(this.detail, this.layer);
+    const outline = related && this.layer === "wider" ? outlineOf(this.shown, related) : [];
+    this.views[0].lines = [...outline, ...(this.measurement.active ? [] : stored), ...this.measurement.lines()];
     this.views[0].crosshair = this.measurement.active && !this.measurement.result ? this.measurement.crosshair : null;
     this.views[0].draw();
     this.canvases[0].classList.toggle("measures", this.measurement.active);
@@ -287,6 +304,10 @@ export class ContactView {
   }
 
   zoom(factor) {
+    if (continuesOut(this, factor)) {
+      this.showLayer("wider");
+      return;
+    }
     this.views[0].zoom(factor);
     this.redrawAll();
   }
@@ -415,7 +436,7 @@ export class ContactView {
       h("span", { class: "number", text: `${position(contact.lat_deg, contact.lon_deg)}${sigma} · range ${quantity(record?.slant_range_m ?? contact.range_m, "m", 0)} · altitude ${quantity(record?.altitude_m, "m")}` }));
     this.#drawTools();
     drawVersions(this);
-    fill(this.strip, integrityStrip(this.shown, this.shownLayer));
+    fill(this.strip, integrityStrip(relatedVersion(this.detail, this.layer) ?? this.shown, this.shownLayer));
   }
 
   #drawTools() {

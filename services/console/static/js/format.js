@@ -10,8 +10,17 @@ const known = (value) => value !== null && value !== undefined && Number.isFinit
 
 export const verdict = (name) => (VERDICTS.includes(name) ? t(`verdict.${name}`) : name ?? DASH);
 /** Name of a kind of request for operators. */
-const REQUEST_KINDS = { wider: "expand", original: "unfiltered image" };
-export const requestKind = (kind) => REQUEST_KINDS[kind] ?? kind;
+const REQUEST_KINDS = ["refine", "resend", "revisit", "wider", "original"];
+export const requestKind = (kind) => (REQUEST_KINDS.includes(kind) ? t(`request.${kind}`) : kind);
+
+/** Name of a layer for operators: tiles of a codebook are not raw pixels. */
+export function layerName(version, name) {
+  if (name === "raw" && version?.texture === "codebook") return t("layer.tiles");
+  return ["raw", "enhanced", "wider", "original"].includes(name) ? t(`layer.${name}`) : name;
+}
+
+/** Smallest detail of an image, for example "≈ 0.4 m"; null where it is not known. */
+export const sharpness = (version) => (known(version.sharp_to_m) ? `≈ ${quantity(version.sharp_to_m, "m", version.sharp_to_m < 0.095 ? 2 : 1)}` : null);
 export const symbol = (name) => SYMBOLS[name] ?? "·";
 
 /** A number and its unit, separated by a thin space. */
@@ -38,14 +47,14 @@ export function probabilities(row) {
 /** Statement about the despeckling of an image; null where it is not known. */
 export function despeckling(version) {
   if (!known(version.despeckle_strength)) return null;
-  return version.despeckle_strength > 0 ? `strength ${version.despeckle_strength.toFixed(2)}` : "not despeckled";
+  return version.despeckle_strength > 0 ? t("format.despeckle_strength", { value: version.despeckle_strength.toFixed(2) }) : t("format.not_despeckled");
 }
 
-/** Percent received; below 100 until the image is complete. */
+/** What has been received of an image: its bytes, or the percentage of an announced length, below 100 until complete. */
 export function received(row) {
-  if (!known(row.percent_received)) return DASH;
-  if (!row.complete) return percent(Math.min(99, Math.max(1, Math.round(row.percent_received))));
-  return percent(row.percent_received);
+  if (row.stage === "record") return t("received.record");
+  if (row.stage === "part") return percent(Math.min(99, Math.max(1, Math.round(row.percent_received))));
+  return t(`received.${row.stage}`, { bytes: bytes(row.bytes_received) });
 }
 
 export function withSigma(value, sigma, unit = "m", digits = 2) {

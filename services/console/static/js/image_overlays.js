@@ -214,7 +214,7 @@ export function drawLines(context, view, g) {
   const used = [];
   for (const line of view.lines) {
     const [from, to] = [g.toCanvas(line.from), g.toCanvas(line.to)];
-    drawLine(context, from, to, line.colour);
+    drawLine(context, from, to, line.colour, !line.outline);
     if (line.profile) drawProfile(context, view, g, line, from, to);
     if (!line.label) continue;
     const anchor = from[0] > to[0] ? from : to;
@@ -235,13 +235,14 @@ export function drawLines(context, view, g) {
   }
 }
 
-export function drawLine(context, [x0, y0], [x1, y1], colour) {
+/** Draw a line, with marks at its ends unless it is part of an outline. */
+export function drawLine(context, [x0, y0], [x1, y1], colour, marked = true) {
   const length = Math.hypot(x1 - x0, y1 - y0) || 1;
   const [tx, ty] = [(-(y1 - y0) / length) * 7, ((x1 - x0) / length) * 7];
   outlined(context, colour, 2, () => {
     context.moveTo(x0, y0);
     context.lineTo(x1, y1);
-    for (const [x, y] of [[x0, y0], [x1, y1]]) { context.moveTo(x - tx, y - ty); context.lineTo(x + tx, y + ty); }
+    for (const [x, y] of marked ? [[x0, y0], [x1, y1]] : []) { context.moveTo(x - tx, y - ty); context.lineTo(x + tx, y + ty); }
   });
 }
 

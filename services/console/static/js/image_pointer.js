@@ -22,7 +22,12 @@ export function startPointer(view) {
     const image = view.views[index];
     one.addEventListener("wheel", (event) => {
       event.preventDefault();
-      image.zoom(event.deltaY < 0 ? 1.25 : 0.8, ...at(event));
+      const factor = event.deltaY < 0 ? 1.25 : 0.8;
+      if (continuesOut(view, factor)) {
+        view.showLayer("wider");
+        return;
+      }
+      image.zoom(factor, ...at(event));
       view.redrawAll();
     }, { passive: false });
 

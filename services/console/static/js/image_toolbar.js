@@ -1,8 +1,7 @@
-// Toolbar and version buttons of the image.
+// Toolbar of the image.
 
-import { api } from "./api.js";
 import { fill, h } from "./dom.js";
-import { received, time } from "./format.js";
+import { layerName } from "./format.js";
 import { MAPS } from "./image_data.js";
 import { ORIENTATIONS } from "./image_projection.js";
 import { emit } from "./state.js";
@@ -43,10 +42,10 @@ export function drawTools(view) {
   const compared = view.compare !== "off" && view.shown !== null && view.comparedImage() !== null;
   const open = !view.displayPanel.classList.contains("hidden");
   const { display } = view;
-  refill(view.tools, [view.shown?.layers, view.layer, display.map, open, view.autoGain, view.compare, compared, locked, view.measurement.active], () => [
-    h("span", { class: "set", role: "group", "aria-label": `${t("tools.layer")} (e)` }, (view.shown?.layers ?? []).map((one) => h("button", {
+  refill(view.tools, [view.layers, view.shown?.texture, view.layer, display.map, open, view.autoGain, view.compare, compared, locked, view.measurement.active], () => [
+    h("span", { class: "set", role: "group", "aria-label": `${t("tools.layer")} (e)` }, view.layers.map((one) => h("button", {
       type: "button", "aria-pressed": String(one.name === view.layer), title: one.reason || t("tools.received_pixels"), data: { tool: `layer-${one.name}` },
-      on: { click: () => view.showLayer(one.name) }, text: one.synthesised ? `${one.name} ✱` : one.name,
+      on: { click: () => view.showLayer(one.name) }, text: `${layerName(view.shown, one.name)}${one.synthesised ? " ✱" : ""}`,
     })), h("kbd", { text: "e" })),
     menu("map", "c", Object.keys(MAPS), display.map, (name) => view.setMap(name)),
     h("span", { class: "set", role: "group", "aria-label": t("tools.gain") },
@@ -83,17 +82,4 @@ function drawOptions(view) {
     h("button", { type: "button", title: `${t("region_request.key")} (7)`, data: { tool: "region" }, on: { click: () => emit("region") } }, t("region_request.button"), " ", h("kbd", { text: "7" })),
     toggle("loupe", "'", view.loupeOn, () => view.toggleLoupe()),
   ]);
-}
-
-/** Draw a button for each of the last eight versions. */
-export function drawVersions(view) {
-  const { versions } = view.detail;
-  const newest = versions.at(-1)?.version;
-  fill(view.versions, versions.length ? h("kbd", { text: "[" }) : null, versions.slice(-8).map((one) => h("button", {
-    type: "button", "aria-pressed": String(one.version === view.version), on: { click: () => view.showVersion(one.version) },
-    "aria-label": `Version ${one.version}, ${received(one)} received, ${time(one.received_utc_s)}`,
-  }, h("img", { src: api.thumbnailUrl(view.detail.contact.id, one.version), alt: "" }), h("span", { class: "number", text: `v${one.version} ${received(one)}` }))),
-  versions.length ? h("kbd", { text: "]" }) : null,
-  newest && view.version !== newest ? h("span", { class: "stale", text: `Version ${newest} is newer than the displayed one.` }) : null);
-  view.versions.querySelector('[aria-pressed="true"]')?.scrollIntoView({ block: "nearest", inline: "nearest" });
 }

@@ -37,7 +37,7 @@ export class ImageView {
     this.image = null;
     this.projection = null;
     this.display = { map: "grey", low: 0, high: 100, gamma: 1, hatch: true, smooth: null, grid: true, ground: false, orientation: "nadir" };
-    this.lines = []; // measurements: {from: [row, column], to, label, colour, profile}
+    this.lines = []; // measurements: {from: [row, column], to, label, colour, profile, outline: without end marks}
     this.crosshair = null; // [row, column] of the measurement crosshair
     this.title = "";
     new ResizeObserver(() => this.draw()).observe(canvas);
@@ -236,7 +236,7 @@ export class ImageView {
     this.#paint(context, this.coloured, g);
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     const enlarged = (one) => g.toCanvas(one).map((value, axis) => size / 2 + LOUPE_ZOOM * (value - [x, y][axis]));
-    for (const line of this.lines) drawLine(context, enlarged(line.from), enlarged(line.to), line.colour);
+    for (const line of this.lines) drawLine(context, enlarged(line.from), enlarged(line.to), line.colour, !line.outline);
     drawCrosshair(context, [size / 2, size / 2]);
   }
 }

@@ -88,7 +88,7 @@ export class MapView {
     fill(this.card, h("div", { class: "card" }, h("h3", {}, contact.name, h("span", { class: `badge ${contact.review}`, text: `${symbol(contact.review)} ${verdict(contact.review)}` })),
       contact.has_picture ? h("img", { src: contact.thumbnail, alt: "" }) : null,
       h("p", { class: "number", text: `${quantity(one.x_m, "m", 0)} east, ${quantity(one.y_m, "m", 0)} north of the origin, ± ${quantity(one.sigma_m, "m", 0)}` }),
-      h("p", { class: "number", text: `ATD ${contact.atd_class ? `${contact.atd_class} ` : ""}${quantity(contact.atd_confidence, "", 2)} · ${received(contact)} received · ${time(contact.seen_utc_s)}` }),
+      h("p", { class: "number", text: `ATD ${contact.atd_class ? `${contact.atd_class} ` : ""}${quantity(contact.atd_confidence, "", 2)} · ${received(contact)} · ${time(contact.seen_utc_s)}` }),
       probabilities(contact) ? h("p", { class: "number probabilities", text: probabilities(contact) }) : null,
       h("button", { type: "button", class: "primary", on: { click: () => this.open() } }, "review ", h("kbd", { text: "Enter" }))));
   }

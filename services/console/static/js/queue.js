@@ -107,7 +107,7 @@ function rowLabel(row) {
   return [
     row.name, verdict(row.review), row.atd_confidence === null ? t("queue.no_confidence") : t("queue.confidence_label", { value: row.atd_confidence.toFixed(2) }),
     row.atd_class ? t("queue.class_label", { name: row.atd_class }) : "", probabilities(row) ?? "",
-    row.complete ? t("queue.complete") : t("queue.received", { share: received(row) }), t("queue.seen", { time: time(row.seen_utc_s ?? row.first_frame_utc_s) }),
+    received(row), t("queue.seen", { time: time(row.seen_utc_s ?? row.first_frame_utc_s) }),
     row.looks > 1 ? t("queue.looks", { count: row.looks }) : "", row.contradictory ? t("object.contradictory") : "", decidedOnLess(row) ?? "", row.advised ? t("queue.advised") : "",
     row.authenticated === false ? t("queue.unauthenticated") : "",
   ].filter(Boolean).join(", ");
@@ -154,7 +154,7 @@ function queueRow(row, index, count, selected) {
       h("span", { title: t("queue.confidence"), text: t("queue.detector", { value: row.atd_confidence === null ? DASH : row.atd_confidence.toFixed(2) }) }),
       meter((row.atd_confidence ?? 0) * 50, t("queue.confidence"), "atd"),
       h("span", { class: "share", text: received(row) }),
-      meter(row.percent_received ?? 0, t("queue.received_title"), row.complete ? "whole" : "part")),
+      row.percent_received === null ? null : meter(row.percent_received, t("queue.received_title"), row.complete ? "whole" : "part")),
     h("div", { class: "third muted number" },
       h("span", { class: "time", text: time(row.seen_utc_s ?? row.first_frame_utc_s) }),
       row.newer_detail ? h("span", { class: "newer", title: t("object.newer"), text: decidedOnLess(row) }) : h("span", { class: "range", text: quantity(row.range_m, "m", 0) }),

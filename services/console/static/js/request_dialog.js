@@ -1,23 +1,22 @@
-// The dialog for requests to a vehicle. It shows the cost of each request before one is sent.
+// The table of costs of all requests about a contact, with the reasons of those that are not possible.
 
 import { api } from "./api.js";
 import { h, showDialog, toast } from "./dom.js";
-import { bytes, duration, requestKind } from "./format.js";
+import { DASH, bytes, duration, requestKind } from "./format.js";
 import { emit, state } from "./state.js";
+import { t } from "./texts.js";
 
-const DESCRIPTIONS = {
-  refine: "more detail in the whole image", resend: "missing parts of the image", wider: "more seabed around the contact",
-  revisit: "pass the position again", original: "the image without despeckling",
-};
+const COLUMNS = ["request", "airtime", "bytes", "queue", "basis"];
 
-function costRow(cost, index) {
+function costRow(cost, contact, checked) {
   const usable = cost.available && state.session.may.request;
-  const reason = cost.available ? (usable ? cost.basis : "your role may not send requests") : cost.reason;
+  const reason = cost.available ? (usable ? cost.basis : t("request_dialog.role")) : t(`request_dialog.reason.${cost.reason_code}`, { vehicle: contact.vehicle_id, codec: contact.codec });
+  const value = (text) => (cost.available ? text : DASH);
   return h("tr", { class: usable ? "" : "muted" },
-    h("td", {}, h("label", {}, h("input", { type: "radio", name: "kind", value: cost.kind, disabled: !usable, checked: usable && index === 0 }), ` ${requestKind(cost.kind)}: ${DESCRIPTIONS[cost.kind] ?? ""}`)),
-    h("td", { class: "number" }, h("b", { text: cost.available ? duration(cost.airtime_s) : "–" })),
-    h("td", { class: "number", text: cost.available ? bytes(cost.bytes) : "–" }),
-    h("td", { class: "number", text: cost.available ? duration(cost.wait_s) : "–" }),
+    h("td", {}, h("label", {}, h("input", { type: "radio", name: "kind", value: cost.kind, disabled: !usable, checked }), ` ${requestKind(cost.kind)}: ${t(`request_dialog.${cost.kind}`)}`)),
+    h("td", { class: "number" }, h("b", { text: value(duration(cost.airtime_s)) })),
+    h("td", { class: "number", text: value(bytes(cost.bytes)) }),
+    h("td", { class: "number", text: value(duration(cost.wait_s)) }),
     h("td", { class: "muted", text: reason }));
 }
 
@@ -32,17 +31,15 @@ export async function openRequestDialog(contact) {
   }
   const usable = costs.filter((cost) => cost.available && state.session.may.request);
   const table = h("table", { class: "costs" },
-    h("thead", {}, h("tr", {}, ["request", "air time", "bytes", "queue before it", "basis of the estimate"].map((name) => h("th", { scope: "col", text: name })))),
-    h("tbody", {}, costs.map((cost) => costRow(cost, usable.indexOf(cost)))));
-  const action = await showDialog(`${contact.name}: request more data`, [
-    h("p", { text: "The air time includes both directions. Other images wait during this time." }), table,
-  ], [{ label: "Send request", value: "send", primary: true, disabled: usable.length === 0 }, { label: "Cancel", value: null }]);
+    h("thead", {}, h("tr", {}, COLUMNS.map((name) => h("th", { scope: "col", text: t(`request_dialog.column.${name}`) })))),
+    h("tbody", {}, costs.map((cost) => costRow(cost, contact, cost === usable[0]))));
+  const action = await showDialog(t("request_dialog.title", { name: contact.name }), [
+    h("p", { text: t("request_dialog.airtime_note") }), table,
+  ], [{ label: t("request_buttons.send"), value: "send", primary: true, disabled: usable.length === 0 }, { label: t("request_buttons.cancel"), value: null }]);
   const kind = table.querySelector("input:checked")?.value;
   if (action !== "send" || !kind) return;
-  const { airtime_s } = costs.find((cost) => cost.kind === kind);
   try {
-    await api.request(contact.id, { kind, airtime_s });
-    toast(`${contact.name}: ${requestKind(kind)} requested, ≈ ${duration(airtime_s)} of air time`);
+    await api.request(contact.id, { kind, airtime_s: costs.find((cost) => cost.kind === kind).airtime_s });
   } catch (error) {
     toast(error.message, { bad: true });
   }
