@@ -12,13 +12,12 @@ from typing import Final, Literal
 from sonarpost import wire
 from sonarpost.codec.region import RegionBox
 from sonarpost.messages import Command, Contact, ReconstructedImage
+from sonarpost.review.image_matching import EXPAND_FACTOR, place_in_wider
 from sonarpost.services.console.store.serialisers import Json, contact_record_json, decode_image, version_json
 
 Relation = Literal["wider", "original", "region"]
 """Kind of the request that the image answers."""
 
-EXPAND_FACTOR: Final = 2.0
-"""Ratio of the pixel sizes of the image of kind `wider` and of its contact."""
 SIZE_TOLERANCE: Final = 0.06
 """Relative deviation of a ratio of pixel sizes; the link transmits them in steps of 2.5 %."""
 
@@ -102,17 +101,24 @@ def _link(db: sqlite3.Connection, contact_id: str, parent: str, relation: Relati
 def related_images_json(db: sqlite3.Connection, contact_id: str) -> list[Json]:
     """Return the images that answer requests about a contact, the earliest first."""
     found: list[Json] = []
+    contact = db.execute(
+        "SELECT v.* FROM version v JOIN contact c ON c.id = v.contact_id AND c.version = v.version WHERE c.id = ?",
+        (contact_id,),
+    ).fetchone()
     rows = db.execute(
         "SELECT id, relation, image_id FROM contact WHERE parent = ? ORDER BY arrived_utc_s, id", (contact_id,)
     ).fetchall()
     for row in rows:
         versions = db.execute("SELECT * FROM version WHERE contact_id = ? ORDER BY version", (row["id"],)).fetchall()
+        newest = decode_image(versions[-1])
+        place = _place(decode_image(contact), newest) if row["relation"] == "wider" else None
         found.append(
             {
                 "id": row["id"],
                 "relation": row["relation"],
                 "image_id": row["image_id"],
-                "record": contact_record_json(decode_image(versions[-1])),
+                "record": contact_record_json(newest),
+                "place": place,
                 "versions": [version_json(version) for version in versions],
                 "place_px": _place_of_region(db, contact_id, row["id"]) if row["relation"] == "region" else None,
             }
@@ -130,3 +136,11 @@ def _place_of_region(db: sqlite3.Connection, contact_id: str, region_id: str) ->
     command = wire.decode(Command, bytes(request["payload"]), f"request about {contact_id}")
     whole = db.execute("SELECT height_px, width_px FROM contact WHERE id = ?", (contact_id,)).fetchone()
     return None if command.box is None else [*RegionBox(*command.box).pixels(whole["height_px"], whole["width_px"])]
+
+
+def _place(image: ReconstructedImage, wider: ReconstructedImage) -> list[int] | None:
+    """Return [row, column] of the upper left corner of an image in the wider image; None if it is not known."""
+    if not image.codec or not wider.codec:
+        return None
+    place = place_in_wider(image.picture.to_array(), wider.picture.to_array())
+    return None if place is None else list(place)

@@ -1,5 +1,7 @@
 // Mouse, pen and touch on the image: zoom, move, pinch, measure by dragging.
 
+import { continuesOut } from "./related_images.js";
+
 const GRAB_PX = 14;
 const DRAG_PX = 5;
 

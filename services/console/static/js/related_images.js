@@ -19,15 +19,14 @@ export function relatedLayers(detail) {
 export function relatedVersion(detail, layer) {
   const related = relatedOf(detail, layer);
   const version = related?.versions.findLast((one) => one.codec);
-  return version ? { ...version, contact_id: related.id } : null;
+  return version ? { ...version, contact_id: related.id, place: related.place } : null;
 }
 
-/** Outline of the contact's image on the wider image, as lines of the image view. */
+/** Outline of the contact's image on the wider image, as lines of the image view; empty if its place is not known. */
 export function outlineOf(version, wider) {
-  if (!version) return [];
-  const half = [version.height_px / EXPANDED_PIXEL / 2, version.width_px / EXPANDED_PIXEL / 2];
-  const [top, bottom] = [wider.height_px / 2 - half[0], wider.height_px / 2 + half[0]];
-  const [left, right] = [wider.width_px / 2 - half[1], wider.width_px / 2 + half[1]];
+  if (!version || !wider.place) return [];
+  const [top, left] = wider.place;
+  const [bottom, right] = [top + version.height_px / EXPANDED_PIXEL, left + version.width_px / EXPANDED_PIXEL];
   const corners = [[top, left], [top, right], [bottom, right], [bottom, left]];
   return corners.map((from, index) => ({ from, to: corners[(index + 1) % 4], text: "", colour: OUTLINE_COLOUR, outline: true }));
 }

@@ -1,0 +1,47 @@
+"""Place of a contact's image within an image of more seabed around it."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import fftconvolve
+
+EXPAND_FACTOR: Final = 2
+"""Ratio of the pixel sizes."""
+MIN_CORRELATION: Final = 0.4
+"""Normalised cross-correlation below which the place counts as unknown."""
+
+Grey = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+
+
+def place_in_wider(image: Grey, wider: Grey) -> tuple[int, int] | None:
+    """Return (row, column) of the upper left corner of an image in the wider image, None if it is not found.
+
+    Both windows are shifted at the borders of a recording, so that their centres can differ. The place is the maximum
+    of the normalised cross-correlation.
+
+    Args:
+        image: Shape (height_px, width_px).
+        wider: Any shape of at least half of these sides, with pixels of twice the size.
+    """
+    rows, columns = image.shape[0] // EXPAND_FACTOR, image.shape[1] // EXPAND_FACTOR
+    if rows < 1 or columns < 1 or rows > wider.shape[0] or columns > wider.shape[1]:
+        return None
+    cut = image[: rows * EXPAND_FACTOR, : columns * EXPAND_FACTOR].astype(np.float64)
+    template = cut.reshape(rows, EXPAND_FACTOR, columns, EXPAND_FACTOR).mean(axis=(1, 3))
+    template -= template.mean()
+    scene = wider.astype(np.float64)
+    scene -= scene.mean()
+    window = np.ones_like(template)
+    sums = fftconvolve(scene, window, mode="valid")
+    squares = fftconvolve(scene**2, window, mode="valid")
+    power = np.maximum(squares - sums**2 / template.size, 0.0) * float((template**2).sum())
+    products = fftconvolve(scene, template[::-1, ::-1], mode="valid")
+    correlation = products / np.sqrt(np.maximum(power, 1e-9 * max(1.0, float(power.max()))))
+    best = int(np.argmax(correlation))
+    if correlation.flat[best] < MIN_CORRELATION:
+        return None
+    row, column = divmod(best, correlation.shape[1])
+    return row, column

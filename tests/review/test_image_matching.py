@@ -1,0 +1,41 @@
+"""Place of an image in an image of more seabed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from sonarpost.review.image_matching import place_in_wider
+
+
+def seabed(seed=0):
+    """Grey seabed of 160 x 280 px with structure of a few pixels."""
+    field = gaussian_filter(np.random.default_rng(seed).normal(size=(160, 280)), 3)
+    return (128 + 40 * field / field.std()).clip(0, 255).astype(np.uint8)
+
+
+def reduced(image):
+    rows, columns = image.shape
+    return image.reshape(rows // 2, 2, columns // 2, 2).mean(axis=(1, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("place", [(20, 35), (0, 0), (40, 70), (4, 58)])
+def test_image_is_found_in_the_wider_image(place):
+    scene = seabed()
+    row, column = 2 * place[0], 2 * place[1]
+    image = scene[row : row + 80, column : column + 140]
+    assert place_in_wider(image, reduced(scene)) == place
+
+
+def test_image_of_other_seabed_is_not_found():
+    assert place_in_wider(seabed(1)[:80, :140], reduced(seabed(2))) is None
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (400, 400)])
+def test_images_that_do_not_fit_are_not_found(shape):
+    assert place_in_wider(np.zeros(shape, np.uint8), reduced(seabed())) is None
+
+
+def test_image_without_contrast_is_not_found():
+    assert place_in_wider(np.full((80, 140), 7, np.uint8), reduced(seabed())) is None
