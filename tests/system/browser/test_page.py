@@ -6,7 +6,7 @@ import time
 
 import pytest
 from builders.common import REPOSITORY, eventually
-from builders.console import PASSWORD, image_record
+from builders.console import FIRST_UTC_S, PASSWORD, image_record
 
 from sonarpost import keys, wire
 from sonarpost.messages import Health
@@ -112,7 +112,7 @@ def test_complete_review_with_the_keyboard(served):
     assert "air time" in visit.text("dialog .costs")
     assert visit.page.locator("dialog .costs input[value=wider]:not([disabled])").count() == 1
     visit.press("ArrowDown", "Enter")
-    visit.wait('details[data-name="requests"] >> text=/resend|revisit/')
+    visit.wait('details[data-name="requests"] >> text=/Send lost parts again|Second pass/')
     # The other views, and back.
     visit.press("n", "p")
     visit.until(MAP_DRAWN)
@@ -173,7 +173,7 @@ def test_integrity_strip_shows_received_and_missing_parts(served):
     assert "150 of 200" in strip
     assert "75" in strip
     assert "25" in strip
-    assert "never received" in strip
+    assert "Hatched areas were not received" in strip
     with_hatch = visit.page.locator("canvas").first.screenshot()
     visit.press("h")
     visit.until("() => document.querySelector('[data-tool=hatch]').ariaPressed === 'false'")
@@ -182,16 +182,18 @@ def test_integrity_strip_shows_received_and_missing_parts(served):
 
 def test_despeckled_image_is_named_and_the_image_without_it_can_be_requested(served):
     for image_id, strength in (("00A6", 0.0), ("00A7", 1.0)):
-        served.state.store_image(image_record(image_id).model_copy(update={"despeckle_strength": strength}))
+        # Equal records with and without despeckling are one contact and its layer.
+        record = image_record(image_id, time_utc_s=FIRST_UTC_S + strength)
+        served.state.store_image(record.model_copy(update={"despeckle_strength": strength}))
     visit = served.visit()
     visit.wait_for_contact("00A7")
     assert "strength 1.00" in visit.text(".strip")
     visit.press("r")
     visit.wait("dialog .costs")
     visit.page.locator("dialog .costs input[value=original]").check()
-    assert "unfiltered image" in visit.text("dialog .costs")
+    assert "Without despeckling" in visit.text("dialog .costs")
     visit.page.locator("dialog [data-action=send]").click()
-    visit.wait('details[data-name="requests"] >> text=unfiltered image')
+    visit.wait('details[data-name="requests"] >> text=Without despeckling')
     [item] = served.state.unsent_records()
     assert (item.record.kind, item.record.image_id) == ("original", "00A7")
     visit.press("j")
@@ -206,19 +208,19 @@ def test_displayed_image_is_updated_by_new_versions(served):
     assert "50" in visit.text(row("00A7"))
     served.state.store_image(image_record("00A7", 2))
     visit.until("() => document.querySelector('canvas').dataset.shows.endsWith(' 2 raw')")
-    visit.wait(f"{row('00A7')} >> text=100")
+    visit.wait(f"{row('00A7')} >> text=sent 200")
     # A chosen older version stays displayed.
     visit.press("[")
     visit.until("() => document.querySelector('canvas').dataset.shows.endsWith(' 1 raw')")
     served.state.store_image(image_record("00A7", 3))
-    visit.wait(".versions >> text=Version 3 is newer")
+    visit.wait('.versions [data-version="3"] .newer')
     assert visit.page.evaluate("document.querySelector('canvas').dataset.shows").endswith(" 1 raw")
     # The image does not change during a measurement.
     visit.press("]", "]")
     visit.until("() => document.querySelector('canvas').dataset.shows.endsWith(' 3 raw')")
     visit.press("m", "Enter")
     served.state.store_image(image_record("00A7", 4))
-    visit.wait(".versions >> text=Version 4 is newer")
+    visit.wait('.versions [data-version="4"] .newer')
     assert visit.page.evaluate("document.querySelector('canvas').dataset.shows").endswith(" 3 raw")
     visit.press("s")
     visit.until("() => !document.querySelectorAll('canvas')[1].classList.contains('hidden')")
