@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
-import pytest
-from builders.console import image_record
+import random
 
+import pytest
+from builders.console import FIRST_UTC_S, image_record
+
+from research.common.images import simulated_images
+from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.link.config import SenderConfig
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.v1.receiver import V1Receiver
+from sonarpost.link.frames.v1.sender import V1Sender
+from sonarpost.link.received_image import received_image
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.review.resolution import detail_px, sharp_to_m
+from sonarpost.services.decompressor.decoder import Decoder
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 
@@ -105,3 +115,48 @@ def test_codebook_texture_is_stated(codec, texture, console):
     [version] = versions_of(console)
     assert version["texture"] == texture
     assert "guessed_fraction" not in version
+
+
+def test_versions_over_a_lossy_v1_link_state_true_values(make_console):
+    """Sender, link with 30 % loss, receiver, decoder and console."""
+    pixels = simulated_images(1).images[0].pixels
+    stream = EmbCodec().encode(pixels, 630)
+    draws = random.Random(4)
+    console = make_console(assumed_rate=1)
+    receiver = V1Receiver()
+    sender = V1Sender(
+        SenderConfig(frame_bytes=64, feedback=True, stream_bytes=314, group_delay_s=0.0, max_defer_s=60.0)
+    )
+    summary = ContactSummary(
+        height_px=80,
+        width_px=80,
+        time_utc_s=FIRST_UTC_S,
+        pixel_along_m=0.1,
+        pixel_across_m=0.1,
+        lat_deg=56.0,
+        lon_deg=-5.0,
+    )
+    sender.add_image(7, summary, stream, FIRST_UTC_S)
+
+    def transmit(start_s, stop_s):
+        for second in range(start_s, stop_s, 5):
+            now = FIRST_UTC_S + second
+            frame = sender.next_frame(now)
+            if frame is not None and draws.random() > 0.3:
+                for event in receiver.accept(3, frame, now):
+                    record = received_image(event, "vessel-1", "uuv-1")
+                    console.state.store_image(Decoder(()).decode(record))
+            if receiver.feedback_is_due(3, now) and (feedback := receiver.feedback(3, now)) is not None:
+                sender.on_feedback(feedback, now)
+
+    transmit(0, 1500)
+    [row] = console.browser("watch").get("/api/contacts").json()["items"]
+    assert (row["stage"], row["bytes_received"] >= 314) == ("sent", True)
+    versions = console.browser("watch").contact(row["id"])["versions"]
+    for version in versions:
+        assert version["percent_received"] == {"preview": None, "sent": 100.0}[version["stage"]]
+        assert version["frames_received"] is None
+        assert version["airtime_is"] == "at_least"
+        assert version["airtime_s"] == pytest.approx(version["bytes_received"] / 192 * RATES[1].airtime_s)
+    details = [one["sharp_to_m"] for one in versions]
+    assert details == sorted(details, reverse=True)
