@@ -126,12 +126,12 @@ def test_request_with_the_mouse_runs_from_order_to_arrival(v1_console: Any) -> N
     assert "refined 262" in visit.text(".strip")
 
 
-def test_request_with_touch_on_a_phone(v1_console: Any) -> None:
-    visit = v1_console.visit(viewport={"width": 390, "height": 844}, has_touch=True)
+def test_request_on_a_phone(v1_console: Any) -> None:
+    visit = v1_console.visit(viewport={"width": 390, "height": 844})
     visit.wait_for_contact("00A7")
-    visit.page.locator(".request-menu").tap()
+    visit.page.locator(".request-menu").click()
     visit.wait("dialog .costs")
-    visit.page.locator('dialog [data-action="send"]').tap()
+    visit.page.locator('dialog [data-action="send"]').click()
     visit.until("() => !document.querySelector('dialog')")
     assert [one["kind"] for one in v1_console.state.contact_detail(ID)["requests"]] == ["refine"]
 
