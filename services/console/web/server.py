@@ -51,8 +51,8 @@ from sonarpost.services.console.web.export_routes import ExportRoutes
 from sonarpost.services.console.web.installation_routes import installation_routes
 from sonarpost.services.console.web.map_routes import MapRoutes
 from sonarpost.services.console.web.mission_routes import MissionRoutes
-from sonarpost.services.console.web.report_routes import ReportRoutes
 from sonarpost.services.console.web.object_routes import ObjectRoutes
+from sonarpost.services.console.web.report_routes import ReportRoutes
 from sonarpost.services.console.web.score_routes import ScoreRoutes
 from sonarpost.services.console.web.session_routes import SessionRoutes
 from sonarpost.services.console.web.settings_routes import SettingsRoutes
