@@ -8,7 +8,15 @@ from sonarpost.review.measured_size import MeasuredSize, measured_size
 
 
 def body(kind: str, value_m: float, **fields: Any) -> dict[str, object]:
-    return {"id": 1, "kind": kind, "value_m": value_m, "sigma_m": 0.1, "height_m": None, "height_sigma_m": None, **fields}
+    return {
+        "id": 1,
+        "kind": kind,
+        "value_m": value_m,
+        "sigma_m": 0.1,
+        "height_m": None,
+        "height_sigma_m": None,
+        **fields,
+    }
 
 
 def test_latest_measurement_of_each_quantity_counts() -> None:

@@ -91,7 +91,7 @@ def score(decisions: Sequence[ScoredDecision]) -> Score:
 
 
 def score_by_bytes(decisions: Sequence[ScoredDecision]) -> list[tuple[int, int | None, Score]]:
-    """Return lower limit (exclusive), upper limit (inclusive; None for no limit) and score of each group with decisions.
+    """Return lower limit (exclusive), upper limit (inclusive, None: no limit) and score of the groups with decisions.
 
     The groups are those of `BYTE_LIMITS`.
     """

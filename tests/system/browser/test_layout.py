@@ -54,7 +54,8 @@ COVERED = """() => [...document.querySelectorAll('button, a.button, select, inpu
 
 CUT_OFF = """() => [...document.querySelectorAll('button, h1, h2, .pill, .count, .sum, .row b')].filter(element =>
   element.checkVisibility({ visibilityProperty: true }) && element.scrollWidth > element.clientWidth + 1
-  && element.clientWidth > 0 && getComputedStyle(element).display !== 'inline').map(element => element.outerHTML.slice(0, 100))"""
+  && element.clientWidth > 0 && getComputedStyle(element).display !== 'inline')
+  .map(element => element.outerHTML.slice(0, 100))"""
 
 
 def options(size, **more):

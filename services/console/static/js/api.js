@@ -1,5 +1,7 @@
 // Requests to the server. Every failure becomes an ApiError whose message is shown to the operator.
 
+import { t } from "./texts.js";
+
 export class ApiError extends Error {
   constructor(status, code, message, body = {}, retry_after_s = 0) {
     super(message);
@@ -15,8 +17,8 @@ async function errorOf(response) {
   const body = await response.json().catch(() => ({}));
   const retry_after_s = Number(response.headers.get("Retry-After")) || 0;
   const busy = response.status === 429 || response.status === 503;
-  const again = retry_after_s ? `in ${retry_after_s} s` : "later";
-  const text = busy ? `The server is busy (status ${response.status}): try again ${again}.` : `The server returned status ${response.status}.`;
+  const { status } = response;
+  const text = !busy ? t("api.status", { status }) : retry_after_s ? t("api.busy_for", { status, seconds: retry_after_s }) : t("api.busy", { status });
   const { code = "error", message = text } = body.error ?? {};
   return new ApiError(response.status, code, message, body, retry_after_s);
 }
@@ -37,7 +39,7 @@ async function request(method, path, body) {
       body: method === "GET" ? undefined : JSON.stringify(body ?? {}), signal: AbortSignal.timeout(15000),
     });
   } catch (error) {
-    throw new ApiError(0, "no_connection", "No response from the console's server.", { cause: String(error) });
+    throw new ApiError(0, "no_connection", t("api.no_response"), { cause: String(error) });
   }
   if (response.status === 204) return null;
   if (response.ok) return response.json().catch(() => ({}));
@@ -52,7 +54,7 @@ async function download(path) {
     response = await fetch(path, { credentials: "same-origin", cache: "no-store", redirect: "error" });
     if (response.ok) return await response.blob();
   } catch (error) {
-    throw new ApiError(0, "no_connection", "The export was interrupted.", { cause: String(error) });
+    throw new ApiError(0, "no_connection", t("api.interrupted"), { cause: String(error) });
   }
   if (response.status === 401) location.assign("/login");
   throw await errorOf(response);

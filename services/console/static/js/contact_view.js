@@ -33,6 +33,12 @@ function secondImage(detail, { version, layer, compare }) {
   return other ? [shown, other.name] : null;
 }
 
+/** Slant range, or ground range where the record has no slant range. */
+function rangeText(contact, record) {
+  const slant_m = record?.slant_range_m ?? null;
+  return t(slant_m === null ? "contact_view.ground_range" : "contact_view.slant_range", { range: quantity(slant_m ?? contact.range_m, "m", 0) });
+}
+
 export class ContactView {
   constructor() {
     this.detail = null;
@@ -236,7 +242,7 @@ export class ContactView {
       along_m: (version.pixel_along_m * version.height_px) / image.height,
       across_m: (version.pixel_across_m * version.width_px) / image.width,
     } : null;
-    const title = `version ${version.version} · ${layerName(version, version.contact_id ? this.layer : layer)}${version.complete ? "" : ` · ${received(version)}`}`;
+    const title = `${t("contact_view.version", { version: version.version })} · ${layerName(version, version.contact_id ? this.layer : layer)}${version.complete ? "" : ` · ${received(version)}`}`;
     const synthesised = version.layers.find((one) => one.name === layer)?.synthesised ?? false;
     const record = this.detail.record ?? {};
     // A layer may have more pixels than the image; the mark is in pixels of the image.
@@ -431,9 +437,9 @@ export class ContactView {
     fill(this.heading,
       h("h2", { text: contact.name }),
       h("span", { class: "number", text: time(contact.seen_utc_s ?? contact.first_frame_utc_s, { date: true }) }),
-      h("span", { class: "number", text: `ATD ${contact.atd_class ? `${contact.atd_class} ` : ""}${contact.atd_confidence === null ? DASH : contact.atd_confidence.toFixed(2)}` }),
+      h("span", { class: "number", text: t("contact_view.detector", { class: contact.atd_class ? `${contact.atd_class} ` : "", confidence: contact.atd_confidence === null ? DASH : contact.atd_confidence.toFixed(2) }) }),
       probabilities(contact) ? h("span", { class: "number probabilities", text: probabilities(contact) }) : null,
-      h("span", { class: "number", text: `${position(contact.lat_deg, contact.lon_deg)}${sigma} · range ${quantity(record?.slant_range_m ?? contact.range_m, "m", 0)} · altitude ${quantity(record?.altitude_m, "m")}` }));
+      h("span", { class: "number", text: [`${position(contact.lat_deg, contact.lon_deg)}${sigma}`, rangeText(contact, record), t("contact_view.altitude", { altitude: quantity(record?.altitude_m, "m") })].join(" · ") }));
     this.#drawTools();
     drawVersions(this);
     fill(this.strip, integrityStrip(relatedVersion(this.detail, this.layer) ?? this.shown, this.shownLayer));

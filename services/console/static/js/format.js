@@ -33,7 +33,7 @@ export const percent = (value, digits = 0) => (known(value) ? `${value.toFixed(d
 /** Statement about the authentication of a contact's acoustic frames; null where it is not known. */
 export function authentication(row) {
   if (row.authenticated === null || row.authenticated === undefined) return null;
-  return row.authenticated ? "authenticated" : "unauthenticated: any modem in range can have forged this contact";
+  return t(row.authenticated ? "format.authenticated" : "format.unauthenticated");
 }
 
 /** Probabilities of a contact as whole percentages that add up to 100; null where they are not known. */
@@ -41,7 +41,7 @@ export function probabilities(row) {
   if (!known(row.p_mine_like) || !known(row.p_other_object)) return null;
   const mineLike = Math.round(100 * row.p_mine_like);
   const other = Math.min(Math.round(100 * row.p_other_object), 100 - mineLike);
-  return `mine-like ${percent(mineLike)}, other object ${percent(other)}, seabed ${percent(100 - mineLike - other)}`;
+  return t("format.probabilities", { mine_like: percent(mineLike), other: percent(other), seabed: percent(100 - mineLike - other) });
 }
 
 /** Statement about the despeckling of an image; null where it is not known. */
@@ -91,28 +91,25 @@ function degrees(value, positive, negative, width) {
 
 /** Degrees and decimal minutes, as on charts. */
 export function position(lat_deg, lon_deg) {
-  if (!known(lat_deg) || !known(lon_deg)) return "position unknown";
+  if (!known(lat_deg) || !known(lon_deg)) return t("format.no_position");
   return `${degrees(lat_deg, "N", "S", 2)}  ${degrees(lon_deg, "E", "W", 3)}`;
 }
 
+const SHORE_TONES = { waiting: "", relay: "", delivered: "good", refused: "bad", withdrawn: "", none: "" };
+const VEHICLE_TONES = { waiting: "", asked: "", sent: "", confirmed: "good", withdrawn: "", disputed: "", refused: "bad", expired: "bad", none: "" };
+
 /** Delivery state to the shore site: [text, CSS class]. */
 export function shoreState(delivery) {
-  const texts = {
-    waiting: ["waiting on this vessel", ""], relay: ["at the relay", ""], delivered: ["at the shore site", "good"],
-    refused: ["refused by the shore site", "bad"], withdrawn: [t("format.withdrawn"), ""], none: ["no shore site configured", ""],
-  };
-  return texts[delivery?.shore] ?? [DASH, ""];
+  const step = delivery?.shore;
+  return step in SHORE_TONES ? [t(`delivery.shore.${step}`), SHORE_TONES[step]] : [DASH, ""];
 }
 
 /** Delivery state to the vehicle: [text, CSS class]. */
 export function vehicleState(delivery) {
-  const times = delivery?.times_sent ? `, sent ${delivery.times_sent}×` : "";
-  const texts = {
-    waiting: ["waiting on this vessel", ""], asked: ["waiting for the modem", ""], sent: [`not confirmed${times}`, ""],
-    confirmed: [`on the vehicle${times}`, "good"], withdrawn: [t("format.withdrawn"), ""], disputed: [t("format.disputed"), ""], refused: ["refused by the vehicle", "bad"],
-    expired: [`not confirmed in time${times}`, "bad"], none: ["no acoustic link configured", ""],
-  };
-  return texts[delivery?.vehicle] ?? [DASH, ""];
+  const step = delivery?.vehicle;
+  if (!(step in VEHICLE_TONES)) return [DASH, ""];
+  const times = delivery.times_sent && ["sent", "confirmed", "expired"].includes(step) ? `, ${t("delivery.times", { count: delivery.times_sent })}` : "";
+  return [t(`delivery.vehicle.${step}`) + times, VEHICLE_TONES[step]];
 }
 
 /** Distance between the lines of a grid or axis: 1, 2 or 5 times a power of ten. */
