@@ -5,6 +5,7 @@ import { api } from "./api.js";
 import { Chain, chainBanner } from "./chain.js";
 import { fill, h } from "./dom.js";
 import { opener } from "./layout.js";
+import { openScoreDialog } from "./score_dialog.js";
 import { emit, listen, setting, state } from "./state.js";
 import { t } from "./texts.js";
 
@@ -61,6 +62,7 @@ export class Header {
     const button = (name, text, handler) => h("button", { type: "button", title: t(name), "aria-label": t(name), on: { click: handler } }, text);
     const menu = h("div", { class: "menu-items" },
       h("nav", { "aria-label": t("header.views") }, this.tabs),
+      state.info.known_objects ? h("button", { type: "button", id: "score", text: t("score.title"), on: { click: openScoreDialog } }) : null,
       button("header.exports", "⇩", actions.exports),
       button("header.theme", "◐", toggleTheme),
       button("header.type_size", "A±", toggleTypeSize),
@@ -94,7 +96,7 @@ export class Header {
   render() {
     this.chain.render();
     document.body.dataset.online = String(state.online);
-    const banners = [state.info.training ? h("p", { id: "training", text: t("header.training") }) : null, chainBanner()].filter(Boolean);
+    const banners = [state.info.training ? h("p", { id: "training" }, h("b", { text: t("header.training") }), " ", h("span", { text: t("header.training_note") })) : null, chainBanner()].filter(Boolean);
     const shown = [...this.banners.children];
     const same = banners.map((one) => one.id).join() === shown.map((one) => one.id).join();
     // An unchanged banner keeps its element: a screen reader reads each one once.

@@ -1,8 +1,8 @@
-// The object of a contact of training or of the calibrated watch, after the decision; the button of the score.
+// The object of a contact of training or of the calibrated watch, after the decision.
 
 import { fill, h } from "./dom.js";
 import { emit, listen, state } from "./state.js";
-import { isCorrect, openScoreDialog } from "./score_dialog.js";
+import { isCorrect } from "./score_dialog.js";
 import { t } from "./texts.js";
 
 /** Result of a decision as text and CSS class. */
@@ -15,8 +15,7 @@ export class KnownObject {
   constructor() {
     this.element = h("div", { class: "known hidden", role: "note" });
     this.line = h("span", { role: "status", id: "truth" });
-    this.score = h("button", { type: "button", id: "score", text: t("score.title"), class: state.info.known_objects ? "" : "hidden", on: { click: openScoreDialog } });
-    document.getElementById("result").append(this.line, this.score);
+    document.getElementById("result").append(this.line);
     listen("truth", (one) => { if (one.operator === state.session.user) this.#announce(one); });
   }
 

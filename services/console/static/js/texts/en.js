@@ -268,7 +268,8 @@ export default {
   "header.of": "of {total}",
   "header.title": "({unreviewed}) {platform} · sonarpost console",
   "header.title_alerts": { one: "{count} alert · {title}", other: "{count} alerts · {title}" },
-  "header.training": "TRAINING — all contacts are simulated. Nothing is sent to a vehicle or a shore site.",
+  "header.training": "TRAINING: all contacts are simulated.",
+  "header.training_note": "Nothing is sent to a vehicle or a shore site.",
   // chain.js
   "chain.place.browser": "browser",
   "chain.place.server": "server",
