@@ -268,7 +268,8 @@ export default {
   "header.of": "von {total}",
   "header.title": "({unreviewed}) {platform} · sonarpost-Konsole",
   "header.title_alerts": { one: "{count} Alarm · {title}", other: "{count} Alarme · {title}" },
-  "header.training": "AUSBILDUNG — alle Kontakte sind simuliert. Nichts wird an ein Fahrzeug oder eine Landstelle gesendet.",
+  "header.training": "AUSBILDUNG: alle Kontakte sind simuliert.",
+  "header.training_note": "Nichts wird an ein Fahrzeug oder eine Landstelle gesendet.",
   // chain.js
   "chain.place.browser": "Browser",
   "chain.place.server": "Server",
