@@ -29,10 +29,10 @@ from sonarpost.services.console.training.simulator import VESSEL, TrainingSimula
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "explanation" / "console"
-SMALL, LARGE = (1366, 768), (1920, 1080)
+PHONE, TABLET, SMALL, LARGE = (390, 844), (1024, 768), (1366, 768), (1920, 1080)
 BOB = Actor("bob", "operator", "127.0.0.1")
 BACKLOG, CONTACTS = 34, 60
-MAX_BYTES = 300_000
+MAX_BYTES = 400_000
 
 
 class Scene:
@@ -40,7 +40,7 @@ class Scene:
 
     def __init__(self, state: ConsoleState, users: Users, address: str, browser: Browser) -> None:
         self.state, self.address, self._browser = state, address, browser
-        self._token = users.start_session("anna").token
+        self._users = users
         rows = state.list_contacts(ContactFilter(limit=200, sort="confidence"))["items"]
         self.rows: list[Json] = [row for row in rows if row["has_picture"]]
 
@@ -48,6 +48,10 @@ class Scene:
         """Return one of the contacts with the highest confidence of the detector."""
         found = [row["id"] for row in self.rows if row["complete"] == complete and row["range_m"] > 6]
         return str(found[index])
+
+    def looks(self) -> str:
+        """Return a contact that is one of several looks at an object."""
+        return next(str(row["id"]) for row in self.rows if row["looks"] > 1)
 
     def decide(self, contact_id: str, verdict: str, confidence: float, mlo_class: str | None, remark: str) -> None:
         """Decide as another operator."""
@@ -58,15 +62,16 @@ class Scene:
         self.state.decide(contact_id, DecisionInput(revision, displayed, verdict, confidence, mlo_class, remark), BOB)  # type: ignore[arg-type]
 
     @contextmanager
-    def page(self, size: tuple[int, int], theme: str, contact_id: str = "") -> Iterator[Page]:
+    def page(self, size: tuple[int, int], theme: str, contact_id: str, user: str = "anna") -> Iterator[Page]:
         """Open the page at a contact."""
+        token = self._users.start_session(user).token
         width, height = size
         context = self._browser.new_context(
             viewport={"width": width, "height": height},
             color_scheme="dark" if theme == "night" else "light",
             reduced_motion="reduce",
         )
-        context.add_cookies([{"name": "sonarpost_session", "value": self._token, "url": self.address}])
+        context.add_cookies([{"name": "sonarpost_session", "value": token, "url": self.address}])
         page = context.new_page()
         page.add_init_script("localStorage.setItem('sonarpost.review', '')")
         page.goto(f"{self.address}#{quote(contact_id, safe='')}")
@@ -109,7 +114,8 @@ def measurement(scene: Scene) -> None:
     """Day theme, small: a measured shadow."""
     contact_id = scene.contact(complete=True, index=0)
     with scene.page(SMALL, "day", contact_id) as page:
-        measure_shadow(page)
+        press(page, "6", *["Shift+ArrowLeft"] * 2, "Enter", *["Shift+ArrowRight"] * 3, "Enter")
+        page.wait_for_selector(".size-panel >> text=±")
         press(page, "Enter")
         page.wait_for_selector('details[data-name="measurements"]')
         page.focus("#queue")
@@ -117,14 +123,8 @@ def measurement(scene: Scene) -> None:
         save(page, "review-day-1366")
 
 
-def measure_shadow(page: Page) -> None:
-    """Measure the shadow, which begins left of the centre of the image."""
-    press(page, "m", "m", "m", *["Shift+ArrowLeft"] * 4, "Enter", *["Shift+ArrowRight"] * 3, "Enter")
-    page.wait_for_selector(".hint >> text=Enter keeps it")
-
-
 def decision(scene: Scene) -> None:
-    """Night theme, large: a delivered decision and a comment from the shore site."""
+    """Night theme, large: a delivered decision and a comment from the shore site, two versions side by side."""
     contact_id = scene.contact(complete=True, index=0)
     row = scene.state.contact_detail(contact_id)["contact"]
     advice = Advice(
@@ -142,13 +142,11 @@ def decision(scene: Scene) -> None:
     )
     scene.state.store_advice(advice)
     with scene.page(LARGE, "night", contact_id) as page:
-        press(page, "Shift+Digit1", "g", "ArrowRight", *["ArrowRight"] * 5, "w")
+        press(page, "Shift+Digit1", "g", *["ArrowRight"] * 6, "w")
         page.keyboard.type("highlight and shadow agree")
         page.keyboard.press("Control+Enter")
         page.wait_for_selector("#result >> text=mine-like")
-        page.evaluate("id => { location.hash = ''; location.replace(`/#${encodeURIComponent(id)}`); }", contact_id)
-        page.reload()
-        page.wait_for_function("id => document.querySelector('canvas')?.dataset.shows?.includes(id)", arg=contact_id)
+    with scene.page(LARGE, "night", contact_id) as page:
         page.wait_for_selector(".progress >> text=on the vehicle")
         page.wait_for_selector('.progress >> text="at the shore site"')
         press(page, "s")
@@ -158,7 +156,7 @@ def decision(scene: Scene) -> None:
 
 def partial_image(scene: Scene) -> None:
     """Night theme, small: an image whose half is missing."""
-    halves = [row["id"] for row in scene.rows if 30 < row["percent_received"] < 70]
+    halves = [row["id"] for row in scene.rows if not row["complete"] and row["percent_received"] == 50]
     with scene.page(SMALL, "night", str(halves[0])) as page:
         press(page, "c", "c", "c")
         save(page, "partial-night-1366")
@@ -169,10 +167,10 @@ def request(scene: Scene) -> None:
     with scene.page(SMALL, "day", scene.contact(complete=False, index=1)) as page:
         press(page, "r")
         page.wait_for_selector("dialog .costs")
-        save(page, "ask-day-1366")
+        save(page, "requests-day-1366")
 
 
-def conflict(scene: Scene) -> None:
+def dispute(scene: Scene) -> None:
     """Day theme, large: a contact that two operators dispute."""
     contact_id = scene.contact(complete=True, index=4)
     with scene.page(LARGE, "day", contact_id) as page:
@@ -180,22 +178,50 @@ def conflict(scene: Scene) -> None:
         page.wait_for_selector(".overrule")
         press(page, "1")
         page.wait_for_selector(".overrule.disputed li")
-        save(page, "conflict-day-1920")
+        save(page, "disputed-day-1920")
 
 
-def map_and_link(scene: Scene) -> None:
-    """Small: the map in the day theme, the link view in the night theme."""
+def views(scene: Scene) -> None:
+    """The map, the link, the mission and an object with two looks."""
     contact_id = scene.contact(complete=True, index=0)
     with scene.page(SMALL, "day", contact_id) as page:
         press(page, "p")
-        page.wait_for_function("() => document.querySelector('.map canvas').width > 300")
+        page.wait_for_selector(".map .leaflet-container, .map.leaflet-container, .map canvas")
+        page.wait_for_timeout(1500)
         press(page, *["j"] * 8)
         page.wait_for_selector(".map .card")
+        page.wait_for_timeout(800)
         save(page, "map-day-1366")
     with scene.page(SMALL, "night", contact_id) as page:
         press(page, "f")
         page.wait_for_selector(".frames li")
         save(page, "link-night-1366")
+    with scene.page(LARGE, "day", contact_id) as page:
+        press(page, "M")
+        page.wait_for_selector(".mission >> text=All vehicles")
+        save(page, "mission-day-1920")
+    with scene.page(SMALL, "night", scene.looks()) as page:
+        press(page, "O")
+        page.wait_for_selector("dialog canvas")
+        page.wait_for_timeout(1000)
+        save(page, "object-night-1366")
+
+
+def small_screens(scene: Scene) -> None:
+    """A tablet and a phone."""
+    with scene.page(TABLET, "night", scene.contact(complete=True, index=2)) as page:
+        save(page, "review-night-1024")
+    with scene.page(PHONE, "day", scene.contact(complete=True, index=2)) as page:
+        save(page, "review-day-390")
+
+
+def score(scene: Scene) -> None:
+    """Day theme, tablet: the score of the training."""
+    with scene.page(TABLET, "day", scene.contact(complete=True, index=0), user="eva") as page:
+        page.wait_for_selector("#score", state="attached")
+        page.evaluate("document.getElementById('score').click()")
+        page.wait_for_selector("dialog .score")
+        save(page, "score-day-1024")
 
 
 def main() -> None:
@@ -208,7 +234,8 @@ def main() -> None:
         folder = Path(scratch)
         config = ConsoleConfig(port=0, vessel_lat_deg=56.4495, vessel_lon_deg=-5.6012)
         database, users = Database(folder / "review.db"), Users(folder / "users.db")
-        users.add("anna", "operator", "correct horse battery")
+        for name, role in (("anna", "operator"), ("eva", "expert")):
+            users.add(name, role, "correct horse battery")
         state = ConsoleState(config, database)
         app = ConsoleApp(state, users, VESSEL, training=True)
         server = WebServer(app.asgi, config.host, config.port)
@@ -221,7 +248,7 @@ def main() -> None:
         try:
             scene = Scene(state, users, server.address, browser)
             add_decisions(scene)
-            for take in (measurement, decision, partial_image, request, conflict, map_and_link):
+            for take in (measurement, decision, partial_image, request, dispute, views, small_screens, score):
                 take(scene)
         finally:
             browser.close()

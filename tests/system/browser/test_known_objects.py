@@ -42,6 +42,9 @@ def test_object_is_shown_after_the_decision_and_counted_in_the_score(serve):
     assert "boulder" in table
     assert "correct" in table
     assert "wrong" in table
+    assert "Pd" in table
+    assert "100\u202f% (1 of 1; " in table
+    assert "[object" not in table
     visit.page.click("dialog tbody button >> text=00A7")
     visit.wait_for_contact("00A7")
     visit.wait(".known >> text=practice mine")

@@ -57,7 +57,7 @@ export async function openScoreDialog() {
   const close = () => document.querySelector("dialog[open]")?.close();
   const heads = ["contact", "operator", "verdict", "object", "result", "bytes", "decided_at"].map((name) => h("th", { scope: "col", text: t(`score.${name}`) }));
   await showDialog(t("score.title"), sheet.operators.length ? [
-    h("p", { text: t("score.intro") }), sheet.operators.map(scoreTable),
+    h("p", { text: t("score.intro") }), ...sheet.operators.flatMap(scoreTable),
     h("h3", { text: t("score.decisions") }),
     h("table", { class: "score" }, h("thead", {}, h("tr", {}, heads)), h("tbody", {}, sheet.decisions.map((one) => decisionRow(one, close)))),
   ] : [h("p", { text: t("score.empty") })], [{ label: t("score.close"), value: null, primary: true }]);
