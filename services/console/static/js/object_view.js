@@ -53,7 +53,7 @@ class ObjectPanel {
     this.object = object;
     if (!object.looks.some((look) => look.contact.id === this.selected)) this.selected = object.looks[0].contact.id;
     this.dialog.querySelector("h2").textContent = t("object.title", { count: object.number_of_looks });
-    const extent = (one) => (one ? `${quantity(one.value, "m")}${one.sigma === null ? "" : ` ± ${one.sigma.toFixed(1)}`}` : DASH);
+    const extent = (one) => (one ? `${quantity(one.value, "m")}${one.sigma === null || one.sigma < 0.05 ? "" : ` ± ${one.sigma.toFixed(1)}`}` : DASH);
     const aspects = object.looks.map((look) => look.aspect_deg).filter((aspect) => aspect !== null);
     const gap = widestGap(aspects);
     fill(this.head,
