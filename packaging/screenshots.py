@@ -186,8 +186,7 @@ def views(scene: Scene) -> None:
     contact_id = scene.contact(complete=True, index=0)
     with scene.page(SMALL, "day", contact_id) as page:
         press(page, "p")
-        page.wait_for_selector(".map .leaflet-container, .map.leaflet-container, .map canvas")
-        page.wait_for_timeout(1500)
+        page.wait_for_selector(".map[data-drawn]")
         press(page, *["j"] * 8)
         page.wait_for_selector(".map .card")
         page.wait_for_timeout(800)

@@ -47,6 +47,8 @@ def main() -> int:
     missing = wanted() - names
     top_level = {"sonarpost"} | {name.partition("/")[0] for name in names if ".dist-info/" in name}
     extra = {name for name in names if name.partition("/")[0] not in top_level or "__pycache__" in name}
+    vendor = "sonarpost/services/console/static/vendor/leaflet/"
+    missing |= {vendor + name for name in ("leaflet.js", "leaflet.css", "LICENSE.md")} - names
     licence = any(name.endswith("licenses/LICENSE") for name in names)
     for problem, which in (("missing from", missing), ("does not belong into", extra)):
         for name in sorted(which):

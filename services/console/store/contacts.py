@@ -48,6 +48,8 @@ _RECORD_COLUMNS: Final = (
     "length_m",
     "width_m",
     "height_m",
+    "heading_deg",
+    "pixel_along_m",
 )
 _PLACE_COLUMNS: Final = "group_id, parent, lat_deg, lon_deg, position_sigma_m, seen_utc_s, length_m, width_m, height_m"
 _IMAGE_COLUMNS: Final = (

@@ -68,6 +68,7 @@ CREATE TABLE IF NOT EXISTS contact (
     codec TEXT NOT NULL, has_picture INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL,
     group_id TEXT, authenticated INTEGER, despeckle_strength REAL, p_mine_like REAL, p_other_object REAL,
     parent TEXT, relation TEXT, sealed INTEGER NOT NULL DEFAULT 0, length_m REAL, width_m REAL, height_m REAL,
+    heading_deg REAL, pixel_along_m REAL,
     contradictory INTEGER NOT NULL DEFAULT 0, decided_version INTEGER, decided_bytes INTEGER
 ) WITHOUT ROWID;
 CREATE UNIQUE INDEX IF NOT EXISTS contact_image ON contact (vessel_id, vehicle_id, image_id, first_s);
@@ -158,6 +159,8 @@ _ADDED_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
         "contradictory": "INTEGER NOT NULL DEFAULT 0",
         "decided_version": "INTEGER",
         "decided_bytes": "INTEGER",
+        "heading_deg": "REAL",
+        "pixel_along_m": "REAL",
     },
     "version": {"removed": "INTEGER NOT NULL DEFAULT 0"},
     "measurement": {"withdrawn_by": "TEXT", "withdrawn_utc_s": "REAL"},

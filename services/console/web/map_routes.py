@@ -8,7 +8,6 @@ from pathlib import Path
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from sonarpost.review.positions import LocalFrame
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import NotFoundError
 from sonarpost.services.console.store.serialisers import Json
@@ -56,12 +55,12 @@ def _zoom_levels(folder: Path | None) -> list[int]:
 
 
 def map_json(state: ConsoleState) -> Json:
-    """Return contacts, tracks and vessel in metres around an origin."""
+    """Return contacts, vehicles and vessel with WGS 84 positions in degrees."""
     with state.database.read() as db:
         rows = db.execute(
             "SELECT c.id, c.name, c.vehicle_id, c.lat_deg, c.lon_deg, c.position_sigma_m, c.review, c.atd_confidence,"
-            " c.atd_class,"
-            " c.group_id, c.vehicle_lat_deg, c.vehicle_lon_deg,"
+            " c.atd_class, c.group_id, c.vehicle_lat_deg, c.vehicle_lon_deg, c.heading_deg,"
+            " c.pixel_along_m * c.height_px AS along_m,"
             " COALESCE(c.seen_utc_s, c.first_frame_utc_s) AS at_utc_s,"
             " COUNT(*) OVER (PARTITION BY COALESCE(c.group_id, c.id)) AS looks"
             " FROM contact c WHERE c.parent IS NULL AND c.sealed < 2"
@@ -72,45 +71,39 @@ def map_json(state: ConsoleState) -> Json:
             "SELECT COUNT(*) FROM contact WHERE parent IS NULL AND sealed < 2 AND (lat_deg IS NULL OR lon_deg IS NULL)"
         ).fetchone()[0]
     config = state.config
-    frame = None
-    if config.vessel_lat_deg is not None and config.vessel_lon_deg is not None:
-        frame = LocalFrame(config.vessel_lat_deg, config.vessel_lon_deg)
-    elif rows:
-        # The origin is the earliest contact, so that it does not change while contacts arrive.
-        frame = LocalFrame(rows[-1]["lat_deg"], rows[-1]["lon_deg"])
-    contacts: list[Json] = []
-    tracks: dict[str, list[list[float]]] = {}
-    if frame is not None:
-        points = frame.to_local([row["lat_deg"] for row in rows], [row["lon_deg"] for row in rows])
-        contacts = [_contact_json(row, point) for row, point in zip(rows, points, strict=True)]
-        seen = [row for row in reversed(rows) if row["vehicle_lat_deg"] is not None]
-        points = frame.to_local([r["vehicle_lat_deg"] for r in seen], [r["vehicle_lon_deg"] for r in seen])
-        for row, (x_m, y_m) in zip(seen, points, strict=True):
-            tracks.setdefault(row["vehicle_id"], []).append([x_m, y_m, row["at_utc_s"]])
-    vehicles = state.fleet.vehicles()
+    fleet = state.fleet.vehicles()
+    last: dict[str, sqlite3.Row] = {}
+    for row in rows:
+        if row["vehicle_lat_deg"] is not None:
+            last.setdefault(row["vehicle_id"], row)
     return {
-        "origin": None if frame is None else {"lat_deg": frame.lat_deg, "lon_deg": frame.lon_deg},
-        "contacts": contacts,
+        "contacts": [_contact_json(row) for row in rows],
         "unlocated": unlocated,
         "vehicles": [
-            {"vehicle_id": name, "track": track, "stale": name not in vehicles or vehicles[name]["stale"]}
-            for name, track in sorted(tracks.items())
+            {
+                "vehicle_id": name,
+                "lat_deg": row["vehicle_lat_deg"],
+                "lon_deg": row["vehicle_lon_deg"],
+                "heading_deg": row["heading_deg"],
+                "utc_s": row["at_utc_s"],
+                "stale": name not in fleet or fleet[name]["stale"],
+            }
+            for name, row in sorted(last.items())
         ],
-        "vessel": None if config.vessel_lat_deg is None else {"x_m": 0.0, "y_m": 0.0},
+        "vessel": None
+        if config.vessel_lat_deg is None
+        else {"lat_deg": config.vessel_lat_deg, "lon_deg": config.vessel_lon_deg},
         "ring_m": list(config.ring_m),
     }
 
 
-def _contact_json(row: sqlite3.Row, point: tuple[float, float]) -> Json:
-    return {
-        "id": row["id"],
-        "name": row["name"],
-        "x_m": point[0],
-        "y_m": point[1],
+def _contact_json(row: sqlite3.Row) -> Json:
+    names = ("id", "name", "lat_deg", "lon_deg", "review", "atd_confidence", "atd_class", "looks")
+    return {name: row[name] for name in names} | {
         "sigma_m": row["position_sigma_m"],
-        "review": row["review"],
-        "atd_confidence": row["atd_confidence"],
-        "atd_class": row["atd_class"],
         "group": row["group_id"] if row["looks"] > 1 else None,
-        "looks": row["looks"],
+        "vehicle_lat_deg": row["vehicle_lat_deg"],
+        "vehicle_lon_deg": row["vehicle_lon_deg"],
+        "heading_deg": row["heading_deg"],
+        "along_m": row["along_m"],
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sqlite3
 
 import pytest
 from builders.console import image_record
@@ -10,29 +11,64 @@ from builders.console import image_record
 from sonarpost import keys, wire
 from sonarpost.messages import AcousticFrame, Health, LinkQuality, QueuedImage, QueueState
 from sonarpost.review.positions import LocalFrame, destination, distance_m, vehicle_position
+from sonarpost.services.console.store.database import Database
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 
 
-def test_map_is_in_metres_around_the_vessel(make_console):
-    console = make_console(vessel_lat_deg=56.0, vessel_lon_deg=-5.0)
-    console.state.store_image(image_record("0001", position=destination(56.0, -5.0, 90.0, 300.0)))
+def test_map_has_positions_in_degrees(make_console):
+    console = make_console(vessel_lat_deg=56.0, vessel_lon_deg=-5.0, ring_m=[250.0])
+    position = destination(56.0, -5.0, 90.0, 300.0)
+    console.state.store_image(image_record("0001", position=position))
     console.state.store_image(image_record("0002", position=None))
     chart = console.browser("watch").get("/api/map").json()
     [point] = chart["contacts"]
-    assert (point["x_m"], point["y_m"]) == (pytest.approx(300.0, abs=0.01), pytest.approx(0.0, abs=0.01))
-    # The heading is north and the object 12 m to starboard: the vehicle was 12 m west of it.
-    [[x_m, y_m, _]] = chart["vehicles"][0]["track"]
-    assert (x_m, y_m) == (pytest.approx(288.0, abs=0.01), pytest.approx(0.0, abs=0.01))
-    assert (chart["unlocated"], chart["vessel"]) == (1, {"x_m": 0.0, "y_m": 0.0})
+    assert (point["lat_deg"], point["lon_deg"]) == position
+    # The image has 40 lines of 0.1 m. The heading is north and the object 12 m to starboard.
+    assert (point["heading_deg"], point["along_m"]) == (0.0, pytest.approx(4.0))
+    vehicle_at = destination(*position, 270.0, 12.0)
+    assert (point["vehicle_lat_deg"], point["vehicle_lon_deg"]) == pytest.approx(vehicle_at)
+    [vehicle] = chart["vehicles"]
+    assert (vehicle["lat_deg"], vehicle["lon_deg"]) == pytest.approx(vehicle_at)
+    assert (vehicle["vehicle_id"], vehicle["heading_deg"], vehicle["stale"]) == ("uuv-1", 0.0, True)
+    assert (chart["unlocated"], chart["vessel"]) == (1, {"lat_deg": 56.0, "lon_deg": -5.0})
+    assert chart["ring_m"] == [250.0]
     [vehicle] = console.browser("watch").get("/api/fleet").json()["vehicles"]
     assert vehicle["range_m"] == pytest.approx(288.0, abs=0.1)
     assert (vehicle["stale"], vehicle["queue"]) == (True, None)
 
 
-def test_map_without_contacts_has_no_origin(console):
+def test_vehicle_on_the_map_is_at_its_newest_contact(console):
+    for number, seen_s in ((1, 50.0), (2, 90.0), (3, 70.0)):
+        console.state.store_image(
+            image_record(f"000{number}", position=(56.0 + 0.01 * number, -5.0), time_utc_s=1_700_000_000.0 + seen_s)
+        )
+    [vehicle] = console.browser("watch").get("/api/map").json()["vehicles"]
+    assert (vehicle["lat_deg"], vehicle["utc_s"]) == (pytest.approx(56.02, abs=1e-4), 1_700_000_090.0)
+
+
+def test_map_without_contacts_or_vessel_is_empty(console):
     chart = console.browser("watch").get("/api/map").json()
-    assert (chart["origin"], chart["contacts"], chart["vessel"]) == (None, [], None)
+    assert (chart["contacts"], chart["vehicles"], chart["vessel"]) == ([], [], None)
+
+
+def test_contact_without_heading_is_on_the_map(console):
+    console.state.store_image(image_record("0001", heading_deg=None))
+    chart = console.browser("watch").get("/api/map").json()
+    [point] = chart["contacts"]
+    assert (point["heading_deg"], point["vehicle_lat_deg"], chart["vehicles"]) == (None, None, [])
+
+
+@pytest.mark.parametrize("column", ["heading_deg", "pixel_along_m"])
+def test_database_of_an_earlier_version_gains_the_column(column, tmp_path):
+    path = tmp_path / "review.db"
+    Database(path).close()
+    with sqlite3.connect(path) as old:
+        old.execute(f"ALTER TABLE contact DROP COLUMN {column}")
+    database = Database(path)
+    with database.read() as db:
+        assert column in {row["name"] for row in db.execute("PRAGMA table_info(contact)")}
+    database.close()
 
 
 def test_local_frame():

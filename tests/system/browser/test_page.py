@@ -40,7 +40,7 @@ CONTRAST = """() => {
   return [seen, found];
 }"""
 
-MAP_DRAWN = "() => document.querySelector('.map canvas').width > 300"
+MAP_DRAWN = "() => document.querySelector('.map').dataset.drawn !== undefined"
 
 WITHOUT_NAME = """() => [...document.querySelectorAll('button, input, select, textarea, canvas, a, [role=option], img')]
   .filter(e => e.checkVisibility() && !e.closest('[aria-hidden=true]'))

@@ -50,7 +50,7 @@ class App {
     this.queue = new Queue();
     this.filters = new QueueFilters(debounce(() => this.queue.show(this.filters.query), 120));
     listen("fleet", (fleet) => { state.fleet = fleet; }); // first listener: the others read the state
-    this.map = new MapView();
+    this.map = new MapView(() => this.actions.add(() => this.request()));
     this.fleet = new FleetView();
     this.mission = new MissionView();
     this.empty = new EmptyView();
@@ -228,7 +228,7 @@ class App {
     this.activeView = name;
     for (const [one, element] of [["review", this.review], ["map", this.map.element], ["fleet", this.fleet.element], ["mission", this.mission.element]]) element.classList.toggle("hidden", one !== name);
     this.header.setView(name);
-    if (name === "map") { this.map.load().catch((error) => toast(error.message, { bad: true })); this.map.canvas.focus(); }
+    if (name === "map") { this.map.load().catch((error) => toast(error.message, { bad: true })); this.map.focus(); }
     if (name === "fleet") { this.fleet.render(); this.fleet.element.focus(); }
     if (name === "mission") { this.mission.load(); this.mission.element.focus(); }
     if (name === "review") { this.queue.draw(); this.view.redraw(); this.queue.list.focus(); }
@@ -320,7 +320,8 @@ class App {
 
   escape() {
     if (this.view.measurement.active) this.view.measurement.back();
-    else (this.activeView === "map" ? this.map.canvas : this.queue.list).focus();
+    else if (this.activeView === "map") this.map.escape();
+    else this.queue.list.focus();
   }
 
   exports() { return openExportDialog(this.filters.query, this.queue.rows.matching, this.detail?.contact ?? null); }

@@ -89,10 +89,13 @@ function degrees(value, positive, negative, width) {
   return `${String(whole).padStart(width, "0")}° ${(minutes - whole * 60).toFixed(3).padStart(6, "0")}′ ${value < 0 ? negative : positive}`;
 }
 
+export const latitude = (lat_deg) => degrees(lat_deg, "N", "S", 2);
+export const longitude = (lon_deg) => degrees(lon_deg, "E", "W", 3);
+
 /** Degrees and decimal minutes, as on charts. */
 export function position(lat_deg, lon_deg) {
   if (!known(lat_deg) || !known(lon_deg)) return t("format.no_position");
-  return `${degrees(lat_deg, "N", "S", 2)}  ${degrees(lon_deg, "E", "W", 3)}`;
+  return `${latitude(lat_deg)}  ${longitude(lon_deg)}`;
 }
 
 const SHORE_TONES = { waiting: "", relay: "", delivered: "good", refused: "bad", withdrawn: "", none: "" };

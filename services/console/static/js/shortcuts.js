@@ -83,6 +83,8 @@ export function shortcutTable({ app, queue, view, decision, map }) {
     ["shortcuts.map", [
       [["j"], "shortcuts.map.next", () => map.move(1), onMap], [["k"], "shortcuts.map.previous", () => map.move(-1), onMap],
       [["Enter"], "shortcuts.map.open", () => map.open(), onMap],
+      [["1"], "", () => map.open(), onMap], [["2"], "", () => map.open(), onMap], [["3"], "", () => map.open(), onMap],
+      [["r"], "map.request", () => map.request(), onMap], [["m"], "map.measure", () => map.measure(), onMap],
       [["+", "="], "shortcuts.map.zoom_in", () => map.zoom(1.5), onMap], [["-"], "shortcuts.map.zoom_out", () => map.zoom(1 / 1.5), onMap], [["0"], "shortcuts.map.fit", () => map.fit(), onMap],
       [["ArrowUp"], "", () => map.pan(0, 80), onMap], [["ArrowDown"], "", () => map.pan(0, -80), onMap],
       [["ArrowLeft"], "", () => map.pan(80, 0), onMap], [["ArrowRight"], "", () => map.pan(-80, 0), onMap],

@@ -1,0 +1,313 @@
+"""The map in a real browser: symbols, clusters, position of the cursor, measuring, keys, tiles, 5,000 contacts."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import pytest
+from builders.console import image_record
+from PIL import Image
+
+from sonarpost.review.positions import destination, distance_m
+
+VESSEL = (56.0, -5.0)
+POSITION = re.compile(r"(\d+)° ([\d.]+)′ ([NS])\s+(\d+)° ([\d.]+)′ ([EW])")
+SYMBOL_AT = """id => {
+  const dot = document.querySelector(`.map .contact[title^="uuv-1/${id}"] .dot`).getBoundingClientRect();
+  const chart = document.querySelector('.map .chart').getBoundingClientRect();
+  return [dot.x + dot.width / 2 - chart.x, dot.y + dot.height / 2 - chart.y];
+}"""
+CHOSEN = "() => document.querySelector('.map .card h3')?.firstChild.textContent"
+
+
+def add(served, image_id, bearing_deg, range_m, **fields):
+    served.state.store_image(image_record(image_id, position=destination(*VESSEL, bearing_deg, range_m), **fields))
+
+
+def scene(serve, **options):
+    """Five contacts around a vessel, from west to east 0004, 0003, 0001, 0002, 0005."""
+    served = serve(vessel_lat_deg=VESSEL[0], vessel_lon_deg=VESSEL[1], ring_m=[100.0, 400.0], **options)
+    add(served, "0001", 0.0, 300.0, position_sigma_m=40.0)
+    add(served, "0002", 90.0, 300.0, atd_class="structure")
+    add(served, "0003", 180.0, 300.0, heading_deg=90.0)
+    add(served, "0004", 270.0, 300.0, heading_deg=None)
+    add(served, "0005", 90.0, 450.0)
+    return served
+
+
+def open_map(served, **options):
+    visit = served.visit(**options)
+    visit.press("p")
+    visit.wait(".map[data-drawn]")
+    return visit
+
+
+def chart_box(visit):
+    return visit.page.locator(".map .chart").bounding_box()
+
+
+def degrees(text):
+    """Latitude and longitude of a text in degrees and decimal minutes."""
+    lat, lat_min, north, lon, lon_min, east = POSITION.search(text).groups()
+    return (
+        (int(lat) + float(lat_min) / 60) * (1 if north == "N" else -1),
+        (int(lon) + float(lon_min) / 60) * (1 if east == "E" else -1),
+    )
+
+
+def test_symbols_are_at_their_true_places(serve):
+    served = scene(serve)
+    visit = open_map(served)
+    page = visit.page
+    assert page.locator(".map .contact").count() == 5
+    assert page.locator(".map .contact .dot.structure").count() == 1
+    at = {number: page.evaluate(SYMBOL_AT, f"000{number}") for number in (1, 2, 3, 4, 5)}
+    # North is up, and the same range has the same length in all directions.
+    centre = [(at[2][0] + at[4][0]) / 2, (at[1][1] + at[3][1]) / 2]
+    north, east = centre[1] - at[1][1], at[2][0] - centre[0]
+    assert north == pytest.approx(east, rel=0.02)
+    assert at[1][0] == pytest.approx(centre[0], abs=1.5)
+    assert (at[5][0] - centre[0]) / east == pytest.approx(1.5, abs=0.02)
+    # The range rings have their radius on the same scale.
+    widths = [one["width"] for one in (ring.bounding_box() for ring in page.locator(".map path.ring").all())]
+    assert max(widths) / 2 == pytest.approx(east * 400.0 / 300.0, rel=0.02)
+    # Four contacts have a heading; the position circle of 40 m is larger than its symbol.
+    assert page.locator(".map .contact .tick").count() == 4
+    turns = page.locator(".map .contact .tick").evaluate_all("list => list.map(one => one.style.rotate)")
+    assert sorted(turns) == ["0deg", "0deg", "0deg", "90deg"]
+    assert page.locator(".map path.sigma").bounding_box()["width"] / 2 == pytest.approx(east * 40.0 / 300.0, rel=0.05)
+    # Frame, scale and distances are labelled.
+    assert "′ N" in visit.text(".map .at-west")
+    assert "′ W" in visit.text(".map .at-south")
+    assert re.search(r"\d+ k?m$", visit.text(".map .leaflet-control-scale-line"))
+    assert visit.text(".map .ring-label").endswith("m")
+    # No line joins contacts: apart from frame, rings, bands and circles there is no path.
+    assert page.locator(".map path:not(.frame-line, .ring, .band, .sigma)").count() == 0
+
+
+def test_band_is_from_the_vehicle_to_the_contact(serve):
+    served = serve()
+    served.state.store_image(image_record("0001", position=VESSEL, heading_deg=0.0, ground_range_m=12.0))
+    visit = open_map(served)
+    band = visit.page.locator(".map path.band").bounding_box()
+    # 40 lines of 0.1 m along the track, 12 m across; the contact is at the eastern edge.
+    assert band["width"] / band["height"] == pytest.approx(3.0, rel=0.05)
+    x, _ = visit.page.evaluate(SYMBOL_AT, "0001")
+    assert band["x"] + band["width"] - chart_box(visit)["x"] == pytest.approx(x, abs=2.0)
+
+
+def test_cursor_and_measurement(serve):
+    served = scene(serve)
+    visit = open_map(served)
+    page, box = visit.page, chart_box(visit)
+    x, y = page.evaluate(SYMBOL_AT, "0002")
+    page.mouse.move(box["x"] + x + 60, box["y"] + y - 40)
+    cursor = degrees(visit.text(".map .readout"))
+    shown = re.search(r"from vessel (\d+)\s*m (\d+)°", visit.text(".map .readout"))
+    expected_m = distance_m(*VESSEL, *cursor)
+    assert float(shown[1]) == pytest.approx(expected_m, abs=2.0)
+    # Range and bearing from one contact to another, by clicks.
+    visit.press("m")
+    page.mouse.click(box["x"] + x, box["y"] + y)
+    x, y = page.evaluate(SYMBOL_AT, "0004")
+    page.mouse.click(box["x"] + x, box["y"] + y)
+    visit.until("() => /600.m 270°/.test(document.querySelector('.map .measured').textContent)")
+    assert page.locator(".map path.ruler-line").count() == 1
+    assert page.locator(".map .card").count() == 0  # a click measures, it does not select
+    visit.press("Escape")
+    assert (page.locator(".map path.ruler-line").count(), visit.text(".map .measured")) == (0, "")
+    assert page.locator(".map").is_visible()
+    # By keys: from the selected contact to the next ones.
+    visit.press("j", "m", "j")
+    visit.until("() => /m 135°/.test(document.querySelector('.map .measured').textContent)")
+    visit.press("m")
+    page.mouse.move(box["x"] + 50, box["y"] + 50)
+    assert "from uuv-1/0003" in visit.text(".map .readout")
+
+
+def test_geometry_is_that_of_the_ellipsoid(served):
+    visit = served.visit(path="login", user="")
+    for start, bearing_deg, range_m in (
+        (VESSEL, 33.0, 500.0),
+        (VESSEL, 271.0, 40_000.0),
+        ((-33.5, 151.0), 185.0, 100_000.0),
+        ((70.0, 179.99), 80.0, 20_000.0),
+        ((0.0, 0.0), 45.0, 1000.0),
+    ):
+        end = destination(*start, bearing_deg, range_m)
+        found = visit.page.evaluate(
+            """async ([a, b]) => {
+              const { rangeBearing, offset } = await import('/static/js/map_geometry.js');
+              const position = ([lat_deg, lon_deg]) => ({ lat_deg, lon_deg });
+              const { range_m, bearing_deg } = rangeBearing(position(a), position(b));
+              return { range_m, bearing_deg, there: offset(position(a), bearing_deg, Math.min(range_m, 1000)) };
+            }""",
+            [start, end],
+        )
+        assert found["range_m"] == pytest.approx(range_m, rel=1e-3)
+        assert found["bearing_deg"] == pytest.approx(bearing_deg, abs=0.1)
+        assert distance_m(*start, *found["there"]) == pytest.approx(min(range_m, 1000.0), rel=1e-3)
+
+
+def test_keys_select_from_west_to_east_and_a_verdict_needs_the_image(serve):
+    served = scene(serve)
+    visit = open_map(served)
+    page = visit.page
+    order = page.locator(".in-view [role=option]").evaluate_all("list => list.map(one => one.dataset.id)")
+    found = []
+    for _ in range(5):
+        visit.press("j")
+        visit.wait(".map .contact.chosen .dot")
+        found.append(page.locator(".in-view [aria-selected=true]").get_attribute("data-id"))
+    assert found == order
+    points = served.console.browser("watch").get("/api/map").json()["contacts"]
+    assert order == [one["id"] for one in sorted(points, key=lambda one: (one["lon_deg"], one["lat_deg"]))]
+    visit.until(f"() => ({CHOSEN})() === 'uuv-1/0005'")
+    assert "450" in visit.text(".map .card")
+    assert degrees(visit.text(".map .card")) == pytest.approx(destination(*VESSEL, 90.0, 450.0), abs=1e-4)
+    # The list has the same order with arrow keys, and Enter opens the contact.
+    page.locator(".in-view").focus()
+    visit.press("ArrowUp")
+    visit.until(f"() => ({CHOSEN})() === 'uuv-1/0002'")
+    visit.press("2")
+    visit.wait_for_contact("0002")
+    assert page.locator(".review").is_visible()
+    for contact_id in order:
+        assert served.state.contact_detail(contact_id)["decisions"] == []
+    visit.press("p", "k")
+    visit.until(f"() => ({CHOSEN})()?.startsWith('uuv-1/000')")
+    name = page.evaluate(CHOSEN)
+    visit.press("r")
+    visit.wait("dialog .costs")
+    assert visit.text(".heading h2") == name
+
+
+def test_zoom_pan_and_fit_by_keys(serve):
+    served = scene(serve)
+    visit = open_map(served)
+    page = visit.page
+    before = page.evaluate(SYMBOL_AT, "0001")
+    visit.press("ArrowRight")
+    moved = page.evaluate(SYMBOL_AT, "0001")
+    assert moved[0] == pytest.approx(before[0] - 80, abs=1.5)
+    visit.press("0")
+    assert page.evaluate(SYMBOL_AT, "0001") == pytest.approx(before, abs=1.5)
+    listed = page.locator(".in-view [role=option]")
+    assert listed.count() == 5
+    visit.press("+", "+", "+", "+", "+", "+")
+    visit.until("() => document.querySelectorAll('.in-view [role=option]').length < 5")
+    visit.press("-", "-", "-", "-", "-", "-")
+    visit.until("() => document.querySelectorAll('.in-view [role=option]').length === 5")
+
+
+def test_cluster_has_the_worst_verdict(serve):
+    served = serve()
+    for number in range(6):
+        served.state.store_image(image_record(f"000{number}", position=(56.0, -5.0 + 1e-5 * number)))
+    served.state.store_image(image_record("0006", position=(56.1, -5.0)))
+    browser = served.console.browser("anna")
+    points = {one["name"][-4:]: one["id"] for one in browser.get("/api/map").json()["contacts"]}
+    for number, verdict in (("0000", "not_mine_like"), ("0003", "unsure")):
+        assert browser.decide(points[number], verdict=verdict).status_code == 201
+    visit = open_map(served)
+    page = visit.page
+    clusters = page.locator(".map .cluster")
+    assert clusters.count() == 1
+    count = int(visit.text(".map .cluster span"))
+    assert (count, clusters.get_attribute("title")) == (6, "6 contacts, worst verdict: unsure")
+    browser.decide(points["0001"], verdict="mine_like")
+    # The event of the server updates the open map.
+    visit.wait(".map .cluster.mine_like .dot")
+    page.locator(".map .cluster .dot").click()
+    visit.until("() => !document.querySelector('.map .cluster')")
+    assert page.locator(".map .contact").count() == 6
+
+
+def test_contacts_on_both_sides_of_the_180th_meridian(serve):
+    served = serve()
+    for number, lon_deg in enumerate((179.999, -179.999)):
+        served.state.store_image(image_record(f"000{number}", position=(-40.0, lon_deg)))
+    visit = open_map(served)
+    west, east = (visit.page.evaluate(SYMBOL_AT, f"000{number}") for number in (0, 1))
+    assert 200 < east[0] - west[0] < 1000
+    visit.press("j", "j")
+    visit.until(f"() => ({CHOSEN})() === 'uuv-1/0001'")
+    assert "W" in visit.text(".map .card .number")
+
+
+def test_tiles_of_a_folder_are_dark_at_night(serve, tmp_path):
+    for zoom in (14, 15, 16, 17):
+        size = 2**zoom
+        column = int((VESSEL[1] + 180) / 360 * size)
+        row = int((1 - math.asinh(math.tan(math.radians(VESSEL[0]))) / math.pi) / 2 * size)
+        for x in range(column - 6, column + 7):
+            for y in range(row - 6, row + 7):
+                path = tmp_path / str(zoom) / str(x) / f"{y}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                Image.new("RGB", (256, 256), (250, 250, 250)).save(path)
+    served = scene(serve, tiles_dir=tmp_path)
+    visit = open_map(served)
+    visit.wait(".map .leaflet-tile-loaded")
+    page = visit.page
+    brightness = "() => getComputedStyle(document.querySelector('.map .leaflet-tile-pane')).filter"
+    assert page.evaluate(brightness) == "none"
+    visit.press("t")
+    assert "brightness(0.4)" in page.evaluate(brightness)
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_map_is_loaded_at_its_first_use(serve, theme):
+    served = scene(serve)
+    visit = served.visit(color_scheme=theme)
+    loaded = "() => performance.getEntriesByType('resource').filter(one => one.name.includes('/vendor/')).length"
+    assert visit.page.evaluate(loaded) == 0
+    visit.press("p")
+    visit.wait(".map[data-drawn]")
+    assert visit.page.evaluate(loaded) == 2
+
+
+def test_5000_contacts_are_drawn_in_a_second(serve):
+    served = serve(vessel_lat_deg=VESSEL[0], vessel_lon_deg=VESSEL[1])
+    add(served, "0000", 0.0, 10.0, position_sigma_m=5.0)
+    with served.state.database.transaction() as db:
+        # Copies of one contact: storing images and associating objects are not measured here.
+        first = dict(db.execute("SELECT * FROM contact").fetchone())
+        marks = ", ".join("?" * len(first))
+        for number in range(1, 5000):
+            lat_deg, lon_deg = destination(*VESSEL, 137.508 * number, 70.0 * number**0.5)
+            vehicle = destination(lat_deg, lon_deg, 270.0, 12.0)
+            changes = {
+                "id": f"{first['id'][:-4]}{number:04d}",
+                "image_id": f"{number:04d}",
+                "name": f"uuv-1/{number:04d}",
+            }
+            changes |= {"lat_deg": lat_deg, "lon_deg": lon_deg, "group_id": None}
+            changes |= {"vehicle_lat_deg": vehicle[0], "vehicle_lon_deg": vehicle[1]}
+            db.execute(f"INSERT INTO contact VALUES ({marks})", tuple((first | changes).values()))  # noqa: S608
+    visit = served.visit()
+    took_ms = visit.page.evaluate(
+        """async () => {
+          const element = document.querySelector('.map');
+          const drawn = new Promise((resolve) => new MutationObserver(() => element.dataset.drawn === '5000' && resolve())
+            .observe(element, { attributes: true }));
+          const start_ms = performance.now();
+          document.dispatchEvent(new KeyboardEvent('keydown', { key: 'p', bubbles: true }));
+          await drawn;
+          const loaded_ms = performance.now() - start_ms;
+          await new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
+          return [loaded_ms, performance.now() - start_ms];
+        }"""
+    )
+    again_ms = visit.page.evaluate(
+        """async () => {
+          const start_ms = performance.now();
+          document.dispatchEvent(new KeyboardEvent('keydown', { key: '+', bubbles: true }));
+          await new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
+          return performance.now() - start_ms;
+        }"""
+    )
+    print(f"\n5,000 contacts: map {took_ms[1]:.0f} ms with data and library, zoom {again_ms:.0f} ms")
+    shown = visit.page.locator(".map .cluster span").evaluate_all("list => list.map(one => Number(one.textContent))")
+    assert len(shown) > 20
+    assert took_ms[1] < 5000  # a loaded machine; the printed time is that of an idle one
