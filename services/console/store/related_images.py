@@ -21,6 +21,9 @@ Relation = Literal["wider", "original", "region"]
 SIZE_TOLERANCE: Final = 0.06
 """Relative deviation of a ratio of pixel sizes; the link transmits them in steps of 2.5 %."""
 
+MAX_COMPARED: Final = 20
+"""Contacts of one detection that are compared with a new image."""
+
 _NOT_COMPARED: Final = {"contact_id", "pixel_along_m", "pixel_across_m"}
 
 
@@ -75,8 +78,13 @@ def link_related_images(db: sqlite3.Connection, contact_id: str, image: Reconstr
     linked: list[str] = []
     others = db.execute(
         "SELECT id, version, review FROM contact"
-        " WHERE vehicle_id = ? AND seen_utc_s = ? AND vessel_id = ? AND id <> ? AND parent IS NULL",
-        (row["vehicle_id"], row["seen_utc_s"], row["vessel_id"], contact_id),
+        " WHERE vehicle_id = ? AND seen_utc_s = ? AND vessel_id = ? AND id <> ? AND parent IS NULL"
+        " AND lat_deg IS ? AND lon_deg IS ? AND range_m IS ? AND atd_confidence IS ? LIMIT ?",
+        (
+            *(row[name] for name in ("vehicle_id", "seen_utc_s", "vessel_id", "id")),
+            *(row[name] for name in ("lat_deg", "lon_deg", "range_m", "atd_confidence")),
+            MAX_COMPARED,
+        ),
     ).fetchall()
     for other in others:
         stored = db.execute(

@@ -374,7 +374,7 @@ def test_list_of_thousands_of_contacts(served):
             contacts.store_image(db, record, None, 1_700_000_000.0 + number, 8.0)
     visit = served.visit()
     visit.wait_for_contact("4999")
-    assert visit.text("#unreviewed") == "5000 to review of 5000"
+    assert visit.text("#unreviewed") == "5000 to review"
     # Only visible rows have elements.
     assert visit.page.locator(".row").count() < 40
     assert visit.page.locator(".row").first.get_attribute("aria-setsize") == "5000"
@@ -410,6 +410,7 @@ def test_comment_of_an_expert_is_displayed(serve):
         advised_utc_s=1_700_000_100.0,
     )
     vessel.state.store_advice(advice)
+    visit.page.click('.details [data-name="advice"] > summary')
     visit.wait(".advice >> text=seen before, mark 3")
     # At the shore site, an expert writes a comment.
     shore = serve(role="shore")

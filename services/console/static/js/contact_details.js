@@ -7,7 +7,7 @@ import { DASH, authentication, layerName, position, probabilities, quantity, rec
 import { measurementLine } from "./measurement.js";
 import { openObject } from "./object_view.js";
 import { requestState, requestTitle } from "./request_state.js";
-import { emit, now } from "./state.js";
+import { emit, now, state } from "./state.js";
 import { t } from "./texts.js";
 
 const section = (name, title, count, children, open = true) => h("details", { data: { name }, open },
@@ -86,8 +86,8 @@ export class ContactDetails {
   #render({ contact, record, advice, requests, measurements, group, earlier, audit, decisions }) {
     const part = (name, title, count, make, open = true) => (count > 0 ? section(name, title, count, make(), this.open.get(name) ?? open) : null);
     fill(this.element,
-      // Before the decision, comments are folded, so that they do not influence it.
-      part("advice", t("contact_details.comments"), advice.length, () => commentList(advice), contact.review !== "unreviewed"),
+      // Before a decision on the vessel, comments are folded, so that they do not influence it.
+      part("advice", t("contact_details.comments"), advice.length, () => commentList(advice), state.info.side === "shore" || contact.review !== "unreviewed"),
       part("requests", t("contact_details.requests"), requests.length, () => requestList(requests, contact.vehicle_id)),
       part("measurements", t("contact_details.measurements"), measurements.length, () => measurementList(measurements)),
       part("looks", t("contact_details.looks"), contact.looks - 1, () => [
