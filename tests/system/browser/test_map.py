@@ -12,7 +12,7 @@ from PIL import Image
 from sonarpost.review.positions import destination, distance_m
 
 VESSEL = (56.0, -5.0)
-POSITION = re.compile(r"(\d+)° ([\d.]+)′ ([NS])\s+(\d+)° ([\d.]+)′ ([EW])")
+POSITION = re.compile(r"(\d+)° ([\d.]+)\u2032 ([NS])\s+(\d+)° ([\d.]+)\u2032 ([EW])")
 SYMBOL_AT = """id => {
   const dot = document.querySelector(`.map .contact[title^="uuv-1/${id}"] .dot`).getBoundingClientRect();
   const chart = document.querySelector('.map .chart').getBoundingClientRect();
@@ -78,8 +78,8 @@ def test_symbols_are_at_their_true_places(serve):
     assert sorted(turns) == ["0deg", "0deg", "0deg", "90deg"]
     assert page.locator(".map path.sigma").bounding_box()["width"] / 2 == pytest.approx(east * 40.0 / 300.0, rel=0.05)
     # Frame, scale and distances are labelled.
-    assert "′ N" in visit.text(".map .at-west")
-    assert "′ W" in visit.text(".map .at-south")
+    assert "\u2032 N" in visit.text(".map .at-west")
+    assert "\u2032 W" in visit.text(".map .at-south")
     assert re.search(r"\d+ k?m$", visit.text(".map .leaflet-control-scale-line"))
     assert visit.text(".map .ring-label").endswith("m")
     # No line joins contacts: apart from frame, rings, bands and circles there is no path.
@@ -204,7 +204,7 @@ def test_zoom_pan_and_fit_by_keys(serve):
 def test_cluster_has_the_worst_verdict(serve):
     served = serve()
     for number in range(6):
-        served.state.store_image(image_record(f"000{number}", position=(56.0, -5.0 + 1e-5 * number)))
+        served.state.store_image(image_record(f"000{number}", position=(56.0, -5.0 + 3e-5 * number)))
     served.state.store_image(image_record("0006", position=(56.1, -5.0)))
     browser = served.console.browser("anna")
     points = {one["name"][-4:]: one["id"] for one in browser.get("/api/map").json()["contacts"]}
@@ -284,13 +284,18 @@ def test_5000_contacts_are_drawn_in_a_second(serve):
             }
             changes |= {"lat_deg": lat_deg, "lon_deg": lon_deg, "group_id": None}
             changes |= {"vehicle_lat_deg": vehicle[0], "vehicle_lon_deg": vehicle[1]}
-            db.execute(f"INSERT INTO contact VALUES ({marks})", tuple((first | changes).values()))  # noqa: S608
+            db.execute(f"INSERT INTO contact VALUES ({marks})", tuple((first | changes).values()))
+            copied = "version, received_utc_s, rate, payload, removed"
+            sql = f"INSERT INTO version (contact_id, {copied}) SELECT ?, {copied} FROM version WHERE contact_id = ?"
+            db.execute(sql, (changes["id"], first["id"]))
     visit = served.visit()
     took_ms = visit.page.evaluate(
         """async () => {
           const element = document.querySelector('.map');
-          const drawn = new Promise((resolve) => new MutationObserver(() => element.dataset.drawn === '5000' && resolve())
-            .observe(element, { attributes: true }));
+          const isDrawn = () => element.dataset.drawn === '5000';
+          const drawn = new Promise((resolve) => {
+            new MutationObserver(() => isDrawn() && resolve()).observe(element, { attributes: true });
+          });
           const start_ms = performance.now();
           document.dispatchEvent(new KeyboardEvent('keydown', { key: 'p', bubbles: true }));
           await drawn;
@@ -311,3 +316,19 @@ def test_5000_contacts_are_drawn_in_a_second(serve):
     shown = visit.page.locator(".map .cluster span").evaluate_all("list => list.map(one => Number(one.textContent))")
     assert len(shown) > 20
     assert took_ms[1] < 5000  # a loaded machine; the printed time is that of an idle one
+
+
+def test_click_on_contacts_at_one_place_selects_each_in_turn(serve):
+    served = serve()
+    for number in range(3):
+        served.state.store_image(image_record(f"000{number}", position=VESSEL))
+    visit = open_map(served)
+    visit.press(*["+"] * 12)
+    found = set()
+    for _ in range(3):
+        before = visit.page.evaluate(CHOSEN)
+        visit.page.locator(".in-view").focus()
+        visit.page.evaluate("document.querySelector('.map .cluster, .map .contact:not(.chosen)').click()")
+        visit.until(f"before => ({CHOSEN})() && ({CHOSEN})() !== before", before)
+        found.add(visit.page.evaluate(CHOSEN))
+    assert len(found) == 3

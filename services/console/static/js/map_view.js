@@ -14,7 +14,6 @@ const MAX_ZOOM = 22; // 2 cm a pixel at 56° N
 const FIT_ZOOM = 19;
 const MARGIN_PX = 30; // a selected contact is at least this far from the edge
 const MAX_LISTED = 200;
-const SAME_PLACE_PX = 30; // contacts that stay one symbol at the largest scale
 
 let leaflet = null;
 
@@ -82,8 +81,7 @@ export class MapView {
     data.contacts.sort((a, b) => a.lon_deg - b.lon_deg || a.lat_deg - b.lat_deg); // west to east
     this.data = data;
     if (!this.map) this.#create(L);
-    if (!this.fitted) this.fit();
-    this.draw();
+    if (this.fitted || !this.fit()) this.draw();
   }
 
   async #load() {
@@ -113,15 +111,16 @@ export class MapView {
     if (!this.fitted) this.fit();
   }
 
-  /** Fit the map to all objects. */
+  /** Fit the map to all objects, which draws it. Returns false if there are none, or no size. */
   fit() {
-    if (!this.data || this.chart.clientWidth === 0) return;
+    if (!this.data || this.chart.clientWidth === 0) return false;
     const { contacts, vehicles, vessel } = this.data;
     const points = [...contacts, ...vehicles, ...(vessel ? [vessel] : [])].map(latLng);
-    if (!points.length) return;
+    if (!points.length) return false;
     this.fitted = true;
     this.map.invalidateSize({ animate: false, pan: false });
     this.map.fitBounds(this.L.latLngBounds(points).pad(0.1), { maxZoom: FIT_ZOOM, animate: false });
+    return true;
   }
 
   /** Zoom around the selected contact if it is in the view, otherwise around the centre. */
@@ -184,14 +183,13 @@ export class MapView {
       return;
     }
     const bounds = this.L.latLngBounds(contacts.map(latLng));
-    const [low, high] = [bounds.getSouthWest(), bounds.getNorthEast()].map((corner) => this.map.project(corner, MAX_ZOOM));
+    const closer = bounds.pad(0.2);
     // Contacts at one place cannot be separated: each click selects the next of them.
-    if (low.distanceTo(high) < SAME_PLACE_PX) {
+    if (this.map.getBoundsZoom(closer) <= this.map.getZoom()) {
       const order = (one) => this.data.contacts.indexOf(one);
       const chosen = order(this.#contact);
       this.choose((contacts.find((one) => order(one) > chosen) ?? contacts[0]).id);
-    }
-    else this.map.fitBounds(bounds.pad(0.2), { animate: false });
+    } else this.map.fitBounds(closer, { animate: false });
   }
 
   /** Select the next contact, from west to east. */
