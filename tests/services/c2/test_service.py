@@ -110,7 +110,7 @@ def test_decision_is_stored_and_published(begin, relay, out, watch):
     [kept] = (out / "vessel-1" / "decisions").iterdir()
     assert (
         json.loads(kept.read_text())
-        == decision_record("d1", remark="Stein oder Mine? \u2014 prüfen", confidence=0.75).model_dump()
+        == decision_record("d1", remark="Stein oder Mine? \u2014 prüfen", confidence=0.75).model_dump(mode="json")
     )
 
 

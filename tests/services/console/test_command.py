@@ -135,7 +135,9 @@ def test_training_delivers_decisions_and_requests(console):
     anna = console.browser("anna")
     [contact_id] = [row["id"] for row in anna.get("/api/contacts", limit=1).json()["items"]]
     anna.decide(contact_id)
-    now = time.time()
+    # The decision is sent after the time in which it can be taken back.
+    now = time.time() + console.state.config.take_back_s
+    console.state.clock = lambda: now
     simulator.accept_records(now)
     for later, state in ((0.0, "asked"), (5.0, "sent"), (11.0, "confirmed")):
         simulator.advance_downlink(now + later)

@@ -51,8 +51,9 @@ def test_page_receives_events_of_an_interruption(console, open_stream):
     assert data["contact"]["image_id"] == "0001"
     assert (data["new"], data["total"], data["unreviewed"]) == (True, 1, 1)
     first.close()
-    console.state.store_image(image_record("0002"))
-    console.state.store_image(image_record("0003"))
+    # At other positions: a look at the same object would change the first contact too.
+    console.state.store_image(image_record("0002", position=(56.1, -5.0)))
+    console.state.store_image(image_record("0003", position=(56.2, -5.0)))
     for again in (open_stream(**{"Last-Event-ID": identifier}), open_stream(f"?last={identifier}")):
         eventually(lambda page=again: page.names().count("contact") == 2, what="missed events")
         assert [e[2]["contact"]["image_id"] for e in again.events if e[0] == "contact"] == ["0002", "0003"]
