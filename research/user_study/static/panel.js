@@ -1,7 +1,7 @@
 // The page of the user study. Whether an answer was right is not shown, so that participants do not learn.
 
-import { fill, h, toast } from "/static/js/dom.js";
-import { duration, percent } from "/static/js/format.js";
+import { fill, h, toast } from "/static/js/base/dom.js";
+import { duration, percent } from "/static/js/base/format.js";
 
 const main = document.getElementById("panel");
 const panel = { id: null, title: "", trial: null, choice: null, sure: null, began_ms: 0 };

@@ -396,7 +396,7 @@ def test_drafts_survive_reload_and_the_end_of_the_session(served):
     # The number of drafts is bounded.
     visit.page.evaluate(
         """async () => {
-          const { Drafts } = await import('/static/js/drafts.js');
+          const { Drafts } = await import('/static/js/decision/drafts.js');
           const drafts = new Drafts('anna');
           for (let i = 0; i < 70; i += 1) drafts.change(`c${i}`, { remark: 'x' });
         }"""

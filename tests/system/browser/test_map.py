@@ -138,7 +138,7 @@ def test_geometry_is_that_of_the_ellipsoid(served):
         end = destination(*start, bearing_deg, range_m)
         found = visit.page.evaluate(
             """async ([a, b]) => {
-              const { rangeBearing, offset } = await import('/static/js/map_geometry.js');
+              const { rangeBearing, offset } = await import('/static/js/map/map_geometry.js');
               const position = ([lat_deg, lon_deg]) => ({ lat_deg, lon_deg });
               const { range_m, bearing_deg } = rangeBearing(position(a), position(b));
               return { range_m, bearing_deg, there: offset(position(a), bearing_deg, Math.min(range_m, 1000)) };

@@ -1,8 +1,8 @@
 // Log-in page: by name and password, or by a log-in link, whose token is the part of the address after "#".
 
-import { api } from "./api.js";
-import { restoreTheme } from "./header.js";
-import { setting } from "./state.js";
+import { api } from "./base/api.js";
+import { restoreTheme } from "./shell/header.js";
+import { setting } from "./base/state.js";
 import { loadLanguage, t, translate } from "./texts.js";
 
 const LINK_PROBLEMS = ["link_unknown", "link_used", "link_expired"];

@@ -1,7 +1,7 @@
 // The page that the service worker shows when the server is not reached.
 
-import { restoreTheme } from "./header.js";
-import { setting } from "./state.js";
+import { restoreTheme } from "./shell/header.js";
+import { setting } from "./base/state.js";
 import { loadLanguage, translate } from "./texts.js";
 
 restoreTheme();

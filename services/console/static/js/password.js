@@ -1,8 +1,8 @@
 // Page for changing the own password.
 
-import { api, setToken } from "./api.js";
-import { accountButtons, restoreTheme } from "./header.js";
-import { setting, state } from "./state.js";
+import { api, setToken } from "./base/api.js";
+import { accountButtons, restoreTheme } from "./shell/header.js";
+import { setting, state } from "./base/state.js";
 import { loadLanguage, t, translate } from "./texts.js";
 
 const FIELDS = ["old", "new", "again"];

@@ -1,0 +1,122 @@
+// Requests to the server. Every failure becomes an ApiError whose message is shown to the operator.
+
+import { t } from "../texts.js";
+
+export class ApiError extends Error {
+  constructor(status, code, message, body = {}, retry_after_s = 0) {
+    super(message);
+    this.status = status;
+    this.code = code;
+    this.body = body;
+    this.retry_after_s = retry_after_s;
+  }
+}
+
+/** The error of a response. A response of a proxy has no message of the server. */
+async function errorOf(response) {
+  const body = await response.json().catch(() => ({}));
+  const retry_after_s = Number(response.headers.get("Retry-After")) || 0;
+  const busy = response.status === 429 || response.status === 503;
+  const { status } = response;
+  const text = !busy ? t("api.status", { status }) : retry_after_s ? t("api.busy_for", { status, seconds: retry_after_s }) : t("api.busy", { status });
+  const { code = "error", message = text } = body.error ?? {};
+  return new ApiError(response.status, code, message, body, retry_after_s);
+}
+
+let csrf = "";
+export const setToken = (token) => { csrf = token; };
+
+async function request(method, path, body) {
+  const headers = { Accept: "application/json" };
+  if (method !== "GET") {
+    headers["Content-Type"] = "application/json";
+    headers["X-CSRF-Token"] = csrf;
+  }
+  let response;
+  try {
+    response = await fetch(path, {
+      method, headers, credentials: "same-origin", cache: "no-store", redirect: "error",
+      body: method === "GET" ? undefined : JSON.stringify(body ?? {}), signal: AbortSignal.timeout(15000),
+    });
+  } catch (error) {
+    throw new ApiError(0, "no_connection", t("api.no_response"), { cause: String(error) });
+  }
+  if (response.status === 204) return null;
+  if (response.ok) return response.json().catch(() => ({}));
+  if (response.status === 401 && !path.startsWith("/api/login")) location.assign("/login");
+  throw await errorOf(response);
+}
+
+/** Download a file. The server prepares exports one at a time, so that the response may take minutes. */
+async function download(path) {
+  let response;
+  try {
+    response = await fetch(path, { credentials: "same-origin", cache: "no-store", redirect: "error" });
+    if (response.ok) return await response.blob();
+  } catch (error) {
+    throw new ApiError(0, "no_connection", t("api.interrupted"), { cause: String(error) });
+  }
+  if (response.status === 401) location.assign("/login");
+  throw await errorOf(response);
+}
+
+/** Return why the event stream is refused; null if it is accepted. */
+async function streamError(path) {
+  const ended = new AbortController();
+  try {
+    const response = await fetch(path, { credentials: "same-origin", cache: "no-store", signal: ended.signal });
+    return response.ok ? null : await errorOf(response);
+  } catch {
+    return null; // no connection: the stream reconnects
+  } finally {
+    ended.abort();
+  }
+}
+
+const contactPath = (id) => `/api/contacts/${encodeURIComponent(id)}`;
+const objectPath = (id) => `/api/objects/${encodeURIComponent(id)}`;
+const queryString = (values) => {
+  const parts = Object.entries(values).filter(([, value]) => value !== "" && value !== null && value !== undefined);
+  return new URLSearchParams(parts).toString();
+};
+
+export const api = {
+  login: (user, password) => request("POST", "/api/login", { user, password }),
+  logout: () => request("POST", "/api/logout"),
+  password: (old, replacement) => request("POST", "/api/password", { old, new: replacement }),
+  loginLink: (token) => request("POST", "/api/login-link", { token }),
+  settings: () => request("GET", "/api/settings"),
+  storeSettings: (settings) => request("POST", "/api/settings", { settings }),
+  session: () => request("GET", "/api/session"),
+  info: () => request("GET", "/api/info"),
+  contacts: (values) => request("GET", `/api/contacts?${queryString(values)}`),
+  contact: (id) => request("GET", contactPath(id)),
+  measure: (id, body) => request("POST", `${contactPath(id)}/measure`, body),
+  withdrawMeasurement: (id, measurement) => request("POST", `${contactPath(id)}/measure/${measurement}/withdraw`),
+  decide: (id, body) => request("POST", `${contactPath(id)}/decisions`, body),
+  lastDecision: () => request("GET", "/api/decisions/last"),
+  notices: () => request("GET", "/api/notices"),
+  acknowledge: (notice) => request("POST", `/api/notices/${notice}/acknowledge`),
+  undo: (id, body) => request("POST", `${contactPath(id)}/undo`, body),
+  object: (id) => request("GET", objectPath(id)),
+  decideObject: (id, body) => request("POST", `${objectPath(id)}/decisions`, body),
+  splitLook: (id, contact) => request("POST", `${objectPath(id)}/split`, { contact }),
+  mergeObjects: (id, contact) => request("POST", `${objectPath(id)}/merge`, { contact }),
+  costs: (id) => request("GET", `${contactPath(id)}/costs`),
+  request: (id, body) => request("POST", `${contactPath(id)}/requests`, body),
+  advise: (id, body) => request("POST", `${contactPath(id)}/advice`, body),
+  airTime: () => request("GET", "/api/airtime"),
+  fleet: () => request("GET", "/api/fleet"),
+  score: () => request("GET", "/api/score"),
+  mission: () => request("GET", "/api/mission"),
+  map: () => request("GET", "/api/map"),
+  export: (format, filter) => download(`/api/export/contacts.${format}?${queryString(filter)}`),
+  exportProgress: () => request("GET", "/api/export"),
+  cancelExport: () => request("POST", "/api/export/cancel"),
+  sheetsUrl: (filter) => `/report?${queryString(filter)}`,
+  streamError,
+  reportUrl: (id) => `/report/${encodeURIComponent(id)}`,
+  imageUrl: (id, version, layer) => `${contactPath(id)}/versions/${version}/picture.png?${queryString({ layer, map: "grey" })}`,
+  maskUrl: (id, version, kind, layer) => `${contactPath(id)}/versions/${version}/mask.png?${queryString({ kind, layer })}`,
+  thumbnailUrl: (id, version) => `${contactPath(id)}/versions/${version}/thumbnail.png`,
+};

@@ -1,0 +1,451 @@
+// Contact view: the image with toolbar, versions and data integrity strip.
+
+import { api } from "../base/api.js";
+import { h, fill, toast } from "../base/dom.js";
+import { DASH, layerName, position, probabilities, quantity, received, time } from "../base/format.js";
+import { MAPS, autoRange, loadImage } from "../image/image_data.js";
+import { ImageLevels } from "../image/image_levels.js";
+import { startPointer } from "../image/image_pointer.js";
+import { ORIENTATIONS } from "../image/image_projection.js";
+import { COMPARE_MODES, drawTools } from "../image/image_toolbar.js";
+import { ImageView, defaultViewport } from "../image/image_view.js";
+import { integrityStrip } from "./integrity_strip.js";
+import { toolbarWithMore } from "../base/layout.js";
+import { Loupe } from "../image/loupe.js";
+import { continuesOut, outlineOf, relatedLayers, relatedVersion } from "./related_images.js";
+import { MeasurementTool, measurementLine } from "../image/measurement.js";
+import { drawSizePanel } from "../image/size_panel.js";
+import { emit, setting, state } from "../base/state.js";
+import { t } from "../texts.js";
+import { drawVersions } from "./versions_bar.js";
+
+const GAIN_STEP = 5;
+const GAMMA_STEP = 1.15;
+const CACHED_IMAGES = 20;
+
+/** Second image of a comparison: [version, layer], or null. `choice` has version number, layer and comparison. */
+function secondImage(detail, { version, layer, compare }) {
+  const { versions } = detail;
+  const shown = versions.find((one) => one.version === version);
+  if (compare === "versions" && versions.length > 1) return [versions.find((one) => one.version !== version), "raw"];
+  if (relatedVersion(detail, layer)) return null;
+  const other = compare === "layers" ? shown?.layers.find((one) => one.name !== layer) : null;
+  return other ? [shown, other.name] : null;
+}
+
+/** Slant range, or ground range where the record has no slant range. */
+function rangeText(contact, record) {
+  const slant_m = record?.slant_range_m ?? null;
+  return t(slant_m === null ? "contact_view.ground_range" : "contact_view.slant_range", { range: quantity(slant_m ?? contact.range_m, "m", 0) });
+}
+
+export class ContactView {
+  constructor() {
+    this.detail = null;
+    this.version = null; // number of the displayed version
+    this.follow = true; // display newer versions when they arrive
+    this.layer = "raw";
+    this.compare = "off";
+    this.autoGain = true;
+    this.changes = 0; // number of selections and displayed contacts
+    this.target = null; // selected choice whose images are being loaded
+    this.cache = new Map(); // key of an image → promise
+    this.display = { map: setting("map") in MAPS ? setting("map") : "grey", low: 0, high: 100, gamma: 1, hatch: true, smooth: null, grid: setting("grid") !== "off", ground: setting("ground") === "on", orientation: setting("orientation") ?? "nadir" };
+    this.loupeOn = false; // also without a measurement
+    this.#build();
+    this.measurement = new MeasurementTool(() => this.#displayed(), () => this.#drawLines());
+    startPointer(this);
+  }
+
+  #build() {
+    const viewport = defaultViewport();
+    this.canvases = [t("image.label"), t("image.compared")].map((label) => h("canvas", { role: "img", "aria-label": label }));
+    this.views = this.canvases.map((canvas) => new ImageView(canvas, viewport));
+    for (const view of this.views) view.display = this.display;
+    this.heading = h("div", { class: "heading", role: "group", tabindex: 0, "aria-label": t("contact_view.heading") });
+    this.tools = h("div", { class: "tools", role: "toolbar", "aria-label": t("tools.group") });
+    this.placeholder = h("p", { class: "placeholder" });
+    this.loading = h("p", { class: "loading-name", role: "status" });
+    this.loupe = new Loupe(this.views[0], () => this.loupeOn || this.measurement.active);
+    this.levels = new ImageLevels((name, value) => this.setLevel(name, value));
+    this.options = h("div", { class: "tools", role: "toolbar", "aria-label": t("tools.options") });
+    this.displayPanel = h("div", { class: "display hidden" }, this.options, this.levels.element);
+    this.sizes = h("div", { class: "size-panel", role: "region", "aria-label": t("measure.panel") });
+    this.stage = h("div", { class: "stage" }, this.canvases, this.placeholder, this.loupe.element, this.displayPanel, this.loading);
+    this.versions = h("div", { class: "versions", role: "toolbar", "aria-label": t("versions_bar.title") });
+    this.strip = h("div", { class: "strip", role: "region", tabindex: 0, "aria-label": t("integrity_strip.title") });
+    this.element = h("section", { class: "contact", "aria-label": t("contact_view.contact") }, this.heading, toolbarWithMore(this.tools), this.stage, this.sizes,
+      h("div", { class: "contact-foot" }, this.versions, this.strip));
+  }
+
+  get shown() { return this.detail?.versions.find((one) => one.version === this.version) ?? null; }
+  /** Layers of the displayed version, and the images that answer requests about the contact. */
+  get layers() { return this.shown ? [...this.shown.layers, ...relatedLayers(this.detail)] : []; }
+  get shownLayer() { return this.layers.find((one) => one.name === this.layer) ?? null; }
+
+  get zoomed() { return this.views[0].viewport.zoom > 1; }
+
+  #displayed() {
+    const view = this.views[0];
+    return { id: this.detail?.contact.id, version: this.version, layer: this.layer, image: view.image, projection: view.projection };
+  }
+
+  /**
+   * Identifier, version, layer and digest of the image on the canvas; null without an image.
+   *
+   * A layer that is an image of its own belongs to the displayed version of the contact.
+   */
+  get drawn() {
+    const source = this.views[0].image?.source ?? null;
+    if (!source || source.id === this.detail.contact.id) return source;
+    return { id: this.detail.contact.id, version: this.version, layer: this.layer, sha256: this.shown.sha256 };
+  }
+
+  /**
+   * Load the images to display of a contact: newest version and raw layer, or what is selected of the displayed contact.
+   *
+   * Returns the argument of `commit`.
+   */
+  async prepare(detail) {
+    const same = detail.contact.id === this.detail?.contact.id;
+    const newest = detail.versions.at(-1)?.version ?? null;
+    const choice = same ? this.#choice() : { version: newest, layer: "raw", follow: true, compare: this.compare };
+    // The image does not change during a measurement.
+    if (same && this.follow && !this.measurement.active) choice.version = newest;
+    return { detail, choice, changes: this.changes, images: await this.#load(detail, choice) };
+  }
+
+  /** Display a prepared contact: heading, image, versions and strip in one step. */
+  commit({ detail, choice, changes, images }) {
+    const other = detail.contact.id !== this.detail?.contact.id;
+    this.detail = detail;
+    if (other) {
+      this.autoGain = true;
+      this.measurement.stop();
+      Object.assign(this.views[0].viewport, defaultViewport());
+    } else if (changes !== this.changes) {
+      // The operator has selected another image in the meantime.
+      this.#renderText();
+      return;
+    }
+    this.changes += 1;
+    this.#draw(choice, images);
+  }
+
+  #choice() { return { version: this.version, layer: this.layer, follow: this.follow, compare: this.compare, ...this.target }; }
+
+  /** Select version, layer or comparison; the display changes when the images are loaded. */
+  async #select(selected) {
+    const { detail } = this;
+    const choice = { ...this.#choice(), ...selected };
+    this.target = choice;
+    const number = (this.changes += 1);
+    try {
+      const images = await this.#load(detail, choice);
+      if (number === this.changes) this.#draw(choice, images);
+    } catch (error) {
+      if (number === this.changes) this.target = null;
+      toast(error.message, { bad: true });
+    }
+  }
+
+  /** Display the version with a number. */
+  async showVersion(number) {
+    const newest = this.detail?.versions.at(-1)?.version;
+    if (!this.detail?.versions.some((one) => one.version === number)) return;
+    this.measurement.stop();
+    await this.#select({ version: number, follow: number === newest });
+  }
+
+  async stepVersion(step) {
+    const { version } = this.#choice();
+    const index = this.detail?.versions.findIndex((one) => one.version === version) ?? -1;
+    const next = this.detail?.versions[index + step];
+    if (next) await this.showVersion(next.version);
+  }
+
+  async showLayer(name) {
+    const layer = this.layers.find((one) => one.name === name);
+    if (!layer) return;
+    // The wider image shows other seabed: the viewport of one image does not fit the other.
+    if (name === "wider" || this.layer === "wider") Object.assign(this.views[0].viewport, defaultViewport());
+    if (!layer.measurable && this.measurement.active) this.measurement.stop();
+    await this.#select({ layer: name });
+  }
+
+  async nextLayer() {
+    const names = this.layers.map((one) => one.name);
+    if (names.length) await this.showLayer(names[(names.indexOf(this.#choice().layer) + 1) % names.length]);
+  }
+
+  /** Select the next mode of comparison that has a second image. */
+  async nextCompare() {
+    if (!this.detail) return;
+    const choice = this.#choice();
+    do choice.compare = COMPARE_MODES[(COMPARE_MODES.indexOf(choice.compare) + 1) % COMPARE_MODES.length];
+    while (choice.compare !== "off" && !secondImage(this.detail, choice));
+    await this.#select({ compare: choice.compare });
+  }
+
+  /** Second image of the display: [version, layer], or null. */
+  comparedImage() { return secondImage(this.detail, this); }
+
+  #image(detail, [version, layer]) {
+    const id = version.contact_id ?? detail.contact.id;
+    const key = `${id} ${version.version} ${layer} ${version.sha256}`;
+    if (!this.cache.has(key)) {
+      if (this.cache.size >= CACHED_IMAGES) this.cache.delete(this.cache.keys().next().value);
+      const image = loadImage(
+        { id, version: version.version, layer, sha256: version.sha256 },
+        api.imageUrl(id, version.version, layer),
+        version.missing_fraction > 0 ? api.maskUrl(id, version.version, "missing", layer) : null,
+      );
+      image.catch(() => this.cache.delete(key));
+      this.cache.set(key, image);
+    }
+    return this.cache.get(key);
+  }
+
+  /** Load the images of a choice; null for a canvas without an image. */
+  #load(detail, choice) {
+    const shown = detail.versions.find((one) => one.version === choice.version);
+    const related = relatedVersion(detail, choice.layer);
+    const requested = [related ? [related, "raw"] : shown ? [shown, choice.layer] : null, secondImage(detail, choice)];
+    return Promise.all(requested.map(async (one) => one && { image: await this.#image(detail, one), version: one[0], layer: one[1] }));
+  }
+
+  #draw(choice, images) {
+    Object.assign(this, choice);
+    this.target = null;
+    this.canvases.forEach((canvas, index) => canvas.classList.toggle("hidden", !images[index]));
+    this.placeholder.textContent = this.shown && this.detail.contact.has_picture ? "" : t("contact_view.no_image");
+    if (this.autoGain && images[0]) [this.display.low, this.display.high] = autoRange(images[0].image);
+    this.views.forEach((view, index) => {
+      if (images[index]) this.#showOn(view, images[index].image, images[index].version, images[index].layer);
+      else view.show(null, {});
+    });
+    this.canvases[0].dataset.shows = this.drawn ? `${this.drawn.id} ${this.drawn.version} ${this.drawn.layer}` : "";
+    this.#renderText();
+    this.#drawLines();
+  }
+
+  /** Dim the image while another contact is loaded; null ends it. */
+  showLoading(name) {
+    this.stage.classList.toggle("loading", name !== null);
+    this.loading.textContent = name === null ? "" : t("contact_view.loading", { name });
+  }
+
+  #showOn(view, image, version, layer) {
+    const known = version.pixel_along_m && version.pixel_across_m;
+    // A layer may have more pixels than the image, for the same area.
+    const scale = known ? {
+      along_m: (version.pixel_along_m * version.height_px) / image.height,
+      across_m: (version.pixel_across_m * version.width_px) / image.width,
+    } : null;
+    const title = `${t("contact_view.version", { version: version.version })} · ${layerName(version, version.contact_id ? this.layer : layer)}${version.complete ? "" : ` · ${received(version)}`}`;
+    const synthesised = version.layers.find((one) => one.name === layer)?.synthesised ?? false;
+    const record = this.detail.record ?? {};
+    // A layer may have more pixels than the image; the mark is in pixels of the image.
+    const same = version.width_px === image.width && version.height_px === image.height;
+    const geometry = {
+      scale, range_axis: version.range_axis, mark: same ? version.mark : null, box: same ? version.box : null,
+      altitude_m: record.altitude_m ?? null, heading_deg: record.heading_deg ?? null, side: record.channel ?? null,
+    };
+    view.show(image, { geometry, title, synthesised });
+  }
+
+  #drawLines() {
+    const current = Object.values(this.detail?.size ?? {}).map((one) => one?.measurement);
+    const stored = (this.detail?.measurements ?? []).filter((one) => current.includes(one.id) && one.version === this.version && one.layer === this.layer).map(measurementLine);
+    const related = relatedVersion(this.detail, this.layer);
+    const outline = related && this.layer === "wider" ? outlineOf(this.shown, related) : [];
+    this.views[0].lines = [...outline, ...(this.measurement.active ? [] : stored), ...this.measurement.lines()];
+    this.views[0].crosshair = this.measurement.active && !this.measurement.result ? this.measurement.crosshair : null;
+    this.views[0].draw();
+    this.canvases[0].classList.toggle("measures", this.measurement.active);
+    this.showLoupe(this.measurement.active && !this.measurement.result ? this.measurement.crosshair : null);
+    drawSizePanel(this, this.sizes);
+  }
+
+  /** Show the loupe at [row, column], or hide it (null). */
+  showLoupe(point) { this.loupe.show(point); }
+
+  /** Measure a kind, or the next one; show the reason if measurements are locked. */
+  startMeasurement(kind = null) {
+    const reason = this.measurementLock();
+    if (reason) {
+      toast(t("measure.locked", { reason }), { bad: true });
+      return;
+    }
+    if (kind) this.measurement.start(kind);
+    else this.measurement.next();
+    this.#drawTools();
+    this.canvases[0].focus();
+  }
+
+  async keepMeasurement() {
+    const stored = await this.measurement.keep();
+    if (stored) emit("changed", { id: this.detail.contact.id });
+  }
+
+  /** Withdraw a stored measurement; it stays in the list of measurements and in the audit. */
+  async withdraw(measurement) {
+    const { id } = this.detail.contact;
+    try {
+      await api.withdrawMeasurement(id, measurement);
+      toast(t("measure.withdrawn"));
+      emit("changed", { id });
+    } catch (error) {
+      toast(error.message, { bad: true });
+    }
+  }
+
+  /** Reason why measurements are locked; empty if they are not. */
+  measurementLock() {
+    if (!this.shown) return t("measure.no_image");
+    if (!state.session.may.measure) return t("measure.no_permission");
+    if (!this.shownLayer?.measurable) return this.shownLayer?.reason || t("measure.synthetic", { layer: this.layer });
+    if (!this.views[0].scale) return t("measure.no_scale");
+    return "";
+  }
+
+  zoom(factor) {
+    if (continuesOut(this, factor)) {
+      this.showLayer("wider");
+      return;
+    }
+    this.views[0].zoom(factor);
+    this.redrawAll();
+  }
+
+  fit() {
+    Object.assign(this.views[0].viewport, defaultViewport());
+    this.redrawAll();
+  }
+
+  pan(across, along) {
+    this.views[0].pan(across, along);
+    this.redrawAll();
+  }
+
+  /** Make the image brighter (1) or darker (-1); 0 selects automatic gain. */
+  changeGain(step) {
+    if (step === 0) {
+      this.autoGain = true;
+      const { image } = this.views[0];
+      if (image) [this.display.low, this.display.high] = autoRange(image);
+      this.display.gamma = 1;
+      this.#applyColours();
+    } else this.setLevel("high", this.display.high - step * GAIN_STEP);
+  }
+
+  /** Raise (1) or lower (-1) the black point. */
+  changeBlack(step) { this.setLevel("low", this.display.low + step * GAIN_STEP); }
+
+  /** Raise (1) or lower (-1) gamma: brighter or darker shadows. */
+  changeGamma(step) { this.setLevel("gamma", this.display.gamma * GAMMA_STEP ** step); }
+
+  /** Set black point or white point in percent, or gamma. */
+  setLevel(name, value) {
+    this.autoGain = false;
+    const { display } = this;
+    if (name === "gamma") display.gamma = Math.max(0.3, Math.min(3, value));
+    else if (name === "low") display.low = Math.max(0, Math.min(display.high - GAIN_STEP, value));
+    else display.high = Math.max(display.low + GAIN_STEP, Math.min(100 + 10 * GAIN_STEP, value));
+    this.#applyColours();
+  }
+
+  /** Show or hide the options of the display: gaps, grid, ranges, orientation, black point, white point, gamma. */
+  toggleDisplayPanel() {
+    this.displayPanel.classList.toggle("hidden");
+    this.#drawTools();
+  }
+
+  toggleGrid() {
+    this.display.grid = !this.display.grid;
+    setting("grid", this.display.grid ? "on" : "off");
+    this.#applyColours();
+  }
+
+  toggleSmooth() {
+    this.display.smooth = !this.views[0].smooth;
+    this.#applyColours();
+  }
+
+  /** Display slant range or ground range. */
+  toggleGround() {
+    if (!this.views[0].projection?.convertible) {
+      toast(t("image.no_ground"), { bad: true });
+      return;
+    }
+    this.display.ground = !this.display.ground;
+    setting("ground", this.display.ground ? "on" : "off");
+    this.#applyColours();
+  }
+
+  setOrientation(name) {
+    this.display.orientation = name;
+    setting("orientation", name);
+    this.#applyColours();
+  }
+
+  nextOrientation() {
+    const { projection } = this.views[0];
+    if (!projection) return;
+    let index = ORIENTATIONS.indexOf(projection.orientation);
+    do index = (index + 1) % ORIENTATIONS.length;
+    while (!projection.orientable(ORIENTATIONS[index]));
+    this.setOrientation(ORIENTATIONS[index]);
+  }
+
+  toggleLoupe() {
+    this.loupeOn = !this.loupeOn;
+    if (!this.loupeOn && !this.measurement.active) this.showLoupe(null);
+    this.#drawTools();
+  }
+
+  nextMap(step = 1) {
+    const names = Object.keys(MAPS);
+    this.setMap(names[(names.indexOf(this.display.map) + step + names.length) % names.length]);
+  }
+
+  setMap(name) {
+    this.display.map = name;
+    setting("map", name);
+    this.#applyColours();
+  }
+
+  toggleHatch() {
+    this.display.hatch = !this.display.hatch;
+    this.#applyColours();
+  }
+
+  #applyColours() {
+    for (const view of this.views) view.applyColours();
+    this.#drawTools();
+  }
+
+  redrawAll() {
+    for (const view of this.views) view.draw();
+  }
+
+  redraw() { this.#applyColours(); }
+
+  #renderText() {
+    const { contact, record } = this.detail;
+    const sigma = contact.position_sigma_m ? ` ± ${quantity(contact.position_sigma_m, "m", 0)}` : "";
+    fill(this.heading,
+      h("h2", { text: contact.name }),
+      h("span", { class: "number", text: time(contact.seen_utc_s ?? contact.first_frame_utc_s, { date: true }) }),
+      h("span", { class: "number", text: t("contact_view.detector", { class: contact.atd_class ? `${contact.atd_class} ` : "", confidence: contact.atd_confidence === null ? DASH : contact.atd_confidence.toFixed(2) }) }),
+      probabilities(contact) ? h("span", { class: "number probabilities", text: probabilities(contact) }) : null,
+      h("span", { class: "number", text: [`${position(contact.lat_deg, contact.lon_deg)}${sigma}`, rangeText(contact, record), t("contact_view.altitude", { altitude: quantity(record?.altitude_m, "m") })].join(" · ") }));
+    this.#drawTools();
+    drawVersions(this);
+    fill(this.strip, integrityStrip(relatedVersion(this.detail, this.layer) ?? this.shown, this.shownLayer));
+  }
+
+  #drawTools() {
+    if (this.detail) drawTools(this);
+  }
+}
