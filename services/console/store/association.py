@@ -31,14 +31,14 @@ _METRES_PER_DEGREE: Final = 111_000.0
 _LOOK: Final = "id, lat_deg, lon_deg, position_sigma_m, vehicle_id, seen_utc_s, length_m, width_m, height_m"
 _IS_LOOK: Final = "parent IS NULL AND sealed < 2"
 """Condition of the contacts that are looks: those in lists."""
+_IS_ASSOCIATED: Final = "parent IS NULL AND sealed = 0"
+"""Condition of the looks that are associated with others; a sealed contact is an object of its own."""
 
 
 def find_look(db: sqlite3.Connection, contact_id: str) -> Look | None:
     """Return a contact as a look; None without a position."""
-    row = db.execute(
-        f"SELECT {_LOOK} FROM contact WHERE id = ? AND {_IS_LOOK} AND lat_deg IS NOT NULL AND lon_deg IS NOT NULL",  # noqa: S608
-        (contact_id,),
-    ).fetchone()
+    condition = f"id = ? AND {_IS_ASSOCIATED} AND lat_deg IS NOT NULL AND lon_deg IS NOT NULL"
+    row = db.execute(f"SELECT {_LOOK} FROM contact WHERE {condition}", (contact_id,)).fetchone()  # noqa: S608
     return None if row is None else Look(*row)
 
 
@@ -65,7 +65,7 @@ def looks_near(db: sqlite3.Connection, look: Look, distance_m: float) -> list[Lo
     lon_limit = min(360.0, lat_limit / max(math.cos(math.radians(look.lat_deg)), 1e-6))
     rows = db.execute(
         f"SELECT {_LOOK} FROM contact WHERE lat_deg BETWEEN ? AND ?"  # noqa: S608
-        " AND (ABS(lon_deg - ?) <= ? OR ABS(lon_deg - ?) >= 360 - ?) AND id <> ? AND parent IS NULL AND sealed < 2",
+        " AND (ABS(lon_deg - ?) <= ? OR ABS(lon_deg - ?) >= 360 - ?) AND id <> ? AND parent IS NULL AND sealed = 0",
         (
             look.lat_deg - lat_limit,
             look.lat_deg + lat_limit,
@@ -190,6 +190,13 @@ def update_decided_on(db: sqlite3.Connection, contact_id: str) -> None:
         "UPDATE contact SET decided_version = ?, decided_bytes = ? WHERE id = ?", (row["version"], received, contact_id)
     )
     _update_contradiction(db, contact_id)
+
+
+def isolate_look(db: sqlite3.Connection, contact_id: str) -> None:
+    """Make a new contact an object of its own."""
+    db.execute(
+        "UPDATE contact SET group_id = ? WHERE id = ?", (f"g{insert_row(db, 'object', {'id': None})}", contact_id)
+    )
 
 
 def separate_look(db: sqlite3.Connection, contact_id: str, others: Iterable[str], rule: AssociationRule) -> set[str]:

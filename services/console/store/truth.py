@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from typing import Final
 
 from sonarpost.review.scoring import ScoredDecision, score, score_by_bytes
+from sonarpost.services.console.store.association import isolate_look
 from sonarpost.services.console.store.database import insert_row
 from sonarpost.services.console.store.serialisers import Json
 
@@ -52,7 +53,8 @@ def add_truth(db: sqlite3.Connection, contact_id: str, truth: Truth, now_utc_s: 
         insert_row(db, "truth", {"contact_id": contact_id, **asdict(truth), "added_utc_s": now_utc_s})
         if truth.sealed:
             # A sealed contact is no look at an object of the survey.
-            db.execute("UPDATE contact SET sealed = 1, group_id = NULL WHERE id = ?", (contact_id,))
+            db.execute("UPDATE contact SET sealed = 1 WHERE id = ?", (contact_id,))
+            isolate_look(db, contact_id)
 
 
 def is_sealed(db: sqlite3.Connection, contact_id: str) -> bool:

@@ -10,6 +10,7 @@ from builders.console import FIRST_UTC_S, image_record
 from sonarpost.services.console.known_objects import KnownObjects
 from sonarpost.services.console.store.contacts import ContactFilter
 from sonarpost.services.console.store.truth import Truth
+from sonarpost.services.console.training import sealed_images
 from sonarpost.services.console.training.calibrated_watch import DELAY_S, CalibratedWatch
 
 MINE = Truth(is_mine_like=True, label="cylinder", sealed=True)
@@ -28,6 +29,12 @@ def clock(console):
     return console.state.clock
 
 
+@pytest.fixture
+def short_surveys(monkeypatch):
+    """Surveys of the watch with fewer pings."""
+    monkeypatch.setattr(sealed_images, "PINGS", 400)
+
+
 def add(console, image_id, truth=None, **changes):
     console.state.store_image(image_record(image_id, **changes), truth)
     return next(
@@ -40,13 +47,20 @@ def listed(console):
 
 
 def test_sealed_contact_differs_in_nothing_before_the_decision(console):
-    sealed, real = add(console, "00A7", MINE), add(console, "00A8")
+    real, sealed = add(console, "00A8"), add(console, "00A7", MINE)
     anna = console.browser("anna")
     one, other = anna.contact(sealed), anna.contact(real)
     assert one.keys() == other.keys()
     assert one["truth"] is None
     assert other["truth"] is None
     assert one["contact"].keys() == other["contact"].keys()
+    # Unknown values are those of the other contact too.
+    assert {name for name, value in one["contact"].items() if value is None} == {
+        name for name, value in other["contact"].items() if value is None
+    }
+    for contact in (one["contact"], other["contact"]):
+        looks = anna.get(f"/api/objects/{contact['object']}").json()["looks"]
+        assert [look["contact"]["id"] for look in looks] == [contact["id"]]
     assert "cylinder" not in str(one)
     assert listed(console) == {"00A7", "00A8"}
 
@@ -120,7 +134,7 @@ def test_score_by_operator_and_bytes(console, clock):
     assert {one["operator"] for one in anna.get("/api/score").json()["operators"]} == {"anna"}
 
 
-def test_watch_adds_a_sealed_contact_of_the_kind_of_the_vehicles(console):
+def test_watch_adds_a_sealed_contact_of_the_kind_of_the_vehicles(console, short_surveys):
     watch = CalibratedWatch(console.state, share=1.0, draws=random.Random(3))
     reference = image_record("00A7", total=120)
     console.state.store_image(reference)
@@ -139,7 +153,7 @@ def test_watch_adds_a_sealed_contact_of_the_kind_of_the_vehicles(console):
     assert rows[added]["looks"] == 1
 
 
-def test_watch_answers_a_request_for_a_sealed_contact(console, clock):
+def test_watch_answers_a_request_for_a_sealed_contact(console, clock, short_surveys):
     watch = CalibratedWatch(console.state, share=1.0, draws=random.Random(3))
     watch.contact_arrived(image_record("00A7", total=120), now_s=0.0)
     watch.step(DELAY_S[1])
