@@ -108,10 +108,9 @@ def test_decision_is_stored_and_published(begin, relay, out, watch):
     eventually(lambda: len(seen) == 1)
     assert msgpack.unpackb(seen[0].payload.to_bytes())["verdict"] == "mine_like"
     [kept] = (out / "vessel-1" / "decisions").iterdir()
-    assert (
-        json.loads(kept.read_text())
-        == decision_record("d1", remark="Stein oder Mine? \u2014 prüfen", confidence=0.75).model_dump(mode="json")
-    )
+    assert json.loads(kept.read_text()) == decision_record(
+        "d1", remark="Stein oder Mine? \u2014 prüfen", confidence=0.75
+    ).model_dump(mode="json")
 
 
 def test_repeated_record_changes_no_file_and_is_published_again(begin, relay, image, out, watch):

@@ -89,6 +89,7 @@ def test_commands_work_after_the_end(folder: Path) -> None:
         with pasted(view, folder, errors) as page:
             assert page.stdout is not None
             address = page.stdout.readline().split()[0]
+            assert page.stdout.readline().startswith("log-in link of watch")
             assert page.stdout.readline().startswith(f"{count} contacts in demo-out/shore/images, read only")
             with urllib.request.urlopen(address, timeout=10) as reply:
                 assert b"<title>" in reply.read()

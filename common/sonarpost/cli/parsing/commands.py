@@ -69,6 +69,7 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "install-units": "install-units vessel --dry-run",
     "console": "console --training 40",
     "console user add": "console user add anna --role operator --state-dir state",
+    "console user link": "console user link anna --state-dir state",
     "console user passwd": "console user passwd anna --state-dir state",
     "console user rm": "console user rm anna --state-dir state",
     "console user ls": "console user ls --state-dir state",
