@@ -38,7 +38,8 @@ OUTSIDE = """() => {
   }).map(element => element.outerHTML.slice(0, 100));
 }"""
 
-COVERED = """() => [...document.querySelectorAll('button, a.button, select, input')].filter(element => {
+COVERED = """() => [...(document.querySelector('dialog[open], .panel.open, .menu-items.open') ?? document)
+  .querySelectorAll('button, a.button, select, input')].filter(element => {
   if (!element.checkVisibility({ visibilityProperty: true }) || element.closest('.skip')) return false;
   const box = element.getBoundingClientRect();
   const [x, y] = [box.left + box.width / 2, box.top + box.height / 2];
