@@ -71,7 +71,8 @@ def report_html(contacts: Iterable[ReportContact], now_utc_s: float, title: str,
     return (
         "<!DOCTYPE html>\n<html lang='en'><head><meta charset='utf-8'>"
         f"<title>{html.escape(title)}</title><link rel='icon' href='/static/icon.svg'>"
-        f"<link rel='stylesheet' href='/static/report.css'></head><body class='report'><main>{sheets}</main></body></html>\n"
+        "<link rel='stylesheet' href='/static/report.css'></head>"
+        f"<body class='report'><main>{sheets}</main></body></html>\n"
     )
 
 

@@ -38,7 +38,7 @@ OUTSIDE = """() => {
   }).map(element => element.outerHTML.slice(0, 100));
 }"""
 
-COVERED = """() => [...(document.querySelector('dialog[open], .panel.open, .menu-items.open') ?? document)
+COVERED = """() => [...(document.querySelector('dialog[open], .panel.open, .menu-items.open, .tools.open') ?? document)
   .querySelectorAll('button, a.button, select, input')].filter(element => {
   if (!element.checkVisibility({ visibilityProperty: true }) || element.closest('.skip')) return false;
   const box = element.getBoundingClientRect();
