@@ -101,7 +101,9 @@ class ConsoleService(Service[ConsoleConfig]):
             # Imported lazily: it loads the simulation and the detector.
             from sonarpost.services.console.training import calibrated_watch  # noqa: PLC0415
 
-            self._watch = calibrated_watch.CalibratedWatch(self.state, config.calibration_share, count=self.count)
+            self._watch = calibrated_watch.CalibratedWatch(
+                self.state, config.calibration_share, count=lambda: self.count("sealed_contacts")
+            )
 
     @property
     def address(self) -> str:

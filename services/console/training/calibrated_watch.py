@@ -51,7 +51,7 @@ class CalibratedWatch:
         state: State of the console.
         share: Sealed contacts for each contact of a vehicle, 0 to 1.
         draws: Random draws; by default from the operating system, so that they cannot be predicted.
-        count: Called with "sealed_contacts" for each added contact.
+        count: Called for each added contact.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class CalibratedWatch:
         state: ConsoleState,
         share: float,
         draws: random.Random | None = None,
-        count: Callable[[str], None] = lambda _: None,
+        count: Callable[[], object] = lambda: None,
     ) -> None:
         self._state = state
         self._known = KnownObjects(state)
@@ -124,7 +124,7 @@ class CalibratedWatch:
         truth = Truth(known.target.is_mine_like, known.target.kind.value.replace("_", " "), sealed=True)
         if self._state.store_image(record, truth):
             self._snippets[contact_uid(record)] = known.snippet
-            self._count("sealed_contacts")
+            self._count()
 
     def _position(self, contact: Contact, known: sealed_images.KnownObject) -> tuple[float, float]:
         """Return a position on the line of the vehicle, some distance before or after a contact."""
