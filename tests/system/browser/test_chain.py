@@ -130,5 +130,5 @@ def test_contact_is_received_measured_and_decided(
     operator.press("Enter")
     eventually(lambda: len(autonomy.received) == 2, what="the command on the vehicle")
     assert autonomy.received[1].kind == "revisit"
-    operator.wait('details[data-name="requests"] >> text=on the vehicle')
+    operator.wait('details[data-name="requests"] >> text=accepted by the vehicle')
     users.close()
