@@ -99,7 +99,7 @@ def measure(page: Page, address: str, session: zenoh.Session, changes: int) -> N
         page.wait_for_function("() => window.firstRow_ms !== null")
         opened.append(float(page.evaluate("window.firstRow_ms")))
     show("page opened to list drawn", opened)
-    page.wait_for_function("() => document.getElementById('live')?.textContent === 'live'")
+    page.wait_for_function("() => document.body.dataset.online === 'true'")
     simulated = next(simulated_contacts(7, time.time()))
     first = simulated.record(VESSEL, 0, time.time(), time.time())
     rows, images = [], []
