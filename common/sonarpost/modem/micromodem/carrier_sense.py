@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from sonarpost.modem.interface import CarrierSenseIgnored, CarrierSenseRestored, ModemEvent
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import CarrierSenseIgnored, CarrierSenseRestored, ModemEvent
 from sonarpost.modem.micromodem.sentences import TransmitMark
 
 

@@ -15,25 +15,30 @@ from datetime import datetime
 from typing import ClassVar
 
 from sonarpost.errors import SentenceError
+from sonarpost.modem.interface import (
+    Modem,
+    ModemCapabilities,
+    ModemEvent,
+    PacketFailed,
+    PacketReceived,
+    PollHandler,
+    PollReceived,
+    RequestFailed,
+    SentenceRejected,
+    TransmissionEnded,
+    TransmissionStarted,
+)
 from sonarpost.modem.micromodem.carrier_sense import CarrierSense
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.events import (
     FailureReason,
     FlexibleDataReceived,
     FrameAcknowledged,
-    ModemError,
-    ModemEvent,
-    PacketFailed,
-    PacketReceived,
-    PollReceived,
-    RequestFailed,
-    SentenceRejected,
-    TransmissionEnded,
-    TransmissionStarted,
+    MicroModemError,
     UnhandledSentence,
 )
 from sonarpost.modem.micromodem.nmea import FieldReader, LineAssembler, Sentence
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem.rates import CAPABILITIES, RATES
 from sonarpost.modem.micromodem.reception import ReceptionTracker
 from sonarpost.modem.micromodem.requests import (
     ModemRequest,
@@ -64,11 +69,11 @@ from sonarpost.modem.micromodem.sentences import (
 )
 from sonarpost.modem.micromodem.statistics import TransmitStatistics
 from sonarpost.modem.micromodem.supervisor import ModemSupervisor, Phase
-from sonarpost.modem.micromodem.transmit_cycle import QueuedPacket, TransmitCycle, check_packet
+from sonarpost.modem.micromodem.transmit_cycle import QueuedPacket, TransmitCycle
 from sonarpost.modem.micromodem.transmit_monitor import TransmitMonitor
 
 
-class MicroModem:
+class MicroModem(Modem):
     """Drives one modem: configures it, sends packets and requests one at a time, returns what it receives.
 
     Args:
@@ -84,13 +89,18 @@ class MicroModem:
         self._cycle: TransmitCycle | None = None
         self._request: RequestExchange | None = None
         self._queue: deque[QueuedPacket | ModemRequest] = deque()
-        self._poll_handler: Callable[[PollReceived], Sequence[bytes]] | None = None
+        self._poll_handler: PollHandler | None = None
         self._next_id = 1
         self._out = bytearray()
         self._events: list[ModemEvent] = []
         self._events_since_s = 0.0
         self._carrier = CarrierSense(config)
         self._monitor = TransmitMonitor(config)
+
+    @property
+    def capabilities(self) -> ModemCapabilities:
+        """Capabilities of every Micro-Modem."""
+        return CAPABILITIES
 
     @property
     def phase(self) -> Phase:
@@ -165,7 +175,7 @@ class MicroModem:
         Raises:
             FrameError: An address, a rate or frames that the modem cannot send.
         """
-        check_packet(destination, rate, frames)
+        CAPABILITIES.check_packet(destination, rate, frames)
         packet = QueuedPacket(self._next_id, destination, rate, tuple(bytes(f) for f in frames), ack, now)
         self._enqueue(packet, now)
         return packet.packet_id
@@ -214,7 +224,7 @@ class MicroModem:
         command = poll_command(source, self.config.address, rate, frames, ack=ack)
         return self._enqueue_request(RequestKind.POLL, source, command, now, rate)
 
-    def set_poll_handler(self, handler: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
+    def set_poll_handler(self, handler: PollHandler | None) -> None:
         """Set the function that returns the frames when another modem polls this one.
 
         It is called inside `receive` and must not call the driver. It may return no frames. Frames that do not fit the
@@ -395,7 +405,7 @@ class MicroModem:
         frames = tuple(bytes(frame) for frame in self._poll_handler(poll))
         if not frames:
             return True
-        check_packet(poll.dest, poll.rate, frames)
+        CAPABILITIES.check_packet(poll.dest, poll.rate, frames)
         packet = QueuedPacket(self._next_id, poll.dest, poll.rate, frames, poll.ack, now)
         self._next_id += 1
         self._cycle = TransmitCycle(packet, self.config, self._send, now, polled=cycle)
@@ -483,7 +493,7 @@ class MicroModem:
 
     def _on_error(self, sentence: Sentence, now: float) -> None:
         report = ErrorReport.parse(sentence)
-        self._events.append(ModemError(report))
+        self._events.append(MicroModemError(report.text, report))
         self._supervisor.on_error(report, now)
         if self._exchange is not None:
             self._exchange.on_error(report, now)

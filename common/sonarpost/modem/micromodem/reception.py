@@ -5,16 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from sonarpost.errors import SentenceError
+from sonarpost.modem.interface import FrameDecoded, FrameReceived, ModemEvent, PacketReceived, SentenceRejected
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import (
-    FrameDecoded,
-    FrameReceived,
-    ModemEvent,
-    ModemMessageReceived,
-    PacketReceived,
-    SentenceRejected,
-    StatisticsReceived,
-)
+from sonarpost.modem.micromodem.events import ModemMessageReceived, StatisticsReceived
 from sonarpost.modem.micromodem.nmea import Sentence
 from sonarpost.modem.micromodem.sentences import Cycle, ModemMessage, ReceivedData
 from sonarpost.modem.micromodem.statistics import LinkStatistics

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from sonarpost.errors import FrameError
+from sonarpost.modem.interface import RequestDone, RequestFailed
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import FailureReason, RequestDone, RequestFailed
+from sonarpost.modem.micromodem.events import FailureReason
 from sonarpost.modem.micromodem.nmea import MAX_ADDRESS, Sentence
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.modem.micromodem.sentences import FLEXIBLE_RATES, MAX_MINI_BITS, Cycle, ErrorReport, TransmitMark

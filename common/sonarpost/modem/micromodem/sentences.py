@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from sonarpost.errors import SentenceError
+from sonarpost.modem.interface import ModemEvent, RangeMeasured, ShortMessageReceived
 from sonarpost.modem.micromodem.nmea import FieldReader, Sentence
 
 MAX_MINI_BITS = 0x1FFF
@@ -229,6 +230,13 @@ class ErrorReport:
     message: str = ""
     modem_time: str = ""
 
+    @property
+    def text(self) -> str:
+        """The report as one line of text."""
+        return ", ".join(
+            part for part in (self.module, "" if self.number is None else str(self.number), self.message) if part
+        )
+
     @classmethod
     def parse(cls, sentence: Sentence) -> ErrorReport:
         """Read `CAERR`; an invalid number becomes part of the message."""
@@ -270,7 +278,7 @@ def parse_clock(sentence: Sentence) -> datetime:
 
 
 @dataclass(frozen=True, slots=True)
-class PingReceived:
+class PingReceived(ModemEvent):
     """`CAMPA,src,dest`: a ping from `src` to `dest`, whose modem replies automatically."""
 
     src: int
@@ -284,12 +292,8 @@ class PingReceived:
 
 
 @dataclass(frozen=True, slots=True)
-class PingAnswered:
+class PingAnswered(RangeMeasured):
     """`CAMPR,src,dest,travel_s`: the reply of `src` to a ping, with the one-way travel time (None where absent)."""
-
-    src: int
-    dest: int
-    travel_s: float | None
 
     @classmethod
     def parse(cls, sentence: Sentence) -> PingAnswered:
@@ -302,12 +306,8 @@ class PingAnswered:
 
 
 @dataclass(frozen=True, slots=True)
-class MiniPacketReceived:
+class MiniPacketReceived(ShortMessageReceived):
     """`CAMUA,src,dest,HHHH`: a user mini-packet; `bits` is 0..0x1FFF."""
-
-    src: int
-    dest: int
-    bits: int
 
     @classmethod
     def parse(cls, sentence: Sentence) -> MiniPacketReceived:
@@ -320,7 +320,7 @@ class MiniPacketReceived:
 
 
 @dataclass(frozen=True, slots=True)
-class MiniPacketAnswered:
+class MiniPacketAnswered(ModemEvent):
     """`CAMUR,src,dest`: `src` has received the mini-packet."""
 
     src: int

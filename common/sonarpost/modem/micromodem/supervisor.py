@@ -12,17 +12,16 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import Enum, auto
 
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import (
-    ClockConfirmed,
+from sonarpost.modem.interface import (
     ModemEvent,
     ModemReady,
     ModemRebooted,
     ModemUnresponsive,
     RestartRequested,
     SettingUnconfirmed,
-    UnhandledSentence,
 )
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.events import ClockConfirmed, UnhandledSentence
 from sonarpost.modem.micromodem.nmea import Sentence
 from sonarpost.modem.micromodem.sentences import ISO_SECONDS, ConfigurationSetting, ErrorReport, Revision, parse_clock
 

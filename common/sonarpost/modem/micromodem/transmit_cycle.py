@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from sonarpost.errors import FrameError
+from sonarpost.modem.interface import PacketFailed, PacketSent
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import FailureReason, PacketFailed, PacketSent
-from sonarpost.modem.micromodem.nmea import MAX_ADDRESS, Sentence
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.micromodem.events import FailureReason, MicroModemPacketSent
+from sonarpost.modem.micromodem.nmea import Sentence
 from sonarpost.modem.micromodem.reception import FSK_MINI_PACKET
 from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
@@ -38,26 +37,6 @@ class QueuedPacket:
     def failed(self, reason: FailureReason, *, maybe_sent: bool = False) -> PacketFailed:
         """Return the event of a failed packet."""
         return PacketFailed(self.packet_id, self.dest, self.rate, self.frames, reason, maybe_sent)
-
-
-def check_packet(destination: int, rate: int, frames: Sequence[bytes]) -> None:
-    """Reject a packet that the modem cannot send.
-
-    Raises:
-        FrameError: An address outside 0..127, an unknown rate, no frame, more frames or longer ones than the rate has.
-    """
-    where = "packet to send"
-    if not 0 <= destination <= MAX_ADDRESS:
-        raise FrameError(where, "destination", destination, f"0..{MAX_ADDRESS}")
-    if rate not in RATES:
-        raise FrameError(where, "rate", rate, f"one of {sorted(RATES)}")
-    limit = RATES[rate]
-    if not 1 <= len(frames) <= limit.frames:
-        raise FrameError(where, "frames", len(frames), f"1..{limit.frames} frames at rate {rate}")
-    for number, frame in enumerate(frames, start=1):
-        if len(frame) > limit.frame_bytes:
-            expected = f"at most {limit.frame_bytes} bytes at rate {rate}"
-            raise FrameError(where, f"length of frame {number}", len(frame), expected)
 
 
 class TransmitStage(Enum):
@@ -268,7 +247,7 @@ class TransmitCycle:
     def _finish(self, now: float) -> None:
         p = self.packet
         acknowledged = tuple(sorted(self._acknowledged))
-        self.result = PacketSent(
+        self.result = MicroModemPacketSent(
             p.packet_id,
             p.dest,
             p.rate,
@@ -276,8 +255,8 @@ class TransmitCycle:
             acknowledged,
             self._started_s,
             now,
-            self._statistics,
             self._end_reported,
+            self._statistics,
         )
         self.stage = TransmitStage.OVER
 

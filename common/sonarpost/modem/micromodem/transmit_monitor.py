@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import (
-    FailureReason,
+from sonarpost.modem.interface import (
     ModemEvent,
     PacketFailed,
     PacketSent,
@@ -13,6 +11,8 @@ from sonarpost.modem.micromodem.events import (
     TransmissionFailing,
     TransmissionRecovered,
 )
+from sonarpost.modem.micromodem.config import MicroModemConfig
+from sonarpost.modem.micromodem.events import FailureReason
 from sonarpost.modem.micromodem.requests import RequestKind
 
 ExchangeResult = PacketSent | PacketFailed | RequestDone | RequestFailed
@@ -78,7 +78,7 @@ def _transmitted(result: ExchangeResult) -> bool:
     return isinstance(result, (PacketSent, RequestDone)) or no_answer
 
 
-def _failure(result: ExchangeResult) -> FailureReason | None:
+def _failure(result: ExchangeResult) -> str | None:
     """Return why the modem did not transmit; None if the result has another cause or does not show it."""
     if isinstance(result, PacketFailed):
         return None if result.reason in _OTHER_CAUSES else result.reason

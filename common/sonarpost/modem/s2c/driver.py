@@ -1,0 +1,515 @@
+r"""Driver of an EvoLogics S2C modem: packets as instant messages or as burst data.
+
+The driver sends its commands with the escape sequence of data mode, `+++AT…`: the answers then have a length and name
+their command. It accepts the answers of command mode too. One command waits for its answer at a time, and one
+message for its end. After a missing answer the driver configures the modem again, so that late answers of
+older commands are not taken for new ones.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from sonarpost.errors import FrameError, SentenceError
+from sonarpost.modem.interface import (
+    FrameReceived,
+    Modem,
+    ModemCapabilities,
+    ModemError,
+    ModemEvent,
+    ModemReady,
+    ModemUnresponsive,
+    PacketFailed,
+    PacketReceived,
+    PlainQuality,
+    RangeMeasured,
+    RequestDone,
+    RequestFailed,
+    SentenceRejected,
+    SettingUnconfirmed,
+    TransmissionEnded,
+    TransmissionStarted,
+)
+from sonarpost.modem.packet_queue import PacketQueue, WaitingPacket
+from sonarpost.modem.registry import ModemSettings
+from sonarpost.modem.s2c.events import UsblPosition
+from sonarpost.modem.s2c.messages import (
+    DeliveryReport,
+    Message,
+    MessageAssembler,
+    RawMessage,
+    Received,
+    ReceptionEnd,
+    ReceptionStart,
+    Reply,
+    SendEnd,
+    SendStart,
+    Usbl,
+    parse,
+    parse_travel_time_s,
+)
+from sonarpost.modem.s2c.rates import BURST_FRAME_BYTES, BURST_RATE, CAPABILITIES, INSTANT_RATE
+from sonarpost.modem.s2c.sending import PING_DATA, Sending
+
+LINE_ENDS: Final = (b"\n", b"\r")
+"""End of a command: the first on Ethernet, the second on a serial port. The driver uses the one that is answered."""
+ATTEMPTS: Final = 3
+"""How often a command or a message is sent before it has failed."""
+REFUSED_WAIT_S: Final = 1.0
+"""Wait before a refused message is sent again."""
+PAUSE_S: Final = 2.0
+"""After such a pause an incomplete message of the modem is given up."""
+MAX_RECEPTION_S: Final = 5.0
+"""Longest reception; after it the driver no longer waits for its end."""
+CHECK_INTERVAL_S: Final = 60.0
+"""After such a silence of the modem the driver checks its address."""
+
+
+@dataclass(slots=True)
+class _Command:
+    """A command that waits for its answer."""
+
+    text: bytes
+    deadline_s: float
+    attempts: int = 1
+
+
+class S2cModem(Modem):
+    """One modem.
+
+    Args:
+        settings: Its address and the limits of waits.
+        where: Names the port in errors.
+
+    Raises:
+        ConfigError: An address outside 1..254.
+    """
+
+    def __init__(self, settings: ModemSettings, where: str = "modem port") -> None:
+        CAPABILITIES.check_address(settings.address, where)
+        self._settings = settings
+        self._assembler = MessageAssembler()
+        self._queue = PacketQueue()
+        self._has_sent_burst = False
+        self._pings: set[int] = set()
+        self._next_id = 1
+        self._is_open = False
+        self._ready = False
+        self._unresponsive = False
+        self._failures = 0
+        self._line_end = 0
+        self._line_end_known = False
+        self._escaped = False
+        self._steps: deque[tuple[bytes, bool]] = deque()
+        self._command: _Command | None = None
+        self._firmware: str | None = None
+        self._sending: Sending | None = None
+        self._received_s = 0.0
+        self._answered_s: float | None = None
+        self._receiving_until_s: float | None = None
+        self._receiving_since_s = 0.0
+        self._out = bytearray()
+        self._events: list[ModemEvent] = []
+        self._events_since_s = 0.0
+
+    @property
+    def capabilities(self) -> ModemCapabilities:
+        """Capabilities of the driver."""
+        return CAPABILITIES
+
+    @property
+    def ready(self) -> bool:
+        """Whether the modem is configured and answers."""
+        return self._ready
+
+    @property
+    def queued(self) -> int:
+        """Number of packets and pings that are queued or in progress."""
+        return len(self._queue) + (self._sending is not None)
+
+    @property
+    def receiving(self) -> bool:
+        """Whether the modem has reported the start of a reception and not yet its end."""
+        return self._receiving_until_s is not None
+
+    def port_opened(self, now: float) -> None:
+        """Configure the modem."""
+        if self._is_open:
+            self.port_lost(now)
+        self._is_open = True
+        self._line_end_known = self._escaped = False
+        self._configure(now)
+        self._advance(now)
+
+    def port_lost(self, now: float) -> None:
+        """Fail the message in progress."""
+        self._is_open = self._ready = False
+        self._fail("the port was lost")
+        self._steps.clear()
+        self._command = self._receiving_until_s = None
+        self._out.clear()
+        self._assembler.reset()
+        self._events_since_s = now
+
+    def send_packet(
+        self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False, now: float
+    ) -> int:
+        """Queue a packet; see `Modem.send_packet`. Burst data has no broadcast."""
+        CAPABILITIES.check_packet(destination, rate, frames)
+        if rate == BURST_RATE and destination == CAPABILITIES.broadcast:
+            raise FrameError("packet to send", "destination", destination, f"the address of one modem at rate {rate}")
+        is_acknowledged = ack and destination != CAPABILITIES.broadcast
+        return self._add(destination, rate, tuple(map(bytes, frames)), ack=is_acknowledged, now=now)
+
+    def ping(self, destination: int, now: float) -> int:
+        """Queue an acknowledged message whose travel time is measured; see `Modem.ping`."""
+        CAPABILITIES.check_packet(destination, INSTANT_RATE, (PING_DATA,))
+        if destination == CAPABILITIES.broadcast:
+            raise FrameError("ping", "destination", destination, "the address of one modem")
+        self._pings.add(self._next_id)
+        return self._add(destination, INSTANT_RATE, (PING_DATA,), ack=True, now=now)
+
+    def receive(self, data: bytes, now: float) -> list[ModemEvent]:
+        """Process received bytes; invalid ones are reported as events."""
+        if self._is_open:
+            self._give_up_incomplete(now)
+            self._received_s = now
+            self._process(self._assembler.feed(data), now)
+        self._advance(now)
+        return self._take_events()
+
+    def poll(self, now: float) -> list[ModemEvent]:
+        """Do what is due."""
+        self._give_up_incomplete(now)
+        self._advance(now)
+        return self._take_events()
+
+    def next_wakeup(self) -> float | None:
+        """Return when `poll` has something to do, or None."""
+        times_s = [self._events_since_s if self._events else None, self._queue.deadline_s(), self._receiving_until_s]
+        if self._command is not None:
+            times_s.append(self._command.deadline_s)
+        elif self._is_open:
+            times_s.append(max(self._answered_s or 0.0, self._received_s) + CHECK_INTERVAL_S)
+        if self._sending is not None and (self._sending.accepted or self._sending.refused):
+            times_s.append(self._sending.deadline_s)
+        if self._assembler.incomplete:
+            times_s.append(self._received_s + PAUSE_S)
+        return min((time_s for time_s in times_s if time_s is not None), default=None)
+
+    def bytes_to_send(self) -> bytes:
+        """Remove and return the bytes for the port."""
+        data = bytes(self._out)
+        self._out.clear()
+        return data
+
+    def _add(self, destination: int, rate: int, frames: tuple[bytes, ...], *, ack: bool, now: float) -> int:
+        number, self._next_id = self._next_id, self._next_id + 1
+        failed = self._queue.add(WaitingPacket(number, destination, rate, frames, ack, now))
+        if failed is not None:
+            self._emit_failed(failed)
+        self._advance(now)
+        return number
+
+    def _advance(self, now: float) -> None:
+        self._events_since_s = now
+        for failed in self._queue.expire(now):
+            self._emit_failed(failed)
+        if self._receiving_until_s is not None and now >= self._receiving_until_s:
+            self._receiving_until_s = None
+        if not self._is_open:
+            return
+        if self._command is not None:
+            if now >= self._command.deadline_s:
+                self._on_no_answer(self._command, now)
+        elif self._steps:
+            self._send_command(b"AT" + self._steps[0][0], now)
+        elif self._sending is not None:
+            self._advance_sending(self._sending, now)
+        elif now >= max(self._answered_s or 0.0, self._received_s) + CHECK_INTERVAL_S:
+            # A modem that has restarted has lost its settings.
+            self._steps.extend(((b"@ZX1", False), (b"?AL", True)))
+            self._send_command(b"AT" + self._steps[0][0], now)
+        if self._ready and self._sending is None and self._command is None and not self._defers(now):
+            packet = self._queue.take()
+            if packet is not None:
+                is_ping = packet.number in self._pings
+                self._pings.discard(packet.number)
+                self._sending = Sending(packet, is_ping, now)
+                self._send_message(self._sending, now)
+
+    def _defers(self, now: float) -> bool:
+        """Return whether a reception delays the next message."""
+        return (
+            self._receiving_until_s is not None and now - self._receiving_since_s < self._settings.max_carrier_sense_s
+        )
+
+    def _configure(self, now: float) -> None:
+        """Begin the configuration; packets wait for its end."""
+        own = str(self._settings.address).encode()
+        # The first command shows whether the modem answers. Those that are not required are missing in older firmware.
+        steps = (
+            (b"?AL", True),
+            # Burst data of before, whose late report would be taken for the next one.
+            *(((b"Z1", False),) if self._has_sent_burst else ()),
+            (b"@CTRL", False),
+            (b"I0", False),
+            (b"@ZX1", False),
+            (b"!AL" + own, True),
+            (b"?AL", True),
+        )
+        self._steps = deque(steps)
+        self._command = None
+        self._ready = False
+        self._events_since_s = now
+
+    def _send_command(self, text: bytes, now: float) -> None:
+        self._command = _Command(text, now + self._settings.reply_timeout_s)
+        self._write(text)
+
+    def _write(self, text: bytes) -> None:
+        self._out += b"+++" + text + LINE_ENDS[self._line_end]
+
+    def _on_no_answer(self, command: _Command, now: float) -> None:
+        if not self._line_end_known:
+            self._line_end = 1 - self._line_end
+        if self._sending is not None:
+            self._fail("the modem has not answered the command")
+            self._configure(now)
+            self._send_command(b"AT" + self._steps[0][0], now)
+        elif command.attempts < ATTEMPTS or self._unresponsive:
+            command.attempts += 1
+            command.deadline_s = now + self._settings.reply_timeout_s
+            self._write(command.text)
+        else:
+            self._report_unresponsive(command.text, now)
+            self._line_end_known = False
+            self._configure(now)
+            self._send_command(b"AT" + self._steps[0][0], now)
+
+    def _report_unresponsive(self, command: bytes, now: float) -> None:
+        if not self._unresponsive:
+            self._unresponsive = True
+            silent_s = None if self._answered_s is None else now - self._answered_s
+            self._events.append(ModemUnresponsive(command.decode("latin-1"), ATTEMPTS, silent_s))
+
+    def _send_message(self, sending: Sending, now: float) -> None:
+        sending.attempts += 1
+        sending.refused = False
+        self._has_sent_burst = self._has_sent_burst or sending.is_burst
+        self._send_command(sending.command(), now)
+
+    def _advance_sending(self, sending: Sending, now: float) -> None:
+        if now < sending.deadline_s:
+            return
+        if sending.refused:
+            self._send_message(sending, now)
+        else:
+            # The modem accepted the message and the time has passed: its report was lost, or the modem has restarted.
+            self._finish(sending, now, delivered=False)
+            self._configure(now)
+            self._send_command(b"AT" + self._steps[0][0], now)
+
+    def _process(self, items: Sequence[RawMessage | SentenceError], now: float) -> None:
+        for item in items:
+            if isinstance(item, SentenceError):
+                self._events.append(SentenceRejected(item))
+                continue
+            if item.command is None and self._escaped:
+                # Bytes outside messages are data of another modem: it must not pass for a message.
+                error = SentenceError("S2C modem", "message", item.text[:40], "a message of data mode")
+                self._events.append(SentenceRejected(error))
+                continue
+            self._escaped = self._escaped or item.command is not None
+            try:
+                self._on_message(parse(item), now)
+            except SentenceError as error:
+                self._events.append(SentenceRejected(error))
+
+    def _give_up_incomplete(self, now: float) -> None:
+        if self._assembler.incomplete and now >= self._received_s + PAUSE_S:
+            self._process(self._assembler.abandon(), now)
+
+    def _on_message(self, message: Message, now: float) -> None:
+        self._answered_s = now
+        match message:
+            case Reply():
+                self._on_reply(message, now)
+            case Received():
+                self._on_received(message, now)
+            case DeliveryReport():
+                self._on_report(message, now)
+            case SendStart():
+                self._events.append(TransmissionStarted(message.duration_s))
+            case SendEnd():
+                self._events.append(TransmissionEnded(message.duration_s))
+                self._on_send_end(message, now)
+            case ReceptionStart():
+                if self._receiving_until_s is None:
+                    self._receiving_since_s = now
+                self._receiving_until_s = now + MAX_RECEPTION_S
+            case ReceptionEnd():
+                self._receiving_until_s = None
+                if message.failed:
+                    self._events.append(PacketReceived((), 1, None, None, None, None, None, complete=False))
+            case Usbl():
+                self._events.append(
+                    UsblPosition(
+                        message.address,
+                        message.east_m,
+                        message.north_m,
+                        message.up_m,
+                        message.travel_s,
+                        message.accuracy_m,
+                    )
+                )
+            case _:
+                pass
+
+    def _on_reply(self, reply: Reply, now: float) -> None:
+        command = self._command
+        if command is None or not _answers(reply, command):
+            return  # a late or repeated answer
+        self._line_end_known = True
+        self._command = None
+        is_refused = reply.text.startswith(("BUSY", "ERROR"))
+        if self._steps:
+            self._on_setting(command, reply.text, is_refused=is_refused, now=now)
+        elif self._sending is not None and self._sending.delivered:
+            self._on_travel_time(self._sending, reply.text, now)
+        elif self._sending is not None and is_refused:
+            self._on_refused(self._sending, reply.text, now)
+        elif self._sending is not None:
+            self._sending.accepted = True
+            self._sending.deadline_s = now + self._sending.limit_s(self._settings.reply_timeout_s)
+
+    def _on_setting(self, command: _Command, text: str, *, is_refused: bool, now: float) -> None:
+        step, is_required = self._steps[0]
+        is_last = len(self._steps) == 1
+        has_wrong_address = is_last and text != str(self._settings.address)
+        if is_required and (is_refused or has_wrong_address):
+            self._failures += 1
+            if self._failures >= ATTEMPTS:
+                self._report_unresponsive(command.text, now)
+            # Wait as for an answer before the next attempt.
+            self._configure(now)
+            self._command = _Command(b"AT" + self._steps[0][0], now + self._settings.reply_timeout_s)
+            return
+        if step == b"@ZX1" and is_refused:
+            self._events.append(SettingUnconfirmed("AT@ZX1"))
+        if step == b"I0" and not is_refused:
+            self._firmware = text[:40]
+        self._steps.popleft()
+        if is_last:
+            self._failures = 0
+            self._unresponsive = False
+            if not self._ready:
+                self._ready = True
+                self._events.append(ModemReady(self._settings.address, self._firmware))
+
+    def _on_refused(self, sending: Sending, text: str, now: float) -> None:
+        if text.startswith("ERROR"):
+            self._events.append(ModemError(text[:200]))
+        self._retry(sending, text[:80], now)
+
+    def _retry(self, sending: Sending, reason: str, now: float) -> None:
+        if sending.attempts >= ATTEMPTS:
+            self._fail(f"the modem has refused the message: {reason}", maybe_sent=sending.ended)
+            return
+        sending.accepted = sending.ended = False
+        sending.refused = True
+        sending.deadline_s = now + REFUSED_WAIT_S
+
+    def _on_send_end(self, message: SendEnd, now: float) -> None:
+        sending = self._sending
+        if sending is None or not sending.accepted or message.kind != "im" or sending.is_burst:
+            return  # the modem transmits acknowledgements of its own too; a report ends burst data
+        if message.address != sending.packet.destination:
+            return
+        sending.ended = True
+        if not sending.packet.ack:
+            self._finish(sending, now, delivered=False)
+
+    def _on_report(self, report: DeliveryReport, now: float) -> None:
+        sending = self._sending
+        if sending is None or not sending.expects(report):
+            return
+        if report.result == "CANCELED":
+            self._retry(sending, "the modem has canceled it", now)
+        elif report.result == "DELIVERED" and sending.packet.ack and sending.is_ping:
+            sending.delivered = True
+            self._send_command(b"AT?T", now)
+        elif sending.packet.ack or sending.is_burst:
+            sending.ended = True
+            self._finish(sending, now, delivered=report.result == "DELIVERED")
+
+    def _on_travel_time(self, sending: Sending, text: str, now: float) -> None:
+        packet = sending.packet
+        travel_s = parse_travel_time_s(text)
+        if travel_s is None:
+            self._fail("the modem has reported no travel time")
+            return
+        self._sending = None
+        self._events.append(RangeMeasured(packet.destination, self._settings.address, travel_s))
+        self._events.append(RequestDone(packet.number, "ping", packet.destination))
+
+    def _finish(self, sending: Sending, now: float, *, delivered: bool) -> None:
+        """End the message in progress: it was transmitted, as far as known."""
+        if sending.is_ping:
+            self._fail("the other modem has not answered")
+            return
+        self._sending = None
+        self._events.append(sending.sent(now, delivered=delivered))
+
+    def _fail(self, reason: str, *, maybe_sent: bool = True) -> None:
+        """End the message in progress, if there is one: it has failed."""
+        sending, self._sending = self._sending, None
+        self._command = None
+        if sending is None:
+            return
+        packet = sending.packet
+        if sending.is_ping:
+            self._events.append(RequestFailed(packet.number, "ping", packet.destination, reason))
+        else:
+            self._events.append(packet.failed(reason, maybe_sent=maybe_sent))
+
+    def _emit_failed(self, failed: PacketFailed) -> None:
+        """Report a packet or a ping that left the queue."""
+        if failed.packet_id in self._pings:
+            self._pings.discard(failed.packet_id)
+            self._events.append(RequestFailed(failed.packet_id, "ping", failed.dest, failed.reason))
+        else:
+            self._events.append(failed)
+
+    def _on_received(self, received: Received, now: float) -> None:
+        self._receiving_until_s = None
+        if received.data == PING_DATA:
+            return
+        rate = {"IM": INSTANT_RATE, "": BURST_RATE}.get(received.kind)
+        starts = range(0, max(1, len(received.data)), BURST_FRAME_BYTES)
+        parts = [received.data[start : start + BURST_FRAME_BYTES] for start in starts]
+        source, destination = received.source, received.destination
+        quality = PlainQuality(doppler=received.velocity_mps, nframes=len(parts), nbad=0)
+        frames = tuple(
+            FrameReceived(source, destination, received.ack, number, part, now, rate, quality)
+            for number, part in enumerate(parts, start=1)
+        )
+        packet = PacketReceived(frames, 0, len(frames), source, destination, rate, quality, complete=True)
+        self._events += [*frames, packet]
+
+    def _take_events(self) -> list[ModemEvent]:
+        events, self._events = self._events, []
+        return events
+
+
+def _answers(reply: Reply, command: _Command) -> bool:
+    """Return whether a reply can be the one to a command. In command mode a reply does not name its command."""
+    if reply.command is None:
+        return True
+    name, comma, _ = command.text.partition(b",")
+    asked = f"AT{reply.command}".encode()
+    # `*SEND` is no answer to `*SENDIM`; the answer to `@ZX1` names `@ZX`.
+    return name == asked if comma else reply.command != "" and name.startswith(asked)

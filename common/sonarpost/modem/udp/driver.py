@@ -1,0 +1,240 @@
+"""Driver that exchanges packets as datagrams with other stations; there is no modem between them.
+
+A packet is one datagram. After it the driver waits for the packet's air time, so that the rates are those of
+`sonarpost.modem.udp.rates`. A station answers a datagram that requests it with one acknowledgement.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from sonarpost.errors import SentenceError
+from sonarpost.modem.interface import (
+    FrameReceived,
+    Modem,
+    ModemCapabilities,
+    ModemEvent,
+    ModemReady,
+    PacketReceived,
+    PacketSent,
+    SentenceRejected,
+    TransmissionEnded,
+    TransmissionStarted,
+)
+from sonarpost.modem.packet_queue import PacketQueue, WaitingPacket
+from sonarpost.modem.registry import ModemSettings
+from sonarpost.modem.udp.datagram import Datagram, DatagramAssembler, DatagramKind
+from sonarpost.modem.udp.rates import CAPABILITIES, RATES
+
+REMEMBERED_PACKETS: Final = 256
+"""Numbers of received packets that are kept to recognise a repeated datagram."""
+PAUSE_S: Final = 2.0
+"""After such a pause an unfinished datagram is dropped."""
+
+
+@dataclass(slots=True)
+class _Sending:
+    """The packet in progress: on the air until `ends_s`, then waiting for its acknowledgement until `ack_s`."""
+
+    packet: WaitingPacket
+    number: int
+    started_s: float
+    ends_s: float
+    ack_s: float
+    acknowledged: set[int] = field(default_factory=set)
+    on_air: bool = True
+
+
+class UdpModem(Modem):
+    """One station.
+
+    Args:
+        settings: Address, and the wait for an acknowledgement as `reply_timeout_s`.
+        where: Names the port in errors.
+
+    Raises:
+        ConfigError: An address outside 0..254.
+    """
+
+    def __init__(self, settings: ModemSettings, where: str = "modem port") -> None:
+        CAPABILITIES.check_address(settings.address, where)
+        self._settings = settings
+        self._assembler = DatagramAssembler()
+        self._queue = PacketQueue()
+        self._received_s = 0.0
+        self._sending: _Sending | None = None
+        self._seen: dict[tuple[int, int, int], None] = {}
+        self._is_open = False
+        self._next_id = 1
+        self._out: list[bytes] = []
+        self._events: list[ModemEvent] = []
+        self._events_since_s = 0.0
+
+    @property
+    def capabilities(self) -> ModemCapabilities:
+        """Capabilities of the driver."""
+        return CAPABILITIES
+
+    @property
+    def ready(self) -> bool:
+        """Whether the port is open."""
+        return self._is_open
+
+    @property
+    def queued(self) -> int:
+        """Number of packets that are queued or in progress."""
+        return len(self._queue) + (self._sending is not None)
+
+    @property
+    def receiving(self) -> bool:
+        """False: a datagram arrives at once."""
+        return False
+
+    def port_opened(self, now: float) -> None:
+        """Begin to send and receive."""
+        if self._is_open:
+            self.port_lost(now)
+        self._is_open = True
+        self._events.append(ModemReady(self._settings.address, None))
+        self._advance(now)
+
+    def port_lost(self, now: float) -> None:
+        """Fail the packet in progress."""
+        self._is_open = False
+        if self._sending is not None:
+            self._events.append(self._sending.packet.failed("the port was lost", maybe_sent=True))
+        self._sending = None
+        self._out.clear()
+        self._assembler.reset()
+        self._events_since_s = now
+
+    def send_packet(
+        self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False, now: float
+    ) -> int:
+        """Queue a packet; see `Modem.send_packet`."""
+        CAPABILITIES.check_packet(destination, rate, frames)
+        number, self._next_id = self._next_id, self._next_id + 1
+        failed = self._queue.add(WaitingPacket(number, destination, rate, tuple(map(bytes, frames)), ack, now))
+        if failed is not None:
+            self._events.append(failed)
+        self._advance(now)
+        return number
+
+    def receive(self, data: bytes, now: float) -> list[ModemEvent]:
+        """Process received bytes; invalid ones are reported as events."""
+        if now - self._received_s > PAUSE_S:
+            self._assembler.reset()
+        self._received_s = now
+        for item in self._assembler.feed(data) if self._is_open else ():
+            if isinstance(item, SentenceError):
+                self._events.append(SentenceRejected(item))
+            elif item.source != self._settings.address:  # a multicast socket also receives its own datagrams
+                self._on_datagram(item, now)
+        self._advance(now)
+        return self._take_events()
+
+    def poll(self, now: float) -> list[ModemEvent]:
+        """Do what is due."""
+        self._advance(now)
+        return self._take_events()
+
+    def next_wakeup(self) -> float | None:
+        """Return when `poll` has something to do, or None."""
+        times_s = [self._events_since_s if self._events else None, self._queue.deadline_s()]
+        if self._sending is not None:
+            times_s.append(self._sending.ends_s if self._sending.on_air else self._sending.ack_s)
+        return min((time_s for time_s in times_s if time_s is not None), default=None)
+
+    def bytes_to_send(self) -> bytes:
+        """Remove and return the next datagram, so that each write of the port is one."""
+        return self._out.pop(0) if self._out else b""
+
+    def _advance(self, now: float) -> None:
+        self._events_since_s = now
+        self._events += self._queue.expire(now)
+        if self._sending is not None:
+            self._advance_packet(self._sending, now)
+        if self._is_open and self._sending is None and (packet := self._queue.take()) is not None:
+            self._start(packet, now)
+
+    def _start(self, packet: WaitingPacket, now: float) -> None:
+        rate = RATES[packet.rate]
+        number = packet.number & 0xFFFF
+        ack = packet.ack and packet.destination != CAPABILITIES.broadcast
+        kind = DatagramKind.DATA_WITH_ACK if ack else DatagramKind.DATA
+        frames = packet.frames
+        self._send(Datagram(kind, self._settings.address, packet.destination, packet.rate, number, frames))
+        ends_s = now + rate.airtime_s
+        ack_s = ends_s + (self._settings.reply_timeout_s if ack else 0.0)
+        self._sending = _Sending(packet, number, now, ends_s, ack_s)
+        self._events.append(TransmissionStarted(rate.airtime_s))
+
+    def _advance_packet(self, sending: _Sending, now: float) -> None:
+        if sending.on_air and now >= sending.ends_s:
+            sending.on_air = False
+            self._events.append(TransmissionEnded(RATES[sending.packet.rate].airtime_s))
+        complete = len(sending.acknowledged) == len(sending.packet.frames)
+        if not sending.on_air and (complete or now >= sending.ack_s):
+            packet = sending.packet
+            acknowledged = tuple(sorted(sending.acknowledged))
+            self._events.append(
+                PacketSent(
+                    packet.number,
+                    packet.destination,
+                    packet.rate,
+                    packet.frames,
+                    acknowledged,
+                    sending.started_s,
+                    now,
+                )
+            )
+            self._sending = None
+
+    def _on_datagram(self, datagram: Datagram, now: float) -> None:
+        numbers = [number for number, frame in enumerate(datagram.frames, start=1) if frame is not None]
+        if datagram.kind is DatagramKind.ACK:
+            sending = self._sending
+            if sending is not None and datagram.destination == self._settings.address:
+                expected = (sending.packet.destination, sending.number)
+                if sending.packet.ack and (datagram.source, datagram.number) == expected:
+                    sending.acknowledged |= {n for n in numbers if n <= len(sending.packet.frames)}
+            return
+        if datagram.kind is DatagramKind.DATA_WITH_ACK and datagram.destination == self._settings.address:
+            received = tuple(None if frame is None else b"" for frame in datagram.frames)
+            own = self._settings.address
+            self._send(Datagram(DatagramKind.ACK, own, datagram.source, datagram.rate, datagram.number, received))
+        if self._is_repeated(datagram):
+            return
+        rate = datagram.rate if datagram.rate in RATES else None
+        ack = datagram.kind is DatagramKind.DATA_WITH_ACK
+        frames = tuple(
+            FrameReceived(datagram.source, datagram.destination, ack, number, frame, now, rate, None)
+            for number, frame in enumerate(datagram.frames, start=1)
+            if frame is not None
+        )
+        lost, count = len(datagram.frames) - len(frames), len(datagram.frames)
+        source, destination = datagram.source, datagram.destination
+        packet = PacketReceived(frames, lost, count, source, destination, rate, None, complete=lost == 0)
+        self._events += [*frames, packet]
+
+    def _is_repeated(self, datagram: Datagram) -> bool:
+        """Return whether the network has repeated a datagram."""
+        # A station that has restarted counts from 1 again, so the number alone does not identify a packet.
+        content = zlib.crc32(b"".join(frame or b"" for frame in datagram.frames))
+        key = (datagram.source, datagram.number, content)
+        if key in self._seen:
+            return True
+        self._seen[key] = None
+        if len(self._seen) > REMEMBERED_PACKETS:
+            del self._seen[next(iter(self._seen))]
+        return False
+
+    def _send(self, datagram: Datagram) -> None:
+        self._out.append(datagram.pack())
+
+    def _take_events(self) -> list[ModemEvent]:
+        events, self._events = self._events, []
+        return events
