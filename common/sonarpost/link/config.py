@@ -10,6 +10,7 @@ from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.frames.v1.frame import MAX_FRAME_BYTES, MIN_FRAME_BYTES
 from sonarpost.link.frames.v1.payload_objects import WINDOW
 from sonarpost.link.state import Bounds, check_bounds
+from sonarpost.modem.interface import RateInfo
 
 _LINK: Final = "acoustic link v1"
 _QUEUE: Final = "acoustic queue"
@@ -114,8 +115,8 @@ class QueueConfig:
     """Configuration of the transmit queue.
 
     Attributes:
-        rates: Numbers of the allowed rates; the measured loss determines which one is used.
-        first_rate: The rate at the start.
+        rates: The allowed rates; the measured loss determines which one is used.
+        first_rate: Number of the rate at the start.
         expected_loss: Share of frames lost until it is measured.
         burst_frames: Mean number of frames lost in a row.
         feedback: "never", or "auto": with feedback as long as it arrives.
@@ -133,8 +134,8 @@ class QueueConfig:
         ConfigError: A value out of range.
     """
 
-    rates: tuple[int, ...] = (1,)
-    first_rate: int = 1
+    rates: tuple[RateInfo, ...]
+    first_rate: int
     expected_loss: Annotated[float, Bounds(0.0, 0.95)] = 0.2
     burst_frames: Annotated[float, Bounds(1.0, 1000.0)] = 1.0
     feedback: str = "auto"
@@ -150,5 +151,21 @@ class QueueConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self, _QUEUE, ConfigError)
+        if self.first_rate not in self.rate_numbers:
+            raise ConfigError(_QUEUE, "first_rate", self.first_rate, f"one of {sorted(self.rate_numbers)}")
+        for rate in self.rates:
+            if not MIN_FRAME_BYTES <= rate.frame_bytes <= MAX_FRAME_BYTES:
+                expected = f"frames of {MIN_FRAME_BYTES}..{MAX_FRAME_BYTES} bytes"
+                raise ConfigError(_QUEUE, f"rate {rate.number}", rate.frame_bytes, expected)
         if self.feedback not in ("auto", "never"):
             raise ConfigError(_QUEUE, "feedback", self.feedback, "auto, never")
+
+    @property
+    def rate_numbers(self) -> frozenset[int]:
+        """Numbers of the allowed rates."""
+        return frozenset(rate.number for rate in self.rates)
+
+    def rate(self, number: int) -> RateInfo:
+        """Return the allowed rate with a number; the first rate if it is not allowed (any more)."""
+        by_number = {rate.number: rate for rate in self.rates}
+        return by_number.get(number, by_number[self.first_rate])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from sonarpost.errors import FrameError
+from sonarpost.link.frames.contact_record import ContactSummary, atd_class_of
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.messages import Contact, ReceivedImage
+from sonarpost.sonar.survey import Side
 
 
 def received_image(
@@ -23,29 +26,7 @@ def received_image(
         ValidationError: A value does not fit the record.
     """
     summary = update.contact
-    contact = (
-        None
-        if summary is None
-        else Contact(
-            contact_id=f"{vehicle_id}/{update.image_id}",
-            vehicle_id=vehicle_id,
-            channel=summary.side.value if summary.side else None,
-            time_utc_s=summary.time_utc_s,
-            lat_deg=summary.lat_deg,
-            lon_deg=summary.lon_deg,
-            position_sigma_m=summary.position_sigma_m,
-            depth_m=summary.depth_m,
-            altitude_m=summary.altitude_m,
-            heading_deg=summary.heading_deg,
-            ground_range_m=summary.ground_range_m,
-            atd_class=summary.atd_class,
-            atd_confidence=summary.confidence,
-            pixel_along_m=summary.pixel_along_m,
-            pixel_across_m=summary.pixel_across_m,
-            p_mine_like=summary.p_mine_like,
-            p_other_object=summary.p_other_object,
-        )
-    )
+    contact = None if summary is None else contact_of(summary, vehicle_id, update.image_id)
     return ReceivedImage(
         vessel_id=vessel_id,
         vehicle_id=vehicle_id,
@@ -66,3 +47,64 @@ def received_image(
         last_frame_utc_s=update.last_frame_s,
         authenticated=authenticated,
     )
+
+
+def contact_of(summary: ContactSummary, vehicle_id: str, image_id: str) -> Contact:
+    """Return the contact that a contact record describes.
+
+    Raises:
+        ValidationError: A value does not fit the record.
+    """
+    return Contact(
+        contact_id=f"{vehicle_id}/{image_id}",
+        vehicle_id=vehicle_id,
+        channel=summary.side.value if summary.side else None,
+        time_utc_s=summary.time_utc_s,
+        lat_deg=summary.lat_deg,
+        lon_deg=summary.lon_deg,
+        position_sigma_m=summary.position_sigma_m,
+        depth_m=summary.depth_m,
+        altitude_m=summary.altitude_m,
+        heading_deg=summary.heading_deg,
+        ground_range_m=summary.ground_range_m,
+        atd_class=summary.atd_class,
+        atd_confidence=summary.confidence,
+        pixel_along_m=summary.pixel_along_m,
+        pixel_across_m=summary.pixel_across_m,
+        p_mine_like=summary.p_mine_like,
+        p_other_object=summary.p_other_object,
+    )
+
+
+def contact_record(contact: Contact, height_px: int | None, width_px: int | None, image_id: str) -> bytes:
+    """Return the contact record of 25 bytes if it represents exactly this contact and size, otherwise no bytes."""
+    if contact.atd_class is not None and atd_class_of(contact.atd_class) is None:
+        return b""
+    try:
+        packed = ContactSummary(
+            height_px=height_px,
+            width_px=width_px,
+            lat_deg=contact.lat_deg,
+            lon_deg=contact.lon_deg,
+            time_utc_s=contact.time_utc_s,
+            confidence=contact.atd_confidence,
+            heading_deg=contact.heading_deg,
+            altitude_m=contact.altitude_m,
+            depth_m=contact.depth_m,
+            side=None if contact.channel is None else Side(contact.channel),
+            ground_range_m=contact.ground_range_m,
+            pixel_along_m=contact.pixel_along_m,
+            pixel_across_m=contact.pixel_across_m,
+            position_sigma_m=contact.position_sigma_m,
+            atd_class=atd_class_of(contact.atd_class),
+            p_mine_like=contact.p_mine_like,
+            p_other_object=contact.p_other_object,
+        ).pack()
+        summary = ContactSummary.unpack(packed)
+    except FrameError:
+        return b""
+    is_exact = contact_of(summary, contact.vehicle_id, image_id) == contact and (
+        summary.height_px,
+        summary.width_px,
+    ) == (height_px, width_px)
+    return packed if is_exact else b""

@@ -15,9 +15,9 @@ from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
 from sonarpost.link.queue.messages import MessageQueue
 from sonarpost.link.state import Bounds, Errors, Parts
-from sonarpost.modem.micromodem import RATES
+from sonarpost.modem.interface import MAX_RATE
 
-RateNumber = Annotated[int, Bounds(min(RATES), max(RATES))]
+RateNumber = Annotated[int, Bounds(0, MAX_RATE)]
 
 _SMOOTHING: Final = 0.2
 
@@ -232,7 +232,15 @@ class ImageSender(ABC):
         return self.messages.waiting_bytes
 
     def add_message(
-        self, message_id: str, source: str, data: bytes, now: float, *, priority: int = 4, lifetime_s: float = 3600.0
+        self,
+        message_id: str,
+        source: str,
+        data: bytes,
+        now: float,
+        *,
+        priority: int = 4,
+        lifetime_s: float = 3600.0,
+        once: bool = False,
     ) -> bool:
         """Add a message; return False if it is known, or has expired.
 
@@ -243,6 +251,7 @@ class ImageSender(ABC):
             now: UTC in seconds.
             priority: 1 first to 7 last.
             lifetime_s: Time from `now` on after which it is not sent any more.
+            once: Whether it is sent once, without copies against loss.
 
         Raises:
             FrameError: The wire format has no messages.

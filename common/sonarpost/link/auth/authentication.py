@@ -119,14 +119,15 @@ class FrameAuthenticator:
             ...save `limit` durably...
             authenticator.grant(limit)
 
-    Memory: a window of two numbers for each of at most 128 transmitters, created after the first genuine frame.
+    Memory: a window of two numbers for each of at most 256 transmitters, created after the first genuine frame.
 
     Attributes:
         counts: The counters.
+        last_counter: Counter of the frame that was verified last, -1 before the first.
 
     Args:
         key: The common key.
-        address: Modem address of this station, 0..127. Stations that send in the same direction need different ones.
+        address: Modem address of this station, 0..255. Stations that send in the same direction need different ones.
         sends: Direction of this station's frames; it verifies frames of the other direction.
         settings: As agreed with the other station.
         first_counter: The last limit that was saved, 0 with a new key.
@@ -159,6 +160,12 @@ class FrameAuthenticator:
         self._ahead: dict[int, int] = {}
         self._next = self._limit = first_counter
         self.counts = AuthenticationCounts()
+        self.last_counter = -1
+
+    @property
+    def fingerprint(self) -> str:
+        """Fingerprint of the key."""
+        return self._key.fingerprint
 
     @property
     def overhead_bytes(self) -> int:
@@ -231,6 +238,7 @@ class FrameAuthenticator:
             if plain is not None:
                 self._check_counter(source, window, counter, where)
                 self.counts.genuine += 1
+                self.last_counter = counter
                 return head + plain
         self.counts.forged += 1
         raise FrameError(where, "tag", tag, f"a tag of modem {source} with key {self._key.fingerprint}")

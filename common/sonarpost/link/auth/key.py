@@ -19,7 +19,8 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from sonarpost.errors import ConfigError
 
 KEY_BYTES: Final = 32
-MAX_ADDRESS: Final = 127
+MAX_ADDRESS: Final = 255
+"""The key derivation has one byte for the address."""
 COUNTER_BYTES: Final = (1, 2)
 TAG_BYTES: Final = (4, 6, 8)
 
@@ -108,7 +109,7 @@ class AcousticKey:
         """Return AES-256-CCM with the key of one transmitter.
 
         Args:
-            source: The transmitter's modem address, 0..127.
+            source: The transmitter's modem address, 0..255.
             direction: Direction of its frames.
             settings: The settings.
         """

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from sonarpost.errors import ConfigError
 from sonarpost.link.frames.v1.frame import HEADER_BYTES
 from sonarpost.link.state import Bounds, check_bounds
-from sonarpost.modem.micromodem import RATES
+from sonarpost.modem.interface import RateInfo
 
 Values = npt.NDArray[np.float64]
 
@@ -103,22 +103,22 @@ class RateSelector:
     known loss. So a faster rate is tried every half hour, and left as soon as its loss is measured.
 
     Args:
-        allowed: Numbers of the allowed rates.
+        allowed: The allowed rates.
         current: The rate in use.
         losses: Loss and time of the measurement, by rate.
 
     Raises:
-        ConfigError: An unknown rate, or the current one is not allowed.
+        ConfigError: The current rate is not allowed.
     """
 
-    allowed: Sequence[int]
+    allowed: Sequence[RateInfo]
     current: int
     losses: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not set(self.allowed) <= set(RATES) or self.current not in self.allowed:
-            expected = f"some of {sorted(RATES)}, with the first"
-            raise ConfigError("rate selection", "rates", tuple(self.allowed), expected)
+        numbers = tuple(rate.number for rate in self.allowed)
+        if self.current not in numbers:
+            raise ConfigError("rate selection", "rates", numbers, f"rates with the first, {self.current}")
 
     def record_loss(self, loss: float, now: float) -> None:
         """Record the measured loss at the current rate, 0..1."""
@@ -131,7 +131,7 @@ class RateSelector:
             return self.current  # a rate on trial stays until its loss is measured
         goodput_bps: dict[int, float] = {}
         assumed = 0.0
-        for rate in sorted((RATES[number] for number in self.allowed), key=lambda rate: rate.throughput_bps):
+        for rate in sorted(self.allowed, key=lambda rate: rate.throughput_bps):
             loss = self.losses[rate.number][0] if rate.number in self.losses else assumed
             assumed = max(assumed, loss)
             payload_bytes = rate.frames * (rate.frame_bytes - HEADER_BYTES)

@@ -1,4 +1,4 @@
-"""Contents of `v1` messages: commands, decisions, their confirmations, and data of the vehicle's programs.
+"""Contents of `v1` messages: commands, decisions, their confirmations, the vehicle's status, data of its programs.
 
 The first byte of a message is its kind. Everything but data fits the 27 bytes that a message has in a frame of 32.
 docs/specifications/acoustic-v1.md specifies the bytes.
@@ -18,6 +18,7 @@ from typing import Annotated, Final, Literal
 
 from sonarpost.codec.region import PACKED_BYTES, RegionBox
 from sonarpost.errors import BadInputError, FrameError
+from sonarpost.link.downlink.status_message import StatusMessage
 from sonarpost.link.frames.paper.frame import format_image_id, is_image_id
 from sonarpost.link.frames.v1.payload_objects import MAX_NUMBER, MAX_STREAM_BYTES, ImageNumber, StreamPosition
 from sonarpost.link.state import Bounds, check_bounds
@@ -59,6 +60,7 @@ class MessageKind(IntEnum):
     CONFIRMATION = 0x08
     PRIORITISE = 0x09
     DATA = 0x10
+    STATUS = 0x11
 
 
 _COMMANDS: Final = (
@@ -250,7 +252,7 @@ DownlinkCommand = (
     | RegionMessage
     | PrioritiseMessage
 )
-Content = DownlinkCommand | ConfirmationMessage | DataMessage
+Content = DownlinkCommand | ConfirmationMessage | DataMessage | StatusMessage
 
 
 def pack(content: Content, room_bytes: int = SMALLEST_ROOM_BYTES) -> bytes:
@@ -273,6 +275,8 @@ def _packed(content: Content, room_bytes: int) -> bytes:
     match content:
         case DataMessage():
             return bytes([MessageKind.DATA]) + content.data
+        case StatusMessage():
+            return bytes([MessageKind.STATUS]) + content.pack()
         case ConfirmationMessage():
             return bytes([MessageKind.CONFIRMATION]) + b"".join(_OUTCOME.pack(*each) for each in content.outcomes)
         case RevisitMessage():
@@ -326,6 +330,8 @@ def _content(data: bytes) -> Content:
     kind, body = data[0] if data else -1, data[1:]
     if kind == MessageKind.DATA:
         return DataMessage(body)
+    if kind == MessageKind.STATUS:
+        return StatusMessage.unpack(body)
     if kind == MessageKind.CONFIRMATION:
         return _confirmation(body)
     if kind not in _COMMANDS:

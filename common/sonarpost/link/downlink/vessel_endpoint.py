@@ -12,9 +12,11 @@ from typing import Final
 
 from sonarpost.errors import FrameError
 from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.auth.merging import FrameMerger
 from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.downlink.commands import CommandState, CommandTracker, PendingCommand
 from sonarpost.link.downlink.messages import ConfirmationMessage, DataMessage, DecisionMessage, unpack
+from sonarpost.link.downlink.status_message import StatusMessage
 from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments, segments_room
 from sonarpost.link.frames.v1.payload_objects import Feedback
@@ -45,12 +47,14 @@ class ReceivedContent:
         messages: Messages of the vehicle's programs.
         commands: Commands whose state changed.
         rejected: Why the frame, or a part of it, was rejected.
+        statuses: Statuses of the vehicle.
     """
 
     images: tuple[ImageUpdate, ...] = ()
     messages: tuple[bytes, ...] = ()
     commands: tuple[PendingCommand, ...] = ()
     rejected: tuple[FrameError, ...] = ()
+    statuses: tuple[StatusMessage, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +94,7 @@ class VesselEndpoint:
         commands: The commands.
         config: Configuration of the receiver of `v1`.
         protection: Authenticates frames. With it the `paper` format is rejected: it has no authentication.
+        merger: Merges the frames that other vessels received; None without other vessels.
         feedback: Whether feedback is sent.
         wire_formats: Formats to receive.
         pairing_timeout_s: See `PaperReceiver`.
@@ -101,12 +106,13 @@ class VesselEndpoint:
         config: ReceiverConfig | None = None,
         *,
         protection: FrameAuthenticator | None = None,
+        merger: FrameMerger | None = None,
         feedback: bool = True,
         wire_formats: Sequence[WireFormat] = ("v1",),
         pairing_timeout_s: float = 60.0,
     ) -> None:
         self.commands = commands
-        self.v1 = V1Receiver(config, protection=protection)
+        self.v1 = V1Receiver(config, protection=protection, merger=merger)
         memory_s = max(self.v1.config.contact_memory_s, pairing_timeout_s)
         self.paper = PaperReceiver(pairing_timeout_s, memory_s=memory_s)
         self._receiver = CombinedReceiver(
@@ -121,7 +127,9 @@ class VesselEndpoint:
         self._feedback_failed: set[int] = set()
         self._overheard: set[int] = set()
 
-    def accept(self, source: int, frame: bytes, now: float, *, overheard: bool = False) -> ReceivedContent:
+    def accept(
+        self, source: int, frame: bytes, now: float, *, overheard: bool = False, vessel: str = ""
+    ) -> ReceivedContent:
         """Process a frame. Never raises because of `frame`.
 
         Args:
@@ -130,8 +138,12 @@ class VesselEndpoint:
             now: UTC in seconds.
             overheard: The frame was addressed to another station. Only its images are used, and its sender gets no
                 feedback until it sends a frame to this station.
+            vessel: Name of the other vessel that received the frame; empty for this one.
         """
-        events = self._receiver.accept(source, frame, now)
+        if vessel:
+            events = self.v1.accept_from(vessel, source, frame, now)
+        else:
+            events = self._receiver.accept(source, frame, now)
         if overheard:
             content = self._content([event for event in events if not isinstance(event, MessageReceived)])
             self._overheard |= set() if content.rejected else {source}
@@ -175,6 +187,7 @@ class VesselEndpoint:
         messages: list[bytes] = []
         commands: list[PendingCommand] = []
         rejected: list[FrameError] = []
+        statuses: list[StatusMessage] = []
         for event in events:
             match event:
                 case ImageUpdate():
@@ -191,12 +204,14 @@ class VesselEndpoint:
                         continue
                     if isinstance(content, DataMessage):
                         messages.append(content.data)
+                    elif isinstance(content, StatusMessage):
+                        statuses.append(content)
                     elif isinstance(content, ConfirmationMessage):
                         confirmed = self.commands.confirm(event.source, content.outcomes)
                         self._stop_decided_images(confirmed)
                         commands += confirmed
                     # Other contents are commands of another vessel.
-        return ReceivedContent(tuple(images), tuple(messages), tuple(commands), tuple(rejected))
+        return ReceivedContent(tuple(images), tuple(messages), tuple(commands), tuple(rejected), tuple(statuses))
 
     def _stop_decided_images(self, confirmed: Sequence[PendingCommand]) -> None:
         for command in confirmed:

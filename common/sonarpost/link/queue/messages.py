@@ -29,6 +29,7 @@ class QueuedMessage:
         added_s: Time of arrival, UTC in seconds.
         expires_s: Time when the message becomes useless.
         data: Content.
+        once: Whether it is sent once, without copies against loss.
     """
 
     key: Count
@@ -38,6 +39,7 @@ class QueuedMessage:
     added_s: float
     expires_s: float
     data: bytes
+    once: bool = False
 
     def level(self, now: float, aging_s: float) -> int:
         """Return the priority after aging: one level more urgent every `aging_s`, up to 2."""
@@ -82,7 +84,15 @@ class MessageQueue:
         return sum(len(message.data) for message in self.waiting.values())
 
     def add(
-        self, message_id: str, source: str, priority: int, data: bytes, *, added_s: float, expires_s: float
+        self,
+        message_id: str,
+        source: str,
+        priority: int,
+        data: bytes,
+        *,
+        added_s: float,
+        expires_s: float,
+        once: bool = False,
     ) -> bool:
         """Add a message; return False if the program has used the identifier before."""
         name = f"{source}\0{message_id}"
@@ -96,7 +106,7 @@ class MessageQueue:
             # A program that was silent has no credit: with it, the program could block all others.
             floor = min((self.served.get(name, 0) for name in active), default=0)
             self.served[source] = max(self.served.get(source, 0), floor)
-        message = QueuedMessage(self.next_key, message_id, source, priority, added_s, expires_s, data)
+        message = QueuedMessage(self.next_key, message_id, source, priority, added_s, expires_s, data, once)
         self.waiting[message.key] = message
         self.next_key += 1
         return True
@@ -177,8 +187,17 @@ class MessageSender:
     waiting: list[MessageCopies] = field(default_factory=list)
     next_number: Byte = 0
 
-    def add(self, data: bytes, priority: int, expires_s: float, copies: int, rises_s: float | None = None) -> int:
-        """Add a message; return its number.
+    def add(
+        self,
+        data: bytes,
+        priority: int,
+        expires_s: float,
+        copies: int,
+        rises_s: float | None = None,
+        *,
+        once: bool = False,
+    ) -> int:
+        """Add a message; return its number. With `once` it is sent once, whatever the number of `copies`.
 
         Raises:
             FrameError: It is empty or longer than 4096 bytes.
@@ -187,7 +206,10 @@ class MessageSender:
             raise FrameError("acoustic link v1", "message", f"{len(data)} bytes", f"1..{MAX_MESSAGE_BYTES}")
         number = self.next_number
         self.next_number = (number + 1) % 256
-        self.waiting.append(MessageCopies(number, data, priority, expires_s, copies, 0, rises_s))
+        added = MessageCopies(number, data, priority, expires_s, copies, 0, rises_s)
+        if once:
+            added.copies, added.extra = 1, 0
+        self.waiting.append(added)
         self.waiting.sort(key=lambda m: -m.priority)
         return number
 

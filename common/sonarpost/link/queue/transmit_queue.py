@@ -23,7 +23,6 @@ from sonarpost.link.frames.v1.sender import FIRST_URGENCY, LAST_URGENCY, V1Sende
 from sonarpost.link.queue.messages import FILLER_PRIORITY, MessageQueue
 from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket, RateNumber, SentImage
 from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
-from sonarpost.modem.micromodem import RATES
 
 _SEGMENTS: Final = 2
 _MIN_LOSS_CHANGE: Final = 0.02
@@ -70,21 +69,18 @@ class TransmitQueue(ImageSender):
         config: The configuration.
         first_block: See `V1Sender`.
         protection: See `V1Sender`.
-
-    Raises:
-        ConfigError: An unknown rate.
     """
 
     def __init__(
         self, config: QueueConfig, *, first_block: int = 0, protection: FrameAuthenticator | None = None
     ) -> None:
-        super().__init__(RATES[config.first_rate].airtime_s)
+        super().__init__(config.rate(config.first_rate).airtime_s)
         self.config = config
         self.max_messages = config.max_messages
         self.rate_selector = RateSelector(config.rates, config.first_rate)
         self.sender = V1Sender(
             SenderConfig(
-                frame_bytes=RATES[config.first_rate].frame_bytes,
+                frame_bytes=config.rate(config.first_rate).frame_bytes,
                 channels=(LossChannel(config.expected_loss, config.burst_frames),),
                 frames_per_image=config.frames_per_image,
                 stream_bytes=config.stream_bytes,
@@ -201,14 +197,22 @@ class TransmitQueue(ImageSender):
         return self.sender.prioritise(number, now, first=first)
 
     def add_message(
-        self, message_id: str, source: str, data: bytes, now: float, *, priority: int = 4, lifetime_s: float = 3600.0
+        self,
+        message_id: str,
+        source: str,
+        data: bytes,
+        now: float,
+        *,
+        priority: int = 4,
+        lifetime_s: float = 3600.0,
+        once: bool = False,
     ) -> bool:
         """Add a message; see `ImageSender.add_message`."""
         if lifetime_s <= 0:
             self.messages.expired += 1
             return False
         return self.messages.add(
-            message_id, source, priority, data, added_s=float(now), expires_s=float(now + lifetime_s)
+            message_id, source, priority, data, added_s=float(now), expires_s=float(now + lifetime_s), once=once
         )
 
     def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int) -> None:
@@ -241,7 +245,7 @@ class TransmitQueue(ImageSender):
         self._open_before_packet = self.open_numbers()
         self._update(now)
         frames: list[bytes] = []
-        while len(frames) < RATES[self.rate].frames:
+        while len(frames) < self.config.rate(self.rate).frames:
             self._load_messages(now)
             frame = self._next_frame(now)
             if frame is None and not frames and self.sender.state.messages.waiting:
@@ -279,7 +283,7 @@ class TransmitQueue(ImageSender):
         before = self.rate
         if self.rate_selector.select(now) != before:
             self.sender.state.tracker.meters.clear()
-            self.sender.resize(RATES[self.rate].frame_bytes)
+            self.sender.resize(self.config.rate(self.rate).frame_bytes)
 
     def _load_messages(self, now: float) -> None:
         """Pass the next messages to the sender; the others wait here, where more urgent ones can overtake them."""
@@ -296,6 +300,7 @@ class TransmitQueue(ImageSender):
                 lifetime_s=message.expires_s - now,
                 times=copies(worst, _MISSED / 10 if message.priority <= _URGENT else _MISSED),
                 rises_s=message.added_s + (message.priority - FILLER_PRIORITY + 1) * self.config.aging_s,
+                once=message.once,
             )
             loaded += len(message.data)
 
@@ -320,7 +325,7 @@ class TransmitQueue(ImageSender):
         Detail of the blocks in transmission is sent in turns, so all of it ends at about the same time; groups follow
         one another. Messages that arrive later are not included.
         """
-        frame_s = self.packet_interval_s / RATES[self.rate].frames
+        frame_s = self.packet_interval_s / self.config.rate(self.rate).frames
         frames_of = dict.fromkeys(self.open_numbers(), 0.0)
         previews: dict[int, float] = {}
         ahead = len(self.sender.state.messages.waiting) / 2
@@ -388,7 +393,8 @@ class TransmitQueue(ImageSender):
     def restore(self, parts: Parts) -> Errors:
         """Replace the state of a new queue by saved parts; the configuration stays. Return why parts were skipped.
 
-        If the rate in use is not configured any more, the queue continues with the first rate.
+        If the rate in use is not configured any more, the queue continues with the first rate. The packet in flight
+        then counts as lost: the modem may not have its rate, or may be another one.
         """
         reader = PartReader(parts, "queue state")
         state = reader.read("queue", QueueState)
@@ -397,19 +403,21 @@ class TransmitQueue(ImageSender):
         if state is not None:
             self._restore_plan(state)
         errors = {**reader.errors, **self.sender.restore(parts)}
-        if state is not None and state.rate not in self.config.rates:
-            self.sender.resize(RATES[self.rate].frame_bytes)
+        if self.in_flight is not None and self.in_flight.rate not in self.config.rate_numbers:
+            self.in_flight = None
+        if state is not None and state.rate not in self.config.rate_numbers:
+            self.sender.resize(self.config.rate(self.rate).frame_bytes)
         return errors
 
     def _restore_plan(self, state: QueueState) -> None:
         self.sender.config = replace(
             self.sender.config,
-            frame_bytes=RATES[state.rate].frame_bytes,
+            frame_bytes=self.config.rate(state.rate).frame_bytes,
             feedback=state.feedback,
             channels=(LossChannel(state.planned_loss, self.config.burst_frames),),
         )
         self.rate_selector.losses = dict(state.losses)
-        if state.rate in self.config.rates:
+        if state.rate in self.config.rate_numbers:
             self.rate_selector.current = state.rate
         self.packet_interval_s = state.packet_interval_s
         self._image_credit = state.image_credit

@@ -34,7 +34,7 @@ from sonarpost.link.frames.paper.frame import (
 from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
 from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket, SentImage
 from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
-from sonarpost.modem.micromodem import RATES
+from sonarpost.modem.interface import RateInfo
 
 Packet = tuple[bytes, ...]
 
@@ -84,11 +84,11 @@ class PaperSender(ImageSender):
         images: Images of which packets are still to be sent, in the order of sending.
 
     Args:
-        rate: Number of the modem's rate.
+        rate: The modem's rate.
     """
 
-    def __init__(self, rate: int) -> None:
-        super().__init__(RATES[rate].airtime_s)
+    def __init__(self, rate: RateInfo) -> None:
+        super().__init__(rate.airtime_s)
         self._rate = rate
         self.images: list[WaitingImage] = []
         self._next_order = 1
@@ -97,7 +97,7 @@ class PaperSender(ImageSender):
     @property
     def rate(self) -> int:
         """Number of the rate."""
-        return self._rate
+        return self._rate.number
 
     @property
     def is_idle(self) -> bool:
@@ -124,8 +124,8 @@ class PaperSender(ImageSender):
         return True
 
     def _plan(self, image: WaitingImage) -> tuple[Packet, ...]:
-        rate = RATES[self.rate]
-        return plan_packets(image.image_id, image.stream, image.contact, rate.frames, rate.frame_bytes)
+        frames, frame_bytes = self._rate.frames, self._rate.frame_bytes
+        return plan_packets(image.image_id, image.stream, image.contact, frames, frame_bytes)
 
     def _select_packet(self, now: float) -> OutgoingPacket | None:
         if not self.images:

@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from typing import Annotated, Final
 
 from sonarpost.errors import FrameError
+from sonarpost.link.auth.authentication import WINDOW as REPLAY_WINDOW
 from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.auth.merging import Arrival, FrameMerger
 from sonarpost.link.coding.block_decoder import BlockDecoder, DecodedObject, SymbolChunk
 from sonarpost.link.coding.byte_ranges import PartialBytes
 from sonarpost.link.config import ReceiverConfig
@@ -148,6 +150,8 @@ class PeerState:
         feedback_frames: `frames` at the last feedback.
         redundant_symbols: Symbols of complete blocks since the last feedback.
         order: Rises with every frame of any sender.
+        moves: With frames of several vessels: for each of the last 32 blocks that became the newest, the counter of the
+            frame and the number of the block, counted without wrapping.
     """
 
     address: int
@@ -164,6 +168,7 @@ class PeerState:
     redundant_symbols: Count = 0
     order: Count = 0
     image_order: Count = 0
+    moves: list[tuple[Count, Count]] = field(default_factory=list)
 
     def delete_old(self, now: float, config: ReceiverConfig) -> None:
         """Delete what has had no frame for too long; after the clock was set back nothing stays longer."""
@@ -176,17 +181,41 @@ class PeerState:
                 del table[number]
         if not self.blocks:
             self.newest_block, self.block_span = -1, 0
+            self.moves.clear()
         for number in [n for n, i in self.images.items() if i.last_frame_s + config.contact_memory_s < now]:
             del self.images[number]
         self.recent_messages = [m for m in self.recent_messages if m[2] + config.block_memory_s >= now]
 
-    def add_symbol(self, symbol: Symbol, now: float, config: ReceiverConfig) -> list[Event]:
+    def is_outdated(self, symbol: Symbol, counter: int) -> bool:
+        """Whether a symbol is of a block before the window: its number belongs to a later block by now.
+
+        Args:
+            symbol: The symbol.
+            counter: Counter of its frame. A late frame was transmitted when the block of the last move with a lower
+                counter was the newest; its own block is within 16 of that one.
+        """
+        if not self.moves or counter >= self.moves[-1][0]:
+            return False
+        first_counter, first_block = self.moves[0]
+        if counter < first_counter and (len(self.moves) >= BLOCKS or counter < first_counter - REPLAY_WINDOW):
+            return True
+        newest_then = next((block for at, block in reversed(self.moves) if at <= counter), first_block)
+        after = (symbol.block - newest_then + WINDOW) % BLOCKS - WINDOW
+        return newest_then + after <= self.moves[-1][1] - WINDOW
+
+    def add_symbol(self, symbol: Symbol, now: float, config: ReceiverConfig, counter: int | None = None) -> list[Event]:
         """Add a symbol.
+
+        Args:
+            symbol: The symbol.
+            now: Time of the frame.
+            config: Configuration of the receiver.
+            counter: Counter of the frame if frames of several vessels are merged.
 
         Raises:
             FrameError: It does not fit the others of its block.
         """
-        self._move_window(symbol.block)
+        self._move_window(symbol.block, counter)
         block = self._block_for(symbol, now)
         self.redundant_symbols += block.complete
         events: list[Event] = []
@@ -194,7 +223,7 @@ class PeerState:
             events += self.add_object(found, now, config)
         return events
 
-    def _move_window(self, number: int) -> None:
+    def _move_window(self, number: int, counter: int | None) -> None:
         ahead = (number - self.newest_block) % BLOCKS if self.newest_block >= 0 else 1
         if 0 < ahead < WINDOW or self.newest_block < 0:
             self.newest_block = number
@@ -204,6 +233,11 @@ class PeerState:
                     del table[old]
         else:
             self.block_span = min(WINDOW, max(self.block_span, (self.newest_block - number) % BLOCKS + 1))
+            ahead = 0
+        if counter is not None and (ahead or not self.moves):
+            last_counter, last_block = self.moves[-1] if self.moves else (counter, self.newest_block - ahead)
+            move = (max(counter, last_counter), last_block + ahead)
+            self.moves = [*self.moves, move][-BLOCKS:]
 
     def _block_for(self, symbol: Symbol, now: float) -> BlockDecoder:
         """Return the block of a symbol.
@@ -344,6 +378,8 @@ class V1ReceiverCounts:
         messages: `MessageReceived` events.
         feedback: `FeedbackReceived` events.
         evicted_sources: Senders deleted because `max_sources` was reached.
+        duplicates: Frames that another vessel had received, too.
+        late: Frames of other vessels that arrived too late to be used.
     """
 
     frames: Count = 0
@@ -353,6 +389,8 @@ class V1ReceiverCounts:
     messages: Count = 0
     feedback: Count = 0
     evicted_sources: Count = 0
+    duplicates: Count = 0
+    late: Count = 0
 
 
 class V1Receiver:
@@ -367,11 +405,19 @@ class V1Receiver:
     Args:
         config: Bounds and times.
         protection: Verifies frames.
+        merger: Verifies and merges the frames that other vessels received; None without other vessels.
     """
 
-    def __init__(self, config: ReceiverConfig | None = None, *, protection: FrameAuthenticator | None = None) -> None:
+    def __init__(
+        self,
+        config: ReceiverConfig | None = None,
+        *,
+        protection: FrameAuthenticator | None = None,
+        merger: FrameMerger | None = None,
+    ) -> None:
         self.config = config or ReceiverConfig()
         self._protection = protection
+        self._merger = merger
         self._sources: dict[int, PeerState] = {}  # the one whose last frame is oldest first
         self.counts = V1ReceiverCounts()
 
@@ -382,19 +428,49 @@ class V1Receiver:
 
     def accept(self, source: int, frame: bytes, now: float) -> list[Event]:
         """Process a frame; see `FrameReceiver.accept`."""
-        now = float(now)
+        return self._accept(source, frame, float(now), self._protection)
+
+    def accept_from(self, vessel: str, source: int, frame: bytes, now: float) -> list[Event]:
+        """Process a frame that another vessel received, as `accept` does; one that arrived before gives no event.
+
+        Args:
+            vessel: Name of the vessel, one of those of `merger`.
+            source: Modem address of the vehicle.
+            frame: The frame as the modem of the vessel delivered it.
+            now: Seconds, when the frame arrived here.
+        """
+        protection = None if self._merger is None else self._merger.verifier(vessel)
+        if protection is None:
+            self.counts.frames += 1
+            self.counts.rejected += 1
+            reason = FrameError("acoustic frame", "vessel", vessel, "a configured vessel")
+            return [FrameRejected(source, reason, float(now))]
+        return self._accept(source, frame, float(now), protection)
+
+    def _accept(self, source: int, frame: bytes, now: float, protection: FrameAuthenticator | None) -> list[Event]:
         self.counts.frames += 1
         where = f"acoustic frame from modem {source}"
         try:
-            content = parse_frame(frame, source, self._protection, where)
+            content = parse_frame(frame, source, protection, where)
         except FrameError as reason:
             self.counts.rejected += 1
             return [FrameRejected(source, reason, now)]
+        counter = None
+        if self._merger is not None and protection is not None:
+            counter = protection.last_counter
+            arrival = self._merger.arrive(source, counter)
+            self.counts.duplicates += arrival is Arrival.DUPLICATE
+            self.counts.late += arrival is Arrival.LATE
+            if arrival is not Arrival.NEW:
+                return []
         peer = self._peer(source, now)
+        if self._merger is not None and counter is not None and self._merger.is_newest(source, counter):
+            # Higher ones are of a key that was replaced.
+            peer.moves = [move for move in peer.moves if move[0] <= counter]
         events: list[Event] = []
         for item in [content] if isinstance(content, Symbol) else content:
             try:
-                events += self._process(peer, item, now, where)
+                events += self._process(peer, item, now, where, counter)
             except FrameError as reason:
                 self.counts.rejected += 1
                 events.append(FrameRejected(source, reason, now))
@@ -413,12 +489,14 @@ class V1Receiver:
         """Return None, see `poll`."""
         return None
 
-    def _process(self, peer: PeerState, item: Symbol | Segment, now: float, where: str) -> list[Event]:
+    def _process(
+        self, peer: PeerState, item: Symbol | Segment, now: float, where: str, counter: int | None
+    ) -> list[Event]:
         if isinstance(item, Symbol):
-            return peer.add_symbol(item, now, self.config)
+            return self._add_symbol(peer, item, now, counter)
         match item.kind:
             case SegmentKind.SYMBOL:
-                return peer.add_symbol(parse_symbol(item.data, where), now, self.config)
+                return self._add_symbol(peer, parse_symbol(item.data, where), now, counter)
             case SegmentKind.MESSAGE if len(item.data) > 1:
                 return peer.add_message(MessageObject(item.data[0], item.data[1:]), now)
             case SegmentKind.CONTACT | SegmentKind.PREVIEW:
@@ -429,6 +507,12 @@ class V1Receiver:
                 return [FeedbackReceived(peer.address, RefineRequest.unpack(item.data, where), now)]
             case _:
                 raise FrameError(where, "segment kind", item.kind, "1..6, a message not empty")
+
+    def _add_symbol(self, peer: PeerState, symbol: Symbol, now: float, counter: int | None) -> list[Event]:
+        if counter is not None and peer.is_outdated(symbol, counter):
+            self.counts.late += 1
+            return []
+        return peer.add_symbol(symbol, now, self.config, counter)
 
     def _peer(self, source: int, now: float) -> PeerState:
         peer = self._sources.pop(source, None)

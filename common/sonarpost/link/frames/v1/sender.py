@@ -195,6 +195,7 @@ class V1Sender:
         lifetime_s: float = 3600.0,
         times: int | None = None,
         rises_s: float | None = None,
+        once: bool = False,
     ) -> int:
         """Add a message; return its number.
 
@@ -205,12 +206,13 @@ class V1Sender:
             lifetime_s: Time after which it is not sent any more.
             times: Number of copies; by default computed from the measured loss.
             rises_s: See `MessageCopies`.
+            once: Whether it is sent once only.
 
         Raises:
             FrameError: Empty or too long.
         """
         times = copies(self.config.worst) if times is None else max(1, times)
-        return self.state.messages.add(data, priority, float(now + lifetime_s), times, rises_s)
+        return self.state.messages.add(data, priority, float(now + lifetime_s), times, rises_s, once=once)
 
     def plan_for(self, channels: tuple[LossChannel, ...]) -> None:
         """Use another measured loss for future plans; existing plans stay."""
