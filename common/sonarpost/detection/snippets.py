@@ -97,7 +97,7 @@ def cut_expanded(survey: Survey, detection: Detection, height_px: int, width_px:
         return None
     raw, known = _file_values(survey, detection.side, (top, rows), (left, columns))
     count = _sums_of_four(known.astype(np.float64))
-    means = _sums_of_four(raw.astype(np.float64)) / np.maximum(count, 1.0)
+    means = _sums_of_four(raw) / np.maximum(count, 1.0)
     return to_grey(means, count > 0)
 
 
@@ -131,19 +131,23 @@ def _centre_column(detection: Detection, width_px: int) -> int:
 
 def _file_values(
     survey: Survey, side: Side, pings: tuple[int, int], samples: tuple[int, int]
-) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.bool_]]:
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
     """Return the file values of a window (0 where not recorded) and where they are recorded.
+
+    If the scale of the pings changes, the values are converted to that of the first one.
 
     `pings` and `samples` are each the first index and the number.
     """
     (top, rows), (left, columns) = pings, samples
-    raw = np.zeros((rows, columns), dtype=np.uint32)
+    raw = np.zeros((rows, columns), dtype=np.float64)
     known = np.zeros((rows, columns), dtype=np.bool_)
+    scale: float | None = None
     for row in range(rows):
         channel = survey.pings[top + row].channel(side)
         if channel is not None:
+            scale = channel.scale if scale is None else scale
             values = channel.samples[left : left + columns]
-            raw[row, : values.shape[0]] = values
+            raw[row, : values.shape[0]] = values.astype(np.float64) * (channel.scale / scale)
             known[row, : values.shape[0]] = True
     return raw, known
 

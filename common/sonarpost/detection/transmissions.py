@@ -96,12 +96,14 @@ class MaskedSource(SurveySource):
 
     Attributes:
         masked_count: Pings that the latest iteration has masked.
+        newest: Latest ping with a position; None before the first.
     """
 
     def __init__(self, source: SurveySource, intervals: TransmitIntervals) -> None:
         self.info = source.info
         self.options = source.options
         self.masked_count = 0
+        self.newest: Ping | None = None
         self._source = source
         self._intervals = intervals
 
@@ -114,6 +116,8 @@ class MaskedSource(SurveySource):
         self.masked_count = 0
         for ping, masked in _with_mask(self._source.pings(), self._intervals):
             self.masked_count += masked is not ping
+            if ping.lat_deg is not None and ping.lon_deg is not None:
+                self.newest = ping
             yield masked
 
     @property

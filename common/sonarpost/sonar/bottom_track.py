@@ -47,12 +47,13 @@ def track_bottom(survey: Survey, *, window_pings: int = 31) -> FloatArray:
     if window_pings < 1 or window_pings % 2 == 0:
         raise ValueError(f"window_pings is {window_pings}, expected an odd number above 0")
     range_m = max(survey.max_slant_range_m(side) for side in Side)
-    if range_m <= 0:
+    skip = round(_RING_DOWN_M / range_m * _BINS) if range_m > 0 else _BINS
+    if skip >= _BINS:  # nothing follows the ringing
         return np.full(len(survey.pings), np.nan)
     echo = _common_range(survey, range_m)
     echo = uniform_filter(echo, size=(_SMOOTHING_PINGS, 3), mode="nearest")
-    first = _first_rise(echo, round(_RING_DOWN_M / range_m * _BINS))
-    first = _with_local_steps(echo, first, round(_RING_DOWN_M / range_m * _BINS))
+    first = _first_rise(echo, skip)
+    first = _with_local_steps(echo, first, skip)
     return _median_smoothed(first * range_m / _BINS, window_pings)
 
 

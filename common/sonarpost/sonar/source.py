@@ -109,7 +109,8 @@ class StreamedSource(SurveySource):
             sides.update(channel.side for channel in ping.channels)
             count += 1
         if not sides:
-            raise SurveyFileError(str(self.path), "pings", count, "at least one ping with a port or starboard channel")
+            found = "; ".join([str(count), *self._format_warnings()])
+            raise SurveyFileError(str(self.path), "pings", found, "at least one ping with a port or starboard channel")
         warnings = (*self._format_warnings(), *checks.warnings(count))
         ordered = tuple(side for side in Side if side in sides)
         self.info = SurveyInfo(self.path, sonar_id, line_name, count, ordered, warnings, self._grid())

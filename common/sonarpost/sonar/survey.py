@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-Samples = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.uint32]
+Samples = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.uint32] | npt.NDArray[np.float32]
 FloatImage = npt.NDArray[np.float32]
 
 MAX_SLANT_RANGE_M: Final = 10_000.0
@@ -31,8 +31,8 @@ class ChannelPing:
 
     Attributes:
         side: Port or starboard.
-        samples: Stored values, shape (n,), integer dtype of the file; **index 0 is nearest the vehicle** on both
-            sides, in any file order.
+        samples: Stored values, shape (n,), unsigned integers of 8 to 32 bits or float32, finite and from 0 on; **index
+            0 is nearest the vehicle** on both sides, in any file order.
         slant_range_m: Slant range of the far edge of the last sample.
         frequency_hz: Sonar frequency; None if unknown.
         scale: Factor from `samples` to echo strength: the recorder's gain or weight of this ping.

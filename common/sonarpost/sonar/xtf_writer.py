@@ -23,7 +23,7 @@ from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _CHANNEL_TYPE: Final = {Side.PORT: 1, Side.STARBOARD: 2}
-_SAMPLE_FORMAT: Final = {1: 8, 2: 3, 4: 2}
+_SAMPLE_FORMAT: Final = {"uint8": 8, "uint16": 3, "uint32": 2, "float32": 5}
 _SONAR_NAME_BYTES: Final = 15
 _MAX_CHANNELS: Final = 6
 _SOUND_SPEED_MPS: Final = 1500.0
@@ -36,10 +36,10 @@ _Slot = tuple[Side, int]
 def write_xtf(survey: Survey, path: Path, projected_crs: str | None = None) -> None:
     """Write a survey as XTF, atomically.
 
-    Samples keep their size (8, 16 or 32 bits). Time is rounded to 10 ms, the resolution of the format; altitude,
-    depth, heading, attitude and speed to 32-bit floats. XTF has no code for an unknown value: None is written as zero,
-    which the reader takes as None for a position, an altitude, or a field that is zero in every ping. For the same
-    reason a heading of exactly 0 degrees is written as 360. The same survey gives the same bytes.
+    Samples keep their type (integers of 8, 16 or 32 bits, or floats). Time is rounded to 10 ms, the resolution of the
+    format; altitude, depth, heading, attitude and speed to 32-bit floats. XTF has no code for an unknown value: None is
+    written as zero, which the reader takes as None for a position, an altitude, or a field that is zero in every ping.
+    For the same reason a heading of exactly 0 degrees is written as 360. The same survey gives the same bytes.
 
     Args:
         survey: The survey.
@@ -81,8 +81,8 @@ def _slots(survey: Survey, path: Path) -> dict[_Slot, ChannelPing]:
             known = found.setdefault(slot, channel)
             if known.samples.dtype != channel.samples.dtype:
                 raise _refuse(path, row, "sample type", channel.samples.dtype, f"{known.samples.dtype} throughout")
-            if channel.samples.dtype.kind != "u" or channel.samples.dtype.itemsize not in _SAMPLE_FORMAT:
-                raise _refuse(path, row, "sample type", channel.samples.dtype, "uint8, uint16 or uint32")
+            if channel.samples.dtype.name not in _SAMPLE_FORMAT:
+                raise _refuse(path, row, "sample type", channel.samples.dtype, ", ".join(_SAMPLE_FORMAT))
     if not 1 <= len(found) <= _MAX_CHANNELS:
         raise SurveyFileError(str(path), "channels", len(found), f"1 to {_MAX_CHANNELS}")
     order = list(Side)
@@ -116,7 +116,7 @@ def _file_header(survey: Survey, slots: dict[_Slot, ChannelPing], path: Path) ->
         info.CorrectionFlags = 1  # slant range
         info.UniPolar = 1
         info.BytesPerSample = channel.samples.dtype.itemsize
-        info.SampleFormat = _SAMPLE_FORMAT[channel.samples.dtype.itemsize]
+        info.SampleFormat = _SAMPLE_FORMAT[channel.samples.dtype.name]
         info.ChannelName = f"{side.name}{ordinal or ''}".encode("ascii")
         info.VoltScale = 5.0
         info.Frequency = (channel.frequency_hz or 0.0) / 1000

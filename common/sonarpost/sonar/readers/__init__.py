@@ -2,12 +2,14 @@
 
 A reader is a function from a path and options to an open `SurveySource`. For a bad file it raises `SurveyFileError`
 only. Other packages add formats by entry points of the group `sonarpost.survey_readers`: the name is the suffix
-without its dot, the object is the reader (example: docs/how-to/survey-reader.md).
+without its dot, the object is the reader (example: docs/how-to/survey-reader.md). A reader of recordings of several
+files names them with its attribute `parts`, see `recording_parts`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -16,6 +18,10 @@ from typing import Final
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers.humminbird import HumminbirdSource
+from sonarpost.sonar.readers.jsf import JsfSource
+from sonarpost.sonar.readers.lowrance import LowranceSource
+from sonarpost.sonar.readers.sdf import SdfSource
+from sonarpost.sonar.readers.svlog import SvlogSource
 from sonarpost.sonar.readers.waterfall_images import WaterfallSource
 from sonarpost.sonar.readers.xtf import XtfSource
 from sonarpost.sonar.source import SurveySource, load_survey
@@ -27,11 +33,13 @@ ENTRY_POINTS = "sonarpost.survey_readers"
 _READERS: Final[Mapping[str, SurveyReader]] = {
     ".xtf": XtfSource,
     ".dat": HumminbirdSource,
+    ".jsf": JsfSource,
+    ".sdf": SdfSource,
+    ".sl2": LowranceSource,
+    ".sl3": LowranceSource,
+    ".svlog": SvlogSource,
     ".waterfall.toml": WaterfallSource,
 }
-
-_SEVERAL_FILES: Final = frozenset({".dat", ".waterfall.toml"})
-"""Formats of this package whose recordings consist of several files."""
 
 
 def supported_suffixes() -> tuple[str, ...]:
@@ -39,12 +47,22 @@ def supported_suffixes() -> tuple[str, ...]:
     return tuple(sorted({*_READERS, *_plug_ins()}))
 
 
-def single_file_suffixes() -> tuple[str, ...]:
-    """Return the suffixes of recordings that consist of one file, including those of all plug-ins, sorted.
+def recording_parts(path: Path) -> tuple[Path, ...]:
+    """Return the files of a recording, those that are missing included; the given one is first.
 
-    A folder can be watched for them. When all files of the other formats have arrived cannot be determined.
+    A reader whose recordings consist of several files has a function `parts` from the path to the paths of all of them,
+    the given one included. It names the files that must exist, and others of the recording that exist. It returns the
+    given path alone if that file does not name the others yet. A reader without `parts` reads one file.
+
+    Raises:
+        SurveyFileError: No reader for the suffix, or a plug-in that cannot be loaded.
+        OSError: A folder cannot be read.
     """
-    return tuple(suffix for suffix in supported_suffixes() if suffix not in _SEVERAL_FILES)
+    parts: Callable[[Path], Iterable[Path]] | None = getattr(_reader(path), "parts", None)
+    if parts is None:
+        return (path,)
+    named = (Path(os.path.normpath(part)) for part in parts(path))
+    return tuple(dict.fromkeys((path, *named)))
 
 
 def open_survey(path: Path | str, options: SurveyOptions | None = None) -> SurveySource:

@@ -3,7 +3,8 @@
 The layout is that of the recording in PyHum's source distribution and of the published descriptions of PyHum and
 PING-Mapper. A ping begins with C0 DE AB 21. Fields follow, each a tag and a big-endian value of four bytes (tags from
 0x80) or one byte (tags 0x40 to 0x7F). The tag A0 contains the number of samples and, with a byte 21, ends the header.
-Headers of 67, 72 and 152 bytes are known; all are read by their tags. Samples are bytes, nearest first.
+Headers of 67, 72 and 152 bytes are known; all are read by their tags. Samples are bytes, nearest first. A DAT file of
+96 or 100 bytes is that of the SOLIX series, with a little-endian date (published description; no recording was read).
 
 Assumptions where the format is incomplete:
 
@@ -47,9 +48,14 @@ _NUMBER, _TIME_MS, _EAST, _NORTH, _HEADING, _SPEED, _DEPTH, _FREQUENCY, _SAMPLES
     0xA0,
 )
 _SIDES: Final = {Side.PORT: "B002.SON", Side.STARBOARD: "B003.SON"}
+_CHANNEL_SUFFIXES: Final = (".son", ".idx")
 _DAT_MAGICS: Final = (0xC1, 0xC3)
 _DAT_BYTES: Final = 24
 _DAT_TIME_OFFSET: Final = 20
+_SOLIX_DAT_BYTES: Final = (96, 100)
+"""Sizes of the DAT files of the SOLIX series, which are little endian and have no known first byte."""
+_SOLIX_TIMES_S: Final = (946_684_800, 4_102_444_800)
+"""2000 to 2100."""
 _MAX_DAT_BYTES: Final = 1 << 16
 _RADIUS_M: Final = 6_378_388.0
 _GEODETIC: Final = 1.006_764_292_7
@@ -88,6 +94,21 @@ class HumminbirdSource(StreamedSource):
         except BaseException:
             self.close()
             raise
+
+    @staticmethod
+    def parts(path: Path) -> tuple[Path, ...]:
+        """Return the DAT file, the files of both sides, and the other channels and indices that exist.
+
+        Raises:
+            OSError: The folder cannot be read.
+        """
+        folder = path.with_suffix("")
+        sides = [_channel_path(path, name) or folder / name for name in _SIDES.values()]
+        try:
+            others = sorted(each for each in folder.iterdir() if each.suffix.lower() in _CHANNEL_SUFFIXES)
+        except (FileNotFoundError, NotADirectoryError):
+            others = []
+        return (path, *sides, *others)
 
     def close(self) -> None:
         """Close the channels."""
@@ -237,6 +258,12 @@ def _start_time(path: Path) -> float:
         if not _DAT_BYTES <= file.size_bytes <= _MAX_DAT_BYTES:
             raise file.error("file size", file.size_bytes, f"{_DAT_BYTES} to {_MAX_DAT_BYTES} bytes")
         raw = file.read_at(0, _DAT_BYTES, "header")
+        if file.size_bytes in _SOLIX_DAT_BYTES:
+            (started_s,) = struct.unpack_from("<I", raw, _DAT_TIME_OFFSET)
+            low_s, high_s = _SOLIX_TIMES_S
+            if not low_s <= started_s <= high_s:
+                raise file.error("time", started_s, f"seconds since 1970, {low_s} to {high_s}")
+            return float(started_s)
         if raw[0] not in _DAT_MAGICS:
             raise file.error("first byte", hex(raw[0]), " or ".join(hex(magic) for magic in _DAT_MAGICS))
         (started_s,) = struct.unpack_from(">I", raw, _DAT_TIME_OFFSET)

@@ -98,6 +98,16 @@ class WaterfallSource(StreamedSource):
             self._table.close()
             raise
 
+    @staticmethod
+    def parts(path: Path) -> tuple[Path, ...]:
+        """Return the description, its images and its table; the description alone if it cannot be read."""
+        try:
+            config = _read_description(path)
+        except SurveyFileError:
+            return (path,)
+        names = (config.port, config.starboard, config.navigation)
+        return (path, *(path.parent / name for name in names if name is not None))
+
     def close(self) -> None:
         """Close the table."""
         self._table.close()

@@ -9,6 +9,8 @@ Field meanings are those of the XTF file format, revision 35 and later:
 * A port channel is stored farthest sample first, so that port and starboard side by side form an image. It is
   reversed here: index 0 is nearest the vehicle on both sides.
 * Speed is in knots, slant range in metres, frequency in kHz.
+* Float samples (SampleFormat 5, IEEE) stay floats. A sample that is negative or not finite becomes 0.
+* Ground-range samples (CorrectionFlags 2) are converted to equal steps of slant range with the altitude of the ping.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 from pyxtf import XTFAttitudeData, XTFChanInfo, XTFFileHeader, XTFPacketStart, XTFPingChanHeader, XTFPingHeader
 
-from sonarpost.sonar.geometry import Position
+from sonarpost.sonar.geometry import Position, slant_to_ground_range_m
 from sonarpost.sonar.navigation import (
     KNOT_MPS,
     NAVIGATION_LIMITS,
@@ -63,8 +65,11 @@ _PING_BYTES: Final = ctypes.sizeof(XTFPingHeader)
 _PING_CHAN_BYTES: Final = ctypes.sizeof(XTFPingChanHeader)
 _SIDES: Final = {1: Side.PORT, 2: Side.STARBOARD}
 _CHANNEL_NAMES: Final = {0: "sub-bottom", 3: "bathymetry"}
-_FORMAT_BYTES: Final = {2: 4, 3: 2, 8: 1}
-"""SampleFormat of the integer encodings and their sizes; 0: the file is older than the field."""
+_FORMAT_BYTES: Final = {2: 4, 3: 2, 5: 4, 8: 1}
+"""SampleFormat of integers and IEEE floats, and their sizes; 0: the file is older than the field."""
+_FLOAT: Final = 5
+_MAX_FLOAT: Final = 1e12
+"""Maximum of a float sample; a weight of up to 2^31 keeps it finite."""
 _GROUND_RANGE: Final = 2
 _MAX_WEIGHT: Final = 31
 _DELAY_AGREEMENT: Final = 0.02
@@ -93,8 +98,9 @@ def read_header(reader: SequentialReader, file: CheckedFile) -> tuple[XTFFileHea
         raise file.error("FileFormat", hex(header.FileFormat), hex(FILE_MAGIC))
     count = int(header.channel_count())
     if not 1 <= count <= MAX_CHANNELS or not header.NumberOfSonarChannels:
-        expected = f"1 to {MAX_CHANNELS} channels, at least one of them sonar"
-        raise file.error("channel counts", (int(header.NumberOfSonarChannels), count), expected)
+        sonar = int(header.NumberOfSonarChannels)
+        expected = f"1 to {MAX_CHANNELS} channels, of side-scan sonar (recordings of a multibeam alone are not read)"
+        raise file.error("channel counts", f"{sonar} sonar, {count - sonar} other", expected)
     # The header contains six channels; every further eight channels add 1024 bytes.
     extra = math.ceil(max(count - 6, 0) / 8)
     raw += reader.read(1024 * extra, "file header")
@@ -150,7 +156,7 @@ class PingParser:
         """Yield the side-scan channels of a ping.
 
         Raises:
-            SurveyFileError: A channel exceeds the packet, or its samples are not integers.
+            SurveyFileError: A channel exceeds the packet, or its samples have another format.
         """
         where = f"ping {head.PingNumber}, {place}"
         count = int(head.NumChansToFollow)
@@ -170,7 +176,7 @@ class PingParser:
             if end > len(raw):
                 limit = (len(raw) - offset) // bytes_per_sample
                 raise self._file.error(f"{where}, channel {number}, NumSamples", samples, f"at most {limit}")
-            channel = self._channel_ping(channel_head, info, raw[offset:end], float(head.SoundVelocity))
+            channel = self._channel_ping(channel_head, info, raw[offset:end], head)
             offset = end
             if channel is not None:
                 yield channel
@@ -179,18 +185,14 @@ class PingParser:
         size = int(info.BytesPerSample)
         if size not in _FORMAT_BYTES.values():
             raise self._file.error(f"channel {number}, BytesPerSample", size, "1, 2 or 4")
-        # Only side-scan channels must contain integers; other channels are skipped.
+        # Other channels than side-scan are skipped.
         if info.TypeOfChannel in _SIDES and info.SampleFormat and _FORMAT_BYTES.get(info.SampleFormat) != size:
-            expected = f"0, or the unsigned integer of {size} bytes"
+            expected = f"0, or the unsigned integer or IEEE float of {size} bytes"
             raise self._file.error(f"channel {number}, SampleFormat", info.SampleFormat, expected)
-        if info.TypeOfChannel in _SIDES and info.CorrectionFlags == _GROUND_RANGE:
-            raise self._file.error(
-                f"channel {number}, CorrectionFlags", info.CorrectionFlags, "slant-range samples (1)"
-            )
         return size
 
     def _channel_ping(
-        self, head: XTFPingChanHeader, info: XTFChanInfo, raw: bytes, sound_velocity_mps: float
+        self, head: XTFPingChanHeader, info: XTFChanInfo, raw: bytes, ping: XTFPingHeader
     ) -> ChannelPing | None:
         side = _SIDES.get(info.TypeOfChannel)
         if side is None:
@@ -201,9 +203,16 @@ class PingParser:
         if not raw or not 0 < slant_range_m <= MAX_SLANT_RANGE_M:  # includes NaN
             self.notes[f"skipped {side.value} channel: no samples or no slant range"] += 1
             return None
-        samples = _samples(raw, info.BytesPerSample, reverse=self._reverse[side])
-        if head.TimeDelay:
-            delayed = _with_delay(samples, slant_range_m, head, sound_velocity_mps)
+        samples = self._samples(raw, info, reverse=self._reverse[side])
+        if info.CorrectionFlags == _GROUND_RANGE:
+            projected = _at_slant_ranges(samples, slant_range_m, head, float(ping.SensorPrimaryAltitude))
+            if projected is None:
+                self.notes[f"skipped {side.value} channel: ground-range samples without a plausible altitude"] += 1
+                return None
+            self.notes["ground-range samples converted to slant range with the altitude"] += 1
+            samples, slant_range_m = projected
+        elif head.TimeDelay:
+            delayed = _with_delay(samples, slant_range_m, head, float(ping.SoundVelocity))
             if delayed is None:
                 self.notes[f"skipped {side.value} channel: TimeDelay, SlantRange and TimeDuration disagree"] += 1
                 return None
@@ -217,6 +226,18 @@ class PingParser:
             scale=self._scale(int(head.Weight)),
         )
 
+    def _samples(self, raw: bytes, info: XTFChanInfo, *, reverse: bool) -> Samples:
+        """Return little-endian samples in native byte order, reversed if requested."""
+        kind = "f" if info.SampleFormat == _FLOAT else "u"
+        stored = np.frombuffer(raw, dtype=f"<{kind}{info.BytesPerSample}")[:: -1 if reverse else 1]
+        samples: Samples = stored.astype(f"{kind}{info.BytesPerSample}")  # a copy in any case
+        if kind == "f":
+            valid = (samples >= 0) & (samples <= _MAX_FLOAT)  # excludes NaN
+            if not valid.all():
+                self.notes[f"samples that are negative, not finite or above {_MAX_FLOAT:g} are read as 0"] += 1
+                samples[~valid] = 0
+        return samples
+
     def _scale(self, weight: int) -> float:
         """Return the scale of a weight N: echo strength is the sample times 2^-N."""
         if not -_MAX_WEIGHT <= weight <= _MAX_WEIGHT:
@@ -225,10 +246,31 @@ class PingParser:
         return math.ldexp(1.0, -weight)
 
 
-def _samples(raw: bytes, bytes_per_sample: int, *, reverse: bool) -> Samples:
-    """Return little-endian unsigned integers in native byte order, reversed if requested."""
-    samples = np.frombuffer(raw, dtype=f"<u{bytes_per_sample}")[:: -1 if reverse else 1]
-    return samples.astype(f"u{bytes_per_sample}")  # a copy in any case
+def _at_slant_ranges(
+    samples: Samples, slant_range_m: float, head: XTFPingChanHeader, altitude_m: float
+) -> tuple[Samples, float] | None:
+    """Convert samples in equal steps of ground range to the same number of equal steps of slant range.
+
+    A new sample is the one that contains its ground range, so that no new values arise; 0 in the water column.
+
+    Returns:
+        Samples and the slant range of their end; None if altitude or ranges are implausible.
+    """
+    if not is_plausible("altitude_m", altitude_m) or altitude_m == 0:
+        return None
+    ground_range_m = float(head.GroundRange)
+    if not 0 < ground_range_m <= MAX_SLANT_RANGE_M:  # includes NaN
+        ground_range_m = float(slant_to_ground_range_m(slant_range_m, altitude_m))
+    if not ground_range_m > 0:  # includes NaN
+        return None
+    count = samples.shape[0]
+    far_m = math.hypot(ground_range_m, altitude_m)
+    ground_m = slant_to_ground_range_m((np.arange(count) + 0.5) * (far_m / count), altitude_m)
+    on_bottom = np.isfinite(ground_m)
+    indices = np.minimum(ground_m[on_bottom] * (count / ground_range_m), count - 1).astype(np.intp)
+    projected = np.zeros_like(samples)
+    projected[on_bottom] = samples[indices]
+    return projected, far_m
 
 
 def _with_delay(

@@ -1,0 +1,1 @@
+"""Maps of recordings: mosaic, waterfalls of lines, covered seabed, GeoTIFF files."""
