@@ -25,6 +25,10 @@ from sonarpost.sonar.image_files import png_bytes, tiff_bytes
 DIGEST_CHARACTERS = 16
 
 
+PREVIEW_NOTE = "preview from a short message"
+"""Note of an image of which a short message has brought the beginning."""
+
+
 class WrittenImage(NamedTuple):
     """Result of `write_image`.
 
@@ -89,6 +93,21 @@ def side_car(image: ReconstructedImage) -> dict[str, object]:
     }
 
 
+def side_car_text(image: ReconstructedImage) -> bytes:
+    """Return the content of the JSON file as bytes."""
+    return (json.dumps(side_car(image), indent=1) + "\n").encode()
+
+
+def other_name(name: str, text: bytes) -> str:
+    """Return the file name without suffix of an image whose plain name belongs to another image.
+
+    Args:
+        name: Plain file name without suffix.
+        text: Content of the JSON file.
+    """
+    return f"{name}_{hashlib.sha256(text).hexdigest()[:DIGEST_CHARACTERS]}"
+
+
 def write_image(folder: Path, image: ReconstructedImage) -> WrittenImage:
     """Write the three files of an image; files of the same and of other images are not changed.
 
@@ -109,13 +128,20 @@ def add_image(files: AtomicFiles, folder: Path, image: ReconstructedImage) -> Wr
     Raises:
         OSError: The folder cannot be written; none of the three files is added.
     """
-    text = (json.dumps(side_car(image), indent=1) + "\n").encode()
+    text = side_car_text(image)
     plain = folder / f"{image_file_name(image)}.json"
-    other = plain.with_name(f"{plain.stem}_{hashlib.sha256(text).hexdigest()[:DIGEST_CHARACTERS]}.json")
+    other = plain.with_name(f"{other_name(plain.stem, text)}.json")
     for path in (plain, other):
         if _is_stored(files, path, text):
             return WrittenImage(path.with_suffix(".tiff"), is_new=False, is_conflict=path == other)
-    is_conflict = other.exists() or _is_other_image(files.text_of(plain) or _content(plain), image, text)
+    stored = files.text_of(plain) or _content(plain)
+    is_other = _is_other_image(stored, image, text)
+    if is_other and _same_version(stored, image):
+        if PREVIEW_NOTE in image.notes:
+            return WrittenImage(plain.with_suffix(".tiff"), is_new=False, is_conflict=False)
+        if PREVIEW_NOTE in _notes(stored):
+            is_other = False  # the whole replaces its preview
+    is_conflict = other.exists() or is_other
     sidecar = other if is_conflict else plain
     tiff, png = sidecar.with_suffix(".tiff"), sidecar.with_suffix(".png")
     folder.mkdir(parents=True, exist_ok=True)
@@ -151,3 +177,23 @@ def _is_other_image(content: bytes | None, image: ReconstructedImage, text: byte
     except ValueError:
         return False
     return isinstance(fields, dict) and fields.get("type") == image.TYPE
+
+
+def _fields(content: bytes | None) -> dict[str, object]:
+    try:
+        fields = json.loads(content or b"")
+    except ValueError:
+        return {}
+    return fields if isinstance(fields, dict) else {}
+
+
+def _notes(content: bytes | None) -> tuple[object, ...]:
+    notes = _fields(content).get("notes")
+    return tuple(notes) if isinstance(notes, list) else ()
+
+
+def _same_version(content: bytes | None, image: ReconstructedImage) -> bool:
+    """Return whether a side-car belongs to the same version of the same image, by identifiers and time."""
+    names = ("vessel_id", "vehicle_id", "image_id", "version", "first_frame_utc_s")
+    fields = _fields(content)
+    return all(fields.get(name) == getattr(image, name) for name in names)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -37,6 +38,11 @@ def files_digest(paths: Iterable[Path]) -> str:
         OSError: A file is missing or cannot be read.
     """
     return " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths)
+
+
+def decision_text(decision: Decision) -> bytes:
+    """Return the content of a decision's file."""
+    return (json.dumps(decision.model_dump(), indent=1) + "\n").encode()
 
 
 def verify_files(out_dir: Path, row: ImageRow | DecisionRow) -> Verified:
@@ -78,13 +84,33 @@ def image_row(
     Raises:
         OSError: A file is missing.
     """
+    folder = out_dir / image.vessel_id
+    contents = [(folder / f"{name}{suffix}").read_bytes() for suffix in SUFFIXES]
+    return row_of_image(name, image, relayed_utc_s, accepted_utc_s, contents)
+
+
+def row_of_image(
+    name: str,
+    image: ReconstructedImage | SideCar,
+    relayed_utc_s: float | None,
+    accepted_utc_s: float,
+    contents: Sequence[bytes],
+) -> ImageRow:
+    """Return the index row of an image.
+
+    Args:
+        name: File name without suffix.
+        image: The image, or its side-car.
+        relayed_utc_s: See `ImageRow`.
+        accepted_utc_s: See `ImageRow`.
+        contents: Content of its files, in the order of `SUFFIXES`.
+    """
     height_px, width_px = (
         (image.height_px, image.width_px)
         if isinstance(image, SideCar)
         else (image.picture.height_px, image.picture.width_px)
     )
     contact = image.contact
-    folder = out_dir / image.vessel_id
     return ImageRow(
         vessel_id=image.vessel_id,
         name=name,
@@ -104,9 +130,9 @@ def image_row(
         lon_deg=contact.lon_deg if contact else None,
         atd_class=contact.atd_class if contact else None,
         atd_confidence=contact.atd_confidence if contact else None,
-        size_bytes=sum((folder / f"{name}{suffix}").stat().st_size for suffix in SUFFIXES),
+        size_bytes=sum(len(content) for content in contents),
         conflict=name != image_file_name(image),
-        files_sha256=files_digest(folder / f"{name}{suffix}" for suffix in SUFFIXES),
+        files_sha256=" ".join(hashlib.sha256(content).hexdigest() for content in contents),
         despeckle_strength=image.despeckle_strength,
         p_mine_like=contact.p_mine_like if contact else None,
         p_other_object=contact.p_other_object if contact else None,

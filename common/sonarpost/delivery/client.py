@@ -22,20 +22,38 @@ class NotDeliveredError(DeliveryError):
     """No consumer accepted the record before the time-out. Its identifier makes it safe to send it again."""
 
 
-def deliver(session: zenoh.Session, key: str, consumer: str, record: Record, timeout_s: float) -> None:
+def deliver(
+    session: zenoh.Session,
+    key: str,
+    consumer: str,
+    record: Record,
+    timeout_s: float,
+    *,
+    origin: bytes | None = None,
+    seq: int = 1,
+) -> None:
     """Send a record and return when the consumer has committed it.
+
+    Args:
+        session: Session at the router of the consumer.
+        key: Key of the record.
+        consumer: Name of the consumer.
+        record: The record.
+        timeout_s: Time limit.
+        origin: Identity of a queue, 16 random bytes. None: one for this record alone.
+        seq: Number of the record in that queue, from 1.
 
     Raises:
         PayloadError: The consumer has refused it; `expected` holds the reason.
         NotDeliveredError: No consumer accepted it within `timeout_s`.
     """
     payload = wire.encode(record)
-    item = OutboxItem(consumer, 1, key, "", 4, payload, hashlib.sha256(payload).digest())
-    origin = uuid.uuid4().bytes
+    item = OutboxItem(consumer, seq, key, "", 4, payload, hashlib.sha256(payload).digest())
+    queue_origin = uuid.uuid4().bytes if origin is None else origin
     ends_s = time.monotonic() + timeout_s
     offset, reason = 0, "no reply"
     while True:
-        reply = _query(session, item, origin, offset)
+        reply = _query(session, item, queue_origin, offset)
         if reply is not None and reply.status == "stored":
             return
         if reply is not None and reply.status == "refused":

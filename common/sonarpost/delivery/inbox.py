@@ -6,7 +6,7 @@ import hashlib
 import logging
 import queue
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ from sonarpost.delivery.protocol import MAX_BATCH_RECORDS, MAX_RECORD_BYTES, Ack
 from sonarpost.delivery.records import ReceivedChunk
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
-from sonarpost.errors import BadInputError, DeliveryError, PayloadError, RetryLaterError
+from sonarpost.errors import BadInputError, DeliveryError, MissingBaseError, PayloadError, RetryLaterError
 from sonarpost.logs import kv, log_context
 
 log = logging.getLogger(__name__)
@@ -58,8 +58,12 @@ class Inbox:
         key_expressions: Keys of the records.
         validate: Called with (key, payload) before a record is stored; raises BadInputError to refuse it.
         on_refused: Called with each error that caused a record to be refused.
+        expand: Called with a valid record in the transaction that accepts it; returns the payload to store in its
+            place. Raises MissingBaseError to refuse a difference, which its producer then sends as a whole.
         check_capacity: Called with the key before a record is stored; raises RetryLaterError if there is no space.
         delivery_only_keys: Key expressions on which plain publications are ignored.
+        before_commit: Called with the accepted records, as key and payload, before they are committed and acknowledged;
+            raises DeliveryError to leave them with their senders.
 
     Attributes:
         storage_failing: Whether records cannot be stored at present, for example because of a full disk.
@@ -74,14 +78,19 @@ class Inbox:
         validate: Callable[[str, bytes], None],
         on_refused: Callable[[BadInputError], None],
         *,
+        expand: Callable[[Transaction, str, bytes], bytes] = lambda _tx, _key, payload: payload,
         check_capacity: Callable[[str], None] = lambda _: None,
         delivery_only_keys: Collection[str] = (),
+        before_commit: Callable[[Sequence[tuple[str, bytes]]], None] = lambda _: None,
     ) -> None:
         self._store = store
         self._key_suffix = "/handoff/" + consumer
         self._validate = validate
         self._on_refused = on_refused
+        self._expand = expand
         self._check_capacity = check_capacity
+        self._before_commit = before_commit
+        self._accepted: list[tuple[str, bytes]] = []
         self._messages: queue.Queue[_Message] = queue.Queue(QUEUE_LIMIT)
         self._stop = threading.Event()
         self.storage_failing = False
@@ -89,16 +98,38 @@ class Inbox:
         self._no_capacity: dict[str, str | None] = {}
         self._thread = threading.Thread(target=self._run, name=f"inbox-{consumer}", daemon=True)
         self._thread.start()
-        self._declared: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
+        self._session = session
+        self._is_preferred = True
+        self._queryables: dict[str, zenoh.Queryable[None]] = {}
+        self._subscribers: list[zenoh.Subscriber[None]] = []
         for key in key_expressions:
-            self._declared.append(session.declare_queryable(keys.delivery_query(key, consumer), self._on_query))
+            self._declare(keys.delivery_query(key, consumer))
             if key not in delivery_only_keys:
-                self._declared.append(session.declare_subscriber(key, self._on_sample))
+                self._subscribers.append(session.declare_subscriber(key, self._on_sample))
+
+    def _declare(self, key: str) -> None:
+        # Of several consumers of one name, a query goes to the nearest one that is complete, or to all if none is.
+        self._queryables[key] = self._session.declare_queryable(key, self._on_query, complete=self._is_preferred)
+
+    def set_preferred(self, *, is_preferred: bool) -> None:
+        """Leave new queries to other consumers of the same name while there is one, or end that.
+
+        Raises:
+            zenoh.ZError: The session is closed.
+        """
+        if is_preferred == self._is_preferred:
+            return
+        self._is_preferred = is_preferred
+        for key, queryable in list(self._queryables.items()):
+            queryable.undeclare()
+            self._declare(key)
 
     def close(self) -> None:
         """Stop receiving; uncommitted records are not acknowledged, their producers send them again."""
-        for declared in self._declared:
-            declared.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
+        for queryable in self._queryables.values():
+            queryable.undeclare()
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
         self._stop.set()
         self._thread.join()
 
@@ -151,9 +182,12 @@ class Inbox:
     def _commit(self, messages: list[_Message]) -> list[Replies]:
         """Store several messages in one transaction, so that they share one write to the disk."""
         self._no_capacity.clear()
+        self._accepted.clear()
         try:
             with self._store.transaction() as tx:
                 replies = [self._store_message(tx, message) for message in messages]
+                if self._accepted:
+                    self._before_commit(self._accepted)
         except DeliveryError as error:
             if not self.storage_failing:
                 log.exception("Records cannot be stored; senders keep them", extra=kv(error=str(error)))
@@ -231,8 +265,13 @@ class Inbox:
         with log_context(payload):
             try:
                 self._validate(key, payload)
+                stored = self._expand(tx, key, payload)
             except DeliveryError:
                 raise
+            except MissingBaseError as error:
+                # Not an error of the producer: it sends the whole record, and nothing has to be kept.
+                log.info("Difference refused; its producer sends the whole", extra=kv(reason=str(error)))
+                return AckReply("refused", reason=str(error))
             except BadInputError as error:
                 self._on_refused(error)
                 return self._quarantine(tx, key, payload, str(error))
@@ -240,7 +279,8 @@ class Inbox:
                 # An unexpected exception must neither block later records nor lose this one.
                 log.exception("Record quarantined after an unexpected exception", extra=kv(key=key))
                 return self._quarantine(tx, key, payload, f"{type(error).__name__}: {error}")
-        tx.accept(key, payload, chunk)
+        tx.accept(key, stored, chunk)
+        self._accepted.append((key, stored))
         return AckReply("stored")
 
     def _quarantine(self, tx: Transaction, key: str, payload: bytes, reason: str) -> AckReply:

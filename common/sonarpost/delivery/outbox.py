@@ -43,8 +43,11 @@ PRIORITIES = {
     7: zenoh.Priority.BACKGROUND,
 }
 
-OnAcknowledged = Callable[[Transaction, OutboxItem, str | None], None]
-"""Called in the transaction that removes a record, with the consumer's reason if it was refused."""
+OnAcknowledged = Callable[[Transaction, OutboxItem, str | None], bool | None]
+"""Called in the transaction that removes a record, with the consumer's reason if it was refused.
+
+It returns True if a refused record was replaced and need not be quarantined.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -429,14 +432,17 @@ class QueueSender:
     def _quarantine(self, transfer: RecordTransfer, reason: str) -> None:
         item = transfer.item
         with self._store.transaction() as tx:
-            tx.quarantine_refused(item, reason)
-            if self._on_acknowledged is not None:
-                self._on_acknowledged(tx, item, reason)
+            replaced = self._on_acknowledged is not None and self._on_acknowledged(tx, item, reason)
+            if replaced:
+                tx.remove_acknowledged(item.queue, (item.seq,))
+            else:
+                tx.quarantine_refused(item, reason)
         with log_context(item.payload):
-            log.error(
-                "Record refused by its consumer and quarantined",
-                extra=kv(consumer=self._queue, key=item.key, reason=reason),
-            )
+            fields = kv(consumer=self._queue, key=item.key, reason=reason)
+            if replaced:
+                log.info("Refused record replaced", extra=fields)
+            else:
+                log.error("Record refused by its consumer and quarantined", extra=fields)
         self._scheduler.remove(transfer)
         self._clear(item.seq)
 

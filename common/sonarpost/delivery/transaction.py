@@ -204,6 +204,10 @@ class Transaction:
         self._numbers[queue] = (seq, uuid.uuid4().bytes)
         self._write_numbers()
 
+    def has_topic(self, queue: str, topic: str) -> bool:
+        """Return whether a queue holds a record of a topic."""
+        return bool(self._editions(queue, topic))
+
     def _editions(self, queue: str, topic: str) -> list[tuple[int, int, int, int]]:
         """Return (seq, edition, position, priority) of a topic's records in a queue."""
         if (queue, topic) in self._new_topics:
@@ -340,6 +344,11 @@ class Transaction:
         return self._partial_records.reclaim()
 
     # State
+
+    def get_state(self, name: str) -> bytes | None:
+        """Return the value under `name`, with the changes of this transaction; None if there is none."""
+        found = self._db.execute("SELECT value FROM state WHERE name = ?", (name,)).fetchone()
+        return None if found is None else bytes(found[0])
 
     def put_state(self, name: str, value: bytes) -> None:
         """Store `value` under `name`."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import subspace_angles
 
 from sonarpost.codec.vq.tile_search import IncrementalTileSet
 from sonarpost.codec.vq.tiles import TileDatabase
@@ -84,7 +83,16 @@ def compare(first: TileDatabase, second: TileDatabase) -> CodebookDifference:
 
 def principal_angles_deg(first: npt.NDArray[np.int16], second: npt.NDArray[np.int16]) -> npt.NDArray[np.float64]:
     """Return the principal angles between the row spaces of two bases, shape (rows of the smaller,), in degrees."""
-    return np.asarray(np.degrees(subspace_angles(first.T.astype(np.float64), second.T.astype(np.float64))), np.float64)
+    # Knyazev and Argentati (2002): the cosine is inexact for small angles, the sine for large ones.
+    one, other = (np.linalg.qr(basis.T.astype(np.float64))[0] for basis in (first, second))
+    if one.shape[1] < other.shape[1]:
+        one, other = other, one
+    product = one.T @ other
+    cosines = np.linalg.svd(product, compute_uv=False)
+    sines = np.linalg.svd(other - one @ product, compute_uv=False)[::-1]
+    small = cosines**2 >= 0.5
+    angles = np.where(small, np.arcsin(np.clip(sines, -1, 1)), np.arccos(np.clip(cosines, -1, 1)))
+    return np.asarray(np.degrees(np.sort(angles)[::-1]), np.float64)
 
 
 def _unmatched(

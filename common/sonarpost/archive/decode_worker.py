@@ -1,0 +1,190 @@
+"""Decoding of images in a process of its own: a stream that crashes the decoder, or never ends, costs that image only.
+
+`DecodeWorker` starts `python -m sonarpost.archive.decode_worker`, writes a coded image to its standard input and reads
+the decoded one from its standard output. Messages have a length of four bytes before them. The process ends when its
+standard input is closed, also if its parent is killed.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Final
+
+import msgpack
+
+from sonarpost import wire
+from sonarpost.archive.decoder import Decoder
+from sonarpost.codec.jit import use_code_folder
+from sonarpost.codec.vq import codebook
+from sonarpost.errors import BadInputError, MissingCodebookError
+from sonarpost.messages import CodedImage, ReconstructedImage
+
+log = logging.getLogger(__name__)
+
+DECODE_TIMEOUT_S: Final = 120.0
+"""Maximum duration of one image, which includes the compilation of the codec at the first one."""
+NICE: Final = 5
+"""Lower priority of the decoder, so that records are accepted first."""
+_LENGTH = struct.Struct(">I")
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """Result for one image.
+
+    Attributes:
+        image: The decoded image; None if it could not be decoded.
+        reason: Why not.
+        missing_model: The codebook that is not known, as in `coded_image`; empty if that is not the reason.
+        is_crash: Whether the process ended or exceeded the time.
+    """
+
+    image: ReconstructedImage | None = None
+    reason: str = ""
+    missing_model: str = ""
+    is_crash: bool = False
+
+
+class DecodeWorker:
+    """A decoding process, started for the first image and again after a crash. Used by one thread at a time.
+
+    Args:
+        codebooks: Names or files of codebooks.
+        folder: Folder with further codebooks, `{vessel}/{model}.tiles`, which may be added at any time. An image uses
+            those of its vessel only.
+        state_dir: Folder for the compiled machine code.
+        timeout_s: Maximum duration of one image.
+    """
+
+    def __init__(
+        self, codebooks: Sequence[str], folder: Path, state_dir: Path, timeout_s: float = DECODE_TIMEOUT_S
+    ) -> None:
+        self._command = [
+            sys.executable,
+            "-m",
+            "sonarpost.archive.decode_worker",
+            str(folder.absolute()),
+            str(state_dir.absolute()),
+            *codebooks,
+        ]
+        self._timeout_s = timeout_s
+        self._process: subprocess.Popen[bytes] | None = None
+        self._lock = threading.Lock()
+        self._closed = False
+
+    @property
+    def pid(self) -> int | None:
+        """Identifier of the process; None while it does not run."""
+        process = self._process
+        return None if process is None else process.pid
+
+    def decode(self, image: CodedImage) -> Decoded:
+        """Decode an image.
+
+        Raises:
+            OSError: The process cannot be started.
+        """
+        with self._lock:
+            if self._closed:
+                return Decoded(reason="the service stops", is_crash=True)
+            if self._process is None:
+                self._process = subprocess.Popen(  # noqa: S603  the arguments are those of this module
+                    self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+                )
+            process = self._process
+        assert process.stdin is not None
+        assert process.stdout is not None
+        timer = threading.Timer(self._timeout_s, process.kill)
+        timer.start()
+        try:
+            _write(process.stdin, wire.encode(image))
+            answer = _read(process.stdout)
+        except OSError:
+            answer = None  # the process has ended
+        finally:
+            timer.cancel()
+        if answer is None:
+            self._end(process)
+            return Decoded(reason=f"the decoder ended with status {process.returncode}", is_crash=True)
+        fields = msgpack.unpackb(answer)
+        if "payload" not in fields:
+            return Decoded(reason=fields["reason"], missing_model=fields["model"])
+        return Decoded(wire.decode(ReconstructedImage, fields["payload"], f"image {image.image_id}"))
+
+    def close(self) -> None:
+        """End the process, also while it decodes."""
+        with self._lock:
+            self._closed = True
+            process = self._process
+        if process is not None:
+            self._end(process)
+
+    def _end(self, process: subprocess.Popen[bytes]) -> None:
+        with self._lock:
+            if self._process is process:
+                self._process = None
+        process.kill()
+        process.wait()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with suppress(OSError):  # what was not written yet
+                    pipe.close()
+
+
+def _write(file: IO[bytes], data: bytes) -> None:
+    file.write(_LENGTH.pack(len(data)) + data)
+    file.flush()
+
+
+def _read(file: IO[bytes]) -> bytes | None:
+    head = file.read(_LENGTH.size)
+    if len(head) < _LENGTH.size:
+        return None
+    length = _LENGTH.unpack(head)[0]
+    data = file.read(length)
+    return data if len(data) == length else None
+
+
+def _decode(decoder: Decoder, folder: Path, payload: bytes) -> dict[str, object]:
+    """Return the answer for one image; a codebook that is missing is looked for in the folder."""
+    image = wire.decode(CodedImage, payload, "decode worker")
+    path = folder / image.vessel_id / f"{image.model}{codebook.SUFFIX}"
+    try:
+        further = None
+        if image.model and decoder.codebook(image.model) is None and path.is_file():
+            further = codebook.load(path)
+        return {"payload": wire.encode(decoder.decode(image, further))}
+    except MissingCodebookError as error:
+        return {"reason": str(error), "model": error.model}
+    except BadInputError as error:
+        return {"reason": str(error), "model": ""}
+    except Exception as error:
+        # An unexpected exception costs this image only.
+        log.exception("Image not decoded after an unexpected exception")
+        return {"reason": f"{type(error).__name__}: {error}", "model": ""}
+
+
+def main() -> None:
+    """Answer images until standard input ends."""
+    folder, state_dir, *codebooks = sys.argv[1:]
+    os.nice(NICE)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # output of libraries must not get between the answers
+    use_code_folder(Path(state_dir))
+    decoder = Decoder(codebooks)
+    while (payload := _read(sys.stdin.buffer)) is not None:
+        packed: bytes = msgpack.packb(_decode(decoder, Path(folder), payload))
+        _write(answers, packed)
+
+
+if __name__ == "__main__":
+    main()
