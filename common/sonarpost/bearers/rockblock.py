@@ -1,0 +1,218 @@
+"""Shore side of a message bearer, as RockBLOCK's gateway offers it over HTTP.
+
+Messages from a terminal arrive as a POST to a web address of the shore site (the webhook). Messages to a terminal are
+a POST to the gateway.
+"""
+
+from __future__ import annotations
+
+import hmac
+import logging
+import re
+import threading
+import urllib.request
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Final
+from urllib.error import HTTPError
+from urllib.parse import parse_qs, urlencode, urlsplit
+
+from sonarpost.errors import BadInputError, ConfigError, DeliveryError
+
+log = logging.getLogger(__name__)
+
+MAX_BODY_BYTES: Final = 4096
+MAX_FIELDS: Final = 20
+MAX_MT_BYTES: Final = 270
+REQUEST_S: Final = 10.0
+MAX_REQUESTS: Final = 16
+"""Requests that are handled at the same time; further ones are refused with 503."""
+_IMEI = re.compile(r"[0-9]{15}")
+_HEX = re.compile(r"(?:[0-9a-fA-F]{2}){0,340}")
+
+
+class WebhookError(BadInputError):
+    """A request to the webhook is invalid."""
+
+
+@dataclass(frozen=True, slots=True)
+class TerminalMessage:
+    """A message of a terminal.
+
+    Attributes:
+        imei: Terminal, 15 digits.
+        momsn: Sequence number that the network has assigned (0..65535).
+        data: Content, 0 to 340 bytes.
+    """
+
+    imei: str
+    momsn: int
+    data: bytes
+
+
+def parse_webhook(body: bytes) -> TerminalMessage:
+    """Parse the form of a request; fields that sonarpost does not use (time, position) are ignored.
+
+    Raises:
+        WebhookError: A field is missing or invalid.
+    """
+    where = "webhook"
+    try:
+        fields = parse_qs(body.decode("ascii"), keep_blank_values=True, max_num_fields=MAX_FIELDS)
+    except ValueError as error:
+        raise WebhookError(where, "body", body[:40], f"a form of at most {MAX_FIELDS} fields") from error
+    values = {name: found[0] for name, found in fields.items() if len(found) == 1}
+    imei, momsn, data = values.get("imei", ""), values.get("momsn", ""), values.get("data", "-")
+    if not _IMEI.fullmatch(imei):
+        raise WebhookError(where, "imei", imei, "15 digits")
+    if not (momsn.isascii() and momsn.isdigit() and len(momsn) <= 5 and int(momsn) <= 0xFFFF):
+        raise WebhookError(where, "momsn", momsn, "0 to 65535")
+    if not _HEX.fullmatch(data):
+        raise WebhookError(where, "data", data, "0 to 340 bytes in hexadecimal")
+    return TerminalMessage(imei, int(momsn), bytes.fromhex(data))
+
+
+Receive = Callable[[TerminalMessage], None]
+"""Stores a message durably. Raises BadInputError to refuse it, DeliveryError to have the gateway repeat it."""
+
+
+class Webhook:
+    """HTTP server to which the gateway delivers messages: `POST /{token}`.
+
+    It replies 200 after `receive` has returned, 400 to what is invalid, 404 without the token, 503 if the message
+    cannot be stored at present: the gateway then repeats it.
+
+    Args:
+        host: Address to listen on. The server has no TLS: a reverse proxy adds it.
+        port: Port, 0 for any.
+        token: Shared secret, part of the address that is entered at the gateway.
+        receive: Called for each message, from several threads.
+    """
+
+    def __init__(self, host: str, port: int, token: str, receive: Receive) -> None:
+        handler = type("Handler", (_WebhookHandler,), {"token": token, "receive": staticmethod(receive)})
+        self._server = _Server((host, port), handler)
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), name="webhook", daemon=True)
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        """The port."""
+        return int(self._server.server_address[1])
+
+    def close(self) -> None:
+        """Stop the server."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
+        super().__init__(address, handler)
+        self.slots = threading.BoundedSemaphore(MAX_REQUESTS)
+
+    def process_request(self, request: object, client_address: object) -> None:
+        if not self.slots.acquire(blocking=False):
+            self.shutdown_request(request)  # type: ignore[arg-type]
+            return
+        super().process_request(request, client_address)  # type: ignore[arg-type]
+
+    def process_request_thread(self, request: object, client_address: object) -> None:
+        try:
+            super().process_request_thread(request, client_address)  # type: ignore[arg-type]
+        finally:
+            self.slots.release()
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        log.debug("Connection to the webhook lost")
+
+
+class _WebhookHandler(BaseHTTPRequestHandler):
+    timeout = REQUEST_S
+    server_version = "sonarpost"
+    sys_version = ""
+    token: str
+    receive: Receive
+
+    def do_POST(self) -> None:
+        """Handle one message."""
+        path = urlsplit(self.path).path.removeprefix("/")
+        if not hmac.compare_digest(path.encode(), self.token.encode()):
+            self._reply(404, "not found")
+            return
+        length = self.headers.get("Content-Length", "")
+        if not (length.isascii() and length.isdigit() and len(length) < 8 and int(length) <= MAX_BODY_BYTES):
+            self._reply(413, f"at most {MAX_BODY_BYTES} bytes with a Content-Length")
+            return
+        body = self.rfile.read(int(length))
+        try:
+            type(self).receive(parse_webhook(body))
+        except BadInputError as error:
+            self._reply(400, str(error))
+        except DeliveryError as error:
+            self._reply(503, str(error))
+        else:
+            self._reply(200, "OK")
+
+    def _reply(self, status: int, text: str) -> None:
+        data = text.encode()
+        self.send_response(status)
+        self.send_header("Content-Type", "text/plain; charset=utf-8")
+        self.send_header("Content-Length", str(len(data)))
+        self.send_header("Connection", "close")
+        self.end_headers()
+        self.wfile.write(data)
+        self.close_connection = True
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 of the base class
+        """Log nothing: the address contains the token."""
+
+
+@dataclass(frozen=True, slots=True)
+class RockBlockAccount:
+    """Access to the gateway, to send messages to terminals.
+
+    Attributes:
+        url: Address of the gateway's MT interface, http or https.
+        username: Name of the account.
+        password: Its password.
+    """
+
+    url: str
+    username: str
+    password: str
+
+    def __post_init__(self) -> None:
+        if urlsplit(self.url).scheme not in ("http", "https"):
+            raise ConfigError("gateway", "url", self.url, "http://… or https://…")
+
+    def send(self, imei: str, data: bytes) -> None:
+        """Send a message to a terminal.
+
+        Raises:
+            DeliveryError: The gateway is not reached, or refuses it.
+        """
+        if not 1 <= len(data) <= MAX_MT_BYTES:
+            raise DeliveryError(f"message to {imei}: {len(data)} bytes, expected 1 to {MAX_MT_BYTES}")
+        form: Mapping[str, str] = {
+            "imei": imei,
+            "username": self.username,
+            "password": self.password,
+            "data": data.hex(),
+        }
+        request = urllib.request.Request(self.url, urlencode(form).encode(), method="POST")  # noqa: S310 checked above
+        try:
+            with urllib.request.urlopen(request, timeout=REQUEST_S) as response:  # noqa: S310
+                reply = response.read(MAX_BODY_BYTES).decode("utf-8", "replace").strip()
+        except (OSError, ValueError) as error:
+            if isinstance(error, HTTPError):
+                error.close()
+            raise DeliveryError(f"gateway {urlsplit(self.url).hostname}: {error}") from error
+        # "OK,12345678" or "FAILED,10,Invalid login credentials"
+        if not reply.startswith("OK"):
+            raise DeliveryError(f"gateway {urlsplit(self.url).hostname}: {reply[:100]}")
