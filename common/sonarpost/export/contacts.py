@@ -39,6 +39,9 @@ from sonarpost.wire import first_error
 MAX_FILE_BYTES: Final = 1 << 20
 """Larger JSON files are rejected. A side-car with 64 notes of 2000 characters is far smaller."""
 
+MAX_PICTURE_BYTES: Final = 1 << 26
+"""A larger image file is omitted and reported."""
+
 DECISIONS: Final = "decisions"
 
 R = TypeVar("R", bound=Record)
@@ -64,6 +67,7 @@ class SideCar(Record):
     missing_fraction: Fraction
     missing_halves: tuple[Literal["top", "bottom"], ...]
     missing_rows: Annotated[tuple[Count, ...], Field(strict=False)] = ()
+    missing_pixels: Count = 0
     bytes_received: Count
     bytes_total: Count
     frames_received: Count
@@ -244,6 +248,24 @@ def read_stored_records(out_dir: Path) -> StoredRecords:
             if decision is not None and _is_of_vessel(decision, folder, path, problems):
                 decisions.append(decision)
     return StoredRecords(tuple(images), tuple(decisions), tuple(problems))
+
+
+def read_png(contact: ExportContact, problems: list[BadInputError]) -> bytes | None:
+    """Return the PNG of a contact; None without one, and if it cannot be read, which is added to `problems`."""
+    path = contact.image_path
+    if path is None:
+        return None
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_PICTURE_BYTES + 1)
+    except OSError as error:
+        problems.append(StoredFileError(str(path), "", error.strerror or str(error), "a readable PNG"))
+        return None
+    if len(data) > MAX_PICTURE_BYTES:
+        limit = f"{MAX_PICTURE_BYTES} bytes"
+        problems.append(StoredFileError(str(path), "size", f"more than {limit}", f"at most {limit}"))
+        return None
+    return data
 
 
 def match_start_time(start_times: Sequence[Seconds], utc_s: float) -> Seconds | None:

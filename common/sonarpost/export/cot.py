@@ -82,13 +82,24 @@ def cot_type(contact: ExportContact, options: CotOptions | None = None) -> str:
     return f"a-{affiliation}-{SEA_MINE}" + (f"-{position}" if position else "")
 
 
-def cot_event(contact: ExportContact, now_utc_s: float, options: CotOptions | None = None) -> bytes:
+def cot_event(
+    contact: ExportContact,
+    now_utc_s: float,
+    options: CotOptions | None = None,
+    attachment_sha256: str | None = None,
+) -> bytes:
     """Return one event as a single line of XML, UTF-8, without XML declaration.
 
     `time` and `start` are the time of sending, because the clock of the vehicle may be wrong. The time of detection is
     in the remarks. `ce` is `position_sigma_m` times 1: the base schema defines an error as the one-sigma point of a
     zero-mean normal distribution, and the circle with the worse axis as radius contains the error ellipse. The height
     above the ellipsoid is unknown, because depth is measured from the surface.
+
+    Args:
+        contact: The contact.
+        now_utc_s: Time of sending.
+        options: Options of the event.
+        attachment_sha256: Digest of an attached file, hexadecimal, for `attachment_list`; None without one.
 
     Raises:
         ValueError: The contact has no position.
@@ -121,6 +132,10 @@ def cot_event(contact: ExportContact, now_utc_s: float, options: CotOptions | No
     }
     ET.SubElement(event, "point", point)
     _add_detail(event, contact)
+    if attachment_sha256 is not None:
+        detail = event.find("detail")
+        assert detail is not None
+        ET.SubElement(detail, "attachment_list", {"hashes": f'["{attachment_sha256}"]'})
     xml: bytes = ET.tostring(event, encoding="utf-8")
     return xml
 

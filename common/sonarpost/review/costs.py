@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.interface import RateInfo
 
 NEW_IMAGE_KINDS: Final = ("wider", "original")
 """Kinds of requests that are answered with an image of its own."""
@@ -36,27 +36,27 @@ class RequestCost:
         return None if self.uplink_s is None else self.downlink_s + self.uplink_s
 
 
-def packets_for(payload_bytes: int, rate: int, overhead_bytes: int) -> int:
-    """Return the number of packets of a Micro-Modem rate for a payload, with `overhead_bytes` in each frame."""
-    frame_bytes = RATES[rate].frame_bytes - overhead_bytes
-    return math.ceil(math.ceil(payload_bytes / frame_bytes) / RATES[rate].frames)
+def packets_for(payload_bytes: int, rate: RateInfo, overhead_bytes: int) -> int:
+    """Return the number of packets of a rate for a payload, with `overhead_bytes` in each frame."""
+    frame_bytes = rate.frame_bytes - overhead_bytes
+    return math.ceil(math.ceil(payload_bytes / frame_bytes) / rate.frames)
 
 
-def airtime_of_frames(frames: int, rate: int) -> float:
+def airtime_of_frames(frames: int, rate: RateInfo) -> float:
     """Return the air time in seconds of the packets that carry this number of frames."""
-    return math.ceil(frames / RATES[rate].frames) * RATES[rate].airtime_s
+    return math.ceil(frames / rate.frames) * rate.airtime_s
 
 
-def least_airtime_s(payload_bytes: int, rate: int) -> float:
+def least_airtime_s(payload_bytes: int, rate: RateInfo) -> float:
     """Return the air time in seconds of a payload that shares full packets of a rate with other data."""
-    return payload_bytes / RATES[rate].packet_bytes * RATES[rate].airtime_s
+    return payload_bytes / rate.packet_bytes * rate.airtime_s
 
 
 def request_cost(
     kind: str,
     *,
-    downlink_rate: int,
-    uplink_rate: int | None,
+    downlink_rate: RateInfo,
+    uplink_rate: RateInfo | None,
     bytes_received: int,
     bytes_total: int,
     loss: float | None,
@@ -70,17 +70,17 @@ def request_cost(
 
     Args:
         kind: Kind of the request.
-        downlink_rate: Micro-Modem rate of the vessel.
+        downlink_rate: Rate of the vessel.
         uplink_rate: Latest rate of the vehicle; None if unknown.
         bytes_received: Received bytes of the stream; 0 for `NEW_IMAGE_KINDS`.
         bytes_total: Announced length of the stream; for `NEW_IMAGE_KINDS` the expected length of the new stream.
         loss: Fraction of recently lost frames; None if unknown.
         overhead_bytes: Header bytes in each frame.
     """
-    downlink_s = RATES[downlink_rate].airtime_s
+    downlink_s = downlink_rate.airtime_s
     if kind in ("revisit", "prioritise"):
         result = "the result is a new contact" if kind == "revisit" else "the images are sent in another order"
-        return RequestCost(downlink_s, 0.0, 0, 0, f"one packet down at rate {downlink_rate}; {result}")
+        return RequestCost(downlink_s, 0.0, 0, 0, f"one packet down at rate {downlink_rate.number}; {result}")
     if uplink_rate is None:
         return RequestCost(downlink_s, None, None, None, "rate of the vehicle unknown: no frame received")
     if bytes_total == 0:
@@ -94,7 +94,7 @@ def request_cost(
         if kind in (*NEW_IMAGE_KINDS, "region")
         else f"{wanted_bytes} of {total_bytes} bytes missing"
     )
-    basis = f"latest rate {uplink_rate}, {size}"
+    basis = f"latest rate {uplink_rate.number}, {size}"
     if loss:
         basis += f", {loss:.0%} of frames lost"
-    return RequestCost(downlink_s, packets * RATES[uplink_rate].airtime_s, wanted_bytes, packets, basis)
+    return RequestCost(downlink_s, packets * uplink_rate.airtime_s, wanted_bytes, packets, basis)

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import fftconvolve
+from scipy import fft
 
 EXPAND_FACTOR: Final = 2
 """Ratio of the pixel sizes."""
@@ -35,13 +35,23 @@ def place_in_wider(image: Grey, wider: Grey) -> tuple[int, int] | None:
     scene = wider.astype(np.float64)
     scene -= scene.mean()
     window = np.ones_like(template)
-    sums = fftconvolve(scene, window, mode="valid")
-    squares = fftconvolve(scene**2, window, mode="valid")
+    sums = _convolve_valid(scene, window)
+    squares = _convolve_valid(scene**2, window)
     power = np.maximum(squares - sums**2 / template.size, 0.0) * float((template**2).sum())
-    products = fftconvolve(scene, template[::-1, ::-1], mode="valid")
+    products = _convolve_valid(scene, template[::-1, ::-1])
     correlation = products / np.sqrt(np.maximum(power, 1e-9 * max(1.0, float(power.max()))))
     best = int(np.argmax(correlation))
     if correlation.flat[best] < MIN_CORRELATION:
         return None
     row, column = divmod(best, correlation.shape[1])
     return row, column
+
+
+def _convolve_valid(scene: npt.NDArray[np.float64], kernel: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the convolution where the kernel lies inside the scene; without scipy.signal, which is large."""
+    full = [rows + kernel_rows - 1 for rows, kernel_rows in zip(scene.shape, kernel.shape, strict=True)]
+    shape = [fft.next_fast_len(size, real=True) for size in full]
+    product = fft.irfft2(fft.rfft2(scene, shape) * fft.rfft2(kernel, shape), shape)
+    rows, columns = scene.shape
+    valid: npt.NDArray[np.float64] = product[kernel.shape[0] - 1 : rows, kernel.shape[1] - 1 : columns]
+    return valid

@@ -1,0 +1,168 @@
+"""TAK data packages: a ZIP file with a manifest of version 2, Cursor-on-Target events, and their images as attachments.
+
+A client that imports a package adds each event to its map and attaches the image to it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import time
+import uuid
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree as ET
+
+from sonarpost.errors import BadInputError
+from sonarpost.export.contacts import ContactSet, ExportContact, read_png
+from sonarpost.export.cot import UNKNOWN, CotOptions, cot_event
+from sonarpost.export.text import utc_text, xml_text
+from sonarpost.files import atomic_file
+
+MANIFEST: Final = "MANIFEST/manifest.xml"
+FILE_TRANSFER: Final = "b-f-t-r"
+"""CoT type of a request to download a file."""
+_HUMAN: Final = "h-e"
+"""CoT "human, estimated": clients expect it of file transfers."""
+_NAMESPACE: Final = uuid.UUID("6f4f2a0e-54b8-5b2f-9b0c-0a3c4b7d6f11")
+_ZIP_TIME: Final = (1980, 1, 1, 0, 0, 0)
+
+
+def write_data_package(path: Path, contacts: ContactSet) -> list[BadInputError]:
+    """Write a data package of all contacts with a position atomically, one image at a time in memory.
+
+    Returns:
+        One error for each image that cannot be read. Its event has no attachment.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    problems: list[BadInputError] = []
+    pairs = ((contact, read_png(contact, problems)) for contact in contacts.located)
+    with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
+        _fill(archive, path.name.partition(".")[0], pairs, time.time(), None)
+    return problems
+
+
+def data_package(contact: ExportContact, png: bytes, now_utc_s: float, options: CotOptions | None = None) -> bytes:
+    """Return a data package of one contact with its image.
+
+    Raises:
+        ValueError: The contact has no position.
+    """
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        _fill(archive, contact.name, [(contact, png)], now_utc_s, options)
+    return buffer.getvalue()
+
+
+def attachment_sha256(png: bytes) -> str:
+    """Return the digest by which an event names its attachment."""
+    return hashlib.sha256(png).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class UploadedPackage:
+    """A data package on a server: its address for clients, its SHA-256 digest (hexadecimal), its size."""
+
+    url: str
+    sha256: str
+    size_bytes: int
+
+
+def file_transfer_event(contact: ExportContact, package: UploadedPackage, sender: str, now_utc_s: float) -> bytes:
+    """Return the event that makes clients download a data package.
+
+    Args:
+        contact: Contact of the package, with a position.
+        package: The package.
+        sender: Name of the sender on the clients.
+        now_utc_s: Time of sending; the event is valid for 10 minutes.
+
+    Raises:
+        ValueError: The contact has no position.
+    """
+    if contact.position is None:
+        raise ValueError(f"{contact.uid}: got no position, expected one")
+    event = ET.Element(
+        "event",
+        {
+            "version": "2.0",
+            "uid": str(uuid.uuid5(_NAMESPACE, package.sha256)),
+            "type": FILE_TRANSFER,
+            "time": utc_text(now_utc_s),
+            "start": utc_text(now_utc_s),
+            "stale": utc_text(now_utc_s + 600.0),
+            "how": _HUMAN,
+        },
+    )
+    lat_deg, lon_deg = contact.position
+    point = {"lat": f"{lat_deg:.7f}", "lon": f"{lon_deg:.7f}", "hae": UNKNOWN, "ce": UNKNOWN, "le": UNKNOWN}
+    ET.SubElement(event, "point", point)
+    detail = ET.SubElement(event, "detail")
+    ET.SubElement(
+        detail,
+        "fileshare",
+        {
+            "filename": f"{file_name(contact)}.zip",
+            "name": xml_text(contact.name),
+            "senderCallsign": xml_text(sender),
+            "senderUid": str(uuid.uuid5(_NAMESPACE, sender)),
+            "senderUrl": xml_text(package.url),
+            "sha256": package.sha256,
+            "sizeInBytes": str(package.size_bytes),
+        },
+    )
+    xml: bytes = ET.tostring(event, encoding="utf-8")
+    return xml
+
+
+def file_name(contact: ExportContact) -> str:
+    """Return the name of a contact's files: vehicle, image and version."""
+    return f"{contact.image.vehicle_id}_{contact.image.image_id}_v{contact.image.version}"
+
+
+def _fill(
+    archive: zipfile.ZipFile,
+    name: str,
+    contacts: Iterable[tuple[ExportContact, bytes | None]],
+    now_utc_s: float,
+    options: CotOptions | None,
+) -> None:
+    manifest = ET.Element("MissionPackageManifest", {"version": "2"})
+    configuration = ET.SubElement(manifest, "Configuration")
+    contents = ET.SubElement(manifest, "Contents")
+    uids: list[str] = []
+    for contact, png in contacts:
+        uids.append(contact.uid)
+        digest = None if png is None else attachment_sha256(png)
+        entry = f"{contact.uid}/{contact.uid}.cot"
+        _add(archive, entry, cot_event(contact, now_utc_s, options, digest))
+        _content(contents, entry, {"uid": contact.uid, "name": contact.name})
+        if png is not None:
+            entry = f"{digest}/{file_name(contact)}.png"
+            _add(archive, entry, png)
+            # A file with the identifier of an event is an attachment of it.
+            _content(contents, entry, {"uid": contact.uid})
+    package_uid = str(uuid.uuid5(_NAMESPACE, json.dumps([name, uids])))
+    for key, value in (("uid", package_uid), ("name", name)):
+        ET.SubElement(configuration, "Parameter", {"name": key, "value": xml_text(value)})
+    _add(archive, MANIFEST, ET.tostring(manifest, encoding="utf-8", xml_declaration=True))
+
+
+def _content(contents: ET.Element, entry: str, parameters: dict[str, str]) -> None:
+    content = ET.SubElement(contents, "Content", {"ignore": "false", "zipEntry": entry})
+    for key, value in parameters.items():
+        ET.SubElement(content, "Parameter", {"name": key, "value": xml_text(value)})
+
+
+def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
+    entry = zipfile.ZipInfo(name, _ZIP_TIME)
+    # Images are already compressed.
+    entry.compress_type = zipfile.ZIP_STORED if name.endswith(".png") else zipfile.ZIP_DEFLATED
+    entry.external_attr = 0o644 << 16
+    archive.writestr(entry, data)
