@@ -1,4 +1,4 @@
-"""Thread that connects the sans-I/O modem driver with its serial port and a clock."""
+"""Thread that connects the sans-I/O modem driver with its port and a clock."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from datetime import datetime
 
 from sonarpost.errors import PortError
 from sonarpost.logs import kv
-from sonarpost.modem.micromodem import MicroModem, ModemEvent, PollReceived
-from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialPort
+from sonarpost.modem.interface import Modem, ModemCapabilities, ModemEvent, PollHandler
+from sonarpost.runtime.modem_port import ModemPort
+from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened
 
 log = logging.getLogger(__name__)
 
@@ -33,8 +33,8 @@ class ModemRunner:
 
     def __init__(
         self,
-        driver: MicroModem,
-        port: SerialPort,
+        driver: Modem,
+        port: ModemPort,
         on_event: Callable[[ModemEvent], None],
         clock: Callable[[], float] = time.monotonic,
         *,
@@ -49,6 +49,11 @@ class ModemRunner:
         self._inputs: queue.SimpleQueue[PortEvent | None] = queue.SimpleQueue()
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
+
+    @property
+    def capabilities(self) -> ModemCapabilities:
+        """What the driver and its modem can do."""
+        return self._driver.capabilities
 
     @property
     def ready(self) -> bool:
@@ -95,7 +100,7 @@ class ModemRunner:
             thread.join(_STOP_S)
 
     def send_packet(self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False) -> int:
-        """Queue a packet, from any thread; see `MicroModem.send_packet`.
+        """Queue a packet, from any thread; see `Modem.send_packet`.
 
         Raises:
             FrameError: An address, a rate or frames that the modem cannot send.
@@ -103,29 +108,22 @@ class ModemRunner:
         return self.request(lambda driver, now: driver.send_packet(destination, rate, frames, ack=ack, now=now))
 
     def request_packet(self, source: int, rate: int, frames: int | None = None, *, ack: bool = False) -> int:
-        """Queue a poll of another modem, from any thread; see `MicroModem.request_packet`.
+        """Queue a poll of another modem, from any thread; see `Modem.request_packet`.
 
         Raises:
             FrameError: An address, a rate or a number of frames that the modem cannot request.
         """
         return self.request(lambda driver, now: driver.request_packet(source, rate, frames, ack=ack, now=now))
 
-    def set_poll_handler(self, uplink: Callable[[PollReceived], Sequence[bytes]] | None) -> None:
-        """Set the function that returns frames when another modem polls; see `MicroModem.set_poll_handler`.
+    def set_poll_handler(self, uplink: PollHandler | None) -> None:
+        """Set the function that returns frames when another modem polls; see `Modem.set_poll_handler`.
 
         It is called in the runner's thread. It must not block or call the runner.
         """
         with self._lock:
             self._driver.set_poll_handler(uplink)
 
-    def set_clock(self, utc: datetime) -> bool:
-        """Set the modem's clock if the modem is idle, from any thread; see `MicroModem.set_clock`."""
-        with self._lock:
-            sent = self._driver.set_clock(utc, self._clock())
-        self._inputs.put(None)
-        return sent
-
-    def request(self, request: Callable[[MicroModem, float], int]) -> int:
+    def request(self, request: Callable[[Modem, float], int]) -> int:
         """Call any other request of the driver, from any thread: `runner.request(lambda d, now: d.ping(2, now))`.
 
         Args:
@@ -160,8 +158,8 @@ class ModemRunner:
             now = self._clock()
             events = self._apply(item, now)
             events += self._driver.poll(now)
-            data = self._driver.bytes_to_send()
-        if data:
+            parts = list(iter(self._driver.bytes_to_send, b""))
+        for data in parts:
             self._write(data)
         self._deliver(events)
 

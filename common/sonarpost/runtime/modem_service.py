@@ -5,75 +5,134 @@ from __future__ import annotations
 import logging
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, TypeVar
+from typing import Annotated, ClassVar, Self, TypeVar
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.errors import ConfigError
 from sonarpost.logs import kv
 from sonarpost.messages import AcousticFrame
-from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, ModemEvent, PacketSent
-from sonarpost.modem.micromodem import events as ev
+from sonarpost.modem import interface as ev
+from sonarpost.modem.interface import MAX_ADDRESS, MAX_RATE, ModemCapabilities, ModemEvent, PacketSent, RateInfo
+from sonarpost.modem.registry import ModemSettings, modem_driver
+from sonarpost.runtime.modem_port import open_modem_port
 from sonarpost.runtime.modem_runner import ModemRunner
-from sonarpost.runtime.serial_port import SerialPort
 from sonarpost.runtime.service import Service
 from sonarpost.security.acoustic_key import UNAUTHENTICATED, link_key
 
 log = logging.getLogger(__name__)
 
 
+RateNumber = Annotated[int, Field(ge=0, le=MAX_RATE)]
+"""Number of a rate; which numbers exist depends on the modem."""
+Address = Annotated[int, Field(ge=0, le=MAX_ADDRESS)]
+"""Address of a modem; which addresses exist depends on the modem."""
+
+
 class ModemServiceConfig(ServiceConfig):
     """Configuration of a service with a modem.
 
     Attributes:
-        port: Any pyserial URL: /dev/ttyUSB0, socket://host:port, rfc2217://host:port.
+        port: Any pyserial URL: /dev/ttyUSB0, socket://host:port, rfc2217://host:port; or udp://group:port.
         baud: Bit rate of the serial line.
         address: The modem's own address, set at start-up.
         reply_timeout_s: Time to wait for the modem's reply before a command is sent again.
         max_carrier_sense_s: Longest time for which a busy channel delays a packet; some times the longest packet.
     """
 
+    TABLE: ClassVar[str] = ""
+    """Name of the table in errors."""
+    UPLINK_RATES: ClassVar[tuple[str, ...]] = ()
+    """Keys whose default is the driver's uplink rate."""
+    DOWNLINK_RATES: ClassVar[tuple[str, ...]] = ()
+    """Keys whose default is the driver's downlink rate."""
+
     port: Annotated[str, Field(min_length=1)]
     baud: Annotated[int, Field(ge=300, le=4_000_000)] = 19200
-    address: Annotated[int, Field(ge=0, le=127)]
+    address: Address
     reply_timeout_s: Annotated[float, Field(gt=0, le=600)] = 5.0
     max_carrier_sense_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
+    _capabilities: ModemCapabilities | None = PrivateAttr(default=None)
 
     def check_with(self, platform: PlatformConfig) -> None:
-        """Check the kind of the port and the acoustic key.
+        """Check the driver, the kind of the port and the acoustic key.
 
         Raises:
             ConfigError: As `ModemService`.
         """
-        SerialPort(self.port, self.baud)
+        self.for_modem(modem_driver(platform.modem.driver).capabilities)
+        open_modem_port(self.port, self.baud)
         link_key(platform)
+
+    @property
+    def capabilities(self) -> ModemCapabilities:
+        """What the modem can do; that of the default driver before `for_modem`."""
+        return self._capabilities or modem_driver().capabilities
+
+    def rate_info(self, number: int) -> RateInfo:
+        """Return a rate of the modem.
+
+        Raises:
+            KeyError: The modem does not have it; `for_modem` has checked those of the configuration.
+        """
+        return self.capabilities.rates[number]
+
+    def for_modem(self, capabilities: ModemCapabilities) -> Self:
+        """Return this table for a modem: rates that the file does not set have the default of its driver.
+
+        Raises:
+            ConfigError: An address or a rate that the modem does not have.
+        """
+        defaults = dict.fromkeys(self.UPLINK_RATES, capabilities.uplink_rate)
+        defaults |= dict.fromkeys(self.DOWNLINK_RATES, capabilities.downlink_rate)
+        unset = {name: rate for name, rate in defaults.items() if name not in self.model_fields_set}
+        table = self.model_copy(update=unset)
+        table._capabilities = capabilities  # noqa: SLF001 - an object of this class
+        table._check_modem(capabilities)  # noqa: SLF001 - an object of this class
+        return table
+
+    def _check_modem(self, capabilities: ModemCapabilities) -> None:
+        """Check the keys that depend on the modem.
+
+        Raises:
+            ConfigError: See `for_modem`.
+        """
+        for name in (*self.UPLINK_RATES, *self.DOWNLINK_RATES):
+            self._check_rate(name, getattr(self, name))
+        self._check_address("address", self.address)
+
+    def _check_rate(self, name: str, rate: int) -> None:
+        if rate not in self.capabilities.rates:
+            raise ConfigError(self.TABLE, name, rate, f"one of {sorted(self.capabilities.rates)}")
+
+    def _check_address(self, name: str, address: int) -> None:
+        self.capabilities.check_address(address, self.TABLE, name)
 
 
 M = TypeVar("M", bound=ModemServiceConfig)
 
 
 class ModemService(Service[M]):
-    """A service that drives a Micro-Modem. Subclasses handle events in `on_modem_event`.
+    """A service that drives a modem. Subclasses handle events in `on_modem_event`.
 
     Attributes:
         key: Authenticates acoustic frames; None with `acoustic_auth = "none"`.
 
     Raises:
-        ConfigError: Unsupported kind of URL, no acoustic key is configured, or its file cannot be read or is not
-            private to its owner.
+        ConfigError: Unknown driver, an address or rate that its modem does not have, unsupported kind of URL, no
+            acoustic key is configured, or its file cannot be read or is not private to its owner.
     """
 
     def __init__(self, platform: PlatformConfig, config: M) -> None:
         # Before the store is opened, so that a configuration error leaves no open store.
-        self._port = SerialPort(config.port, config.baud)
+        driver = modem_driver(platform.modem.driver)
+        config = config.for_modem(driver.capabilities)
+        self._port = open_modem_port(config.port, config.baud)
         self.key = link_key(platform)
         super().__init__(platform, config)
-        settings = MicroModemConfig(
-            config.address,
-            reply_timeout_s=config.reply_timeout_s,
-            max_carrier_sense_s=config.max_carrier_sense_s,
-        )
-        self.modem = ModemRunner(MicroModem(settings, config.port), self._port, self._on_event)
+        settings = ModemSettings(config.address, config.reply_timeout_s, config.max_carrier_sense_s)
+        self.modem = ModemRunner(driver.create(settings, config.port), self._port, self._on_event)
         self._modem_error = f"{config.port}: no reply from the modem yet"
         self._transmit_failure = ""
         self._carrier_warning = ""
@@ -133,7 +192,7 @@ class ModemService(Service[M]):
                 log.warning("Modem did not confirm a setting", extra=kv(command=event.command))
             case ev.ModemError():
                 self.count("modem_errors")
-                self._modem_errors.log(error=event.report)
+                self._modem_errors.log(error=event.text)
             case ev.SentenceRejected():
                 self.count("sentences_rejected")
                 self._rejected_lines.log(reason=str(event.error))
@@ -149,7 +208,7 @@ class ModemService(Service[M]):
                 self._transmit_failure = f"{port}: the modem does not transmit: {event.reason}"
                 self.count("modem_transmit_failures")
                 log.error(
-                    "Modem does not transmit", extra=kv(port=port, failures=event.failures, reason=event.reason.value)
+                    "Modem does not transmit", extra=kv(port=port, failures=event.failures, reason=str(event.reason))
                 )
             case ev.RestartRequested():
                 self.count("modem_restarts_requested")
@@ -175,13 +234,13 @@ class ModemService(Service[M]):
 
 
 def sent_frames(
-    platform_id: str, source: int, packet: PacketSent, number: int, sent_utc_s: float
+    platform_id: str, config: ModemServiceConfig, packet: PacketSent, number: int, sent_utc_s: float
 ) -> list[AcousticFrame]:
     """Return the records of the frames of a packet that was sent.
 
     Args:
         platform_id: Name of the platform.
-        source: Its modem address.
+        config: Its configuration.
         packet: The packet.
         number: Number of the packet on this platform.
         sent_utc_s: End of the packet.
@@ -191,13 +250,14 @@ def sent_frames(
             direction="tx",
             platform_id=platform_id,
             time_utc_s=sent_utc_s,
-            source=source,
+            source=config.address,
             destination=packet.dest,
             rate=packet.rate,
             packet=number,
             frame_number=frame_number,
             frame_count=len(packet.frames),
             data=data,
+            airtime_s=config.rate_info(packet.rate).airtime_s,
         )
         for frame_number, data in enumerate(packet.frames, start=1)
     ]

@@ -1,4 +1,4 @@
-"""Blocking interface to a Micro-Modem on a serial port, for scripts."""
+"""Blocking interface to a modem on a serial port, for scripts."""
 
 from __future__ import annotations
 
@@ -8,16 +8,10 @@ from collections.abc import Sequence
 from typing import Final, Self
 
 from sonarpost.errors import PortError, TransmissionError
-from sonarpost.modem.micromodem import (
-    MicroModem,
-    MicroModemConfig,
-    ModemEvent,
-    PacketFailed,
-    PacketReceived,
-    PacketSent,
-)
+from sonarpost.modem.interface import ModemEvent, PacketFailed, PacketReceived, PacketSent
+from sonarpost.modem.registry import DEFAULT_DRIVER, ModemSettings, modem_driver
+from sonarpost.runtime.modem_port import open_modem_port
 from sonarpost.runtime.modem_runner import ModemRunner
-from sonarpost.runtime.serial_port import SerialPort
 
 MAX_RECEIVED_PACKETS: Final = 1000
 """Received packets that wait for `receive`; the oldest is dropped when another arrives."""
@@ -34,19 +28,22 @@ class SerialModem:
 
     Args:
         url: Serial device, or another pyserial URL (`socket://host:port`, `rfc2217://host:port`).
-        address: Address that the modem gets, 0 to 127.
+        address: Address that the modem gets; 0 to 127 for the Micro-Modem.
         baud: Bit rate of the serial line.
         ready_timeout_s: How long `open` waits until the modem is configured.
+        driver: Name of the modem's driver.
 
     Raises:
-        ConfigError: An unsupported kind of URL, or an address out of range.
+        ConfigError: An unsupported kind of URL, an unknown driver, or an address out of range.
     """
 
-    def __init__(self, url: str, *, address: int, baud: int = 19200, ready_timeout_s: float = 30.0) -> None:
+    def __init__(
+        self, url: str, *, address: int, baud: int = 19200, ready_timeout_s: float = 30.0, driver: str = DEFAULT_DRIVER
+    ) -> None:
         self._url = url
         self._ready_timeout_s = ready_timeout_s
-        self._port = SerialPort(url, baud)
-        self._runner = ModemRunner(MicroModem(MicroModemConfig(address), url), self._port, self._on_event)
+        self._port = open_modem_port(url, baud)
+        self._runner = ModemRunner(modem_driver(driver).create(ModemSettings(address), url), self._port, self._on_event)
         self._changed = threading.Condition()
         self._results: dict[int, PacketSent | PacketFailed] = {}
         self._received: deque[PacketReceived] = deque(maxlen=MAX_RECEIVED_PACKETS)
@@ -90,9 +87,9 @@ class SerialModem:
         """Send one packet; return when it is transmitted.
 
         Args:
-            frames: The frames, at most as many and as long as the rate allows (`RATES`).
-            destination: Address of the receiving modem, 0 to 127; 127 for all.
-            rate: Rate number, 0 to 6.
+            frames: The frames, at most as many and as long as the rate allows.
+            destination: Address of the receiving modem, or of all; 127 for all Micro-Modems.
+            rate: Rate number; 0 to 6 for the Micro-Modem.
             ack: Request acoustic acknowledgements; the result has the numbers of the acknowledged frames.
 
         Raises:

@@ -146,6 +146,19 @@ class Service(ABC, Generic[C]):
         """
         self._disk_reserve.require()
 
+    def before_accepting(self, records: Sequence[tuple[str, bytes]]) -> None:
+        """Store records outside the service's own store before they are committed and acknowledged; by default nothing.
+
+        Called inside a store transaction, as `validate` is. The records can be stored although they are not accepted
+        afterwards; their senders repeat them.
+
+        Args:
+            records: Key and payload of each record.
+
+        Raises:
+            DeliveryError: No record is accepted now; the senders keep them and retry.
+        """
+
     def delivery_only_keys(self) -> Collection[str]:
         """Return the consumed key expressions on which plain publications are ignored."""
         return ()
@@ -154,14 +167,26 @@ class Service(ABC, Generic[C]):
         """Return the settings with which an outbox queue is sent."""
         return QueuePolicy(publish=self.PUBLISH)
 
-    def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
+    def expand(self, tx: Transaction, key: str, payload: bytes) -> bytes:
+        """Return the payload to store for a valid record, in the transaction that accepts it; by default its own.
+
+        Raises:
+            MissingBaseError: The record is a difference to a version that is not known; its producer sends the whole.
+        """
+        return payload
+
+    def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> bool | None:
         """React to a consumer's acknowledgement, in the transaction that removes the record from the outbox.
 
         Args:
             tx: The open transaction.
             item: The record.
             reason: None if the consumer accepted the record, else its reason for refusing it.
+
+        Returns:
+            True if a refused record was replaced: it is removed without a copy in the quarantine.
         """
+        return None
 
     def before_session(self) -> None:
         """Start what needs no router; called before the session opens, which can take any time."""
@@ -223,8 +248,10 @@ class Service(ABC, Generic[C]):
                 tuple(wanted),
                 self._check_payload,
                 self._refused,
+                expand=self.expand,
                 check_capacity=self.check_capacity,
                 delivery_only_keys=self.delivery_only_keys(),
+                before_commit=self.before_accepting,
             )
             self.start_thread(self._work, "work")
         self.on_start()
@@ -384,8 +411,12 @@ class Service(ABC, Generic[C]):
 
     def publish(self, key: str, record: Record) -> bool:
         """Publish a record for subscribers, without durable delivery; return whether Zenoh has taken it."""
+        return self.publish_payload(key, wire.encode(record), wire.encoding_of(type(record)))
+
+    def publish_payload(self, key: str, payload: bytes, encoding: str) -> bool:
+        """Publish bytes as `publish` does."""
         try:
-            self.session.put(key, wire.encode(record), encoding=wire.encoding_of(type(record)))
+            self.session.put(key, payload, encoding=encoding)
         except zenoh.ZError as error:
             if not self.stopping.is_set():
                 log.warning("Record not published", extra=kv(key=key, error=str(error)))
@@ -399,6 +430,11 @@ class Service(ABC, Generic[C]):
     def acknowledged_count(self, queue: str) -> int:
         """Return the number of records that the consumer of a queue has acknowledged since the start."""
         return 0 if self._outbox is None else self._outbox.acknowledged_count(queue)
+
+    def prefer_other_consumers(self, *, others: bool) -> None:
+        """Leave new records to other services of the same name while there is one, or end that."""
+        if self._inbox is not None and not self.session.is_closed():
+            self._inbox.set_preferred(is_preferred=not others)
 
     # Health
 

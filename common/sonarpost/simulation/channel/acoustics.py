@@ -92,10 +92,9 @@ def transmission_loss_db(
 def frame_error_rate(rate: int, snr_db: float) -> float:
     """Return the probability, 0..1, that a frame of `rate` is lost: linear between the published points.
 
-    Raises:
-        KeyError: A rate outside 0..6.
+    Only those of the Micro-Modem are published; another rate has that of rate 1, the most robust one.
     """
-    table = _ERROR_RATES[_TABLE_OF_RATE[rate]]
+    table = _ERROR_RATES[_TABLE_OF_RATE.get(rate, 1)]
     if snr_db <= table[0][0]:
         return table[0][1]
     for (low_db, low), (high_db, high) in pairwise(table):

@@ -9,10 +9,11 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from sonarpost.config import ServiceConfig
-from sonarpost.modem.micromodem import RATES
+from sonarpost.modem.interface import MAX_ADDRESS, MAX_RATE
+from sonarpost.modem.registry import modem_driver
 from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.parameters import ChannelParameters, build_parameters
-from sonarpost.simulation.modem.settings import EmulatedModemConfig
+from sonarpost.simulation.modem.emulated import DEFAULT_MODEM, EMULATED, EmulatorSettings, settings_for
 
 
 class Site(ServiceConfig):
@@ -41,7 +42,7 @@ class ModemSite(Site):
         address: Its initial `SRC`.
     """
 
-    address: Annotated[int, Field(ge=0, le=127)]
+    address: Annotated[int, Field(ge=0, le=MAX_ADDRESS)]
 
 
 class TransponderSite(Site):
@@ -64,6 +65,7 @@ class EmulatorConfig(ChannelParameters):
         tcp_host: Address to listen on.
         log: File for the log of every packet; none by default.
         time_scale: Simulated seconds per real second.
+        driver: Name of the driver whose modem is emulated.
         preset: A set of channel parameters; other given parameters override it.
         airtime_s: Air times by rate number, where they differ from the nominal ones.
         generation: Generation of the emulated Micro-Modem, 1 or 2.
@@ -83,7 +85,8 @@ class EmulatorConfig(ChannelParameters):
     log: Path | None = None
     time_scale: Annotated[float, Field(ge=0.01, le=10_000)] = 1.0
     preset: Literal["still", "sea-trial"] = "still"
-    airtime_s: Mapping[Annotated[int, Field(ge=min(RATES), le=max(RATES))], Annotated[float, Field(gt=0, le=600)]] = {}
+    driver: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")] = DEFAULT_MODEM
+    airtime_s: Mapping[Annotated[int, Field(ge=0, le=MAX_RATE)], Annotated[float, Field(gt=0, le=600)]] = {}
     generation: Annotated[int, Field(ge=1, le=2)] = 2
     statistics_version: Literal[6, 8] = 6
     transponder: Annotated[tuple[TransponderSite, ...], Field(max_length=4)] = ()
@@ -93,6 +96,13 @@ class EmulatorConfig(ChannelParameters):
     @model_validator(mode="after")
     def _check_together(self) -> Self:
         addresses = [modem.address for modem in self.modem]
+        if self.driver not in EMULATED:
+            raise ValueError(f"driver: got {self.driver!r}, expected one of {', '.join(EMULATED)}")
+        modem = modem_driver(self.driver).capabilities
+        if unknown := set(self.airtime_s) - set(modem.rates):
+            raise ValueError(f"airtime_s: got rates {sorted(unknown)}, expected {sorted(modem.rates)}")
+        if not all(modem.min_address <= address <= modem.max_address for address in addresses):
+            raise ValueError(f"modem: got addresses {addresses}, expected {modem.min_address}..{modem.max_address}")
         if len(set(addresses)) != len(addresses):
             raise ValueError(f"modem: got addresses {addresses}, expected all different")
         if self.tcp_ports and len(self.tcp_ports) != len(addresses):
@@ -106,7 +116,7 @@ class EmulatorConfig(ChannelParameters):
         values = self.model_dump(mode="json", include=given, exclude_none=True)
         return build_parameters(values | {"preset": self.preset}, "channel")
 
-    def modem_config(self, modem: ModemSite, utc_at_zero_s: float, data_timeout_s: int) -> EmulatedModemConfig:
+    def modem_config(self, modem: ModemSite, utc_at_zero_s: float, data_timeout_s: int) -> EmulatorSettings:
         """Return the configuration of one modem.
 
         Args:
@@ -114,7 +124,8 @@ class EmulatorConfig(ChannelParameters):
             utc_at_zero_s: Reading of its clock at simulated time zero, seconds since 1970 UTC.
             data_timeout_s: Its initial `DTO`.
         """
-        return EmulatedModemConfig(
+        return settings_for(
+            self.driver,
             address=modem.address,
             generation=self.generation,
             statistics_version=self.statistics_version,

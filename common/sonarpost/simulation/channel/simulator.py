@@ -18,9 +18,8 @@ from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.events import ArrivalStarted, Transmission
 from sonarpost.simulation.channel.model import ChannelModel
 from sonarpost.simulation.channel.parameters import ChannelParameters
-from sonarpost.simulation.modem.emulator import EmulatedMicroModem
+from sonarpost.simulation.modem.emulated import EmulatedModem, EmulatorSettings, create_modem
 from sonarpost.simulation.modem.receiver import HostOutput, PacketReport
-from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
 Item = TypeVar("Item")
 
@@ -73,7 +72,7 @@ class SerialLine(Generic[Item]):
 class PlacedModem:
     """Configuration and position of one modem."""
 
-    config: EmulatedModemConfig
+    config: EmulatorSettings
     position: LocalPosition = field(default_factory=LocalPosition)
 
 
@@ -81,7 +80,7 @@ class PlacedModem:
 class _ModemPort:
     """A modem with both directions of its serial line, and its outputs for the host."""
 
-    modem: EmulatedMicroModem
+    modem: EmulatedModem
     to_modem: SerialLine[bytes]
     to_host: SerialLine[HostOutput]
     outputs: list[HostOutput] = field(default_factory=list)
@@ -108,9 +107,7 @@ class ChannelSimulator:
         self.channel = ChannelModel(parameters, {number: modem.position for number, modem in modems.items()})
         self._ports = {
             number: _ModemPort(
-                EmulatedMicroModem(
-                    modem.config, travel_times=partial(self.channel.travel_times_s, number, transponders)
-                ),
+                create_modem(modem.config, partial(self.channel.travel_times_s, number, transponders)),
                 SerialLine(serial_baud),
                 SerialLine(serial_baud),
             )
@@ -119,7 +116,7 @@ class ChannelSimulator:
         # The modems' start-up sentences belong to this moment, not to the first event.
         self._step(self.now)
 
-    def modem(self, number: int) -> EmulatedMicroModem:
+    def modem(self, number: int) -> EmulatedModem:
         """Return one modem."""
         return self._ports[number].modem
 
