@@ -1,8 +1,8 @@
 """Configuration: one TOML file for each platform, with a table for each service.
 
-`[platform]` applies to all services of the file, `[{service}]` to one service. An unknown table or key is an error that
-names file, line and key. The environment variable `SONARPOST_{TABLE}__{KEY}` overrides a value; its text is parsed as a
-TOML value, or used as a string if it is not one. An empty variable overrides nothing.
+`[platform]` and `[modem]` apply to all services of the file, `[{service}]` to one service. An unknown table or key is
+an error that names file, line and key. The environment variable `SONARPOST_{TABLE}__{KEY}` overrides a value; its text
+is parsed as a TOML value, or used as a string if it is not one. An empty variable overrides nothing.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 from pydantic_core import to_json
 
 from sonarpost.errors import ConfigError
@@ -38,6 +38,8 @@ SERVICES = (
     "console",
 )
 
+TABLES = ("platform", "modem", *SERVICES)
+"""Every table of a configuration file."""
 
 # Inline tables of which environment variables can override single keys: SONARPOST_PLATFORM__TLS__KEY.
 NESTED_TABLES = {("platform", "tls")}
@@ -116,8 +118,18 @@ class TlsConfig(ServiceConfig):
     warn_days: Annotated[float, Field(ge=0, le=3650)] = 30.0
 
 
+class ModemTable(ServiceConfig):
+    """The `[modem]` table: the modem of the platform. A shore site names that of its vessels, for estimates.
+
+    Attributes:
+        driver: Name of the driver, see `sonarpost.modem.registry`.
+    """
+
+    driver: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")] = "micromodem"
+
+
 class PlatformConfig(ServiceConfig):
-    """The `[platform]` table.
+    """The `[platform]` table. The property `modem` has the `[modem]` table of the same file.
 
     Attributes:
         id: Name of the platform in key expressions, for example "uuv-1".
@@ -145,6 +157,18 @@ class PlatformConfig(ServiceConfig):
     health_interval_s: Annotated[float, Field(ge=0.05, le=3600)] = 5.0
     log_level: Annotated[str, Field(pattern="^(debug|info|warning|error)$")] = "info"
     log_format: LogFormat = "text"
+    _modem: ModemTable = PrivateAttr(default_factory=ModemTable)
+
+    @property
+    def modem(self) -> ModemTable:
+        """The `[modem]` table of the same file."""
+        return self._modem
+
+    def with_modem(self, modem: ModemTable) -> PlatformConfig:
+        """Return this table with another `[modem]` table."""
+        copy = self.model_copy()
+        copy._modem = modem  # noqa: SLF001 - an object of this class
+        return copy
 
 
 def load(path: Path, service: str, model: type[C], environment: Mapping[str, str]) -> tuple[PlatformConfig, C]:
@@ -161,15 +185,15 @@ def load(path: Path, service: str, model: type[C], environment: Mapping[str, str
             line and key.
     """
     file = ConfigFile(path, environment)
-    platform, own = file.table("platform", PlatformConfig), file.table(service, model)
+    platform, own = file.platform(), file.table(service, model)
     if platform is None or own is None or file.errors:
         raise file.errors[0]
     return platform, own
 
 
 def overridden_keys(service: str, environment: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the keys of `[platform]` and of a service's table that environment variables set, as `table.key`."""
-    prefixes = tuple(f"{ENVIRONMENT_PREFIX}{table.upper()}__" for table in ("platform", service))
+    """Return the keys of a service's tables that environment variables set, as `table.key`."""
+    prefixes = tuple(f"{ENVIRONMENT_PREFIX}{table.upper()}__" for table in ("platform", "modem", service))
     names = sorted(name for name, text in environment.items() if text and name.startswith(prefixes))
     return tuple(name.removeprefix(ENVIRONMENT_PREFIX).lower().replace("__", ".") for name in names)
 
@@ -204,8 +228,8 @@ class ConfigFile:
         self.services = tuple(name for name in SERVICES if name in self._tables)
         self.errors: list[ConfigError] = []
         for name, table in self._tables.items():
-            if name not in ("platform", *SERVICES):
-                self.errors.append(self.error((name,), "an unknown table", "platform, " + ", ".join(SERVICES)))
+            if name not in TABLES:
+                self.errors.append(self.error((name,), "an unknown table", ", ".join(TABLES)))
             elif not isinstance(table, dict):
                 self.errors.append(self.error((name,), table, f"a table [{name}]"))
         self._overrides: dict[str, dict[str, object]] = {}
@@ -220,11 +244,16 @@ class ConfigFile:
         where = str(self.path) if line is None else f"{self.path}:{line}"
         return ConfigError(where, ".".join(names), value, expected)
 
+    def platform(self) -> PlatformConfig | None:
+        """Return `[platform]` with `[modem]`; None if one of them is invalid, with all errors in `errors`."""
+        platform, modem = self.table("platform", PlatformConfig), self.table("modem", ModemTable)
+        return None if platform is None or modem is None else platform.with_modem(modem)
+
     def table(self, name: str, model: type[C]) -> C | None:
         """Return a table with its overrides; None if it is invalid, with all its errors in `errors`.
 
         Args:
-            name: "platform" or a service; an absent table has default values.
+            name: "platform", "modem" or a service; an absent table has default values.
             model: Type of the table.
         """
         written = self._tables.get(name, {})
@@ -260,7 +289,7 @@ class ConfigFile:
         if not text or not name.startswith(ENVIRONMENT_PREFIX) or "__" not in name:
             return
         table, _, key = name[len(ENVIRONMENT_PREFIX) :].lower().partition("__")
-        if key and table in ("platform", *SERVICES):
+        if key and table in TABLES:
             self._overrides.setdefault(table, {})[key] = _toml_value(text)
         else:
             expected = "SONARPOST_{platform or a service's name}__{KEY}"

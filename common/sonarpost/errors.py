@@ -44,6 +44,10 @@ class PayloadError(BadInputError):
     """A Zenoh payload is not a valid record of its key."""
 
 
+class MissingBaseError(PayloadError):
+    """A record is the difference to a version that its consumer does not have; its producer sends the whole."""
+
+
 class StreamError(BadInputError):
     """A codec stream (an encoded image) cannot be decoded."""
 
@@ -64,8 +68,28 @@ class CodebookError(BadInputError):
     """A tile codebook cannot be read, or differs from the one that the encoder used."""
 
 
+class MissingCodebookError(CodebookError):
+    """The codebook that a stream requires is not known here.
+
+    Attributes:
+        model: First 32 hexadecimal digits of its identity; empty if only the tag in the stream is known.
+    """
+
+    def __init__(self, where: str, model: str, tag: int, known: str) -> None:
+        super().__init__(where, "model_tag", f"{tag:#06x} {model}".strip(), f"a known codebook: {known}")
+        self.model = model
+
+
 class StoredFileError(BadInputError):
     """A record file of c2 cannot be read, or does not match its name."""
+
+
+class McapFileError(BadInputError):
+    """An MCAP file cannot be read, or is incomplete."""
+
+
+class QueryRefusedError(SonarpostError):
+    """c2 does not accept a query; the text is its error reply."""
 
 
 class PortError(SonarpostError):
@@ -82,3 +106,7 @@ class DeliveryError(SonarpostError):
 
 class RetryLaterError(DeliveryError):
     """A record cannot be accepted at present; its sender keeps it and retries, other records are not affected."""
+
+
+class DatabaseUnavailableError(DeliveryError):
+    """The database server of a shore site is not reached, or rejects a statement; the caller retries."""

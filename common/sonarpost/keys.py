@@ -60,6 +60,26 @@ def acoustic_rx(platform: str) -> str:
     return _of(platform, "acoustic/rx")
 
 
+def vessel_frames(lead: str, vessel: str) -> str:
+    """A frame of a vehicle that a vessel received, for the lead vessel that merges it with its own.
+
+    Record: acoustic_frame. From: op_modem. To: op_modem. Delivery: durable, priority 4, not published.
+    """
+    return _of(lead, f"inbox/{_name('vessel', vessel)}/frame")
+
+
+def frames_vessel(key: str) -> str:
+    """Return the vessel that a key made by `vessel_frames` names.
+
+    Raises:
+        BadInputError: It is another key.
+    """
+    parts = key.split("/")
+    if len(parts) != 6 or not key.startswith(f"{ROOT}/") or parts[3] != "inbox" or parts[5] != "frame":
+        raise BadInputError(key, "", key, f"{ROOT}/{{lead}}/inbox/{{vessel}}/frame")
+    return _name("vessel", parts[4])
+
+
 def acoustic_image(vessel: str) -> str:
     """The coded content of an image, after more of it arrived.
 
@@ -79,6 +99,43 @@ def acoustic_queue(platform: str) -> str:
 def acoustic_queue_everywhere() -> str:
     """The transmit queues of all vehicles."""
     return f"{ROOT}/*/acoustic/queue"
+
+
+def vehicle_status(vehicle: str) -> str:
+    """The position and state of the vehicle.
+
+    uuv_modem sends the latest one at intervals if `status_period_s` is set.
+
+    Record: vehicle_status. From: atd_stub, a navigation program of the vehicle. To: uuv_modem. Delivery: plain,
+    priority 5.
+    """
+    return _of(vehicle, "status")
+
+
+def acoustic_status(vessel: str) -> str:
+    """The position and state of a vehicle, received over the acoustic link.
+
+    Record: received_status. From: op_modem. To: relay, console, watchers. Delivery: plain, priority 5.
+    """
+    return _of(vessel, "acoustic/status")
+
+
+def acoustic_status_everywhere() -> str:
+    """The status of all vehicles, as all vessels receive it."""
+    return f"{ROOT}/*/acoustic/status"
+
+
+def acoustic_range(vessel: str) -> str:
+    """The measured distance between vessel and vehicle.
+
+    Record: vehicle_range. From: op_modem. To: console, watchers. Delivery: plain, priority 5.
+    """
+    return _of(vessel, "acoustic/range")
+
+
+def acoustic_range_everywhere() -> str:
+    """The measured distances of all vessels."""
+    return f"{ROOT}/*/acoustic/range"
 
 
 def acoustic_transmissions(vehicle: str) -> str:
@@ -118,9 +175,32 @@ def message_outgoing(vehicle: str) -> str:
 def image_reconstructed(vessel: str) -> str:
     """A decoded image (the paper's imgToDecompress on the operator's side).
 
+    The relay accepts those that a decompressor of an earlier version has queued for it.
+
     Record: reconstructed_image. From: decompressor. To: relay, console. Delivery: durable, priority 5.
     """
     return _of(vessel, "image/reconstructed")
+
+
+def image_coded(vessel: str) -> str:
+    """The coded content of an image that the vessel could decode.
+
+    Record: coded_image. From: decompressor. To: relay. Delivery: durable, priority 5.
+    """
+    return _of(vessel, "image/coded")
+
+
+def codebook(vessel: str, model: str) -> str:
+    """A codebook of the vessel's decompressor, which replies to a query with one piece of the file.
+
+    Record: none. From: c2. To: decompressor. Delivery: query.
+    """
+    return _of(vessel, f"codebook/{_name('model', model)}")
+
+
+def codebook_all(vessel: str) -> str:
+    """All codebooks of one vessel."""
+    return _of(vessel, "codebook/*")
 
 
 def contact_decision(vessel: str) -> str:
@@ -167,6 +247,33 @@ def shore_inbox(vessel: str, site: str = SHORE) -> str:
     return _of(site, f"inbox/{_name('vessel', vessel)}")
 
 
+def shore_part(vessel: str, site: str = SHORE) -> str:
+    """A vessel's coded image: the whole, or the difference to a version that the site has acknowledged.
+
+    Priority 5 for the first version of an image, 6 for later ones.
+
+    Record: part. From: relay. To: c2. Delivery: durable, priority 5 or 6, not published.
+    """
+    return _of(site, f"inbox/{_name('vessel', vessel)}/part")
+
+
+def shore_part_all(site: str = SHORE) -> str:
+    """Coded images of every vessel to one site."""
+    return _of(site, "inbox/*/part")
+
+
+def part_vessel(key: str) -> str:
+    """Return the vessel that a key made by `shore_part` names.
+
+    Raises:
+        BadInputError: It is another key.
+    """
+    parts = key.split("/")
+    if len(parts) != 6 or not key.startswith(f"{ROOT}/") or parts[3] != "inbox" or parts[5] != "part":
+        raise BadInputError(key, "", key, f"{ROOT}/{{site}}/inbox/{{vessel}}/part")
+    return _name("vessel", parts[4])
+
+
 def shore_inbox_all(site: str = SHORE) -> str:
     """Envelopes of every vessel to one site."""
     return _of(site, "inbox/*")
@@ -180,12 +287,43 @@ def shore_image(vessel: str, site: str = SHORE) -> str:
     return _of(site, f"contact/{_name('vessel', vessel)}/image")
 
 
+def shore_coded(vessel: str, site: str = SHORE) -> str:
+    """A vessel's image in coded form that the site's c2 has accepted.
+
+    Record: coded_image. From: c2. To: watchers. Delivery: plain, priority 5.
+    """
+    return _of(site, f"contact/{_name('vessel', vessel)}/coded")
+
+
+def shore_coded_all(site: str = SHORE) -> str:
+    """Coded images of every vessel that a site's c2 has accepted."""
+    return _of(site, "contact/*/coded")
+
+
 def shore_decision(vessel: str, site: str = SHORE) -> str:
     """A vessel's decision that the site's c2 has stored.
 
     Record: decision. From: c2. To: watchers. Delivery: plain, priority 5.
     """
     return _of(site, f"contact/{_name('vessel', vessel)}/decision")
+
+
+def shore_status(vessel: str, site: str = SHORE) -> str:
+    """The latest status of a vehicle that the site's c2 has received from a vessel. It is not stored.
+
+    Record: received_status. From: c2. To: console, watchers. Delivery: plain, priority 5.
+    """
+    return _of(site, f"status/{_name('vessel', vessel)}")
+
+
+def shore_status_all(site: str = SHORE) -> str:
+    """Statuses of the vehicles of every vessel at one site."""
+    return _of(site, "status/*")
+
+
+def shore_status_everywhere() -> str:
+    """Statuses of the vehicles of every vessel at every site."""
+    return f"{ROOT}/*/status/*"
 
 
 def shore_image_all(site: str = SHORE) -> str:
@@ -201,6 +339,28 @@ def shore_decision_all(site: str = SHORE) -> str:
 def shore_contact_all(site: str = SHORE) -> str:
     """All records of every vessel that a site's c2 has stored."""
     return _of(site, "contact/*/*")
+
+
+def shore_contact_everywhere() -> str:
+    """All records of every vessel that the c2 of any site has stored, for routers."""
+    return f"{ROOT}/*/contact/*/*"
+
+
+def json_mirror_all(site: str = SHORE) -> str:
+    """JSON forms of all records that a site's c2 publishes, if its `json_mirror` is set."""
+    return _of(site, "json/**")
+
+
+def json_mirror(key: str) -> str:
+    """Return the key of the JSON form of a record that c2 publishes: `json` after the site.
+
+    Raises:
+        BadInputError: It is not a key below a platform.
+    """
+    parts = key.split("/")
+    if len(parts) < 4 or not key.startswith(f"{ROOT}/"):
+        raise BadInputError(key, "", key, f"{ROOT}/{{site}}/…")
+    return "/".join([*parts[:3], "json", *parts[3:]])
 
 
 def tasking_advice(vessel: str, site: str = SHORE) -> str:
@@ -252,6 +412,11 @@ def tasking_state(vessel: str, site: str = SHORE) -> str:
 def tasking_state_all(site: str = SHORE) -> str:
     """Progress of comments and commands to every vessel."""
     return _of(site, "tasking/*/state")
+
+
+def tasking_state_everywhere() -> str:
+    """Progress of comments and commands at every site, for routers."""
+    return f"{ROOT}/*/tasking/*/state"
 
 
 def health(platform: str, service: str) -> str:

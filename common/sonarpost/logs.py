@@ -20,7 +20,7 @@ from functools import lru_cache
 from typing import Literal
 
 from sonarpost.errors import PayloadError
-from sonarpost.messages import Relayed
+from sonarpost.messages import ImagePart, Relayed
 from sonarpost.wire import unpack_map
 
 LogFormat = Literal["text", "json"]
@@ -71,12 +71,15 @@ _context: ContextVar[log_context | None] = ContextVar("log_context", default=Non
 def context_of_payload(payload: bytes) -> dict[str, str]:
     """Return `vehicle`, `image_id` and `contact_id` of a record as far as its payload holds them.
 
-    The record inside a `relayed` record is read as well. An invalid payload gives no fields.
+    The record inside a `relayed` record and the short names of a `part` are read as well. An invalid payload gives no
+    fields.
     """
     fields = _unpacked(payload)
     inner = fields.get("payload")
     if fields.get("type") == Relayed.TYPE and isinstance(inner, bytes):
         fields = _unpacked(inner)
+    if fields.get("type") == ImagePart.TYPE:
+        fields = {"vehicle_id": fields.get("u"), "image_id": fields.get("i")}
     contact = fields.get("contact")
     contact = contact if isinstance(contact, dict) else {}
     found = {

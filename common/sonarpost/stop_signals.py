@@ -1,14 +1,16 @@
-"""Signals that end a process: SIGINT and SIGTERM, and the end of its parent."""
+"""End of a process: SIGINT, SIGTERM, the end of its parent, and the exit itself."""
 
 from __future__ import annotations
 
 import ctypes
+import logging
 import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NoReturn
 
 EXIT_WITH_PARENT = "SONARPOST_EXIT_WITH_PARENT"
 EXIT_ORPHANED = 1
@@ -53,3 +55,17 @@ def exit_with_parent() -> None:
     if os.getppid() != int(parent):
         # The parent ended before prctl took effect.
         os._exit(EXIT_ORPHANED)
+
+
+def exit_process(status: int) -> NoReturn:
+    """End this process after its output is written; threads of libraries are not waited for.
+
+    At the usual end of the interpreter, a thread of Zenoh that waits for the interpreter's lock aborts the process.
+    """
+    logging.shutdown()
+    try:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    except BrokenPipeError:
+        pass  # the reader has closed the output
+    os._exit(status)

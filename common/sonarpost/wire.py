@@ -31,9 +31,9 @@ def encoding_of(record_type: type[Record]) -> str:
 def encode(record: Record) -> bytes:
     """Return the record as msgpack: `type`, `v`, then its fields in the order of their definition.
 
-    Equal records give equal bytes on every platform.
+    Equal records give equal bytes on every platform. A sparse record omits fields with their default value.
     """
-    fields = {"type": record.TYPE, "v": record.VERSION, **record.model_dump()}
+    fields = {"type": record.TYPE, "v": record.VERSION, **record.model_dump(exclude_defaults=record.SPARSE)}
     packed: bytes = msgpack.packb(fields, use_bin_type=True)
     return packed
 
@@ -69,10 +69,12 @@ def decode(record_type: type[R], payload: bytes, where: str) -> R:
         PayloadError: The payload is not a valid record of this type.
     """
     fields = unpack_map(payload, where)
-    for name, expected in (("type", record_type.TYPE), ("v", record_type.VERSION)):
-        # In Python 1.0 and true equal 1; other languages distinguish them.
-        if type(fields.get(name)) is not type(expected) or fields[name] != expected:
-            raise PayloadError(where, name, fields.get(name), repr(expected))
+    if fields.get("type") != record_type.TYPE:
+        raise PayloadError(where, "type", fields.get("type"), repr(record_type.TYPE))
+    version, versions = fields.get("v"), range(record_type.OLDEST, record_type.VERSION + 1)
+    # In Python 1.0 and true equal 1; other languages distinguish them.
+    if type(version) is not int or version not in versions:
+        raise PayloadError(where, "v", version, " or ".join(map(str, versions)))
     return validated(record_type, fields, where)
 
 

@@ -29,7 +29,7 @@ from sonarpost.errors import BadInputError, ConfigError, DeliveryError, Sonarpos
 from sonarpost.messages import Health, ServiceState
 from sonarpost.monitoring.service_manager import ServiceManager
 from sonarpost.security.tls_files import TlsMonitor
-from sonarpost.stop_signals import exit_with_parent, stop_on_signals, wait_until_set
+from sonarpost.stop_signals import exit_process, exit_with_parent, stop_on_signals, wait_until_set
 
 log = logging.getLogger(__name__)
 
@@ -308,4 +308,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    exit_process(main())

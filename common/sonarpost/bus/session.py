@@ -12,22 +12,26 @@ import zenoh
 from sonarpost.bus.connectivity import probe_endpoint
 from sonarpost.config import TlsConfig
 from sonarpost.logs import kv
+from sonarpost.security.router_config import dropped_replies
 
 log = logging.getLogger(__name__)
 
-OPEN_TIMEOUT_MS = 1000
+OPEN_TIMEOUT_MS = (1000, 2000, 4000)
+"""Time-outs of the first, second and all later attempts: TLS on a busy computer may take longer than a second."""
 WAIT_BEFORE_DROP_US = 50_000
 RETRY_S = (0.1, 0.2, 0.5, 1.0)
 
 
-def client_config(endpoints: Sequence[str], tls: TlsConfig | None = None) -> zenoh.Config:
+def client_config(endpoints: Sequence[str], tls: TlsConfig | None = None, attempt: int = 2) -> zenoh.Config:
     """Return the configuration of a service: a client of its platform's router.
 
     Args:
         endpoints: The router's endpoints.
         tls: The host's own certificate for `tls/...` endpoints, where both sides present one.
+        attempt: Number of the attempt to open a session, from 0; it selects one of `OPEN_TIMEOUT_MS`.
     """
-    connect = {"endpoints": list(endpoints), "timeout_ms": OPEN_TIMEOUT_MS}
+    timeout_ms = OPEN_TIMEOUT_MS[min(attempt, len(OPEN_TIMEOUT_MS) - 1)]
+    connect = {"endpoints": list(endpoints), "timeout_ms": timeout_ms}
     return _config({"mode": "client", "listen": {"endpoints": []}, "connect": connect}, tls)
 
 
@@ -60,6 +64,7 @@ def _config(settings: dict[str, object], tls: TlsConfig | None) -> zenoh.Config:
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         # On one host, shared memory would bypass the network link and hide its behaviour.
         "transport": {"shared_memory": {"enabled": False}, "link": link},
+        "qos": dropped_replies(),
     }
     return zenoh.Config.from_json5(json.dumps(settings | common))
 
@@ -93,7 +98,7 @@ def open_with_retry(
     while not stop.is_set():
         endpoint = endpoints[attempt % len(endpoints)]
         try:
-            return zenoh.open(client_config([endpoint], tls))
+            return zenoh.open(client_config([endpoint], tls, attempt // len(endpoints)))
         except zenoh.ZError as error:
             if attempt == 0:
                 # Zenoh reports a refused certificate as a time-out.

@@ -10,7 +10,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Final
 
-from sonarpost.cli.c2.stored import EXIT_INCOMPLETE, RecordFilter, add_filters, folder_of
+from sonarpost.archive.reader import as_folder
+from sonarpost.cli.c2.stored import EXIT_INCOMPLETE, RecordFilter, add_filters, archive_of
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers, add_command, make_output_folder, printable
 from sonarpost.errors import BadInputError
@@ -55,8 +56,8 @@ def add_parser(subparsers: Subparsers) -> None:
 def run_export(parsed: argparse.Namespace) -> int:
     """Write the data set; return 0, or 1 if there is no verdict or a stored file was rejected."""
     record_filter = RecordFilter.of(parsed)
-    folder = folder_of(parsed)
-    with ProgressDisplay(step=f"reading {folder}") as display:
+    place = archive_of(parsed)
+    with ProgressDisplay(step=f"reading {place}") as display, as_folder(place) as folder:
         stored = load_contacts(folder)
         contacts = [
             each
@@ -79,7 +80,7 @@ def run_export(parsed: argparse.Namespace) -> int:
     if not images:
         reasons = ", ".join(f"{name.replace('_', ' ')} {states[name]}" for name in _COUNTED)
         print(
-            f"sonarpost dataset: {folder}: no contact with a usable verdict ({reasons}); nothing is written",
+            f"sonarpost dataset: {place}: no contact with a usable verdict ({reasons}); nothing is written",
             file=sys.stderr,
         )
     return EXIT_INCOMPLETE if problems or not images else 0

@@ -8,11 +8,13 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
+from typing import NoReturn
 
 from sonarpost import __version__
 from sonarpost.cli.parsing.commands import COMMANDS, EXTRAS, RENAMED_COMMANDS
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.errors import SonarpostError
+from sonarpost.stop_signals import exit_process
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
@@ -22,6 +24,11 @@ _STATUS = (
     "Exit status: 0 success; 1 done, with a result that needs attention (the help of the command says which); "
     "2 invalid input, one line on standard error; 130 interrupted by Ctrl-C."
 )
+
+
+def run_command() -> NoReturn:
+    """Run the command of the command line and end the process with its exit status."""
+    exit_process(main())
 
 
 def parser(command: str | None = None) -> CommandParser:
@@ -119,4 +126,4 @@ def _failed(prog: str, error: Exception, text: str = "") -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command()

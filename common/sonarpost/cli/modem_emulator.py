@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from sonarpost.cli.shared import Subparsers, in_new_folder
 from sonarpost.errors import ConfigError
-from sonarpost.modem.micromodem import RATES
+from sonarpost.modem.registry import modem_driver
 from sonarpost.simulation.channel.config import EmulatorConfig
 from sonarpost.simulation.channel.emulator import ChannelEmulator
 from sonarpost.simulation.channel.parameters import PRESETS, build_parameters, config_error, read_parameters
@@ -177,7 +177,8 @@ def _airtime(text: str) -> tuple[int, float]:
     try:
         return int(rate), float(seconds)
     except ValueError as error:
-        expected = f"RATE=SECONDS with a rate {min(RATES)}..{max(RATES)}"
+        rates = modem_driver().capabilities.rates
+        expected = f"RATE=SECONDS with a rate {min(rates)}..{max(rates)}"
         raise ConfigError("command line", "--airtime", text, expected) from error
 
 

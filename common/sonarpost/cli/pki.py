@@ -53,6 +53,10 @@ def add_parser(subparsers: Subparsers) -> None:
     issue.add_argument("--role", choices=ROLES, required=True, help="role, which determines the rights at routers")
     _add_certificate_options(issue)
 
+    prepare = _add_action(actions, "prepare", run_prepare, "let routers admit platforms that get certificates later")
+    prepare.add_argument("platforms", nargs="+", metavar="PLATFORM", help="names of the platforms")
+    prepare.add_argument("--role", choices=ROLES, required=True, help="role that their certificates will have")
+
     renew = _add_action(actions, "renew", run_renew, "issue a new key and certificate under the present name")
     renew.add_argument("platform", help="name of the platform")
     _add_certificate_options(renew)
@@ -148,6 +152,22 @@ def _add_router_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--site", action="append", dest="sites", metavar="NAME", help=f"name of the shore site in keys ({SHORE})"
     )
+    parser.add_argument(
+        "--other-vessel",
+        action="append",
+        dest="other_vessels",
+        metavar="NAME",
+        help="vessel whose acoustic frames this lead vessel merges; can be repeated",
+    )
+    parser.add_argument("--lead-vessel", default="", metavar="NAME", help="lead vessel that merges the acoustic frames")
+    parser.add_argument(
+        "--thin-link",
+        action="store_true",
+        help="for a link of a few kB/s, at both routers: compress it; a vessel's router also sends other platforms "
+        "only every second health report of a service, one in 10 s with the default health_interval_s of 5 s. "
+        "Console and `sonarpost status` show a service as silent or stale after 15 s without one. Images, decisions "
+        "and commands are all sent",
+    )
     parser.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: standard output)")
     parser.add_argument("--replace", action="store_true", help="overwrite an existing file")
 
@@ -171,8 +191,21 @@ def run_init(args: argparse.Namespace) -> int:
 
 def run_issue(args: argparse.Namespace) -> int:
     """Issue a certificate; return 0."""
-    _show(_fleet(args).issue(args.platform, args.role, args.hosts or (), args.days, args.out))
-    print(f"To admit it, {UPDATE_ROUTERS}.")
+    fleet = _fleet(args)
+    bundle = fleet.issue(args.platform, args.role, args.hosts or (), args.days, args.out)
+    _show(bundle)
+    if bundle.entry.common_name in {name.common_name for name in fleet.index().prepared}:
+        print("Routers that were configured after `sonarpost pki prepare` admit it.")
+    else:
+        print(f"To admit it, {UPDATE_ROUTERS}.")
+    return 0
+
+
+def run_prepare(args: argparse.Namespace) -> int:
+    """Add names that routers admit before their certificates are issued; return 0."""
+    _fleet(args).prepare(args.platforms, args.role)
+    print(f"prepared   {', '.join(args.platforms)}")
+    print(f"Once, {UPDATE_ROUTERS}. `sonarpost pki issue` of these names then needs neither.")
     return 0
 
 
@@ -224,6 +257,9 @@ def run_router_config(args: argparse.Namespace) -> int:
         files=args.files,
         sites=tuple(args.sites or (SHORE,)),
         open_local=args.open_local,
+        other_vessels=tuple(args.other_vessels or ()),
+        lead_vessel=args.lead_vessel,
+        thin_link=args.thin_link,
     )
     text = router_json5(_fleet(args).index(), options, time.time())
     if args.out is None:

@@ -21,7 +21,7 @@ from rich.text import Text
 
 from sonarpost.cli.shared import Subparsers, add_router_options, aligned, printable, router_of
 from sonarpost.errors import ConfigError
-from sonarpost.monitoring.fleet import FleetState, FleetWatcher, ServiceStatus
+from sonarpost.monitoring.fleet import FleetState, FleetWatcher, ServiceStatus, VehicleState
 from sonarpost.stop_signals import stop_on_signals
 
 EXIT_NOT_OK = 1
@@ -40,7 +40,8 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = subparsers.add_parser(
         "status",
         help="show the services of all platforms, live",
-        description="Show the services of all platforms at a router: state, queues, link, disk. Ctrl-C ends it.",
+        description="Show the services of all platforms at a router: state, queues, link, disk; and the position of "
+        "each vehicle that reports its status. Ctrl-C ends it.",
     )
     add_router_options(parser)
     parser.add_argument("--once", action="store_true", help="print once; exit status 0 if all services are ok, else 1")
@@ -254,13 +255,14 @@ def table(state: FleetState, rows: Sequence[Row], router: str) -> RenderableType
         previous = platform
         whole.add_row(*(Text(printable(cell)) for cell in cells), style=_STYLES[row.severity])
     headline = Text(_headline(state, router), style="" if state.connected else "bold red")
-    return Group(headline, whole, *(Text(line, style="red", overflow="fold") for line in _details(rows)))
+    vehicles = (Text(line, overflow="fold") for line in _vehicle_lines(state))
+    return Group(headline, whole, *vehicles, *(Text(line, style="red", overflow="fold") for line in _details(rows)))
 
 
 def plain_text(state: FleetState, rows: Sequence[Row], router: str) -> str:
     """Return the table as plain text, with columns aligned by spaces."""
     lines = aligned([HEADINGS, *([printable(cell) for cell in row.cells] for row in rows)])
-    return "\n".join([_headline(state, router), *lines, *_details(rows)])
+    return "\n".join([_headline(state, router), *lines, *_vehicle_lines(state), *_details(rows)])
 
 
 def as_json(state: FleetState, rows: Sequence[Row], time_utc: str) -> str:
@@ -284,7 +286,15 @@ def as_json(state: FleetState, rows: Sequence[Row], time_utc: str) -> str:
                 "gauges": health.gauges if health else {},
             }
         )
-    whole = {"time_utc": time_utc, "connected": state.connected, "rejected": state.rejected, "services": services}
+    vehicles = [{**one.received.model_dump(), "age_s": round(one.age_s, 1)} for one in state.vehicles]
+    whole = {
+        "time_utc": time_utc,
+        "connected": state.connected,
+        "rejected": state.rejected,
+        "services": services,
+        "vehicles": vehicles,
+        "ranges": [{**record.model_dump(), "age_s": round(age_s, 1)} for record, age_s in state.ranges],
+    }
     return json.dumps(whole)
 
 
@@ -295,6 +305,37 @@ def _headline(state: FleetState, router: str) -> str:
     platforms = len({status.platform for status in state.services})
     rejected = f", {state.rejected} records rejected" if state.rejected else ""
     return f"{router}: {alive} of {len(state.services)} services alive on {platforms} platforms{rejected}"
+
+
+def _vehicle_lines(state: FleetState) -> list[str]:
+    """Return a line for each vehicle with a status, and one for each measured distance, with their ages."""
+    ranges = [
+        f"{one.vehicle_id}: {one.distance_m:.0f} m from {one.vessel_id}, measured {age_text(age_s)} ago"
+        for one, age_s in state.ranges
+    ]
+    return [printable(text) for text in (*(vehicle_text(one) for one in state.vehicles), *ranges)]
+
+
+def vehicle_text(vehicle: VehicleState) -> str:
+    """Return the last status of a vehicle on one line, values that are not known left out."""
+    received, status = vehicle.received, vehicle.received.status
+    at = datetime.fromtimestamp(status.time_utc_s, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+    position = "no position"
+    if status.lat_deg is not None and status.lon_deg is not None:
+        position = f"{status.lat_deg:.5f}, {status.lon_deg:.5f} at {at}"
+    values = (
+        ("heading", status.heading_deg, "°", 0),
+        ("speed", status.speed_mps, " m/s", 1),
+        ("depth", status.depth_m, " m", 1),
+        ("altitude", status.altitude_m, " m", 1),
+        ("battery", None if status.battery is None else 100 * status.battery, " %", 0),
+        ("images waiting", status.images_waiting, "", 0),
+    )
+    known = [f"{name} {value:.{decimals}f}{unit}" for name, value, unit, decimals in values if value is not None]
+    if status.disk_free_bytes is not None:
+        known.append(f"disk {bytes_text(status.disk_free_bytes)}")
+    heard = f"received {age_text(vehicle.age_s)} ago by {received.vessel_id}"
+    return f"{received.vehicle_id}: " + ", ".join([position, *known, heard])
 
 
 def _details(rows: Sequence[Row]) -> list[str]:

@@ -1,4 +1,4 @@
-"""State of all services of all platforms: last health record, its age, and liveliness.
+"""State of all services of all platforms: last health record, its age, and liveliness. Last status of each vehicle.
 
 `FleetTracker` holds the state, with the time as an argument; `FleetWatcher` updates it from a router. Ages are measured
 with the clock of this host from the arrival of a record, because the clocks of platforms differ.
@@ -20,12 +20,14 @@ from sonarpost.bus.session import open_with_retry
 from sonarpost.config import TlsConfig
 from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.logs import kv
-from sonarpost.messages import Health
+from sonarpost.messages import Health, ReceivedStatus, VehicleRange
 
 log = logging.getLogger(__name__)
 
 MAX_SERVICES: Final = 1000
 """Limit of the memory that publishers can use with invented names."""
+
+MAX_VEHICLES: Final = 200
 
 Name = tuple[str, str]
 
@@ -50,6 +52,19 @@ class ServiceStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class VehicleState:
+    """Last status of a vehicle as a vessel received it.
+
+    Attributes:
+        received: The record.
+        age_s: Time since its arrival at this host.
+    """
+
+    received: ReceivedStatus
+    age_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class FleetState:
     """State of the fleet at one moment.
 
@@ -57,11 +72,15 @@ class FleetState:
         services: Services, ordered by platform and name.
         connected: Whether a router is reached.
         rejected: Number of invalid records since the start.
+        vehicles: Vehicles with a status since the start, ordered by vessel and name.
+        ranges: Last measured distances with the time since their arrival, in the same order.
     """
 
     services: tuple[ServiceStatus, ...]
     connected: bool
     rejected: int
+    vehicles: tuple[VehicleState, ...] = ()
+    ranges: tuple[tuple[VehicleRange, float], ...] = ()
 
 
 class FleetTracker:
@@ -77,6 +96,8 @@ class FleetTracker:
         self._health: dict[Name, Health] = {}
         self._last_s: dict[Name, float] = {}
         self._alive: frozenset[Name] = frozenset()
+        self._vehicles: dict[Name, tuple[ReceivedStatus, float]] = {}
+        self._ranges: dict[Name, tuple[VehicleRange, float]] = {}
         self._connected = False
         self._rejected = 0
 
@@ -103,6 +124,48 @@ class FleetTracker:
                 self._rejected += 1
             log.warning("Health record rejected", extra=kv(reason=str(error)))
 
+    def add_status(self, key: str, payload: bytes, now_s: float) -> None:
+        """Add the status of a vehicle; an invalid one is logged, counted and dropped.
+
+        Args:
+            key: Key of the record, on the vessel or at a shore site; its vessel must be that of the record.
+            payload: The record.
+            now_s: Time of arrival, monotonic.
+        """
+        try:
+            record = wire.decode(ReceivedStatus, payload, key)
+            at_shore = key.split("/")[-2:] == ["status", record.vessel_id]
+            if key != keys.acoustic_status(record.vessel_id) and not at_shore:
+                raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
+            name = (record.vessel_id, record.vehicle_id)
+            with self._lock:
+                if name not in self._vehicles and len(self._vehicles) >= MAX_VEHICLES:
+                    raise PayloadError(key, "vehicle_id", record.vehicle_id, f"no more than {MAX_VEHICLES} vehicles")
+                known = self._vehicles.get(name)
+                # At a shore site a record can arrive twice, directly and later through the relay.
+                if known is None or known[0] != record:
+                    self._vehicles[name] = (record, now_s)
+        except BadInputError as error:
+            with self._lock:
+                self._rejected += 1
+            log.warning("Status of a vehicle rejected", extra=kv(reason=str(error)))
+
+    def add_range(self, key: str, payload: bytes, now_s: float) -> None:
+        """Add the measured distance of a vehicle; an invalid one is logged, counted and dropped. As `add_status`."""
+        try:
+            record = wire.decode(VehicleRange, payload, key)
+            if key != keys.acoustic_range(record.vessel_id):
+                raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
+            name = (record.vessel_id, record.vehicle_id)
+            with self._lock:
+                if name not in self._ranges and len(self._ranges) >= MAX_VEHICLES:
+                    raise PayloadError(key, "vehicle_id", record.vehicle_id, f"no more than {MAX_VEHICLES} vehicles")
+                self._ranges[name] = (record, now_s)
+        except BadInputError as error:
+            with self._lock:
+                self._rejected += 1
+            log.warning("Distance of a vehicle rejected", extra=kv(reason=str(error)))
+
     def set_alive(self, tokens: Iterable[str] | None, now_s: float) -> None:
         """Set the keys of all present liveliness tokens; None if the router is not reached."""
         names: set[Name] = set()
@@ -126,7 +189,10 @@ class FleetTracker:
         """Return the state at `now_s`, monotonic."""
         with self._lock:
             services = tuple(self._status(name, now_s) for name in sorted(self._last_s))
-            return FleetState(services, self._connected, self._rejected)
+            statuses = [record_and_time for _, record_and_time in sorted(self._vehicles.items())]
+            vehicles = tuple(VehicleState(record, max(0.0, now_s - at_s)) for record, at_s in statuses)
+            ranges = tuple((record, max(0.0, now_s - at_s)) for _, (record, at_s) in sorted(self._ranges.items()))
+            return FleetState(services, self._connected, self._rejected, vehicles, ranges)
 
     def _status(self, name: Name, now_s: float) -> ServiceStatus:
         health = self._health.get(name)
@@ -177,6 +243,9 @@ class FleetWatcher:
         # A session that is not closed would keep the process from exiting.
         with session:
             session.declare_subscriber(keys.health_everywhere(), self._on_health)
+            for key in (keys.acoustic_status_everywhere(), keys.shore_status_everywhere()):
+                session.declare_subscriber(key, self._on_status)
+            session.declare_subscriber(keys.acoustic_range_everywhere(), self._on_range)
             while True:
                 self._poll(session)
                 if self._stop.wait(self._poll_s):
@@ -185,6 +254,14 @@ class FleetWatcher:
     def _on_health(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
             self.fleet.add(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic())
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self.fleet.add_status(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic())
+
+    def _on_range(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self.fleet.add_range(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic())
 
     def _poll(self, session: zenoh.Session) -> None:
         """Query the tokens; this also finds tokens that ended during a link cut."""

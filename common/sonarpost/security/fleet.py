@@ -85,14 +85,34 @@ class CertificateEntry(BaseModel):
         return (self.not_after_utc_s - now_utc_s) / DAY_S
 
 
+class PreparedName(BaseModel):
+    """A platform that routers admit before its certificate is issued.
+
+    Attributes:
+        platform: The platform; its first certificate has this common name.
+        role: Role that its certificate will have.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    platform: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")]
+    role: Role
+
+    @property
+    def common_name(self) -> str:
+        """Common name of the first certificate."""
+        return certificates.common_name(self.platform, 1)
+
+
 class FleetIndex(BaseModel):
-    """All certificates that the authority has issued, oldest first."""
+    """All certificates that the authority has issued, oldest first, and the names that it will issue."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     v: Literal[1] = 1
     fleet: Annotated[str, Field(min_length=1, max_length=64)]
     certificates: tuple[CertificateEntry, ...] = ()
+    prepared: tuple[PreparedName, ...] = ()
 
     @classmethod
     def read(cls, folder: Path) -> FleetIndex:
@@ -117,7 +137,9 @@ class FleetIndex(BaseModel):
 
     def to_bytes(self) -> bytes:
         """Return the content of the file."""
-        return (self.model_dump_json(indent=1) + "\n").encode()
+        # Versions without prepared names read an index that has none.
+        unused = set() if self.prepared else {"prepared"}
+        return (self.model_dump_json(indent=1, exclude=unused) + "\n").encode()
 
     def find(self, platform: str) -> CertificateEntry | None:
         """Return the newest certificate of a platform that is not revoked; it can have expired."""
@@ -135,10 +157,15 @@ class FleetIndex(BaseModel):
             raise PkiError("pki", "platform", platform, "a platform with a certificate that is not revoked")
         return entry
 
-    def allowed(self, role: Role) -> Sequence[CertificateEntry]:
-        """Return the newest certificate of each common name of a role that is not revoked."""
-        newest = {e.common_name: e for e in self.certificates if e.revoked_utc_s is None and e.role == role}
-        return sorted(newest.values(), key=lambda e: e.common_name)
+    def allowed(self, role: Role) -> Sequence[CertificateEntry | PreparedName]:
+        """Return the newest certificate of each common name of a role that is not revoked, and its prepared names."""
+        # A prepared name is in use, or revoked, once a certificate has it.
+        issued = {e.common_name for e in self.certificates}
+        found: dict[str, CertificateEntry | PreparedName] = {
+            name.common_name: name for name in self.prepared if name.role == role and name.common_name not in issued
+        }
+        found |= {e.common_name: e for e in self.certificates if e.revoked_utc_s is None and e.role == role}
+        return [found[name] for name in sorted(found)]
 
     def revoked_names(self) -> Sequence[str]:
         """Return all revoked common names."""
@@ -239,7 +266,8 @@ class Fleet:
         """Issue a certificate under a new common name: the platform, or its next generation after a revocation.
 
         Raises:
-            PkiError: The platform has a certificate that is not revoked (renew or revoke it), or `out` exists.
+            PkiError: The platform has a certificate that is not revoked (renew or revoke it), is prepared for another
+                role, or `out` exists.
             BadInputError: A name, a host, the passphrase or a file of the authority is invalid.
             OSError: A file cannot be written.
         """
@@ -250,7 +278,27 @@ class Fleet:
                 got = f"a valid certificate, {known.common_name}, serial {known.serial}"
                 raise PkiError("pki", platform, got, "none; `pki renew` extends it, `pki revoke` ends it")
             name = index.next_name(platform)
+            _check_prepared(next((known for known in index.prepared if known.platform == platform), None), role)
             return self._issue(index, name, platform, role, hosts, days, out or self.folder / ISSUED / name)
+
+    def prepare(self, platforms: Sequence[str], role: Role) -> None:
+        """Let the routers admit platforms whose certificates will be issued later, without a further restart.
+
+        Raises:
+            PkiError: A platform has had a certificate, or is prepared for another role.
+            BadInputError: A name is invalid.
+            OSError: The index cannot be written.
+        """
+        with self._locked():
+            index = self.index()
+            prepared = {name.platform: name for name in index.prepared}
+            for platform in platforms:
+                certificates.check_platform(platform)
+                if any(entry.platform == platform for entry in index.certificates):
+                    raise PkiError("pki", platform, "a platform with a certificate", "a new platform")
+                _check_prepared(prepared.get(platform), role)
+                prepared[platform] = PreparedName(platform=platform, role=role)
+            self._write(index.model_copy(update={"prepared": tuple(prepared.values())}))
 
     def renew(
         self,
@@ -373,6 +421,11 @@ class Fleet:
             yield
         finally:
             os.close(descriptor)
+
+
+def _check_prepared(known: PreparedName | None, role: Role) -> None:
+    if known is not None and known.role != role:
+        raise PkiError("pki", known.platform, role, f"{known.role}, the role for which it is prepared")
 
 
 def _existing(folder: Path) -> PkiError:

@@ -20,9 +20,10 @@ from pathlib import PurePosixPath
 from typing import Literal
 
 from sonarpost import keys
+from sonarpost.config import SERVICES
 from sonarpost.errors import BadInputError
 from sonarpost.security import fleet
-from sonarpost.security.fleet import CertificateEntry, FleetIndex, PkiError, Role
+from sonarpost.security.fleet import CertificateEntry, FleetIndex, PkiError, PreparedName, Role
 
 LEASE_MS = 3000
 # A message in transmission on a slow radio link takes longer than Zenoh's default of five seconds.
@@ -30,6 +31,10 @@ WAIT_BEFORE_CLOSE_US = 60_000_000
 # A record has at most 8 MiB; the difference is for Zenoh's headers.
 MAX_PAYLOAD_BYTES = 8 * 1024 * 1024
 MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES + 64 * 1024
+THIN_HEALTH_S = 7.5
+"""Shortest time between two health reports of a service on a thin link. With the default interval of 5 s, every second
+report passes, up to 2.5 s early or late. Console and `sonarpost status` show a service as silent or stale after
+15 s."""
 TLS_FOLDER = PurePosixPath("/etc/sonarpost/tls")
 PEER_ROLES: dict[Role, tuple[Role, ...]] = {
     "shore": ("vessel", "uuv", "console", "observer", "shore"),
@@ -63,6 +68,10 @@ class RouterOptions:
         files: Folder of ca.pem, certificate.pem and key.pem on the router's host.
         sites: Names of the shore site in keys.
         open_local: Whether `local` may be other than a loopback address.
+        other_vessels: Vessels that may deliver their frames to this lead vessel.
+        lead_vessel: Vessel that this one may deliver its frames to; empty for none.
+        thin_link: Compress the link to routers that have this option too. The router of a vessel also sends other
+            platforms only one health report of each of its services in `THIN_HEALTH_S`.
     """
 
     platform: str
@@ -72,6 +81,9 @@ class RouterOptions:
     files: PurePosixPath = TLS_FOLDER
     sites: Sequence[str] = (keys.SHORE,)
     open_local: bool = False
+    other_vessels: Sequence[str] = ()
+    lead_vessel: str = ""
+    thin_link: bool = False
 
 
 def router_json5(index: FleetIndex, options: RouterOptions, now_utc_s: float) -> str:
@@ -85,7 +97,8 @@ def router_json5(index: FleetIndex, options: RouterOptions, now_utc_s: float) ->
     head = [
         f"// Router of {entry.platform} ({entry.role}), fleet {index.fleet}.",
         f"// Written by `sonarpost pki router-config` on {datetime.fromtimestamp(now_utc_s, UTC):%Y-%m-%d %H:%M} UTC.",
-        "// Zenoh reads it at the start only: after `sonarpost pki issue` or `revoke`, write it again and restart.",
+        "// Zenoh reads it at the start only: after `sonarpost pki issue` of a name that is not in it, and after",
+        "// `sonarpost pki revoke`, write it again and restart.",
     ]
     if revoked := index.revoked_names():
         head.append("// Revoked and denied: " + ", ".join(revoked) + ".")
@@ -116,6 +129,7 @@ def _settings(index: FleetIndex, router: CertificateEntry, options: RouterOption
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
             "shared_memory": {"enabled": False},
+            "unicast": {"compression": {"enabled": options.thin_link}},
             "link": {
                 "protocols": ["tcp", "tls"],
                 "tx": {
@@ -126,6 +140,7 @@ def _settings(index: FleetIndex, router: CertificateEntry, options: RouterOption
                 "tls": tls,
             },
         },
+        "qos": dropped_replies(),
         "low_pass_filter": [
             {
                 "id": "records",
@@ -136,8 +151,45 @@ def _settings(index: FleetIndex, router: CertificateEntry, options: RouterOption
                 "size_limit": MAX_PAYLOAD_BYTES,
             }
         ],
-        "access_control": _access_control(index, router, options.sites),
+        "downsampling": _thinned_health(router) if options.thin_link else [],
+        "access_control": _access_control(index, router, options),
     }
+
+
+def _thinned_health(router: CertificateEntry) -> list[Json]:
+    """Return Zenoh's `downsampling` section: health of a vessel's services on its way to other platforms.
+
+    Zenoh keeps one time for each rule: with a wildcard, the report of one service would cause the reports of all others
+    to be dropped. Hence one rule for each service. A shore site sends no health to a vessel.
+    """
+    if router.role != "vessel":
+        return []
+    names = ("router", *SERVICES)
+    return [
+        {
+            "id": "health",
+            "flows": ["egress"],
+            "link_protocols": ["tls"],
+            "messages": ["put"],
+            "rules": [{"key_expr": keys.health(router.platform, name), "freq": 1 / THIN_HEALTH_S} for name in names],
+        }
+    ]
+
+
+def dropped_replies() -> Json:
+    """Return Zenoh's `qos` section: replies of c2 are dropped for a client that does not read them.
+
+    A reply has the congestion control of its query. With that of a query to c2 set to drop, a client that stops reading
+    cannot block the router. Replies are numbered and counted, so that the client notices a gap.
+    """
+    overwrite: Json = {
+        "id": "queries for stored records",
+        "messages": ["query"],
+        "key_exprs": [keys.shore_contact_everywhere(), keys.tasking_state_everywhere()],
+        "overwrite": {"congestion_control": "drop"},
+        "flows": ["ingress"],
+    }
+    return {"network": [overwrite]}
 
 
 def _check_endpoints(options: RouterOptions) -> None:
@@ -161,11 +213,11 @@ def _check_endpoints(options: RouterOptions) -> None:
 # Access control
 
 
-def _access_control(index: FleetIndex, router: CertificateEntry, sites: Sequence[str]) -> Json:
-    """Return Zenoh's `access_control` section: the platform's own services, and all certificates not revoked.
+def _access_control(index: FleetIndex, router: CertificateEntry, options: RouterOptions) -> Json:
+    """Return Zenoh's `access_control` section: the platform's own services, all admitted names.
 
     Raises:
-        PkiError: A platform of this role has no router.
+        PkiError: A platform of this role has no router, or a vessel that is named has no certificate.
     """
     if router.role not in PEER_ROLES:
         raise PkiError("pki", "role", router.role, "shore or vessel: only those have a router for other platforms")
@@ -177,8 +229,19 @@ def _access_control(index: FleetIndex, router: CertificateEntry, sites: Sequence
         if entry.platform != router.platform:
             peer: Json = {"cert_common_names": [entry.common_name], "link_protocols": ["tls"]}
             at_shore = router.role == "shore"
-            rules = _rules_at_shore(entry, sites) if at_shore else _rules_at_vessel(entry, router.platform, sites)
+            rules = (
+                _rules_at_shore(entry, options.sites)
+                if at_shore
+                else _rules_at_vessel(entry, router.platform, options.sites)
+            )
             grants.append((f"{entry.role} {entry.common_name}", peer, rules))
+    for name, rules in _rules_of_other_vessels(router, options).items():
+        entries = [entry for entry in index.allowed("vessel") if entry.platform == name != router.platform]
+        if not entries:
+            raise PkiError("router-config", "vessel", name, "another vessel of the fleet with a certificate")
+        for entry in entries:
+            named_vessel: Json = {"cert_common_names": [entry.common_name], "link_protocols": ["tls"]}
+            grants.append((f"vessel {entry.common_name}", named_vessel, rules))
     named = [(subject, number, rule) for subject, _, rules in grants for number, rule in enumerate(rules, start=1)]
     return {
         "enabled": True,
@@ -205,7 +268,7 @@ def _access_control(index: FleetIndex, router: CertificateEntry, sites: Sequence
     }
 
 
-def _rules_at_shore(entry: CertificateEntry, sites: Sequence[str]) -> list[Rule]:
+def _rules_at_shore(entry: CertificateEntry | PreparedName, sites: Sequence[str]) -> list[Rule]:
     """Return the rights of a certificate at the router of a shore site."""
     own = (keys.everything_of(entry.platform),)
     match entry.role:
@@ -225,20 +288,22 @@ def _rules_at_shore(entry: CertificateEntry, sites: Sequence[str]) -> list[Rule]
             return [("ingress", ("put", "liveliness_token"), own), ("egress", INTEREST, (keys.ANY,))]
         case "console":
             taskings = [(keys.tasking_advice_all(site), keys.tasking_command_all(site)) for site in sites]
-            return [*_reading(), *_sending(tuple(keys.below(key) for pair in taskings for key in pair))]
+            sent = tuple(keys.below(key) for pair in taskings for key in pair)
+            return [*_reading(), *_sending(sent), *_querying(_accepted(sites))]
         case "observer":
-            return _reading()
+            return [*_reading(), *_querying(_accepted(sites))]
         case "shore":
-            # Another shore site reads what this one has accepted.
-            accepted = tuple(keys.below(keys.shore_contact_all(site)) for site in sites)
-            return [("ingress", INTEREST, (keys.ANY,)), ("egress", ("put",), accepted)]
+            # Another shore site reads what this one has accepted from vessels.
+            contacts = tuple(keys.shore_contact_all(site) for site in sites)
+            published = tuple(keys.below(key) for key in contacts)
+            return [("ingress", INTEREST, (keys.ANY,)), ("egress", ("put",), published), *_querying(contacts)]
 
 
-def _rules_at_vessel(entry: CertificateEntry, vessel: str, sites: Sequence[str]) -> list[Rule]:
+def _rules_at_vessel(entry: CertificateEntry | PreparedName, vessel: str, sites: Sequence[str]) -> list[Rule]:
     """Return the rights of a certificate at the router of a vessel.
 
-    The shore can send advice and commands. It can neither send images or decisions as if they came from the vessel nor
-    read the vessel's internal records.
+    The shore can send advice and commands, and request codebooks. It can neither send images or decisions as if they
+    came from the vessel nor read the vessel's internal records.
     """
     match entry.role:
         case "shore":
@@ -252,6 +317,8 @@ def _rules_at_vessel(entry: CertificateEntry, vessel: str, sites: Sequence[str])
                 ("egress", ("put", "liveliness_token"), (keys.everything_of(vessel),)),
                 ("egress", ("reply", "declare_queryable", "declare_subscriber"), downward),
                 ("egress", ("query",), inboxes),
+                ("ingress", ("query",), (keys.codebook_all(vessel),)),
+                ("egress", ("reply", "declare_queryable"), (keys.codebook_all(vessel),)),
             ]
         case "console":
             # A console on the vessel sends decisions and commands, and receives advice.
@@ -267,6 +334,32 @@ def _rules_at_vessel(entry: CertificateEntry, vessel: str, sites: Sequence[str])
             return _reading()
 
 
+def _rules_of_other_vessels(router: CertificateEntry, options: RouterOptions) -> dict[str, list[Rule]]:
+    """Return the rights of the other vessels that are named, at the router of a vessel.
+
+    A vessel delivers frames to its own inbox at the lead vessel. Neither of them reads or sends anything else.
+
+    Raises:
+        PkiError: The router is not that of a vessel.
+    """
+    names = [*options.other_vessels, *([options.lead_vessel] if options.lead_vessel else [])]
+    if names and router.role != "vessel":
+        raise PkiError("router-config", "vessel", ", ".join(names), "none: only vessels exchange frames")
+    if len(set(names)) != len(names):
+        raise PkiError("router-config", "vessel", ", ".join(names), "each name once")
+    found: dict[str, list[Rule]] = {}
+    for name in options.other_vessels:
+        inbox = (keys.below(keys.vessel_frames(router.platform, name)),)
+        found[name] = [("ingress", ("query",), inbox), ("egress", ("reply", "declare_queryable"), inbox)]
+    if options.lead_vessel:
+        inbox = (keys.below(keys.vessel_frames(options.lead_vessel, router.platform)),)
+        found[options.lead_vessel] = [
+            ("egress", ("query",), inbox),
+            ("ingress", ("reply", "declare_queryable"), inbox),
+        ]
+    return found
+
+
 def _reading() -> list[Rule]:
     return [("ingress", INTEREST, (keys.ANY,)), ("egress", ("put", "liveliness_token"), (keys.everything(),))]
 
@@ -276,6 +369,18 @@ def _sending(expressions: tuple[str, ...]) -> list[Rule]:
         ("ingress", ("query", "put"), expressions),
         ("egress", ("reply", "declare_queryable", "declare_subscriber"), expressions),
     ]
+
+
+def _querying(expressions: tuple[str, ...]) -> list[Rule]:
+    return [
+        ("ingress", ("query",), expressions),
+        ("egress", ("reply", "declare_queryable"), expressions),
+    ]
+
+
+def _accepted(sites: Sequence[str]) -> tuple[str, ...]:
+    """Return the keys on which the c2 of a site replies to queries."""
+    return tuple(key for site in sites for key in (keys.shore_contact_all(site), keys.tasking_state_all(site)))
 
 
 def _inbox_queryables(sites: Sequence[str]) -> tuple[str, ...]:

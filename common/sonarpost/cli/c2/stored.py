@@ -1,4 +1,4 @@
-"""`sonarpost c2 ls`, `get` and `export`: list, copy and export the records in the c2 service's folder."""
+"""`sonarpost c2 ls`, `get` and `export`: list, copy and export the records in the archive of c2."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import re
 import sys
 import time
 from collections.abc import Iterable, Sequence
-from contextlib import closing
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,24 +20,39 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sonarpost.archive.shore_files import find_image, image_paths
-from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, TaskingRow
+from sonarpost.archive.reader import ArchivePlace, as_folder, open_reader, place_of, read_image_files
+from sonarpost.archive.shore_files import find_image
+from sonarpost.archive.shore_index import DecisionRow, ImageRow, TaskingRow
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers, in_new_folder, make_output_folder, printable, time_text
 from sonarpost.config import load
-from sonarpost.errors import BadInputError, ConfigError, StoredFileError
-from sonarpost.export.contacts import ExportContact, load_contacts, match_start_time
+from sonarpost.errors import BadInputError, ConfigError, DeliveryError
+from sonarpost.export.contacts import ContactSet, ExportContact, load_contacts, match_start_time
 from sonarpost.export.cot import cot_events
 from sonarpost.export.cot_sender import CotSender, TlsFiles
+from sonarpost.export.geopackage import write_geopackage
 from sonarpost.export.kml import write_kml, write_kmz
+from sonarpost.export.reports import write_caris_text, write_mine_report
 from sonarpost.export.tables import write_csv, write_geojson
+from sonarpost.export.tak import write_data_package
 from sonarpost.export.text import probabilities_text
 from sonarpost.files import write_atomically
 
 DEMO_IMAGES = Path("demo-out/shore/images")
 SHORE_CONFIG = Path("/etc/sonarpost/shore.toml")
 PIPED_WIDTH = 160
-WRITERS = {"geojson": write_geojson, "kml": write_kml, "kmz": write_kmz, "csv": write_csv}
+WRITERS = {
+    "geojson": write_geojson,
+    "kml": write_kml,
+    "kmz": write_kmz,
+    "csv": write_csv,
+    "gpkg": write_geopackage,
+    "tak.zip": write_data_package,
+    "caris.txt": write_caris_text,
+    "app11-like.txt": write_mine_report,
+}
+"""End of a file name -> function that writes the file."""
+FORMER_OPTIONS = ("geojson", "kml", "kmz", "csv")
 EXIT_INCOMPLETE = 1
 
 _AGO = re.compile(r"(\d+(?:\.\d+)?)([smhd])")
@@ -94,7 +109,9 @@ def add_actions(actions: Subparsers) -> None:
     _add_archive(get)
     get.set_defaults(run=run_get)
 
-    export = actions.add_parser("export", help="write GeoJSON, KML, KMZ or CSV, or send Cursor-on-Target events")
+    export = actions.add_parser(
+        "export", help="write GeoJSON, KML, KMZ, CSV, GeoPackage, TAK packages or text, or send Cursor-on-Target events"
+    )
     add_filters(export)
     export.add_argument(
         "--out",
@@ -102,9 +119,9 @@ def add_actions(actions: Subparsers) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="file to write, named *.geojson, *.kml, *.kmz or *.csv; can be repeated",
+        help="file to write, named *." + ", *.".join(WRITERS) + "; can be repeated",
     )
-    for name in WRITERS:
+    for name in FORMER_OPTIONS:
         export.add_argument(f"--{name}", type=Path, help=argparse.SUPPRESS)  # former spellings of --out
     export.add_argument("--cot", metavar="URL", help="send events to tcp://host:port, tls://… or udp://…")
     for name in ("ca", "certificate", "key"):
@@ -119,37 +136,41 @@ def _add_archive(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
         "--archive",
-        type=Path,
         metavar="DIR",
-        help=f"folder of c2 (default: {DEMO_IMAGES} if there is one, else that of {SHORE_CONFIG}, else out)",
+        help=f"folder of c2, or address of its database, postgresql://USER@HOST/NAME (default: {DEMO_IMAGES} if there"
+        f" is one, else that of {SHORE_CONFIG}, else out)",
     )
-    where.add_argument("--out-dir", dest="archive", type=Path, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
-    where.add_argument("--config", type=Path, metavar="FILE", help="TOML file of the shore site; its out_dir is used")
+    where.add_argument("--out-dir", dest="archive", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
+    where.add_argument(
+        "--config", type=Path, metavar="FILE", help="TOML file of the shore site; its database or out_dir is used"
+    )
 
 
-def folder_of(parsed: argparse.Namespace) -> Path:
-    """Return the folder of c2 that the options select; one that they do not name is printed on standard error.
+def archive_of(parsed: argparse.Namespace) -> ArchivePlace:
+    """Return the archive of c2 that the options select; one that they do not name is printed on standard error.
 
     Raises:
         ConfigError: The configuration file is invalid.
     """
     if parsed.archive is not None:
-        return Path(parsed.archive)
+        return place_of(parsed.archive, "c2 --archive")
     path: Path | None = parsed.config
-    folder = DEMO_IMAGES
+    place: ArchivePlace = DEMO_IMAGES
     if path is None and not DEMO_IMAGES.is_dir():
         path = SHORE_CONFIG if SHORE_CONFIG.is_file() else None
-        folder = Path("out")
+        place = Path("out")
     if path is not None:
         # The import contract does not allow a static import of a service here.
         model = importlib.import_module("sonarpost.services.c2.config").C2Config
-        folder = load(path, "c2", model, os.environ)[1].out_dir
-    print(f"sonarpost c2: folder {folder}", file=sys.stderr)
-    return folder
+        config = load(path, "c2", model, os.environ)[1]
+        place = config.database_address() or config.out_dir
+    noun = "folder" if isinstance(place, Path) else "database"
+    print(f"sonarpost c2: {noun} {place}", file=sys.stderr)
+    return place
 
 
 def add_filters(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `folder_of` and `RecordFilter`: the folder of c2, --vessel, --vehicle and --since."""
+    """Add the options of `archive_of` and `RecordFilter`: the archive of c2, --vessel, --vehicle and --since."""
     _add_archive(parser)
     parser.add_argument("--vessel", metavar="NAME", help="only this vessel")
     parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle")
@@ -180,7 +201,7 @@ def since_of(text: str | None, now_utc_s: float | None = None) -> float:
 def run_ls(parsed: argparse.Namespace) -> int:
     """Print the table of images, or of commands and comments; return 0."""
     record_filter = RecordFilter.of(parsed)
-    with closing(ShoreIndex(folder_of(parsed), writable=False)) as index:
+    with open_reader(archive_of(parsed)) as index:
         if parsed.tasking:
             _print_tasking(index.tasking(), record_filter, as_json=parsed.json)
             return 0
@@ -307,15 +328,10 @@ def _print_table(headings: Sequence[str], rows: Sequence[Sequence[str]], noun: s
 
 def run_get(parsed: argparse.Namespace) -> int:
     """Copy the files of an image and print their paths; return 0."""
-    folder = folder_of(parsed)
-    with closing(ShoreIndex(folder, writable=False)) as index:
+    place = archive_of(parsed)
+    with open_reader(place) as index:
         row = find_image(index.images(), parsed.picture, parsed.vessel, parsed.version)
-    copies = []
-    for path in image_paths(folder, row):
-        try:
-            copies.append((parsed.out / path.name, path.read_bytes()))
-        except OSError as error:
-            raise StoredFileError(str(path), "", error.strerror or str(error), "a readable file of c2") from error
+    copies = [(parsed.out / name, content) for name, content in read_image_files(place, row).items()]
     make_output_folder(parsed.out)
     for path, data in copies:
         write_atomically(path, data)
@@ -332,9 +348,21 @@ def run_export(parsed: argparse.Namespace) -> int:
     if not outputs and parsed.cot is None:
         raise ConfigError("c2 export", "", "no output", "--out FILE or --cot URL")
     record_filter = RecordFilter.of(parsed)
-    folder = folder_of(parsed)
-    with ProgressDisplay(step=f"reading {folder}"):
-        contacts = load_contacts(folder)
+    place = archive_of(parsed)
+    with ExitStack() as stack:
+        with ProgressDisplay(step=f"reading {place}"):
+            # Exports need no TIFF files.
+            contacts = load_contacts(stack.enter_context(as_folder(place, (".json", ".png"))))
+        return _write_contacts(parsed, place, contacts, outputs, record_filter)
+
+
+def _write_contacts(
+    parsed: argparse.Namespace,
+    place: ArchivePlace,
+    contacts: ContactSet,
+    outputs: Sequence[tuple[str, Path]],
+    record_filter: RecordFilter,
+) -> int:
     chosen = tuple(
         contact
         for contact in contacts.contacts
@@ -351,7 +379,7 @@ def run_export(parsed: argparse.Namespace) -> int:
         with CotSender(parsed.cot, TlsFiles(parsed.cot_ca, parsed.cot_certificate, parsed.cot_key)) as sender:
             sender.send(events, parsed.cot_wait)
         print(f"{parsed.cot}: {len(events)} events, {len(contacts.unlocated)} contacts without a position omitted")
-    _mark_exported(folder, contacts.contacts)
+    _mark_exported(place, contacts.contacts)
     for problem in problems:
         print(f"rejected: {problem}", file=sys.stderr)
     return EXIT_INCOMPLETE if problems else 0
@@ -359,19 +387,21 @@ def run_export(parsed: argparse.Namespace) -> int:
 
 def _export_files(parsed: argparse.Namespace) -> list[tuple[str, Path]]:
     """Return format and path of every file to write."""
-    files = [(path.suffix.lower().removeprefix("."), path) for path in parsed.out]
-    for name, path in files:
-        if name not in WRITERS:
+    files = []
+    for path in parsed.out:
+        name = next((name for name in WRITERS if path.name.lower().endswith(f".{name}")), None)
+        if name is None:
             raise ConfigError("c2 export", "--out", str(path), "a name that ends in ." + ", .".join(WRITERS))
-    return files + [(name, path) for name in WRITERS if (path := getattr(parsed, name)) is not None]
+        files.append((name, path))
+    return files + [(name, path) for name in FORMER_OPTIONS if (path := getattr(parsed, name)) is not None]
 
 
-def _mark_exported(out_dir: Path, contacts: Sequence[ExportContact]) -> None:
+def _mark_exported(place: ArchivePlace, contacts: Sequence[ExportContact]) -> None:
     """Mark images as exported in the index; retention deletes exported images first."""
     exported = {(c.image.vessel_id, c.image.vehicle_id, c.image.image_id, c.image.first_frame_utc_s) for c in contacts}
     try:
-        with closing(ShoreIndex(out_dir)) as index:
+        with open_reader(place, writable=True) as index:
             rows = [row for row in index.images() if _image_key(row) in exported]
             index.mark("exported_utc_s", rows, time.time())
-    except (OSError, BadInputError) as error:
+    except (OSError, DeliveryError, BadInputError) as error:
         print(f"not marked as exported: {error}", file=sys.stderr)

@@ -19,6 +19,8 @@ from sonarpost.errors import PayloadError
 from sonarpost.messages import Decision, ReconstructedImage, Record, TaskingState
 
 POLL_S = 0.2
+MAX_WAITING = 4096
+"""Records that wait to be handled; further ones are dropped, and counted."""
 DISCONNECTED_AFTER_S = 1.0
 
 
@@ -57,6 +59,9 @@ def run(parsed: argparse.Namespace) -> int:
 class Watch:
     """Subscription to the records that a site publishes. Zenoh reconnects; this class logs it.
 
+    Attributes:
+        gaps: Number of interruptions and drops, after each of which records can be missing.
+
     Args:
         session: Session at the router of the site.
         site: Name of the site.
@@ -66,33 +71,45 @@ class Watch:
     def __init__(self, session: zenoh.Session, site: str, vessel: str | None) -> None:
         self._session = session
         self._vessel = vessel
-        self._samples: queue.Queue[tuple[str, bytes]] = queue.Queue()
+        self.gaps = 0
+        self._samples: queue.Queue[tuple[str, bytes]] = queue.Queue(MAX_WAITING)
         for key in (keys.shore_contact_all(site), keys.tasking_state_all(site)):
             session.declare_subscriber(key, self._on_sample)
         self._disconnected_since_s: float | None = None
         self._disconnect_logged = False
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._samples.put((str(sample.key_expr), sample.payload.to_bytes()))
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        try:
+            self._samples.put_nowait((str(sample.key_expr), sample.payload.to_bytes()))
+        except queue.Full:
+            self.gaps += 1
 
     def run(self, show: Callable[[Record], None], count: int | None, stop: threading.Event) -> None:
         """Call `show` for each record until `stop` is set or `count` records were shown."""
         shown = 0
         while not stop.is_set() and (count is None or shown < count):
-            self._check_connection()
-            try:
-                key, payload = self._samples.get(timeout=POLL_S)
-            except queue.Empty:
-                continue
-            record = _decode(key, payload)
-            if record is not None and self._vessel in (None, record.vessel_id):
+            record = self.poll()
+            if record is not None:
                 show(record)
                 shown += 1
+
+    def poll(self) -> ReconstructedImage | Decision | TaskingState | None:
+        """Return the next record; None if there is none for 0.2 s, or if it is invalid or of another vessel."""
+        self._check_connection()
+        try:
+            key, payload = self._samples.get(timeout=POLL_S)
+        except queue.Empty:
+            return None
+        record = _decode(key, payload)
+        return record if record is not None and self._vessel in (None, record.vessel_id) else None
 
     def _check_connection(self) -> None:
         """Log when the connection to the router is lost and when it is restored."""
         if self._session.info.routers_zid():
+            if self._disconnected_since_s is not None:
+                self.gaps += 1
             if self._disconnect_logged:
                 _log("router reconnected; `sonarpost c2 ls` lists the records accepted in between")
             self._disconnected_since_s, self._disconnect_logged = None, False

@@ -25,11 +25,12 @@ from sonarpost.cli.demo.watch import Watcher
 from sonarpost.cli.progress import progress_console
 from sonarpost.cli.shared import add_fit_option, add_survey_options, print_notes, survey_options_of
 from sonarpost.errors import ConfigError, SurveyFileError
-from sonarpost.modem.micromodem import RATES
+from sonarpost.modem.registry import DEFAULT_DRIVER, modem_driver
+from sonarpost.simulation.modem.emulated import EMULATED
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import SIDE_CAR_SUFFIX
-from sonarpost.sonar.readers import open_survey, single_file_suffixes
+from sonarpost.sonar.readers import open_survey, recording_parts, supported_suffixes
 from sonarpost.sonar.survey import Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -67,9 +68,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--rate",
         type=int,
-        default=1,
-        choices=sorted(RATES),
-        help="Micro-Modem rate (default: 1, packets of 192 B in 6.1 s); table: docs/reference/modem-rates.md",
+        help="rate of the modem (default: that of its driver; Micro-Modem: 1, packets of 192 B in 6.1 s, see "
+        "docs/reference/modem-rates.md)",
+    )
+    parser.add_argument(
+        "--modem",
+        choices=EMULATED,
+        default=DEFAULT_DRIVER,
+        help="driver whose modems are emulated (default: %(default)s)",
     )
     parser.add_argument("--loss", type=_probability, default=0.0, metavar="P", help="probability that a frame is lost")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the survey and channel simulators")
@@ -103,6 +109,19 @@ def _positive(text: str) -> float:
     return value
 
 
+def _rate(parsed: argparse.Namespace) -> int:
+    """Return the rate of the demo.
+
+    Raises:
+        ConfigError: The modem does not have it.
+    """
+    modem = modem_driver(parsed.modem).capabilities
+    rate = modem.uplink_rate if parsed.rate is None else int(parsed.rate)
+    if rate not in modem.rates:
+        raise ConfigError("command line", "--rate", rate, f"one of {sorted(modem.rates)}")
+    return rate
+
+
 def run(parsed: argparse.Namespace) -> int:
     """Run the demo; return 0 if everything that the channel can deliver is at the shore site, unchanged."""
     console = progress_console()
@@ -111,6 +130,7 @@ def run(parsed: argparse.Namespace) -> int:
     # Routers and services start together: failed first attempts to connect are expected.
     logging.getLogger("sonarpost.bus.session").setLevel(logging.ERROR)
     started = time.monotonic()
+    rate = _rate(parsed)
     detection_settings, inputs = _detection_settings(parsed), _inputs(parsed, console)
     if inputs is not None and inputs[0] == parsed.survey:
         # A single file that cannot be read is reported before the services start.
@@ -123,7 +143,8 @@ def run(parsed: argparse.Namespace) -> int:
             folder=folder,
             mode="snippets" if parsed.images else "survey",
             link=parsed.link,
-            rate=parsed.rate,
+            modem=parsed.modem,
+            rate=rate,
             loss=parsed.loss,
             seed=parsed.seed,
             time_scale=parsed.time_scale,
@@ -207,7 +228,7 @@ def _inputs(parsed: argparse.Namespace, console: Console) -> tuple[Path, ...] | 
     given: Path | None = parsed.survey
     if given is None:
         return None
-    suffixes = single_file_suffixes()
+    suffixes = supported_suffixes()
     if given.is_file():
         if not given.name.lower().endswith(suffixes):
             raise SurveyFileError(str(given), "suffix", given.suffix, "one of " + ", ".join(suffixes))
@@ -257,11 +278,20 @@ def _fresh_folder(folder: Path) -> Path:
 
 
 def _print_no_contacts(settings: ChainSettings, console: Console) -> None:
-    """Print how many contacts each file has at lower thresholds, as atd_stub has logged it."""
+    """Print how many contacts each file has at lower thresholds, as atd_stub has logged it, and what can be done."""
     log = (settings.folder / "logs" / "atd_stub.log").read_text(encoding="utf-8", errors="replace")
-    for name, counts in re.findall(r' File processed .*?file=("[^"]*"|\S+) .*counts="([^"]*)"', log):
+    files = re.findall(r' File processed .*?file=("[^"]*"|\S+) .*counts="([^"]*)"', log)
+    for name, counts in files:
         console.print(f"{name}: {counts}", markup=False, highlight=False, soft_wrap=True)
-    console.print("[red]no contacts to send[/red]; see --threshold and `sonarpost detect --plot`")
+    lower = any(int(count) for _, counts in files for count in re.findall(r"(\d+) (?:contacts )?above", counts))
+    console.print(
+        "[red]no contacts to send[/red]: "
+        + ("run the demo again with a lower --threshold, or " if lower else "")
+        + "cut out places of your choice with `sonarpost detect --pick PING,SIDE,SAMPLE --snippets DIR`, "
+        "and send these images with `sonarpost demo --images DIR`",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _print_refused(settings: ChainSettings, console: Console) -> int:
@@ -298,6 +328,8 @@ def _deposit(
         if settings.mode == "snippets" and side_car.is_file():
             shutil.copyfile(side_car, settings.incoming / side_car.name)
             side_cars += 1
+        if settings.mode != "snippets":
+            _copy_other_parts(path, settings.incoming)
         partial = settings.incoming / f".{path.name}"
         shutil.copyfile(path, partial)
         partial.rename(settings.incoming / path.name)
@@ -307,10 +339,19 @@ def _deposit(
     return len(inputs)
 
 
+def _copy_other_parts(path: Path, folder: Path) -> None:
+    """Copy the other files of a recording that exist beside it or below its folder."""
+    for part in recording_parts(path):
+        if part != path and part.is_relative_to(path.parent) and part.is_file():
+            target = folder / part.relative_to(path.parent)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(part, target)
+
+
 def _follow(chain: Chain, watcher: Watcher, files: int, console: Console) -> None:
     """Show progress until the chain has finished, or nothing has changed for too long."""
     settings = chain.settings
-    airtime_s = RATES[settings.rate].airtime_s
+    airtime_s = settings.rate_info.airtime_s
     stalled_s = STALLED_S + 10 * settings.packet_s + MAX_FEEDBACK_INTERVALS * settings.feedback_interval_s
     columns = (
         TextColumn("{task.description:<24}"),

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Literal
 
 from sonarpost.errors import PortError
-from sonarpost.modem.micromodem import RATES
+from sonarpost.modem.interface import RateInfo
+from sonarpost.modem.registry import DEFAULT_DRIVER, modem_driver
 
 ROUTER_PORTS = (7467, 7457, 7447)
 """Ports of the routers of a demo's vehicle, vessel and shore site, if they are free. 7447 is Zenoh's usual port."""
@@ -28,6 +29,10 @@ PLATFORM_OF = {
     "c2": SHORE,
 }
 HEALTH_INTERVAL_S = 0.25
+STATUS_PERIOD_S = 60.0
+"""Time between two statuses of the vehicle in the channel: 25 of 1900 B at rate 1."""
+MIN_STATUS_PERIOD_S = 5.0
+"""The least one that uuv_modem accepts, in real time."""
 STREAM_BYTES = 200
 """Stream length with v1: what the paper's codec makes of 140 x 80 px, so that both can be compared."""
 
@@ -40,7 +45,8 @@ class ChainSettings:
         folder: Folder of everything that the chain writes.
         mode: As in [atd_stub].
         link: Wire format: "v1" with the codec emb, or the paper's with its tile codec.
-        rate: Micro-Modem rate.
+        modem: Name of the modem driver.
+        rate: Rate of the modem.
         loss: Probability that a frame is lost.
         seed: Seed of the channel simulator.
         time_scale: Simulated seconds in the channel for each real second.
@@ -56,6 +62,7 @@ class ChainSettings:
     folder: Path
     mode: Literal["survey", "snippets"] = "survey"
     link: Literal["v1", "paper"] = "v1"
+    modem: str = DEFAULT_DRIVER
     rate: int = 1
     loss: float = 0.0
     seed: int = 1
@@ -88,9 +95,14 @@ class ChainSettings:
         return self.folder / "water" / "channel.jsonl"
 
     @property
+    def rate_info(self) -> RateInfo:
+        """The rate of the modem."""
+        return modem_driver(self.modem).capabilities.rates[self.rate]
+
+    @property
     def packet_s(self) -> float:
         """Real duration of a packet."""
-        return RATES[self.rate].airtime_s / self.time_scale
+        return self.rate_info.airtime_s / self.time_scale
 
     @property
     def pairing_timeout_s(self) -> float:
@@ -184,6 +196,7 @@ def _platform_table(settings: ChainSettings, platform: str, port: int) -> str:
         f"health_interval_s = {HEALTH_INTERVAL_S}\n"
         # The emulated channel has no other modems, and the paper's format has no authentication.
         'acoustic_auth = "none"\n'
+        f'[modem]\ndriver = "{settings.modem}"\n'
     )
 
 
@@ -205,7 +218,8 @@ def _service_table(settings: ChainSettings, service: str) -> str:
         + ("" if page is None else 'image_consumers = ["relay", "console"]\n'),
         "relay": "[relay]\n" + ("" if page is None else 'advice_consumers = ["console"]\n'),
         "c2": f'[c2]\nout_dir = "{settings.shore_images.parent}"\n',
-        "acoustic_channel": f'[acoustic_channel]\npty_dir = "{settings.ports_folder}"\nlog = "{settings.channel_log}"\n'
+        "acoustic_channel": f'[acoustic_channel]\ndriver = "{settings.modem}"\n'
+        f'pty_dir = "{settings.ports_folder}"\nlog = "{settings.channel_log}"\n'
         f"seed = {settings.seed}\nframe_loss = {settings.loss}\ntime_scale = {settings.time_scale}\n"
         f"modem = [{{ address = {UUV_ADDRESS} }}, {{ address = {VESSEL_ADDRESS}, east_m = 100.0 }}]\n",
     }
@@ -231,12 +245,15 @@ def _vehicle_link(settings: ChainSettings) -> str:
         return 'link = "paper"\n'
     # Services run in real time: durations in the channel are divided by the time scale; the host's own delays are not.
     scale = settings.time_scale
+    status_s = max(MIN_STATUS_PERIOD_S, STATUS_PERIOD_S / scale)
     return (
         f'link = "v1"\nexpected_loss = {min(settings.loss, 0.9)}\nstream_bytes = {STREAM_BYTES}\n'
         f"tx_burst_s = {60 / scale:.3f}\nrx_window_s = {10 / scale + 0.5:.3f}\nholdoff_s = {5 / scale + 0.1:.3f}\n"
         f"queue_interval_s = 0.2\ngroup_delay_s = {20 / scale:.3f}\nretry_s = 0.2\n"
         f"max_defer_s = {120 / scale + 1:.3f}\n"
         f"reply_timeout_s = {settings.reply_timeout_s:.3f}\n"
+        # The page shows the track. Without it, the frames of a demo are those of its images.
+        + ("" if settings.console_port is None else f"status_period_s = {status_s:.3f}\n")
     )
 
 

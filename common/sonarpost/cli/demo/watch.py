@@ -18,13 +18,12 @@ from sonarpost.link.downlink.messages import image_of_number, number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.messages import AcousticFrame, EncodedImage, Health, QueueState, ReconstructedImage, Record, Snippet
-from sonarpost.modem.micromodem import RATES
 
 log = logging.getLogger(__name__)
 
 R = TypeVar("R", bound=Record)
 
-CONNECT_S = 20.0
+CONNECT_S = 120.0
 # Gauges that are zero when a service has no work left.
 IDLE_GAUGES: Mapping[str, tuple[str, ...]] = {
     "atd_stub": ("files_waiting", "contacts_waiting", "outbox"),
@@ -33,7 +32,7 @@ IDLE_GAUGES: Mapping[str, tuple[str, ...]] = {
     "op_modem": ("outbox", "unsaved", "images_waiting"),
     "decompressor": ("inbox", "outbox"),
     "relay": ("inbox", "outbox"),
-    "c2": ("inbox",),
+    "c2": ("inbox", "images_undecoded"),
 }
 
 
@@ -145,7 +144,7 @@ class Watcher:
     @property
     def packets_planned(self) -> int:
         """Packets that the images encoded so far need: computed for the paper's format, from the queue for v1."""
-        rate = RATES[self.settings.rate]
+        rate = self.settings.rate_info
         with self._lock:
             images, queue = tuple(self.encoded.values()), self.queue
         if self.settings.link == "v1":

@@ -103,7 +103,7 @@ def check_file(path: Path, environment: Mapping[str, str]) -> CheckedFile:
         ConfigError: The file is unreadable or not TOML.
     """
     file = ConfigFile(path, environment)
-    platform = file.table("platform", PlatformConfig)
+    platform = file.platform()
     services = {name: file.table(name, configuration_type(name)) for name in file.services}
     errors: list[BadInputError] = list(file.errors)
     warnings: list[BadInputError] = []
@@ -159,7 +159,7 @@ _SELECTED_BY = {"codec registry": "codec", "modem port": "port"}
 def _located(file: ConfigFile, table: str, platform: PlatformConfig, error: BadInputError) -> BadInputError:
     """Return an error of a table or of what it names, with the file and line of the key."""
     detail = ""
-    if error.where in ("[platform]", f"[{table}]"):
+    if error.where in ("[platform]", "[modem]", f"[{table}]"):
         names = [name for name in (error.where.strip("[]"), error.field) if name]
     elif error.where in _SELECTED_BY:
         names = [table, _SELECTED_BY[error.where]]

@@ -8,11 +8,11 @@ import time
 
 from sonarpost.cli.shared import Subparsers, add_command
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, ModemEvent, PingAnswered
-from sonarpost.modem.micromodem import events as ev
-from sonarpost.modem.micromodem.nmea import MAX_ADDRESS
+from sonarpost.modem import interface as ev
+from sonarpost.modem.interface import ModemEvent, RangeMeasured
+from sonarpost.modem.registry import DEFAULT_DRIVER, ModemSettings, modem_driver
+from sonarpost.runtime.modem_port import ModemPort, open_modem_port
 from sonarpost.runtime.modem_runner import ModemRunner
-from sonarpost.runtime.serial_port import SerialPort
 
 EXIT_UNANSWERED = 1
 SOUND_SPEED_M_PER_S = 1500.0
@@ -25,11 +25,12 @@ the port first. Exit status: 0 if every ping was answered, 1 if one was not, 2 i
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add the command and its action."""
-    actions = add_command(subparsers, "modem", "test a Micro-Modem without services")
+    actions = add_command(subparsers, "modem", "test a modem without services")
     ping = actions.add_parser("ping", help="measure the travel time to another modem", description=_PING)
     ping.add_argument("--port", required=True, metavar="URL", help="as in the configuration, for example /dev/ttyUSB0")
     ping.add_argument("--baud", type=int, default=19200, metavar="B", help="of the serial line (default: 19200)")
-    ping.add_argument("--address", type=int, required=True, metavar="N", help="address to give to this modem, 0 to 127")
+    ping.add_argument("--address", type=int, required=True, metavar="N", help="address to give to this modem")
+    ping.add_argument("--driver", default=DEFAULT_DRIVER, metavar="NAME", help="of the modem (default: %(default)s)")
     ping.add_argument("--destination", type=int, required=True, metavar="N", help="address of the other modem")
     ping.add_argument("--count", type=int, default=3, metavar="N", help="number of pings (default: 3)")
     ping.add_argument("--wait", type=float, default=30.0, metavar="S", help="maximum wait for this modem (default: 30)")
@@ -43,12 +44,16 @@ def run(parsed: argparse.Namespace) -> int:
         ConfigError: An option is out of range, or the kind of port is not supported.
         PortError: The port cannot be opened, or the modem does not reply.
     """
-    if not 0 <= parsed.destination <= MAX_ADDRESS or parsed.destination == parsed.address:
-        expected = f"0..{MAX_ADDRESS}, another one than --address"
+    driver = modem_driver(parsed.driver)
+    low, high = driver.capabilities.min_address, driver.capabilities.max_address
+    if not driver.capabilities.ranging:
+        raise ConfigError("command line", "--driver", parsed.driver, "a modem that measures ranges")
+    if not low <= parsed.destination <= high or parsed.destination == parsed.address:
+        expected = f"{low}..{high}, another one than --address"
         raise ConfigError("command line", "--destination", parsed.destination, expected)
     events: queue.SimpleQueue[ModemEvent] = queue.SimpleQueue()
-    port = SerialPort(parsed.port, parsed.baud)
-    runner = ModemRunner(MicroModem(MicroModemConfig(parsed.address), parsed.port), port, events.put)
+    port = open_modem_port(parsed.port, parsed.baud)
+    runner = ModemRunner(driver.create(ModemSettings(parsed.address), parsed.port), port, events.put)
     runner.start()
     try:
         _wait_until_ready(events, port, parsed.wait)
@@ -59,7 +64,7 @@ def run(parsed: argparse.Namespace) -> int:
     return 0 if answered == parsed.count else EXIT_UNANSWERED
 
 
-def _wait_until_ready(events: queue.SimpleQueue[ModemEvent], port: SerialPort, wait_s: float) -> None:
+def _wait_until_ready(events: queue.SimpleQueue[ModemEvent], port: ModemPort, wait_s: float) -> None:
     deadline_s = time.monotonic() + wait_s
     waiting_for = ""
     while True:
@@ -94,7 +99,7 @@ def _ping(runner: ModemRunner, events: queue.SimpleQueue[ModemEvent], destinatio
         except queue.Empty:
             break
         match event:
-            case PingAnswered(src=source) if source == destination:
+            case RangeMeasured(src=source) if source == destination:
                 travel_s = event.travel_s
             case ev.RequestDone(request_id=done) if done == request:
                 print(f"ping {number}: {_travel_text(travel_s)}", flush=True)
@@ -103,7 +108,7 @@ def _ping(runner: ModemRunner, events: queue.SimpleQueue[ModemEvent], destinatio
                 reason = str(event.reason)
                 break
             case ev.ModemError():
-                print(f"modem reports an error: {event.report}", flush=True)
+                print(f"modem reports an error: {event.text}", flush=True)
             case _:
                 pass
     print(f"ping {number}: not answered ({reason})", flush=True)

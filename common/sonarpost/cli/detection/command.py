@@ -33,6 +33,7 @@ from sonarpost.cli.shared import (
     survey_options_of,
 )
 from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
+from sonarpost.detection.contact_map import ContactMap, contact_map
 from sonarpost.detection.detector import MINE_LIKE, Detection, counts_text
 from sonarpost.detection.picks import PICKED, LocatedPick, PickedDetection
 from sonarpost.detection.record import contact_record
@@ -44,6 +45,7 @@ from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.messages import Contact
 from sonarpost.sonar.image_files import encode_png, write_png
+from sonarpost.sonar.maps.geotiff import write_image
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.side_car import write_side_car
@@ -59,6 +61,7 @@ _HEADER = (
 # Size of the snippets that are projected to the bottom: 10 m x 10 m.
 _GROUND_PX = 100
 _GROUND_PIXEL_M = 0.1
+_MAP_SIDE_M = 20
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -81,6 +84,11 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument(
         "--snippets", type=Path, metavar="DIR", help="write the snippets of each contact into this folder"
+    )
+    parser.add_argument(
+        "--geotiff",
+        action="store_true",
+        help=f"with --snippets: also write the seabed around each contact as GeoTIFF, {_MAP_SIDE_M} m a side, north up",
     )
     parser.add_argument(
         "--threshold",
@@ -108,6 +116,8 @@ def run(parsed: argparse.Namespace) -> int:
     if parsed.images is not None:
         return run_images(parsed.images, parsed.pixel_m, settings, as_json=parsed.json)
     _check_vehicle_id(parsed.vehicle)
+    if parsed.geotiff and parsed.snippets is None:
+        raise ConfigError("detect", "--geotiff", "without --snippets", "--geotiff together with --snippets DIR")
     options = survey_options_of(parsed)
     transmissions = transmissions_of(parsed)
     files: list[Path] = parsed.files
@@ -117,8 +127,14 @@ def run(parsed: argparse.Namespace) -> int:
     if parsed.snippets is not None:
         make_output_folder(parsed.snippets)
     with ProgressDisplay() as display:
-        with_images = parsed.snippets is not None
-        detection = _Detection(settings, options, parsed.vehicle, transmissions, with_images=with_images)
+        detection = _Detection(
+            settings,
+            options,
+            parsed.vehicle,
+            transmissions,
+            with_images=parsed.snippets is not None,
+            with_maps=parsed.geotiff,
+        )
         results = detection.run(files, display)
         if picks:
             detection.add_picks(picks)
@@ -167,6 +183,7 @@ class ListedContact:
         record: Its contact record.
         image: Its snippet at the resolution of the recording; None without --snippets.
         ground: Its snippet projected to the bottom; None without --snippets, and where it is not known.
+        seabed: Georeferenced image of the seabed around it; None without --geotiff, and where its place is not known.
         is_picked: Whether it is at a place of --pick.
     """
 
@@ -174,6 +191,7 @@ class ListedContact:
     record: Contact
     image: npt.NDArray[np.uint8] | None = None
     ground: npt.NDArray[np.uint8] | None = None
+    seabed: ContactMap | None = None
     is_picked: bool = False
 
 
@@ -205,12 +223,13 @@ class _Detection:
         transmissions: TransmitIntervals,
         *,
         with_images: bool,
+        with_maps: bool,
     ) -> None:
         self._settings = settings
         self._options = options
         self._transmissions = transmissions
         self._vehicle_id = vehicle_id
-        self._with_images = with_images
+        self._with_images, self._with_maps = with_images, with_maps
         self._detector = StreamDetector(self._describe, settings)
         self._results: list[FileListing] = []
 
@@ -271,7 +290,8 @@ class _Detection:
             return ListedContact(in_file, record)
         image = cut_snippet(survey, detection).image
         ground = ground_projected_image(survey, detection, _GROUND_PX, _GROUND_PX, _GROUND_PIXEL_M)
-        return ListedContact(in_file, record, image, ground)
+        seabed = contact_map(survey, detection, _MAP_SIDE_M, _GROUND_PIXEL_M) if self._with_maps else None
+        return ListedContact(in_file, record, image, ground, seabed)
 
 
 def _print_table(result: FileListing, threshold: float) -> None:
@@ -324,13 +344,16 @@ def _plot_path(plot: Path, survey_path: Path, *, several: bool) -> Path:
 def _write_snippets(folder: Path, result: FileListing) -> None:
     """Write the snippet of each contact at the resolution of the recording and, if possible, at 10 cm a pixel.
 
-    Each has a side-car with the fields of the contact. The names of picked contacts contain "-pick".
+    Each has a side-car with the fields of the contact. A georeferenced image has the suffix .tif and no side-car. The
+    names of picked contacts contain "-pick".
     """
     for number, contact in enumerate(result.contacts, start=1):
         name = f"{result.info.path.stem}-{number:03d}{'-pick' if contact.is_picked else ''}"
         if contact.image is not None:
             write_png(folder / f"{name}.png", contact.image)
             write_side_car(folder / f"{name}.txt", contact.record)
+        if contact.seabed is not None:
+            write_image(folder / f"{name}.tif", contact.seabed.image, contact.seabed.transform)
         if contact.ground is not None:
             write_png(folder / f"{name}-ground.png", contact.ground)
             changes = {

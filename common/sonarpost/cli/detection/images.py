@@ -23,7 +23,7 @@ MIN_SIDE_PX: Final = 32
 DEFAULT_PIXEL_M: Final = 0.05
 PIXEL_RANGE_M: Final = (0.005, 1.0)
 EXIT_SOME_INVALID: Final = 2
-_SURVEY_OPTIONS: Final = ("plot", "snippets", "threshold", "max_contacts", "options", "crs")
+_SURVEY_OPTIONS: Final = ("plot", "snippets", "geotiff", "threshold", "max_contacts", "options", "crs")
 """Options of survey files that have no meaning for images."""
 
 
@@ -78,7 +78,7 @@ def check_image_options(parsed: argparse.Namespace) -> None:
         raise ConfigError("detect", "FILE", given, f"either survey files or --images {parsed.images}, not both")
     for name in _SURVEY_OPTIONS:
         value = getattr(parsed, name)
-        if value is not None:
+        if value is not None and value is not False:
             option = "--" + name.replace("_", "-")
             raise ConfigError("detect", option, str(value), "this option with survey files only, not with --images")
     low_m, high_m = PIXEL_RANGE_M

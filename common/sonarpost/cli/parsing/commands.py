@@ -11,6 +11,8 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "router": ("cli.run", "run an embedded Zenoh router"),
     "status": ("cli.status", "show the services of all platforms, live"),
     "c2": ("cli.c2", "list, export and watch the contacts of a shore site; send commands"),
+    "record": ("cli.record", "record the keys of a router into an MCAP file"),
+    "replay": ("cli.record", "publish the records of an MCAP file again, or send them to a c2"),
     "dataset": ("cli.dataset", "training data from the verdicts of operators"),
     "store": ("cli.store", "check the store of a stopped service, and recover a damaged one"),
     "config": ("cli.deployment.config_files", "print an example configuration; check a configuration file"),
@@ -25,7 +27,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "codebook": ("cli.codebook", "build, compare and adapt tile codebooks"),
     "prepare": ("cli.prepare", "compile the machine code of the codecs in advance"),
     "pki": ("cli.pki", "certificates of the fleet, access control of its routers, key of its acoustic link"),
-    "modem": ("cli.deployment.modem_ping", "test a Micro-Modem without services"),
+    "modem": ("cli.deployment.modem_ping", "test a modem without services"),
     "modem-emulator": ("cli.modem_emulator", "emulated acoustic modems on pseudo-terminals or TCP ports"),
     "completion": ("cli.parsing.completion", "print the completion script of a shell"),
 }
@@ -47,7 +49,15 @@ RENAMED_COMMANDS: Final[Mapping[str, str]] = {
 }
 """Commands of version 0.1 that have another name now."""
 
-EXTRAS: Final[Mapping[str, str]] = {"starlette": "console", "uvicorn": "console", "matplotlib": "research"}
+EXTRAS: Final[Mapping[str, str]] = {
+    "starlette": "console",
+    "uvicorn": "console",
+    "matplotlib": "research",
+    "lz4": "mcap",
+    "mcap": "mcap",
+    "zstandard": "mcap",
+    "paho": "mqtt",
+}
 """Package -> the extra that installs it."""
 
 EXAMPLES: Final[Mapping[str, str]] = {
@@ -59,8 +69,13 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "c2 get": "c2 get uuv-1/0001",
     "c2 export": "c2 export --out contacts.geojson --out contacts.kmz",
     "c2 watch": "c2 watch --router tcp/127.0.0.1:7447 --count 1",
+    "c2 cot": "c2 cot tls://tak.example:8089 --tak-api https://tak.example:8443 --archive out",
+    "c2 alert": "c2 alert --webhook https://hooks.example/mines --threshold 0.7 --state alerts.db --archive out",
+    "c2 migrate": "c2 migrate --config shore.toml --archive out",
     "c2 command": "c2 command uuv-1/0001 --vessel vessel-1 --kind refine",
     "c2 comment": "c2 comment uuv-1/0001 --vessel vessel-1 --verdict mine_like --remark 'same as last year'",
+    "record": "record dive.mcap --router tcp/127.0.0.1:7447 --duration 3600",
+    "replay": "replay dive.mcap --router tcp/127.0.0.1:7447 --to-c2 --speed 0",
     "dataset export": "dataset export --archive demo-out/shore/images --out dataset",
     "store check": "store check state/relay.db",
     "store salvage": "store salvage state/relay.db --out relay-new.db",
@@ -78,6 +93,9 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "survey info": "survey info line.xtf --json",
     "survey plot": "survey plot line.xtf --ground --out plots",
     "survey view": "survey view line.xtf --out line.xtf.picks",
+    "survey mosaic": "survey mosaic line.xtf --out mosaic.tif --coverage coverage.geojson",
+    "survey waterfall": "survey waterfall line.xtf --out waterfalls",
+    "survey coverage": "survey coverage line.xtf --out coverage.gpkg",
     "survey export": "survey export line.xtf --format geojson --out track.geojson",
     "detect": "detect line.xtf --threshold 0.5 --pick 73,port,720 --plot contacts.png",
     "encode": "encode contact.png --budget 64 --out streams",
@@ -88,6 +106,7 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "codebook adapt": "codebook adapt nominal-10 --images images --out adapted.tiles",
     "prepare": "prepare",
     "pki init": "pki init --dir fleet --fleet north",
+    "pki prepare": "pki prepare uuv-8 uuv-9 --dir fleet --role uuv",
     "pki issue": "pki issue vessel-1 --dir fleet --role vessel --host 192.0.2.1",
     "pki renew": "pki renew vessel-1 --dir fleet --out vessel-1-2027",
     "pki revoke": "pki revoke vessel-1 --dir fleet --reason 'computer lost'",

@@ -34,12 +34,12 @@ def _models() -> list[str]:
 
 
 def _rates() -> list[str]:
-    from sonarpost.modem.micromodem import RATES  # noqa: PLC0415
+    from sonarpost.modem.registry import modem_driver  # noqa: PLC0415
 
     return [
         f"{rate.number}  {rate.frames} x {rate.frame_bytes:3} B = {rate.packet_bytes:4} B in {rate.airtime_s:g} s, "
         f"{rate.modulation}"
-        for rate in RATES.values()
+        for rate in modem_driver().capabilities.rates.values()
     ]
 
 

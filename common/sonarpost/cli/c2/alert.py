@@ -1,0 +1,202 @@
+"""`sonarpost c2 alert`: sends an alert for each contact above a threshold to a webhook or an MQTT broker."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sqlite3
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+from sonarpost import logs
+from sonarpost.bus.session import open_with_retry
+from sonarpost.cli.c2.alert_senders import AlertRefusedError, AlertSender, Mqtt, Webhook, read_secret
+from sonarpost.cli.c2.live import ContactStream, add_live_options
+from sonarpost.cli.shared import Subparsers, in_new_folder, log_level, router_of
+from sonarpost.errors import ConfigError, PortError, StoredFileError
+from sonarpost.export.alerts import alert_document, needs_alert
+from sonarpost.export.contacts import ExportContact
+from sonarpost.export.cot_sender import TlsFiles
+from sonarpost.export.text import utc_text
+from sonarpost.logs import kv
+from sonarpost.stop_signals import stop_on_signals
+
+log = logging.getLogger(__name__)
+
+RETRY_S: Final = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
+MAX_WAITING: Final = 1000
+"""Alerts that wait for the receiver; above it further contacts wait in c2's folder for the next start."""
+MAX_SENT: Final = 200_000
+"""Identifiers in the state file; the oldest are deleted."""
+
+
+def add_actions(actions: Subparsers) -> None:
+    """Add the action `alert`."""
+    parser = actions.add_parser(
+        "alert", help="send an alert for each contact above a threshold to a webhook or an MQTT broker; Ctrl-C ends it"
+    )
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--webhook", metavar="URL", help="address that receives an HTTP POST of JSON")
+    where.add_argument("--mqtt", metavar="URL", help="broker and topic, mqtts://[user@]host[:port]/topic or mqtt://…")
+    parser.add_argument(
+        "--threshold",
+        type=float,
+        default=0.5,
+        metavar="P",
+        help="probability of a mine-like object, 0 to 1, or half the confidence of the detector (default: 0.5)",
+    )
+    parser.add_argument(
+        "--state",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="file with the identifiers of the alerts that were sent",
+    )
+    parser.add_argument(
+        "--secret-file", type=Path, metavar="FILE", help="key of the webhook's signature, or password of the MQTT user"
+    )
+    for name in ("ca", "certificate", "key"):
+        parser.add_argument(f"--alert-{name}", type=Path, metavar="PEM", help=f"{name} for https://… and mqtts://…")
+    add_live_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(parsed: argparse.Namespace) -> int:
+    """Send alerts until interrupted; return 0."""
+    if not 0 <= parsed.threshold <= 1:
+        raise ConfigError("command line", "--threshold", parsed.threshold, "0 to 1")
+    tls = TlsFiles(parsed.alert_ca, parsed.alert_certificate, parsed.alert_key)
+    secret = None if parsed.secret_file is None else read_secret(parsed.secret_file, "--secret-file")
+    sender: AlertSender = Webhook(parsed.webhook, tls, secret) if parsed.webhook else Mqtt(parsed.mqtt, tls, secret)
+    endpoints, router_tls = router_of(parsed)
+    logs.configure_logging("alert", log_level(parsed))
+    with stop_on_signals() as stop, closing(SentAlerts(in_new_folder(parsed.state))) as sent, closing(sender):
+        session = open_with_retry(endpoints, stop, router_tls)
+        if session is None:
+            return 0
+        try:
+            stream = ContactStream(session, parsed.site, parsed.vessel, parsed.archive)
+            service = AlertService(sender, sent, parsed.threshold)
+            log.info("Sending alerts", extra=kv(site=parsed.site, threshold=parsed.threshold))
+            while not stop.is_set():
+                for change in stream.poll():
+                    service.add(change.contact)
+                while not stop.is_set() and service.send_due():
+                    pass
+        finally:
+            session.close()
+    return 0
+
+
+class SentAlerts:
+    """Identifiers of sent alerts in a SQLite file, so that a restart does not repeat them.
+
+    Args:
+        path: The file; it is created if it does not exist.
+
+    Raises:
+        StoredFileError: It cannot be opened, or is no such file.
+    """
+
+    def __init__(self, path: Path, max_rows: int = MAX_SENT) -> None:
+        self._path = path
+        self._max_rows = max_rows
+        try:
+            self._db = sqlite3.connect(path)
+            self._db.execute("PRAGMA synchronous = FULL")
+            self._db.execute(
+                "CREATE TABLE IF NOT EXISTS sent (number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE)"
+            )
+        except sqlite3.DatabaseError as error:
+            raise StoredFileError(str(path), "", str(error), "the state file of `sonarpost c2 alert`") from error
+
+    def __contains__(self, alert_id: str) -> bool:
+        return self._db.execute("SELECT 1 FROM sent WHERE id = ?", (alert_id,)).fetchone() is not None
+
+    def add(self, alert_id: str) -> None:
+        """Add an identifier, durably; delete the oldest above the limit.
+
+        Raises:
+            StoredFileError: The file cannot be written.
+        """
+        try:
+            with self._db:
+                cursor = self._db.execute("INSERT OR IGNORE INTO sent (id) VALUES (?)", (alert_id,))
+                self._db.execute("DELETE FROM sent WHERE number <= ?", ((cursor.lastrowid or 0) - self._max_rows,))
+        except sqlite3.DatabaseError as error:
+            raise StoredFileError(str(self._path), "", str(error), "a writable state file") from error
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()
+
+
+class AlertService:
+    """Sends one alert for each contact, at least once, in the order of their arrival.
+
+    An identifier is stored after the receiver has accepted the alert: a crash between both repeats the alert with the
+    same identifier. A refused alert is logged and not repeated.
+
+    Args:
+        sender: Way of the alerts.
+        sent: Alerts that were sent before.
+        threshold: Smallest score of a contact without a verdict, 0 to 1.
+        clock: Monotonic clock, seconds.
+        utc: UTC clock, seconds.
+    """
+
+    def __init__(
+        self,
+        sender: AlertSender,
+        sent: SentAlerts,
+        threshold: float,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        utc: Callable[[], float] = time.time,
+    ) -> None:
+        self._sender = sender
+        self._sent = sent
+        self._threshold = threshold
+        self._clock = clock
+        self._utc = utc
+        self._waiting: OrderedDict[str, ExportContact] = OrderedDict()
+        self._failures = 0
+        self._next_s = clock()
+
+    def add(self, contact: ExportContact) -> None:
+        """Queue the alert of a contact, if it needs one that was not sent before."""
+        if contact.uid in self._waiting:
+            self._waiting[contact.uid] = contact
+            return
+        if not needs_alert(contact, self._threshold) or contact.uid in self._sent:
+            return
+        if len(self._waiting) >= MAX_WAITING:
+            log.error("Alert dropped until the next start: too many wait", extra=kv(contact=contact.uid))
+            return
+        self._waiting[contact.uid] = contact
+
+    def send_due(self) -> bool:
+        """Send the first waiting alert if it is time; return whether the receiver has accepted it."""
+        if not self._waiting or self._clock() < self._next_s:
+            return False
+        uid, contact = next(iter(self._waiting.items()))
+        try:
+            self._sender.send(uid, contact.image.vessel_id, alert_document(contact, utc_text(self._utc())))
+        except AlertRefusedError as error:
+            log.error("Alert refused; it is not sent again", extra=kv(contact=uid, error=str(error)))
+        except PortError as error:
+            pause_s = RETRY_S[min(self._failures, len(RETRY_S) - 1)]
+            self._failures += 1
+            self._next_s = self._clock() + pause_s
+            log.warning("Alert not sent; retrying", extra=kv(contact=uid, retry_s=pause_s, error=str(error)))
+            return False
+        else:
+            log.info("Alert sent", extra=kv(contact=uid, review=contact.review))
+        self._failures = 0
+        self._sent.add(uid)
+        del self._waiting[uid]
+        return True

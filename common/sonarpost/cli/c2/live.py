@@ -1,0 +1,96 @@
+"""Live contacts of a shore site, for commands that pass them on to other programs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import zenoh
+
+from sonarpost.cli.c2.watch import Watch
+from sonarpost.cli.shared import add_router_options, add_site_option
+from sonarpost.errors import BadInputError
+from sonarpost.export.contacts import ExportContact, load_contacts, read_png
+from sonarpost.export.live import LiveContacts
+from sonarpost.messages import Decision, ReconstructedImage
+from sonarpost.review.rendering import eight_bits, encode_png
+
+
+@dataclass(frozen=True, slots=True)
+class ContactChange:
+    """A contact that is new or has changed; `png` is its image if that is new, else None."""
+
+    contact: ExportContact
+    png: bytes | None
+
+
+def add_live_options(parser: argparse.ArgumentParser) -> None:
+    """Add --site, --vessel, --archive and the options of the router."""
+    add_site_option(parser)
+    add_router_options(parser)
+    parser.add_argument("--vessel", metavar="NAME", help="only this vessel")
+    parser.add_argument(
+        "--archive",
+        type=Path,
+        metavar="DIR",
+        help="folder of c2; its contacts are read at the start and after an interruption, so that none is missed",
+    )
+
+
+class ContactStream:
+    """Contacts of a site: those of c2's folder first, then each change, live.
+
+    After an interrupted connection the folder is read again.
+
+    Args:
+        session: Session at the router of the site.
+        site: Name of the site.
+        vessel: Only contacts of this vessel; None for all.
+        archive: Folder of c2; None if it is not on this host.
+    """
+
+    def __init__(self, session: zenoh.Session, site: str, vessel: str | None, archive: Path | None) -> None:
+        self._watch = Watch(session, site, vessel)
+        self._vessel = vessel
+        self._archive = archive
+        self._contacts = LiveContacts()
+        self._gaps_read = -1
+
+    def poll(self) -> list[ContactChange]:
+        """Return the changed contacts; an empty list after 0.2 s without a change.
+
+        Raises:
+            StoredFileError: The folder of c2 cannot be read.
+        """
+        record = self._watch.poll()
+        # The folder is read after the subscription exists: a contact between both is in the folder.
+        changes = self._read_archive() if self._watch.gaps != self._gaps_read else []
+        if isinstance(record, (ReconstructedImage, Decision)):
+            contact = self._contacts.add(record)
+            if contact is not None:
+                changes.append(ContactChange(contact, _png_of(record)))
+        return changes
+
+    def _read_archive(self) -> list[ContactChange]:
+        self._gaps_read = self._watch.gaps
+        if self._archive is None:
+            return []
+        stored = load_contacts(self._archive)
+        problems: list[BadInputError] = list(stored.problems)
+        chosen = (c for c in stored.contacts if self._vessel in (None, c.image.vessel_id))
+        changes = [
+            ContactChange(replace(contact, image_path=None), read_png(contact, problems))
+            for contact in self._contacts.restore(chosen)
+        ]
+        for problem in problems:
+            print(f"rejected: {problem}", file=sys.stderr)
+        return changes
+
+
+def _png_of(record: ReconstructedImage | Decision) -> bytes | None:
+    if isinstance(record, Decision) or not record.codec:
+        # Without a codec only the contact record was received; its pixels are black.
+        return None
+    return encode_png(eight_bits(record.picture.to_array()))

@@ -1,0 +1,72 @@
+"""`sonarpost survey coverage FILE...`: the covered seabed as polygons, GeoPackage or GeoJSON."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.cli.shared import Subparsers, add_survey_options, in_new_folder, survey_options_of
+from sonarpost.errors import ConfigError
+from sonarpost.export.coverage import write_coverage_geojson
+from sonarpost.export.geopackage import write_coverage_geopackage
+from sonarpost.sonar.maps.coverage import CoveragePolygon, survey_coverage
+
+WRITERS: Final[Mapping[str, Callable[[Path, Sequence[CoveragePolygon]], None]]] = {
+    ".gpkg": write_coverage_geopackage,
+    ".geojson": write_coverage_geojson,
+}
+"""Suffix -> function that writes the file."""
+
+
+def add_action(actions: Subparsers) -> None:
+    """Add the action."""
+    parser = actions.add_parser(
+        "coverage",
+        help="write the covered seabed as polygons",
+        description="Write the outline of the swath, a polygon for each part of a line without gap, in WGS 84.",
+    )
+    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="survey file")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help="file to write, named *.gpkg or *.geojson"
+    )
+    add_survey_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(parsed: argparse.Namespace) -> int:
+    """Write the polygons; return 0.
+
+    Raises:
+        ConfigError: The name of the file has another suffix.
+        SurveyFileError: A recording cannot be read, or none can be positioned.
+    """
+    write = coverage_writer(parsed.out, "survey coverage", "--out")
+    options = survey_options_of(parsed)
+    in_new_folder(parsed.out)
+    with ProgressDisplay(step="outlining the swath"):
+        coverage = survey_coverage(parsed.files, options)
+        write(parsed.out, coverage.polygons)
+    area_m2 = sum(polygon.area_m2 for polygon in coverage.polygons)
+    print(f"{parsed.out}: polygons {len(coverage.polygons)}, area {area_m2:.0f} m², pings {coverage.pings}")
+    print_left_out(coverage.left_out)
+    return 0
+
+
+def coverage_writer(path: Path, command: str, option: str) -> Callable[[Path, Sequence[CoveragePolygon]], None]:
+    """Return the function that writes a file of this name.
+
+    Raises:
+        ConfigError: The name has another suffix.
+    """
+    if (write := WRITERS.get(path.suffix.lower())) is None:
+        raise ConfigError(command, option, str(path), "a file named *" + " or *".join(WRITERS))
+    return write
+
+
+def print_left_out(pings: int) -> None:
+    """Print the number of pings that could not be placed, if there are any."""
+    if pings:
+        print(f"left out: {pings} pings without position, heading or altitude")

@@ -1,0 +1,64 @@
+"""`sonarpost survey mosaic FILE...`: a mosaic of the seabed as GeoTIFF, and its coverage as polygons."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.cli.shared import Subparsers, add_survey_options, in_new_folder, survey_options_of
+from sonarpost.cli.survey.coverage import coverage_writer, print_left_out
+from sonarpost.errors import ConfigError
+from sonarpost.sonar.maps.mosaic import MIN_RESOLUTION_M, write_mosaic
+
+
+def add_action(actions: Subparsers) -> None:
+    """Add the action."""
+    parser = actions.add_parser("mosaic", help="write a mosaic of the seabed as cloud-optimised GeoTIFF")
+    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="survey file")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.tif", help="the GeoTIFF to write")
+    parser.add_argument(
+        "--resolution-m", type=float, default=0.1, metavar="M", help="side of a pixel in metres (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--coverage", type=Path, metavar="FILE", help="also write the covered area as polygons, *.gpkg or *.geojson"
+    )
+    add_survey_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(parsed: argparse.Namespace) -> int:
+    """Write the mosaic; return 0.
+
+    Raises:
+        ConfigError: The resolution is out of range, or the name of the coverage has another suffix.
+        SurveyFileError: A recording cannot be read or positioned.
+    """
+    check_resolution(parsed.resolution_m, "survey mosaic")
+    write_coverage = None
+    if parsed.coverage is not None:
+        write_coverage = coverage_writer(parsed.coverage, "survey mosaic", "--coverage")
+        in_new_folder(parsed.coverage)
+    options = survey_options_of(parsed)
+    in_new_folder(parsed.out)
+    with ProgressDisplay(step="drawing the mosaic"):
+        result = write_mosaic(parsed.files, parsed.out, parsed.resolution_m, options)
+        if write_coverage is not None:
+            write_coverage(parsed.coverage, result.coverage.polygons)
+    height_px, width_px = result.size_px
+    print(
+        f"{parsed.out}: {width_px} x {height_px} px of {parsed.resolution_m:g} m, EPSG:{result.transform.epsg}, "
+        f"{result.coverage.pings} pings"
+    )
+    print_left_out(result.coverage.left_out)
+    return 0
+
+
+def check_resolution(resolution_m: float, command: str) -> None:
+    """Check --resolution-m.
+
+    Raises:
+        ConfigError: It is out of range.
+    """
+    if not MIN_RESOLUTION_M <= resolution_m <= 1000:  # includes NaN
+        raise ConfigError(command, "--resolution-m", resolution_m, f"{MIN_RESOLUTION_M} to 1000 metres")
