@@ -1,18 +1,20 @@
-"""Stored images and decisions of c2: files, index and retention."""
+"""Archive of c2: the interface of both kinds, and the one of files with an index in SQLite (the default)."""
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from sonarpost import keys
 from sonarpost.archive.image_files import WrittenImage, add_image
+from sonarpost.archive.reader import RecordReader
 from sonarpost.archive.retention import DAY_S
 from sonarpost.archive.shore_files import (
     decision_path,
+    decision_text,
     delete_image_files,
     files_digest,
     image_row,
@@ -21,14 +23,85 @@ from sonarpost.archive.shore_files import (
     select_images,
     verify_files,
 )
-from sonarpost.archive.shore_index import DEFECTS, DecisionRow, ImageRow, ShoreIndex, TaskingRow
+from sonarpost.archive.shore_index import DEFECTS, DecisionRow, ImageRow, ShoreIndex, TaskingRow, Verified
 from sonarpost.errors import PayloadError
 from sonarpost.files import AtomicFiles
 from sonarpost.logs import kv
-from sonarpost.messages import Decision, ReconstructedImage
+from sonarpost.messages import Decision, ReconstructedImage, TaskingKind
 from sonarpost.services.c2.config import C2Config
+from sonarpost.sonar.image_decoding import GreyImage
+from sonarpost.sonar.image_files import read_image
 
 log = logging.getLogger(__name__)
+
+
+class Storage(Protocol):
+    """What c2 requires of an archive; methods raise OSError or DeliveryError if it cannot be used at present.
+
+    Images and decisions are durable after `flush`. An archive that several c2 share also stores the records that they
+    have acknowledged, so that another c2 can handle them.
+    """
+
+    def open(self) -> None:
+        """Create or migrate the archive at the start of c2, if it can be reached."""
+
+    def index(self) -> RecordReader:
+        """Return what reads the stored records."""
+
+    def store_image(self, image: ReconstructedImage, relayed_utc_s: float) -> WrittenImage:
+        """Add an image to the next `flush`."""
+
+    def store_decision(self, decision: Decision) -> bool:
+        """Add a decision to the next `flush`; see `Archive.store_decision`."""
+
+    def flush(self) -> None:
+        """Make the images and decisions since the last call durable."""
+
+    def read_pixels(self, vessel_id: str, name: str) -> GreyImage:
+        """Return the pixels of a stored image; `name` is that of its files without suffix.
+
+        Raises:
+            BadInputError: They are missing or unreadable.
+        """
+
+    def claim_tasking(self, row: TaskingRow, payload: bytes) -> bytes | None:
+        """Claim a record for a vessel; see `ShoreDatabase.claim_tasking`."""
+
+    def foreign_tasking(self, vessel_id: str, kind: TaskingKind, record_id: str) -> bytes | None:
+        """Return a record for a vessel that another c2 has claimed; see `ShoreDatabase.foreign_tasking`."""
+
+    def store_tasking(self, rows: Sequence[TaskingRow]) -> None:
+        """Index advice and commands with their states."""
+
+    def accept(self, records: Sequence[tuple[str, bytes]]) -> None:
+        """Store records, as key and payload, before they are acknowledged."""
+
+    def handled(self, key: str, payload: bytes) -> None:
+        """Add an accepted record to the next `flush`, which deletes it."""
+
+    def discard(self, key: str, payload: bytes) -> None:
+        """Delete an accepted record that is invalid."""
+
+    def take_over(self, store: Callable[[Sequence[tuple[str, bytes]]], None]) -> int:
+        """Pass records that another c2 has not handled in time to `store`; return their number."""
+
+    def apply_retention(self, now_utc_s: float) -> list[ImageRow]:
+        """Remove images by age and total size; return them."""
+
+    def verify(self, now_utc_s: float, interval_s: float) -> int:
+        """Compare some stored records with their digests; see `Archive.verify`."""
+
+    def defect_counts(self) -> dict[str, int]:
+        """Return the numbers of missing, changed, unreadable and conflicting records, without waiting."""
+
+    def images_bytes(self) -> int:
+        """Return the size of the stored images in bytes, without waiting."""
+
+    def fault(self) -> str:
+        """Return why the archive cannot be used at present; empty if it can."""
+
+    def close(self) -> None:
+        """Release the archive."""
 
 
 class Archive:
@@ -71,16 +144,7 @@ class Archive:
             name = written.tiff.stem
             if written.is_new or not index.has_image(image.vessel_id, name):
                 self._images.append((name, image, relayed_utc_s))
-        fields = kv(
-            vessel=image.vessel_id,
-            version=image.version,
-            transit_s=round(time.time() - relayed_utc_s, 1),
-            file=written.tiff,
-        )
-        if written.is_new and written.is_conflict:
-            log.warning("Image conflicts with a stored one of the same name; both are kept", extra=fields)
-        else:
-            log.info("Image stored" if written.is_new else "Image already stored", extra=fields)
+        log_image(image, relayed_utc_s, written)
         return written
 
     def store_decision(self, decision: Decision) -> bool:
@@ -92,16 +156,11 @@ class Archive:
         index = self.index()
         path = decision_path(self._out_dir, decision.vessel_id, decision.decision_id)
         path.parent.mkdir(parents=True, exist_ok=True)
-        text = (json.dumps(decision.model_dump(), indent=1) + "\n").encode()
+        text = decision_text(decision)
         with self._lock:
             stored = self._files.text_of(path) or (path.read_bytes() if path.is_file() else None)
             if stored is not None and stored != text:
-                raise PayloadError(
-                    keys.contact_decision(decision.vessel_id),
-                    "decision_id",
-                    decision.decision_id,
-                    f"an identifier that no other decision has ({path})",
-                )
+                raise decision_conflict(decision, str(path))
             if stored is None:
                 self._files.add(path, text, last=True)
             if stored is None or not index.has_decision(decision.vessel_id, decision.decision_id):
@@ -133,6 +192,42 @@ class Archive:
         """Index advice and commands with their states."""
         self.index().put(rows)
 
+    # A single c2: its own store has what it has accepted and not handled.
+
+    def open(self) -> None:
+        """Do nothing: the index is opened when it is first required."""
+
+    def read_pixels(self, vessel_id: str, name: str) -> GreyImage:
+        """Return the pixels of a stored image.
+
+        Raises:
+            SurveyFileError: The file is missing or unreadable.
+        """
+        return read_image(self._out_dir / vessel_id / f"{name}.tiff")
+
+    def claim_tasking(self, row: TaskingRow, payload: bytes) -> None:
+        """Return None: there is no other c2."""
+
+    def foreign_tasking(self, vessel_id: str, kind: TaskingKind, record_id: str) -> None:
+        """Return None: there is no other c2."""
+
+    def accept(self, records: Sequence[tuple[str, bytes]]) -> None:
+        """Do nothing: the own store has the records."""
+
+    def handled(self, key: str, payload: bytes) -> None:
+        """Do nothing: the own store has the record."""
+
+    def discard(self, key: str, payload: bytes) -> None:
+        """Do nothing: the own store has the record."""
+
+    def take_over(self, store: Callable[[Sequence[tuple[str, bytes]]], None]) -> int:
+        """Return 0: there is no other c2."""
+        return 0
+
+    def fault(self) -> str:
+        """Return an empty text: faults of the folder are errors of single calls."""
+        return ""
+
     def apply_retention(self, now_utc_s: float) -> list[ImageRow]:
         """Remove images by age and total size; return them."""
         config = self._config
@@ -149,18 +244,7 @@ class Archive:
                 delete_image_files(self._out_dir, row)
             if rows:
                 index.mark("removed_utc_s", rows, now_utc_s)
-        for row in rows:
-            log.warning(
-                "Image removed by retention",
-                extra=kv(
-                    vessel=row.vessel_id,
-                    vehicle=row.vehicle_id,
-                    image_id=row.image_id,
-                    version=row.version,
-                    exported=row.exported_utc_s is not None,
-                    file=row.name,
-                ),
-            )
+        log_removed(rows)
         return rows
 
     def verify(self, now_utc_s: float, interval_s: float) -> int:
@@ -185,18 +269,7 @@ class Archive:
                     results.append(verify_files(self._out_dir, row))
         if results:
             index.mark_verified(results, now_utc_s)
-        new = [result for result in results if result.fault and result.fault != result.row.fault]
-        if new:
-            row = new[0].row
-            log.error(
-                "Stored files differ from the index",
-                extra=kv(
-                    records=len(new),
-                    vessel=row.vessel_id,
-                    first=row.name if isinstance(row, ImageRow) else row.decision_id,
-                    fault=new[0].fault,
-                ),
-            )
+        log_new_faults(results)
         return len(results)
 
     def defect_counts(self) -> dict[str, int]:
@@ -215,3 +288,58 @@ class Archive:
             if self._index is not None:
                 self._index.close()
                 self._index = None
+
+
+def log_image(image: ReconstructedImage, relayed_utc_s: float, written: WrittenImage) -> None:
+    """Log that an image is stored."""
+    fields = kv(
+        vessel=image.vessel_id,
+        vehicle=image.vehicle_id,
+        image_id=image.image_id,
+        version=image.version,
+        transit_s=round(time.time() - relayed_utc_s, 1),
+        file=written.tiff,
+    )
+    if written.is_new and written.is_conflict:
+        log.warning("Image conflicts with a stored one of the same name; both are kept", extra=fields)
+    else:
+        log.info("Image stored" if written.is_new else "Image already stored", extra=fields)
+
+
+def decision_conflict(decision: Decision, stored: str) -> PayloadError:
+    """Return the error for a decision whose identifier another one has, which is stored at `stored`."""
+    key = keys.contact_decision(decision.vessel_id)
+    expected = f"an identifier that no other decision has ({stored})"
+    return PayloadError(key, "decision_id", decision.decision_id, expected)
+
+
+def log_removed(rows: Sequence[ImageRow]) -> None:
+    """Log the images that retention has removed."""
+    for row in rows:
+        log.warning(
+            "Image removed by retention",
+            extra=kv(
+                vessel=row.vessel_id,
+                vehicle=row.vehicle_id,
+                image_id=row.image_id,
+                version=row.version,
+                exported=row.exported_utc_s is not None,
+                file=row.name,
+            ),
+        )
+
+
+def log_new_faults(results: Sequence[Verified]) -> None:
+    """Log the faults that a comparison has found and that were not known before."""
+    new = [result for result in results if result.fault and result.fault != result.row.fault]
+    if new:
+        row = new[0].row
+        log.error(
+            "Stored files differ from the index",
+            extra=kv(
+                records=len(new),
+                vessel=row.vessel_id,
+                first=row.name if isinstance(row, ImageRow) else row.decision_id,
+                fault=new[0].fault,
+            ),
+        )

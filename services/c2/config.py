@@ -5,9 +5,37 @@ from typing import Annotated
 
 from pydantic import Field
 
+from sonarpost.archive.postgresql import DatabaseAddress
+from sonarpost.codec.vq.codebook import open_codebook
+from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.keys import SHORE
 from sonarpost.messages import PlatformId
 from sonarpost.runtime.retention import MaxBytes, RetentionConfig
+
+Imei = Annotated[str, Field(pattern=r"^[0-9]{15}$")]
+
+
+class ShortMessageOptions(ServiceConfig):
+    """The `short_messages` table of c2: messages of satellite terminals, through a gateway like RockBLOCK's.
+
+    Attributes:
+        vessels: IMEI of the terminal = name of its vessel.
+        token_file: File with a secret of at least 16 characters: the gateway's address for deliveries is
+            `http://HOST:PORT/SECRET`.
+        host: Address of the webhook, without TLS; a reverse proxy adds it.
+        port: Port of the webhook; 0 for any.
+        gateway: Address of the gateway, for acknowledgements.
+        username: Name of the account at the gateway.
+        password_file: File with its password.
+    """
+
+    vessels: Annotated[dict[Imei, PlatformId], Field(min_length=1)]
+    token_file: Path
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8480
+    gateway: Annotated[str, Field(pattern=r"^https?://")]
+    username: str
+    password_file: Path
 
 
 class C2Config(RetentionConfig):
@@ -18,10 +46,46 @@ class C2Config(RetentionConfig):
         out_dir: Folder of the stored records, with a folder for each vessel and an index.
         max_bytes: Maximum size of the stored images; above it exported images are removed first, then those with a
             decision, then the others, each the oldest first. Decisions are never removed.
+        codebooks: Tile codebooks that vehicles may use: nominal-10, nominal-20 or files. c2 requests others from the
+            vessel and keeps them in the folder `codebooks` of state_dir.
+        decode_workers: Processes that decode images, each with about 200 MB of memory.
+        database: PostgreSQL database of the records, `postgresql://USER@HOST/DATABASE`, which several c2 can share;
+            without one they are in `out_dir`. The connection uses TLS, unless the server is on this host or the address
+            ends in `?sslmode=disable`; `sslrootcert=FILE` names the authority.
+        database_password_file: File with the password, in place of one in the address.
         verify_days: Time in which every stored file is compared with the index once; 0 disables the comparison.
+        json_mirror: Whether c2 also publishes every record as JSON below `{site}/json`, for clients without msgpack.
+        short_messages: Reception of short messages from satellite terminals; none by default.
     """
 
     site: PlatformId = SHORE
     out_dir: Path = Path("out")
     max_bytes: MaxBytes = 50_000_000_000
+    codebooks: Annotated[tuple[str, ...], Field(min_length=1)] = ("nominal-10", "nominal-20")
+    decode_workers: Annotated[int, Field(ge=1, le=64)] = 1
+    database: str | None = None
+    database_password_file: Path | None = None
     verify_days: Annotated[float, Field(ge=0, le=36500)] = 1.0
+    json_mirror: bool = False
+    short_messages: ShortMessageOptions | None = None
+
+    def check_with(self, platform: PlatformConfig) -> None:
+        """Check that the codebooks can be read, and the address of the database.
+
+        Raises:
+            CodebookError: A codebook cannot be read.
+            ConfigError: The address of the database is invalid, or its password cannot be read.
+        """
+        self.database_address()
+        for name in self.codebooks:
+            open_codebook(name)
+
+    def database_address(self) -> DatabaseAddress | None:
+        """Return the address of the database; None for an archive of files.
+
+        Raises:
+            ConfigError: It is invalid, or its password cannot be read.
+        """
+        if self.database is None:
+            return None
+        return DatabaseAddress.parse(self.database, self.database_password_file, "c2")

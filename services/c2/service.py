@@ -5,22 +5,44 @@ from __future__ import annotations
 import logging
 import threading
 import time
+import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 from sonarpost import keys, wire
+from sonarpost.archive import image_parts
+from sonarpost.archive.codebook_transfer import CodebookFetcher
+from sonarpost.archive.decoder import OTHER_PIXELS
+from sonarpost.archive.journal import Accepted, JournalEntry
 from sonarpost.bus.connectivity import declare_presence
+from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem, OutboxItem, platform_of, queue_of
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import DeliveryError, PayloadError
 from sonarpost.logs import kv
-from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
+from sonarpost.messages import (
+    Advice,
+    Command,
+    Decision,
+    ImagePart,
+    ReceivedStatus,
+    ReconstructedImage,
+    Record,
+    Relayed,
+)
 from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, ServiceStoppingError, UnitOfWork
 from sonarpost.services.c2 import tasking
-from sonarpost.services.c2.archive import Archive
+from sonarpost.services.c2.accepted import AcceptedRecords, accepted_fields, payload_of
+from sonarpost.services.c2.archive import Archive, Storage
 from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.decoding import BACKLOG, AcceptedImage, BacklogNames, Decoding, decode_workers
+from sonarpost.services.c2.json_form import ENCODING, json_payload
+from sonarpost.services.c2.queries import QueryService
+from sonarpost.services.c2.shared_archive import SharedArchive
+from sonarpost.services.c2.short_messages import Access, ShortMessages
 from sonarpost.services.c2.tasking import Tasking
 
 log = logging.getLogger(__name__)
@@ -30,13 +52,21 @@ ADVICE_PRIORITY = 2
 CONSUMER = "relay"
 VERIFICATION_INTERVAL_S = 60.0
 RETRY_S = 1.0
+TAKE_OVER_INTERVAL_S = 5.0
+OWNER = "archive-owner"
+"""State with the identity of this service's store."""
+VERSIONS = "version/"
+"""Prefix of the states with the last accepted version of an image, to which vessels send differences."""
+CODEBOOKS = "codebooks"
+"""Folder of state_dir with the codebooks of vessels."""
 
 
 class C2Service(Service[C2Config]):
     """Stores and publishes relayed records, and sends advice and commands to vessels.
 
     A record is acknowledged to the vessel when it is committed to this service's store, and published to subscribers
-    when its files are written. A restart can publish a record again; subscribers identify it by its identifiers.
+    when its files are written. Coded images are decoded by other processes, while further records are
+    accepted. A restart can publish a record again; subscribers identify it by its identifiers.
     """
 
     NAME = "c2"
@@ -45,22 +75,69 @@ class C2Service(Service[C2Config]):
     PUBLISH = False
 
     def __init__(self, platform: PlatformConfig, config: C2Config) -> None:
+        # Before the store is opened: a wrong secret ends the service.
+        access = None if config.short_messages is None else Access.read(config.short_messages)
         super().__init__(platform, config)
-        self._archive = Archive(config)
+        address = config.database_address()
+        self._archive: Storage = Archive(config) if address is None else SharedArchive(config, address, self._owner())
+        journal_folder = config.out_dir if address is None else platform.state_dir
+        self._accepted = AcceptedRecords(self._archive, journal_folder, config.site)
+        self._queries = QueryService(self._accepted, config.site, self.count)
         self._retention = Retention(self._apply_retention, self.stopping)
         self._changed = threading.Event()
         self._changed_names: set[str] = set()
         self._changed_lock = threading.Lock()
         self._background_faults: dict[str, str] = {}
+        self._short_messages: ShortMessages | None = None
+        if config.short_messages is not None and access is not None:
+            self._short_messages = ShortMessages(
+                config.short_messages,
+                access,
+                config.codebooks,
+                config.site,
+                self.store,
+                self.count,
+                self.check_capacity,
+                self.interval_log(log, logging.WARNING, "Short message refused or not acknowledged"),
+            )
         # Of the records that are handled and not committed yet.
-        self._to_publish: list[tuple[str, Record]] = []
+        self._to_publish: list[JournalEntry] = []
         self._uncommitted: dict[str, bytes] = {}
+        # Records are added to the archive and flushed by one thread at a time.
+        self._archiving = threading.Lock()
+        self._stored_versions = 0
+        self._backlog_names = BacklogNames(self.store)
+        folder = platform.state_dir / CODEBOOKS
+        self.decoding = Decoding(
+            self.store,
+            decode_workers(config.decode_workers, config.codebooks, folder, platform.state_dir),
+            self._keep_images,
+            self._on_undecodable,
+            self.stopping,
+        )
+        self._codebooks = CodebookFetcher(
+            folder,
+            self.decoding.missing.pairs,
+            lambda: self.decoding.wake(codebook_added=True),
+            self.stopping,
+        )
+        self.decoding.missing.on_added = self._codebooks.wake
+
+    def _owner(self) -> str:
+        """Return the identity of this service's store, which is made once: a new store is another owner of records."""
+        known = self.store.get_state(OWNER)
+        if known is None:
+            known = uuid.uuid4().hex.encode()
+            with self.store.transaction() as tx:
+                tx.put_state(OWNER, known)
+        return known.decode()
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Relayed records of all vessels, and advice and commands for them."""
         site = self.config.site
         return {
             keys.shore_inbox_all(site): Relayed,
+            keys.shore_part_all(site): ImagePart,
             keys.tasking_advice_all(site): Advice,
             keys.tasking_command_all(site): Command,
         }
@@ -75,29 +152,86 @@ class C2Service(Service[C2Config]):
                 raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
             self._unpack(record)
             return
+        if isinstance(record, ImagePart):
+            if record.b == 0:
+                image_parts.coded_image(record, keys.part_vessel(key), key)
+            return
         assert isinstance(record, (Advice, Command))
         vessel = keys.tasking_vessel(key)
         if isinstance(record, Advice) and record.vessel_id != vessel:
             raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
         self._is_known(vessel, key, record)
 
+    def expand(self, tx: Transaction, key: str, payload: bytes) -> bytes:
+        """Return the whole image of a difference; store it, because the vessel sends later differences to it.
+
+        Raises:
+            MissingBaseError: The version to which it is the difference is not known.
+        """
+        if not image_parts.is_part(key):
+            return payload
+        prefix = f"{VERSIONS}{keys.part_vessel(key)}/"
+        name = image_parts.version_name(prefix, payload)
+        known = tx.get_state(name)
+        if not image_parts.is_whole(payload):
+            base = None if known is None else wire.decode(ImagePart, known, key)
+            whole = image_parts.expand(wire.decode(ImagePart, payload, key), base, key)
+            image_parts.coded_image(whole, keys.part_vessel(key), key)
+            payload = wire.encode(whole)
+        if known is None or image_parts.version_of(known) < image_parts.version_of(payload):
+            tx.put_state(name, payload)
+            self._stored_versions += 1
+            if self._stored_versions % image_parts.PRUNE_EVERY == 0:
+                for surplus in image_parts.surplus_names(self.store.state_names(prefix)):
+                    tx.delete_state(surplus)
+        return payload
+
+    def before_accepting(self, records: Sequence[tuple[str, bytes]]) -> None:
+        """Commit records to an archive that several c2 share, so that another one can handle them."""
+        self._archive.accept(records)
+
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Store the record of a vessel, or queue advice and commands for one."""
+        try:
+            self._handle(key, record, effects)
+        except (OSError, DeliveryError, ServiceStoppingError):
+            raise
+        except Exception:
+            self._archive.discard(key, effects.payload)
+            raise
+        if not isinstance(record, ImagePart):
+            self._archive.handled(key, effects.payload)
+
+    def _handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         if isinstance(record, Relayed):
             inner = self._unpack(record)
             if isinstance(inner, ReconstructedImage):
                 self._store_image(inner, record.relayed_utc_s, effects)
+            elif isinstance(inner, ReceivedStatus):
+                self._publish_status(inner, effects)
             else:
                 self._store_decision(inner, effects)
+        elif isinstance(record, ImagePart):
+            self._accept_image(keys.part_vessel(key), key, record, effects)
         else:
             assert isinstance(record, (Advice, Command))
             self._send_to_vessel(keys.tasking_vessel(key), key, record, effects)
 
-    def _unpack(self, envelope: Relayed) -> ReconstructedImage | Decision:
+    def _publish_status(self, status: ReceivedStatus, effects: UnitOfWork) -> None:
+        """Publish the status of a vehicle. It is not archived: a newer one replaces it."""
+        key = keys.shore_status(status.vessel_id, self.config.site)
+        self.publish(key, status)
+        if self.config.json_mirror:
+            fields = wire.unpack_map(wire.encode(status), key)
+            self.publish_payload(keys.json_mirror(key), json_payload(fields, "none"), ENCODING)
+        effects.count("statuses_published")
+
+    def _unpack(self, envelope: Relayed) -> ReconstructedImage | Decision | ReceivedStatus:
         vessel = envelope.vessel_id
-        known: Mapping[str, type[ReconstructedImage] | type[Decision]] = {
+        known: Mapping[str, type[ReconstructedImage] | type[Decision] | type[ReceivedStatus]] = {
             keys.image_reconstructed(vessel): ReconstructedImage,
             keys.contact_decision(vessel): Decision,
+            keys.acoustic_status(vessel): ReceivedStatus,
         }
         record_type = known.get(envelope.key)
         if record_type is None:
@@ -112,12 +246,56 @@ class C2Service(Service[C2Config]):
         effects.count("images_stored" if written.is_new else "images_repeated")
         if written.is_new and written.is_conflict:
             effects.count("images_conflicting")
-        self._to_publish.append((keys.shore_image(image.vessel_id, self.config.site), image))
+        self._to_publish.append(self._accepted.image(image, written.tiff.stem))
+
+    def _accept_image(self, vessel: str, key: str, part: ImagePart, effects: UnitOfWork) -> None:
+        """Add a coded image to the backlog of the decoder, and publish it in coded form."""
+        image = image_parts.coded_image(part, vessel, key)
+        entry = AcceptedImage(self._backlog_names.next(), vessel, effects.payload)
+        effects.put_state(entry.name, entry.pack())
+        effects.count("images_accepted")
+        self._to_publish.append(self._accepted.coded(image))
+
+    def _keep_images(self, images: Sequence[ReconstructedImage], entries: Sequence[AcceptedImage]) -> None:
+        """Store and publish decoded images of entries of the backlog.
+
+        Raises:
+            OSError, DeliveryError: They cannot be written.
+            ServiceStoppingError: The service stops; they are decoded again after the next start.
+        """
+        with self._archiving:
+            written = [self._archive.store_image(image, image.last_frame_utc_s) for image in images]
+            for entry in entries:
+                self._archive.handled(keys.shore_part(entry.vessel_id, self.config.site), entry.payload)
+            stored = [self._accepted.image(i, files.tiff.stem) for i, files in zip(images, written, strict=True)]
+            numbers = self._accepted.flush(stored)
+        for image, files in zip(images, written, strict=True):
+            self.count("images_stored" if files.is_new else "images_repeated")
+            if files.is_new and files.is_conflict:
+                self.count("images_conflicting")
+            if OTHER_PIXELS in image.notes:
+                self.count("images_differing")
+                log.warning(
+                    "Image decoded with other pixels than on the vessel",
+                    extra=kv(vessel=image.vessel_id, codec=image.codec),
+                )
+        self._publish_stored(stored, numbers)
+        if any(files.is_new for files in written):
+            self._retention.wake()
+
+    def _on_undecodable(self, entry: AcceptedImage, reason: str) -> None:
+        self._archive.handled(keys.shore_part(entry.vessel_id, self.config.site), entry.payload)
+        self.count("images_undecodable")
+        log.error("Image cannot be decoded", extra=kv(vessel=entry.vessel_id, reason=reason))
+
+    def _handle_batch(self, items: Sequence[InboxItem]) -> None:
+        with self._archiving:
+            super()._handle_batch(items)
 
     def _store_decision(self, decision: Decision, effects: UnitOfWork) -> None:
         new = self._archive.store_decision(decision)
         effects.count("decisions_stored" if new else "decisions_repeated")
-        self._to_publish.append((keys.shore_decision(decision.vessel_id, self.config.site), decision))
+        self._to_publish.append(self._accepted.decision(decision))
 
     def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """Commit after the files of all records are on the disk and published.
@@ -126,13 +304,13 @@ class C2Service(Service[C2Config]):
             OSError, DeliveryError: They cannot be written; all records are handled again.
         """
         try:
-            self._archive.flush()
-            for key, record in self._to_publish:
-                self._publish_stored(key, record)
+            self._publish_stored(self._to_publish, self._accepted.flush(self._to_publish))
             superseded = super().commit_batch(handled)
         finally:
             self._to_publish.clear()
             self._uncommitted.clear()
+        if any(effects.counts.get("images_accepted") for effects, _ in handled):
+            self.decoding.wake()
         if any(effects.counts.get("images_stored") for effects, _ in handled):
             self._retention.wake()
         return superseded
@@ -147,10 +325,17 @@ class C2Service(Service[C2Config]):
         """
         name = tasking.state_name(vessel, *tasking.kind_and_id(record))
         known = self._uncommitted.get(name) or self.store.get_state(name)
-        if known is None:
-            return False
-        tasking.reject_conflict(Tasking.unpack(known), record, key)
-        return True
+        if known is not None:
+            tasking.reject_conflict(Tasking.unpack(known), record, key)
+            return True
+        kind, record_id = tasking.kind_and_id(record)
+        return self._is_foreign(vessel, key, record, self._archive.foreign_tasking(vessel, kind, record_id))
+
+    def _is_foreign(self, vessel: str, key: str, record: Advice | Command, payload: bytes | None) -> bool:
+        """Return whether another c2 has a record; see `_is_known` for errors."""
+        if payload:
+            tasking.reject_conflict(Tasking(vessel, tasking.kind_and_id(record)[0], payload), record, key)
+        return payload is not None
 
     def _send_to_vessel(self, vessel: str, key: str, record: Advice | Command, effects: UnitOfWork) -> None:
         if self._is_known(vessel, key, record):
@@ -159,6 +344,10 @@ class C2Service(Service[C2Config]):
         payload = effects.payload
         kind, record_id = tasking.kind_and_id(record)
         item = Tasking(vessel, kind, payload, changed_utc_s=time.time())
+        # Another c2 can have accepted it at the same time.
+        if self._is_foreign(vessel, key, record, self._archive.claim_tasking(item.row(), payload)):
+            effects.count("tasking_repeated")
+            return
         priority = ADVICE_PRIORITY if isinstance(record, Advice) else COMMAND_PRIORITY
         # One queue for each vessel: an unreachable vessel does not delay the others.
         effects.send_payload(item.key, queue_of(CONSUMER, vessel), payload, type(record), priority=priority)
@@ -210,68 +399,137 @@ class C2Service(Service[C2Config]):
                     continue  # not committed yet
                 item = Tasking.unpack(packed)
                 self._archive.store_tasking([item.row()])
-                self._publish_stored(keys.tasking_state(item.vessel_id, self.config.site), item.state_record())
+                state = [self._accepted.state(item)]
+                self._publish_stored(state, self._accepted.number(state))
                 names.discard(name)
         finally:
             with self._changed_lock:
                 self._changed_names |= names
 
+    # Records of another c2
+
+    def _take_over(self) -> None:
+        """Handle the records that another c2 has acknowledged and not handled before it ended."""
+        while not self.stopping.wait(TAKE_OVER_INTERVAL_S):
+            try:
+                while taken := self._archive.take_over(self._store_taken):
+                    self.count("records_taken_over", taken)
+                    log.warning("Records of another c2 taken over", extra=kv(records=taken))
+                self._background_faults.pop("take-over", None)
+                self._prefer_others(others=False)
+            except (OSError, DeliveryError) as error:
+                self._background_faults["take-over"] = str(error)
+                self._prefer_others(others=True)
+
+    def _prefer_others(self, *, others: bool) -> None:
+        """Leave records and queries to c2 that reach the database while there is one, or end that."""
+        self.prefer_other_consumers(others=others)
+        self._queries.set_preferred(is_preferred=not others)
+
+    def _store_taken(self, records: Sequence[tuple[str, bytes]]) -> None:
+        with self.store.transaction() as tx:
+            for key, payload in records:
+                tx.accept(key, payload)
+
     # Start and stop
+
+    def before_session(self) -> None:
+        """Open the archive, so that a wrong database ends the start."""
+        self._archive.open()
 
     def on_start(self) -> None:
         """Start the retention and the publication of delivery states."""
         self.start_thread(self._retention.run, "retention")
         self.start_thread(self._run_verification, "verification")
         self.start_thread(self._publish_states, "tasking")
+        if isinstance(self._archive, SharedArchive):
+            self.start_thread(self._take_over, "take-over")
+        self.start_thread(self.decoding.run, "decoding")
+        self.start_thread(lambda: self._codebooks.run(self.session), "codebooks")
+        self.start_thread(self._run_queries, "queries")
+        if self._short_messages is not None:
+            self._short_messages.open()
+            self.start_thread(partial(self._short_messages.run, self.stopping), "short-messages")
         declare_presence(self.session, self.platform.id, self.NAME, self.config.site)
 
     def on_stop(self) -> None:
-        """Wake the background threads."""
+        """Wake the background threads and close the webhook."""
+        if self._short_messages is not None:
+            self._short_messages.close()
         self._retention.wake()
         self._changed.set()
+        self.decoding.close()
+        self._codebooks.wake()
 
     def stop(self) -> None:
-        """Stop, then close the index."""
+        """Stop, then close the archive."""
         super().stop()
+        self._accepted.close()
         self._archive.close()
 
     def _apply_retention(self, now_utc_s: float) -> None:
         removed = self._archive.apply_retention(now_utc_s)
         if removed:
+            self._accepted.remove(removed)
             self.count("images_removed", len(removed))
+
+    def _run_queries(self) -> None:
+        """Answer queries over a session of their own until the service stops."""
+        session = open_with_retry(self.platform.router, self.stopping, self.platform.tls)
+        if session is not None:
+            self._queries.start(session)
+            self.stopping.wait()
+            self._queries.close()
 
     def _run_verification(self) -> None:
         while not self.stopping.wait(VERIFICATION_INTERVAL_S):
             try:
                 self._archive.verify(time.time(), VERIFICATION_INTERVAL_S)
                 self._background_faults.pop("verification", None)
-            except OSError as error:
+            except (OSError, DeliveryError) as error:
                 self._background_faults["verification"] = f"stored files cannot be verified: {error}"
                 log.error("Verification of stored files failed", extra=kv(reason=str(error)))
 
     def warning(self) -> str:
-        """Return how many records are missing, changed or conflicting in `out_dir`."""
+        """Return how many records are missing, changed or conflicting, and which codebooks are missing."""
+        waiting = self.decoding.missing.warning()
+        reasons = "; ".join(sorted(set(self._codebooks.faults.values())))
+        waiting = f"{waiting}: {reasons}" if waiting and reasons else waiting
         counts = [f"{count} {defect}" for defect, count in self._archive.defect_counts().items() if count]
-        return f"{self.config.out_dir}: stored records {', '.join(counts)}" if counts else ""
+        place = self.config.out_dir if self.config.database is None else "database"
+        stored = f"{place}: stored records {', '.join(counts)}" if counts else ""
+        return "; ".join(text for text in (stored, waiting) if text)
 
     def degraded_reason(self) -> str:
-        """Return the faults of the background threads."""
-        return "; ".join(fault for fault in (*self._background_faults.values(), self._retention.error) if fault)
+        """Return the faults of the archive and of the background threads."""
+        faults = (
+            self._archive.fault(),
+            *self._background_faults.values(),
+            self.decoding.fault,
+            self._retention.error,
+        )
+        return "; ".join(dict.fromkeys(fault for fault in faults if fault))
 
     def gauges(self) -> Mapping[str, float]:
         """Return the size of the stored images and the number of records queued for vessels."""
         waiting = [q for q in self.store.queues() if q.startswith(CONSUMER)]
         return {
+            "images_undecoded": float(self.store.state_count(BACKLOG)),
             "pictures_bytes": float(self._archive.images_bytes()),
             "waiting_for_vessels": float(sum(self.store.queue_depth(queue).records for queue in waiting)),
             **{f"records_{defect}": float(count) for defect, count in self._archive.defect_counts().items()},
         }
 
-    def _publish_stored(self, key: str, record: Record) -> None:
-        """Publish a record.
+    def _publish_stored(self, entries: Sequence[JournalEntry], numbers: Sequence[Accepted]) -> None:
+        """Publish records with their numbers.
 
         Raises:
-            ServiceStoppingError: The session was closed: the record is published after the next start.
+            ServiceStoppingError: The session was closed: the records are published after the next start.
         """
-        if not self.publish(key, record) and self.stopping.is_set():
-            raise ServiceStoppingError
+        for entry, accepted in zip(entries, numbers, strict=True):
+            fields = accepted_fields(wire.unpack_map(wire.encode(entry.record), entry.key), accepted)
+            encoding = wire.encoding_of(type(entry.record))
+            if not self.publish_payload(entry.key, payload_of(fields), encoding) and self.stopping.is_set():
+                raise ServiceStoppingError
+            if self.config.json_mirror:
+                self.publish_payload(keys.json_mirror(entry.key), json_payload(fields, "png"), ENCODING)
