@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sonarpost.archive.reader import place_of
 from sonarpost.archive.shore_index import FILE_NAME as FILE_NAME_OF_INDEX
 from sonarpost.config import load
 from sonarpost.errors import ConfigError, PortError
@@ -38,7 +39,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
     page = parser.add_mutually_exclusive_group()
     page.add_argument("--training", type=int, metavar="N", help="serve a training console with N simulated contacts")
-    page.add_argument("--view", type=Path, metavar="DIR", help="serve the contacts in a folder of c2, read only")
+    page.add_argument("--view", metavar="DIR", help="serve the contacts in a folder or database of c2, read only")
     parser.add_argument("--port", type=int, help="port of the page (default: 8470, or any if it is in use; 0: any)")
     parser.add_argument("--state", type=Path, metavar="DIR", help="folder for the training data (default: none)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the simulation (default: 1)")
@@ -159,19 +160,20 @@ def _run_view(parsed: argparse.Namespace) -> int:
     from sonarpost.services.console.service import stored_records  # noqa: PLC0415
     from sonarpost.services.console.state import ConsoleState  # noqa: PLC0415
 
-    if not (parsed.view / FILE_NAME_OF_INDEX).is_file():
-        raise ConfigError("console", "--view", str(parsed.view), "a folder of c2, with its index")
+    place = place_of(parsed.view, "console --view")
+    if isinstance(place, Path) and not (place / FILE_NAME_OF_INDEX).is_file():
+        raise ConfigError("console", "--view", parsed.view, "a folder of c2, with its index, or its database")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sonarpost-view-")))
         state = ConsoleState(
             ConsoleConfig(role="shore"), stack.enter_context(closing(Database(folder / DATABASE_NAME)))
         )
-        records = list(stored_records(parsed.view))
+        records = list(stored_records(place))
         state.store_images([record for record in records if isinstance(record, ReconstructedImage)])
         for record in records:
             if isinstance(record, Decision):
                 state.store_decision(record)
-        note = f"{state.counts().total} contacts in {parsed.view}, read only. Ctrl-C ends the page."
+        note = f"{state.counts().total} contacts in {place}, read only. Ctrl-C ends the page."
         # An observer: a comment could not be sent.
         _serve(parsed, state, folder, (("watch", "observer"),), SHORE, note)
     return 0

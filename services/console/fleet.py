@@ -11,13 +11,14 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 
 from sonarpost.detection.difficulty import RELIABLE_PD, unreliable_text
-from sonarpost.messages import AcousticFrame, QueueState
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.messages import AcousticFrame, QueueState, VehicleRange
+from sonarpost.modem.interface import RateInfo
 from sonarpost.monitoring.fleet import FleetTracker, ServiceStatus
 from sonarpost.review.positions import distance_m
 from sonarpost.services.console.chain import SERVICE_STALE_S, ChainHistory, HeardVehicle, RouterState, chain_links
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.serialisers import Json
+from sonarpost.services.console.store.tracks import latest_statuses, status_json
 
 PACKETS_KEPT = 20
 MAX_VEHICLES = 200
@@ -51,15 +52,18 @@ class FleetMonitor:
 
     Args:
         stale_s: Time without a frame after which a vehicle is stale.
+        rates: Rates of the vessel's modem; records of earlier versions have no air time.
     """
 
-    def __init__(self, stale_s: float) -> None:
+    def __init__(self, stale_s: float, rates: Mapping[int, RateInfo]) -> None:
         self.services = FleetTracker()
         self.chain_history = ChainHistory()
         self._stale_s = stale_s
+        self._rates = rates
         self._lock = threading.Lock()
         self._links: dict[str, _Link] = {}
         self._queues: dict[str, tuple[QueueState, float]] = {}
+        self._ranges: dict[str, VehicleRange] = {}
 
     def add_frame(self, vehicle_id: str, frame: AcousticFrame, now_s: float | None = None) -> None:
         """Add a frame received from a vehicle; `now_s` is monotonic."""
@@ -77,9 +81,16 @@ class FleetMonitor:
                 link.packets.pop()
             else:
                 link.packet_count += 1
-                link.unknown_rates += frame.rate is None
-                link.airtime_s += 0.0 if frame.rate is None else RATES[frame.rate].airtime_s
+                airtime_s = self._airtime_s(frame)
+                link.unknown_rates += airtime_s is None
+                link.airtime_s += airtime_s or 0.0
             link.packets.append((frame.packet, frames, bad))
+
+    def _airtime_s(self, frame: AcousticFrame) -> float | None:
+        """Return the nominal duration of a frame's packet; None if unknown."""
+        if frame.airtime_s is not None or frame.rate is None or frame.rate not in self._rates:
+            return frame.airtime_s
+        return self._rates[frame.rate].airtime_s
 
     def set_queue(self, state: QueueState, now_s: float | None = None) -> None:
         """Store the state of a vehicle's transmit queue; `now_s` is monotonic."""
@@ -87,8 +98,22 @@ class FleetMonitor:
             if state.platform_id in self._queues or len(self._queues) < MAX_VEHICLES:
                 self._queues[state.platform_id] = (state, time.monotonic() if now_s is None else now_s)
 
+    def set_range(self, record: VehicleRange) -> None:
+        """Store the measured distance of a vehicle."""
+        with self._lock:
+            if record.vehicle_id in self._ranges or len(self._ranges) < MAX_VEHICLES:
+                self._ranges[record.vehicle_id] = record
+
+    def measured_ranges(self) -> dict[str, Json]:
+        """Return the last measured distance of each vehicle by name."""
+        with self._lock:
+            return {
+                name: {"distance_m": record.distance_m, "measured_utc_s": record.measured_utc_s}
+                for name, record in sorted(self._ranges.items())
+            }
+
     def uplink_rate(self, vehicle_id: str, default: int | None) -> int | None:
-        """Return the latest Micro-Modem rate of a vehicle, or `default` if unknown."""
+        """Return the latest rate of a vehicle, or `default` if unknown."""
         with self._lock:
             link = self._links.get(vehicle_id)
             rate = None if link is None else link.frame.rate
@@ -258,7 +283,7 @@ def fleet_json(
     router: RouterState | None,
     now_utc_s: float,
 ) -> Json:
-    """Return the state of services, vehicles and chain, with the position of each vehicle at its last contact.
+    """Return the state of services, vehicles and chain, with the latest position of each vehicle.
 
     The connection of the database, which one thread has at a time, also protects the history of the chain.
     """
@@ -276,22 +301,23 @@ def fleet_json(
             " WHERE r.state IN ('waiting', 'asked', 'sent') GROUP BY c.vehicle_id"
         ).fetchall()
     )
-    known = monitor.vehicles()
+    known, statuses, ranges = monitor.vehicles(), latest_statuses(db), monitor.measured_ranges()
     vehicles: list[Json] = []
-    for name in sorted({*known, *positions}):
-        row = positions.get(name)
+    for name in sorted({*known, *positions, *statuses, *ranges}):
+        position = _latest_position(positions.get(name), statuses.get(name))
         range_m = None
-        if row is not None and config.vessel_lat_deg is not None and config.vessel_lon_deg is not None:
-            vehicle = (row["vehicle_lat_deg"], row["vehicle_lon_deg"])
-            range_m = round(distance_m(config.vessel_lat_deg, config.vessel_lon_deg, *vehicle), 1)
+        if position is not None and config.vessel_lat_deg is not None and config.vessel_lon_deg is not None:
+            range_m = round(distance_m(config.vessel_lat_deg, config.vessel_lon_deg, *position[:2]), 1)
         vehicles.append(
             {
                 **(known.get(name) or unknown_vehicle_json(name)),
                 "range_m": range_m,
-                "range_utc_s": row["seen_utc_s"] if row is not None and range_m is not None else None,
-                "lat_deg": row and row["vehicle_lat_deg"],
-                "lon_deg": row and row["vehicle_lon_deg"],
-                "position_utc_s": row and row["seen_utc_s"],
+                "range_utc_s": position[2] if position is not None and range_m is not None else None,
+                "lat_deg": position and position[0],
+                "lon_deg": position and position[1],
+                "position_utc_s": position and position[2],
+                "measured_range": ranges.get(name),
+                "status": status_json(statuses[name]) if name in statuses else None,
                 "open_orders": open_requests.get(name, 0),
             }
         )
@@ -311,3 +337,13 @@ def fleet_json(
         "services": [*monitor.service_list()],
         "vehicles": [*vehicles],
     }
+
+
+def _latest_position(contact: sqlite3.Row | None, status: sqlite3.Row | None) -> tuple[float, float, float] | None:
+    """Return (lat_deg, lon_deg, time in UTC seconds) of the last contact or of the status, whichever is newer."""
+    found: list[tuple[float, float, float]] = []
+    if contact is not None:
+        found.append((contact["vehicle_lat_deg"], contact["vehicle_lon_deg"], contact["seen_utc_s"]))
+    if status is not None and status["lat_deg"] is not None:
+        found.append((status["lat_deg"], status["lon_deg"], status["time_utc_s"]))
+    return max(found, key=lambda position: position[2], default=None)

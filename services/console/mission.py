@@ -1,7 +1,8 @@
 """Progress of a mission: contacts, area, air time, queue and decisions, for each vehicle and in total.
 
-Only what the console has received is counted. No record of a vehicle states the area of its survey, so that the area
-is that in which contacts lie. Air time on the uplink counts received packets since the start of the console.
+Only what the console has received is counted. The surveyed area follows from the statuses of a vehicle; without them
+only the area in which contacts lie is known. Air time on the uplink counts received packets since the start of the
+console.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from typing import Final
 
-from sonarpost.modem.micromodem.rates import RATES
+from sonarpost.modem.interface import RateInfo
 from sonarpost.review.positions import LocalFrame
+from sonarpost.services.console.coverage import surveyed_area
 from sonarpost.services.console.fleet import FleetMonitor
 from sonarpost.services.console.store.serialisers import Json
+from sonarpost.services.console.store.tracks import track_points
 
 HOURS: Final = 24
 HOUR_S: Final = 3600.0
@@ -147,17 +150,17 @@ def queue_forecast(queue: Json | None, now_utc_s: float) -> Json | None:
     }
 
 
-def mission_json(monitor: FleetMonitor, db: sqlite3.Connection, downlink_rate: int, now_utc_s: float) -> Json:
+def mission_json(monitor: FleetMonitor, db: sqlite3.Connection, downlink_rate: RateInfo, now_utc_s: float) -> Json:
     """Return the progress of the mission.
 
     Args:
         monitor: Frames, queues and seabed of the vehicles.
         db: Database of the console.
-        downlink_rate: Micro-Modem rate of the vessel.
+        downlink_rate: Rate of the vessel.
         now_utc_s: Present time.
     """
     known = monitor.vehicles()
-    names = {row[0] for row in db.execute("SELECT DISTINCT vehicle_id FROM contact")}
+    names = {row[0] for row in db.execute("SELECT vehicle_id FROM contact UNION SELECT vehicle_id FROM track")}
     vehicles: list[Json] = []
     for name in sorted({*known, *names}):
         state = known.get(name, {})
@@ -169,6 +172,7 @@ def mission_json(monitor: FleetMonitor, db: sqlite3.Connection, downlink_rate: i
                 "uplink": monitor.uplink_json(name),
                 "queue": queue_forecast(queue if isinstance(queue, dict) else None, now_utc_s),
                 "seabed": state.get("seabed"),
+                "coverage": surveyed_area(track_points(db, name)),
             }
         )
     decisions = db.execute(
@@ -185,7 +189,7 @@ def mission_json(monitor: FleetMonitor, db: sqlite3.Connection, downlink_rate: i
     }
 
 
-def _contacts_json(db: sqlite3.Connection, vehicle_id: str | None, downlink_rate: int, now_utc_s: float) -> Json:
+def _contacts_json(db: sqlite3.Connection, vehicle_id: str | None, downlink_rate: RateInfo, now_utc_s: float) -> Json:
     """Return what the database has about the contacts of a vehicle; of all vehicles for None."""
     of = {"vehicle": vehicle_id, "since": now_utc_s - (HOURS + 1) * HOUR_S, "limit": MAX_CONTACTS}
     reviews = db.execute(
@@ -223,7 +227,7 @@ def _contacts_json(db: sqlite3.Connection, vehicle_id: str | None, downlink_rate
         "area": contact_area(located),
         "downlink": {
             "transmissions": packets,
-            "airtime_s": round(packets * RATES[downlink_rate].airtime_s, 1),
+            "airtime_s": round(packets * downlink_rate.airtime_s, 1),
             "time_utc_s": sent["changed_utc_s"],
         },
     }

@@ -14,6 +14,7 @@ import numpy as np
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.archive.reader import ArchivePlace, archive_parts
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
@@ -28,10 +29,13 @@ from sonarpost.messages import (
     Health,
     Pixels,
     QueueState,
+    ReceivedStatus,
     ReconstructedImage,
     Record,
     TaskingState,
+    VehicleRange,
 )
+from sonarpost.modem.registry import modem_driver
 from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.console.chain import RouterState
@@ -85,7 +89,7 @@ class ConsoleService(Service[ConsoleConfig]):
         super().__init__(platform, config)
         self._database = Database(platform.state_dir / DATABASE_NAME)
         self._users = Users(platform.state_dir / FILE_NAME, config.session_s, config.session_max_s)
-        self.state = ConsoleState(config, self._database)
+        self.state = ConsoleState(config, self._database, modem=modem_driver(platform.modem.driver).capabilities)
         self._app = ConsoleApp(self.state, self._users, platform.id)
         self._server: WebServer | None = None
         self._wake = threading.Event()
@@ -226,7 +230,7 @@ class ConsoleService(Service[ConsoleConfig]):
         self.start_thread(self._retention.run, "retention")
         if self._watch is not None:
             self._watch.start()
-        if not self._on_vessel and self.config.out_dir is not None:
+        if not self._on_vessel and self.config.archive() is not None:
             self.start_thread(self._catch_up, "catch-up")
 
     def on_start(self) -> None:
@@ -236,9 +240,12 @@ class ConsoleService(Service[ConsoleConfig]):
             self._subscribe(keys.acoustic_rx(vessel), AcousticFrame, self._on_frame)
             self._subscribe(keys.acoustic_downlink(vessel), DownlinkState, self.state.apply_downlink_state)
             self._subscribe(keys.contact_decision(vessel), Decision, self._on_decision)
+            self._subscribe(keys.acoustic_status(vessel), ReceivedStatus, self._on_status)
+            self._subscribe(keys.acoustic_range(vessel), VehicleRange, self.state.fleet.set_range)
             self._subscribe(keys.acoustic_queue_everywhere(), QueueState, self.state.fleet.set_queue)
         else:
             self._subscribe(keys.tasking_state_all(self.config.site), TaskingState, self.state.apply_tasking_state)
+            self._subscribe(keys.shore_status_all(self.config.site), ReceivedStatus, self.state.store_status)
         # A shore site subscribes to its own health only: the health of all vessels would load their radio links.
         health = keys.health_everywhere() if self._on_vessel else keys.health_all(self.platform.id)
         self.session.declare_subscriber(health, self._on_health)
@@ -286,6 +293,11 @@ class ConsoleService(Service[ConsoleConfig]):
         if record.vessel_id != self.platform.id:
             raise PayloadError(keys.contact_decision(self.platform.id), "vessel_id", record.vessel_id, self.platform.id)
         self.state.store_decision(record)
+
+    def _on_status(self, record: ReceivedStatus) -> None:
+        if record.vessel_id != self.platform.id:
+            raise PayloadError(keys.acoustic_status(self.platform.id), "vessel_id", record.vessel_id, self.platform.id)
+        self.state.store_status(record)
 
     def _update_loop(self) -> None:
         """Publish the fleet state once a second, and fail if the web server has stopped."""
@@ -337,8 +349,9 @@ class ConsoleService(Service[ConsoleConfig]):
 
     def _catch_up(self) -> None:
         """Store the records that c2 accepted while the console was stopped."""
-        assert self.config.out_dir is not None
-        records = stored_records(self.config.out_dir)
+        place = self.config.archive()
+        assert place is not None
+        records = stored_records(place)
         try:
             while not self.stopping.is_set() and (batch := list(islice(records, CATCH_UP_BATCH))):
                 new = self.state.store_images([record for record in batch if isinstance(record, ReconstructedImage)])
@@ -393,27 +406,27 @@ def _table_and_id(item: OutboxItem) -> tuple[Table, str]:
     return table, str(getattr(wire.decode(record_type, item.payload, item.key), ID_COLUMN[table]))
 
 
-def stored_records(out_dir: Path) -> Iterator[ReconstructedImage | Decision]:
-    """Yield the images and decisions in the folder of c2, images first. Invalid files are logged and skipped.
+def stored_records(place: ArchivePlace) -> Iterator[ReconstructedImage | Decision]:
+    """Yield the images and decisions in the archive of c2, images first. Invalid files are logged and skipped.
 
     The side-car states rows with missing pixels, not the pixels. Whole rows are marked as missing.
 
     Args:
-        out_dir: Folder of c2, with one folder for each vessel.
+        place: Folder or database of c2.
     """
     try:
-        stored = read_stored_records(out_dir)
+        for folder in archive_parts(place):
+            stored = read_stored_records(folder)
+            for problem in stored.problems:
+                log.warning("Stored file skipped", extra=kv(reason=str(problem)))
+            for side_car, path in stored.images:
+                try:
+                    yield _stored_image(side_car, path)
+                except (BadInputError, OSError) as error:
+                    log.warning("Stored image skipped", extra=kv(file=path, reason=str(error)))
+            yield from stored.decisions
     except BadInputError as error:
-        log.error("Folder of c2 not readable", extra=kv(reason=str(error)))
-        return
-    for problem in stored.problems:
-        log.warning("Stored file skipped", extra=kv(reason=str(problem)))
-    for side_car, path in stored.images:
-        try:
-            yield _stored_image(side_car, path)
-        except (BadInputError, OSError) as error:
-            log.warning("Stored image skipped", extra=kv(file=path, reason=str(error)))
-    yield from stored.decisions
+        log.error("Archive of c2 not readable", extra=kv(reason=str(error)))
 
 
 def _stored_image(side_car: SideCar, path: Path) -> ReconstructedImage:

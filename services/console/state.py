@@ -9,7 +9,19 @@ from dataclasses import asdict, dataclass
 from types import MappingProxyType
 
 from sonarpost import wire
-from sonarpost.messages import Advice, Command, CommandKind, Decision, DownlinkState, ReconstructedImage, TaskingState
+from sonarpost.messages import (
+    Advice,
+    Command,
+    CommandKind,
+    Decision,
+    DownlinkState,
+    QueueState,
+    ReceivedStatus,
+    ReconstructedImage,
+    TaskingState,
+)
+from sonarpost.modem.interface import ModemCapabilities, RateInfo
+from sonarpost.modem.registry import modem_driver
 from sonarpost.review.costs import NEW_IMAGE_KINDS, RequestCost, request_cost
 from sonarpost.review.measurement import Line, measure_line, summary
 from sonarpost.review.objects import AssociationRule
@@ -26,6 +38,7 @@ from sonarpost.services.console.store import (
     objects,
     request_results,
     requests,
+    tracks,
 )
 from sonarpost.services.console.store import truth as known_truth
 from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter, NotFoundError
@@ -88,16 +101,26 @@ class ConsoleState:
 
     Attributes:
         clock: UTC seconds.
+        modem: Capabilities of the vessel's modem; by default those of the default driver.
         router: Connection to the router; None for a console without a network.
         rule: Limits of the association of looks.
         on_unsent: Called after an action has stored a record to send.
     """
 
-    def __init__(self, config: ConsoleConfig, database: Database, clock: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self,
+        config: ConsoleConfig,
+        database: Database,
+        clock: Callable[[], float] = time.time,
+        modem: ModemCapabilities | None = None,
+    ) -> None:
+        modem = modem or modem_driver().capabilities
+        self.rates = modem.rates
+        self.downlink_rate = config.rate_of(modem)
         self.config = config
         self.database = database
         self.events = EventHub()
-        self.fleet = FleetMonitor(config.vehicle_stale_s)
+        self.fleet = FleetMonitor(config.vehicle_stale_s, modem.rates)
         self.rule = AssociationRule(config.group_radius_m, config.mission_gap_s)
         self.clock = clock
         self.router: RouterState | None = None
@@ -169,6 +192,11 @@ class ConsoleState:
         if contact_id is not None:
             self.publish_contact(contact_id)
             self._publish("advice", record.advice_id)
+
+    def store_status(self, record: ReceivedStatus) -> None:
+        """Store the status of a vehicle. The pages show it with the next fleet event."""
+        with self.database.transaction() as db:
+            tracks.store_status(db, record)
 
     def apply_downlink_state(self, state: DownlinkState) -> None:
         """Update the delivery of a decision or request to a vehicle."""
@@ -286,8 +314,8 @@ class ConsoleState:
             return {
                 "contact": contact,
                 "record": contact_record_json(decode_image(versions[-1])),
-                "versions": [version_json(row, refine_base) for row in versions],
-                "related": related_images_json(db, contact_id),
+                "versions": [version_json(row, self.rates, refine_base) for row in versions],
+                "related": related_images_json(db, contact_id, self.rates),
                 "decisions": list_records(db, "decision", contact_id),
                 "standing": decisions.standing_decisions(db, contact_id),
                 "advice": list_records(db, "advice", contact_id),
@@ -360,8 +388,8 @@ class ConsoleState:
             bytes_total = stream_bytes
         return request_cost(
             kind,
-            downlink_rate=self.config.downlink_rate,
-            uplink_rate=self.fleet.uplink_rate(row["vehicle_id"], self.config.assumed_rate),
+            downlink_rate=self.downlink_rate,
+            uplink_rate=self._rate(self.fleet.uplink_rate(row["vehicle_id"], self.config.assumed_rate)),
             bytes_received=0 if is_new_image else row["bytes_received"],
             bytes_total=bytes_total,
             loss=self.fleet.frame_loss(row["vehicle_id"]),
@@ -375,16 +403,23 @@ class ConsoleState:
             lengths = (decode_image(version).bytes_total for version in versions)
             return next((length for length in lengths if length), row["bytes_total"])
 
-    def _uplink_rate(self, vehicle_id: str) -> int | None:
-        return self.fleet.uplink_rate(vehicle_id, self.config.assumed_rate)
+    def _rate(self, number: int | None) -> RateInfo | None:
+        return None if number is None else self.rates.get(number)
+
+    def _uplink_rate(self, vehicle_id: str, queue: QueueState | None) -> RateInfo | None:
+        """Return the rate of a vehicle's queue or, without one, its latest rate; None if unknown."""
+        if queue is not None:
+            return self._rate(queue.rate)
+        return self._rate(self.fleet.uplink_rate(vehicle_id, self.config.assumed_rate))
 
     def air_time(self) -> Json:
         """Return the images that vehicles still send, with cost and gain, and the air time that verdicts gave back."""
         now = self.clock()
         with self.database.read() as db:
             vehicles = [
-                air_time.vehicle_json(db, name, self.fleet.queue(name), self._uplink_rate(name), now)
+                air_time.vehicle_json(db, name, queue, self._uplink_rate(name, queue), now)
                 for name in self.fleet.vehicle_names()
+                for queue in (self.fleet.queue(name),)
             ]
             return {"vehicles": vehicles, "given_back": air_time.given_back_json(db)}
 
@@ -406,7 +441,8 @@ class ConsoleState:
             stored = decisions.add_decision(db, contact_id, entered, actor, self.clock(), states)
             if entered.verdict in air_time.FINAL and states.vehicle != "none":
                 vehicle_id = contacts.find_contact(db, contact_id)["vehicle_id"]
-                queue, rate = self.fleet.queue(vehicle_id), self._uplink_rate(vehicle_id)
+                queue = self.fleet.queue(vehicle_id)
+                rate = self._uplink_rate(vehicle_id, queue)
                 air_time.store_given_back(db, stored.decision_id, contact_id, queue, rate, self.clock())
         decision = self._publish_action("decision", contact_id, stored.decision_id)
         self._publish_other_looks(contact_id)

@@ -7,6 +7,7 @@ import statistics
 from typing import Final
 
 from sonarpost.messages import QueueState
+from sonarpost.modem.interface import RateInfo
 from sonarpost.review.airtime import WaitingImage, gain_bits, gain_per_s, proposal
 from sonarpost.review.costs import least_airtime_s
 from sonarpost.services.console.store.database import insert_row
@@ -80,10 +81,12 @@ def _p_mine_like(row: sqlite3.Row) -> float | None:
 
 
 def vehicle_json(
-    db: sqlite3.Connection, vehicle_id: str, queue: QueueState | None, rate: int | None, now_utc_s: float
+    db: sqlite3.Connection, vehicle_id: str, queue: QueueState | None, rate: RateInfo | None, now_utc_s: float
 ) -> Json:
-    """Return the images that a vehicle still sends, with cost and gain, and the proposal for the next minute."""
-    rate = queue.rate if queue is not None else rate
+    """Return the images that a vehicle still sends, with cost and gain, and the proposal for the next minute.
+
+    `rate` is that of the queue, if there is one.
+    """
     images: list[Json] = []
     waiting: list[WaitingImage] = []
     rows = [] if rate is None else waiting_rows(db, vehicle_id, queue, now_utc_s)
@@ -111,7 +114,7 @@ def vehicle_json(
     first = [{"id": key, "name": names[key]} for key in proposal(waiting, HORIZON_S)]
     return {
         "vehicle_id": vehicle_id,
-        "rate": rate,
+        "rate": None if rate is None else rate.number,
         "basis": "queue" if queue is not None else "estimate",
         "images": images,
         "proposal": {"horizon_s": HORIZON_S, "send": first},
@@ -119,11 +122,18 @@ def vehicle_json(
 
 
 def store_given_back(
-    db: sqlite3.Connection, decision_id: str, contact_id: str, queue: QueueState | None, rate: int | None, now: float
+    db: sqlite3.Connection,
+    decision_id: str,
+    contact_id: str,
+    queue: QueueState | None,
+    rate: RateInfo | None,
+    now: float,
 ) -> None:
-    """Store the estimate of the air time that a final verdict gives back; nothing if nothing of the image is left."""
+    """Store the estimate of the air time that a final verdict gives back; nothing if nothing of the image is left.
+
+    `rate` is that of the queue, if there is one.
+    """
     contact = db.execute("SELECT vehicle_id FROM contact WHERE id = ?", (contact_id,)).fetchone()
-    rate = queue.rate if queue is not None else rate
     rows = waiting_rows(db, contact["vehicle_id"], queue, now)
     bytes_left = next((left for row, left, _ in rows if row["id"] == contact_id), 0)
     if rate is None or bytes_left <= 0:

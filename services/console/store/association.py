@@ -17,7 +17,12 @@ from sonarpost.review.objects import (
     ordered_pair,
     possible_partners,
 )
-from sonarpost.services.console.store.database import CONTRADICTORY, insert_row
+from sonarpost.services.console.store.database import (
+    CONTRADICTORY,
+    LATITUDE_BAND,
+    LATITUDE_BANDS_PER_DEGREE,
+    insert_row,
+)
 from sonarpost.services.console.store.serialisers import decode_image
 
 MAX_LOOKS: Final = 50
@@ -60,23 +65,25 @@ def object_of(db: sqlite3.Connection, contact_id: str) -> str:
 
 
 def looks_near(db: sqlite3.Connection, look: Look, distance_m: float) -> list[Look]:
-    """Return the other looks in a square around a look, found with the index on latitude."""
+    """Return the other looks in a square around a look, found with the index on bands of latitude and on longitude."""
     lat_limit = distance_m / _METRES_PER_DEGREE
     lon_limit = min(360.0, lat_limit / max(math.cos(math.radians(look.lat_deg)), 1e-6))
-    rows = db.execute(
-        f"SELECT {_LOOK} FROM contact WHERE lat_deg BETWEEN ? AND ?"  # noqa: S608
-        " AND (ABS(lon_deg - ?) <= ? OR ABS(lon_deg - ?) >= 360 - ?) AND id <> ? AND parent IS NULL AND sealed = 0",
-        (
-            look.lat_deg - lat_limit,
-            look.lat_deg + lat_limit,
-            look.lon_deg,
-            lon_limit,
-            look.lon_deg,
-            lon_limit,
-            look.contact_id,
-        ),
+    first = math.floor((look.lat_deg - lat_limit) * LATITUDE_BANDS_PER_DEGREE)
+    last = math.ceil((look.lat_deg + lat_limit) * LATITUDE_BANDS_PER_DEGREE)
+    sql = (
+        f"SELECT {_LOOK} FROM contact WHERE {LATITUDE_BAND} = ? AND lon_deg BETWEEN ? AND ?"  # noqa: S608
+        " AND lat_deg BETWEEN ? AND ? AND id <> ? AND parent IS NULL AND sealed = 0"
     )
-    return [Look(*row) for row in rows]
+    lat_range = (look.lat_deg - lat_limit, look.lat_deg + lat_limit)
+    found: dict[str, Look] = {}
+    for band in range(first, last + 1):
+        for turn_deg in (-360.0, 0.0, 360.0):  # the square may cross the 180th meridian
+            lon_deg = look.lon_deg + turn_deg
+            lon_range = (lon_deg - lon_limit, lon_deg + lon_limit)
+            if lon_range[0] <= 180.0 and lon_range[1] >= -180.0:
+                for row in db.execute(sql, (band, *lon_range, *lat_range, look.contact_id)):
+                    found[row["id"]] = Look(*row)
+    return list(found.values())
 
 
 def earlier_contacts(db: sqlite3.Connection, contact_id: str, rule: AssociationRule) -> list[str]:

@@ -66,10 +66,12 @@ _IMAGE_COLUMNS: Final = (
 REVIEW_CONDITIONS: Final[Mapping[str, str]] = {
     "reviewed": "c.review <> 'unreviewed'",
     "mine_like": "c.review IN ('mine_like', 'disputed')",
-    "to_do": "(c.review = 'unreviewed' OR c.contradictory = 1)",
+    # The plus signs keep SQLite from an index on the state: most contacts may have it, and all would be sorted.
+    "unreviewed": "+c.review = 'unreviewed'",
+    "to_do": "(+c.review = 'unreviewed' OR +c.contradictory = 1)",
     "newer_detail": NEWER_DETAIL,
 }
-"""SQL conditions of the values of `review` that are more than one state."""
+"""SQL conditions of values of `review`; any other value is one state."""
 
 
 class ContactFilter(BaseModel):
@@ -161,7 +163,7 @@ def store_image(
     Args:
         db: Connection in a transaction.
         image: The record.
-        rate: Latest Micro-Modem rate of the vehicle; None if unknown.
+        rate: Number of the latest rate of the vehicle; None if unknown.
         now_utc_s: Time of arrival.
         rule: Limits of the association of looks.
 

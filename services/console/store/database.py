@@ -42,8 +42,13 @@ CONTRADICTORY: Final = (
 )
 """SQL aggregate over the looks `g` of an object: verdicts on one look, or on several, contradict each other."""
 
+LATITUDE_BANDS_PER_DEGREE: Final = 1000
+LATITUDE_BAND: Final = f"CAST(ROUND(lat_deg * {LATITUDE_BANDS_PER_DEGREE}) AS INTEGER)"
+"""SQL number of a band of latitude of about 111 m, in which the index `contact_square` orders contacts by longitude."""
+
 _OBJECT_SCHEMA: Final = (
-    "CREATE INDEX IF NOT EXISTS contact_place ON contact (lat_deg, lon_deg)",
+    "DROP INDEX IF EXISTS contact_place",
+    f"CREATE INDEX IF NOT EXISTS contact_square ON contact ({LATITUDE_BAND}, lon_deg)",
     "CREATE INDEX IF NOT EXISTS contact_contradictory ON contact (contradictory, arrived_utc_s, id)",
     "CREATE TABLE IF NOT EXISTS object (id INTEGER PRIMARY KEY AUTOINCREMENT)",
     """CREATE TABLE IF NOT EXISTS look_pair (
@@ -140,6 +145,12 @@ CREATE INDEX IF NOT EXISTS decision_operator ON decision (operator, seq);
 CREATE TABLE IF NOT EXISTS given_back (
     decision_id TEXT PRIMARY KEY, contact_id TEXT NOT NULL, bytes_left INTEGER NOT NULL, seconds REAL NOT NULL,
     basis TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS track (
+    seq INTEGER PRIMARY KEY AUTOINCREMENT, vehicle_id TEXT NOT NULL, received_utc_s REAL NOT NULL,
+    time_utc_s REAL NOT NULL, lat_deg REAL, lon_deg REAL, heading_deg REAL, speed_mps REAL, depth_m REAL,
+    altitude_m REAL, swath_m REAL, battery REAL, images_waiting INTEGER, disk_free_bytes INTEGER,
+    authenticated INTEGER NOT NULL);
+CREATE INDEX IF NOT EXISTS track_vehicle ON track (vehicle_id, seq);
 """
 """Tables and indexes that databases of version 0.2 do not have."""
 
@@ -188,8 +199,15 @@ _ADDED_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
 """Columns that databases of earlier versions lack, by table."""
 
 _ADDED_INDEXES: Final = (
-    "CREATE INDEX IF NOT EXISTS contact_seen ON contact (vehicle_id, seen_utc_s)",
-    "CREATE INDEX IF NOT EXISTS contact_parent ON contact (parent)",
+    "DROP INDEX IF EXISTS contact_seen",
+    "CREATE INDEX IF NOT EXISTS contact_detection ON contact (vehicle_id, seen_utc_s, lat_deg, lon_deg)",
+    "DROP INDEX IF EXISTS contact_parent",
+    "CREATE INDEX IF NOT EXISTS contact_answers ON contact (parent) WHERE parent IS NOT NULL",
+    (
+        "CREATE INDEX IF NOT EXISTS contact_listed ON contact (review, contradictory, parent, sealed)"
+        " WHERE parent IS NULL AND sealed < 2"
+    ),
+    "CREATE INDEX IF NOT EXISTS contact_first ON contact (contradictory DESC, arrived_utc_s, id)",
 )
 
 

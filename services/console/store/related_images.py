@@ -7,11 +7,13 @@ same contact record, except for image and pixel sizes, because the vehicle makes
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Mapping
 from typing import Final, Literal
 
 from sonarpost import wire
 from sonarpost.codec.region import RegionBox
 from sonarpost.messages import Command, Contact, ReconstructedImage
+from sonarpost.modem.interface import RateInfo
 from sonarpost.review.image_matching import EXPAND_FACTOR, place_in_wider
 from sonarpost.services.console.store.serialisers import Json, contact_record_json, decode_image, version_json
 
@@ -106,8 +108,8 @@ def _link(db: sqlite3.Connection, contact_id: str, parent: str, relation: Relati
     )
 
 
-def related_images_json(db: sqlite3.Connection, contact_id: str) -> list[Json]:
-    """Return the images that answer requests about a contact, the earliest first."""
+def related_images_json(db: sqlite3.Connection, contact_id: str, rates: Mapping[int, RateInfo]) -> list[Json]:
+    """Return the images that answer requests about a contact, the earliest first; `rates` are those of the modem."""
     found: list[Json] = []
     contact = db.execute(
         "SELECT v.* FROM version v JOIN contact c ON c.id = v.contact_id AND c.version = v.version WHERE c.id = ?",
@@ -127,7 +129,7 @@ def related_images_json(db: sqlite3.Connection, contact_id: str) -> list[Json]:
                 "image_id": row["image_id"],
                 "record": contact_record_json(newest),
                 "place": place,
-                "versions": [version_json(version) for version in versions],
+                "versions": [version_json(version, rates) for version in versions],
                 "place_px": _place_of_region(db, contact_id, row["id"]) if row["relation"] == "region" else None,
             }
         )

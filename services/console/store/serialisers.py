@@ -10,6 +10,7 @@ from typing import Final, Literal
 
 from sonarpost import wire
 from sonarpost.messages import ReconstructedImage
+from sonarpost.modem.interface import RateInfo
 from sonarpost.review.costs import airtime_of_frames, least_airtime_s
 from sonarpost.review.edge_blur import edge_sigma_px
 from sonarpost.review.image_geometry import contact_box, contact_mark, range_axis
@@ -174,7 +175,7 @@ def decode_image(row: sqlite3.Row) -> ReconstructedImage:
     return wire.decode(ReconstructedImage, bytes(row["payload"]), f"contact {row['contact_id']}")
 
 
-def _airtime(image: ReconstructedImage, rate: int | None) -> Json:
+def _airtime(image: ReconstructedImage, rate: RateInfo | None) -> Json:
     """Return the air time of an image.
 
     A wire format that does not count frames puts several images and messages into one. Their bytes then give the least
@@ -187,8 +188,8 @@ def _airtime(image: ReconstructedImage, rate: int | None) -> Json:
     return {"airtime_s": least_airtime_s(image.bytes_received, rate), "airtime_is": "at_least"}
 
 
-def version_json(row: sqlite3.Row, refine_base: int | None = None) -> Json:
-    """Return an image version; `refine_base`: see `stage_of`."""
+def version_json(row: sqlite3.Row, rates: Mapping[int, RateInfo], refine_base: int | None = None) -> Json:
+    """Return an image version; `rates` are those of the modem, `refine_base`: see `stage_of`."""
     image = decode_image(row)
     contact = image.contact
     has_codebook = image.codec in CODEBOOK_CODECS
@@ -213,7 +214,7 @@ def version_json(row: sqlite3.Row, refine_base: int | None = None) -> Json:
         "frames_received": image.frames_received or None,
         "sharp_to_m": sharp_to_m(image),
         "missing_halves": list(image.missing_halves),
-        **_airtime(image, row["rate"]),
+        **_airtime(image, rates.get(row["rate"])),
         "pixel_along_m": contact.pixel_along_m if contact else None,
         "pixel_across_m": contact.pixel_across_m if contact else None,
         "range_axis": range_axis(contact),

@@ -24,7 +24,7 @@ from sonarpost.messages import (
     QueueState,
     ReconstructedImage,
 )
-from sonarpost.modem.micromodem import RATES
+from sonarpost.modem.registry import modem_driver
 from sonarpost.review.costs import NEW_IMAGE_KINDS
 from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.fleet import DETECTOR, frame_event
@@ -245,10 +245,11 @@ class TrainingSimulator:
 
     def _receive_frame(self, vehicle: str, now_utc_s: float) -> None:
         bad_frames = int(self._random.random() < 0.15)
+        rate = modem_driver().capabilities.rates[RATE]
         quality = LinkQuality(
             snr_in_db=round(self._random.gauss(14, 2), 1),
             snr_out_db=round(self._random.gauss(9, 2), 1),
-            frames=RATES[RATE].frames,
+            frames=rate.frames,
             bad_frames=bad_frames,
         )
         frame = AcousticFrame(
@@ -260,8 +261,8 @@ class TrainingSimulator:
             rate=RATE,
             packet=self._packet,
             frame_number=1,
-            frame_count=RATES[RATE].frames,
-            data=bytes(RATES[RATE].frame_bytes),
+            frame_count=rate.frames,
+            data=bytes(rate.frame_bytes),
             quality=quality,
         )
         self._state.fleet.add_frame(vehicle, frame)

@@ -11,6 +11,7 @@ from starlette.routing import Route
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import NotFoundError
 from sonarpost.services.console.store.serialisers import Json
+from sonarpost.services.console.store.tracks import latest_statuses, tracks_json
 from sonarpost.services.console.web.access import AccessControl, Call
 
 MAX_CONTACTS = 10_000
@@ -70,31 +71,35 @@ def map_json(state: ConsoleState) -> Json:
         unlocated = db.execute(
             "SELECT COUNT(*) FROM contact WHERE parent IS NULL AND sealed < 2 AND (lat_deg IS NULL OR lon_deg IS NULL)"
         ).fetchone()[0]
+        statuses, tracks = latest_statuses(db), tracks_json(db)
     config = state.config
     fleet = state.fleet.vehicles()
-    last: dict[str, sqlite3.Row] = {}
+    last: dict[str, tuple[float, Json]] = {}  # with the time of the position
     for row in rows:
         if row["vehicle_lat_deg"] is not None:
-            last.setdefault(row["vehicle_id"], row)
+            place = _place_json(row["vehicle_lat_deg"], row["vehicle_lon_deg"], row["heading_deg"])
+            last.setdefault(row["vehicle_id"], (row["at_utc_s"], place))
+    for name, row in statuses.items():
+        if row["lat_deg"] is not None and (name not in last or row["time_utc_s"] >= last[name][0]):
+            last[name] = (row["time_utc_s"], _place_json(row["lat_deg"], row["lon_deg"], row["heading_deg"]))
     return {
         "contacts": [_contact_json(row) for row in rows],
         "unlocated": unlocated,
         "vehicles": [
-            {
-                "vehicle_id": name,
-                "lat_deg": row["vehicle_lat_deg"],
-                "lon_deg": row["vehicle_lon_deg"],
-                "heading_deg": row["heading_deg"],
-                "utc_s": row["at_utc_s"],
-                "stale": name not in fleet or fleet[name]["stale"],
-            }
-            for name, row in sorted(last.items())
+            {"vehicle_id": name, **place, "utc_s": utc_s, "stale": name not in fleet or fleet[name]["stale"]}
+            for name, (utc_s, place) in sorted(last.items())
         ],
+        "tracks": tracks,
+        "ranges": [{"vehicle_id": name, **measured} for name, measured in state.fleet.measured_ranges().items()],
         "vessel": None
         if config.vessel_lat_deg is None
         else {"lat_deg": config.vessel_lat_deg, "lon_deg": config.vessel_lon_deg},
         "ring_m": list(config.ring_m),
     }
+
+
+def _place_json(lat_deg: float, lon_deg: float, heading_deg: float | None) -> Json:
+    return {"lat_deg": lat_deg, "lon_deg": lon_deg, "heading_deg": heading_deg}
 
 
 def _contact_json(row: sqlite3.Row) -> Json:

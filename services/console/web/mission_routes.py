@@ -23,4 +23,4 @@ class MissionRoutes:
     def _mission(self, _call: Call) -> Response:
         state = self._state
         with state.database.read() as db:
-            return JSONResponse(mission_json(state.fleet, db, state.config.downlink_rate, state.clock()))
+            return JSONResponse(mission_json(state.fleet, db, state.downlink_rate, state.clock()))

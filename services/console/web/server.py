@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import socket
@@ -164,6 +165,18 @@ async def routing_error(_request: Request, error: Exception) -> Response:
     return error_response(ApiError(404, "not_found", "no such route"))
 
 
+class _Server(uvicorn.Server):
+    """A server that closes all connections when it ends, also those whose client does not read."""
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop to accept, wait for running requests, then abort the connections that are left."""
+        await super().shutdown(sockets)
+        for connection in list(self.server_state.connections):
+            if connection.transport is not None:
+                connection.transport.abort()
+        await asyncio.sleep(0)  # lets the event loop close the aborted connections
+
+
 class WebServer:
     """Runs an application on one address, in a thread.
 
@@ -218,7 +231,7 @@ class WebServer:
         self.host = host
         self.port = int(self._socket.getsockname()[1])
         self._tls = tls is not None
-        self._server = uvicorn.Server(config)
+        self._server = _Server(config)
         self._thread = threading.Thread(target=self._run, name="web", daemon=True)
 
     @property

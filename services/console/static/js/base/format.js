@@ -10,13 +10,13 @@ const known = (value) => value !== null && value !== undefined && Number.isFinit
 
 export const verdict = (name) => (VERDICTS.includes(name) ? t(`verdict.${name}`) : name ?? DASH);
 /** Name of a kind of request for operators. */
-const REQUEST_KINDS = ["refine", "resend", "revisit", "wider", "original"];
+const REQUEST_KINDS = ["refine", "resend", "revisit", "wider", "original", "region"];
 export const requestKind = (kind) => (REQUEST_KINDS.includes(kind) ? t(`request.${kind}`) : kind);
 
 /** Name of a layer for operators: tiles of a codebook are not raw pixels. */
 export function layerName(version, name) {
   if (name === "raw" && version?.texture === "codebook") return t("layer.tiles");
-  return ["raw", "enhanced", "wider", "original"].includes(name) ? t(`layer.${name}`) : name;
+  return ["raw", "enhanced", "wider", "original", "region"].includes(name) ? t(`layer.${name}`) : name;
 }
 
 /** Smallest detail of an image, for example "≈ 0.4 m"; null where it is not known. */

@@ -12,7 +12,7 @@ import { ImageView, defaultViewport } from "../image/image_view.js";
 import { integrityStrip } from "./integrity_strip.js";
 import { toolbarWithMore } from "../base/layout.js";
 import { Loupe } from "../image/loupe.js";
-import { continuesOut, outlineOf, relatedLayers, relatedVersion } from "./related_images.js";
+import { compose, compositionOf, continuesOut, outlinesOf, relatedLayers, relatedVersion } from "./related_images.js";
 import { MeasurementTool, measurementLine } from "../image/measurement.js";
 import { drawSizePanel } from "../image/size_panel.js";
 import { emit, setting, state } from "../base/state.js";
@@ -210,8 +210,20 @@ export class ContactView {
   #load(detail, choice) {
     const shown = detail.versions.find((one) => one.version === choice.version);
     const related = relatedVersion(detail, choice.layer);
+    const composition = compositionOf(detail, shown, choice.layer);
     const requested = [related ? [related, "raw"] : shown ? [shown, choice.layer] : null, secondImage(detail, choice)];
-    return Promise.all(requested.map(async (one) => one && { image: await this.#image(detail, one), version: one[0], layer: one[1] }));
+    return Promise.all(requested.map(async (one, index) => {
+      if (index === 0 && composition) return this.#composed(detail, composition, choice.layer);
+      return one && { image: await this.#image(detail, one), version: one[0], layer: one[1] };
+    }));
+  }
+
+  /** Load and compose the images of a layer. Its source is the image that answers the request. */
+  async #composed(detail, { base, factor, parts, mark, box }, layer) {
+    const [image, ...others] = await Promise.all([base, ...parts.map((one) => one.version)].map((version) => this.#image(detail, [version, "raw"])));
+    const { source } = [image, ...others].findLast((one) => one.source.id !== detail.contact.id);
+    const composed = { ...compose(image, factor, parts.map((one, index) => ({ image: others[index], box: one.box }))), source };
+    return { image: composed, version: base, layer, mark: { mark, box } };
   }
 
   #draw(choice, images) {
@@ -221,7 +233,7 @@ export class ContactView {
     this.placeholder.textContent = this.shown && this.detail.contact.has_picture ? "" : t("contact_view.no_image");
     if (this.autoGain && images[0]) [this.display.low, this.display.high] = autoRange(images[0].image);
     this.views.forEach((view, index) => {
-      if (images[index]) this.#showOn(view, images[index].image, images[index].version, images[index].layer);
+      if (images[index]) this.#showOn(view, images[index]);
       else view.show(null, {});
     });
     this.canvases[0].dataset.shows = this.drawn ? `${this.drawn.id} ${this.drawn.version} ${this.drawn.layer}` : "";
@@ -235,7 +247,7 @@ export class ContactView {
     this.loading.textContent = name === null ? "" : t("contact_view.loading", { name });
   }
 
-  #showOn(view, image, version, layer) {
+  #showOn(view, { image, version, layer, mark = null }) {
     const known = version.pixel_along_m && version.pixel_across_m;
     // A layer may have more pixels than the image, for the same area.
     const scale = known ? {
@@ -245,10 +257,10 @@ export class ContactView {
     const title = `${t("contact_view.version", { version: version.version })} · ${layerName(version, version.contact_id ? this.layer : layer)}${version.complete ? "" : ` · ${received(version)}`}`;
     const synthesised = version.layers.find((one) => one.name === layer)?.synthesised ?? false;
     const record = this.detail.record ?? {};
-    // A layer may have more pixels than the image; the mark is in pixels of the image.
-    const same = version.width_px === image.width && version.height_px === image.height;
+    // A layer may have more pixels than the image; the mark is in pixels of the image. The place of a region alone is unknown.
+    const same = version.width_px === image.width && version.height_px === image.height && !(version.contact_id && this.layer === "region");
     const geometry = {
-      scale, range_axis: version.range_axis, mark: same ? version.mark : null, box: same ? version.box : null,
+      scale, range_axis: version.range_axis, ...(mark ?? { mark: same ? version.mark : null, box: same ? version.box : null }),
       altitude_m: record.altitude_m ?? null, heading_deg: record.heading_deg ?? null, side: record.channel ?? null,
     };
     view.show(image, { geometry, title, synthesised });
@@ -257,9 +269,7 @@ export class ContactView {
   #drawLines() {
     const current = Object.values(this.detail?.size ?? {}).map((one) => one?.measurement);
     const stored = (this.detail?.measurements ?? []).filter((one) => current.includes(one.id) && one.version === this.version && one.layer === this.layer).map(measurementLine);
-    const related = relatedVersion(this.detail, this.layer);
-    const outline = related && this.layer === "wider" ? outlineOf(this.shown, related) : [];
-    this.views[0].lines = [...outline, ...(this.measurement.active ? [] : stored), ...this.measurement.lines()];
+    this.views[0].lines = [...outlinesOf(this.detail && compositionOf(this.detail, this.shown, this.layer)), ...(this.measurement.active ? [] : stored), ...this.measurement.lines()];
     this.views[0].crosshair = this.measurement.active && !this.measurement.result ? this.measurement.crosshair : null;
     this.views[0].draw();
     this.canvases[0].classList.toggle("measures", this.measurement.active);

@@ -1,34 +1,83 @@
-// Layers of a contact that are images of their own: more seabed around it, and the image without despeckling.
+// Layers of a contact that answer requests: surroundings of its image, regions of it, and the image without despeckling.
 
 import { t } from "../texts.js";
 
 const EXPANDED_PIXEL = 2; // ratio of the pixel sizes of the wider image and of the contact's image
 const OUTLINE_COLOUR = "#52e0ff";
 
-/** Related image of a layer: `{id, relation, versions}`; null for a layer of the contact's own image. */
-export const relatedOf = (detail, layer) => detail?.related.find((one) => one.relation === layer) ?? null;
+const withPicture = (one) => one.versions.some((version) => version.codec);
+
+/** Related images of a layer that have a picture, the earliest first: `{id, relation, versions}`. */
+const relatedOf = (detail, layer) => (detail?.related ?? []).filter((one) => one.relation === layer && withPicture(one));
 
 /** Layers of the related images that have a picture; they are not measured. */
 export function relatedLayers(detail) {
-  return (detail?.related ?? []).filter((one) => one.versions.some((version) => version.codec)).map((one) => ({
-    name: one.relation, measurable: false, synthesised: false, reason: t(`related_images.${one.relation}_title`),
-  }));
+  const names = new Set((detail?.related ?? []).filter(withPicture).map((one) => one.relation));
+  return [...names].map((name) => ({ name, measurable: false, synthesised: false, reason: t(`related_images.${name}_title`) }));
 }
 
-/** Newest version with a picture of the image of a layer, with the identifier of this image; null for own layers. */
+const newestOf = (related) => ({ ...related.versions.findLast((one) => one.codec), contact_id: related.id });
+
+/** Newest version of the newest image of a layer, with the identifier of this image; null for own layers. */
 export function relatedVersion(detail, layer) {
-  const related = relatedOf(detail, layer);
-  const version = related?.versions.findLast((one) => one.codec);
-  return version ? { ...version, contact_id: related.id, place: related.place } : null;
+  const related = relatedOf(detail, layer).at(-1);
+  return related ? newestOf(related) : null;
 }
 
-/** Outline of the contact's image on the wider image, as lines of the image view; empty if its place is not known. */
-export function outlineOf(version, wider) {
-  if (!version || !wider.place) return [];
-  const [top, left] = wider.place;
-  const [bottom, right] = [top + version.height_px / EXPANDED_PIXEL, left + version.width_px / EXPANDED_PIXEL];
-  const corners = [[top, left], [top, right], [bottom, right], [bottom, left]];
-  return corners.map((from, index) => ({ from, to: corners[(index + 1) % 4], text: "", colour: OUTLINE_COLOUR, outline: true }));
+const boxOf = ([top, left, bottom, right]) => ({ top, left, bottom, right });
+
+/**
+ * How a layer is composed of several images: regions on the contact's image, or this image on the wider one.
+ *
+ * `base` is drawn in pixels of 1 / `factor` of its size, and `parts`, `{version, box}`, at their places in these pixels.
+ * `mark` and `box` are those of the contact. Null for a layer of one image, and where no place is known.
+ */
+export function compositionOf(detail, shown, layer) {
+  if (!shown?.codec || shown.height_px !== detail.contact.height_px || shown.width_px !== detail.contact.width_px) return null;
+  if (layer === "region") {
+    const placed = relatedOf(detail, layer).filter((one) => one.place_px);
+    const parts = placed.map((one) => ({ version: newestOf(one), box: boxOf(one.place_px) }));
+    return parts.length ? { base: shown, factor: 1, parts, mark: shown.mark, box: shown.box } : null;
+  }
+  const wider = layer === "wider" ? relatedOf(detail, layer).at(-1) : null;
+  if (!wider?.place) return null;
+  const [row, column] = wider.place.map((value) => value * EXPANDED_PIXEL);
+  const { mark, box } = shown;
+  return {
+    base: newestOf(wider), factor: EXPANDED_PIXEL,
+    parts: [{ version: shown, box: boxOf([row, column, row + shown.height_px, column + shown.width_px]) }],
+    mark: mark && { ...mark, row: mark.row + row, column: mark.column + column, columns: mark.columns.map((one) => one + column) },
+    box: box && { rows: box.rows.map((one) => one + row), columns: box.columns.map((one) => one + column) },
+  };
+}
+
+/** Compose images: pixels of `parts`, `{image, box}`, replace those of `base`, except where they were not received. */
+export function compose(base, factor, parts) {
+  const [width, height] = [base.width * factor, base.height * factor];
+  const masks = ["levels", "missing", "guessed"];
+  const out = { width, height, ...Object.fromEntries(masks.map((name) => [name, new Uint8Array(width * height)])) };
+  const copy = (image, from, to) => { for (const name of masks) out[name][to] = image[name][from]; };
+  for (let y = 0; y < height; y += 1) {
+    for (let x = 0; x < width; x += 1) copy(base, Math.floor(y / factor) * base.width + Math.floor(x / factor), y * width + x);
+  }
+  for (const { image, box } of parts) {
+    for (let y = Math.max(0, box.top); y < Math.min(height, box.bottom); y += 1) {
+      const row = Math.floor(((y - box.top) * image.height) / (box.bottom - box.top)) * image.width;
+      for (let x = Math.max(0, box.left); x < Math.min(width, box.right); x += 1) {
+        const from = row + Math.floor(((x - box.left) * image.width) / (box.right - box.left));
+        if (!image.missing[from]) copy(image, from, y * width + x);
+      }
+    }
+  }
+  return out;
+}
+
+/** Outlines of the parts of a composed layer, as lines of the image view. */
+export function outlinesOf(composition) {
+  return (composition?.parts ?? []).flatMap(({ box: { top, left, bottom, right } }) => {
+    const corners = [[top, left], [top, right], [bottom, right], [bottom, left]];
+    return corners.map((from, index) => ({ from, to: corners[(index + 1) % 4], text: "", colour: OUTLINE_COLOUR, outline: true }));
+  });
 }
 
 /** Whether zooming out from the whole image continues into the wider image. */

@@ -158,14 +158,15 @@ export class ImageView {
     drawNorth(context, this, g);
     drawLines(context, this, g);
     if (this.crosshair) drawCrosshair(context, g.toCanvas(this.crosshair));
-    this.#describe(mark);
+    this.#describe(mark, this.lines.filter((one) => one.outline).map((one) => g.toCanvas(one.from)));
   }
 
   /** What is drawn, for screen readers: axes, nadir and contact. */
-  #describe(mark) {
+  #describe(mark, outlines) {
     const axes = axesOf(this.projection);
     this.canvas.setAttribute("aria-description", [captionOf(this.projection), axes.across.name, axes.along.name, mark ? t("image.marked") : ""].filter(Boolean).join("; "));
     this.canvas.dataset.mark = mark ? JSON.stringify(mark) : "";
+    this.canvas.dataset.outlines = JSON.stringify(outlines); // corners
     this.canvas.dataset.extent = JSON.stringify(this.projection.extent.map((metres) => Number(metres.toFixed(3))));
   }
 

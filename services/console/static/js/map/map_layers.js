@@ -1,5 +1,6 @@
 // Layers of the map: tiles, frame, range rings, vehicles, bands, and contacts with their clusters.
 
+import { age } from "../base/ages.js";
 import { h } from "../base/dom.js";
 import { latitude, longitude, symbol, verdict } from "../base/format.js";
 import { band, circle, clusters, frameLines, metresPerDegree, nearLongitude } from "./map_geometry.js";
@@ -30,7 +31,7 @@ export class MapLayers {
   }
 
   /** Draw all layers. `contacts` are all contacts, `chosen` is the identifier of the selected one. */
-  draw({ contacts, vehicles, vessel, ring_m }, chosen) {
+  draw({ contacts, vehicles, tracks, ranges, vessel, ring_m }, chosen) {
     const bounds = this.map.getBounds();
     this.#drawFrame(bounds);
     this.ground.clearLayers();
@@ -39,6 +40,8 @@ export class MapLayers {
     const inside = contacts.filter((one) => wide.contains(latLng(one)));
     this.#drawBands(inside);
     if (vessel) this.#drawVessel(vessel, ring_m);
+    if (vessel) for (const one of ranges) this.#drawRange(vessel, one);
+    for (const track of tracks) this.ground.addLayer(this.#shape(track.points, "track", false));
     for (const vehicle of vehicles) this.#drawVehicle(vehicle);
     this.#drawContacts(inside, chosen);
   }
@@ -86,6 +89,14 @@ export class MapLayers {
       this.ground.addLayer(this.#marker({ lat_deg: ring[0][0], lon_deg: ring[0][1] }, "ring-label", h("span", { text: rangeText(radius_m) })));
     }
     this.ground.addLayer(this.#marker(vessel, "vessel", [h("i", { class: "hull" }), h("span", { class: "name", text: t("map.vessel") })]));
+  }
+
+  /** Circle around the vessel on which a vehicle was when its distance was measured. */
+  #drawRange(vessel, one) {
+    const ring = circle(vessel, one.distance_m);
+    this.ground.addLayer(this.#shape([ring], "measured-range"));
+    const text = t("map.measured_range", { name: one.vehicle_id, range: rangeText(one.distance_m), age: age(one.measured_utc_s) });
+    this.ground.addLayer(this.#marker({ lat_deg: ring[0][0], lon_deg: ring[0][1] }, "ring-label", h("span", { text })));
   }
 
   #drawVehicle(one) {

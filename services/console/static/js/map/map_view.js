@@ -77,6 +77,7 @@ export class MapView {
     const [L, data] = await Promise.all([loadLeaflet(), api.map()]);
     const reference_deg = (data.vessel ?? data.contacts.at(-1))?.lon_deg ?? 0;
     for (const one of [...data.contacts, ...data.vehicles]) one.lon_deg = nearLongitude(one.lon_deg, reference_deg);
+    for (const track of data.tracks) for (const point of track.points) point[1] = nearLongitude(point[1], reference_deg);
     for (const one of data.contacts) if (one.vehicle_lon_deg !== null) one.vehicle_lon_deg = nearLongitude(one.vehicle_lon_deg, reference_deg);
     data.contacts.sort((a, b) => a.lon_deg - b.lon_deg || a.lat_deg - b.lat_deg); // west to east
     this.data = data;
@@ -114,8 +115,8 @@ export class MapView {
   /** Fit the map to all objects, which draws it. Returns false if there are none, or no size. */
   fit() {
     if (!this.data || this.chart.clientWidth === 0) return false;
-    const { contacts, vehicles, vessel } = this.data;
-    const points = [...contacts, ...vehicles, ...(vessel ? [vessel] : [])].map(latLng);
+    const { contacts, vehicles, tracks, vessel } = this.data;
+    const points = [...[...contacts, ...vehicles, ...(vessel ? [vessel] : [])].map(latLng), ...tracks.flatMap((track) => track.points)];
     if (!points.length) return false;
     this.fitted = true;
     this.map.invalidateSize({ animate: false, pan: false });

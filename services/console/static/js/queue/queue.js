@@ -169,6 +169,7 @@ export class Queue {
     this.selectedIndex = 0;
     this.refreshing = false;
     this.refreshAgain = false;
+    this.loading = false; // rows for scrolling
     this.space = h("div", { class: "space", role: "presentation" });
     this.list = h("div", {
       id: "queue", class: "list", role: "listbox", tabindex: 0, "aria-label": t("queue.title"),
@@ -327,7 +328,21 @@ export class Queue {
       this.drawn.set(index, element);
     }
     this.#updateActiveRow();
-    if (missing) this.rows.ensure(first, last).then((response) => response && this.draw());
+    if (missing) this.#loadVisible(first, last);
+  }
+
+  /** Load rows and draw them. Scrolling during a load starts no other one: the rows visible at its end are loaded next. */
+  async #loadVisible(first, last) {
+    if (this.loading) return;
+    this.loading = true;
+    const { generation } = this.rows;
+    let response = null;
+    try {
+      response = await this.rows.ensure(first, last);
+    } finally {
+      this.loading = false;
+    }
+    if (response || generation !== this.rows.generation) this.draw();
   }
 
   #updateActiveRow() {

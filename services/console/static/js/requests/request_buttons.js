@@ -67,7 +67,7 @@ export class RequestButtons {
       fill(this.buttons, this.#buttons(contact, costs, waiting));
       if (focused) this.buttons.querySelector(`[data-request="${CSS.escape(focused)}"]`)?.focus();
     }
-    fill(this.states, KINDS.map((kind) => this.#latest(kind)).filter(Boolean).map((one) => {
+    fill(this.states, [...KINDS, "region"].map((kind) => this.#latest(kind)).filter(Boolean).map((one) => {
       const { text, tone } = requestState(one, contact.vehicle_id, now());
       return h("li", { data: { kind: one.kind, tone } }, h("b", { text: requestKind(one.kind) }), " ", h("span", { class: tone, text }));
     }));

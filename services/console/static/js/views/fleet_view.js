@@ -53,11 +53,27 @@ function seabedFacts(seabed) {
   ];
 }
 
-/** Time of a vehicle's position: that of its last contact. */
+/** Time of a vehicle's position: that of its status or of its last contact. */
 function positionTime(one, limit_s) {
   if (one.lat_deg === null || one.position_utc_s === null) return null;
+  if (one.status?.lat_deg != null && one.status.time_utc_s === one.position_utc_s) return withAge("", one.position_utc_s, limit_s);
   const is_old = now() - one.position_utc_s > 86400;
   return is_old ? h("span", { class: "stale", text: t("fleet.seen_on", { date: date(one.position_utc_s) }) }) : withAge(t("fleet.seen"), one.position_utc_s, limit_s);
+}
+
+/** What the vehicle reports of itself over the acoustic link. */
+function statusFact(status) {
+  if (!status) return null;
+  const values = [
+    status.heading_deg === null ? null : t("fleet.heading", { value: quantity(status.heading_deg, "°", 0) }),
+    status.speed_mps === null ? null : t("fleet.speed", { value: quantity(status.speed_mps, "m/s") }),
+    status.depth_m === null ? null : t("fleet.depth", { value: quantity(status.depth_m, "m") }),
+    status.altitude_m === null ? null : t("fleet.altitude", { value: quantity(status.altitude_m, "m") }),
+    status.battery === null ? null : t("fleet.battery", { value: percent(100 * status.battery) }),
+    status.disk_free_bytes === null ? null : t("fleet.disk", { value: bytes(status.disk_free_bytes) }),
+    status.images_waiting === null ? null : t("fleet.images", { count: status.images_waiting }),
+  ];
+  return fact(t("fleet.vehicle_status"), values.filter(Boolean).join(" · "), " ", withAge("", status.received_utc_s, state.info.stale_after_s.vehicle));
 }
 
 function vehicleCard(one) {
@@ -73,7 +89,9 @@ function vehicleCard(one) {
       fact(t("fleet.frames"), t("fleet.frames_value", { frames: one.frames, bad: one.bad_frames })),
       fact(t("fleet.loss"), h("span", { class: (one.loss ?? 0) > 0.3 ? "bad" : "", text: loss })),
       fact(t("fleet.range"), quantity(one.range_m, "m", 0), " ", one.range_m === null ? null : withAge("", one.range_utc_s, limit_s)),
+      one.measured_range ? fact(t("fleet.measured_range"), quantity(one.measured_range.distance_m, "m", 0), " ", withAge("", one.measured_range.measured_utc_s, limit_s)) : null,
       fact(t("fleet.position"), one.lat_deg === null ? DASH : position(one.lat_deg, one.lon_deg), " ", positionTime(one, limit_s)),
+      statusFact(one.status),
       fact(t("fleet.requests"), String(one.open_orders))),
     h("h4", { text: t("fleet.seabed") }), seabedFacts(one.seabed),
     h("h4", { text: t(one.queue ? "fleet.send_queue" : "fleet.no_send_queue", { vehicle: one.vehicle_id }) }), queueTable(one.queue));

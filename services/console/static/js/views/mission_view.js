@@ -45,10 +45,15 @@ function fact(name, text, utc_s) {
   return [h("dt", { text: name }), h("dd", { class: "number" }, value, utc_s ? h("span", { class: "muted age", text: ` ${age(utc_s)}` }) : null)];
 }
 
+const squareText = (area_m2) => (area_m2 >= KM2 / 10 ? quantity(area_m2 / KM2, "km²", 2) : quantity(area_m2, "m²", 0));
+
 function areaText(area) {
-  return area === null ? null : t("mission.contact_area", {
-    area: area.area_m2 >= KM2 / 10 ? quantity(area.area_m2 / KM2, "km²", 2) : quantity(area.area_m2, "m²", 0), count: area.contacts,
-  });
+  return area === null ? null : t("mission.contact_area", { area: squareText(area.area_m2), count: area.contacts });
+}
+
+/** Area from the track of a vehicle and the range of its sonar, if the vehicle reports both. */
+function coverageFact(coverage) {
+  return fact(t("mission.coverage"), coverage === null ? null : t("mission.coverage_value", { area: squareText(coverage.area_m2), count: coverage.legs }), coverage?.time_utc_s);
 }
 
 function contactFacts(one) {
@@ -57,7 +62,6 @@ function contactFacts(one) {
   return [
     fact(t("mission.contacts"), String(Object.values(counts).reduce((sum, count) => sum + count, 0)), one.contacts_utc_s),
     names.map((name) => fact(`· ${verdict(name)}`, String(counts[name] ?? 0))),
-    fact(t("mission.coverage"), null),
     fact(t("mission.contacts_lie_in"), areaText(one.area) ?? DASH, one.area?.time_utc_s),
     fact(t("mission.image_bytes"), bytes(one.image_bytes), one.image_bytes_utc_s),
     fact(t("mission.downlink"), t("mission.air_time", { duration: duration(one.downlink.airtime_s), count: one.downlink.transmissions }), one.downlink.time_utc_s),
@@ -91,7 +95,7 @@ function seabedFact(seabed) {
 function vehicleCard(one) {
   return h("article", { class: "card", "aria-label": one.vehicle_id },
     h("h3", { text: one.vehicle_id }),
-    h("dl", { class: "facts" }, contactFacts(one), uplinkFact(one.uplink), queueFacts(one.queue), seabedFact(one.seabed)),
+    h("dl", { class: "facts" }, contactFacts(one), coverageFact(one.coverage), uplinkFact(one.uplink), queueFacts(one.queue), seabedFact(one.seabed)),
     histogram(one.hours));
 }
 
@@ -135,7 +139,8 @@ export class MissionView {
   render() {
     if (!this.visible || this.data === null) return;
     const { vehicles, total, operators } = this.data;
-    const heads = ["operator", "decisions", "verdicts", "median", "last"].map((name) => h("th", { scope: "col", text: t(`mission.column.${name}`) }));
+    const heads = ["operator", "decisions", "verdicts", "median", "last"].map((name) =>
+      h("th", { scope: "col", class: ["operator", "verdicts"].includes(name) ? "" : "number", text: t(`mission.column.${name}`) }));
     const listening = state.fleet?.listening_since_utc_s;
     fill(this.body,
       h("p", { class: "muted", text: listening ? t("mission.basis", { since: since(listening) }) : t("mission.basis_stored") }),
