@@ -1,11 +1,12 @@
-"""The polled input folder: which files are there, and which of them are complete."""
+"""The polled input folder: which recordings are there, and which of them are complete."""
 
 from __future__ import annotations
 
 import errno
 import hashlib
 import os
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 DONE_SUFFIX = ".done"
@@ -13,26 +14,36 @@ DONE_SUFFIX = ".done"
 
 @dataclass(frozen=True, slots=True)
 class InputFile:
-    """A file as one poll of the folder found it.
+    """A file, or a recording of several files, as one poll of the folder found it.
 
     Attributes:
-        path: The file.
-        size_bytes: Its size.
-        modified_ns: Its modification time.
+        path: The file; of several ones that which names the recording.
+        size_bytes: Size of all files.
+        modified_ns: Latest modification time.
+        others: Other files of the recording that exist.
+        missing: Number of files that do not exist yet.
         is_done: Whether its recorder has put `NAME.done` beside it. Not part of the comparison.
     """
 
     path: Path
     size_bytes: int
     modified_ns: int
+    others: tuple[Path, ...] = ()
+    missing: int = 0
     is_done: bool = field(default=False, compare=False)
+
+    @property
+    def parts(self) -> tuple[Path, ...]:
+        """All files that exist, `path` first."""
+        return (self.path, *self.others)
 
 
 class StableFiles:
     """Decides which files are complete.
 
     Args:
-        settle_s: A file is complete when its size and date have not changed for this long, or at once with `NAME.done`.
+        settle_s: A recording is complete when all its files exist and their sizes and dates have not changed for this
+            long, or at once with `NAME.done`.
         require_done_marker: A file without `NAME.done` is never complete.
     """
 
@@ -53,13 +64,21 @@ class StableFiles:
         complete = (
             file
             for file, since_s in self._unchanged_since_s.items()
-            if is_done[file.path] or (now_s - since_s >= self._settle_s and not self._require_done_marker)
+            if is_done[file.path]
+            or (now_s - since_s >= self._settle_s and not file.missing and not self._require_done_marker)
         )
         return tuple(sorted(complete, key=lambda file: (file.modified_ns, file.path.name)))
 
 
-def list_input_files(folder: Path, suffixes: tuple[str, ...]) -> tuple[InputFile, ...]:
+def list_input_files(
+    folder: Path, suffixes: tuple[str, ...], parts_of: Callable[[Path], tuple[Path, ...]] | None = None
+) -> tuple[InputFile, ...]:
     """Return the regular files with these suffixes. Names that begin with a dot are skipped (copy in progress).
+
+    Args:
+        folder: The folder.
+        suffixes: Suffixes in lower case.
+        parts_of: Names the files of a recording; None if each is one file.
 
     Raises:
         OSError: The folder cannot be read.
@@ -80,8 +99,31 @@ def list_input_files(folder: Path, suffixes: tuple[str, ...]) -> tuple[InputFile
             if error.errno in (errno.ENOENT, errno.ELOOP):
                 continue  # removed after the folder was listed, or a link to itself
             raise
-        files.append(InputFile(Path(entry.path), status.st_size, status.st_mtime_ns, entry.name + DONE_SUFFIX in names))
+        is_done = entry.name + DONE_SUFFIX in names
+        file = InputFile(Path(entry.path), status.st_size, status.st_mtime_ns, is_done=is_done)
+        files.append(file if parts_of is None else _with_parts(file, parts_of(file.path)))
     return tuple(files)
+
+
+def _with_parts(file: InputFile, parts: tuple[Path, ...]) -> InputFile:
+    """Return the file with the other files of its recording.
+
+    Raises:
+        OSError: A file cannot be examined.
+    """
+    others: list[Path] = []
+    size_bytes, modified_ns, missing = file.size_bytes, file.modified_ns, 0
+    for part in parts:
+        if part == file.path:
+            continue
+        try:
+            status = part.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            missing += 1
+            continue
+        others.append(part)
+        size_bytes, modified_ns = size_bytes + status.st_size, max(modified_ns, status.st_mtime_ns)
+    return replace(file, size_bytes=size_bytes, modified_ns=modified_ns, others=tuple(others), missing=missing)
 
 
 def printable(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import shutil
 import time
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import msgpack
 
+from sonarpost import keys
 from sonarpost.archive.retention import DAY_S, Stored, remove_files, select_for_removal
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
@@ -21,7 +23,7 @@ from sonarpost.detection.transmissions import WARNING_SHARE
 from sonarpost.errors import BadInputError, DeliveryError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.logs import kv
-from sonarpost.messages import Record, Snippet
+from sonarpost.messages import Record, Snippet, VehicleStatus
 from sonarpost.runtime.retention import INTERVAL_S
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.atd_stub.config import AtdStubConfig
@@ -42,7 +44,7 @@ from sonarpost.services.atd_stub.snippet_files import SNIPPET_SUFFIXES, read_sni
 from sonarpost.services.atd_stub.survey_detection import DetectionResult, detect_in_survey
 from sonarpost.services.atd_stub.transmissions import TransmissionLog
 from sonarpost.sonar.image_files import IMAGE_SUFFIXES
-from sonarpost.sonar.readers import single_file_suffixes
+from sonarpost.sonar.readers import recording_parts, supported_suffixes
 
 log = logging.getLogger(__name__)
 
@@ -61,9 +63,11 @@ class AtdStubService(Service[AtdStubConfig]):
 
     def __init__(self, platform: PlatformConfig, config: AtdStubConfig) -> None:
         super().__init__(platform, config)
-        self._suffixes = single_file_suffixes() if config.mode == "survey" else IMAGE_SUFFIXES
+        self._suffixes = supported_suffixes() if config.mode == "survey" else IMAGE_SUFFIXES
         self._stable_files = StableFiles(config.settle_s, require_done_marker=config.require_done_marker)
+        self._present: tuple[InputFile, ...] = ()
         self._processed: dict[InputFile, str] = {}  # with the digest of the content
+        self._incomplete: set[Path] = set()
         self._stable_picks = StableFiles(config.settle_s)
         self._handled_picks: set[InputFile] = set()
         self._retention_due_s = 0.0
@@ -75,6 +79,7 @@ class AtdStubService(Service[AtdStubConfig]):
             self.store, self.commit, self._ignore_transmissions, config.transmissions_file
         )
         self._seabed = SeabedHistory()
+        self._status: VehicleStatus | None = None
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Not called: this service consumes no records."""
@@ -143,6 +148,9 @@ class AtdStubService(Service[AtdStubConfig]):
                 if self._masks:
                     self._transmissions.save(time.monotonic())
                 self._process_picks()
+                # Repeated, so that a uuv_modem that starts later receives it.
+                if self._status is not None:
+                    self.publish(keys.vehicle_status(self.platform.id), self._status)
                 self._apply_retention(time.time())
             except (OSError, DeliveryError) as error:
                 self.set_degraded(f"{type(error).__name__}: {error}")
@@ -175,8 +183,9 @@ class AtdStubService(Service[AtdStubConfig]):
         removed = select_for_removal(stored, now_utc_s, config.retain_days, config.max_bytes)
         for file in removed:
             done = file.path.with_name(file.path.name + DONE_SUFFIX)
-            for path in (file.path, file.path.with_suffix(".txt"), done, picks_path(file.path)):
+            for path in (*self._own_parts(file), file.path.with_suffix(".txt"), done, picks_path(file.path)):
                 path.unlink(missing_ok=True)
+            _remove_empty_folders(file)
             log.warning("Input file removed by retention", extra=kv(file=printable(file.path.name)))
         present = {content for file, content in self._processed.items() if file not in removed}
         for name, entry in entries.items():
@@ -195,8 +204,11 @@ class AtdStubService(Service[AtdStubConfig]):
 
     def _process_folder(self) -> None:
         self.config.input_dir.mkdir(parents=True, exist_ok=True)
-        files = list_input_files(self.config.input_dir, self._suffixes)
-        present = set(files)
+        files = list_input_files(
+            self.config.input_dir, self._suffixes, _known_parts if self.config.mode == "survey" else None
+        )
+        self._present, present = files, set(files)
+        self._log_incomplete(files)
         self._processed = {file: content for file, content in self._processed.items() if file in present}
         new = tuple(file for file in files if file not in self._processed)
         complete = self._stable_files.update(new, time.monotonic())
@@ -216,6 +228,13 @@ class AtdStubService(Service[AtdStubConfig]):
                 self._files_waiting -= 1
         if first_error is not None:
             raise first_error
+
+    def _log_incomplete(self, files: tuple[InputFile, ...]) -> None:
+        """Log each recording with missing files once."""
+        incomplete = {file.path: file.missing for file in files if file.missing}
+        for path in incomplete.keys() - self._incomplete:
+            log.info("Recording waits for missing files", extra=kv(file=path.name, missing=incomplete[path]))
+        self._incomplete = set(incomplete)
 
     def _process_picks(self) -> None:
         """Send the contacts of picks of processed surveys; each pick once.
@@ -273,32 +292,33 @@ class AtdStubService(Service[AtdStubConfig]):
     def _process(self, file: InputFile) -> str:
         """Process a file; return its digest, empty if it was removed or changed and has to be tried again."""
         try:
-            content = content_sha256(file.path)
+            content = _content_of(file)
         except FileNotFoundError:
             return ""
         if (entry := self.store.get_state(_state_name(content))) is not None:
-            self._skip_known(file.path, content, entry)
+            self._skip_known(file, content, entry)
             return content
-        return content if self._detect(file.path, content) else ""
+        return content if self._detect(file, content) else ""
 
-    def _detect(self, path: Path, content: str) -> bool:
+    def _detect(self, file: InputFile, content: str) -> bool:
+        path = file.path
         started = time.perf_counter()
         try:
             result = self._contacts_of(path, content)
         except SurveyFileError as error:
             # If the file was removed or changed during the search, the error is not about this content.
-            if not _is_unchanged(path, content):
+            if not _is_unchanged(file, content):
                 return False
-            self._quarantine(path, content, str(error))
+            self._quarantine(file, content, str(error))
             return True
         except (OSError, DeliveryError):
             raise
         except Exception as error:
             # A defect of the detector must not block the files after this one.
             log.exception("File not processed", extra=kv(file=path.name))
-            self._quarantine(path, content, f"{type(error).__name__}: {error}")
+            self._quarantine(file, content, f"{type(error).__name__}: {error}")
             return True
-        if not _is_unchanged(path, content):
+        if not _is_unchanged(file, content):
             log.warning("File changed while it was read; trying again", extra=kv(file=path.name))
             return False
         self._commit_result(path, content, result, round(time.perf_counter() - started, 2))
@@ -328,6 +348,8 @@ class AtdStubService(Service[AtdStubConfig]):
             threshold = self.config.confidence_threshold
             counts["counts"] = counts_text(threshold, result.contact_count, result.weaker)
             self._seabed.add(result.difficulty, time.monotonic())
+            if self._is_newer(result.status):
+                self._status = result.status
             if result.difficulty is not None:
                 counts["expected_pd"] = f"{result.difficulty.expected_pd:.2f}"
         log.info(
@@ -363,6 +385,10 @@ class AtdStubService(Service[AtdStubConfig]):
         for warning in result.warnings:
             log.warning(message, extra=kv(file=path.name, warning=printable(warning)))
 
+    def _is_newer(self, status: VehicleStatus | None) -> bool:
+        """Return whether a status is not older than the one that is published."""
+        return status is not None and (self._status is None or status.time_utc_s >= self._status.time_utc_s)
+
     def _commit_contacts(self, effects: UnitOfWork, snippets: tuple[Snippet, ...]) -> None:
         """Count and commit contacts that are ready for release, with `effects`; their files are written before."""
         effects.count("contacts_detected", len(snippets))
@@ -393,52 +419,92 @@ class AtdStubService(Service[AtdStubConfig]):
         for snippet in snippets:
             log.info("Held contact released", extra=kv(contact_id=snippet.contact.contact_id, reason=reason))
 
-    def _skip_known(self, path: Path, content: str, entry: bytes) -> None:
+    def _skip_known(self, file: InputFile, content: str, entry: bytes) -> None:
         """Skip a file that was processed before; move one that was refused to the quarantine again."""
         known = msgpack.unpackb(entry)
         refused_reason = known.get("refused")
         log.info(
             "File already processed",
-            extra=kv(file=path.name, processed_as=known.get("file"), refused=refused_reason or "no"),
+            extra=kv(file=file.path.name, processed_as=known.get("file"), refused=refused_reason or "no"),
         )
         if refused_reason is not None:
-            self._move_to_quarantine(path, content, refused_reason)
+            self._move_to_quarantine(file, content, refused_reason)
 
-    def _quarantine(self, path: Path, content: str, reason: str) -> None:
+    def _quarantine(self, file: InputFile, content: str, reason: str) -> None:
         """Store that a file is bad, so that it is read once only, and move it to the quarantine with the reason."""
         reason = printable(reason)
-        log.error("File quarantined", extra=kv(file=path.name, reason=reason))
+        log.error("File quarantined", extra=kv(file=file.path.name, reason=reason))
         effects = UnitOfWork()
-        entry = {"file": printable(path.name), "refused": reason, "processed_utc_s": time.time()}
+        entry = {"file": printable(file.path.name), "refused": reason, "processed_utc_s": time.time()}
         effects.put_state(_state_name(content), msgpack.packb(entry))
         effects.count("files_quarantined")
         self.commit(effects)
-        self._move_to_quarantine(path, content, reason)
+        self._move_to_quarantine(file, content, reason)
 
-    def _move_to_quarantine(self, path: Path, content: str, reason: str) -> None:
+    def _move_to_quarantine(self, file: InputFile, content: str, reason: str) -> None:
+        path, parts = file.path, self._own_parts(file)
         folder = self.config.quarantine_dir or self.config.input_dir / "quarantine"
-        target = folder / path.name
-        if target.exists():
+        if any((folder / part.relative_to(path.parent)).exists() for part in parts):
             # Another bad file of this name is there and must not be overwritten.
-            target = folder / f"{path.stem}-{content[:8]}{path.suffix}"
+            names = [f"{path.stem}-{content[:8]}{path.suffix}"]
+            if len(parts) > 1:
+                # Files of one recording refer to each other by name.
+                folder /= f"{path.stem}-{content[:8]}"
+                names = [str(part.relative_to(path.parent)) for part in parts]
+        else:
+            names = [str(part.relative_to(path.parent)) for part in parts]
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            write_atomically(target.with_name(f"{target.name}.reason.txt"), f"{reason}\n".encode())
-            # Not a rename: the quarantine may be on another disk.
-            shutil.move(path, target)
+            write_atomically(folder / f"{names[0]}.reason.txt", f"{reason}\n".encode())
+            for part, name in reversed(list(zip(parts, names, strict=True))):
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                # Not a rename: the quarantine may be on another disk.
+                shutil.move(part, folder / name)
+            _remove_empty_folders(file)
         except OSError as error:
             # In a read-only folder the file stays; its stored entry prevents that it is processed again.
             log.warning("File cannot be moved to quarantine", extra=kv(file=path.name, error=str(error)))
 
+    def _own_parts(self, file: InputFile) -> tuple[Path, ...]:
+        """Return the files of a recording in the input folder that no other recording there uses, its own first."""
+        used = {part for other in self._present if other.path != file.path for part in other.parts}
+        inside = (part for part in file.others if part.is_relative_to(file.path.parent) and part not in used)
+        return (file.path, *inside)
 
-def _is_unchanged(path: Path, content: str) -> bool:
-    """Return whether the file exists and has the content that was read.
+
+def _known_parts(path: Path) -> tuple[Path, ...]:
+    """Return the files of a recording; the file alone if its reader cannot be loaded, which reading it will report."""
+    try:
+        return recording_parts(path)
+    except SurveyFileError:
+        return (path,)
+
+
+def _content_of(file: InputFile) -> str:
+    """Return the hex SHA-256 of a file; of several files that of their digests in order.
 
     Raises:
-        OSError: It cannot be read.
+        OSError: A file cannot be read.
+    """
+    digests = [content_sha256(part) for part in file.parts]
+    return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
+
+
+def _remove_empty_folders(file: InputFile) -> None:
+    """Remove the empty folders of a recording below its own folder."""
+    for folder in {part.parent for part in file.others} - {file.path.parent}:
+        if folder.is_relative_to(file.path.parent) and not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def _is_unchanged(file: InputFile, content: str) -> bool:
+    """Return whether the files exist and have the content that was read.
+
+    Raises:
+        OSError: A file cannot be read.
     """
     try:
-        return content_sha256(path) == content
+        return _content_of(file) == content
     except FileNotFoundError:
         return False
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from pydantic import ValidationError
 
 from sonarpost import wire
 from sonarpost.codec.interface import MIN_SIDE_PX
@@ -14,10 +18,13 @@ from sonarpost.detection.record import contact_record
 from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamDetector, StreamEnd
 from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals
-from sonarpost.messages import Contact, Pixels, Snippet
+from sonarpost.logs import kv
+from sonarpost.messages import Contact, Pixels, Snippet, VehicleStatus
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.sonar.readers import open_survey
-from sonarpost.sonar.survey import Survey
+from sonarpost.sonar.survey import Ping, Survey
+
+log = logging.getLogger(__name__)
 
 SurveyEnd = StreamEnd[bytes]
 """The end of a recording; its contacts are encoded snippets, as they are stored."""
@@ -43,6 +50,7 @@ class DetectionResult:
         masked_pings: Number of pings that were recorded during a transmission of the own modem.
         masked_share: The same as a share of the pings of the file, 0 to 1.
         difficulty: Difficulty of the file's seabed; None if too little of it is known.
+        status: Position and swath of the vehicle at the newest ping with a position; None without one.
     """
 
     snippets: tuple[Snippet, ...]
@@ -58,6 +66,7 @@ class DetectionResult:
     masked_pings: int = 0
     masked_share: float = 0.0
     difficulty: Difficulty | None = None
+    status: VehicleStatus | None = None
 
 
 def detect_in_survey(
@@ -107,7 +116,30 @@ def detect_in_survey(
         masked_pings=masked.masked_count,
         masked_share=masked.masked_share,
         difficulty=found.difficulty,
+        status=None if masked.newest is None else status_of(masked.newest, vehicle_id),
     )
+
+
+def status_of(ping: Ping, vehicle_id: str) -> VehicleStatus | None:
+    """Return the status of the vehicle at a ping; None if a value of the ping is out of range."""
+    swath_m = ping.max_slant_range_m()
+    if swath_m is not None and ping.altitude_m is not None:
+        swath_m = math.sqrt(max(0.0, swath_m**2 - ping.altitude_m**2))
+    try:
+        return VehicleStatus(
+            vehicle_id=vehicle_id,
+            time_utc_s=ping.time_utc_s,
+            lat_deg=ping.lat_deg,
+            lon_deg=ping.lon_deg,
+            heading_deg=None if ping.heading_deg is None else ping.heading_deg % 360,
+            speed_mps=ping.speed_mps,
+            depth_m=ping.depth_m,
+            altitude_m=ping.altitude_m,
+            swath_m=swath_m,
+        )
+    except ValidationError as error:
+        log.warning("No vehicle status: ping out of range", extra=kv(ping=ping.number, reason=error.errors()[0]["msg"]))
+        return None
 
 
 def _descending_confidence(snippet: Snippet) -> float:

@@ -18,7 +18,8 @@ class DecompressorConfig(RetentionConfig):
         max_bytes: Maximum size of the image files; above it versions that a later one has replaced are removed first,
             then the others, each the oldest first. Records that wait for delivery are in the store and stay.
         codebooks: Tile codebooks that vehicles may use: nominal-10, nominal-20 or files.
-        image_consumers: Services on the vessel that receive the decoded images; name only services that run.
+        image_consumers: Services on the vessel that receive the images; name only services that run. `relay` receives
+            the coded stream, every other service the pixels.
     """
 
     out_dir: Path = Path("out")

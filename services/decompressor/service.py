@@ -1,14 +1,22 @@
-"""decompressor: decodes received images, writes their files and sends them to the relay and the console."""
+"""decompressor: decodes received images, writes their files, sends pixels to the console and streams to the relay."""
 
 from __future__ import annotations
 
+import hashlib
 import logging
+import uuid
 from collections.abc import Mapping
 
+import zenoh
+
 from sonarpost import keys, wire
+from sonarpost.archive.codebook_transfer import declare_codebooks
+from sonarpost.archive.decoder import Decoder
 from sonarpost.archive.image_files import remove_old_images, write_image
 from sonarpost.codec.jit import use_code_folder
 from sonarpost.config import PlatformConfig
+from sonarpost.delivery.protocol import attachment
+from sonarpost.delivery.records import OutboxItem
 from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import ReceivedImage, ReconstructedImage, Record
@@ -16,10 +24,13 @@ from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.security.acoustic_key import link_key
 from sonarpost.services.decompressor.config import DecompressorConfig
-from sonarpost.services.decompressor.decoder import Decoder
 from sonarpost.services.decompressor.migration import migrate_store
 
 log = logging.getLogger(__name__)
+
+STREAM_CONSUMER = "relay"
+"""The consumer that gets the coded stream: the link to the shore site carries no pixels."""
+WATCHERS = "watchers"
 
 
 class DecompressorService(Service[DecompressorConfig]):
@@ -38,6 +49,7 @@ class DecompressorService(Service[DecompressorConfig]):
         self._decoder = Decoder(config.codebooks)
         super().__init__(platform, config)
         self._retention = Retention(self._apply_retention, self.stopping)
+        self._copy_origin, self._copies = uuid.uuid4().bytes, 0
 
     def start(self) -> bool:
         """Convert the frames and the receiver state that version 0.1 left in the store, then start."""
@@ -45,7 +57,8 @@ class DecompressorService(Service[DecompressorConfig]):
         return super().start()
 
     def on_start(self) -> None:
-        """Start the retention."""
+        """Start the retention, and reply to queries for codebooks."""
+        declare_codebooks(self.session, self.platform.id, self._decoder)
         self.start_thread(self._retention.run, "retention")
 
     def on_stop(self) -> None:
@@ -93,9 +106,14 @@ class DecompressorService(Service[DecompressorConfig]):
                 "Image conflicts with a stored one of the same name; both are kept", extra=kv(file=written.tiff)
             )
             effects.count("images_conflicting")
-        payload, out_key = wire.encode(image), keys.image_reconstructed(self.platform.id)
         for consumer in self.config.image_consumers:
-            effects.send_payload(out_key, consumer, payload, ReconstructedImage, priority=5)
+            if consumer == STREAM_CONSUMER:
+                coded = self._decoder.coded_image(record, image)
+                effects.send(keys.image_coded(self.platform.id), consumer, coded, priority=5)
+            else:
+                effects.send(keys.image_reconstructed(self.platform.id), consumer, image, priority=5)
+        if not set(self.config.image_consumers) - {STREAM_CONSUMER}:
+            self._publish_copy(image)
         effects.count("images_reconstructed")
         effects.count("images_complete", int(image.complete))
         log.info(
@@ -107,6 +125,17 @@ class DecompressorService(Service[DecompressorConfig]):
                 file=written.tiff,
             ),
         )
+
+    def _publish_copy(self, image: ReconstructedImage) -> None:
+        """Publish the pixels for watchers; the attachment marks them as a copy, which no consumer accepts."""
+        payload, key = wire.encode(image), keys.image_reconstructed(self.platform.id)
+        encoding = wire.encoding_of(ReconstructedImage)
+        self._copies += 1
+        item = OutboxItem(WATCHERS, self._copies, key, encoding, 5, payload, hashlib.sha256(payload).digest())
+        try:
+            self.session.put(key, payload, encoding=encoding, attachment=attachment(self._copy_origin, item))
+        except zenoh.ZError as error:
+            log.warning("Image not published", extra=kv(error=str(error)))
 
     def _quarantine_stream(self, received: ReceivedImage, reason: str, effects: UnitOfWork) -> None:
         effects.count("images_undecodable")

@@ -14,16 +14,25 @@ from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import DeliveryError, FrameError, PayloadError
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
+from sonarpost.link.auth.merging import FrameMerger
 from sonarpost.link.downlink.commands import PendingCommand
 from sonarpost.link.downlink.vessel_endpoint import DownlinkPacket
 from sonarpost.link.state import SavedParts
 from sonarpost.logs import kv
 from sonarpost.messages import Command, Decision, Record
-from sonarpost.modem.micromodem import RATES, FrameReceived, PacketFailed, PacketSent
+from sonarpost.modem.interface import (
+    FrameReceived,
+    PacketFailed,
+    PacketSent,
+    RangeMeasured,
+    RequestDone,
+    RequestFailed,
+)
 from sonarpost.runtime.modem_service import ModemService, sent_frames
 from sonarpost.runtime.service import UnitOfWork
 from sonarpost.security.acoustic_key import key_warning
 from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.ranging import Ranging
 from sonarpost.services.op_modem.transmit_gate import TransmitGate
 from sonarpost.services.op_modem.vessel_endpoint import VesselLink
 
@@ -53,7 +62,8 @@ class DownlinkService(ModemService[OpModemConfig]):
         super().__init__(platform, config)
         self._authenticated_since_s = self._begin_authentication()
         self._partial_packet: list[FrameReceived] = []
-        self._gate = TransmitGate(config)
+        self._gate = TransmitGate(self.config)
+        self._ranging = Ranging(platform.id, self.config)
         self._link_lock = threading.RLock()
         self._link = self._new_link()
         self._saved_parts = SavedParts({})
@@ -63,12 +73,18 @@ class DownlinkService(ModemService[OpModemConfig]):
         self._new_commands: list[PendingCommand] = []
 
     def _new_link(self) -> VesselLink:
-        authenticator = None
+        authenticator, merger = None, None
         if self.key is not None:
             limit = int(self.store.get_state(_COUNTER_LIMIT + self.key.fingerprint) or b"0")
             address = self.config.address
             authenticator = FrameAuthenticator(self.key, address, Direction.TO_VEHICLE, first_counter=limit)
-        return VesselLink(self.platform.id, self.config, authenticator, self._authenticated_since_s)
+            if self.config.other_vessels:
+                verifiers = {
+                    vessel: FrameAuthenticator(self.key, address, Direction.TO_VEHICLE)
+                    for vessel in self.config.other_vessels
+                }
+                merger = FrameMerger(authenticator, verifiers)
+        return VesselLink(self.platform.id, self.config, authenticator, self._authenticated_since_s, merger)
 
     def _begin_authentication(self) -> float:
         """Return the time from which on the store holds content of authenticated frames only, UTC in seconds.
@@ -216,18 +232,20 @@ class DownlinkService(ModemService[OpModemConfig]):
     def _send_if_due(self) -> None:
         if self._in_flight is not None or not self.modem.ready or self.modem.queued:
             return
+        if self._ranging.in_progress and self._ranging.due_address(time.monotonic()) is None:
+            return
         now_s, now = time.monotonic(), time.time()
         receiving = self.modem.receiving or bool(self._partial_packet)
         with self._link_lock:
             pending = self._link.endpoint.due_address(now) is not None
             if self._gate.may_transmit(now_s, now, receiving=receiving, pending=pending):
                 self._send(now)
-            elif not pending and not receiving:
+            elif not pending and not receiving and not self._ping_vehicle(now_s, now):
                 self._poll_vehicle(now_s)
 
     def _send(self, now: float) -> None:
         """Build the next packet, commit the state that follows from it, and send it; requires the lock."""
-        rate = RATES[self.config.downlink_rate]
+        rate = self.config.rate_info(self.config.downlink_rate)
         with self._link_step() as link:
             self._reserve_counters(link.authenticator)
             packet = link.endpoint.next_packet(rate.frames, rate.frame_bytes, now)
@@ -249,8 +267,34 @@ class DownlinkService(ModemService[OpModemConfig]):
     def _poll_vehicle(self, now_s: float) -> None:
         address = self._gate.vehicle_to_poll(now_s, sorted(int(address) for address in self.config.vehicles))
         if address is not None:
-            self.modem.request_packet(address, self.config.poll_rate, RATES[self.config.poll_rate].frames)
+            self.modem.request_packet(
+                address, self.config.poll_rate, self.config.rate_info(self.config.poll_rate).frames
+            )
             self.count("polls_sent")
+
+    def _ping_vehicle(self, now_s: float, now: float) -> bool:
+        """Ping a vehicle if one is due and the channel is free; return whether a ping was sent."""
+        address = self._ranging.due_address(now_s)
+        if address is None or not self._gate.is_free(now_s, now, receiving=False):
+            return False
+        request_id = self.modem.request(lambda driver, at_s: driver.ping(address, at_s))
+        self._ranging.started(request_id, address, now_s)
+        self.count("pings_sent")
+        return True
+
+    def range_event(self, event: RangeMeasured | RequestDone | RequestFailed) -> None:
+        """Publish a measured distance, or record the end of a ping."""
+        with self._link_lock:
+            if not isinstance(event, RangeMeasured):
+                if self._ranging.ended(event) and isinstance(event, RequestFailed):
+                    self.count("pings_failed")
+                return
+            record = self._ranging.measured(event, time.time())
+        if record is None:
+            self.count("ranges_ignored")
+            return
+        self.count("ranges_measured")
+        self.publish(keys.acoustic_range(self.platform.id), record)
 
     def packet_ended(self, event: PacketSent | PacketFailed) -> None:
         """Record that the modem has sent a packet, or failed to."""
@@ -267,7 +311,7 @@ class DownlinkService(ModemService[OpModemConfig]):
                 log.warning("Packet not sent", extra=kv(destination=packet.address, reason=event.reason))
                 return
             changed = self._commit_sent(packet, now)
-        for record in sent_frames(self.platform.id, self.config.address, event, event.packet_id, now):
+        for record in sent_frames(self.platform.id, self.config, event, event.packet_id, now):
             self.publish(keys.acoustic_tx(self.platform.id), record)
         self._publish_states(changed)
 
@@ -313,6 +357,9 @@ class DownlinkService(ModemService[OpModemConfig]):
             if authenticator is not None:
                 counts = authenticator.counts
                 gauges |= {"frames_forged": float(counts.forged), "frames_replayed": float(counts.replayed)}
+                if self.config.other_vessels:
+                    merged = endpoint.v1.counts
+                    gauges |= {"frames_duplicate": float(merged.duplicates), "frames_late": float(merged.late)}
                 gauges |= {"frames_genuine": float(counts.genuine), "key_frames_left": float(authenticator.frames_left)}
             return gauges
 

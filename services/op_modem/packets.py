@@ -6,10 +6,9 @@ from collections.abc import Sequence
 
 import msgpack
 
+from sonarpost.errors import FrameError
 from sonarpost.messages import AcousticFrame, LinkQuality
-from sonarpost.modem.micromodem import RATES, FrameReceived, LinkStatistics, PacketReceived
-
-_MAX_FRAMES = 8
+from sonarpost.modem.interface import FrameReceived, ModemCapabilities, PacketReceived, ReceptionQuality
 
 
 def pack_partial(frames: Sequence[FrameReceived], received_utc_s: float) -> bytes:
@@ -33,7 +32,12 @@ def unpack_partial(saved: bytes) -> tuple[PacketReceived, float] | None:
 
 
 def received_frame(
-    vessel_id: str, frame: FrameReceived, packet: PacketReceived, number: int, received_utc_s: float
+    vessel_id: str,
+    frame: FrameReceived,
+    packet: PacketReceived,
+    number: int,
+    received_utc_s: float,
+    modem: ModemCapabilities,
 ) -> AcousticFrame:
     """Return the record of a received frame.
 
@@ -43,26 +47,35 @@ def received_frame(
         packet: Its packet.
         number: Number of the packet on this vessel.
         received_utc_s: End of the packet.
+        modem: Capabilities of the modem.
 
     Raises:
-        ValidationError: No Micro-Modem sends such a frame.
+        FrameError: This modem does not send such a frame.
+        ValidationError: No modem sends such a frame.
     """
+    most = max(rate.frames for rate in modem.rates.values())
+    if not modem.min_address <= frame.src <= modem.max_address:
+        raise FrameError("acoustic frame", "source", frame.src, f"{modem.min_address}..{modem.max_address}")
+    if not 1 <= frame.frame_number <= most:
+        raise FrameError("acoustic frame", "frame_number", frame.frame_number, f"1..{most}")
+    rate = None if frame.rate is None else modem.rates.get(frame.rate)
     return AcousticFrame(
         direction="rx",
         platform_id=vessel_id,
         time_utc_s=received_utc_s,
         source=frame.src,
         destination=frame.dest,
-        rate=frame.rate if frame.rate in RATES else None,
+        rate=None if rate is None else rate.number,
         packet=number,
         frame_number=frame.frame_number,
-        frame_count=_within(packet.nframes, _MAX_FRAMES),
+        frame_count=_within(packet.nframes, most),
         data=frame.data,
         quality=quality_of(packet.statistics),
+        airtime_s=None if rate is None else rate.airtime_s,
     )
 
 
-def quality_of(statistics: LinkStatistics | None) -> LinkQuality | None:
+def quality_of(statistics: ReceptionQuality | None) -> LinkQuality | None:
     """Return the modem's statistics as a record; an impossible count becomes None."""
     if statistics is None:
         return None

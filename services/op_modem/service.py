@@ -6,22 +6,34 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from pydantic import ValidationError
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
-from sonarpost.errors import DeliveryError, PayloadError
+from sonarpost.delivery.outbox import QueuePolicy
+from sonarpost.delivery.records import InboxItem
+from sonarpost.errors import DeliveryError, FrameError, PayloadError
 from sonarpost.link.downlink.vessel_endpoint import ReceivedContent
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.logs import kv
-from sonarpost.messages import AcousticFrame, LinkQuality, ReceivedImage, ReceivedMessage
-from sonarpost.modem.micromodem import FrameDecoded, ModemEvent, PacketFailed, PacketReceived, PacketSent
+from sonarpost.messages import AcousticFrame, LinkQuality, ReceivedImage, ReceivedMessage, ReceivedStatus, Record
+from sonarpost.modem.interface import (
+    FrameDecoded,
+    ModemEvent,
+    PacketFailed,
+    PacketReceived,
+    PacketSent,
+    RangeMeasured,
+    RequestDone,
+    RequestFailed,
+)
 from sonarpost.runtime.service import UnitOfWork
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.downlink_service import DownlinkService
 from sonarpost.services.op_modem.packets import pack_partial, quality_of, received_frame, unpack_partial
+from sonarpost.services.op_modem.received_statuses import StatusLimiter, status_record
 from sonarpost.services.op_modem.vessel_endpoint import VesselLink
 
 log = logging.getLogger(__name__)
@@ -33,7 +45,6 @@ _QUEUE_0_1 = "decompressor"
 TICK_S = 0.1
 SAVE_RETRY_S = 1.0
 MAX_UNSAVED = 10_000
-BROADCAST = 127
 
 
 class OpModemService(DownlinkService):
@@ -43,6 +54,9 @@ class OpModemService(DownlinkService):
     `image_consumers`, again after more of it arrived. One transaction holds everything that follows from a packet: the
     state of the receivers, the images, and the state of commands and feedback. While the disk rejects it, packets wait
     in memory. The frames of an unfinished packet are stored as they arrive.
+
+    A vessel with a `lead_vessel` also sends the frames that it accepted to that vessel. The lead vessel processes the
+    frames of `other_vessels` as its own.
 
     With `link = "v1"` the service also sends commands, decisions and feedback to the vehicles.
 
@@ -59,8 +73,12 @@ class OpModemService(DownlinkService):
         self._unsaved: deque[tuple[PacketReceived, float]] = deque()
         self._unsaved_lock = threading.Lock()
         self._storage_error = ""
+        self._merged_messages: list[ReceivedMessage] = []
         self._rejections = 0
         self._last_rejection = ""
+        self._status_limiter = StatusLimiter(
+            self.config.status_interval_s, [int(address) for address in self.config.vehicles]
+        )
         self._limit_log = self.interval_log(log, logging.WARNING, "Image limit reached")
 
     def start(self) -> bool:
@@ -90,6 +108,8 @@ class OpModemService(DownlinkService):
         """Process a received packet, store a frame of an unfinished one, or record the end of a transmission."""
         if isinstance(event, (PacketSent, PacketFailed)):
             self.packet_ended(event)
+        elif isinstance(event, (RangeMeasured, RequestDone, RequestFailed)):
+            self.range_event(event)
         elif isinstance(event, FrameDecoded):
             self._gate.frame_received(time.monotonic())
             self._partial_packet.append(event.frame)
@@ -173,12 +193,13 @@ class OpModemService(DownlinkService):
         number = int(self.store.get_state(_PACKETS) or b"0") + 1
         effects = UnitOfWork()
         frames: list[AcousticFrame] = []
+        modem = self.config.capabilities
         for frame in packet.frames:
             try:
-                frames.append(received_frame(self.platform.id, frame, packet, number, received_utc_s))
-            except ValidationError as error:
-                # No Micro-Modem sends such a frame: an error on the serial line that its checksum did not detect.
-                reason = f"frame {frame.frame_number} of {len(frame.data)} bytes: {error.errors()[0]['msg']}"
+                frames.append(received_frame(self.platform.id, frame, packet, number, received_utc_s, modem))
+            except (ValidationError, FrameError) as error:
+                # No modem sends such a frame: an error on the serial line that its checksum did not detect.
+                reason = f"frame {frame.frame_number} of {len(frame.data)} bytes: {_text(error)}"
                 log.error("Frame quarantined", extra=kv(source=frame.src, reason=reason))
                 effects.quarantine(keys.acoustic_rx(self.platform.id), frame.data, reason)
                 effects.count("frames_refused")
@@ -186,13 +207,12 @@ class OpModemService(DownlinkService):
             contents = [(frame, self._accept(link, frame)) for frame in frames]
             images = [update for _, content in contents for update in content.images]
             rejected = [reason for _, content in contents for reason in content.rejected]
-            messages = [self._message(frame, data) for frame, content in contents for data in content.messages]
-            self._send_images(images, effects)
-            for message in messages:
-                for consumer in self.config.message_consumers:
-                    effects.send(keys.message_received(self.platform.id), consumer, message)
-            effects.count("frames_rejected", len(rejected))
-            effects.count("messages_received", len(messages))
+            messages = self._add_effects(contents, effects)
+            statuses = self._statuses(contents, effects)
+            if self.config.lead_vessel is not None:
+                key = keys.vessel_frames(self.config.lead_vessel, self.platform.id)
+                for record in (record for record, content in contents if not content.rejected):
+                    effects.send(key, self.NAME, record)
             self._save_state(effects)
             effects.put_state(_PACKETS, str(number).encode())
             # Frames of the next packet may have arrived.
@@ -202,20 +222,57 @@ class OpModemService(DownlinkService):
             self.publish(keys.acoustic_rx(self.platform.id), record)
         for message in messages if not self.config.message_consumers else ():
             self.publish(keys.message_received(self.platform.id), message)
+        for status in statuses:
+            self.publish(keys.acoustic_status(self.platform.id), status)
         self._publish_states([command for _, content in contents for command in content.commands])
-        if rejected:
-            self._rejections, self._last_rejection = self._rejections + len(rejected), str(rejected[-1])
+        self._add_rejections(rejected)
         log.info(
             "Packet received",
             extra=kv(source=packet.src, rate=packet.rate, frames=len(packet.frames), bad=packet.bad_frames),
         )
         self._log_images(images)
 
-    def _accept(self, link: VesselLink, frame: AcousticFrame) -> ReceivedContent:
+    def _add_effects(
+        self, contents: Sequence[tuple[AcousticFrame, ReceivedContent]], effects: UnitOfWork
+    ) -> list[ReceivedMessage]:
+        """Add the images and messages of frames to a unit of work; return the messages."""
+        messages = [self._message(frame, data) for frame, content in contents for data in content.messages]
+        self._send_images([update for _, content in contents for update in content.images], effects)
+        for message in messages:
+            for consumer in self.config.message_consumers:
+                effects.send(keys.message_received(self.platform.id), consumer, message)
+        effects.count("frames_rejected", sum(len(content.rejected) for _, content in contents))
+        effects.count("messages_received", len(messages))
+        return messages
+
+    def _add_rejections(self, rejected: Sequence[FrameError]) -> None:
+        if rejected:
+            self._rejections, self._last_rejection = self._rejections + len(rejected), str(rejected[-1])
+
+    def _accept(self, link: VesselLink, frame: AcousticFrame, vessel: str = "") -> ReceivedContent:
         """Pass a frame to the endpoint; only a frame to this modem or to all can hold messages for this vessel."""
-        addressed = frame.destination in (self.config.address, BROADCAST) and frame.source != BROADCAST
+        broadcast = self.config.capabilities.broadcast
+        addressed = frame.destination in (self.config.address, broadcast) and frame.source != broadcast
         overheard = not (addressed and self.config.transmits)
-        return link.endpoint.accept(frame.source, frame.data, frame.time_utc_s, overheard=overheard)
+        # The clocks of two vessels differ: the time of this one counts.
+        now = time.time() if vessel else frame.time_utc_s
+        return link.endpoint.accept(frame.source, frame.data, now, overheard=overheard, vessel=vessel)
+
+    def _statuses(
+        self, contents: Sequence[tuple[AcousticFrame, ReceivedContent]], effects: UnitOfWork
+    ) -> list[ReceivedStatus]:
+        """Return the records of the received statuses that are published."""
+        records: list[ReceivedStatus] = []
+        for frame, content in contents:
+            latest = self._status_limiter.latest(frame.source, content.statuses, frame.time_utc_s)
+            effects.count("statuses_received", len(content.statuses))
+            effects.count("statuses_dropped", len(content.statuses) - (latest is not None))
+            if latest is not None:
+                vehicle, authenticated = self.config.name_of(frame.source), self.key is not None
+                records.append(
+                    status_record(latest, self.platform.id, vehicle, frame.time_utc_s, authenticated=authenticated)
+                )
+        return records
 
     def _message(self, frame: AcousticFrame, data: bytes) -> ReceivedMessage:
         return ReceivedMessage(
@@ -276,6 +333,54 @@ class OpModemService(DownlinkService):
                 ),
             )
 
+    # Frames of other vessels
+
+    def consumed_keys(self) -> Mapping[str, type[Record]]:
+        """Return commands and decisions for vehicles, and the frames of other vessels."""
+        return {**super().consumed_keys(), **dict.fromkeys(self.delivery_only_keys(), AcousticFrame)}
+
+    def delivery_only_keys(self) -> Collection[str]:
+        """Return the keys of the frames of other vessels."""
+        return [keys.vessel_frames(self.platform.id, vessel) for vessel in self.config.other_vessels]
+
+    def queue_policy(self, queue: str) -> QueuePolicy:
+        """Return that frames for the lead vessel are not published."""
+        return QueuePolicy(publish=self.PUBLISH and queue != self.NAME)
+
+    def validate(self, key: str, record: Record) -> None:
+        """Reject a record that can never be sent, or a frame that the vessel in its key did not receive."""
+        if not isinstance(record, AcousticFrame):
+            super().validate(key, record)
+            return
+        vessel = keys.frames_vessel(key)
+        if record.platform_id != vessel:
+            raise PayloadError(key, "platform_id", record.platform_id, vessel)
+        if record.direction != "rx":
+            raise PayloadError(key, "direction", record.direction, "rx")
+        modem = self.config.capabilities
+        if not modem.min_address <= record.source <= modem.max_address:
+            raise PayloadError(key, "source", record.source, f"{modem.min_address}..{modem.max_address}")
+
+    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+        """Add a command or a decision, or process a frame of another vessel."""
+        if not isinstance(record, AcousticFrame):
+            super().handle(key, record, effects)
+            return
+        self._load()
+        content = self._accept(self._link, record, record.platform_id)
+        self._merged_messages = self._add_effects([(record, content)], effects)
+        self._new_commands += content.commands
+        effects.count("frames_merged", int(not content.rejected))
+        self._save_state(effects)
+        self._add_rejections(content.rejected)
+        self._log_images(content.images)
+
+    def _handle_item(self, item: InboxItem) -> None:
+        self._merged_messages = []
+        super()._handle_item(item)
+        for message in self._merged_messages if not self.config.message_consumers else ():
+            self.publish(keys.message_received(self.platform.id), message)
+
     # Migration
 
     def _process_queued_frames(self) -> None:
@@ -307,3 +412,7 @@ class OpModemService(DownlinkService):
                 tx.remove_acknowledged(_QUEUE_0_1, [item.seq for item in items])
             self._is_committed = True
         log.info("Frames of version 0.1 processed", extra=kv(frames=len(items)))
+
+
+def _text(error: ValidationError | FrameError) -> str:
+    return str(error) if isinstance(error, FrameError) else str(error.errors()[0]["msg"])

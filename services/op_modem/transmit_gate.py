@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from sonarpost.modem.micromodem import RATES
 from sonarpost.services.op_modem.config import OpModemConfig
 
 _PACKET_MARGIN_S = 1.0
@@ -56,16 +55,31 @@ class TransmitGate:
             self.pending_since_s = now_s
         if receiving or now_s < self.not_before_s:
             return False
+        if self.config.mac != "csma":
+            return self.is_free(now_s, utc_s, receiving=receiving)
+        return self._is_idle(now_s) or now_s - self.pending_since_s >= self.config.max_defer_s
+
+    def is_free(self, now_s: float, utc_s: float, *, receiving: bool) -> bool:
+        """Return whether the vessel may transmit now without a wait that is limited by `max_defer_s`.
+
+        Args:
+            now_s: Monotonic time.
+            utc_s: UTC in seconds, for TDMA.
+            receiving: Whether a packet is being received.
+        """
+        if receiving or now_s < self.not_before_s:
+            return False
         if self.config.mac == "tdma":
-            packet_s = RATES[self.config.downlink_rate].airtime_s
+            packet_s = self.config.rate_info(self.config.downlink_rate).airtime_s
             slots = self.config.slots()
             # The margin covers the start of the modem; a slot that is too short for it is used without.
             wait_s = slots.wait_s(packet_s + _PACKET_MARGIN_S, utc_s)
             return (slots.wait_s(packet_s, utc_s) if wait_s is None else wait_s) == 0.0
-        if self.config.mac == "polled":
-            return True
-        idle = now_s - self.last_frame_s >= self.config.holdoff_s
-        return idle or now_s - self.pending_since_s >= self.config.max_defer_s
+        return self.config.mac == "polled" or self._is_idle(now_s)
+
+    def _is_idle(self, now_s: float) -> bool:
+        """Return whether no frame was received for `holdoff_s`."""
+        return now_s - self.last_frame_s >= self.config.holdoff_s
 
     def vehicle_to_poll(self, now_s: float, addresses: Sequence[int]) -> int | None:
         """Return the modem address to poll now, None for none."""

@@ -9,6 +9,7 @@ from sonarpost.codec.region import RegionBox
 from sonarpost.errors import FrameError, PayloadError
 from sonarpost.link import migration
 from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.auth.merging import FrameMerger
 from sonarpost.link.downlink import messages as dl
 from sonarpost.link.downlink.commands import MAX_PENDING, CommandTracker, PendingCommand
 from sonarpost.link.downlink.vessel_endpoint import VesselEndpoint
@@ -17,11 +18,10 @@ from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.link.state import Parts, below, prefixed, unpack_plain
 from sonarpost.messages import Command, CommandKind, Decision, DownlinkState, ReceivedImage
-from sonarpost.modem.micromodem import RATES
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.image_limiter import ImageLimiter
 
-_LINK, _AUTHENTICATION, _LIMITS = "link/", "authentication/", "limits/"
+_LINK, _AUTHENTICATION, _LIMITS, _MERGING = "link/", "authentication/", "limits/", "merging/"
 _MESSAGE_OVERHEAD_BYTES = 3  # kind, length and number of a message segment
 LATEST_UTC_S = 2**32 - 1
 
@@ -34,6 +34,7 @@ class VesselLink:
         config: Configuration of op_modem.
         authenticator: Authenticates frames; None without a key.
         authenticated_since_s: UTC in seconds; an image whose first frame is older counts as unauthenticated.
+        merger: Merges the frames of `other_vessels`; None without any.
     """
 
     def __init__(
@@ -42,10 +43,12 @@ class VesselLink:
         config: OpModemConfig,
         authenticator: FrameAuthenticator | None = None,
         authenticated_since_s: float = 0.0,
+        merger: FrameMerger | None = None,
     ) -> None:
         self._vessel_id = vessel_id
         self._config = config
         self.authenticator = authenticator
+        self._merger = merger
         self._authenticated_since_s = authenticated_since_s
         self.limiter = ImageLimiter(
             config.max_images_per_hour, config.max_image_bytes_per_hour, frozenset(config.vehicles.values())
@@ -55,6 +58,7 @@ class VesselLink:
             self.commands,
             config.receiver_config(),
             protection=authenticator,
+            merger=merger,
             feedback=config.feedback and config.transmits,
             wire_formats=config.wire_formats,
             pairing_timeout_s=config.pairing_timeout_s,
@@ -99,7 +103,7 @@ class VesselLink:
     @property
     def _message_bytes(self) -> int:
         """Maximum length of a message in one frame."""
-        frame_bytes = RATES[self._config.downlink_rate].frame_bytes
+        frame_bytes = self._config.rate_info(self._config.downlink_rate).frame_bytes
         return min(255, segments_room(frame_bytes, self.authenticator)) - _MESSAGE_OVERHEAD_BYTES
 
     def state_record(self, command: PendingCommand, now: float) -> DownlinkState:
@@ -128,6 +132,8 @@ class VesselLink:
         parts = {**prefixed(_LINK, self.endpoint.parts()), **prefixed(_LIMITS, self.limiter.parts())}
         if self.authenticator is None:
             return parts
+        if self._merger is not None:
+            parts |= prefixed(_MERGING, self._merger.parts())
         return {**parts, **prefixed(_AUTHENTICATION, self.authenticator.parts())}
 
     def restore(self, parts: Parts) -> dict[str, FrameError]:
@@ -137,6 +143,9 @@ class VesselLink:
         if self.authenticator is not None:
             skipped = self.authenticator.restore(below(_AUTHENTICATION, parts))
             errors |= {_AUTHENTICATION + name: error for name, error in skipped.items()}
+        if self._merger is not None:
+            skipped = self._merger.restore(below(_MERGING, parts))
+            errors |= {_MERGING + name: error for name, error in skipped.items()}
         return errors
 
     def restore_old(self, saved: bytes) -> None:

@@ -3,39 +3,85 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
+from sonarpost.bearers.policy import Window
 from sonarpost.config import ConsumerName, ServiceConfig
 from sonarpost.keys import SHORE
 from sonarpost.messages import PlatformId
 
+_RADIO_KEYS = frozenset({"router", "bandwidth_bytes_per_s", "max_bytes"})
+_SATELLITE_KEYS = frozenset(
+    {"terminal", "baud", "after_s", "preview_bytes", "bytes_per_day", "windows", "check_interval_s", "cost_per_kb"}
+)
+
 
 class UpstreamOptions(ServiceConfig):
-    """A shore site that receives all images and decisions.
+    """A way to a shore site. By radio, the site receives all images and decisions.
+
+    By satellite it receives short messages with contact records, previews and decisions that no radio upstream of the
+    site has delivered within `after_s`. A site can have one upstream of each kind.
 
     Attributes:
         site: Name of the site, `site` in its c2's table.
+        bearer: radio: Zenoh, over any IP network. satellite: a terminal for messages of 340 bytes, on `terminal`.
         router: Zenoh endpoints of the site's own router, tried in turn. By default the site is reached through the
             platform's router and its links.
         bandwidth_bytes_per_s: Bandwidth limit for this site, headers included; no limit by default.
         max_bytes: Maximum size of this site's queue. Above it images are dropped for this site: later versions before
             first ones, oldest first. Decisions are never dropped. No limit by default.
+        terminal: Satellite only: serial port of an Iridium 9602 or 9603, or another URL of pyserial.
+        baud: Satellite only: bits a second.
+        after_s: Satellite only: time that a record waits for the radio first; not used for a site without radio.
+        preview_bytes: Satellite only: longest preview of an image. Up to 260 fit a message of one contact; with 75,
+            two contacts share a message. 0 sends contact records only.
+        bytes_per_day: Satellite only: limit for sent bytes a day in UTC; no limit by default.
+        windows: Satellite only: times of the day in UTC when it is used, `HH:MM-HH:MM`; empty for always.
+        check_interval_s: Satellite only: interval of the checks for acknowledgements.
+        cost_per_kb: Satellite only: price of 1000 bytes, for the gauge of the cost.
     """
 
     site: PlatformId = SHORE
     router: tuple[str, ...] = ()
     bandwidth_bytes_per_s: Annotated[float, Field(ge=50, le=1e9)] | None = None
     max_bytes: Annotated[int, Field(ge=0)] | None = None
+    bearer: Literal["radio", "satellite"] = "radio"
+    terminal: str = ""
+    baud: Annotated[int, Field(ge=300, le=1_000_000)] = 19200
+    after_s: Annotated[float, Field(ge=0, le=604800)] = 120.0
+    preview_bytes: Annotated[int, Field(ge=0, le=260)] = 260
+    bytes_per_day: Annotated[int, Field(ge=340)] | None = None
+    windows: tuple[str, ...] = ()
+    check_interval_s: Annotated[float, Field(ge=1, le=86400)] = 120.0
+    cost_per_kb: Annotated[float, Field(ge=0, le=1e6)] | None = None
+
+    @field_validator("windows")
+    @classmethod
+    def _check_windows(cls, windows: tuple[str, ...]) -> tuple[str, ...]:
+        for text in windows:
+            Window.parse(text)
+        return windows
+
+    @model_validator(mode="after")
+    def _check_bearer(self) -> UpstreamOptions:
+        wrong = _RADIO_KEYS if self.bearer == "satellite" else _SATELLITE_KEYS
+        if given := sorted(self.model_fields_set & wrong):
+            raise ValueError(f"no {given[0]} with bearer {self.bearer}")
+        if self.bearer == "satellite" and not self.terminal:
+            raise ValueError("a terminal with bearer satellite")
+        return self
 
 
 class RelayConfig(ServiceConfig):
     """The `[relay]` table.
 
     Attributes:
-        upstreams: Sites, each with its own queue; empty means the single site `shore`.
+        upstreams: Ways to sites, each with its own queue; empty means the single site `shore`.
         supersede: A newer version of an image replaces queued older ones whose transfer has not started.
+        forward_status: Send the latest status of each vehicle to every site by radio. Sites of version 0.2 or earlier
+            refuse it.
         disk_reserve_bytes: Free space below which images are not accepted; decisions still are.
         advice_consumers: Services on the vessel that receive advice; without any, advice is refused.
         command_consumers: Services on the vessel that receive commands; without any, commands are refused.
@@ -44,6 +90,7 @@ class RelayConfig(ServiceConfig):
 
     upstreams: tuple[UpstreamOptions, ...] = ()
     supersede: bool = True
+    forward_status: bool = True
     disk_reserve_bytes: Annotated[int, Field(ge=0)] = 67_108_864
     advice_consumers: tuple[ConsumerName, ...] = ()
     command_consumers: tuple[ConsumerName, ...] = ()
@@ -52,9 +99,9 @@ class RelayConfig(ServiceConfig):
     @field_validator("upstreams")
     @classmethod
     def _each_site_once(cls, upstreams: tuple[UpstreamOptions, ...]) -> tuple[UpstreamOptions, ...]:
-        site, times = Counter(upstream.site for upstream in upstreams).most_common(1)[0] if upstreams else ("", 0)
-        if times > 1:
-            raise ValueError(f"each site once, not {times} times {site}")
+        for (site, bearer), times in Counter((upstream.site, upstream.bearer) for upstream in upstreams).items():
+            if times > 1:
+                raise ValueError(f"each site once by {bearer}, not {times} times {site}")
         return upstreams
 
     @field_validator("advice_consumers", "command_consumers")
@@ -65,5 +112,10 @@ class RelayConfig(ServiceConfig):
         return tuple(dict.fromkeys(names))
 
     def sites(self) -> tuple[UpstreamOptions, ...]:
-        """Return the upstreams; the single site `shore` if none is configured."""
-        return self.upstreams or (UpstreamOptions(),)
+        """Return the radio upstreams; the single site `shore` if no upstream is configured."""
+        radio = tuple(upstream for upstream in self.upstreams if upstream.bearer == "radio")
+        return radio if self.upstreams else (UpstreamOptions(),)
+
+    def satellites(self) -> tuple[UpstreamOptions, ...]:
+        """Return the satellite upstreams."""
+        return tuple(upstream for upstream in self.upstreams if upstream.bearer == "satellite")

@@ -11,17 +11,31 @@ from functools import partial
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.archive import image_parts
+from sonarpost.bearers.short_message import ShortMessageError
 from sonarpost.bus.connectivity import MonitoredSite, SiteMonitor
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig, TlsConfig
 from sonarpost.delivery.outbox import QueuePolicy
-from sonarpost.delivery.records import InboxItem, Topic, consumer_of, queue_of
+from sonarpost.delivery.records import InboxItem, OutboxItem, Topic, consumer_of, queue_of
 from sonarpost.delivery.store import DiskReserve
-from sonarpost.errors import PayloadError
+from sonarpost.delivery.transaction import Transaction
+from sonarpost.errors import MissingBaseError, PayloadError
 from sonarpost.logs import kv
-from sonarpost.messages import Advice, Command, Decision, ReconstructedImage, Record, Relayed
+from sonarpost.messages import (
+    Advice,
+    CodedImage,
+    Command,
+    Decision,
+    ImagePart,
+    ReceivedStatus,
+    ReconstructedImage,
+    Record,
+    Relayed,
+)
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
+from sonarpost.services.relay.satellite import SatelliteUpstream
 
 log = logging.getLogger(__name__)
 
@@ -31,8 +45,11 @@ CONSUMER = "c2"
 COMMAND_PRIORITY = 1
 ADVICE_PRIORITY = 2
 DECISION_PRIORITY = 2
+STATUS_PRIORITY = 3
 PREVIEW_PRIORITY = 5
 DETAIL_PRIORITY = 6
+VERSIONS = "version/"
+"""Prefix of the states with the last version of an image that a site has acknowledged."""
 
 
 class Upstream:
@@ -94,9 +111,19 @@ class RelayService(Service[RelayConfig]):
         super().__init__(platform, config)
         upstreams = [Upstream(site, platform.tls) for site in config.sites()]
         self._upstreams = {upstream.queue: upstream for upstream in upstreams}
+        self._part_keys = {
+            upstream.queue: keys.shore_part(platform.id, upstream.options.site) for upstream in upstreams
+        }
+        self._stored_versions = 0
         self._inboxes = {upstream.queue: keys.shore_inbox(platform.id, upstream.options.site) for upstream in upstreams}
         sites = [self._monitored(upstream) for upstream in upstreams]
         self._site_monitor = SiteMonitor(platform.id, sites, platform.tls)
+        radio = {upstream.options.site for upstream in upstreams}
+        terminal_log = self.interval_log(log, logging.WARNING, "Satellite terminal failed")
+        self._satellites = [
+            SatelliteUpstream(options, self.store, self.count, terminal_log, has_radio=options.site in radio)
+            for options in config.satellites()
+        ]
         self._image_reserve = DiskReserve(self.store, config.disk_reserve_bytes, "senders keep their images")
 
     def _monitored(self, upstream: Upstream) -> MonitoredSite:
@@ -107,9 +134,15 @@ class RelayService(Service[RelayConfig]):
         return MonitoredSite(options.site, lambda: self.session, self.platform.upstream)
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """Images and decisions of this vessel, advice and commands for it."""
+        """Images, decisions and statuses of this vessel, advice and commands for it.
+
+        Decoded images are those that an earlier version of the decompressor has queued.
+        """
         vessel = self.platform.id
+        statuses: dict[str, type[Record]] = {keys.acoustic_status(vessel): ReceivedStatus}
         return {
+            **(statuses if self.config.forward_status else {}),
+            keys.image_coded(vessel): CodedImage,
             keys.image_reconstructed(vessel): ReconstructedImage,
             keys.contact_decision(vessel): Decision,
             keys.advice(vessel): Advice,
@@ -123,7 +156,7 @@ class RelayService(Service[RelayConfig]):
     def check_capacity(self, key: str) -> None:
         """Reject images below `disk_reserve_bytes`; other records are small and are accepted for longer."""
         super().check_capacity(key)
-        if key == keys.image_reconstructed(self.platform.id):
+        if key in (keys.image_coded(self.platform.id), keys.image_reconstructed(self.platform.id)):
             self._image_reserve.require()
 
     def validate(self, key: str, record: Record) -> None:
@@ -134,7 +167,7 @@ class RelayService(Service[RelayConfig]):
                 raise PayloadError(key, "kind", record.kind, "the kind in the key")
             self._require(self.config.command_consumers, key, "command_consumers")
             return
-        assert isinstance(record, (ReconstructedImage, Decision, Advice))
+        assert isinstance(record, (CodedImage, ReconstructedImage, Decision, Advice, ReceivedStatus))
         if record.vessel_id != vessel:
             raise PayloadError(record.TYPE, "vessel_id", record.vessel_id, vessel)
         if isinstance(record, Advice):
@@ -154,9 +187,46 @@ class RelayService(Service[RelayConfig]):
             for consumer in self.config.command_consumers:
                 effects.send_payload(key, consumer, effects.payload, Command, priority=COMMAND_PRIORITY)
             effects.count("commands_taken")
+        elif isinstance(record, ReceivedStatus):
+            self._queue_status(key, record, effects)
+        elif isinstance(record, CodedImage):
+            self._queue_short(record, effects)
+            self._queue_image(record, effects)
         else:
             assert isinstance(record, (ReconstructedImage, Decision))
+            if isinstance(record, Decision):
+                self._queue_short(record, effects)
             self._queue_for_sites(key, record, effects)
+
+    def _queue_short(self, record: CodedImage | Decision, effects: UnitOfWork) -> None:
+        for satellite in self._satellites:
+            try:
+                satellite.queue(record, effects)
+            except ShortMessageError as error:
+                # The radio still delivers it.
+                effects.count("records_too_long_for_short_messages")
+                log.warning("Record not sent by short message", extra=kv(reason=str(error)))
+
+    def _withdraw_short(self, item: OutboxItem) -> None:
+        """Withdraw the short message of a record that the radio has delivered."""
+        site = self._upstreams[item.queue].options.site
+        fields = wire.unpack_map(item.payload, item.key)
+        if isinstance(payload := fields.get("payload"), bytes):
+            fields = wire.unpack_map(payload, item.key)  # an envelope
+        if fields.get("type") == ReceivedStatus.TYPE:
+            return  # only the radio sends it
+        for satellite in self._satellites:
+            if satellite.options.site == site:
+                satellite.delivered_by_radio(fields)
+
+    def _queue_status(self, key: str, record: ReceivedStatus, effects: UnitOfWork) -> None:
+        """Queue a status for each site; it replaces older ones of the vehicle."""
+        envelope = Relayed(vessel_id=self.platform.id, key=key, payload=effects.payload, relayed_utc_s=time.time())
+        topic = Topic(f"status/{record.vehicle_id}", int(1000 * record.received_utc_s))
+        payload = wire.encode(envelope)
+        for queue, inbox in self._inboxes.items():
+            effects.send_payload(inbox, queue, payload, Relayed, priority=STATUS_PRIORITY, topic=topic)
+        effects.count("statuses_relayed")
 
     def _queue_for_sites(self, key: str, record: ReconstructedImage | Decision, effects: UnitOfWork) -> None:
         vessel = self.platform.id
@@ -172,9 +242,67 @@ class RelayService(Service[RelayConfig]):
         effects.count(f"{record.TYPE}s_relayed")
         log.info("Record queued for the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
 
+    def _queue_image(self, image: CodedImage, effects: UnitOfWork) -> None:
+        """Queue for each site the difference to the version that it has acknowledged last, or the whole image."""
+        whole = image_parts.whole_part(image)
+        payload = wire.encode(whole)
+        priority = PREVIEW_PRIORITY if image.version == 1 else DETAIL_PRIORITY
+        topic = topic_of(image) if self.config.supersede else None
+        for queue, key in self._part_keys.items():
+            known = None
+            if image.version > 1:
+                known = self.store.get_state(image_parts.version_name(f"{VERSIONS}{queue}/", payload))
+            sent = payload
+            if known is not None:
+                sent = wire.encode(image_parts.difference(whole, wire.decode(ImagePart, known, key)))
+            effects.send_payload(key, queue, sent, ImagePart, priority=priority, topic=topic)
+            effects.count("image_differences", int(sent is not payload))
+        effects.count("image_bytes_received", image.bytes_received)
+        effects.count("coded_images_relayed")
+        log.info("Image queued for the shore", extra=kv(version=image.version, bytes=len(payload)))
+
+    def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> bool:
+        """Store which version of an image a site has; send the whole image if the site has refused a difference."""
+        if self._satellites and reason is None and item.queue in self._upstreams:
+            self._withdraw_short(item)
+        if item.key != self._part_keys.get(item.queue):
+            return False
+        prefix = f"{VERSIONS}{item.queue}/"
+        name = image_parts.version_name(prefix, item.payload)
+        known, whole = tx.get_state(name), item.payload
+        if not (is_whole := image_parts.is_whole(whole)):
+            base = None if known is None else wire.decode(ImagePart, known, item.key)
+            try:
+                whole = wire.encode(image_parts.expand(wire.decode(ImagePart, whole, item.key), base, item.key))
+            except MissingBaseError as error:
+                # Only if the base was deleted for newer images: the site asks for the whole when it needs it.
+                log.warning("Difference without its base", extra=kv(site_queue=item.queue, reason=str(error)))
+                return False
+        if reason is None:
+            if known is None or image_parts.version_of(known) < image_parts.version_of(whole):
+                tx.put_state(name, whole)
+                self._prune_versions(tx, item.queue, prefix)
+            return False
+        if is_whole:
+            return False
+        topic = Topic(name.removeprefix(prefix), image_parts.version_of(whole)) if self.config.supersede else None
+        tx.send(item.key, item.queue, whole, encoding=item.encoding, priority=item.priority, topic=topic)
+        self.count("image_differences_refused")
+        return True
+
+    def _prune_versions(self, tx: Transaction, queue: str, prefix: str) -> None:
+        """Delete surplus versions, except those of images with a queued difference."""
+        self._stored_versions += 1
+        if self._stored_versions % image_parts.PRUNE_EVERY == 0:
+            for name in image_parts.surplus_names(self.store.state_names(prefix)):
+                if not tx.has_topic(queue, name.removeprefix(prefix)):
+                    tx.delete_state(name)
+
     def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """Commit, then apply the quota of each site's queue."""
         superseded = super().commit_batch(handled)
+        for satellite in self._satellites:
+            satellite.committed()
         if superseded:
             self.count("records_superseded", superseded)
         for upstream in self._upstreams.values():
@@ -212,10 +340,14 @@ class RelayService(Service[RelayConfig]):
         for upstream in self._upstreams.values():
             if upstream.options.router:
                 self.start_thread(partial(upstream.connect, self.stopping), f"upstream-{upstream.options.site}")
+        for satellite in self._satellites:
+            self.start_thread(partial(satellite.run, self.stopping), f"satellite-{satellite.options.site}")
         self.start_thread(lambda: self._site_monitor.run(self.stopping), "site-monitor")
 
     def on_stop(self) -> None:
-        """Close the sites' own sessions."""
+        """Close the sites' own sessions and the terminals."""
+        for satellite in self._satellites:
+            satellite.stop()
         for upstream in self._upstreams.values():
             upstream.close()
 
@@ -227,8 +359,9 @@ class RelayService(Service[RelayConfig]):
         return self._image_reserve.degraded_reason() or self._site_monitor.degraded_reason()
 
     def warning(self) -> str:
-        """Return which sites are not reached."""
-        return self._site_monitor.warning()
+        """Return which sites are not reached, and what prevents short messages."""
+        warnings = (self._site_monitor.warning(), *(satellite.warning() for satellite in self._satellites))
+        return "; ".join(warning for warning in warnings if warning)
 
     def gauges(self) -> Mapping[str, float]:
         """Return queue depth, age of the oldest record and responsiveness of each site."""
@@ -242,6 +375,8 @@ class RelayService(Service[RelayConfig]):
             found[f"oldest_s_for_{site}"] = age_s
             found[f"delivered_to_{site}"] = float(self.acknowledged_count(queue))
             found[f"answering_{site}"] = float(self.is_responding(queue))
+        for satellite in self._satellites:
+            found |= satellite.gauges()
         # The console shows by this gauge and the inbox whether every decision has reached the shore.
         urgent = (self.store.queue_depth(queue, DECISION_PRIORITY).records for queue in self._upstreams)
         found["decisions_waiting"] = float(sum(urgent))
@@ -253,6 +388,7 @@ def _is_site_queue(queue: str) -> bool:
     return consumer_of(queue) == CONSUMER
 
 
-def topic_of(image: ReconstructedImage) -> Topic:
+def topic_of(image: CodedImage | ReconstructedImage) -> Topic:
     """Return the topic of an image's versions; the time distinguishes images after a restart of the identifiers."""
-    return Topic(f"{image.vehicle_id}/{image.image_id}/{image.first_frame_utc_s!r}", image.version)
+    name = image_parts.subject(image.vehicle_id, image.image_id, image.first_frame_utc_s)
+    return Topic(name, image.version)

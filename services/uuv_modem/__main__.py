@@ -1,10 +1,9 @@
 """Run with `python -m sonarpost.services.uuv_modem --config FILE`."""
 
-import sys
-
 from sonarpost.runtime.process import main
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService
+from sonarpost.stop_signals import exit_process
 
 if __name__ == "__main__":
-    sys.exit(main(UuvModemService, UuvModemConfig))
+    exit_process(main(UuvModemService, UuvModemConfig))

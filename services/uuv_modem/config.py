@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -10,10 +10,10 @@ from sonarpost.config import ConsumerName, PlatformConfig
 from sonarpost.errors import ConfigError
 from sonarpost.link.config import QueueConfig
 from sonarpost.link.mac import Continuous, Csma, MediumAccess, Polled, Tdma
-from sonarpost.modem.micromodem import RATES
-from sonarpost.runtime.modem_service import ModemServiceConfig
+from sonarpost.modem.interface import ModemCapabilities
+from sonarpost.runtime.modem_service import Address, ModemServiceConfig, RateNumber
 
-RateNumber = Annotated[int, Field(ge=min(RATES), le=max(RATES))]
+MIN_STATUS_PERIOD_S = 5.0
 Seconds = Annotated[float, Field(gt=0, le=86400)]
 
 
@@ -24,7 +24,8 @@ class UuvModemConfig(ModemServiceConfig):
         address: Address of the vehicle's modem.
         destination: Address of the vessel's modem; 1 in the paper.
         link: Wire format: "v1", or "paper" for the paper's.
-        rate: Micro-Modem rate 0 to 6; the paper uses 4 in a tank and 1 at sea.
+        rate: Number of the rate, see the driver; of the Micro-Modem, the paper uses 4 in a tank and 1 at sea. The
+            default is that of the Micro-Modem; other drivers have their own.
         contact_class: Whether contact records carry the class of the contact and its probabilities. Vessels of versions
             without them reject such records: false sends every record in the layout that those read.
         retry_s: Wait before a packet that the modem could not send is sent again.
@@ -51,13 +52,18 @@ class UuvModemConfig(ModemServiceConfig):
         stop_on_decision: v1: whether a decision for `mine_like` or `not_mine_like` stops the rest of its image; a later
             decision for `unsure` queues the rest again.
         queue_interval_s: Maximum time between two publications of the queue state.
+        status_period_s: v1: time between two statuses of the vehicle (position, depth, images waiting, free disk space)
+            that are sent to the vessel, 0 for none. Vessels of versions without them reject such messages.
         refine_consumers: v1: services that receive the commands refine, resend, expand, original and region.
         revisit_consumers: v1: services that receive the command revisit.
         decision_consumers: v1: services that receive operators' decisions.
     """
 
-    address: Annotated[int, Field(ge=0, le=127)] = 3
-    destination: Annotated[int, Field(ge=0, le=127)] = 1
+    TABLE: ClassVar[str] = "[uuv_modem]"
+    UPLINK_RATES: ClassVar[tuple[str, ...]] = ("rate",)
+
+    address: Address = 3
+    destination: Address = 1
     link: Literal["v1", "paper"] = "v1"
     rate: RateNumber = 1
     contact_class: bool = True
@@ -82,21 +88,33 @@ class UuvModemConfig(ModemServiceConfig):
     guard_s: Annotated[float, Field(ge=0, le=86400)] = 1.0
     mean_backoff_s: Annotated[float, Field(ge=0, le=86400)] = 10.0
     queue_interval_s: Annotated[float, Field(ge=0.05, le=3600)] = 5.0
+    status_period_s: Annotated[float, Field(ge=0, le=86400)] = 0.0
     stop_on_decision: bool = True
     refine_consumers: tuple[ConsumerName, ...] = ("compressor",)
     revisit_consumers: tuple[ConsumerName, ...] = ()
     decision_consumers: tuple[ConsumerName, ...] = ()
 
     @model_validator(mode="after")
-    def _packets_fit_the_slot(self) -> UuvModemConfig:
-        if self.mac != "tdma":
-            return self
-        if self.slot_start_s + self.slot_s > self.tdma_cycle_s:
+    def _slot_fits_the_cycle(self) -> UuvModemConfig:
+        if self.mac == "tdma" and self.slot_start_s + self.slot_s > self.tdma_cycle_s:
             raise ValueError(f"a slot that ends within tdma_cycle_s = {self.tdma_cycle_s}")
-        longest_s = max(RATES[number].airtime_s for number in (self.rate, *self.allowed_rates))
-        if self.slot_s - self.guard_s < longest_s:
-            raise ValueError(f"slot_s - guard_s of at least {longest_s} s, the longest packet")
+        if 0 < self.status_period_s < MIN_STATUS_PERIOD_S:
+            raise ValueError(f"status_period_s of 0 or at least {MIN_STATUS_PERIOD_S:g} s")
+        if self.status_period_s and self.link != "v1":
+            raise ValueError('status_period_s = 0 where link = "paper", which has no messages')
         return self
+
+    def _check_modem(self, capabilities: ModemCapabilities) -> None:
+        super()._check_modem(capabilities)
+        self._check_address("destination", self.destination)
+        for number in self.allowed_rates:
+            self._check_rate("allowed_rates", number)
+        if self.mac == "polled" and self.link == "v1" and not capabilities.polling:
+            raise ConfigError(self.TABLE, "mac", self.mac, "another one: this modem does not poll")
+        longest_s = max(self.rate_info(number).airtime_s for number in (self.rate, *self.allowed_rates))
+        if self.mac == "tdma" and self.slot_s - self.guard_s < longest_s:
+            expected = f"slot_s - guard_s of at least {longest_s} s, the longest packet"
+            raise ConfigError(self.TABLE, "slot_s", self.slot_s, expected)
 
     def check_with(self, platform: PlatformConfig) -> None:
         """Check the port, the acoustic key and that the wire format can be authenticated.
@@ -126,7 +144,7 @@ class UuvModemConfig(ModemServiceConfig):
     def queue_config(self) -> QueueConfig:
         """Return the configuration of the `v1` transmit queue."""
         return QueueConfig(
-            rates=tuple(sorted({self.rate, *self.allowed_rates})),
+            rates=tuple(self.rate_info(number) for number in sorted({self.rate, *self.allowed_rates})),
             first_rate=self.rate,
             expected_loss=self.expected_loss,
             feedback=self.feedback,

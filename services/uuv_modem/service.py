@@ -16,21 +16,21 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import BadInputError, DeliveryError, RetryLaterError
 from sonarpost.logs import kv
-from sonarpost.messages import EncodedImage, OutgoingMessage, Record
-from sonarpost.modem.micromodem import (
-    RATES,
+from sonarpost.messages import EncodedImage, OutgoingMessage, Record, VehicleStatus
+from sonarpost.modem.interface import (
     FrameDecoded,
     FrameReceived,
-    MiniPacketReceived,
     ModemEvent,
     PacketFailed,
     PacketSent,
     PollReceived,
+    ShortMessageReceived,
 )
 from sonarpost.runtime.modem_service import ModemService, sent_frames
-from sonarpost.runtime.service import UnitOfWork
+from sonarpost.runtime.service import UnitOfWork, disk_gauges
 from sonarpost.security.acoustic_key import key_warning
 from sonarpost.services.uuv_modem.config import UuvModemConfig
+from sonarpost.services.uuv_modem.status_beacon import StatusBeacon
 from sonarpost.services.uuv_modem.transmissions import TransmissionLog
 from sonarpost.services.uuv_modem.vehicle_endpoint import VehicleEndpoint
 
@@ -67,13 +67,15 @@ class UuvModemService(ModemService[UuvModemConfig]):
         try:
             self._migrate()
             rejection_log = self.interval_log(log, logging.WARNING, "Frame rejected")
-            self._endpoint = VehicleEndpoint(platform, config, self.store, self.key, rejection_log)
+            self._endpoint = VehicleEndpoint(platform, self.config, self.store, self.key, rejection_log)
         except BaseException:
             self.store.close()
             raise
-        self._mac = config.new_mac()
+        self._mac = self.config.new_mac()
         self._failed_packets = self.interval_log(log, logging.WARNING, "Packet not sent; retrying")
         self._transmissions = TransmissionLog()
+        self._beacon = StatusBeacon(platform.id, self.config.status_period_s)
+        self._malformed_statuses = self.interval_log(log, logging.WARNING, "Ignoring malformed vehicle status")
         self._events: queue.SimpleQueue[ModemEvent | None] = queue.SimpleQueue()
         self._unsaved: list[Callable[[], None]] = []  # changes of the endpoint that are not committed yet
         self._packet_id: int | None = None  # the packet that the modem is sending
@@ -104,6 +106,8 @@ class UuvModemService(ModemService[UuvModemConfig]):
         """Open the port and start the link's thread."""
         # Before the port is opened: a subscriber that starts later asks for the transmissions it has missed.
         self.session.declare_queryable(keys.acoustic_transmissions(self.platform.id), self._reply_transmissions)
+        if self.config.status_period_s:
+            self.session.declare_subscriber(keys.vehicle_status(self.platform.id), self._on_status)
         super().on_start()
         if self.config.mac == "polled" and self.config.link == "v1":
             self.modem.set_poll_handler(self._answer_poll)
@@ -133,6 +137,35 @@ class UuvModemService(ModemService[UuvModemConfig]):
         """Add a record to the transmit queue."""
         assert isinstance(record, (EncodedImage, OutgoingMessage))
         self._endpoint.add(record, time.time())
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        """Keep the latest status of the vehicle; called in a thread of Zenoh."""
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        try:
+            status = wire.decode(VehicleStatus, sample.payload.to_bytes(), str(sample.key_expr))
+            self._beacon.set_status(status, time.monotonic())
+        except BadInputError as error:
+            self.count("statuses_ignored")
+            self._malformed_statuses.log(reason=str(error))
+
+    def _queue_status(self, now: float) -> None:
+        """Add the vehicle's status to the transmit queue if it is due.
+
+        Raises:
+            DeliveryError: The store cannot be written.
+        """
+        if not self._beacon.is_due(now):
+            return
+        with self._endpoint.step():
+            disk_free_bytes = disk_gauges(self.platform.state_dir).get("disk_free_bytes")
+            status = self._beacon.message(
+                now, self._endpoint.queue.images_waiting, None if disk_free_bytes is None else int(disk_free_bytes)
+            )
+            self._endpoint.add_status(status, now, self.config.status_period_s)
+            self.commit(UnitOfWork())
+        self._beacon.queued(now)
+        self.count("statuses_queued")
 
     def _handle_batch(self, items: Sequence[InboxItem]) -> None:
         with self._endpoint.step():
@@ -187,7 +220,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
                 self._mac.channel_busy(now)
             case FrameReceived(dest=self.config.address):
                 self._receive(partial(self._endpoint.receive, event.src, event.data, now))
-            case MiniPacketReceived(dest=self.config.address):
+            case ShortMessageReceived(dest=self.config.address):
                 self._receive(partial(self._endpoint.receive_mini, event.src, event.bits, now))
             case _:
                 pass
@@ -217,7 +250,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
         self._packet_id = None
         self._retry_at_s = now + self.config.retry_s
         self.count("packets_failed")
-        self._failed_packets.log(reason=failed.reason.value, maybe_sent=failed.maybe_sent)
+        self._failed_packets.log(reason=str(failed.reason), maybe_sent=failed.maybe_sent)
 
     # The link's thread
 
@@ -229,6 +262,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
             try:
                 now = time.time()
                 self._save()
+                self._queue_status(now)
                 wait_s = self._send(now)
                 self._publish_queue_state(now)
             except (DeliveryError, BadInputError) as failure:
@@ -264,7 +298,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
         with self._endpoint.step():
             packet = self._endpoint.queue.in_flight
             rate = packet.rate if packet else self._endpoint.queue.rate
-            mac_wait_s = self._mac.wait_s(self._packet_s.get(rate, RATES[rate].airtime_s), now)
+            mac_wait_s = self._mac.wait_s(self._packet_s.get(rate, self.config.rate_info(rate).airtime_s), now)
             polled = mac_wait_s is None
             retry_wait_s = self._retry_at_s - now
             if retry_wait_s > self.config.retry_s:
@@ -290,7 +324,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
         self._packets += 1
         self.count("packets_sent")
         self.count("frames_sent", len(sent.frames))
-        for frame in sent_frames(self.platform.id, self.config.address, sent, self._packets, now):
+        for frame in sent_frames(self.platform.id, self.config, sent, self._packets, now):
             self.publish(keys.acoustic_tx(self.platform.id), frame)
 
     def _publish_queue_state(self, now: float) -> None:

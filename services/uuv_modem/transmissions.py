@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from sonarpost.messages import MAX_TRANSMISSION_S, Transmission, Transmissions
-from sonarpost.modem.micromodem import ModemEvent, PacketFailed, PacketSent, TransmissionEnded, TransmissionStarted
+from sonarpost.modem.interface import ModemEvent, PacketFailed, PacketSent, TransmissionEnded, TransmissionStarted
 
 KEPT_S: Final = 1800.0
 MAX_KEPT: Final = 1000

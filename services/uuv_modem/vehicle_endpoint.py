@@ -33,6 +33,7 @@ from sonarpost.link.downlink.messages import (
     pack,
     unpack,
 )
+from sonarpost.link.downlink.status_message import StatusMessage
 from sonarpost.link.frames.contact_record import ContactSummary, atd_class_of
 from sonarpost.link.frames.paper.sender import PaperSender
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, unpack_mini
@@ -52,6 +53,7 @@ log = logging.getLogger(__name__)
 _CONFIRMATION_PRIORITY: Final = 2
 _CONFIRMATION_LIFETIME_S: Final = 900.0
 _COMMAND_PRIORITY: Final = 1
+_STATUS_PRIORITY: Final = 5
 _MAX_IMAGES_PUBLISHED: Final = 500
 _LAST_TIME_UTC_S: Final = 0xFFFF_FFFE
 """The latest time that a contact record can hold, in the year 2106."""
@@ -121,7 +123,7 @@ class VehicleEndpoint:
 
     def _new_queue(self) -> ImageSender:
         if not self._is_v1:
-            return PaperSender(self._config.rate)
+            return PaperSender(self._config.rate_info(self._config.rate))
         config, first_block = self._config.queue_config(), self._store.origin[0]
         return TransmitQueue(config, first_block=first_block, protection=self.authenticator)
 
@@ -170,7 +172,7 @@ class VehicleEndpoint:
     def _add_images_of_paper_queue(self) -> None:
         """Move images that still waited when the configuration changed from the `paper` format to `v1`."""
         parts = self._store.states(_PAPER)
-        paper_queue = PaperSender(self._config.rate)
+        paper_queue = PaperSender(self._config.rate_info(self._config.rate))
         for name, reason in paper_queue.restore(below(_QUEUE, parts)).items():
             self._discard(_PAPER + _QUEUE + name, parts[_QUEUE + name], reason)
         for waiting in paper_queue.images:
@@ -209,7 +211,7 @@ class VehicleEndpoint:
 
     def _check_image(self, image: ImageToSend) -> None:
         if not self._is_v1:
-            PaperSender(self._config.rate).add_image(image, 0.0)
+            PaperSender(self._config.rate_info(self._config.rate)).add_image(image, 0.0)
             return
         number_of_image(image.image_id)
         StreamHeader.unpack(image.stream)
@@ -241,6 +243,25 @@ class VehicleEndpoint:
             is_new = self.queue.image_id_of(number_of_image(record.image_id)) is None
             self.queue.add_image(self._image_to_send(record), now)
             self.images_accepted += is_new
+        self.changed = True
+
+    def add_status(self, status: StatusMessage, now: float, lifetime_s: float) -> None:
+        """Add the vehicle's status to the transmit queue. It is sent once: a lost one is replaced by the next.
+
+        Args:
+            status: The status.
+            now: UTC in seconds.
+            lifetime_s: Time after which it is dropped; the next one replaces it.
+        """
+        self.queue.add_message(
+            f"status-{uuid.uuid4().hex}",
+            "uuv_modem status",
+            pack(status),
+            now,
+            priority=_STATUS_PRIORITY,
+            lifetime_s=lifetime_s,
+            once=True,
+        )
         self.changed = True
 
     def _image_to_send(self, record: EncodedImage) -> ImageToSend:
@@ -297,7 +318,7 @@ class VehicleEndpoint:
             self._effects.count("commands_rejected")
             log.warning("Message rejected", extra=kv(reason=str(error)))
             return
-        if isinstance(content, (ConfirmationMessage, DataMessage)):
+        if isinstance(content, (ConfirmationMessage, DataMessage, StatusMessage)):
             log.info("Message ignored", extra=kv(source=event.source, kind=type(content).__name__))
             return
         self._receive_command(event.source, content, now)

@@ -1,0 +1,265 @@
+"""Upstream of the relay over a message bearer: contacts with previews and decisions in short messages."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping
+
+import msgpack
+
+from sonarpost.bearers.iridium import IridiumTerminal, MessageBearer, TerminalError
+from sonarpost.bearers.policy import ByteBudget, Window
+from sonarpost.bearers.sender import (
+    MessageSender,
+    NextMessage,
+    QueuedItem,
+    decision_items,
+    image_items,
+    image_name,
+)
+from sonarpost.bearers.short_message import MAX_MESSAGE_BYTES
+from sonarpost.delivery.store import Store
+from sonarpost.errors import BadInputError, DeliveryError, PortError
+from sonarpost.logs import IntervalLog, kv
+from sonarpost.messages import Decision, ReceivedImage
+from sonarpost.runtime.service import UnitOfWork
+from sonarpost.services.relay.config import UpstreamOptions
+
+log = logging.getLogger(__name__)
+
+POLL_S = 1.0
+RETRY_S = 30.0
+"""Delay after a message that the terminal could not send."""
+
+
+class SatelliteUpstream:
+    """Sends short messages to one site and processes the acknowledgements.
+
+    Its records are copies: the images themselves wait for the radio. A record that a radio upstream of the same site
+    has delivered is not sent.
+
+    Args:
+        options: Configuration of the upstream.
+        has_radio: Whether the site also has a radio upstream.
+        store: Store of the relay; keys with the site's prefix hold items, messages and the budget.
+        count: Increases a health counter.
+        interval_log: Log of repeated faults of the terminal.
+        bearer: The terminal; by default that of the options.
+    """
+
+    def __init__(
+        self,
+        options: UpstreamOptions,
+        store: Store,
+        count: Callable[[str], None],
+        interval_log: IntervalLog,
+        *,
+        has_radio: bool,
+        bearer: MessageBearer | None = None,
+    ) -> None:
+        self.options = options
+        self._store = store
+        self._count = count
+        self._log = interval_log
+        self._bearer = bearer or IridiumTerminal(options.terminal, options.baud)
+        self._prefix = f"short/{options.site}/"
+        self._wake = threading.Event()
+        self._lock = threading.Lock()
+        self._withdrawn: list[str] = []
+        self._fault = ""
+        self._checked_s = 0.0
+        windows = tuple(Window.parse(text) for text in options.windows)
+        self._budget = ByteBudget(options.bytes_per_day, windows)
+        if (counts := store.get_state(f"{self._prefix}budget")) is not None:
+            self._budget.restore(counts)
+        head = store.get_state(f"{self._prefix}head")
+        epoch, next_seq = (secrets.randbits(32), 0) if head is None else msgpack.unpackb(head)
+        number = store.get_state(f"{self._prefix}number")
+        self._next_number = 0 if number is None else int.from_bytes(number, "big")
+        self._sender = MessageSender(epoch, next_seq, after_s=options.after_s if has_radio else 0.0)
+        messages = store.states(f"{self._prefix}message/")
+        self._sender.restore(self._stored_items(), messages.values(), time.time())
+        self._known = set(store.state_names(f"{self._prefix}item/"))
+
+    def _stored_items(self) -> list[QueuedItem]:
+        return [QueuedItem.unpack(data) for data in self._store.states(f"{self._prefix}item/").values()]
+
+    # Records
+
+    def queue(self, record: ReceivedImage | Decision, effects: UnitOfWork) -> None:
+        """Queue a record with the other effects of its handling; `committed` has to follow.
+
+        Raises:
+            ShortMessageError: It does not fit the format.
+        """
+        now_s = time.time()
+        if isinstance(record, Decision):
+            items = decision_items(record, self._next_number, now_s)
+        else:
+            items = image_items(record, self._next_number, self.options.preview_bytes, now_s)
+        self._next_number += len(items)
+        effects.put_state(f"{self._prefix}number", self._next_number.to_bytes(8, "big"))
+        for item in items:
+            effects.put_state(self._item_name(item.number), item.pack())
+
+    def committed(self) -> None:
+        """Send what has been committed."""
+        self._wake.set()
+
+    def delivered_by_radio(self, fields: Mapping[str, object]) -> None:
+        """Withdraw a record that a radio upstream of this site has delivered.
+
+        Args:
+            fields: Fields of a decision, a decoded image or a part of an image.
+        """
+        vehicle_id, image_id = fields.get("vehicle_id", fields.get("u")), fields.get("image_id", fields.get("i"))
+        name = fields.get("decision_id") or image_name(str(vehicle_id), str(image_id))
+        with self._lock:
+            self._withdrawn.append(str(name))
+        self._wake.set()
+
+    # Sending
+
+    def run(self, stopping: threading.Event) -> None:
+        """Send until `stopping` is set, then close the terminal."""
+        try:
+            self._run(stopping)
+        finally:
+            self._bearer.close()
+
+    def _run(self, stopping: threading.Event) -> None:
+        while not stopping.is_set():
+            self._wake.clear()
+            try:
+                self._take_changes()
+                busy = self._step(stopping)
+                self._fault = ""
+            except (PortError, TerminalError, DeliveryError) as error:
+                if stopping.is_set():
+                    return
+                busy = False
+                self._fault = str(error)
+                self._log.log(site=self.options.site, error=str(error))
+            if not busy:
+                self._wake.wait(POLL_S)
+
+    def _take_changes(self) -> None:
+        """Take over committed items, and withdraw those that the radio has delivered."""
+        # Before the items: every withdrawn record was committed earlier.
+        with self._lock:
+            withdrawn, self._withdrawn = self._withdrawn, []
+        new = [name for name in self._store.state_names(f"{self._prefix}item/") if name not in self._known]
+        items = [QueuedItem.unpack(data) for name in new if (data := self._store.get_state(name)) is not None]
+        removed = list(self._sender.insert(sorted(items, key=lambda item: item.number)))
+        self._known.update(new)
+        for name in withdrawn:
+            removed += self._sender.withdraw(name)
+        if removed:
+            with self._store.transaction() as tx:
+                for number in removed:
+                    tx.delete_state(self._item_name(number))
+            self._known.difference_update(self._item_name(number) for number in removed)
+
+    def _step(self, stopping: threading.Event) -> bool:
+        """Send a message, or check for acknowledgements; return whether there may be more to do."""
+        now_s = time.time()
+        message = None
+        if self._budget.allows(MAX_MESSAGE_BYTES, now_s):
+            message = self._sender.next_message(now_s)
+        if message is not None:
+            self._store_message(message, now_s)
+        elif not self._is_check_due(now_s):
+            return False
+        self._checked_s = now_s
+        try:
+            result = self._bearer.exchange(None if message is None else message.data)
+        except (PortError, TerminalError):
+            if message is not None and not stopping.is_set():
+                self._take_back(message)
+            raise
+        if stopping.is_set():
+            return False
+        if message is not None and not result.sent:
+            self._take_back(message)
+        elif message is not None:
+            self._count("short_messages_sent")
+        if result.received is not None:
+            self._acknowledge(result.received)
+            self._checked_s = 0.0 if result.waiting else self._checked_s
+        return message is not None and result.sent
+
+    def _is_check_due(self, now_s: float) -> bool:
+        waits = self._sender.unacknowledged > 0 and self._budget.is_open(now_s)
+        return waits and now_s - self._checked_s >= self.options.check_interval_s
+
+    def _store_message(self, message: NextMessage, now_s: float) -> None:
+        """Store a message and its cost before it is sent, so that no restart sends it under another number."""
+        self._budget.charge(len(message.data), now_s)
+        with self._store.transaction() as tx:
+            tx.put_state(f"{self._prefix}head", msgpack.packb((self._sender.epoch, self._sender.next_seq)))
+            tx.put_state(self._message_name(message.seq), message.stored)
+            tx.put_state(f"{self._prefix}budget", self._budget.pack())
+            for number in message.packed:
+                tx.delete_state(self._item_name(number))
+        self._known.difference_update(self._item_name(number) for number in message.packed)
+
+    def _take_back(self, message: NextMessage) -> None:
+        self._count("short_messages_failed")
+        self._sender.failed(message.seq, time.time(), RETRY_S)
+        self._budget.refund(len(message.data))
+        with self._store.transaction() as tx:
+            tx.put_state(f"{self._prefix}budget", self._budget.pack())
+
+    def _acknowledge(self, data: bytes) -> None:
+        try:
+            done = self._sender.acknowledge(data, time.time())
+        except BadInputError as error:
+            self._count("short_messages_refused")
+            self._log.log(site=self.options.site, error=str(error))
+            return
+        with self._store.transaction() as tx:
+            for seq in done:
+                tx.delete_state(self._message_name(seq))
+        if done:
+            log.info("Short messages acknowledged", extra=kv(site=self.options.site, messages=len(done)))
+
+    def _item_name(self, number: int) -> str:
+        return f"{self._prefix}item/{number}"
+
+    def _message_name(self, seq: int) -> str:
+        return f"{self._prefix}message/{seq}"
+
+    def stop(self) -> None:
+        """Stop the exchange in progress."""
+        self._wake.set()
+        self._bearer.stop()
+
+    # Health
+
+    def warning(self) -> str:
+        """Return the fault of the terminal, or that the budget of the day is used."""
+        site = self.options.site
+        if self._fault:
+            return f"{site} by satellite: {self._fault}"
+        now_s = time.time()
+        limit = self.options.bytes_per_day
+        if limit is not None and self._sender.waiting and self._budget.used_today(now_s) + MAX_MESSAGE_BYTES > limit:
+            return f"{site} by satellite: {limit} bytes of the day are used; {self._sender.waiting} items wait"
+        return ""
+
+    def gauges(self) -> dict[str, float]:
+        """Return queue, budget and cost; those that wait for the radio first are included."""
+        site, budget = self.options.site, self._budget
+        found = {
+            f"satellite_waiting_for_{site}": float(self._sender.waiting),
+            f"satellite_unacknowledged_{site}": float(self._sender.unacknowledged),
+            f"satellite_bytes_today_{site}": float(budget.used_today(time.time())),
+            f"satellite_bytes_{site}": float(budget.total_bytes),
+            f"satellite_messages_{site}": float(budget.total_messages),
+        }
+        if self.options.cost_per_kb is not None:
+            found[f"satellite_cost_{site}"] = budget.total_bytes / 1000 * self.options.cost_per_kb
+        return found
