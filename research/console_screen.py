@@ -68,12 +68,14 @@ def main() -> None:
         endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
         router = zenoh.open(router_config([endpoint]))
         platform = PlatformConfig(id=VESSEL, router=(endpoint,), state_dir=Path(folder))
+        users = Users(Path(folder) / FILE_NAME)
+        users.add("bench", "operator", "a password for the benchmark")
         service = ConsoleService(platform, ConsoleConfig(port=0))
         if not service.start():
             raise SystemExit("the service did not start")
-        users = Users(Path(folder) / FILE_NAME)
-        users.add("bench", "operator", "a password for the benchmark")
+        started_s = time.monotonic()
         TrainingSimulator(service.state, parsed.contacts).load_backlog(parsed.contacts)
+        print(f"{parsed.contacts} contacts simulated and stored in {time.monotonic() - started_s:.0f} s")
         arguments = ["--enable-precise-memory-info", *(["--no-sandbox"] if os.geteuid() == 0 else [])]
         browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
         context = browser.new_context(viewport={"width": 1366, "height": 768})

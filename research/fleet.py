@@ -1,17 +1,32 @@
 """`python -m research.fleet`: many vehicles over several vessels into one shore site, on one host.
 
-    python -m research.fleet [--vehicles 100] [--vessels 4] [--seconds 600] [--every 10] [--grow 10,30] [--dir DIR]
+    python -m research.fleet [--vehicles 100] [--vessels 4] [--seconds 600] [--every 10] [--grow 10,30] [--pixels]
+    python -m research.fleet --accept 20000 [--dir DIR]
 
 Real processes, each with its own store: a router and a relay for each vessel, the router of the shore site, and c2,
 which writes the files of every image. Vehicles, acoustic channel and decompressor are replaced by one load process a
-vessel: it queues a reconstructed image of 300 x 100 px for the relay in its durable outbox, for each of its vehicles
-once every `--every` seconds at a random phase. All processes run on this host and share one clock. The latency of an
-image is the time from queueing it, before it is written to disk, until a subscriber at the shore site receives it from
-c2, after c2 has written its files.
+vessel: it queues a coded image of 300 x 100 px and 200 bytes for the relay in its durable outbox, for each of its
+vehicles once every `--every` seconds at a random phase. With `--pixels`, a run with decoded images of 30 kB, as vessels
+of earlier versions send them, precedes each run, and the ratios of both are printed: compare runs only so, because
+other work on the host changes all figures.
+
+All processes run on this host and share one clock. Both latencies of an image start when it is queued, before it is
+written to disk:
+
+- `acknowledged_*_ms`: until the relay removes it, because c2 has acknowledged it after its commit to the disk. The
+  relay is `research.recording_relay`, which records this time;
+- `shown_*_ms`: until a subscriber at the shore site receives the decoded image from c2, after c2 has written its files.
+
+With `--accept N`, routers, relays and c2 hand over N contacts of 200 coded bytes as fast as they can, and before that,
+in the same way, N / 20 decoded images as vessels of earlier versions send them. Half of the contacts come from each of
+two vessels. A contact counts when the relay has removed it after the acknowledgement of c2, which has it on its disk.
+The decoders of
+c2 work behind the acceptance, with lower priority, on the same cores; the object states how many images they have
+stored when the last contact is accepted.
 
 Each run prints one JSON object, including the load average of the host (mean of samples of the one-minute average) and
-the CPU usage of all processes of the host and of this benchmark. The exit status is 0 if every image arrived once at
-the shore site with the correct sha256.
+the CPU usage of all processes of the host and of this benchmark. The exit status is 0 if every image was acknowledged
+and arrived once at the shore site with the correct sha256.
 """
 
 from __future__ import annotations
@@ -22,33 +37,44 @@ import json
 import os
 import random
 import signal
+import sqlite3
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import msgpack
 import numpy as np
 import zenoh
 
-from sonarpost import keys
+from research.recording_relay import acknowledged
+from sonarpost import keys, wire
 from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.bus.session import client_config
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.codec.registry import default_registry
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.messages import Pixels, ReconstructedImage, Record
+from sonarpost.delivery.store import Store
+from sonarpost.link.downlink.messages import image_of_number
+from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.received_image import contact_of
+from sonarpost.messages import CodedImage, Pixels, ReconstructedImage, Record
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.stop_signals import EXIT_WITH_PARENT
 
 DRAIN_TIMEOUT_S = 120.0
 SAMPLE_S = 5.0
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+STREAM_BYTES, STREAMS = 200, 8
+ACCEPT_TIMEOUT_S = 300.0
 SHAPE = (100, 300)
 """Height and width in pixels: 30 kB."""
 
@@ -91,13 +117,78 @@ def noise_image(
     )
 
 
+@cache
+def coded_streams() -> tuple[bytes, ...]:
+    """Return streams of `emb` of 200 bytes each, of images of 300 x 100 px."""
+    rng = np.random.default_rng(1)
+    codec = default_registry().create("emb")
+    pictures = [np.clip(rng.rayleigh(40.0, SHAPE), 0, 255).astype(np.uint8) for _ in range(STREAMS)]
+    return tuple(codec.encode(picture, STREAM_BYTES) for picture in pictures)
+
+
+def coded_image(vessel: str, vehicle: int, number: int, now_utc_s: float, stream: bytes | None = None) -> CodedImage:
+    """Return a contact with its coded image, as a vessel has received it; without `stream`, the streams repeat."""
+    rng = np.random.default_rng([vehicle, number])
+    if stream is None:
+        stream = coded_streams()[number % STREAMS]
+    name, image_id = f"uuv-{vehicle}", image_of_number(number % 65535 + 1)
+    contact = ContactSummary(
+        height_px=SHAPE[0],
+        width_px=SHAPE[1],
+        lat_deg=rng.uniform(56.0, 57.0),
+        lon_deg=rng.uniform(-6.0, -5.0),
+        time_utc_s=now_utc_s,
+        confidence=1.5,
+        heading_deg=90.0,
+        altitude_m=5.0,
+        depth_m=20.0,
+        atd_class="mine-like",
+        p_mine_like=0.75,
+        p_other_object=0.2,
+    ).rounded()
+    return CodedImage(
+        vessel_id=vessel,
+        vehicle_id=name,
+        image_id=image_id,
+        version=1,
+        contact=contact_of(contact, name, image_id),
+        height_px=SHAPE[0],
+        width_px=SHAPE[1],
+        stream=stream,
+        missing=(),
+        missing_halves=(),
+        complete=True,
+        bytes_received=len(stream),
+        bytes_total=len(stream),
+        frames_received=4,
+        conflicts=0,
+        first_frame_utc_s=now_utc_s,
+        last_frame_utc_s=now_utc_s,
+        authenticated=True,
+        codec="emb",
+        model="",
+    )
+
+
 def new_image(vessel: str, vehicle: int, number: int, now_utc_s: float) -> ReconstructedImage:
     """Return an image of noise, 30 kB, different for every vehicle and number."""
     return noise_image(vessel, f"uuv-{vehicle}", f"{number:04X}", [vehicle, number], now_utc_s)
 
 
-def run_load(endpoint: str, folder: Path, vessel: str, vehicles: Sequence[int], seconds: float, every_s: float) -> None:
+def run_load(
+    endpoint: str,
+    folder: Path,
+    vessel: str,
+    vehicles: Sequence[int],
+    seconds: float,
+    every_s: float,
+    *,
+    is_coded: bool,
+) -> None:
     """Queue images for a time, then wait until the relay has accepted them; print their number."""
+    key = keys.image_coded(vessel) if is_coded else keys.image_reconstructed(vessel)
+    make: Callable[[str, int, int, float], Record] = coded_image if is_coded else new_image
+    make(vessel, vehicles[0], 0, 0.0)  # prepares the streams before the time starts
     platform = PlatformConfig(id=vessel, router=(endpoint,), state_dir=folder / vessel, health_interval_s=60.0)
     load = Load(platform, ServiceConfig())
     load.start()
@@ -107,9 +198,7 @@ def run_load(endpoint: str, folder: Path, vessel: str, vehicles: Sequence[int], 
     for at_s, vehicle, number in due:
         load.stopping.wait(max(0.0, started_s + at_s - time.monotonic()))
         effects = UnitOfWork()
-        effects.send(
-            keys.image_reconstructed(vessel), "relay", new_image(vessel, vehicle, number, time.time()), priority=5
-        )
+        effects.send(key, "relay", make(vessel, vehicle, number, time.time()), priority=5)
         load.commit(effects)
     ends_s = time.monotonic() + DRAIN_TIMEOUT_S
     while load.store.outbox_depth() and time.monotonic() < ends_s:
@@ -138,6 +227,8 @@ class ReceivedImages:
         """Record an image."""
         now_utc_s = time.time()
         image = msgpack.unpackb(sample.payload.to_bytes())  # not validated: this process shares cores with c2
+        if image["type"] != ReconstructedImage.TYPE:
+            return  # the coded form, which c2 publishes before it decodes it
         name = (image["vehicle_id"], image["image_id"], image["first_frame_utc_s"])
         with self.lock:
             if hashlib.sha256(image["picture"]["data"]).hexdigest() != image["picture_sha256"]:
@@ -189,6 +280,11 @@ class HostLoad:
         }
 
 
+def _cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
+
+
 class Processes:
     """The processes of one run, with their CPU time and memory."""
 
@@ -206,9 +302,12 @@ class Processes:
 
     def cpu_s(self, name: str) -> float:
         """Return user and system CPU time of a process."""
-        stat = Path(f"/proc/{self.running[name].pid}/stat").read_text()
-        fields = stat.rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
+        return _cpu_s(self.running[name].pid)
+
+    def children_cpu_s(self, name: str) -> float:
+        """Return user and system CPU time of the running child processes of a process."""
+        children = [path.read_text() for path in Path(f"/proc/{self.running[name].pid}/task").glob("*/children")]
+        return sum(_cpu_s(int(pid)) for text in children for pid in text.split())
 
     def rss_mb(self, name: str) -> float:
         """Return the resident memory of a process, MB."""
@@ -230,7 +329,9 @@ class Processes:
 
 
 @contextmanager
-def fleet(folder: Path, vessels: Sequence[str]) -> Iterator[tuple[Processes, dict[str, str], str]]:
+def fleet(
+    folder: Path, vessels: Sequence[str], *, start_relays: bool = True
+) -> Iterator[tuple[Processes, dict[str, str], str]]:
     """Start routers, relays and c2; yield the processes, the endpoint of each vessel, and that of the shore site."""
     ports = free_ports(len(vessels) + 1)
     shore = f"tcp/127.0.0.1:{ports[0]}"
@@ -249,7 +350,8 @@ def fleet(folder: Path, vessels: Sequence[str]) -> Iterator[tuple[Processes, dic
                 f'[platform]\nid = "{vessel}"\nrouter = ["{endpoint}"]\nstate_dir = "{folder / vessel}"\n[relay]\n'
             )
             processes.start(f"router-{vessel}", "-m", "sonarpost.bus.router", "--listen", endpoint, "--connect", shore)
-            processes.start(f"relay-{vessel}", "-m", "sonarpost.services.relay", "--config", str(file))
+            if start_relays:
+                processes.start(f"relay-{vessel}", "-m", "research.recording_relay", "--config", str(file))
         yield processes, endpoints, shore
     finally:
         processes.stop()
@@ -280,7 +382,9 @@ def wait_until_ready(session: zenoh.Session, vessels: Sequence[str]) -> None:
         alive = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
 
-def run(folder: Path, vehicles: int, vessels: int, seconds: float, every_s: float) -> dict[str, object]:
+def run(
+    folder: Path, vehicles: int, vessels: int, seconds: float, every_s: float, *, is_coded: bool
+) -> dict[str, object]:
     """Run once; return the figures."""
     names = [f"vessel-{n + 1}" for n in range(vessels)]
     received = ReceivedImages()
@@ -295,7 +399,8 @@ def run(folder: Path, vehicles: int, vessels: int, seconds: float, every_s: floa
         for n, name in enumerate(names):
             own_vehicles = ",".join(str(v) for v in range(n, vehicles, vessels))
             options = (endpoints[name], str(folder / "load"), name, own_vehicles, str(seconds), str(every_s))
-            processes.start(f"load-{name}", "-m", "research.fleet", "--load", *options)
+            kind = "coded" if is_coded else "pixels"
+            processes.start(f"load-{name}", "-m", "research.fleet", "--load", *options, kind)
         queued = 0
         for name in names:
             output, _ = processes.running[f"load-{name}"].communicate(timeout=seconds + DRAIN_TIMEOUT_S + 60)
@@ -306,13 +411,77 @@ def run(folder: Path, vehicles: int, vessels: int, seconds: float, every_s: floa
             time.sleep(0.1)
         duration_s = time.monotonic() - started_s
         used = {name: processes.cpu_s(name) - before[name] for name in services}
+        used["decoders"] = processes.children_cpu_s("c2")
         host_load = host.stop(sum(used.values()))
         memory = {name: processes.rss_mb(name) for name in services}
         session.close()
+    entries = [entry for name in names for entry in acknowledged(folder / name)]
     return {
-        **figures(vehicles, vessels, queued, duration_s, received, images_at_shore(folder / "out"), used, memory),
+        "record": "part" if is_coded else "reconstructed_image",
+        "vehicles": vehicles,
+        "vessels": vessels,
+        "bytes_mean": round(sum(entry["bytes"] for entry in entries) / len(entries)),
+        **figures(queued, duration_s, received, images_at_shore(folder / "out"), entries, used, memory),
         **host_load,
     }
+
+
+def accept(folder: Path, count: int, *, is_coded: bool) -> dict[str, object]:
+    """Hand over prepared contacts of two vessels as fast as relays and c2 can; return the figures."""
+    names = ["vessel-1", "vessel-2"]
+    now_utc_s = time.time()
+    for vehicle, name in enumerate(names, start=1):
+        (folder / name).mkdir(parents=True)
+        store = Store(folder / name / "relay.db")
+        records: Iterator[Record]
+        if is_coded:
+            key = keys.image_coded(name)
+            records = (coded_image(name, vehicle, number, now_utc_s + number * 1e-3) for number in range(count // 2))
+        else:
+            key = keys.image_reconstructed(name)
+            records = (new_image(name, vehicle, number, now_utc_s + number) for number in range(count // 2))
+        with store.transaction() as tx:
+            for record in records:
+                tx.accept(key, wire.encode(record))
+        store.close()
+    with fleet(folder, names, start_relays=False) as (processes, _, shore):
+        session = open_session(shore)
+        wait_until_ready(session, [])
+        c2_db = folder / "shore" / "c2.db"
+        before = {name: processes.cpu_s(name) for name in ("c2", "router-shore")}
+        for name in names:
+            processes.start(f"relay-{name}", "-m", "sonarpost.services.relay", "--config", str(folder / f"{name}.toml"))
+        samples: list[tuple[float, int]] = []
+        deadline_s = time.monotonic() + ACCEPT_TIMEOUT_S
+        while (not samples or samples[-1][1] < count) and time.monotonic() < deadline_s:
+            accepted = accepted_records(c2_db)
+            if accepted:
+                samples.append((time.monotonic(), accepted))
+            time.sleep(0.02)
+        used = {name: processes.cpu_s(name) - before.get(name, 0.0) for name in processes.running}
+        stored = images_at_shore(folder / "out")
+        session.close()
+    seconds = samples[-1][0] - samples[0][0]
+    accepted = samples[-1][1] - samples[0][1]
+    return {
+        "record": "part" if is_coded else "reconstructed_image",
+        "contacts": samples[-1][1],
+        "accepted_per_s": round(accepted / seconds),
+        "stored_when_all_accepted": stored,
+        "c2_cpu_ms_per_contact": round(1000 * used["c2"] / count, 3),
+        "relay_cpu_ms_per_contact": round(1000 * sum(used[f"relay-{n}"] for n in names) / count, 3),
+        "router_cpu_ms_per_contact": round(1000 * used["router-shore"] / count, 3),
+        "load_average": round(os.getloadavg()[0], 1),
+        "cores": os.cpu_count(),
+        "good": samples[-1][1] == count,
+    }
+
+
+def accepted_records(store: Path) -> int:
+    """Return the number of records that were ever committed to an inbox, from SQLite's autoincrement counter."""
+    with closing(sqlite3.connect(f"file:{store}?mode=ro", uri=True)) as db:
+        row = db.execute("SELECT seq FROM sqlite_sequence WHERE name = 'inbox'").fetchone()
+    return 0 if row is None else int(row[0])
 
 
 def images_at_shore(out_dir: Path) -> int:
@@ -325,42 +494,55 @@ def images_at_shore(out_dir: Path) -> int:
 
 
 def figures(
-    vehicles: int,
-    vessels: int,
     queued: int,
     duration_s: float,
     received: ReceivedImages,
     rows: int,
+    entries: Sequence[Mapping[str, Any]],
     used: dict[str, float],
     memory: dict[str, float],
 ) -> dict[str, object]:
-    """Return the figures of a run; for processes of one kind the largest value."""
-    latency_ms = 1000 * np.array(sorted(received.latency_s.values()) or [float("nan")])
-    kinds = {
-        "c2": ("c2",),
-        "relay": ("relay-",),
-        "router_vessel": ("router-vessel",),
-        "router_shore": ("router-shore",),
+    """Return the figures of a run; of processes of one kind the sum of the CPU time and the largest memory."""
+    by_kind = {
+        kind: [name for name in used if name.startswith(prefix)]
+        for kind, prefix in {
+            "c2": "c2",
+            "decoders": "decoders",
+            "relays": "relay-",
+            "routers_vessels": "router-vessel",
+            "router_shore": "router-shore",
+        }.items()
     }
-    by_kind = {kind: [n for n in used if n.startswith(prefixes)] for kind, prefixes in kinds.items()}
+    cpu_ms = {kind: round(1000 * sum(used[n] for n in ns) / queued, 2) for kind, ns in by_kind.items()}
     return {
-        "vehicles": vehicles,
-        "vessels": vessels,
-        "images": queued,
+        "contacts": queued,
+        "acknowledged": sum(not entry["refused"] for entry in entries),
         "ashore": rows,
         "shown": len(received.latency_s),
         "shown_again": received.again,
         "sha256_wrong": received.wrong,
         "seconds": round(duration_s, 1),
-        "images_per_s": round(queued / duration_s, 2),
-        "latency_p50_ms": round(float(np.percentile(latency_ms, 50)), 1),
-        "latency_p99_ms": round(float(np.percentile(latency_ms, 99)), 1),
-        "latency_max_ms": round(float(latency_ms[-1]), 1),
-        "cpu_percent": {k: round(100 * max(used[n] for n in ns) / duration_s, 1) for k, ns in by_kind.items()},
-        "cpu_ms_per_image": {k: round(1000 * sum(used[n] for n in ns) / queued, 2) for k, ns in by_kind.items()},
-        "rss_mb": {k: round(max(memory[n] for n in ns)) for k, ns in by_kind.items()},
-        "good": rows == queued and not received.wrong and not received.again,
+        "contacts_per_s": round(queued / duration_s, 2),
+        **_percentiles("acknowledged", [entry["acknowledged_utc_s"] - entry["queued_utc_s"] for entry in entries]),
+        **_percentiles("shown", list(received.latency_s.values())),
+        "cpu_ms_per_contact": {"all": round(sum(cpu_ms.values()), 2), **cpu_ms},
+        "rss_mb": {k: round(max(memory[n] for n in ns)) for k, ns in by_kind.items() if k != "decoders"},
+        "good": rows == queued == len(entries) and not received.wrong and not received.again,
     }
+
+
+def _percentiles(name: str, latency_s: Sequence[float]) -> dict[str, float]:
+    p50, p99 = np.percentile(1000 * np.array(latency_s or [float("nan")]), (50, 99))
+    return {f"{name}_p50_ms": round(float(p50), 1), f"{name}_p99_ms": round(float(p99), 1)}
+
+
+def ratios(coded: Mapping[str, Any], pixels: Mapping[str, Any]) -> dict[str, float]:
+    """Return figures of a run with coded images, divided by those of the run with pixels before it."""
+    names = ("bytes_mean", "acknowledged_p50_ms", "acknowledged_p99_ms", "shown_p50_ms", "shown_p99_ms")
+    found = {name: round(coded[name] / pixels[name], 3) for name in names}
+    kinds = coded["cpu_ms_per_contact"].keys()
+    cpu = {kind: (coded["cpu_ms_per_contact"][kind], pixels["cpu_ms_per_contact"][kind]) for kind in kinds}
+    return found | {f"cpu_{kind}": round(one / other, 3) for kind, (one, other) in cpu.items() if other}
 
 
 def main() -> int:
@@ -372,19 +554,33 @@ def main() -> int:
     parser.add_argument("--every", type=float, default=10.0, metavar="S", help="interval of a vehicle; default: 10 s")
     parser.add_argument("--grow", metavar="N,N", help="several runs with these numbers of vehicles")
     parser.add_argument("--dir", type=Path, metavar="DIR", help="folder for stores and files (default: temporary)")
-    parser.add_argument("--load", nargs=6, help=argparse.SUPPRESS)
+    parser.add_argument("--pixels", action="store_true", help="before each run, one with decoded images of 30 kB")
+    parser.add_argument("--load", nargs=7, help=argparse.SUPPRESS)
+    parser.add_argument("--accept", type=int, metavar="N", help="measure the acceptance of N contacts instead")
     args = parser.parse_args()
     if args.load:
-        endpoint, folder, vessel, vehicles, seconds, every = args.load
+        endpoint, folder, vessel, vehicles, seconds, every, kind = args.load
         own_vehicles = [int(v) for v in vehicles.split(",")]
-        run_load(endpoint, Path(folder), vessel, own_vehicles, float(seconds), float(every))
+        run_load(endpoint, Path(folder), vessel, own_vehicles, float(seconds), float(every), is_coded=kind == "coded")
         return 0
     passed = True
-    for count in [int(n) for n in args.grow.split(",")] if args.grow else [args.vehicles]:
-        with ProgressDisplay(step=f"fleet of {count}"), tempfile.TemporaryDirectory(dir=args.dir) as name:
-            result = run(Path(name), count, args.vessels, args.seconds, args.every)
+    for is_coded in (False, True) if args.accept else ():
+        with ProgressDisplay(step="acceptance"), tempfile.TemporaryDirectory(dir=args.dir) as name:
+            result = accept(Path(name), args.accept if is_coded else args.accept // 20, is_coded=is_coded)
         print(json.dumps(result), flush=True)
         passed = passed and bool(result["good"])
+    if args.accept:
+        return 0 if passed else 1
+    for count in [int(n) for n in args.grow.split(",")] if args.grow else [args.vehicles]:
+        results = []
+        for is_coded in (False, True) if args.pixels else (True,):
+            with ProgressDisplay(step=f"fleet of {count}"), tempfile.TemporaryDirectory(dir=args.dir) as name:
+                result = run(Path(name), count, args.vessels, args.seconds, args.every, is_coded=is_coded)
+            print(json.dumps(result), flush=True)
+            passed = passed and bool(result["good"])
+            results.append(result)
+        if args.pixels:
+            print(json.dumps({"coded_to_pixels": ratios(results[1], results[0])}), flush=True)
     return 0 if passed else 1
 
 

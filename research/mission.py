@@ -180,7 +180,11 @@ class _Vehicle:
         self._spec = spec
         self._rng = rng
         self.config = QueueConfig(
-            rates=(_RATE,), first_rate=_RATE, expected_loss=spec.loss, group_delay_s=60.0, kept_images=_KEPT_IMAGES
+            rates=(RATES[_RATE],),
+            first_rate=_RATE,
+            expected_loss=spec.loss,
+            group_delay_s=60.0,
+            kept_images=_KEPT_IMAGES,
         )
         self.queue = TransmitQueue(self.config)
         self.number = 0

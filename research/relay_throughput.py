@@ -1,9 +1,9 @@
 """`python -m research.relay_throughput`: throughput of the relay, compared with bare Zenoh queries and with the disk.
 
-    python -m research.relay_throughput [--decisions 20000] [--pictures 2000] [--dir DIR]
+    python -m research.relay_throughput [--decisions 20000] [--pictures 2000] [--dir DIR] [--profile]
 
-There are two processes: the far side with the router, and this one. For records of two sizes (a decision, and an image
-of 300 x 100 px) these are measured:
+There are two processes: the far side with the router, and this one. For three kinds of records (a decision, a coded
+image of 200 bytes, and an image of 300 x 100 px as relays of earlier versions send it) these are measured:
 
 - sequential: acknowledged queries without storage, one at a time, through the router to a queryable that replies at
   once;
@@ -16,6 +16,9 @@ of 300 x 100 px) these are measured:
   follows from both: every record is committed three times (outbox, inbox of c2, deletion), up to 512 records with one
   write, and its bytes are written four times (log and table on both sides).
 
+With `--profile`, only the relay's work for coded images is measured, in CPU time of its threads by area. The profiler
+makes calls of Python functions slower: the areas are to be compared with each other only.
+
 One JSON object a line. The exit status is 0 if the relay, with logging, reaches half of the pipelined rate or of the
 bound of the disk.
 """
@@ -23,21 +26,24 @@ bound of the disk.
 from __future__ import annotations
 
 import argparse
+import cProfile
 import json
 import logging
 import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
+from unittest.mock import patch
 
 import zenoh
 
-from research.fleet import noise_image
+from research.fleet import coded_image, noise_image
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.demo.settings import free_ports
@@ -46,7 +52,7 @@ from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.protocol import CHUNK_BYTES
 from sonarpost.delivery.scheduler import WINDOW, WINDOW_BYTES
 from sonarpost.logs import configure_logging
-from sonarpost.messages import Decision, ReconstructedImage, Record, Relayed
+from sonarpost.messages import Decision, ImagePart, ReconstructedImage, Record, Relayed
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
@@ -57,6 +63,18 @@ SEQUENTIAL = 2000
 BULK_BYTES = 2_000_000
 VESSEL = "vessel-1"
 BARE_KEY = "bench/bare"
+AREAS = {
+    "decode": ("sonarpost/wire.py", "decode"),
+    "build_part": ("archive/image_parts.py", "whole_part"),
+    "build_part_contact": ("link/received_image.py", "contact_record"),
+    "encode": ("sonarpost/wire.py", "encode"),
+    "log_line": ("logging/__init__.py", "info"),
+    "commit_queued": ("runtime/service.py", "commit_batch"),
+    "outbox_thread": ("delivery/outbox.py", "_run"),
+    "outbox_thread_versions": ("relay/service.py", "on_acknowledged"),
+}
+"""Areas of the relay's work: the function, with all that it calls. The contact is a part of `build_part`, the stored
+versions are a part of `outbox_thread`."""
 
 
 class Sink(Service[ServiceConfig]):
@@ -67,7 +85,7 @@ class Sink(Service[ServiceConfig]):
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Return the records of the relays."""
-        return {keys.shore_inbox_all(): Relayed}
+        return {keys.shore_inbox_all(): Relayed, keys.shore_part_all(): ImagePart}
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Do nothing: the record is on disk already."""
@@ -202,16 +220,19 @@ def measure_disk(folder: Path, size: int, seconds: float = 1.0) -> float:
 def main() -> int:
     """Run; return 1 if a rate is below the goal."""
     parser = argparse.ArgumentParser(description="relay throughput against bare acknowledged queries")
-    parser.add_argument("--decisions", type=int, default=20000, metavar="N", help="default: 20000")
+    parser.add_argument(
+        "--decisions", type=int, default=20000, metavar="N", help="also the number of coded images; default: 20000"
+    )
     parser.add_argument("--pictures", type=int, default=2000, metavar="N", help="default: 2000")
     parser.add_argument("--dir", type=Path, metavar="DIR", help="folder for the stores (default: a temporary folder)")
+    parser.add_argument("--profile", action="store_true", help="only the CPU time of the relay for coded images")
     parser.add_argument("--far-side", nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.far_side:
         far_side(args.far_side[0], Path(args.far_side[1]))
         return 0
     with ProgressDisplay(step="relay_throughput"), tempfile.TemporaryDirectory(dir=args.dir) as name:
-        return compare(Path(name), args.decisions, args.pictures)
+        return compare(Path(name), args.decisions, args.pictures, is_profile=args.profile)
 
 
 def measure(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes]) -> dict[str, float]:
@@ -246,7 +267,38 @@ def measure(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes]) ->
     }
 
 
-def compare(folder: Path, decisions: int, images: int) -> int:
+@contextmanager
+def profiled_threads() -> Iterator[list[cProfile.Profile]]:
+    """Profile the CPU time of all threads that start in the block."""
+    profiles: list[cProfile.Profile] = []
+    run = threading.Thread.run
+
+    def profiled(thread: threading.Thread) -> None:
+        profile = cProfile.Profile(time.thread_time)
+        profiles.append(profile)
+        profile.runcall(run, thread)
+
+    with patch.object(threading.Thread, "run", profiled):
+        yield profiles
+
+
+def profile_relay(endpoint: str, folder: Path, count: int) -> dict[str, object]:
+    """Return the CPU time of each area of the relay for a coded image, in microseconds with the profiler."""
+    payloads = [wire.encode(coded_image(VESSEL, 1, n, time.time())) for n in range(count)]
+    with profiled_threads() as profiles:
+        measure_relay(endpoint, folder, keys.image_coded(VESSEL), payloads, "info")
+    totals = dict.fromkeys((*AREAS, "all"), 0.0)
+    for profile in profiles:
+        profile.create_stats()
+        for (file, _, function), (_, _, own_s, with_callees_s, _) in profile.stats.items():
+            totals["all"] += own_s
+            for area, (path, name) in AREAS.items():
+                if function == name and file.endswith(path):
+                    totals[area] += with_callees_s
+    return {area: round(1e6 * seconds / count, 1) for area, seconds in totals.items()}
+
+
+def compare(folder: Path, decisions: int, images: int, *, is_profile: bool) -> int:
     """Measure both kinds of records; return 1 if a rate is below the goal."""
     endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     child = subprocess.Popen(
@@ -261,8 +313,16 @@ def compare(folder: Path, decisions: int, images: int) -> int:
     try:
         if child.stdout.readline().strip() != "ready":
             sys.exit("relay_throughput: the far side did not start")
+        if is_profile:
+            print(json.dumps({"record": "stream", "cpu_us": profile_relay(endpoint, folder, decisions)}), flush=True)
+            return 0
         kinds: list[tuple[str, str, list[bytes]]] = [
             ("decision", keys.contact_decision(VESSEL), [wire.encode(decision(n)) for n in range(decisions)]),
+            (
+                "stream",
+                keys.image_coded(VESSEL),
+                [wire.encode(coded_image(VESSEL, 1, n, time.time())) for n in range(decisions)],
+            ),
             ("picture", keys.image_reconstructed(VESSEL), [wire.encode(image(n)) for n in range(images)]),
         ]
         for name, key, payloads in kinds:

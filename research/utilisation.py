@@ -28,15 +28,8 @@ from sonarpost.link.mac import Continuous
 from sonarpost.link.queue.transmit_queue import TransmitQueue
 from sonarpost.link.receiver import FeedbackReceived
 from sonarpost.link.sender import ImageToSend
-from sonarpost.modem.micromodem import (
-    RATES,
-    FrameDecoded,
-    FrameReceived,
-    MicroModem,
-    ModemEvent,
-    PacketFailed,
-    PacketSent,
-)
+from sonarpost.modem.interface import FrameDecoded, FrameReceived, ModemEvent, PacketFailed, PacketSent
+from sonarpost.modem.micromodem import RATES, MicroModem
 from sonarpost.simulation.channel.events import Transmission
 from sonarpost.simulation.channel.parameters import ChannelParameters
 
@@ -106,7 +99,9 @@ class _Vehicle:
 
     def __init__(self, spec: UtilisationSpec) -> None:
         self._rate = spec.rate
-        self.queue = TransmitQueue(QueueConfig(rates=(spec.rate,), first_rate=spec.rate, expected_loss=spec.frame_loss))
+        self.queue = TransmitQueue(
+            QueueConfig(rates=(RATES[spec.rate],), first_rate=spec.rate, expected_loss=spec.frame_loss)
+        )
         self._mac = Continuous(spec.tx_burst_s, spec.rx_window_s, holdoff_s=2.0)
         self._receiver = V1Receiver()
         self._is_sending = False

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, ModemEvent
+from sonarpost.modem.interface import ModemEvent
+from sonarpost.modem.micromodem import MicroModem, MicroModemConfig
 from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.events import Transmission
 from sonarpost.simulation.channel.parameters import ChannelParameters

@@ -161,7 +161,7 @@ def _sample_values(image: Image, snippet: SurveySnippet) -> npt.NDArray[np.float
 
 def _with_samples(channel: ChannelPing, first: int, line: npt.NDArray[np.float64]) -> ChannelPing:
     samples = channel.samples.copy()
-    limit = np.iinfo(samples.dtype).max
+    limit = np.iinfo(samples.dtype.name).max
     inside = line[: len(samples) - first]
     samples[first : first + len(line)] = np.clip(np.rint(inside), 0, limit).astype(samples.dtype)
     return replace(channel, samples=samples)

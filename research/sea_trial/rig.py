@@ -16,12 +16,8 @@ from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import Packet, plan_packets
 from sonarpost.link.receiver import Event, ImageUpdate
-from sonarpost.modem.micromodem import (
-    RATES,
-    FrameReceived,
-    PacketFailed,
-    PacketSent,
-)
+from sonarpost.modem.interface import FrameReceived, PacketFailed, PacketSent
+from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.channel.parameters import ChannelParameters
 
 VEHICLE: Final = 2
