@@ -1,6 +1,5 @@
 """Prints the records of a shore site and saves images as PGM: shore_subscriber.py tcp/127.0.0.1:7447 [FOLDER]."""
 
-import json
 import pathlib
 import signal
 import sys
@@ -10,14 +9,15 @@ import zenoh
 
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the program, also while it waits for the router
 (folder := pathlib.Path(*sys.argv[2:3])).mkdir(parents=True, exist_ok=True)
-connect = {"endpoints": sys.argv[1:2], "timeout_ms": -1}  # wait for the router without a time limit
-config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": connect}))
+# Wait for the router without a time limit.
+config = zenoh.Config.from_json5(f'{{mode: "client", connect: {{endpoints: ["{sys.argv[1]}"], timeout_ms: -1}}}}')
 print(f"waiting for {sys.argv[1]}", file=sys.stderr)
 with zenoh.open(config) as session, session.declare_subscriber("sonarpost/v1/shore/contact/**") as records:
     print("subscribed", file=sys.stderr)
     for sample in records:
         r = msgpack.unpackb(sample.payload.to_bytes())
-        print(r["type"], r["vehicle_id"], r["image_id"], r.get("verdict"), r.get("contact"), flush=True)
+        if r["type"] != "coded_image":  # the decoded image follows
+            print(r["type"], r["vehicle_id"], r["image_id"], r.get("verdict"), r.get("contact"), flush=True)
         if p := r.get("picture"):
             data = p["data"] if p["bits"] == 8 else bytes(p["data"][n ^ 1] for n in range(len(p["data"])))  # big endian
             head = f"P5 {p['width_px']} {p['height_px']} {2 ** p['bits'] - 1}\n".encode()
