@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -10,12 +11,15 @@ from pathlib import Path
 import pytest
 import zenoh
 from builders.common import REPOSITORY, free_port
+from builders.postgresql import database, database_url, postgresql_server
 from hypothesis import settings
 from xdist.remote import Producer
 from xdist.scheduler import LoadFileScheduling
 
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.config import PlatformConfig
+
+__all__ = ["database", "database_url", "postgresql_server"]
 
 # SIGINT is ignored in a suite started in the background, and child processes would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -46,6 +50,16 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Process
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the tests of many real processes first: they take longest and mostly wait."""
     items.sort(key=lambda item: not item.nodeid.startswith(PROCESS_TESTS))
+
+
+@pytest.fixture(autouse=True)
+def log_settings() -> Iterator[None]:
+    """Restore the handlers and the level of the root logger, which commands run by a test replace."""
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
 
 
 @pytest.fixture

@@ -107,7 +107,12 @@ def test_absent_table_has_default_values(tmp_path: Path) -> None:
 
 # Invalid configurations: (text, line or None, key, part of the message)
 INVALID: dict[str, tuple[str, int | None, str, str]] = {
-    "unknown table": (PLATFORM + "\n[relais]\nx = 1\n", 4, "relais", "got 'an unknown table', expected platform, atd_"),
+    "unknown table": (
+        PLATFORM + "\n[relais]\nx = 1\n",
+        4,
+        "relais",
+        "an unknown table', expected platform, modem, atd_",
+    ),
     "unknown table below another": (PLATFORM + "[relais.a.b]\n", 3, "relais", "an unknown table"),
     "key before any table": ("# c\nrate = 1\n" + PLATFORM, 2, "rate", "an unknown table"),
     "a table that is a value": ("relay = 3\n" + PLATFORM, 1, "relay", "got 3, expected a table [relay]"),
@@ -445,3 +450,19 @@ def service_config(name: str) -> type[ServiceConfig]:
         if isinstance(kind, type) and issubclass(kind, ServiceConfig) and kind.__module__ == module.__name__
     ]
     return found
+
+
+class Nothing(ServiceConfig):
+    """No keys."""
+
+
+def test_modem_table_belongs_to_the_platform(tmp_path: Path) -> None:
+    file = tmp_path / "vessel.toml"
+    file.write_text('[platform]\nid = "vessel-1"\n[modem]\ndriver = "other"\n[relay]\n')
+    platform, _ = config.load(file, "relay", Nothing, {})
+    assert platform.modem.driver == "other"
+    platform, _ = config.load(file, "relay", Nothing, {"SONARPOST_MODEM__DRIVER": "third"})
+    assert platform.modem.driver == "third"
+    file.write_text('[platform]\nid = "vessel-1"\n[modem]\ndrivers = "other"\n[relay]\n')
+    with pytest.raises(ConfigError, match=r"vessel.toml:4: modem.drivers: .*expected one of: driver"):
+        config.load(file, "relay", Nothing, {})

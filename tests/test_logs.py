@@ -6,7 +6,6 @@ import json
 import logging
 import math
 import re
-from collections.abc import Iterator
 
 import msgpack
 import pytest
@@ -16,7 +15,7 @@ from hypothesis import strategies as st
 
 from sonarpost import keys, logs, wire
 from sonarpost.logs import IntervalLog, JsonFormatter, TextFormatter, context_of_payload, kv
-from sonarpost.messages import Contact, Decision, Pixels, Relayed, Snippet
+from sonarpost.messages import Contact, Decision, ImagePart, Pixels, Relayed, Snippet
 
 
 def record(message: str = "Picture stored", /, *args: object, **fields: object) -> logging.LogRecord:
@@ -137,18 +136,7 @@ def test_no_traceback_without_an_exception(nothing: object) -> None:
     assert "traceback" not in json.loads(JsonFormatter("relay").format(made))
 
 
-@pytest.fixture
-def clean_root() -> Iterator[logging.Logger]:
-    root = logging.getLogger()
-    handlers, level = root.handlers[:], root.level
-    yield root
-    root.handlers[:] = handlers
-    root.setLevel(level)
-
-
-def test_logs_are_written_to_standard_error_in_the_configured_format(
-    clean_root: logging.Logger, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_logs_are_written_to_standard_error_in_the_configured_format(capsys: pytest.CaptureFixture[str]) -> None:
     logs.configure_logging("relay", "warning", "json")
     logging.getLogger("a.b").info("Not shown")
     logging.getLogger("a.b").warning("Shown", extra=kv(n=1))
@@ -159,7 +147,7 @@ def test_logs_are_written_to_standard_error_in_the_configured_format(
     first, second = err.splitlines()
     assert (json.loads(first)["message"], json.loads(first)["n"]) == ("Shown", 1)
     assert second.endswith("DEBUG c2: Shown too")
-    assert len(clean_root.handlers) == 1
+    assert len(logging.getLogger().handlers) == 1
 
 
 def test_log_context_is_in_both_formats() -> None:
@@ -242,6 +230,8 @@ def test_context_of_every_record_type(name: str) -> None:
         "image_id": getattr(record, "image_id", None),
         "contact_id": getattr(contact, "contact_id", None),
     }
+    if isinstance(record, ImagePart):
+        expected |= {"vehicle": record.u, "image_id": record.i}
     if not isinstance(record, Relayed):
         known = {field: value for field, value in expected.items() if value is not None}
         assert context_of_payload(wire.encode(record)) == known

@@ -6,6 +6,7 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
+from random import SystemRandom
 from typing import TYPE_CHECKING
 
 import pytest
@@ -18,14 +19,27 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 GOLDEN_FOLDER = REPOSITORY / "tests" / "golden"
 
 
+WAIT_S = 120.0
+"""Default limit of waits: only a test that fails waits so long."""
+PORTS = (10_000, 32_000)
+"""Ports of tests: below those of outgoing connections, which could take a port between two uses."""
+
+
 def free_port() -> int:
-    """Return a TCP port that was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """Return a random TCP port of `PORTS` that was free a moment ago."""
+    # Seeded by the system, because Hypothesis and tests set the seed of the module's own generator.
+    random = SystemRandom()
+    while True:
+        port = random.randrange(*PORTS)
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+        return port
 
 
-def eventually(condition: Callable[[], bool], timeout_s: float = 40.0, what: str = "condition") -> None:
+def eventually(condition: Callable[[], bool], timeout_s: float = WAIT_S, what: str = "condition") -> None:
     """Wait until `condition()` is true; fail the test after the time-out."""
     deadline = time.monotonic() + timeout_s
     while not condition():

@@ -102,7 +102,7 @@ class Project:
             env={**os.environ, **self.environment},
             capture_output=True,
             text=True,
-            timeout=170,
+            timeout=400,
             check=False,
         )
         assert not check or done.returncode == 0, f"{arguments}: {done.stdout}\n{done.stderr}"
@@ -201,7 +201,7 @@ def read_pictures(text: str) -> tuple[dict[str, str], int]:
 
 def docker(*arguments: str, check: bool = True) -> str:
     """Run a docker command; its output."""
-    done = subprocess.run(["docker", *arguments], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(["docker", *arguments], capture_output=True, text=True, timeout=400, check=False)
     assert not check or done.returncode == 0, f"{arguments}: {done.stdout}\n{done.stderr}"
     # A container's standard error is its log.
     return done.stdout + done.stderr if arguments[0] == "logs" else done.stdout

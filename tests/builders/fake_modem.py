@@ -7,15 +7,8 @@ from collections import Counter
 from collections.abc import Callable
 from itertools import count
 
-from sonarpost.modem.micromodem import (
-    RATES,
-    FrameDecoded,
-    MicroModem,
-    ModemEvent,
-    TransmissionEnded,
-    TransmissionStarted,
-    nmea,
-)
+from sonarpost.modem.interface import FrameDecoded, ModemEvent, TransmissionEnded, TransmissionStarted
+from sonarpost.modem.micromodem import RATES, MicroModem, nmea
 from sonarpost.modem.micromodem.sentences import Cycle
 
 DropRule = Callable[[nmea.Sentence, int], bool]

@@ -91,7 +91,7 @@ class Router:
         def denied() -> bool:
             return any(p == peer and message in m and key in k for p, m, k in self.denied())
 
-        eventually(denied, timeout_s=20, what=f"denial of {message} {key} from {peer}")
+        eventually(denied, timeout_s=120, what=f"denial of {message} {key} from {peer}")
 
     def stop(self) -> None:
         if self.process.poll() is None:

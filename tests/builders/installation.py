@@ -46,7 +46,7 @@ class Installation:
     def run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         environment = self.environment()
         command = self.command(*arguments)
-        return subprocess.run(command, check=False, env=environment, capture_output=True, text=True, timeout=170)
+        return subprocess.run(command, check=False, env=environment, capture_output=True, text=True, timeout=400)
 
     def machine_code(self) -> list[Path]:
         return list(self._folder.rglob("*.nbc"))

@@ -17,15 +17,8 @@ from dataclasses import dataclass, field
 
 from builders.two_drivers import TwoDrivers
 from sonarpost.errors import SentenceError
-from sonarpost.modem.micromodem import (
-    MicroModem,
-    MicroModemConfig,
-    PacketFailed,
-    PacketSent,
-    RequestDone,
-    RequestFailed,
-    nmea,
-)
+from sonarpost.modem.interface import PacketFailed, PacketSent, RequestDone, RequestFailed
+from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, nmea
 
 KINDS = (
     "CAREV CACFG CACLK CATMS CATMQ CATMG CACYC CADRQ CATXD CATXA CATXP CATXF CAXST CARXP CARXD CARXA CAMSG CACST CAACK "

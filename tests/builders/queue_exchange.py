@@ -6,9 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from builders.v1_world import VEHICLE, contact, stream, take_packet
+from builders.v1_world import VEHICLE, contact, queue_config, stream, take_packet
 from sonarpost.link.coding.byte_ranges import count_positions
-from sonarpost.link.config import QueueConfig
 from sonarpost.link.downlink.messages import image_of_number, number_of_image
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.queue.transmit_queue import TransmitQueue
@@ -25,7 +24,7 @@ class Exchange:
     def __init__(self, loss: float = 0.3, **config: object) -> None:
         rng = np.random.default_rng(5)
         self.lost: Callable[[], bool] = lambda: bool(rng.random() < loss)
-        self.config = QueueConfig(expected_loss=max(loss, 0.05), **config)
+        self.config = queue_config(expected_loss=max(loss, 0.05), **config)
         self.queue = TransmitQueue(self.config)
         self.receiver = V1Receiver()
         self.streams: dict[int, bytes] = {}

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.messages import (
     AcousticFrame,
     Advice,
+    CodedImage,
     Command,
     Contact,
     Decision,
     DownlinkState,
     EncodedImage,
     Health,
+    ImagePart,
     LinkQuality,
     OutgoingMessage,
     Pixels,
@@ -18,6 +21,7 @@ from sonarpost.messages import (
     QueueState,
     ReceivedImage,
     ReceivedMessage,
+    ReceivedStatus,
     ReconstructedImage,
     Record,
     Relayed,
@@ -25,9 +29,29 @@ from sonarpost.messages import (
     TaskingState,
     Transmission,
     Transmissions,
+    VehicleRange,
+    VehicleStatus,
 )
+from sonarpost.sonar.survey import Side
 
 BARE_CONTACT = Contact(contact_id="c1", vehicle_id="uuv-1")
+
+ACOUSTIC_CONTACT = ContactSummary(
+    height_px=80,
+    width_px=140,
+    lat_deg=41.5,
+    lon_deg=-70.5,
+    time_utc_s=1476262800.0,
+    confidence=2.0,
+    altitude_m=3.5,
+    depth_m=12.5,
+    side=Side.PORT,
+    ground_range_m=20.5,
+    atd_class="mine-like",
+    p_mine_like=0.75,
+    p_other_object=0.2,
+).pack()
+"""A contact record of the acoustic link."""
 
 FULL_CONTACT = Contact(
     contact_id="line-7-ab12cd34-0412-port-377",
@@ -114,7 +138,39 @@ NOTHING_GONE = QueuedImage(
     image_id="00A8", contact_id="c2", bytes_left=640, preview_utc_s=1476262850.0, expected_utc_s=1476263000.0
 )
 
+FULL_STATUS = VehicleStatus(
+    vehicle_id="uuv-1",
+    time_utc_s=1476262800.25,
+    lat_deg=41.5251,
+    lon_deg=-70.6712,
+    heading_deg=271.5,
+    speed_mps=1.5,
+    depth_m=12.25,
+    altitude_m=3.5,
+    swath_m=75.0,
+    battery=0.625,
+    images_waiting=4,
+    disk_free_bytes=12_000_000_000,
+)
+
 SAMPLES: dict[str, Record] = {
+    "vehicle-range": VehicleRange(
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        measured_utc_s=1476262840.5,
+        travel_s=0.5,
+        sound_speed_mps=1480.0,
+        distance_m=740.0,
+    ),
+    "vehicle-status-full": FULL_STATUS,
+    "vehicle-status-bare": VehicleStatus(vehicle_id="uuv-1", time_utc_s=1476262800.25),
+    "received-status": ReceivedStatus(
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        received_utc_s=1476262830.5,
+        status=FULL_STATUS,
+        authenticated=True,
+    ),
     "outgoing-message": OutgoingMessage(
         message_id="status-17",
         source="autonomy",
@@ -153,7 +209,7 @@ SAMPLES: dict[str, Record] = {
     ),
     "queued-image-nothing-gone": NOTHING_GONE,
     "queued-image": PREVIEW_GONE,
-    "queue-state-counting": QueueState(
+    "queue-state-counting-2": QueueState(
         platform_id="uuv-1",
         time_utc_s=1476262801.0,
         rate=1,
@@ -165,7 +221,7 @@ SAMPLES: dict[str, Record] = {
         images=(PREVIEW_GONE, NOTHING_GONE),
         images_accepted=725,
     ),
-    "queue-state-uncounted": QueueState(
+    "queue-state-uncounted-2": QueueState(
         platform_id="uuv-1",
         time_utc_s=1476262801.0,
         rate=4,
@@ -205,7 +261,7 @@ SAMPLES: dict[str, Record] = {
     ),
     "link-quality-full": QUALITY,
     "link-quality-bare": LinkQuality(),
-    "acoustic-frame-received": AcousticFrame(
+    "acoustic-frame-received-2": AcousticFrame(
         direction="rx",
         platform_id="vessel-1",
         time_utc_s=1476262801.5,
@@ -217,13 +273,14 @@ SAMPLES: dict[str, Record] = {
         frame_count=3,
         data=b"00A7\x00\x01\x02\x03",
         quality=QUALITY,
+        airtime_s=6.1,
     ),
-    "acoustic-frame-of-unknown-rate": AcousticFrame(
+    "acoustic-frame-of-unknown-rate-2": AcousticFrame(
         direction="tx",
         platform_id="uuv-1",
         time_utc_s=0.0,
         source=3,
-        destination=127,
+        destination=255,
         rate=None,
         packet=0,
         frame_number=1,
@@ -249,6 +306,65 @@ SAMPLES: dict[str, Record] = {
         first_frame_utc_s=1476262801.0,
         last_frame_utc_s=1476262833.5,
         authenticated=True,
+    ),
+    "coded-image": CodedImage(
+        vessel_id="vessel-1",
+        vehicle_id="uuv-1",
+        image_id="00A7",
+        version=2,
+        contact=FULL_CONTACT,
+        height_px=80,
+        width_px=140,
+        stream=bytes(range(16)),
+        missing=((2, 4),),
+        missing_halves=(),
+        complete=False,
+        bytes_received=14,
+        bytes_total=20,
+        frames_received=3,
+        conflicts=0,
+        first_frame_utc_s=1476262801.0,
+        last_frame_utc_s=1476262833.5,
+        authenticated=True,
+        codec="vq",
+        model="5a" * 16,
+        picture_crc32=0xDEADBEEF,
+    ),
+    "part-difference": ImagePart(
+        u="uuv-1",
+        i="00A7",
+        n=3,
+        b=1,
+        t=1476262801.25,
+        d=7,
+        l=1476262833.5,
+        c=b"\x81\xa7channel\xa4port",
+        h=80,
+        w=140,
+        z=30,
+        p=b"\x10\xbe\xef\x41",
+        s=((16, b"abc"), (20, b"d")),
+        m=((24, 26), (28, 30)),
+        k=0x12345678,
+        x=0xDEADBEEF,
+        f=9,
+        e=40,
+        y=22,
+        q=1,
+        g=12,
+        a=bytes(range(16)),
+    ),
+    "part-whole": ImagePart(
+        u="uuv-1",
+        i="00A7",
+        n=1,
+        t=1476262801.0,
+        d=3 << 22,
+        c=ACOUSTIC_CONTACT,
+        p=bytes(range(16)),
+        x=0xDEADBEEF,
+        f=6,
+        g=3,
     ),
     "received-image-paper-unauthenticated": ReceivedImage(
         vessel_id="vessel-1",

@@ -8,10 +8,12 @@ from typing import Any, get_args
 
 from hypothesis import strategies as st
 
+from sonarpost.archive.image_parts import whole_part
 from sonarpost.messages import (
     MIN_REGION_BYTES,
     AcousticFrame,
     Advice,
+    CodedImage,
     Command,
     CommandKind,
     Contact,
@@ -20,6 +22,7 @@ from sonarpost.messages import (
     DownlinkState,
     EncodedImage,
     Health,
+    ImagePart,
     LinkQuality,
     OutgoingMessage,
     Pixels,
@@ -28,6 +31,7 @@ from sonarpost.messages import (
     QueueState,
     ReceivedImage,
     ReceivedMessage,
+    ReceivedStatus,
     ReconstructedImage,
     Record,
     Relayed,
@@ -35,6 +39,8 @@ from sonarpost.messages import (
     TaskingState,
     Transmission,
     Transmissions,
+    VehicleRange,
+    VehicleStatus,
 )
 
 _LOWER = string.ascii_lowercase + string.digits
@@ -154,6 +160,21 @@ def images(draw: st.DrawFn) -> ReconstructedImage:
 
 
 @st.composite
+def coded_images(draw: st.DrawFn) -> CodedImage:
+    fields = dict(draw(received_images()))
+    model = draw(st.binary(min_size=16, max_size=16) | st.just(b"")).hex()
+    crc32 = draw(_maybe(st.integers(0, 2**32 - 1)))
+    return CodedImage(**fields, codec=draw(_text(0, 40)), model=model, picture_crc32=crc32)
+
+
+@st.composite
+def image_parts(draw: st.DrawFn) -> ImagePart:
+    whole = whole_part(draw(coded_images()))
+    base = draw(st.integers(0, whole.n - 1))
+    return whole.model_copy(update={"b": base, "k": draw(st.integers(0, 2**32 - 1)) if base else None})
+
+
+@st.composite
 def received_images(draw: st.DrawFn) -> ReceivedImage:
     stream = draw(st.binary(max_size=64))
     bounds = sorted(draw(st.sets(st.integers(0, len(stream)), max_size=6)))
@@ -207,6 +228,8 @@ STRATEGIES: dict[type[Record], st.SearchStrategy[Any]] = {
     Contact: contacts,
     Pixels: pixels(),
     ReceivedImage: received_images(),
+    CodedImage: coded_images(),
+    ImagePart: image_parts(),
     Snippet: st.builds(Snippet, contact=contacts, picture=pixels(), source=_text(0, 2000), wide=_maybe(pixels())),
     EncodedImage: st.builds(
         EncodedImage,
@@ -351,6 +374,38 @@ STRATEGIES[Transmissions] = st.builds(
     platform_id=_name,
     time_utc_s=_time,
     transmissions=st.lists(STRATEGIES[Transmission], max_size=3).map(tuple),
+)
+STRATEGIES[VehicleStatus] = st.builds(
+    lambda position, **fields: VehicleStatus(
+        lat_deg=position and position[0], lon_deg=position and position[1], **fields
+    ),
+    position=_maybe(st.tuples(_real(-90, 90), _real(-180, 180))),
+    vehicle_id=_name,
+    time_utc_s=_time,
+    heading_deg=_maybe(_real(0, 359)),
+    speed_mps=_maybe(_real(-50, 50)),
+    depth_m=_maybe(_real(-100, 12000)),
+    altitude_m=_maybe(_real(0, 20000)),
+    swath_m=_maybe(_real(0, 20000)),
+    battery=_maybe(_real(0, 1)),
+    images_waiting=_maybe(_count),
+    disk_free_bytes=_maybe(_count),
+)
+STRATEGIES[ReceivedStatus] = st.builds(
+    lambda status, **fields: ReceivedStatus(status=status, vehicle_id=status.vehicle_id, **fields),
+    status=STRATEGIES[VehicleStatus],
+    vessel_id=_name,
+    received_utc_s=_time,
+    authenticated=st.booleans(),
+)
+STRATEGIES[VehicleRange] = st.builds(
+    VehicleRange,
+    vessel_id=_name,
+    vehicle_id=_name,
+    measured_utc_s=_time,
+    travel_s=_real(0, 100),
+    sound_speed_mps=_real(1300, 1700),
+    distance_m=_real(0, 170_000),
 )
 
 any_record: st.SearchStrategy[Record] = st.one_of(*STRATEGIES.values())

@@ -6,6 +6,8 @@ The coverage-guided fuzzer (`run_atheris_survey.py`) and the tests of the defaul
 from __future__ import annotations
 
 import math
+import struct
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -24,20 +26,25 @@ FILES = (
     ("waterfall", "line.waterfall.toml"),
     ("waterfall", "line.csv"),
     ("waterfall", "line.port.png"),
+    ("sl2", "line.sl2"),
+    ("sl3", "line.sl3"),
+    ("jsf", "line.jsf"),
+    ("svlog", "line.svlog"),
+    ("sdf", "line.sdf"),
 )
-"""Format and file that the first byte of an input selects."""
+"""Format and file; the first byte of an input selects one, of the formats in use."""
 MAX_PINGS = 2000
 OPTIONS = SurveyOptions(projected_crs="EPSG:32619", humminbird_depth_as_altitude=True)
 
 
-def tiny_survey() -> Survey:
-    """Return three pings of a few samples."""
+def tiny_survey(pings: int = 3, samples: int = 12) -> Survey:
+    """Return a few pings of a few samples."""
     rng = np.random.default_rng(0)
-    pings = tuple(
+    made = tuple(
         Ping(
             number=row,
             time_utc_s=1_378_847_588.0 + row,
-            channels=tuple(ChannelPing(side, rng.integers(1, 255, 12, dtype=np.uint8), 25.0) for side in Side),
+            channels=tuple(ChannelPing(side, rng.integers(1, 255, samples, dtype=np.uint8), 25.0) for side in Side),
             lat_deg=48.4 + row * 1e-5,
             lon_deg=-68.8,
             heading_deg=90.0,
@@ -47,26 +54,32 @@ def tiny_survey() -> Survey:
             pitch_deg=1.0,
             roll_deg=-1.0,
         )
-        for row in range(3)
+        for row in range(pings)
     )
-    return Survey(Path("line"), "HDS", "line", pings)
+    return Survey(Path("line"), "HDS", "line", made)
 
 
 class Readers:
-    """Valid recordings of every format in a folder; `check` replaces one file at a time."""
+    """Valid recordings in a folder, of every format or the given ones; `check` replaces one file at a time."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, kinds: Collection[str] = tuple(MAKERS)) -> None:
         self._opened: dict[str, Path] = {}
-        for kind, make in MAKERS.items():
+        for kind in kinds:
             (root / kind).mkdir()
-            self._opened[kind] = make(tiny_survey(), root / kind)
-        self._files = [root / kind / name for kind, name in FILES]
+            self._opened[kind] = MAKERS[kind](tiny_survey(), root / kind)
+        self._kinds = [kind for kind, _ in FILES if kind in self._opened]
+        self._files = [root / kind / name for kind, name in FILES if kind in self._opened]
         self._valid = [path.read_bytes() for path in self._files]
 
     def seeds(self) -> list[bytes]:
-        """Return a valid input for each file, and an XTF file whose last packet is cut."""
+        """Return valid inputs for each file, and one of the first file whose end is cut."""
         valid = [bytes([number]) + content for number, content in enumerate(self._valid)]
-        return [*valid, valid[0][:-100]]
+        solix = [  # its DAT file differs from that of the other seed
+            bytes([number]) + bytes(20) + struct.pack("<I", 1_600_000_000) + bytes(72)
+            for number, path in enumerate(self._files)
+            if path.name == "line.DAT"
+        ]
+        return [*valid, *solix, valid[0][:-100]]
 
     def check(self, data: bytes) -> str:
         """Read an input; return "rejected" or "read".
@@ -75,10 +88,10 @@ class Readers:
             AssertionError: A value of a ping is impossible.
             Exception: The reader raised an exception other than SurveyFileError.
         """
-        number = (data[0] if data else 0) % len(FILES)
+        number = (data[0] if data else 0) % len(self._files)
         self._files[number].write_bytes(data[1:])
         try:
-            return self._read(self._opened[FILES[number][0]])
+            return self._read(self._opened[self._kinds[number]])
         finally:
             self._files[number].write_bytes(self._valid[number])
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, ModemEvent, nmea
+from sonarpost.modem.interface import ModemEvent
+from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, nmea
 from sonarpost.simulation.channel.acoustics import LocalPosition
 from sonarpost.simulation.channel.parameters import ChannelParameters
 from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from sonarpost.link.auth.authentication import FrameAuthenticator
-from sonarpost.link.config import ReceiverConfig, SenderConfig
+from sonarpost.link.config import QueueConfig, ReceiverConfig, SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
@@ -17,6 +18,7 @@ from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.receiver import Event, FeedbackReceived, FrameRejected, ImageUpdate, MessageReceived
 from sonarpost.link.sender import ImageSender
+from sonarpost.modem.micromodem import RATES
 
 VEHICLE = 3
 VESSEL = 1
@@ -119,3 +121,10 @@ class World:
     @property
     def messages(self) -> list[bytes]:
         return [e.data for e in self.events if isinstance(e, MessageReceived)]
+
+
+def queue_config(
+    rates: Sequence[int] = (1,), first_rate: int = 1, expected_loss: float = 0.2, **more: Any
+) -> QueueConfig:
+    """Return a configuration of the transmit queue with rates of the Micro-Modem."""
+    return QueueConfig(tuple(RATES[number] for number in rates), first_rate, expected_loss, **more)

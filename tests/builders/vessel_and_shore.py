@@ -224,7 +224,7 @@ class VesselAndShore:
                 process.terminate()
         for process in self._processes.values():
             try:
-                process.wait(timeout=5)
+                process.wait(timeout=20)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()

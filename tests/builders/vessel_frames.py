@@ -7,7 +7,8 @@ import numpy as np
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
 from sonarpost.link.frames.v1.payload_objects import ENTRY_HEAD_BYTES, Preview
-from sonarpost.modem.micromodem import FrameReceived, LinkStatistics, PacketReceived
+from sonarpost.modem.interface import FrameReceived, PacketReceived
+from sonarpost.modem.micromodem import LinkStatistics
 
 CONTACT = ContactSummary(height_px=40, width_px=60, lat_deg=56.4, lon_deg=-5.6, time_utc_s=1_475_568_000.0)
 

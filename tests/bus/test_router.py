@@ -68,7 +68,7 @@ def reach(endpoint: str) -> zenoh.Session:
             return False
         return True
 
-    eventually(try_once, 20, f"a router at {endpoint}")
+    eventually(try_once, 120, f"a router at {endpoint}")
     return opened[0]
 
 
@@ -88,18 +88,18 @@ def test_linked_routers_with_files_forward_a_record(start: Start, tmp_path: Path
         received = threading.Event()
         subscriber = ashore.declare_subscriber("sonarpost/test", lambda _sample: received.set())
         publisher = aboard.declare_publisher("sonarpost/test")
-        eventually(lambda: bool(publisher.matching_status.matching), 20, "the subscriber at the vessel's router")
+        eventually(lambda: bool(publisher.matching_status.matching), 120, "the subscriber at the vessel's router")
 
         def forwarded() -> bool:
             publisher.put(b"here")
             return received.wait(0.2)
 
         # Repeated: the vessel's router can report a subscriber before the link to it is complete.
-        eventually(forwarded, 20, "the record at the shore router")
+        eventually(forwarded, 120, "the record at the shore router")
         subscriber.undeclare()
     for process in processes:
         process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=10) == 0
+        assert process.wait(timeout=120) == 0
         output = process.communicate()[0]
         assert "Router started listen=tcp/127.0.0.1:" in output
         assert "Router stopped" in output
@@ -165,7 +165,7 @@ def test_error_names_invalid_endpoints_without_a_file() -> None:
 
 def test_invalid_file_ends_the_process_with_one_line(start: Start, tmp_path: Path) -> None:
     process = start("--config", str(write_config(tmp_path, "{mode: 'router', lisen: {}}")))
-    output = process.communicate(timeout=20)[0]
+    output = process.communicate(timeout=120)[0]
     assert process.returncode == router.EXIT_CANNOT_START
     [line] = output.splitlines()
     assert line.startswith("router: ")

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import threading
+import zipfile
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -19,7 +20,7 @@ from builders.store_steps import queued_items
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import router_config
-from sonarpost.cli.c2.stored import RecordFilter, join_decisions, select_images, since_of
+from sonarpost.cli.c2.stored import WRITERS, RecordFilter, join_decisions, select_images, since_of
 from sonarpost.cli.main import main
 from sonarpost.cli.shared import printable
 from sonarpost.errors import ConfigError
@@ -174,11 +175,15 @@ def test_get_copies_nothing_if_a_file_is_unreadable(capsys, out, tmp_path):
 
 
 def test_export_writes_all_formats_and_marks_images_as_exported(capsys, out, tmp_path):
-    files = {name: tmp_path / "new" / f"contacts.{name}" for name in ("geojson", "kml", "kmz", "csv")}
+    files = {name: tmp_path / "new" / f"contacts.{name}" for name in WRITERS}
     options = [part for path in files.values() for part in ("--out", str(path))]
     assert main(["c2", "export", "--archive", str(out), "--vessel", "vessel-1", *options]) == 0
     assert len(json.loads(files["geojson"].read_text())["features"]) == 2
     assert files["kmz"].read_bytes().startswith(b"PK")
+    assert files["gpkg"].read_bytes().startswith(b"SQLite format 3")
+    assert zipfile.is_zipfile(files["tak.zip"])
+    assert len(files["caris.txt"].read_text().splitlines()) == 2
+    assert files["app11-like.txt"].read_text().startswith("NOTE/NOT CONFORMANT")
     assert "2 contacts, 0 of them without a position" in capsys.readouterr().out
     exported = {r["image_id"]: r["exported_utc_s"] is not None for r in ls(capsys, out, "--all-versions")}
     assert exported == {"AAAA": True, "BBBB": True, "CCCC": False}
@@ -198,7 +203,7 @@ def test_former_spellings_of_archive_and_out_are_accepted(capsys, out, tmp_path)
 
 def test_export_to_a_file_of_unknown_format_is_an_error(capsys, out, tmp_path):
     assert main(["c2", "export", "--archive", str(out), "--out", str(tmp_path / "contacts.shp")]) == 2
-    expected = "expected a name that ends in .geojson, .kml, .kmz, .csv"
+    expected = "expected a name that ends in .geojson, .kml, .kmz, .csv, .gpkg, .tak.zip, .caris.txt, .app11-like.txt"
     assert expected in capsys.readouterr().err
 
 
@@ -335,7 +340,7 @@ def test_watch_prints_lines_across_router_restarts_until_ctrl_c(watching):
     hub = zenoh.open(router_config([endpoint]))
     process, printed, errors = watching("--router", endpoint)
     try:
-        eventually(lambda: any("watching shore" in line for line in errors), timeout_s=30)
+        eventually(lambda: any("watching shore" in line for line in errors), timeout_s=120)
         publish_once(hub, keys.shore_image("vessel-1"), b"rubbish")
         eventually(lambda: any("expected" in line for line in errors))
         publish(hub, image(), keys.shore_image("vessel-1"))
@@ -351,11 +356,11 @@ def test_watch_prints_lines_across_router_restarts_until_ctrl_c(watching):
         hub.close()
         eventually(lambda: any("router not reached" in line for line in errors))
         hub = zenoh.open(router_config([endpoint]))
-        eventually(lambda: any("router reconnected" in line for line in errors), timeout_s=30)
+        eventually(lambda: any("router reconnected" in line for line in errors), timeout_s=120)
         publish(hub, image("ZZZZ"), keys.shore_image("vessel-1"))
         eventually(lambda: len(printed) > 3)
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=10) == 0
+        assert process.wait(timeout=120) == 0
         assert not any("Traceback" in line for line in errors)
     finally:
         hub.close()

@@ -9,7 +9,6 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
 
 import pytest
 
@@ -31,14 +30,9 @@ def whole() -> argparse.ArgumentParser:
 
 
 @pytest.fixture
-def verbosity(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def verbosity(monkeypatch: pytest.MonkeyPatch) -> None:
     """Restore what -v and -q change."""
     monkeypatch.setenv(LOG_LEVEL_VARIABLE, "info")
-    root = logging.getLogger()
-    before = root.level, root.handlers[:]
-    yield
-    root.setLevel(before[0])
-    root.handlers[:] = before[1]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -22,12 +22,18 @@ import pytest
 import zenoh
 from builders.common import eventually, free_port
 from builders.fleet import BROKEN, FLEET, Platforms, health, on_terminal, seen
+from builders.record_samples import SAMPLES
 
+from sonarpost import keys, wire
 from sonarpost.bus.session import router_config
 from sonarpost.cli.main import main
-from sonarpost.cli.status import age_text, bytes_text, is_ok, plain_text, rows_of
+from sonarpost.cli.status import age_text, as_json, bytes_text, is_ok, plain_text, rows_of, vehicle_text
 from sonarpost.config import PlatformConfig
-from sonarpost.monitoring.fleet import FleetState, ServiceStatus
+from sonarpost.messages import ReceivedStatus, VehicleRange, VehicleStatus
+from sonarpost.monitoring.fleet import MAX_VEHICLES, FleetState, FleetTracker, ServiceStatus, VehicleState
+
+RECEIVED_STATUS = SAMPLES["received-status"]
+assert isinstance(RECEIVED_STATUS, ReceivedStatus)
 
 NAMES = ("uuv_modem", "acoustic_channel", "op_modem", "decompressor")
 
@@ -255,4 +261,43 @@ def test_json_lines_on_a_pipe(router: str, platforms: Platforms, platform: Calla
         while not any(s["well"] for s in json.loads(process.stdout.readline())["services"]):
             pass
         process.send_signal(signal.SIGINT)
-        assert process.wait(10) == 0
+        assert process.wait(120) == 0
+
+
+def test_position_and_age_of_a_vehicle() -> None:
+    state = FleetState((), True, 0, (VehicleState(RECEIVED_STATUS, 65.0),))
+    line = (
+        "uuv-1: 41.52510, -70.67120 at 2016-10-12T09:00:00Z, heading 272°, speed 1.5 m/s, depth 12.2 m, altitude 3.5 m,"
+        " battery 62 %, images waiting 4, disk 12 GB, received 1 min ago by vessel-1"
+    )
+    assert line in plain_text(state, (), "tcp/x").splitlines()
+    assert any(each.startswith("uuv-1: 41.52510, -70.67120") for each in on_terminal(state))
+    measured = SAMPLES["vehicle-range"]
+    assert isinstance(measured, VehicleRange)
+    state = FleetState((), True, 0, state.vehicles, ((measured, 12.0),))
+    assert "uuv-1: 740 m from vessel-1, measured 12 s ago" in plain_text(state, (), "tcp/x").splitlines()
+    assert json.loads(as_json(state, (), "now"))["ranges"][0]["distance_m"] == 740.0
+    (vehicle,) = json.loads(as_json(state, (), "now"))["vehicles"]
+    assert (vehicle["age_s"], vehicle["status"]["lat_deg"]) == (65.0, 41.5251)
+    bare = RECEIVED_STATUS.model_copy(update={"status": VehicleStatus(vehicle_id="uuv-1", time_utc_s=0.0)})
+    assert vehicle_text(VehicleState(bare, 0.0)) == "uuv-1: no position, received 0 s ago by vessel-1"
+
+
+def test_statuses_of_vehicles_are_checked_and_limited() -> None:
+    fleet = FleetTracker()
+    key = keys.acoustic_status("vessel-1")
+    fleet.add_status(key, b"malformed", 0.0)
+    fleet.add_status(keys.acoustic_status("vessel-2"), wire.encode(RECEIVED_STATUS), 0.0)
+    for number in range(MAX_VEHICLES + 3):
+        name = f"uuv-{number}"
+        status = RECEIVED_STATUS.status.model_copy(update={"vehicle_id": name})
+        fleet.add_status(
+            key, wire.encode(RECEIVED_STATUS.model_copy(update={"vehicle_id": name, "status": status})), 1.0
+        )
+    measured = SAMPLES["vehicle-range"]
+    fleet.add_range(keys.acoustic_range("vessel-2"), wire.encode(measured), 2.0)
+    fleet.add_range(keys.acoustic_range("vessel-1"), wire.encode(measured), 2.0)
+    state = fleet.state(5.0)
+    assert state.ranges == ((measured, 3.0),)
+    assert (len(state.vehicles), state.rejected) == (MAX_VEHICLES, 6)
+    assert {one.age_s for one in state.vehicles} == {4.0}

@@ -57,7 +57,7 @@ def origins(producer: Producer) -> set[bytes]:
 
 
 def wait_until_delivered(producer: Producer) -> None:
-    eventually(lambda: producer.store.outbox_depth() == 0, timeout_s=20)
+    eventually(lambda: producer.store.outbox_depth() == 0, timeout_s=120)
 
 
 def names(prefix: str, count: int) -> tuple[str, ...]:
@@ -106,7 +106,7 @@ def test_restored_store_loses_and_doubles_nothing(
         wait_until_delivered(producer)
         expected = Counter([*names("early", 50), *names("copied", queued_in_copy), *names("late", 100)])
         expected += Counter(names("new", after_restore))
-        eventually(lambda: consumer.got.total() >= expected.total(), timeout_s=20)
+        eventually(lambda: consumer.got.total() >= expected.total(), timeout_s=120)
         assert consumer.got == expected
         assert "Store is older than its last delivery" in caplog.text
         assert "producer.db is older than its last delivery to consumer" in producer.health().detail

@@ -14,7 +14,7 @@ import msgpack
 import pytest
 from builders.common import GOLDEN_FOLDER
 from builders.paper_images import received_of
-from builders.v1_world import take_packet
+from builders.v1_world import queue_config, take_packet
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -22,7 +22,7 @@ from sonarpost.errors import FrameError
 from sonarpost.link import migration
 from sonarpost.link.auth.authentication import AuthenticationCounts, FrameAuthenticator
 from sonarpost.link.auth.key import Direction, parse_key
-from sonarpost.link.config import QueueConfig, ReceiverConfig
+from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.downlink.commands import CommandTracker
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.downlink.vessel_endpoint import VesselEndpoint
@@ -118,7 +118,7 @@ def test_paper_receiver() -> None:
 def restored_queue(case: Any, parts: dict[str, bytes]) -> TransmitQueue:
     settings = case["config"]
     queue = TransmitQueue(
-        QueueConfig(tuple(settings["rates"]), settings["first_rate"], settings["expected_loss"]), first_block=5
+        queue_config(tuple(settings["rates"]), settings["first_rate"], settings["expected_loss"]), first_block=5
     )
     converted, errors = migration.queue_parts(parts)
     assert errors == {}
@@ -184,7 +184,7 @@ def test_without_the_core_all_images_and_messages_are_sent_again(core: bytes | N
     parts["picture/2"] = msgpack.packb({"number": 2})
     converted, errors = migration.queue_parts(parts)
     assert set(errors) == {"picture/2"} | ({"core"} if core else set())
-    queue = TransmitQueue(QueueConfig(expected_loss=0.0))
+    queue = TransmitQueue(queue_config(expected_loss=0.0))
     assert queue.restore(converted) == {}
     assert queue.messages_waiting == case["messages_waiting"]
     assert {(i.image_id, i.contact_id) for i in queue.sender.waiting} == {

@@ -6,11 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from builders.v1_world import contact, take_packet
+from builders.v1_world import contact, queue_config, take_packet
 
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import BadInputError, FrameError
-from sonarpost.link.config import QueueConfig
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import PaperSender, plan_packets
@@ -23,8 +22,8 @@ from sonarpost.modem.micromodem import RATES
 
 NewSender = Callable[[], Any]
 SENDERS = {
-    "v1": lambda: TransmitQueue(QueueConfig(expected_loss=0.0, frames_per_image=20.0)),
-    "paper": lambda: PaperSender(1),
+    "v1": lambda: TransmitQueue(queue_config(expected_loss=0.0, frames_per_image=20.0)),
+    "paper": lambda: PaperSender(RATES[1]),
 }
 each_sender = pytest.mark.parametrize("new", SENDERS.values(), ids=SENDERS.keys())
 
@@ -168,7 +167,7 @@ def test_invalid_image_is_rejected(new: NewSender, wrong: dict[str, Any]) -> Non
 
 
 def test_paper_packets_are_those_of_the_plan_in_the_order_of_arrival() -> None:
-    sender, images = PaperSender(1), [image(n, 40 + 90 * n) for n in (3, 1, 2)]
+    sender, images = PaperSender(RATES[1]), [image(n, 40 + 90 * n) for n in (3, 1, 2)]
     for each in images:
         sender.add_image(each, 0.0)
     planned = [p for i in images for p in plan_packets(i.image_id, i.stream, i.contact, 3, 64)]
@@ -179,7 +178,7 @@ def test_paper_packets_are_those_of_the_plan_in_the_order_of_arrival() -> None:
 
 
 def test_an_image_of_the_paper_format_that_arrives_twice_is_sent_twice() -> None:
-    sender = PaperSender(1)
+    sender = PaperSender(RATES[1])
     for _ in range(2):
         assert sender.add_image(image(1), 0.0)
     ended: list[str] = []
@@ -189,10 +188,10 @@ def test_an_image_of_the_paper_format_that_arrives_twice_is_sent_twice() -> None
 
 
 def test_an_image_planned_for_another_rate_is_sent_from_its_beginning() -> None:
-    sender = PaperSender(1)
+    sender = PaperSender(RATES[1])
     sender.add_image(image(1, 400), 0.0)
     take_packet(sender, 0.0)
-    same, other = PaperSender(1), PaperSender(5)
+    same, other = PaperSender(RATES[1]), PaperSender(RATES[5])
     assert same.restore(sender.parts()) == other.restore(sender.parts()) == {}
     plans = {rate: plan_packets("0001", image(1, 400).stream, image(1).contact, *rate) for rate in ((3, 64), (8, 256))}
     assert same.next_packet(0.0).frames == plans[3, 64][1]
@@ -200,7 +199,7 @@ def test_an_image_planned_for_another_rate_is_sent_from_its_beginning() -> None:
 
 
 def test_the_paper_format_has_no_messages_and_no_feedback() -> None:
-    sender = PaperSender(1)
+    sender = PaperSender(RATES[1])
     assert not sender.accepts_messages
     with pytest.raises(FrameError, match="carries images only"):
         sender.add_message("m", "program", b"data", 0.0)

@@ -8,7 +8,8 @@ from builders.modem_fuzz import Fuzz, parse_alone
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, PacketFailed, PacketSent, nmea
+from sonarpost.modem.interface import PacketFailed, PacketSent
+from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, nmea
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -7,12 +7,9 @@ import itertools
 import pytest
 from builders.fake_modem import DropRule, FakeModem, drop_nothing
 
-from sonarpost.modem.micromodem import (
+from sonarpost.modem.interface import (
     CarrierSenseIgnored,
     CarrierSenseRestored,
-    FailureReason,
-    MicroModem,
-    MicroModemConfig,
     ModemReady,
     ModemRebooted,
     PacketFailed,
@@ -23,6 +20,7 @@ from sonarpost.modem.micromodem import (
     TransmissionFailing,
     TransmissionRecovered,
 )
+from sonarpost.modem.micromodem import FailureReason, MicroModem, MicroModemConfig
 
 CONFIG = MicroModemConfig(address=3)
 MARKS = {"TXP": "CATXP", "TXF": "CATXF", "XST": "CAXST"}

@@ -5,17 +5,19 @@ from builders.fake_modem import FakeModem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.modem.micromodem import (
-    FrameAcknowledged,
+from sonarpost.modem.interface import (
     FrameReceived,
-    MicroModem,
-    MicroModemConfig,
-    ModemMessageReceived,
     ModemReady,
     ModemRebooted,
     PacketReceived,
     PacketSent,
     SentenceRejected,
+)
+from sonarpost.modem.micromodem import (
+    FrameAcknowledged,
+    MicroModem,
+    MicroModemConfig,
+    ModemMessageReceived,
     StatisticsReceived,
 )
 

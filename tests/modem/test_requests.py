@@ -7,29 +7,31 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from sonarpost.errors import FrameError
-from sonarpost.modem.micromodem import (
-    RATES,
-    ClockConfirmed,
-    FailureReason,
-    FlexibleDataReceived,
+from sonarpost.modem.interface import (
     FrameReceived,
-    MicroModem,
-    MicroModemConfig,
-    MiniPacketAnswered,
-    MiniPacketReceived,
     PacketFailed,
     PacketReceived,
     PacketSent,
-    PingAnswered,
-    PingReceived,
     PollReceived,
     RequestDone,
     RequestFailed,
     SentenceRejected,
     SettingUnconfirmed,
-    StatisticsReceived,
     TransmissionEnded,
     TransmissionStarted,
+)
+from sonarpost.modem.micromodem import (
+    RATES,
+    ClockConfirmed,
+    FailureReason,
+    FlexibleDataReceived,
+    MicroModem,
+    MicroModemConfig,
+    MiniPacketAnswered,
+    MiniPacketReceived,
+    PingAnswered,
+    PingReceived,
+    StatisticsReceived,
     nmea,
 )
 

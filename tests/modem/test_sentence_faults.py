@@ -11,20 +11,16 @@ from collections.abc import Callable
 import pytest
 from builders.two_drivers import Fault, TwoDrivers, corrupt, drop, duplicate, kinds_of, truncate
 
-from sonarpost.modem.micromodem import (
-    RATES,
-    FlexibleDataReceived,
+from sonarpost.modem.interface import (
     FrameReceived,
-    MiniPacketReceived,
     ModemReady,
     PacketFailed,
     PacketReceived,
     PacketSent,
-    PingAnswered,
     RequestDone,
     RequestFailed,
-    nmea,
 )
+from sonarpost.modem.micromodem import RATES, FlexibleDataReceived, MiniPacketReceived, PingAnswered, nmea
 from sonarpost.simulation.channel.parameters import ChannelParameters
 
 READY_S = 30.0

@@ -5,11 +5,7 @@ import pytest
 from builders.fake_modem import FakeModem, drop_nth
 
 from sonarpost.errors import ConfigError
-from sonarpost.modem.micromodem import (
-    ClockConfirmed,
-    FailureReason,
-    MicroModem,
-    MicroModemConfig,
+from sonarpost.modem.interface import (
     ModemReady,
     ModemRebooted,
     ModemUnresponsive,
@@ -17,8 +13,8 @@ from sonarpost.modem.micromodem import (
     PacketSent,
     SentenceRejected,
     SettingUnconfirmed,
-    UnhandledSentence,
 )
+from sonarpost.modem.micromodem import ClockConfirmed, FailureReason, MicroModem, MicroModemConfig, UnhandledSentence
 from sonarpost.modem.micromodem.supervisor import Phase
 
 CONFIG = MicroModemConfig(address=3)

@@ -4,12 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
-from sonarpost.modem.micromodem import (
-    RATES,
-    FailureReason,
-    FrameAcknowledged,
-    MicroModem,
-    MicroModemConfig,
+from sonarpost.modem.interface import (
     ModemError,
     ModemReady,
     ModemRebooted,
@@ -19,6 +14,14 @@ from sonarpost.modem.micromodem import (
     SentenceRejected,
     TransmissionEnded,
     TransmissionStarted,
+)
+from sonarpost.modem.micromodem import (
+    RATES,
+    FailureReason,
+    FrameAcknowledged,
+    MicroModem,
+    MicroModemConfig,
+    MicroModemPacketSent,
     UnhandledSentence,
     nmea,
 )
@@ -309,7 +312,7 @@ def test_invalid_statistics_end_the_cycle() -> None:
     send(modem, FIRST)
     modem.schedule(3.6, lambda: modem.send("CAXST", "seven", "", ""))
     modem.run(9.0)
-    assert [type(event) for event in modem.events] == [SentenceRejected, PacketSent]
+    assert [type(event) for event in modem.events] == [SentenceRejected, MicroModemPacketSent]
     assert modem.events[1].statistics is None
 
 

@@ -158,7 +158,7 @@ def test_command_reports_a_running_service_as_healthy(
     service = Idle(platform("vessel-1"), ServiceConfig())
     assert service.start()
     try:
-        eventually(path.exists, 10, "a heartbeat")
+        eventually(path.exists, 120, "a heartbeat")
         done = subprocess.run(
             [sys.executable, "-m", "sonarpost.monitoring.healthcheck"],
             env={**os.environ, heartbeat.VARIABLE: str(path)},

@@ -107,7 +107,7 @@ def exporter(router: str) -> Iterator[str]:
 
 def scrape(url: str) -> Samples:
     try:
-        with urllib.request.urlopen(url, timeout=5) as reply:
+        with urllib.request.urlopen(url, timeout=120) as reply:
             return samples(reply.read().decode())
     except OSError:  # not started yet
         return {}
@@ -135,7 +135,7 @@ def test_port_in_use_is_reported_in_one_line(exporter: str, router: str) -> None
     eventually(lambda: scrape(exporter) != {})
     port = exporter.rpartition(":")[2].removesuffix("/metrics")
     command = [sys.executable, "-m", "sonarpost.cli.main", "metrics", "--router", router, "--port", port]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=400, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith(f"sonarpost: 127.0.0.1:{port}: ")
     assert done.stderr.count("\n") == 1

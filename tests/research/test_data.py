@@ -105,7 +105,7 @@ def test_command_without_its_data_says_where_to_get_it(command: str, tmp_path: P
         [sys.executable, "-m", f"research.{arguments[0]}", *arguments[1:]],
         capture_output=True,
         text=True,
-        timeout=200,
+        timeout=400,
         check=False,
         cwd=REPOSITORY,
     )

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.signal import fftconvolve
 
-from sonarpost.review.image_matching import place_in_wider
+from sonarpost.review.image_matching import _convolve_valid, place_in_wider
 
 
 def seabed(seed=0):
@@ -39,3 +40,10 @@ def test_images_that_do_not_fit_are_not_found(shape):
 
 def test_image_without_contrast_is_not_found():
     assert place_in_wider(np.full((80, 140), 7, np.uint8), reduced(seabed())) is None
+
+
+@pytest.mark.parametrize(("scene", "kernel"), [((80, 140), (17, 33)), ((31, 31), (31, 31)), ((64, 50), (1, 7))])
+def test_convolution_is_that_of_scipy_signal(scene, kernel):
+    rng = np.random.default_rng(1)
+    first, second = rng.normal(size=scene), rng.normal(size=kernel)
+    np.testing.assert_allclose(_convolve_valid(first, second), fftconvolve(first, second, mode="valid"), atol=1e-12)

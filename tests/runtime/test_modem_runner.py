@@ -5,27 +5,27 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
 from sonarpost.errors import FrameError, PortError
-from sonarpost.modem.micromodem import (
-    ClockConfirmed,
-    FailureReason,
-    FlexibleDataReceived,
+from sonarpost.modem.interface import (
     FrameReceived,
-    MicroModem,
-    MicroModemConfig,
-    MiniPacketReceived,
     ModemEvent,
     ModemReady,
     PacketFailed,
     PacketReceived,
     PacketSent,
-    PingAnswered,
     RequestDone,
+)
+from sonarpost.modem.micromodem import (
+    FailureReason,
+    FlexibleDataReceived,
+    MicroModem,
+    MicroModemConfig,
+    MiniPacketReceived,
+    PingAnswered,
     nmea,
 )
 from sonarpost.runtime.modem_runner import ModemRunner
@@ -112,7 +112,7 @@ class Rig:
         return [event for event in self.events if isinstance(event, kinds)]
 
 
-def eventually(condition: Callable[[], object], timeout_s: float = 10.0) -> None:
+def eventually(condition: Callable[[], object], timeout_s: float = 120.0) -> None:
     end_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end_s, "condition not met in time"
@@ -143,13 +143,6 @@ def test_the_runner_configures_sends_and_receives(rig: Rig) -> None:
     rig.modem.write("CACST", 8, 0)
     eventually(lambda: rig.of(PacketReceived))
     assert [event.data for event in rig.of(FrameReceived)] == [b"\x00\xff"]
-
-
-def test_the_clock_is_set_through_the_runner(rig: Rig) -> None:
-    eventually(lambda: rig.runner.ready)
-    utc = datetime(2016, 10, 12, 9, 0, 5, tzinfo=UTC)
-    assert rig.runner.set_clock(utc)
-    eventually(lambda: rig.of(ClockConfirmed))
 
 
 def test_an_invalid_packet_raises_in_the_caller(rig: Rig) -> None:
@@ -279,7 +272,7 @@ def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path: Path) -> Non
             runners[1].request(lambda driver, now: driver.send_flexible(2, 1, b"flexible", now)),
             runners[1].request_packet(2, 1),
         ]
-        eventually(lambda: len([e for e in events[1] if isinstance(e, RequestDone)]) == len(requests), 20.0)
+        eventually(lambda: len([e for e in events[1] if isinstance(e, RequestDone)]) == len(requests), 120)
         assert [e.request_id for e in events[1] if isinstance(e, RequestDone)] == requests
         assert [e.travel_s for e in events[1] if isinstance(e, PingAnswered)] == [0.1]
         assert [e.data for e in events[1] if isinstance(e, FrameReceived)] == [b"polled"]

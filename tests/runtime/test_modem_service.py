@@ -10,7 +10,8 @@ import pytest
 from builders.fake_modem import FakeModem
 
 from sonarpost.messages import Record
-from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, ModemEvent, SentenceRejected
+from sonarpost.modem.interface import ModemEvent, SentenceRejected
+from sonarpost.modem.micromodem import MicroModem, MicroModemConfig
 from sonarpost.runtime.modem_service import ModemService, ModemServiceConfig
 from sonarpost.runtime.service import UnitOfWork
 

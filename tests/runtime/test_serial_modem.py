@@ -36,7 +36,7 @@ def test_a_packet_is_sent_and_received(ports: dict[int, str]) -> None:
         assert vehicle.is_ready
         sent = vehicle.send([b"first", b"second"], destination=1, rate=1)
         assert (sent.dest, sent.rate, sent.frames) == (1, 1, (b"first", b"second"))
-        packet = vessel.receive(timeout_s=30)
+        packet = vessel.receive(timeout_s=120)
         assert packet is not None
         assert (packet.src, [frame.data for frame in packet.frames]) == (3, [b"first", b"second"])
         assert vessel.receive(timeout_s=0.05) is None
@@ -107,5 +107,5 @@ def test_close_ends_send_and_receive_in_other_threads(ports: dict[int, str]) -> 
             time.sleep(0.001)
         modem.close()
         with pytest.raises(TransmissionError, match="not sent"):
-            sending.result(timeout=5.0)
-        assert receiving.result(timeout=5.0) is None
+            sending.result(timeout=120)
+        assert receiving.result(timeout=120) is None

@@ -37,6 +37,7 @@ ON_VESSEL = (
     keys.advice(VESSEL),
     keys.acoustic_image(VESSEL),
     keys.message_received(VESSEL),
+    keys.vessel_frames(VESSEL, "vessel-2"),
 )
 ON_VEHICLE = (
     keys.contact_detected(VEHICLE),
@@ -160,7 +161,7 @@ def test_only_granted_records_are_accepted_and_no_peer_blocks_another(
     consumers, producers = sites
     for producer in producers.values():
         producer.send(3)
-    eventually(lambda: all(p.is_done() for p in producers.values()), timeout_s=30, what="the first records")
+    eventually(lambda: all(p.is_done() for p in producers.values()), timeout_s=120, what="the first records")
     origins = [producer.origin for producer in producers.values()]
     doors = {"shore": world.shore_tls, "vessel": world.vessel_tls}
     for who in CERTIFICATES:
@@ -170,7 +171,7 @@ def test_only_granted_records_are_accepted_and_no_peer_blocks_another(
                 attack(session, who, door, origins)  # again: routes are known now
     for producer in producers.values():
         producer.send(RECORDS)
-    eventually(lambda: all(p.is_done() for p in producers.values()), timeout_s=60, what="all records acknowledged")
+    eventually(lambda: all(p.is_done() for p in producers.values()), timeout_s=120, what="all records acknowledged")
 
     received = consumers["c2"].received() + consumers["relay"].received()
     sent = sum((p.sent for p in producers.values()), Counter())

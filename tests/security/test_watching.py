@@ -40,4 +40,4 @@ def test_observer_sees_both_sides_of_the_radio_link(world: Any, capsys: pytest.C
             ("shore-1", "c2", "ok"),
         } <= {(s["platform"], s["service"], s["status"]) for s in services}
 
-    eventually(shows_both, timeout_s=30.0, what="both sides")
+    eventually(shows_both, timeout_s=120, what="both sides")

@@ -72,7 +72,7 @@ class Subscriber:
             self._lines.put(line)
 
     def next(self) -> tuple[str, dict[str, Any]]:
-        key, value = self._lines.get(timeout=15).split()
+        key, value = self._lines.get(timeout=120).split()
         return key, msgpack.unpackb(base64.b64decode(value))
 
     def until(self, key: str) -> dict[str, Any]:
@@ -87,7 +87,7 @@ class Subscriber:
         for process in self._processes:
             process.terminate()
         for process in self._processes:
-            process.communicate(timeout=10)
+            process.communicate(timeout=120)
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ def put(router: str, key: str, payload: bytes) -> None:
         command(router, "put", "-k", key, "-v", value, "--encoder", "base64"),
         capture_output=True,
         text=True,
-        timeout=20,
+        timeout=400,
         check=False,
     )
     assert done.returncode == 0, done.stderr

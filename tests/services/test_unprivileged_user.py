@@ -16,7 +16,7 @@ from builders.installation import NOBODY, Installation, installation
 from builders.record_samples import SAMPLES
 
 from sonarpost import keys
-from sonarpost.messages import EncodedImage, ReceivedImage, ReconstructedImage
+from sonarpost.messages import CodedImage, EncodedImage, ReceivedImage
 from sonarpost.sonar.image_files import write_png
 
 __all__ = ["installation"]
@@ -106,7 +106,7 @@ def test_the_shipped_services_encode_and_decode_and_store_machine_code_in_the_st
     state = run_service("uuv", "compressor")
     runner.peer("uuv-1", "atd_stub").send(keys.contact_detected("uuv-1"), "compressor", snippet("c1"))
     eventually(lambda: modem.received, 300, what=f"an image; see {tmp_path / 'compressor.log'}")
-    relay = runner.peer("vessel-1", "relay", {keys.image_reconstructed("vessel-1"): ReconstructedImage})
+    relay = runner.peer("vessel-1", "relay", {keys.image_coded("vessel-1"): CodedImage})
     run_service("vessel", "decompressor")
     coded = modem.received[0]
     length = len(coded.stream)

@@ -50,6 +50,12 @@ def test_no_altitude_without_first_return():
     assert track_bottom(dataclasses.replace(survey_of(synthetic_echo(np.full(3, 5.0))), pings=())).shape == (0,)
 
 
+@pytest.mark.parametrize("range_m", [0.2, 0.4001, 0.41, 0.5])
+def test_range_of_the_ringing_alone_has_no_altitude(range_m):
+    tracked = track_bottom(survey_of(np.full((60, 12), 80, np.uint8), range_m))
+    assert np.isnan(tracked).all()
+
+
 def test_long_gap_is_not_interpolated():
     rows = synthetic_echo(np.full(200, 7.0))
     rows[60:140] = 0

@@ -123,3 +123,19 @@ def test_humminbird_recording(data_dir):
     depth_m = np.array([ping.altitude_m for ping in sounder])
     assert np.median(np.abs(altitude_m[:2250] - depth_m[:2250])) < 0.4
     assert np.median(np.abs(altitude_m[2600:] - depth_m[2600:])) > 1
+
+
+@pytest.mark.parametrize("size_bytes", [96, 100])
+def test_date_of_a_solix_recording_is_little_endian(tmp_path, small_survey, size_bytes):
+    path = make_humminbird(small_survey(), tmp_path)
+    whole = read_survey(path)
+    dat = bytearray(size_bytes)
+    struct.pack_into("<I", dat, 20, 1_600_000_000)
+    path.write_bytes(dat)
+    survey = read_survey(path)
+    assert survey.pings[0].time_utc_s == pytest.approx(whole.pings[0].time_utc_s % 1 + 1_600_000_000)
+    for value in (0, 5, 2**32 - 1):
+        struct.pack_into("<I", dat, 20, value)
+        path.write_bytes(dat)
+        with pytest.raises(SurveyFileError, match="time"):
+            read_survey(path)

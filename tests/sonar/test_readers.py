@@ -15,7 +15,7 @@ from sonarpost.sonar.options import load_options
 from sonarpost.sonar.readers import (
     open_survey,
     read_survey,
-    single_file_suffixes,
+    recording_parts,
     supported_suffixes,
 )
 from sonarpost.sonar.source import InMemorySource
@@ -24,14 +24,15 @@ from sonarpost.sonar.xtf_writer import write_xtf
 
 @pytest.fixture
 def plug_in(monkeypatch, small_survey):
-    """Register a reader of `.jsf` and a broken one of `.sdf`, like an installed package."""
+    """Register a reader of `.abc` and a broken one of `.bad`, like an installed package."""
     module = types.ModuleType("plug_in_sonar")
-    module.open_jsf = lambda path, options: InMemorySource(small_survey(), options)
+    module.open_abc = lambda path, options: InMemorySource(small_survey(), options)
+    module.open_abc.parts = lambda path: (path, path.with_suffix(".idx"))
     module.not_callable = 7
     monkeypatch.setitem(sys.modules, "plug_in_sonar", module)
     points = [
-        importlib.metadata.EntryPoint("jsf", "plug_in_sonar:open_jsf", readers.ENTRY_POINTS),
-        importlib.metadata.EntryPoint("sdf", "absent_package:open", readers.ENTRY_POINTS),
+        importlib.metadata.EntryPoint("abc", "plug_in_sonar:open_abc", readers.ENTRY_POINTS),
+        importlib.metadata.EntryPoint("bad", "absent_package:open", readers.ENTRY_POINTS),
         importlib.metadata.EntryPoint("odd", "plug_in_sonar:not_callable", readers.ENTRY_POINTS),
         importlib.metadata.EntryPoint("xtf", "absent_package:open", readers.ENTRY_POINTS),
     ]
@@ -43,11 +44,12 @@ def plug_in(monkeypatch, small_survey):
 
 @pytest.mark.usefixtures("plug_in")
 def test_plug_in_reader_opens_its_suffix(tmp_path, small_survey):
-    assert {".jsf", ".sdf", ".xtf"} <= set(supported_suffixes())
-    assert set(supported_suffixes()) - set(single_file_suffixes()) == {".dat", ".waterfall.toml"}
-    assert len(read_survey(tmp_path / "line.JSF").pings) == 5
-    with pytest.raises(SurveyFileError, match=r"survey reader sdf: got .absent_package:open: ModuleNotFoundError"):
-        open_survey(tmp_path / "line.sdf")
+    assert {".abc", ".bad", ".xtf"} <= set(supported_suffixes())
+    assert recording_parts(tmp_path / "line.abc") == (tmp_path / "line.abc", tmp_path / "line.idx")
+    assert recording_parts(tmp_path / "line.xtf") == (tmp_path / "line.xtf",)
+    assert len(read_survey(tmp_path / "line.ABC").pings) == 5
+    with pytest.raises(SurveyFileError, match=r"survey reader bad: got .absent_package:open: ModuleNotFoundError"):
+        open_survey(tmp_path / "line.bad")
     with pytest.raises(SurveyFileError, match="a callable"):
         open_survey(tmp_path / "line.odd")
     # Readers of this package are not replaced.
@@ -57,9 +59,9 @@ def test_plug_in_reader_opens_its_suffix(tmp_path, small_survey):
 def test_reader_registry(small_survey, tmp_path):
     write_xtf(small_survey(), tmp_path / "A.XTF")
     assert len(read_survey(tmp_path / "A.XTF").pings) == 5
-    assert single_file_suffixes() == (".xtf",)
-    with pytest.raises(SurveyFileError, match=r"suffix: got '.jsf', expected .*\.xtf"):
-        read_survey(tmp_path / "a.jsf")
+    assert supported_suffixes() == (".dat", ".jsf", ".sdf", ".sl2", ".sl3", ".svlog", ".waterfall.toml", ".xtf")
+    with pytest.raises(SurveyFileError, match=r"suffix: got '.abc', expected .*\.xtf"):
+        read_survey(tmp_path / "a.abc")
 
 
 def test_options_are_read_from_file(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import struct
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from pyproj import Transformer
 from pyxtf import XTFPingHeader
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.geometry import Position, offset_between_m
+from sonarpost.sonar.geometry import Position, offset_between_m, slant_to_ground_range_m
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Side
@@ -31,6 +32,7 @@ CHAN_INFO = 256
 CHANNEL = HEADER + 256
 CHANNEL_BYTES = 64 + 40
 WEIGHT, TIME_DELAY = 58, 12
+ALTITUDE = XTFPingHeader.SensorPrimaryAltitude.offset
 CUT = "the file ends inside its last packet, as after a power failure: {} bytes are left out"
 
 
@@ -98,6 +100,78 @@ def test_cut_of_other_packets_and_of_longer_ones(tmp_path, raw):
     assert len(read(tmp_path, body[:-1]).pings) == 4
 
 
+def with_samples(survey, *pings):
+    """Return the survey with these samples on both sides."""
+    channels = [tuple(ChannelPing(side, samples, 25.0) for side in Side) for samples in pings]
+    changed = (replace(ping, channels=each) for ping, each in zip(survey.pings, channels, strict=False))
+    return replace(survey, pings=tuple(changed))
+
+
+def test_float_samples_are_kept(tmp_path, small_survey):
+    samples = np.array([0.0, 0.25, 1e-9, 3e7], np.float32)
+    path = tmp_path / "line.xtf"
+    write_xtf(with_samples(small_survey(), samples, samples), path)
+    survey = read_survey(path)
+    assert survey.warnings == ()
+    for ping in survey:
+        for side in Side:
+            assert ping.channel(side).samples.dtype == np.float32
+            np.testing.assert_array_equal(ping.channel(side).echo(), samples)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, -float("inf"), 1e30])
+def test_impossible_float_samples_become_zero(tmp_path, small_survey, value):
+    samples = np.array([1.0, value, 2.0], np.float32)
+    path = tmp_path / "line.xtf"
+    write_xtf(with_samples(small_survey(), samples), path)
+    survey = read_survey(path)
+    assert [c.samples.tolist() for c in survey.pings[0].channels] == [[1.0, 0.0, 2.0]] * 2
+    assert survey.warnings == ("samples that are negative, not finite or above 1e+12 are read as 0 (2 times)",)
+
+
+def as_ground_range(raw: bytearray) -> bytearray:
+    for number in range(2):
+        put(raw, CHAN_INFO + 128 * number + 2, "H", 2)
+    return raw
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_ground_range_samples_are_at_their_ground_range(tmp_path, raw, stated):
+    """Every sample of the bottom keeps the ground range at which the recorder stored it."""
+    altitude_m, range_m = 6.25, 25.0
+    ground_m = float(np.sqrt(range_m**2 - altitude_m**2))
+    plain = read(tmp_path, raw)
+    if stated:
+        for row in range(5):
+            for number in range(2):
+                put(raw, HEADER + row * PACKET + 256 + number * CHANNEL_BYTES + 8, "f", ground_m)
+    survey = read(tmp_path, as_ground_range(raw))
+    assert "ground-range samples converted to slant range with the altitude (10 times)" in survey.warnings
+    for ping, before in zip(survey, plain, strict=True):
+        for side in Side:
+            channel, stored = ping.channel(side), before.channel(side).samples
+            assert channel.slant_range_m == pytest.approx(range_m, rel=1e-5)
+            for sample in range(40):
+                here_m = slant_to_ground_range_m((sample + 0.5) * channel.sample_spacing_m, altitude_m)
+                want = 0 if np.isnan(here_m) else stored[int(here_m / (ground_m / 40))]
+                assert channel.samples[sample] == want
+
+
+@pytest.mark.parametrize("altitude", [0.0, float("nan"), -3.0, 30.0])
+def test_ground_range_without_altitude_is_skipped(tmp_path, raw, altitude):
+    as_ground_range(raw)
+    put(raw, HEADER + ALTITUDE, "f", altitude)
+    survey = read(tmp_path, raw)
+    assert [len(p.channels) for p in survey] == [0, 2, 2, 2, 2]
+    assert "skipped port channel: ground-range samples without a plausible altitude (1 times)" in survey.warnings
+
+
+@pytest.mark.realdata
+def test_recording_of_a_multibeam_alone_is_refused(data_dir):
+    with pytest.raises(SurveyFileError, match=r"got '0 sonar, 1 other'.*multibeam alone are not read"):
+        read_survey(data_dir / "surveys" / "negative" / "multibeam-only-r2sonic.xtf")
+
+
 @pytest.mark.realdata
 def test_recording_without_its_last_658_bytes(data_dir, tmp_path):
     content = (data_dir / "surveys" / "scotsman-iver2.xtf").read_bytes()
@@ -133,7 +207,7 @@ def test_other_file_format_is_rejected(tmp_path):
         (CHAN_INFO + 6, "H", 3, "BytesPerSample"),
         (CHAN_INFO + 6, "H", 0, "BytesPerSample"),
         (CHAN_INFO + 74, "B", 5, "SampleFormat"),
-        (CHAN_INFO + 2, "H", 2, "CorrectionFlags"),
+        (CHAN_INFO + 74, "B", 1, "SampleFormat"),
     ],
 )
 def test_error_names_invalid_field(tmp_path, raw, offset, fmt, value, field):

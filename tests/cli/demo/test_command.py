@@ -25,8 +25,10 @@ def test_a_foreign_output_folder_is_refused_before_the_survey_is_simulated(
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("line.jsf", "line.jsf: suffix: got '.jsf', expected one of .xtf"),
-        ("line.DAT", "line.DAT: suffix: got '.DAT', expected one of .xtf"),
+        ("line.abc", "line.abc: suffix: got '.abc', expected one of .dat, .jsf, .sdf, .sl2, .sl3, .svlog"),
+        ("line.sdf", "line.sdf: page at byte 0, marker: got '74686973', expected ffffffff"),
+        ("line.jsf", "line.jsf: message at byte 0, marker: got '7468', expected 0116"),
+        ("line.DAT", "line.DAT: first byte: got '0x74', expected 0xc1 or 0xc3"),
         ("line.xtf", "line.xtf: FileFormat: got '0x74', expected 0x7b"),
         ("absent.xtf", "absent.xtf: got 'no such file or folder'"),
     ],

@@ -165,7 +165,7 @@ def analyze(root: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     # The colon at the end adds systemd's own folders, for targets such as multi-user.target.
     environment = {**os.environ, "SYSTEMD_UNIT_PATH": f"{units(root)}:", "SYSTEMD_COLORS": "0"}
     return subprocess.run(
-        ["systemd-analyze", *arguments], env=environment, capture_output=True, text=True, timeout=120, check=False
+        ["systemd-analyze", *arguments], env=environment, capture_output=True, text=True, timeout=400, check=False
     )
 
 

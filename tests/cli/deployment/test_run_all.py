@@ -43,7 +43,7 @@ class RunAll:
         return (self.folder / "log").read_text()
 
     def wait_for(self, text: str, count: int = 1) -> None:
-        eventually(lambda: self.log.count(text) >= count, 90, f"{text!r} in {self.folder}/log")
+        eventually(lambda: self.log.count(text) >= count, 120, f"{text!r} in {self.folder}/log")
 
     def child(self, module: str) -> int:
         """Return the process identifier of a module."""

@@ -236,7 +236,7 @@ def test_command_serves_until_a_signal(file, tmp_path):
         with urllib.request.urlopen(f"{address}info") as answer:
             assert b'"pings":200' in answer.read()
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=60)
+        process.communicate(timeout=120)
     finally:
         process.kill()
         process.communicate()

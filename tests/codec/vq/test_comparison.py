@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import subspace_angles
 
 from sonarpost.codec.vq.comparison import compare, principal_angles_deg
 from sonarpost.codec.vq.tiles import TileDatabase
@@ -70,3 +71,13 @@ def test_variance_fraction_of_a_basis() -> None:
 def test_other_tile_sizes_are_rejected() -> None:
     with pytest.raises(CodebookError, match="tile_px"):
         compare(database(0), database(0, tile_px=9))
+
+
+def test_principal_angles_are_those_of_scipy() -> None:
+    rng = np.random.default_rng(5)
+    for rows, other_rows in ((3, 3), (2, 5), (6, 4)):
+        first = rng.integers(-3000, 3000, (rows, 16)).astype(np.int16)
+        second = rng.integers(-3000, 3000, (other_rows, 16)).astype(np.int16)
+        second[0] = first[0]
+        expected = np.degrees(subspace_angles(first.T.astype(float), second.T.astype(float)))
+        assert principal_angles_deg(first, second) == pytest.approx(expected, abs=1e-6)

@@ -82,7 +82,7 @@ def test_frame_of_another_sender_key_or_setting_is_forged() -> None:
     own = FrameAuthenticator(key("fleet"), VEHICLE, Direction.TO_VEHICLE)
     own.grant(10)
     assert rejected_field(own, own.protect(COVERED)) == "tag"  # its own frame, returned
-    for source in (-1, 128, 2**40):
+    for source in (-1, 256, 2**40):
         assert rejected_field(vessel, protected, source) == "tag"
     for short in (b"", b"\x80", protected[: vessel.overhead_bytes]):
         assert rejected_field(vessel, short) == "tag"
@@ -209,7 +209,7 @@ def test_restored_sender_continues_after_its_reservation() -> None:
         ("authentication", {"counts": {"protected": -1}}),
         ("window/3", {"format version": None}),
         ("window/3", {"window": None}),
-        ("window/3", {"source": 128}),
+        ("window/3", {"source": 256}),
         ("window/3", {"window": {"newest": -1, "seen": 0}}),
         ("window/3", {"window": {"newest": 2**20, "seen": 0}}),
         ("window/3", {"window": {"newest": 5, "seen": bytes(8)}}),
@@ -246,7 +246,7 @@ def test_a_limit_beyond_the_lifetime_leaves_no_counter() -> None:
 
 def test_forged_frames_use_no_memory() -> None:
     vessel = vessel_authenticator(AuthenticationSettings(2))
-    for source in range(128):
+    for source in range(256):
         assert rejected_field(vessel, COVERED + b"\0\0fake", source) == "tag"
     assert group(vessel.parts(), "window") == {}
     window = ReplayWindow()
@@ -259,7 +259,7 @@ def test_forged_frames_use_no_memory() -> None:
 def test_settings_out_of_range_are_rejected(wrong: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         AuthenticationSettings(**wrong)  # type: ignore[arg-type]
-    for address, first in ((-1, 0), (128, 0), (1, -1), (1, 2**20 + 1)):
+    for address, first in ((-1, 0), (256, 0), (1, -1), (1, 2**20 + 1)):
         with pytest.raises(ConfigError, match="acoustic authentication"):
             FrameAuthenticator(key("fleet"), address, Direction.FROM_VEHICLE, first_counter=first)
 

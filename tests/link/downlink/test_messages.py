@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from sonarpost.codec.region import RegionBox
 from sonarpost.errors import FrameError
 from sonarpost.link.downlink import messages as dl
+from sonarpost.link.downlink.status_message import StatusMessage
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments, parse_frame
 
 GOLDEN = GOLDEN_FOLDER / "acoustic-v1" / "messages.json"
@@ -32,6 +33,33 @@ SAMPLES: dict[str, dl.Content] = {
     "region-corner": dl.RegionMessage(1, 0, 65535, RegionBox(31, 31, 32, 32), 65535),
     "prioritise-first": dl.PrioritiseMessage(0x0A0B0C10, 1_790_000_007, 7, "first"),
     "prioritise-last": dl.PrioritiseMessage(0x0A0B0C11, 1_790_000_008, 8, "last"),
+    "status": StatusMessage(
+        time_utc_s=1_790_000_009,
+        lat_deg=41.5251234,
+        lon_deg=-70.6712345,
+        heading_deg=271.5,
+        speed_mps=-1.5,
+        depth_m=12.4,
+        altitude_m=3.5,
+        swath_m=76.0,
+        battery=0.63,
+        images_waiting=4,
+        disk_free_bytes=11_585_237_503,
+    ),
+    "status-unknown": StatusMessage(time_utc_s=0),
+    "status-limits": StatusMessage(
+        time_utc_s=2**32 - 1,
+        lat_deg=-90.0,
+        lon_deg=180.0,
+        heading_deg=358.5,
+        speed_mps=12.7,
+        depth_m=13106.8,
+        altitude_m=127.0,
+        swath_m=508.0,
+        battery=1.0,
+        images_waiting=254,
+        disk_free_bytes=0,
+    ),
     "data": dl.DataMessage(b"\x00status"),
 }
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from builders.link_state import group, with_fields
-from builders.v1_world import take_packet
+from builders.v1_world import queue_config, take_packet
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonarpost.errors import ConfigError
-from sonarpost.link.config import QueueConfig
 from sonarpost.link.downlink.messages import image_of_number, number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.receiver import V1Receiver
@@ -63,7 +62,7 @@ def messages(events) -> list[bytes]:
 
 
 def test_all_contacts_precede_detail():
-    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0)), 120)
+    queue = filled(TransmitQueue(queue_config(expected_loss=0.0)), 120)
     receiver, now, first = V1Receiver(), 0.0, None
     seen: set[str] = set()
     while len(seen) < 120:
@@ -79,7 +78,7 @@ def test_all_contacts_precede_detail():
 
 
 def test_urgent_message_waits_for_one_packet_at_most():
-    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0)), 20)
+    queue = filled(TransmitQueue(queue_config(expected_loss=0.0)), 20)
     for n in range(200):
         queue.add_message(f"m{n}", "status", b"%4d" % n * 10, 0.0, priority=5)
     run(queue, 30.0)
@@ -90,7 +89,7 @@ def test_urgent_message_waits_for_one_packet_at_most():
 
 
 def test_programs_of_one_priority_share_the_airtime():
-    queue = TransmitQueue(QueueConfig(expected_loss=0.0))
+    queue = TransmitQueue(queue_config(expected_loss=0.0))
     for n in range(600):
         queue.add_message(f"m{n}", "chatty", b"C" * 50, 0.0, priority=4, lifetime_s=1e5)
     for n in range(40):
@@ -104,7 +103,7 @@ def test_programs_of_one_priority_share_the_airtime():
 
 
 def test_images_keep_their_share_among_many_messages():
-    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0, image_airtime_share=0.25)), 4)
+    queue = filled(TransmitQueue(queue_config(expected_loss=0.0, image_airtime_share=0.25)), 4)
     for n in range(1500):
         queue.add_message(f"m{n}", "flood", b"F" * 55, 0.0, priority=1, lifetime_s=1e5)
     receiver, now, image_frames, frames = V1Receiver(), 0.0, 0, 0
@@ -119,7 +118,7 @@ def test_images_keep_their_share_among_many_messages():
 
 def test_filler_message_is_sent_after_aging():
     def frames_until_it_goes(priority: int) -> float:
-        queue = TransmitQueue(QueueConfig(expected_loss=0.0, aging_s=600.0))
+        queue = TransmitQueue(queue_config(expected_loss=0.0, aging_s=600.0))
         queue.add_message("log", "logger", b"L" * 55, 0.0, priority=priority, lifetime_s=1e6)
         now, n = 0.0, 0
         receiver = V1Receiver()
@@ -137,7 +136,7 @@ def test_filler_message_is_sent_after_aging():
 
 
 def test_expired_message_is_counted_and_not_sent():
-    queue = TransmitQueue(QueueConfig())
+    queue = TransmitQueue(queue_config())
     queue.add_message("old", "s", b"old", 0.0, lifetime_s=10.0)
     assert not queue.add_message("older", "s", b"older", 0.0, lifetime_s=-1.0)
     queue.add_message("new", "s", b"new", 0.0, lifetime_s=100.0)
@@ -148,7 +147,7 @@ def test_expired_message_is_counted_and_not_sent():
 
 
 def test_message_identifier_is_unique_per_program():
-    queue = TransmitQueue(QueueConfig(expected_loss=0.0))
+    queue = TransmitQueue(queue_config(expected_loss=0.0))
     assert queue.add_message("1", "a", b"one", 0.0)
     assert not queue.add_message("1", "a", b"one", 0.0)
     assert queue.add_message("1", "b", b"two", 0.0)
@@ -158,7 +157,7 @@ def test_message_identifier_is_unique_per_program():
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.5])
 def test_feedback_delivers_everything_at_any_loss(share):
-    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.3)), 12)
+    queue = filled(TransmitQueue(queue_config(expected_loss=0.3)), 12)
     for n in range(60):
         queue.add_message(f"m{n}", "s", b"%3d" % n * 5, 0.0, priority=4, lifetime_s=1e5)
     receiver = V1Receiver()
@@ -171,7 +170,7 @@ def test_feedback_delivers_everything_at_any_loss(share):
 
 
 def test_queue_continues_when_feedback_stops():
-    queue = filled(TransmitQueue(QueueConfig(rates=(0, 1), first_rate=1, feedback_memory_s=300.0)), 30)
+    queue = filled(TransmitQueue(queue_config(rates=(0, 1), first_rate=1, feedback_memory_s=300.0)), 30)
     receiver = V1Receiver()
     _, now = run(queue, 300.0, receiver=receiver, feedback=True)
     assert queue.sender.config.feedback
@@ -184,7 +183,7 @@ def test_queue_continues_when_feedback_stops():
 
 
 def test_rate_follows_the_loss():
-    queue = filled(TransmitQueue(QueueConfig(rates=(1, 5), first_rate=5, stream_bytes=4000)), 0)
+    queue = filled(TransmitQueue(queue_config(rates=(1, 5), first_rate=5, stream_bytes=4000)), 0)
     receiver, now = V1Receiver(), 0.0
     rates = []
     lost = {1: losses(0.05), 5: losses(0.97)}
@@ -203,7 +202,7 @@ def test_rate_follows_the_loss():
 
 
 def test_expected_times_match_the_transmission():
-    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.2)), 10)
+    queue = filled(TransmitQueue(queue_config(expected_loss=0.2)), 10)
     queue.next_packet(0.0)
     expected = {e.image_id: e for e in queue.expected(0.0)}
     assert set(expected) == {image_of_number(n) for n in range(1, 11)}
@@ -231,7 +230,7 @@ def copy_of(queue: TransmitQueue, protection=None) -> TransmitQueue:
 @settings(max_examples=25)
 @given(st.data())
 def test_restored_queue_sends_the_same(data):
-    queue = filled(TransmitQueue(QueueConfig(rates=(0, 1), first_rate=1)), data.draw(st.integers(0, 30)))
+    queue = filled(TransmitQueue(queue_config(rates=(0, 1), first_rate=1)), data.draw(st.integers(0, 30)))
     for n in range(data.draw(st.integers(0, 20))):
         priority = data.draw(st.integers(1, 7))
         queue.add_message(f"m{n}", "ab"[n % 2], bytes([n + 1]) * (n + 1), 0.0, priority=priority)
@@ -246,7 +245,7 @@ def test_restored_queue_sends_the_same(data):
 
 
 def test_a_packet_changes_few_small_parts():
-    queue = filled(TransmitQueue(QueueConfig()), 30)
+    queue = filled(TransmitQueue(queue_config()), 30)
     for n in range(300):
         queue.add_message(f"m{n}", "s", b"%3d" % n * 10, 0.0, lifetime_s=1e5)
     take_packet(queue, 0.0)
@@ -264,10 +263,10 @@ def test_a_packet_changes_few_small_parts():
     ("name", "change"),
     [
         ("queue", {"format version": 1}),
-        ("queue", {"rate": 9}),
+        ("queue", {"rate": 256}),
         ("queue", {"losses": {1: [1.5, 0.0]}}),
         ("queue", {"planned_loss": "no"}),
-        ("packet", {"rate": 9}),
+        ("packet", {"rate": 256}),
         ("messages", {"served": {"s": -1}}),
         ("message/0", {"priority": 0}),
         ("message-id/0", {"name": None}),
@@ -275,11 +274,11 @@ def test_a_packet_changes_few_small_parts():
     ids=str,
 )
 def test_a_malformed_part_is_reported_and_the_rest_restored(name, change):
-    queue = filled(TransmitQueue(QueueConfig()), 3)
+    queue = filled(TransmitQueue(queue_config()), 3)
     queue.next_packet(0.0)
     for n in range(2):
         queue.add_message(f"m{n}", "s", b"data", 0.0)
-    again = TransmitQueue(QueueConfig())
+    again = TransmitQueue(queue_config())
     kinds = {
         "queue": QueueState,
         "packet": OutgoingPacket,
@@ -295,7 +294,7 @@ def test_a_malformed_part_is_reported_and_the_rest_restored(name, change):
 
 
 def test_foreign_parts_are_reported_and_nothing_is_restored():
-    again = TransmitQueue(QueueConfig())
+    again = TransmitQueue(queue_config())
     junk = {"queue": b"junk", "sender": b"", "image/1": b"\x80", "block/7": b"\xc1", "message/x": b"\x01"}
     assert set(again.restore(junk)) == set(junk)
     assert again.is_idle
@@ -303,21 +302,22 @@ def test_foreign_parts_are_reported_and_nothing_is_restored():
 
 
 def test_images_are_sent_again_when_their_progress_is_unknown():
-    queue = filled(TransmitQueue(QueueConfig(expected_loss=0.0)), 5)
+    queue = filled(TransmitQueue(queue_config(expected_loss=0.0)), 5)
     take_packet(queue, 0.0)
     parts = {name: data for name, data in queue.parts().items() if name.startswith(("image/", "message"))}
-    again = TransmitQueue(QueueConfig(expected_loss=0.0), first_block=20)
+    again = TransmitQueue(queue_config(expected_loss=0.0), first_block=20)
     assert again.restore(parts) == {}
     events, _ = run(again, 600.0)
     assert {e.image_id for e in events if isinstance(e, ImageUpdate)} == {image_of_number(n) for n in range(1, 6)}
 
 
 def test_rate_that_is_not_configured_any_more_is_replaced():
-    queue = filled(TransmitQueue(QueueConfig(rates=(5,), first_rate=5)), 5)
+    queue = filled(TransmitQueue(queue_config(rates=(5,), first_rate=5)), 5)
     take_packet(queue, 0.0)
-    again = TransmitQueue(QueueConfig(rates=(1,), first_rate=1))
+    again = TransmitQueue(queue_config(rates=(1,), first_rate=1))
     assert not again.restore(queue.parts())
     assert again.rate == 1
+    assert again.in_flight is None
     receiver = V1Receiver()
     events, _ = run(again, 600.0, receiver=receiver)
     assert {number_of_image(e.image_id) for e in events if isinstance(e, ImageUpdate)} == {1, 2, 3, 4, 5}
@@ -335,16 +335,16 @@ def test_rate_that_is_not_configured_any_more_is_replaced():
 )
 def test_error_names_the_invalid_value(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
-        QueueConfig(**wrong)
+        queue_config(**wrong)
 
 
 def test_error_names_an_unknown_rate():
     with pytest.raises(ConfigError, match="rate"):
-        TransmitQueue(QueueConfig(rates=(1,), first_rate=4))
+        TransmitQueue(queue_config(rates=(1,), first_rate=4))
 
 
 def test_longer_stream_of_a_sent_image_sends_only_the_new_part():
-    queue = TransmitQueue(QueueConfig(expected_loss=0.0))
+    queue = TransmitQueue(queue_config(expected_loss=0.0))
     complete = stream(1, 1200)
     receiver = V1Receiver()
     queue.add_image(image(1, complete[:300]), 0.0)
@@ -359,7 +359,7 @@ def test_longer_stream_of_a_sent_image_sends_only_the_new_part():
 
 
 def test_repeated_image_is_sent_again_unless_it_waits():
-    queue = TransmitQueue(QueueConfig(expected_loss=0.0))
+    queue = TransmitQueue(queue_config(expected_loss=0.0))
     assert queue.add_image(image(1), 0.0)
     assert not queue.add_image(image(1), 0.0)
     _, now = run(queue, 200.0)
@@ -369,7 +369,7 @@ def test_repeated_image_is_sent_again_unless_it_waits():
 
 
 def test_refine_sends_more_of_a_kept_stream():
-    queue = TransmitQueue(QueueConfig(expected_loss=0.0, frames_per_image=3.0))
+    queue = TransmitQueue(queue_config(expected_loss=0.0, frames_per_image=3.0))
     queue.add_image(image(1, stream(1, 900)), 0.0)
     receiver = V1Receiver()
     _, now = run(queue, 200.0, receiver=receiver)
@@ -379,7 +379,7 @@ def test_refine_sends_more_of_a_kept_stream():
 
 
 def test_longer_stream_with_another_beginning_is_not_sent():
-    queue = TransmitQueue(QueueConfig(expected_loss=0.0))
+    queue = TransmitQueue(queue_config(expected_loss=0.0))
     queue.add_image(image(1, stream(1, 300)), 0.0)
     _, now = run(queue, 200.0)
     assert not queue.add_image(image(1, stream(2, 600)), now)

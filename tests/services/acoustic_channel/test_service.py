@@ -240,7 +240,7 @@ def test_new_tcp_client_replaces_the_previous_one(make: Make):
     second.send_sentence("CCCFQ", "CST")
     second.expect("CACFG", 2)
     with pytest.raises(serial.SerialException):
-        eventually(lambda: first.wait(0.05) is not None, timeout_s=5.0)
+        eventually(lambda: first.wait(0.05) is not None, timeout_s=120)
 
 
 def test_noise_is_answered_with_errors(make: Make):
@@ -389,7 +389,7 @@ def test_command_lists_its_devices_first_and_ends_cleanly(tmp_path: Path, ending
         # communicate() would miss the output that readline has buffered.
         rest = process.stdout.read()
         assert process.stderr is not None
-        assert (process.wait(timeout=10), process.stderr.read()) == (0, "")
+        assert (process.wait(timeout=120), process.stderr.read()) == (0, "")
     assert rest == log.read_text(encoding="utf-8")
     assert log_of(log)[-1]["event"] == "totals"
     assert list(ports.iterdir()) == []
@@ -403,7 +403,7 @@ def test_command_with_tcp_ports():
         assert [m["device"] for m in listed["modems"]] == [f"socket://127.0.0.1:{port}" for port in ports]
         Host(listed["modems"][1]["device"]).close()
         process.terminate()
-        assert process.wait(timeout=10) == 0
+        assert process.wait(timeout=120) == 0
 
 
 @pytest.mark.parametrize("arguments", [(), ("--json",)])
@@ -422,7 +422,7 @@ def test_command_continues_when_its_output_is_closed(arguments: tuple[str, ...])
         assert process.poll() is None
         process.terminate()
         assert process.stderr is not None
-        assert (process.wait(timeout=10), process.stderr.read()) == (0, "")
+        assert (process.wait(timeout=120), process.stderr.read()) == (0, "")
 
 
 @pytest.mark.parametrize(

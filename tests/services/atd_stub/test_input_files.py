@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders.common import eventually
+from builders.survey_oracle import tiny_survey
+from builders.surveys import MAKERS
 from PIL import Image
 
 from sonarpost import keys
@@ -128,24 +130,41 @@ def test_a_file_is_processed_once_under_any_name(start_service, runner, compress
 
 
 @pytest.fixture
-def jsf_reader(monkeypatch):
-    """Register a reader of `.jsf`, whose files are XTF, as an installed package does."""
+def plug_in_reader(monkeypatch):
+    """Register a reader of `.abc`, whose files are XTF, as an installed package does."""
     module = types.ModuleType("plug_in_sonar")
-    module.open_jsf = XtfSource
+    module.open_abc = XtfSource
     monkeypatch.setitem(sys.modules, "plug_in_sonar", module)
-    point = importlib.metadata.EntryPoint("jsf", "plug_in_sonar:open_jsf", readers.ENTRY_POINTS)
+    point = importlib.metadata.EntryPoint("abc", "plug_in_sonar:open_abc", readers.ENTRY_POINTS)
     monkeypatch.setattr(readers, "entry_points", lambda group: [point] if group == readers.ENTRY_POINTS else [])
     readers._plug_ins.cache_clear()
     yield
     readers._plug_ins.cache_clear()
 
 
-@pytest.mark.usefixtures("jsf_reader")
+@pytest.mark.usefixtures("plug_in_reader")
 def test_files_of_a_plug_in_reader_are_processed(start_service, compressor, put_file, survey_bytes):
-    put_file("line.JSF", survey_bytes(1))
+    put_file("line.ABC", survey_bytes(1))
     service = start_service()
     eventually(lambda: len(compressor.received) == 3)
-    assert {snippet.source for snippet in compressor.received} == {"line.JSF"}
+    assert {snippet.source for snippet in compressor.received} == {"line.ABC"}
+    assert counter(service, "files_quarantined") == 0
+
+
+@pytest.mark.parametrize("kind", ["jsf", "sdf", "sl2", "sl3", "svlog"])
+def test_recordings_of_every_format_are_processed(kind, start_service, tmp_path, put_file):
+    path = MAKERS[kind](tiny_survey(40, 400), tmp_path)
+    put_file(path.name, path.read_bytes())
+    service = start_service()
+    eventually(lambda: counter(service, "files_processed") == 1)
+    assert counter(service, "files_quarantined") == 0
+
+
+@pytest.mark.realdata
+def test_a_lowrance_recording_is_processed(start_service, put_file, data_dir):
+    put_file("line.sl3", (data_dir / "surveys" / "lowrance" / "40MCAL3.sl3").read_bytes())
+    service = start_service()
+    eventually(lambda: counter(service, "files_processed") == 1)
     assert counter(service, "files_quarantined") == 0
 
 

@@ -16,7 +16,7 @@ from sonarpost.cli.detection.transmissions import read_transmissions
 from sonarpost.delivery.store import Store
 from sonarpost.errors import DeliveryError
 from sonarpost.messages import Snippet, Transmission, Transmissions
-from sonarpost.modem.micromodem import TransmissionEnded, TransmissionStarted
+from sonarpost.modem.interface import TransmissionEnded, TransmissionStarted
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.service import AtdStubService
 from sonarpost.services.atd_stub.transmissions import MAX_RETAINED, RETAINED_S, SAVE_INTERVAL_S, TransmissionLog

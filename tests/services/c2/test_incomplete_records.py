@@ -60,6 +60,6 @@ def test_incomplete_records_are_deleted_when_the_disk_reserve_is_reached(
         key = keys.image_reconstructed("vessel-1")
         envelope = Relayed(vessel_id="vessel-1", key=key, payload=wire.encode(image), relayed_utc_s=5.0)
         relay.send(keys.shore_inbox("vessel-1"), "c2", envelope)
-    eventually(lambda: service.health().counters.get("images_stored", 0) == 20, timeout_s=30)
+    eventually(lambda: service.health().counters.get("images_stored", 0) == 20, timeout_s=120)
     (stored,) = service.store._query("SELECT COALESCE(SUM(has), 0) FROM partial")[0]
     assert stored <= 2 * SIZE

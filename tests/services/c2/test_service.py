@@ -9,11 +9,12 @@ import msgpack
 import numpy as np
 import pytest
 from builders.common import eventually
+from builders.record_samples import SAMPLES
 from builders.records import decision_record, reconstructed_image
 
 from sonarpost import keys, wire
 from sonarpost.files import AtomicFiles
-from sonarpost.messages import Contact, Pixels, ReconstructedImage, Relayed
+from sonarpost.messages import Contact, Pixels, ReceivedStatus, ReconstructedImage, Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.sonar.image_files import read_image
@@ -70,9 +71,9 @@ def send(relay, *records, vessel="vessel-1"):
 
 
 def files(folder):
-    """All files but the index."""
+    """All files but index and journal."""
     found = (str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
-    return sorted(name for name in found if not name.startswith("index.db"))
+    return sorted(name for name in found if not name.startswith(("index.db", "journal.db")))
 
 
 def test_image_is_stored_and_published_as_plain_msgpack(begin, relay, image, out, watch, check_monitoring):
@@ -308,3 +309,23 @@ def test_temporary_files_of_a_killed_c2_are_deleted_at_the_next_start(begin, rel
     begin()
     send(relay, image(), decision_record())
     eventually(lambda: [name.rpartition(".")[2] for name in files(out)] == ["json", "json", "png", "tiff"])
+
+
+def test_status_of_a_vehicle_is_published_and_not_archived(begin, relay, watch, refused, out):
+    samples = watch(keys.shore_status("vessel-1"))
+    service = begin()
+    record = SAMPLES["received-status"]
+    foreign = record.model_copy(update={"vessel_id": "vessel-2"})
+    for inner in (foreign, record):
+        envelope = Relayed(
+            vessel_id="vessel-1",
+            key=keys.acoustic_status("vessel-1"),
+            payload=wire.encode(inner),
+            relayed_utc_s=1476262840.0,
+        )
+        relay.send(keys.shore_inbox("vessel-1"), "c2", envelope)
+    eventually(lambda: len(samples) == 1)
+    assert wire.decode(ReceivedStatus, samples[0].payload.to_bytes(), "status") == record
+    eventually(lambda: len(refused(relay)) == 1)
+    eventually(lambda: service.health().counters.get("statuses_published") == 1)
+    assert [path for path in out.rglob("*") if path.suffix in (".json", ".tiff", ".png")] == []

@@ -139,10 +139,10 @@ def test_advice_arrives_once_after_a_link_cut(begin, runner, platform, expert, o
         link.cut()
         expert.send(ADVICE, "c2", advice("later"))
         eventually(lambda: states(out).get(("vessel-1", "advice", "later")) == "waiting")
-        eventually(lambda: not service.is_responding("relay@vessel-1"), timeout_s=20)
+        eventually(lambda: not service.is_responding("relay@vessel-1"), timeout_s=120)
         assert [a.advice_id for a in screen.received] == ["before"]
         link.mend()
-        eventually(lambda: [a.advice_id for a in screen.received] == ["before", "later"], timeout_s=30)
+        eventually(lambda: [a.advice_id for a in screen.received] == ["before", "later"], timeout_s=120)
         eventually(lambda: states(out).get(("vessel-1", "advice", "later")) == "delivered")
     finally:
         runner.stop_all()

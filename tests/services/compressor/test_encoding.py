@@ -43,7 +43,7 @@ def test_a_snippet_is_encoded_with_its_contact(start_service, atd, modem, snippe
 def test_the_default_codec_is_emb(runner, platform, atd, modem, snippet):
     runner.start(CompressorService(platform("uuv-1"), CompressorConfig()))
     atd.send(IN, "compressor", snippet("c1"))
-    eventually(lambda: len(modem.received) == 1, 30)
+    eventually(lambda: len(modem.received) == 1, 120)
     assert modem.received[0].codec == "emb"
 
 

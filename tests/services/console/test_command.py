@@ -103,14 +103,14 @@ def show_folder(command):
             url, _, user = process.stdout.readline().split()[:3]
             assert f"{url}login#" in process.stdout.readline()
             assert "1 contacts in" in process.stdout.readline()
-            with httpx2.Client(base_url=url, timeout=20) as client:
+            with httpx2.Client(base_url=url, timeout=120) as client:
                 browser = Browser(client)
                 assert browser.login(user, PASSWORD).json()["role"] == "observer"
                 [contact] = client.get("/api/contacts").json()["items"]
                 assert contact["review"] == "mine_like"
         finally:
             process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=20) == 0
+        assert process.wait(timeout=120) == 0
 
 
 def test_simulated_contacts_arrive_in_versions_and_are_marked():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import math
 import socket
 import ssl
@@ -133,7 +134,7 @@ def test_unfinished_tls_handshake_is_closed(serve, connect, make_console, tmp_pa
     server = serve(make_console(tls=True).app.asgi, tls, request_s=SHORT_S, max_of_address=2)
     clients = [connect(server) for _ in range(5)]
     context = ssl.create_default_context(cafile=str(tls.ca))
-    with httpx2.Client(base_url=server.address, verify=context, timeout=20) as client:
+    with httpx2.Client(base_url=server.address, verify=context, timeout=120) as client:
         assert client.post("api/login", json={"user": "anna", "password": PASSWORD}).status_code == 200
     eventually(lambda: all(is_closed(one) for one in clients), what="end of the connections")
 
@@ -164,6 +165,22 @@ def test_client_that_does_not_read_is_closed(serve, connect):
     client.sendall(HALF_A_REQUEST + b"\r\n")
     eventually(lambda: server.limits.count == 1, what="connection")
     eventually(lambda: server.limits.count == 0, what="end of the connection")
+    client.close()
+
+
+def test_server_that_ends_closes_a_client_that_does_not_read(serve):
+    async def endless(scope: Any, receive: Any, send: Any) -> None:
+        await Response(bytes(64 << 20))(scope, receive, send)
+
+    server = serve(endless, request_s=600.0, read_s=600.0)
+    client = socket.socket()
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    client.connect(("127.0.0.1", server.port))
+    client.sendall(HALF_A_REQUEST + b"\r\n")
+    assert client.recv(1) == b"H"
+    server.stop()
+    # A transport that is not closed gives a ResourceWarning, which is an error in these tests.
+    gc.collect()
     client.close()
 
 

@@ -116,7 +116,7 @@ def test_exports_run_one_at_a_time_and_their_number_is_limited(console, client_o
     clients = [client_of(user) for user in ("anna", "bo", "eva", "another")]
     with ThreadPoolExecutor(60) as pool:
         first = pool.submit(watch.get, "/api/export/contacts.kmz")
-        assert held.entered.acquire(timeout=20)
+        assert held.entered.acquire(timeout=120)
         repeated = list(pool.map(lambda _: watch.get("/api/export/contacts.kmz"), range(40)))
         assert {error_of(answer) for answer in repeated} == {(429, "too_many")}
         assert all(int(answer.headers["retry-after"]) > 0 for answer in repeated)

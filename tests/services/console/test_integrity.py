@@ -8,6 +8,7 @@ import pytest
 from builders.console import FIRST_UTC_S, image_record
 
 from research.common.images import simulated_images
+from sonarpost.archive.decoder import Decoder
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.contact_record import ContactSummary
@@ -16,7 +17,6 @@ from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.received_image import received_image
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.review.resolution import detail_px, sharp_to_m
-from sonarpost.services.decompressor.decoder import Decoder
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 

@@ -291,7 +291,8 @@ def test_database_of_an_earlier_version_is_migrated(console):
     console.state.database.close()
     old = sqlite3.connect(path)
     old.executescript("""
-        DROP INDEX contact_place; DROP INDEX contact_contradictory; DROP INDEX decision_batch;
+        DROP INDEX contact_square; DROP INDEX contact_contradictory; DROP INDEX contact_first;
+        DROP INDEX contact_listed; DROP INDEX decision_batch;
         DROP TABLE object; DROP TABLE look_pair;
         CREATE TABLE look_group (id INTEGER PRIMARY KEY AUTOINCREMENT, lat_deg REAL NOT NULL, lon_deg REAL NOT NULL,
             sigma_m REAL, vehicle_id TEXT NOT NULL, seen_utc_s REAL);

@@ -236,7 +236,8 @@ def test_database_of_an_earlier_version_opens(tmp_path):
     path = tmp_path / "console-review.db"
     Database(path).close()
     with sqlite3.connect(path) as db:
-        db.execute("DROP INDEX contact_parent")
+        for index in ("contact_answers", "contact_listed"):
+            db.execute(f"DROP INDEX {index}")
         for table, column in (("contact", "parent"), ("contact", "relation"), ("request", "result_bytes")):
             db.execute(f"ALTER TABLE {table} DROP COLUMN {column}")
     database = Database(path)

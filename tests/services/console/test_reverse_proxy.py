@@ -35,7 +35,7 @@ class Proxied:
 
     def client(self, source: str = PROXY) -> httpx2.Client:
         transport = httpx2.HTTPTransport(local_address=source, verify=self.tls)
-        return httpx2.Client(base_url=self.address, transport=transport, timeout=30)
+        return httpx2.Client(base_url=self.address, transport=transport, timeout=120)
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def proxied(make_console, tmp_path) -> Iterator[tuple[Proxied, object]]:
         f"http {{ access_log off; {folders} include {tmp_path}/console.conf; }}\n"
     )
     words = [str(NGINX), "-e", "stderr", "-p", str(tmp_path), "-c", str(tmp_path / "nginx.conf")]
-    subprocess.run([*words, "-t"], check=True, timeout=30)
+    subprocess.run([*words, "-t"], check=True, timeout=400)
     with subprocess.Popen(words) as process:
         eventually(lambda: is_open(port), what="nginx")
         yield Proxied(port, certificates), console

@@ -12,6 +12,7 @@ import pytest
 import zenoh
 from builders.common import eventually, free_port, publish_once
 from builders.console import PASSWORD, Browser, EventReader, image_record
+from builders.record_samples import SAMPLES
 
 from sonarpost import keys, wire
 from sonarpost.archive.image_files import write_image
@@ -24,6 +25,7 @@ from sonarpost.messages import (
     Decision,
     DownlinkState,
     LinkQuality,
+    ReceivedStatus,
     ReconstructedImage,
     Relayed,
     TaskingState,
@@ -210,6 +212,19 @@ def test_received_frames_are_assigned_to_their_vehicle(start, client, log_in):
         return {service["service"] for service in anna.get("/api/fleet").json()["services"]}
 
     eventually(lambda: "console" in services(), what="own health")
+
+
+def test_status_of_a_vehicle_is_shown_and_that_of_another_vessel_ignored(start, client):
+    console = start()
+    record = SAMPLES["received-status"]
+    assert isinstance(record, ReceivedStatus)
+    foreign = record.model_copy(update={"vessel_id": "vessel-9"})
+    publish_once(client, keys.acoustic_status(VESSEL), wire.encode(foreign))
+    eventually(lambda: console.health().counters.get("records_ignored") == 1, what="ignored record")
+    publish_once(client, keys.acoustic_status(VESSEL), wire.encode(record.model_copy(update={"vessel_id": VESSEL})))
+    eventually(lambda: console.state.fleet_state()["vehicles"] != [], what="vehicle")
+    [vehicle] = console.state.fleet_state()["vehicles"]
+    assert (vehicle["vehicle_id"], vehicle["lat_deg"]) == ("uuv-1", 41.5251)
 
 
 def test_invalid_record_is_counted_and_ignored(start, client):
@@ -423,7 +438,7 @@ def test_service_that_does_not_reach_a_router_stops(platform, restartable_router
     starting.start()
     eventually(lambda: console.address != "", what="web server")
     address = console.address
-    assert httpx2.get(f"{address}login", timeout=20).status_code == 200
+    assert httpx2.get(f"{address}login", timeout=120).status_code == 200
     console.stop()
     starting.join(timeout=10)
     assert not starting.is_alive()

@@ -61,7 +61,7 @@ def out(tmp_path):
 @pytest.fixture
 def unstarted(platform, out):
     def make(**options):
-        usual = {"out_dir": out, "codebooks": ("nominal-10",)}
+        usual = {"out_dir": out, "codebooks": ("nominal-10",), "image_consumers": ("console",)}
         return DecompressorService(platform(VESSEL), DecompressorConfig(**(usual | options)))
 
     return make
@@ -73,8 +73,8 @@ def begin(runner, unstarted):
 
 
 @pytest.fixture
-def relay(runner):
-    return runner.peer(VESSEL, "relay", {OUT: ReconstructedImage})
+def console(runner):
+    return runner.peer(VESSEL, "console", {OUT: ReconstructedImage})
 
 
 @pytest.fixture
@@ -118,14 +118,14 @@ def embedded(stream, *, version=1, image_id="0001", complete=False):
     )
 
 
-def test_complete_image_is_decoded(begin, modem, relay, stream, vq, check_monitoring, watch):
+def test_complete_image_is_decoded(begin, modem, console, stream, vq, check_monitoring, watch):
     seen = watch(OUT)
     service = begin()
     data = stream()
     size = StreamHeader.unpack(data).size
     modem.send(IN, "decompressor", *updates(*frames_of("0A1B", data)))
-    eventually(lambda: len(relay.received) == 1)
-    image = relay.received[0]
+    eventually(lambda: len(console.received) == 1)
+    image = console.received[0]
     assert (image.vessel_id, image.vehicle_id, image.image_id, image.version) == (VESSEL, "uuv-1", "0A1B", 1)
     assert (image.complete, image.missing_fraction, image.missing_halves, image.missing_mask) == (True, 0.0, (), b"")
     assert (image.codec, image.model) == ("vq", vq.model_hash)
@@ -140,11 +140,11 @@ def test_complete_image_is_decoded(begin, modem, relay, stream, vq, check_monito
     check_monitoring(service)
 
 
-def test_files_and_record_hold_the_same_image(begin, modem, relay, stream, out):
+def test_files_and_record_hold_the_same_image(begin, modem, console, stream, out):
     begin()
     modem.send(IN, "decompressor", *updates(*frames_of("0A1B", stream())))
-    eventually(lambda: len(relay.received) == 1)
-    image = relay.received[0]
+    eventually(lambda: len(console.received) == 1)
+    image = console.received[0]
     name = f"uuv-1_{datetime.fromtimestamp(START_UTC_S, UTC):%Y%m%dT%H%M%SZ}_0A1B_v1"
     assert image_file_name(image) == name
     assert {p.name for p in out.iterdir()} == {f"{name}.{kind}" for kind in ("tiff", "png", "json")}
@@ -158,12 +158,12 @@ def test_files_and_record_hold_the_same_image(begin, modem, relay, stream, out):
 
 
 @pytest.mark.parametrize(("arrived", "missing"), [("top", "bottom"), ("bottom", "top")])
-def test_missing_half_is_black_and_marked(arrived, missing, begin, modem, relay, stream, vq):
+def test_missing_half_is_black_and_marked(arrived, missing, begin, modem, console, stream, vq):
     begin()
     first = stream(1)
     modem.send(IN, "decompressor", *updates(half("AAAA", first, arrived)))
-    eventually(lambda: len(relay.received) == 1)
-    image = relay.received[0]
+    eventually(lambda: len(console.received) == 1)
+    image = console.received[0]
     assert (image.image_id, image.complete, image.missing_halves) == ("AAAA", False, (missing,))
     assert image.missing_fraction == pytest.approx(0.5, abs=0.1)
     pixels, black = image.picture.to_array(), image.missing()
@@ -173,7 +173,7 @@ def test_missing_half_is_black_and_marked(arrived, missing, begin, modem, relay,
     assert (rows.min() >= 20) if missing == "bottom" else (rows.max() < 20)
 
 
-def test_versions_of_an_embedded_stream_become_finer(begin, modem, relay, emb, texture, out):
+def test_versions_of_an_embedded_stream_become_finer(begin, modem, console, emb, texture, out):
     begin()
     whole = emb.encode(texture(), 192)
     lengths = (40, 96, len(whole))
@@ -182,21 +182,21 @@ def test_versions_of_an_embedded_stream_become_finer(begin, modem, relay, emb, t
         "decompressor",
         *(embedded(whole[:n], version=v, complete=n == len(whole)) for v, n in enumerate(lengths, start=1)),
     )
-    eventually(lambda: len(relay.received) == 3)
-    for length, image in zip(lengths, relay.received, strict=True):
+    eventually(lambda: len(console.received) == 3)
+    for length, image in zip(lengths, console.received, strict=True):
         np.testing.assert_array_equal(image.picture.to_array(), emb.decode(whole[:length]).image)
         assert (image.missing_fraction, image.missing_halves, image.frames_received) == (0.0, (), 0)
         assert (image.bytes_received, image.bytes_total) == (length, length if image.complete else 0)
-    assert [(image.version, image.complete) for image in relay.received] == [(1, False), (2, False), (3, True)]
-    assert (relay.received[0].codec, relay.received[0].model) == ("emb", emb.model_hash)
+    assert [(image.version, image.complete) for image in console.received] == [(1, False), (2, False), (3, True)]
+    assert (console.received[0].codec, console.received[0].model) == ("emb", emb.model_hash)
     assert len(list(out.glob("*.tiff"))) == 3
 
 
-def test_missing_end_of_a_stream_that_is_not_embedded_is_marked(begin, modem, relay, stream, vq):
+def test_missing_end_of_a_stream_that_is_not_embedded_is_marked(begin, modem, console, stream, vq):
     begin()
     modem.send(IN, "decompressor", embedded(stream()[:24]))
-    eventually(lambda: len(relay.received) == 1)
-    image, whole = relay.received[0], vq.decode(stream()).image
+    eventually(lambda: len(console.received) == 1)
+    image, whole = console.received[0], vq.decode(stream()).image
     assert 0.2 < image.missing_fraction < 0.8
     assert not image.complete
     black = image.missing()
@@ -205,12 +205,12 @@ def test_missing_end_of_a_stream_that_is_not_embedded_is_marked(begin, modem, re
 
 
 @pytest.mark.parametrize(("size", "shape"), [({}, (40, 60)), ({"height_px": None, "width_px": None}, (16, 16))])
-def test_contact_record_alone_gives_an_image_of_missing_pixels(size, shape, begin, modem, relay, out):
+def test_contact_record_alone_gives_an_image_of_missing_pixels(size, shape, begin, modem, console, out):
     begin()
     [record] = updates(ContactFrame("AAAA", CONTACT).pack())
     modem.send(IN, "decompressor", record.model_copy(update=size))
-    eventually(lambda: len(relay.received) == 1)
-    image = relay.received[0]
+    eventually(lambda: len(console.received) == 1)
+    image = console.received[0]
     assert (image.contact.lat_deg, image.contact.time_utc_s) == (56.4, 1_475_568_000.0)
     assert (image.codec, image.bytes_total, image.missing_fraction, image.complete) == ("", 0, 1.0, False)
     assert image.missing_halves == ("top", "bottom")
@@ -220,22 +220,22 @@ def test_contact_record_alone_gives_an_image_of_missing_pixels(size, shape, begi
     assert len(list(out.glob("*.json"))) == 1
 
 
-def test_contradicting_frames_are_noted(begin, modem, relay, stream):
+def test_contradicting_frames_are_noted(begin, modem, console, stream):
     begin()
     modem.send(IN, "decompressor", *updates(half("AAAA", stream(1), "top"), half("AAAA", stream(2), "top")))
-    eventually(lambda: len(relay.received) == 1)
-    assert relay.received[0].notes[-1] == "1 frames disagreed with others of this image"
+    eventually(lambda: len(console.received) == 1)
+    assert console.received[0].notes[-1] == "1 frames disagreed with others of this image"
 
 
-def test_index_beyond_the_codebook_is_a_black_tile(begin, modem, relay, stream, vq):
+def test_index_beyond_the_codebook_is_a_black_tile(begin, modem, console, stream, vq):
     begin()
     data = bytearray(stream())
     assert len(vq.tiles) < 1 << 14
     start = StreamHeader.unpack(data).size
     data[start : start + 2] = b"\xff\xff"
     modem.send(IN, "decompressor", *updates(*frames_of("AAAA", bytes(data))))
-    eventually(lambda: len(relay.received) == 1)
-    image, whole = relay.received[0], vq.decode(stream()).image
+    eventually(lambda: len(console.received) == 1)
+    image, whole = console.received[0], vq.decode(stream()).image
     pixels, black = image.picture.to_array(), image.missing()
     assert black[:10, :10].all()
     assert (pixels[black] == 0).all()
@@ -245,12 +245,12 @@ def test_index_beyond_the_codebook_is_a_black_tile(begin, modem, relay, stream, 
     assert image.notes
 
 
-def test_image_of_an_unknown_codebook_is_quarantined(begin, modem, relay, texture, refused, vq, stream):
+def test_image_of_an_unknown_codebook_is_quarantined(begin, modem, console, texture, refused, vq, stream):
     service = begin()
     other = default_registry().create("vq", CodecResources(open_codebook("nominal-20").tiles))
     modem.send(IN, "decompressor", *updates(*frames_of("AAAA", other.encode(texture()))))
     modem.send(IN, "decompressor", *updates(*frames_of("BBBB", stream())))
-    eventually(lambda: [i.image_id for i in relay.received] == ["BBBB"])
+    eventually(lambda: [i.image_id for i in console.received] == ["BBBB"])
     [(key, reason)] = refused(service)
     assert key == "image uuv-1/AAAA"
     for codec in (other, vq):
@@ -266,29 +266,29 @@ def test_undecodable_stream_is_quarantined(begin, modem, emb, texture, refused):
     assert [key for key, _ in refused(service)] == ["image uuv-1/0001"]
 
 
-def test_every_configured_codebook_is_used(begin, modem, relay, texture, stream):
+def test_every_configured_codebook_is_used(begin, modem, console, texture, stream):
     begin(codebooks=("nominal-10", "nominal-20"))
     other = default_registry().create("vq", CodecResources(open_codebook("nominal-20").tiles))
     modem.send(IN, "decompressor", *updates(*frames_of("AAAA", other.encode(texture()))))
     modem.send(IN, "decompressor", *updates(*frames_of("BBBB", stream())))
-    eventually(lambda: len(relay.received) == 2)
-    assert [i.complete for i in relay.received] == [True, True]
-    assert relay.received[0].model == other.model_hash != relay.received[1].model
+    eventually(lambda: len(console.received) == 2)
+    assert [i.complete for i in console.received] == [True, True]
+    assert console.received[0].model == other.model_hash != console.received[1].model
 
 
-def test_malformed_and_foreign_records_are_refused(begin, modem, relay, stream, refused):
+def test_malformed_and_foreign_records_are_refused(begin, modem, console, stream, refused):
     service = begin()
     modem.send_bytes(IN, "decompressor", b"\x80")
     [record] = updates(*frames_of("AAAA", stream()))
     modem.send(IN, "decompressor", record.model_copy(update={"vessel_id": "vessel-2"}), record)
-    eventually(lambda: len(relay.received) == 1)
+    eventually(lambda: len(console.received) == 1)
     assert refused(service) == refused(modem)
     (_, malformed), (_, foreign) = refused(service)
     assert "expected 'received_image'" in malformed
     assert "vessel_id: got 'vessel-2', expected vessel-1" in foreign
 
 
-def test_images_wait_while_the_folder_is_not_writable(begin, runner, modem, relay, stream, tmp_path):
+def test_images_wait_while_the_folder_is_not_writable(begin, runner, modem, console, stream, tmp_path):
     blocker = tmp_path / "disk"
     blocker.write_text("not mounted")
     service = begin(out_dir=blocker / "out")
@@ -297,34 +297,34 @@ def test_images_wait_while_the_folder_is_not_writable(begin, runner, modem, rela
     eventually(lambda: service.health().state == "degraded")
     assert str(blocker) in service.health().detail
     runner.stop(service)
-    assert relay.received == []
+    assert console.received == []
     blocker.unlink()
     service = begin(out_dir=blocker / "out")
-    eventually(lambda: [i.image_id for i in relay.received] == ["AAAA", "BBBB"])
-    assert all(i.complete and i.version == 1 for i in relay.received)
+    eventually(lambda: [i.image_id for i in console.received] == ["AAAA", "BBBB"])
+    assert all(i.complete and i.version == 1 for i in console.received)
     assert len(list((blocker / "out").glob("*.json"))) == 2
     eventually(lambda: service.health().state == "ok")
 
 
-def test_full_disk_leaves_images_with_op_modem(begin, modem, relay, stream):
+def test_full_disk_leaves_images_with_op_modem(begin, modem, console, stream):
     service = begin()
     service.store._db.execute("PRAGMA max_page_count=1")
     modem.send(IN, "decompressor", *updates(*frames_of("AAAA", stream(1, 200, 200))))
     eventually(lambda: service.health().state == "degraded")
-    assert relay.received == []
+    assert console.received == []
     service.store._db.execute("PRAGMA max_page_count=1000000")
-    eventually(lambda: len(relay.received) == 1)
-    assert (relay.received[0].complete, relay.received[0].version) == (True, 1)
+    eventually(lambda: len(console.received) == 1)
+    assert (console.received[0].complete, console.received[0].version) == (True, 1)
     eventually(lambda: service.health().state == "ok")
 
 
-def test_unexpected_exception_costs_one_image(begin, modem, relay, stream, monkeypatch, refused):
+def test_unexpected_exception_costs_one_image(begin, modem, console, stream, monkeypatch, refused):
     service = begin()
     decode = service._decoder.decode
     monkeypatch.setattr(service._decoder, "decode", lambda r: 1 // 0 if r.image_id == "AAAA" else decode(r))
     for seed, image_id in enumerate(("AAAA", "BBBB"), start=1):
         modem.send(IN, "decompressor", *updates(*frames_of(image_id, stream(seed))))
-    eventually(lambda: [i.image_id for i in relay.received] == ["BBBB"])
+    eventually(lambda: [i.image_id for i in console.received] == ["BBBB"])
     [(key, reason)] = refused(service)
     assert key == "image uuv-1/AAAA"
     assert "ZeroDivisionError" in reason
@@ -345,55 +345,55 @@ def test_two_codebooks_with_one_tag_are_rejected(platform, tmp_path, monkeypatch
         database = TileDatabase(10, tiles, np.zeros(100, np.uint8), np.ones((1, 100), np.int16))
         names.append(str(tmp_path / f"{number}.tiles"))
         save(tmp_path / f"{number}.tiles", Codebook(database, {}))
-    monkeypatch.setattr("sonarpost.services.decompressor.decoder.codebook_tag", lambda tiles: 0x1234)
+    monkeypatch.setattr("sonarpost.archive.decoder.codebook_tag", lambda tiles: 0x1234)
     with pytest.raises(CodebookError, match="0x1234"):
         DecompressorService(platform(VESSEL), DecompressorConfig(codebooks=tuple(names)))
     DecompressorService(platform(VESSEL), DecompressorConfig(codebooks=(names[0], names[0]))).store.close()
 
 
-def test_damaged_side_car_is_written_again(begin, runner, modem, relay, stream, out):
+def test_damaged_side_car_is_written_again(begin, runner, modem, console, stream, out):
     service = begin()
     records = updates(*frames_of("AAAA", stream()))
     modem.send(IN, "decompressor", *records)
-    eventually(lambda: len(relay.received) == 1)
+    eventually(lambda: len(console.received) == 1)
     [side] = out.glob("*.json")
     whole = side.read_bytes()
     runner.stop(service)
     side.write_bytes(b"\xff\xfe half of it")
     begin()
     modem.send(IN, "decompressor", *records)
-    eventually(lambda: len(relay.received) == 2)
+    eventually(lambda: len(console.received) == 2)
     assert side.read_bytes() == whole
 
 
 @pytest.mark.parametrize("authenticated", [True, False, None])
-def test_record_and_side_car_state_the_authentication(begin, modem, relay, stream, out, authenticated):
+def test_record_and_side_car_state_the_authentication(begin, modem, console, stream, out, authenticated):
     begin()
     [record] = updates(*frames_of("00A7", stream()))
     modem.send(IN, "decompressor", record.model_copy(update={"authenticated": authenticated}))
-    eventually(lambda: len(relay.received) == 1)
-    assert relay.received[0].authenticated is authenticated
-    side_car = json.loads((out / f"{image_file_name(relay.received[0])}.json").read_text())
+    eventually(lambda: len(console.received) == 1)
+    assert console.received[0].authenticated is authenticated
+    side_car = json.loads((out / f"{image_file_name(console.received[0])}.json").read_text())
     assert side_car.get("authenticated") is authenticated
     assert ("authenticated" in side_car) == (authenticated is not None)
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.5, 1.0, None])
-def test_record_and_side_car_state_the_strength_of_despeckling(begin, modem, relay, stream, texture, out, strength):
+def test_record_and_side_car_state_the_strength_of_despeckling(begin, modem, console, stream, texture, out, strength):
     begin()
     # The streams of vq do not state a strength.
     coded = stream() if strength is None else EmbCodec(strength=strength).encode(texture(40, 60), 200)
     modem.send(IN, "decompressor", *updates(*frames_of("00A7", coded)))
-    eventually(lambda: any(image.complete for image in relay.received))
-    record = next(image for image in relay.received if image.complete)
+    eventually(lambda: any(image.complete for image in console.received))
+    record = next(image for image in console.received if image.complete)
     assert record.despeckle_strength == strength
     side_car = json.loads((out / f"{image_file_name(record)}.json").read_text())
     assert side_car.get("despeckle_strength") == strength
     assert ("despeckle_strength" in side_car) == (strength is not None)
 
 
-def test_contact_record_without_an_image_states_no_strength(begin, modem, relay):
+def test_contact_record_without_an_image_states_no_strength(begin, modem, console):
     begin()
     modem.send(IN, "decompressor", *updates(ContactFrame("00A7", CONTACT).pack()))
-    eventually(lambda: len(relay.received) == 1)
-    assert (relay.received[0].codec, relay.received[0].despeckle_strength) == ("", None)
+    eventually(lambda: len(console.received) == 1)
+    assert (console.received[0].codec, console.received[0].despeckle_strength) == ("", None)

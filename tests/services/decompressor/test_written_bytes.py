@@ -11,12 +11,12 @@ from sonarpost import keys, wire
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
-from sonarpost.messages import ReceivedImage, ReconstructedImage
+from sonarpost.messages import CodedImage, ReceivedImage
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.service import DecompressorService
 
 VESSEL = "vessel-1"
-IN, OUT = keys.acoustic_image(VESSEL), keys.image_reconstructed(VESSEL)
+IN, OUT = keys.acoustic_image(VESSEL), keys.image_coded(VESSEL)
 IMAGES = 20
 MAX_OVERHEAD_BYTES = 10_000
 """Beyond the received record and the sent one."""
@@ -30,7 +30,7 @@ def contact_only(number: int) -> ReceivedImage:
 def test_written_bytes_of_an_image_do_not_depend_on_the_number_of_contacts(runner, platform, tmp_path):
     service = runner.start(DecompressorService(platform(VESSEL), DecompressorConfig(out_dir=tmp_path / "out")))
     op_modem = runner.peer(VESSEL, "op_modem")
-    relay = runner.peer(VESSEL, "relay", {OUT: ReconstructedImage})
+    relay = runner.peer(VESSEL, "relay", {OUT: CodedImage})
 
     def process(numbers: range, in_one_batch: bool) -> None:
         for part in [numbers] if in_one_batch else [range(n, n + 1) for n in numbers]:

@@ -26,7 +26,8 @@ from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.link.state import below
 from sonarpost.messages import AcousticFrame, ReceivedImage
-from sonarpost.modem.micromodem import FrameDecoded, LinkStatistics, nmea
+from sonarpost.modem.interface import FrameDecoded
+from sonarpost.modem.micromodem import LinkStatistics, nmea
 from sonarpost.services.op_modem import service as op_modem
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.packets import quality_of

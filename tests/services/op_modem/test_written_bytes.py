@@ -11,7 +11,7 @@ from builders.written_bytes import written_bytes
 
 from sonarpost import keys
 from sonarpost.messages import ReceivedImage
-from sonarpost.modem.micromodem import FrameDecoded
+from sonarpost.modem.interface import FrameDecoded
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService
 

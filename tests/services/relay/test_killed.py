@@ -62,7 +62,7 @@ def test_every_site_receives_every_record_once_if_the_relay_is_killed(runner, re
     for kill in range(1, KILLS + 1):
         process = relay_process()
         # A little later each time, at a random point of the next batches.
-        eventually(lambda kill=kill: len(first.received) >= kill * RECORDS // (KILLS + 2), timeout_s=60)
+        eventually(lambda kill=kill: len(first.received) >= kill * RECORDS // (KILLS + 2), timeout_s=120)
         time.sleep(rng.uniform(0, 0.02))
         history.fault("relay", "SIGKILL")
         process.kill()
@@ -70,7 +70,7 @@ def test_every_site_receives_every_record_once_if_the_relay_is_killed(runner, re
     relay_process()
     eventually(lambda: console.store.outbox_depth() == 0)
     for name, site in (("shore", first), ("shore-2", second)):
-        eventually(lambda site=site: len(site.received) >= RECORDS, timeout_s=60)
+        eventually(lambda site=site: len(site.received) >= RECORDS, timeout_s=120)
         history.add("consumer", name)
         for envelope in site.received:
             sha256 = hashlib.sha256(envelope.payload).hexdigest()

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import logging
-
 import msgpack
 import pytest
 from builders.common import eventually
+from builders.record_samples import SAMPLES
 from builders.records import decision_record, reconstructed_image
 
 from sonarpost import keys, logs, wire
@@ -129,13 +128,44 @@ def test_sender_keeps_the_record_while_the_disk_is_full(begin, c2, source, image
     eventually(lambda: service.health().state == "ok")
 
 
-def test_log_line_of_a_refused_record_names_vehicle_and_image(begin, source, image, capsys, monkeypatch):
-    root = logging.getLogger()
-    monkeypatch.setattr(root, "handlers", [])
-    monkeypatch.setattr(root, "level", root.level)
+def test_log_line_of_a_refused_record_names_vehicle_and_image(begin, source, image, capsys):
     logs.configure_logging("relay")
     service = begin()
     source.send(IMAGES, "relay", image("00A7", vessel="vessel-2"))
     eventually(lambda: service.health().counters.get("records_refused") == 1)
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "Record refused vehicle=" in line]
     assert "vehicle=uuv-1 image_id=00A7" in line
+
+
+def test_latest_status_of_each_vehicle_waits_for_the_shore_and_precedes_images(
+    begin, runner, c2, source, image, client
+):
+    service = begin()
+    source.send(IMAGES, "relay", image("AAAA"))
+    key, first = keys.acoustic_status("vessel-1"), SAMPLES["received-status"]
+    for number in range(20):
+        vehicle = f"uuv-{number % 2}"
+        status = first.status.model_copy(update={"vehicle_id": vehicle})
+        record = first.model_copy(
+            update={"vehicle_id": vehicle, "status": status, "received_utc_s": 1476262830.5 + number}
+        )
+        client.put(key, wire.encode(record), encoding=wire.encoding_of(type(record)))
+    client.put(key, wire.encode(first.model_copy(update={"vessel_id": "vessel-2"})))
+    eventually(lambda: service.health().counters.get("statuses_relayed") == 20)
+    eventually(lambda: service.health().gauges["waiting_for_shore"] == 3.0)
+    assert service.health().counters["records_refused"] == 1
+    runner.stop(service)
+    shore = c2()
+    begin()
+    eventually(lambda: len(shore.received) == 3)
+    inner = [msgpack.unpackb(e.payload) for e in shore.received]
+    assert [m["type"] for m in inner] == ["received_status", "received_status", "reconstructed_image"]
+    assert {m["vehicle_id"]: m["received_utc_s"] for m in inner[:2]} == {
+        "uuv-0": 1476262848.5,
+        "uuv-1": 1476262849.5,
+    }
+
+
+def test_statuses_are_not_relayed_if_configured(runner, platform):
+    service = runner.start(RelayService(platform("vessel-1"), RelayConfig(forward_status=False)))
+    assert keys.acoustic_status("vessel-1") not in service.consumed_keys()

@@ -17,7 +17,7 @@ from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink.messages import CommandOutcome, ResendMessage, pack
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.messages import AcousticFrame, Command, QueueState
-from sonarpost.modem.micromodem import FrameReceived
+from sonarpost.modem.interface import FrameReceived
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService
 from sonarpost.services.uuv_modem import service as uuv_modem

@@ -10,14 +10,8 @@ from builders.records import outgoing_message
 
 from sonarpost import keys, wire
 from sonarpost.messages import Transmissions
-from sonarpost.modem.micromodem import (
-    RATES,
-    FailureReason,
-    PacketFailed,
-    PacketSent,
-    TransmissionEnded,
-    TransmissionStarted,
-)
+from sonarpost.modem.interface import PacketFailed, PacketSent, TransmissionEnded, TransmissionStarted
+from sonarpost.modem.micromodem import RATES, FailureReason
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.service import OpModemService
 from sonarpost.services.uuv_modem.transmissions import KEPT_S, MAX_KEPT, TransmissionLog
@@ -26,7 +20,7 @@ KEY = keys.acoustic_transmissions("uuv-1")
 
 
 def sent(cycle_s: float) -> PacketSent:
-    return PacketSent(1, 1, 1, (b"x",), (), 50.0, 50.0 + cycle_s, None, end_reported=False)
+    return PacketSent(1, 1, 1, (b"x",), (), 50.0, 50.0 + cycle_s, end_reported=False)
 
 
 FAILED = PacketFailed(1, 1, 1, (b"x",), FailureReason.NO_TRANSMIT_START, maybe_sent=True)

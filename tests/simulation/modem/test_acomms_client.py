@@ -103,7 +103,7 @@ def test_full_packet_in_both_directions(clients: tuple[Client, Client], rate: in
     for sender, receiver in (clients, clients[::-1]):
         data = bytes((7 * n + rate + sender.modem.id) % 256 for n in range(shape.packet_bytes))
         sender.modem.send_packet_data(receiver.modem.id, bytearray(data), rate, ack=True)
-        got = [receiver.frames.get(timeout=15.0) for _ in range(shape.frames)]
+        got = [receiver.frames.get(timeout=120) for _ in range(shape.frames)]
         assert b"".join(bytes(frame.data) for frame in got) == data
         assert [(f.src, f.dest, f.frame_num) for f in got] == [
             (sender.modem.id, receiver.modem.id, n) for n in range(1, shape.frames + 1)
@@ -114,12 +114,12 @@ def test_full_packet_in_both_directions(clients: tuple[Client, Client], rate: in
         assert b"".join(bytes(frame.data) for frame in receiver.packets[0].frames) == data
         # A client that acknowledges blocks until its reply is transmitted.
         eventually(lambda r=receiver, s=sender: r.idle() and s.idle(), what="both clients idle")
-        csts = [receiver.statistics.get(timeout=5.0) for _ in range(2 if rate == 0 else 1)]
+        csts = [receiver.statistics.get(timeout=120) for _ in range(2 if rate == 0 else 1)]
         assert (csts[-1]["mode"], csts[-1]["rate_num"], csts[-1]["num_frames"]) == (0, rate, shape.frames)
         assert (csts[-1]["src"], csts[-1]["dest"]) == (sender.modem.id, receiver.modem.id)
-        xsts = [sender.sent.get(timeout=5.0) for _ in range(2 if rate == 0 else 1)]
+        xsts = [sender.sent.get(timeout=120) for _ in range(2 if rate == 0 else 1)]
         assert (xsts[-1]["nbytes"], xsts[-1]["num_frames_sent"]) == (shape.packet_bytes, shape.frames)
-        sender.statistics.get(timeout=5.0)  # those of the acknowledgement
+        sender.statistics.get(timeout=120)  # those of the acknowledgement
         for client in clients:
             client.acks.clear()
             client.packets.clear()
@@ -155,7 +155,7 @@ def test_poll(clients: tuple[Client, Client], rate: int):
 
     two.modem.set_uplink_data_function(uplink)
     one.modem.send_uplink_request(2, rate_num=rate)
-    frame = one.frames.get(timeout=15.0)
+    frame = one.frames.get(timeout=120)
     assert (frame.src, frame.dest, bytes(frame.data)) == (2, 1, b"requested data")
     assert [(r.src, r.dest, r.num_bytes, r.frame_num) for r in requests] == [(2, 1, RATES[rate].frame_bytes, 1)]
     eventually(lambda: one.idle() and two.idle(), what="both clients idle")

@@ -5,10 +5,7 @@ from __future__ import annotations
 import pytest
 from builders.emulator_bench import EmulatorBench
 
-from sonarpost.modem.micromodem import (
-    RATES,
-    MicroModem,
-    MicroModemConfig,
+from sonarpost.modem.interface import (
     ModemError,
     ModemEvent,
     ModemRebooted,
@@ -18,6 +15,7 @@ from sonarpost.modem.micromodem import (
     PacketSent,
     SentenceRejected,
 )
+from sonarpost.modem.micromodem import RATES, MicroModem, MicroModemConfig
 
 
 def drive(bench: EmulatorBench, drivers: dict[int, MicroModem], until_s: float) -> dict[int, list[ModemEvent]]:

@@ -26,7 +26,7 @@ from sonarpost.services.console.web.server import ConsoleApp, WebServer
 __all__ = ["console", "fast_password_hashes", "make_console", "users_file"]
 
 SMALL = {"width": 1366, "height": 768}
-TIMEOUT_MS = 20_000
+TIMEOUT_MS = 60_000
 COMMANDS = {"chromium": ("chromium",), "firefox": ("firefox", "firefox-esr")}
 """Commands of a browser; the last one is the name of its Debian package."""
 BROWSER_MESSAGES = (
@@ -39,19 +39,26 @@ BROWSER_MESSAGES = (
     "An unknown error occurred when fetching the script.",
 )
 """Parts of messages of browsers that are no errors of the page."""
-FIREFOX_FILES = ("test_decisions.py", "test_known_objects.py", "test_page.py", "test_start.py")
+FIREFOX_FILES = ("test_decisions.py", "test_known_objects.py", "test_page.py", "test_requests.py", "test_start.py")
 """Files that run in Firefox too; with SONARPOST_FIREFOX=all, every file does."""
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests in Firefox of files that are not in `FIREFOX_FILES`."""
+    """Skip tests that Firefox cannot run, and leave out those of files that are not in `FIREFOX_FILES`."""
+
+    def in_firefox(item: pytest.Item) -> bool:
+        parameters = getattr(item, "callspec", None)
+        return parameters is not None and parameters.params.get("browser") == "firefox"
+
+    for item in items:
+        chromium_only = item.get_closest_marker("chromium_only")
+        if chromium_only is not None and in_firefox(item):
+            item.add_marker(pytest.mark.skip(reason=chromium_only.args[0]))
     if os.environ.get("SONARPOST_FIREFOX") == "all":
         return
 
     def is_left_out(item: pytest.Item) -> bool:
-        parameters = getattr(item, "callspec", None)
-        in_firefox = parameters is not None and parameters.params.get("browser") == "firefox"
-        return in_firefox and item.path.name not in FIREFOX_FILES
+        return in_firefox(item) and item.path.name not in FIREFOX_FILES
 
     left_out = [item for item in items if is_left_out(item)]
     config.hook.pytest_deselected(items=left_out)
@@ -69,7 +76,8 @@ def browser(request: pytest.FixtureRequest, playwright: Playwright) -> Iterator[
     """Each browser, one for the tests of a file."""
     name = request.param
     found = (shutil.which(command) for command in COMMANDS[name])
-    path = os.environ.get(f"SONARPOST_{name.upper()}") or next(filter(None, found), None)
+    chosen = os.environ.get(f"SONARPOST_{name.upper()}")
+    path = chosen if chosen not in (None, "", "all") else next(filter(None, found), None)
     if path is None:
         pytest.skip(f"no {name}: apt-get install {COMMANDS[name][-1]}, or set SONARPOST_{name.upper()}")
     if name == "firefox":

@@ -77,17 +77,17 @@ def delay(visit, seconds=LATENCY_S):
 
 
 def open_slow_page(served, count):
-    """A page on the last contact of several, by name, with latency and observation."""
+    """A page on the first contact of several, by name, with latency and observation."""
     add_contacts(served, count)
-    visit = served.visit()
+    visit = open_page(served)
     # All contacts: decided ones stay in the list.
     visit.page.evaluate(
         "() => { localStorage.setItem('sonarpost.review', ''); localStorage.setItem('sonarpost.sort', 'name asc'); }"
     )
     visit.page.reload()
-    visit.until("() => document.querySelector('.row[data-index=\"0\"]')?.dataset.id.endsWith('.0000')")
-    # The list is drawn again after it was loaded.
-    visit.page.locator('.row[data-index="0"]').click()
+    visit.until(
+        "() => document.querySelector('.row[data-index=\"0\"][aria-selected=true]')?.dataset.id.endsWith('.0000')"
+    )
     visit.wait_for_contact("0000")
     visit.page.evaluate("document.getElementById('queue').focus()")
     delay(visit)
@@ -203,7 +203,8 @@ def test_contact_that_cannot_be_loaded_leaves_the_old_one(served):
     assert decisions(served, "0005")[0]["verdict"] == "not_mine_like"
 
 
-def test_decision_and_undo_from_any_contact(served):
+def test_decision_and_undo_from_any_contact(serve):
+    served = serve(take_back_s=60)
     add_contacts(served, 4)
     visit = served.visit()
     visit.wait_for_contact("0003")
@@ -228,9 +229,10 @@ def test_decision_and_undo_from_any_contact(served):
 
 
 def test_take_back_time_ends_and_survives_a_reload(serve):
-    served = serve(take_back_s=12)
+    served = serve(take_back_s=15)
     add_contacts(served, 2)
     visit = served.visit()
+    visit.expect_errors("No response from the console's server.")  # a request that the reload ends
     visit.wait_for_contact("0001")
     visit.press("1")
     visit.wait("#take-back >> text=take back")
@@ -279,8 +281,9 @@ def test_verdict_key_sends_class_confidence_and_remark(serve):
     # The buttons do the same.
     visit.wait_for_contact("0001")
     visit.page.locator(".verdicts .mine_like").click()
+    visit.wait("#result >> text=uuv-1/0001")
     visit.wait_for_contact("0000")
-    assert [one["verdict"] for one in decisions(served, "0001")] == ["mine_like"]
+    eventually(lambda: [one["verdict"] for one in decisions(served, "0001")] == ["mine_like"])
 
 
 def test_form_does_not_move(served):

@@ -5,12 +5,24 @@ from __future__ import annotations
 import time
 
 import pytest
-from builders.common import eventually
+import zenoh
+from builders.common import eventually, free_port
 from builders.console import image_record
+from builders.services import modem_pair, runner
 
 from sonarpost import keys, wire
+from sonarpost.bus.session import router_config
 from sonarpost.messages import AcousticFrame, Health
 from sonarpost.services.console.chain import RouterState
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.service import ConsoleService
+from sonarpost.services.console.store.users import FILE_NAME, Users
+from sonarpost.services.decompressor.config import DecompressorConfig
+from sonarpost.services.decompressor.service import DecompressorService
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.service import OpModemService
+
+__all__ = ["modem_pair", "runner"]
 
 VESSEL = "vessel-1"
 
@@ -29,8 +41,8 @@ def report(served, service, state="ok", detail="", **gauges):
     served.state.fleet.services.add(keys.health(VESSEL, service), wire.encode(health), time.monotonic())
 
 
-def receive_frame(served, vehicle="uuv-1", age_s=0.0):
-    frame = AcousticFrame(
+def frame_of(age_s=0.0):
+    return AcousticFrame(
         direction="rx",
         platform_id=VESSEL,
         time_utc_s=time.time() - age_s,
@@ -42,7 +54,10 @@ def receive_frame(served, vehicle="uuv-1", age_s=0.0):
         frame_count=1,
         data=b"x",
     )
-    served.state.fleet.add_frame(vehicle, frame, time.monotonic() - age_s)
+
+
+def receive_frame(served, vehicle="uuv-1", age_s=0.0):
+    served.state.fleet.add_frame(vehicle, frame_of(age_s), time.monotonic() - age_s)
 
 
 def publish(served):
@@ -93,7 +108,9 @@ def test_each_lost_place_is_named_in_the_chain_and_in_a_banner(vessel):
     assert visit.page.get_attribute("#bar", "data-worst") == "lost"
     # All places work again.
     vessel.state.router = vessel.state.router.changed(time.time(), reached=True)
-    report(vessel, "op_modem", modem_ready=1.0)
+    for service in ("console", "decompressor", "op_modem"):
+        report(vessel, service, modem_ready=1.0)
+    receive_frame(vessel)
     publish(vessel)
     visit.wait(place("modem", "ok"))
     visit.until("() => !document.getElementById('fault')")
@@ -105,9 +122,8 @@ def test_silent_vehicle_is_named(vessel):
     visit.wait(place("vehicle", "degraded"))
     assert "no frames from uuv-2" in visit.text("#fault")
     visit.page.click("#chain summary")
-    details = visit.text("#chain .places")
-    assert "uuv-1" in details
-    assert "no frames from uuv-2" in details
+    visit.wait("#chain .places >> text=uuv-1")
+    assert "no frames from uuv-2" in visit.text("#chain .places")
     visit.press("Escape")
     visit.until("() => !document.getElementById('chain').open")
 
@@ -122,6 +138,39 @@ def test_lost_server_is_named_by_the_page(vessel):
     visit.wait(place("router", "unknown"))
     vessel.restart()
     visit.wait(place("server", "ok"))
+
+
+def test_each_failure_of_running_services_is_named_within_10_s(platform, runner, modem_pair, tmp_path, visit):
+    """A silent vehicle, an unplugged modem, an ended router and an ended server, each at its place on one open page."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    router = zenoh.open(router_config([endpoint]))
+    try:
+        settings = platform(VESSEL).model_copy(update={"router": (endpoint,)})
+        users = Users(settings.state_dir / FILE_NAME)
+        users.add("anna", "operator", "correct horse battery")
+        console = runner.start(ConsoleService(settings, ConsoleConfig(port=0, vehicle_stale_s=1.0)))
+        decoder = DecompressorConfig(out_dir=tmp_path / "out", image_consumers=("console",))
+        runner.start(DecompressorService(settings, decoder))
+        modem_pair.start()
+        modem = OpModemConfig(port=modem_pair.port(modem_pair.VESSEL), vehicles={"3": "uuv-1"})
+        runner.start(OpModemService(settings, modem))
+        page = visit(console.address, users.start_session("anna").token)
+        page.expect_errors("Failed to load resource", "ERR_", "net::")
+        page.wait(place("modem", "ok"))
+        console.state.fleet.add_frame("uuv-1", frame_of())
+        page.wait(place("vehicle", "degraded"), timeout=10_000)
+        assert "no frames from uuv-1" in page.text("#fault")
+        modem_pair.stop()
+        page.wait(place("modem", "lost"), timeout=10_000)
+        assert "the modem does not reply" in page.text("#fault")
+    finally:
+        router.close()
+    page.wait(place("router", "lost"), timeout=10_000)
+    assert "the router is not reached" in page.text("#fault")
+    console.stop()
+    page.wait(place("server", "lost"), timeout=10_000)
+    assert "No connection to the console's server" in page.text("#offline")
+    users.close()
 
 
 def test_page_whose_stream_is_refused_states_the_reason(vessel, monkeypatch):

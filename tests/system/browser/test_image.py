@@ -218,9 +218,11 @@ def test_one_drag_measures_and_both_ends_can_be_moved(served):
     moved = (end[0], end[1] + 40)
     drag(visit, end, moved)
     visit.until("text => document.querySelector('.size[data-kind=length] b').textContent !== text", first)
+    visit.wait(".hint >> text=Enter keeps it")
     second = visit.text(".size[data-kind=length] b")
     drag(visit, start, (start[0], start[1] + 20))
     visit.until("text => document.querySelector('.size[data-kind=length] b').textContent !== text", second)
+    visit.wait(".hint >> text=Enter keeps it")
     assert only_contact(served)["measurements"] == []
     visit.press("Enter")
     visit.wait(".hint >> text=next line is shadow")
@@ -264,6 +266,7 @@ def test_withdrawn_measurement_leaves_the_panel_and_stays_in_the_database(served
     visit.wait('details[data-name="measurements"] li.undone')
 
 
+@pytest.mark.chromium_only("Playwright sends touches of two fingers to Chromium only")
 def test_two_fingers_zoom_the_image(served):
     visit = opened(served, has_touch=True)
     extent = "() => JSON.parse(document.querySelector('.stage canvas').dataset.mark)"

@@ -101,7 +101,9 @@ def check_layout(visit):
 def test_image_has_at_least_45_per_cent_of_the_screen(served, size, theme):
     visit = visit_at(served, size, theme)
     check_layout(visit)
-    assert share_of_the_image(visit) >= MIN_SHARE
+    share = share_of_the_image(visit)
+    print(f"{size}, {theme}: image share {100 * share:.1f} %")  # shown by -rP
+    assert share >= MIN_SHARE
     assert (
         visit.page.evaluate("getComputedStyle(document.querySelector('.stage')).backgroundColor") == "rgb(10, 13, 16)"
     )

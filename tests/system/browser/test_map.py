@@ -7,6 +7,7 @@ import re
 
 import pytest
 from builders.console import image_record
+from builders.record_samples import SAMPLES
 from PIL import Image
 
 from sonarpost.review.positions import destination, distance_m
@@ -84,6 +85,26 @@ def test_symbols_are_at_their_true_places(serve):
     assert visit.text(".map .ring-label").endswith("m")
     # No line joins contacts: apart from frame, rings, bands and circles there is no path.
     assert page.locator(".map path:not(.frame-line, .ring, .band, .sigma)").count() == 0
+
+
+def test_track_and_measured_distance(serve):
+    served = scene(serve)
+    first = SAMPLES["received-status"]
+    for number in range(3):
+        lat_deg, lon_deg = destination(*VESSEL, 90.0, 100.0 + 100.0 * number)
+        changes = {"lat_deg": lat_deg, "lon_deg": lon_deg, "time_utc_s": 1_700_000_000.0 + number}
+        status = first.status.model_copy(update=changes)
+        served.state.store_status(first.model_copy(update={"status": status}))
+    served.state.fleet.set_range(SAMPLES["vehicle-range"].model_copy(update={"distance_m": 300.0}))
+    visit = open_map(served)
+    page = visit.page
+    track = page.locator(".map path.track").bounding_box()
+    at = {number: page.evaluate(SYMBOL_AT, f"000{number}") for number in (2, 4)}
+    pixels_per_m = (at[2][0] - at[4][0]) / 600.0
+    assert track["width"] == pytest.approx(200.0 * pixels_per_m, abs=4.0)
+    circle = page.locator(".map path.measured-range").bounding_box()
+    assert circle["width"] == pytest.approx(600.0 * pixels_per_m, rel=0.02)
+    assert any("uuv-1: 300" in text for text in page.locator(".map .ring-label").all_inner_texts())
 
 
 def test_band_is_from_the_vehicle_to_the_contact(serve):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import time
 
 from builders.common import eventually
 from builders.console import image_record
+from builders.record_samples import SAMPLES
 
 from sonarpost.messages import AcousticFrame, QueuedImage, QueueState
+from sonarpost.review.positions import destination
 from sonarpost.services.console.chain import RouterState
 
 
@@ -86,6 +89,29 @@ def test_mission_page_shows_progress_by_vehicle_and_operator(served):
     visit.until("() => document.querySelector('.mission article dd').textContent.startsWith('5')")
     visit.press("q")
     visit.until("() => document.querySelector('.mission').classList.contains('hidden')")
+
+
+def test_status_of_a_vehicle_on_the_mission_and_fleet_page(served):
+    listen_since(served, time.time() - 60)
+    first = SAMPLES["received-status"]
+    for number in range(2):
+        lat_deg, lon_deg = destination(56.0, -5.0, 90.0, 500.0 * number)
+        changes = {"lat_deg": lat_deg, "lon_deg": lon_deg, "time_utc_s": time.time() - 120 + 60 * number}
+        status = first.status.model_copy(update=changes)
+        served.state.store_status(first.model_copy(update={"status": status, "received_utc_s": time.time()}))
+    served.state.fleet.set_range(SAMPLES["vehicle-range"])
+    visit = served.visit()
+    visit.press("Shift+M")
+    visit.wait('.mission article[aria-label="uuv-1"]')
+    card = visit.text('.mission article[aria-label="uuv-1"]')
+    assert re.search(r"Surveyed area\n7[3-7]\d{3}\s*m², from 1 section of the track", card), card
+    served.state.events.publish("fleet", served.state.fleet_state())
+    visit.press("f")
+    visit.wait('.fleet article[aria-label="uuv-1"]')
+    card = visit.text('.fleet article[aria-label="uuv-1"]')
+    assert "Measured distance\n740" in card
+    assert "Reported status\nheading 272" in card
+    assert "4 images" in card
 
 
 def test_empty_page_states_what_it_listens_to(serve):

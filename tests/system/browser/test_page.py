@@ -72,7 +72,8 @@ def row(image_id):
     return f'.row[data-id*=".{image_id}"]'
 
 
-def test_complete_review_with_the_keyboard(served):
+def test_complete_review_with_the_keyboard(serve):
+    served = serve(take_back_s=60)
     add_contacts(served)
     visit = served.visit("", path="login")
     visit.page.keyboard.type("anna")

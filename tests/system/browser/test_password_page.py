@@ -33,6 +33,7 @@ def test_password_change_with_the_keyboard(served):
     with visit.page.context.expect_page() as opened:
         visit.press("Enter")
     page = opened.value
+    page.bring_to_front()  # Playwright leaves a new tab of Firefox without the focus
     page.wait_for_selector("button[type=submit]:enabled")
     assert page.url == served.address + "password"
     assert page.evaluate(FOCUSED) == "old"

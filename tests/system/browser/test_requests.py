@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import pytest
+from builders.common import eventually
 from builders.console import FIRST_UTC_S, image_record
 
-from sonarpost.messages import DownlinkState
+from sonarpost.codec.region import RegionBox
+from sonarpost.messages import Command, DownlinkState, Pixels
 
 ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 LARGE = {"width": 1920, "height": 1080}
@@ -30,6 +35,43 @@ def wider_record(version: int = 1, *, complete: bool = True) -> Any:
     fields = {"first_utc_s": FIRST_UTC_S + 60, "time_utc_s": FIRST_UTC_S - 100}
     sizes = {"pixel_along_m": 0.2, "pixel_across_m": 0.1}
     return v1_record(version, 300, complete=complete, image_id="00A9", **fields, **sizes)
+
+
+def with_pixels(record: Any, pixels: npt.NDArray[np.uint8]) -> Any:
+    picture = Pixels.from_array(pixels)
+    return record.model_copy(update={"picture": picture, "picture_sha256": picture.sha256})
+
+
+def mean_grey(visit: Any, left: float, top: float, right: float, bottom: float) -> float:
+    """Mean grey level of the canvas in a rectangle, in CSS pixels."""
+    return float(
+        visit.page.evaluate(
+            """([left, top, right, bottom]) => {
+              const ratio = devicePixelRatio || 1;
+              const copy = new OffscreenCanvas((right - left) * ratio, (bottom - top) * ratio);
+              const context = copy.getContext('2d', {willReadFrequently: true});
+              context.drawImage(document.querySelector('.stage canvas'), -left * ratio, -top * ratio);
+              const pixels = context.getImageData(0, 0, copy.width, copy.height).data;
+              let sum = 0;
+              for (let i = 0; i < pixels.length; i += 4) sum += pixels[i];
+              return (4 * sum) / pixels.length;
+            }""",
+            [left, top, right, bottom],
+        )
+    )
+
+
+def outline(visit: Any) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom of the only outline on the canvas, in CSS pixels."""
+    corners = json.loads(visit.page.locator(".stage canvas").first.get_attribute("data-outlines"))
+    assert len(corners) == 4
+    (left, top), (right, bottom) = corners[0], corners[2]
+    return left, top, right, bottom
+
+
+def shows_layer(visit: Any, layer: str) -> None:
+    visit.wait(f'[data-tool="layer-{layer}"][aria-pressed="true"]')
+    visit.until("layer => document.querySelector('canvas').dataset.shows.endsWith(` ${layer}`)", layer)
 
 
 def downlink(served: Any, state: str, reason: str = "") -> None:
@@ -133,7 +175,11 @@ def test_request_on_a_phone(v1_console: Any) -> None:
     visit.wait("dialog .costs")
     visit.page.locator('dialog [data-action="send"]').click()
     visit.until("() => !document.querySelector('dialog')")
-    assert [one["kind"] for one in v1_console.state.contact_detail(ID)["requests"]] == ["refine"]
+    # The dialog closes before the request is stored.
+    eventually(
+        lambda: [one["kind"] for one in v1_console.state.contact_detail(ID)["requests"]] == ["refine"],
+        what="the request",
+    )
 
 
 def test_request_with_keys(v1_console: Any) -> None:
@@ -206,3 +252,83 @@ def test_wheel_continues_into_the_wider_view(v1_console: Any) -> None:
     visit.page.locator(".stage canvas").first.hover()
     visit.page.mouse.wheel(0, 100)
     visit.wait('[data-tool="layer-wider"][aria-pressed="true"]')
+
+
+def test_wider_view_surrounds_the_image_at_its_place(serve: Any) -> None:
+    """The wider image is darker than the contact's image here, so that the latter can be told apart inside it."""
+    blocks = np.random.default_rng(3).integers(100, 250, (20, 30))
+    own = np.kron(blocks, np.ones((2, 2))).astype(np.uint8)
+    surroundings = np.full((40, 60), 20, np.uint8)
+    surroundings[6:26, 20:50] = blocks // 5
+    served = serve(assumed_rate=1)
+    served.state.store_image(with_pixels(v1_record(1, 131), own))
+    served.state.store_image(with_pixels(wider_record(), surroundings))
+    visit = served.visit(viewport=LARGE)
+    visit.wait_for_contact("00A7")
+    visit.press("-")
+    shows_layer(visit, "wider")
+    # The view covers twice the lengths of the contact's image: 40 x 60 px of 0.1 x 0.05 m.
+    across_m, along_m = json.loads(visit.page.locator(".stage canvas").first.get_attribute("data-extent"))
+    assert (across_m, along_m) == pytest.approx((6.0, 8.0))
+    left, top, right, bottom = outline(visit)
+    pixel_px = (right - left) / 60
+    assert mean_grey(visit, left + 4, top + 4, right - 4, bottom - 4) > 100
+    assert mean_grey(visit, left - 20 * pixel_px, top + 4, left - 4 * pixel_px, bottom - 4) < 10
+    # The mark of the contact is inside its image.
+    mark = json.loads(visit.page.locator(".stage canvas").first.get_attribute("data-mark"))
+    for x, y in mark:
+        assert left < x < right
+        assert top < y < bottom
+
+
+def test_region_is_drawn_at_its_place(serve: Any) -> None:
+    served = serve(assumed_rate=1)
+    whole = np.full((40, 60), 30, np.uint8)
+    whole[:3] = 220
+    served.state.store_image(with_pixels(v1_record(1, 131), whole))
+    visit = served.visit(viewport=LARGE)
+    visit.wait_for_contact("00A7")
+    visit.press("7")
+    layer = visit.page.locator(".region-layer")
+    layer.wait_for()
+    box = layer.bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    drawn = box["x"] + 0.55 * box["width"], box["y"] + 0.55 * box["height"]
+    visit.page.mouse.move(*middle)
+    visit.page.mouse.move(*drawn)
+    visit.page.mouse.down()
+    visit.page.mouse.move(drawn[0] + 200, drawn[1] + 100)
+    visit.page.mouse.up()
+    visit.page.get_by_role("dialog").get_by_text("smallest detail").wait_for()
+    visit.page.get_by_role("button", name="Send request").click()
+
+    def commands() -> list[Command]:
+        return [item.record for item in served.state.unsent_records() if isinstance(item.record, Command)]
+
+    eventually(lambda: len(commands()) == 1, what="the request")
+    [command] = commands()
+    top_px, left_px, bottom_px, right_px = RegionBox(*command.box).pixels(40, 60)
+    part = with_pixels(
+        v1_record(1, 96, image_id="00A9", first_utc_s=FIRST_UTC_S + 60, time_utc_s=FIRST_UTC_S - 100),
+        np.full((bottom_px - top_px, right_px - left_px), 220, np.uint8),
+    )
+    served.state.store_image(part)
+    visit.wait(".request-states >> text=arrived: region (+96")
+    assert visit.page.locator(".row").count() == 1
+    visit.page.locator('[data-tool="layer-region"]').click()
+    shows_layer(visit, "region")
+    left, top, right, bottom = outline(visit)
+    corners = visit.page.locator(".stage canvas").first
+    across_m, along_m = json.loads(corners.get_attribute("data-extent"))
+    assert (across_m, along_m) == pytest.approx((3.0, 4.0))
+    assert (right - left) / (bottom - top) == pytest.approx(
+        0.05 * (right_px - left_px) / (0.1 * (bottom_px - top_px)), rel=0.02
+    )
+    assert mean_grey(visit, left + 4, top + 4, right - 4, bottom - 4) > 150
+    assert mean_grey(visit, left + 4, bottom + 8, right - 4, bottom + 14) < 60
+    assert mean_grey(visit, left - 14, top + 4, left - 8, bottom - 4) < 60
+    # The layer is switched off again: the contact's image alone.
+    visit.page.locator('[data-tool="layer-raw"]').click()
+    shows_layer(visit, "raw")
+    assert corners.get_attribute("data-outlines") == "[]"
+    assert mean_grey(visit, left + 4, top + 4, right - 4, bottom - 4) < 60

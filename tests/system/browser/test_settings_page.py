@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 
 import pytest
+from builders.common import eventually
 from builders.console import image_record
 
 pytestmark = pytest.mark.parametrize("browser", ["chromium"], indirect=True)
@@ -31,7 +32,8 @@ def test_settings_follow_the_user_to_another_computer(served):
     here.page.locator(".settings select").nth(2).select_option("large")
     here.page.locator(".settings select").nth(0).select_option("de")
     here.until("() => document.documentElement.lang === 'de'")
-    assert served.users.settings("anna")["language"] == "de"
+    stored = {"theme": "night", "type": "large", "language": "de"}
+    eventually(lambda: stored.items() <= served.users.settings("anna").items(), what="the settings")
     # Another computer, with another cache.
     there = open_page(served)
     assert there.page.evaluate("({ ...document.documentElement.dataset })") == {"theme": "night", "type": "large"}

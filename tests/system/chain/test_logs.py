@@ -19,7 +19,7 @@ STEPS = {
     "uuv_modem": "Image sent",
     "op_modem": "Image received",
     "decompressor": "Image decoded",
-    "relay": "Record queued for the shore",
+    "relay": "Image queued for the shore",
     "c2": "Image stored",
 }
 

@@ -95,7 +95,7 @@ def bench(tmp_path: Path, installation: Installation) -> Iterator[Bench]:
 @pytest.mark.timeout(900)  # compiles the codec for encoder and decoder
 def test_contacts_reach_the_shore_site_from_the_shipped_configurations(bench: Bench) -> None:
     emulator = bench.start("modems", "modem-emulator", "--modems", "2", "--tcp", "--time-scale", str(TIME_SCALE))
-    eventually(lambda: bench.log("modems").count("\n") >= 1, 60, "the emulated modems")
+    eventually(lambda: bench.log("modems").count("\n") >= 1, 120, "the emulated modems")
     first, second = (modem["device"] for modem in json.loads(bench.log("modems").splitlines()[0])["modems"])
     ports = [free_port() for _ in range(3)]
     uuv, vessel, shore = (f'["tcp/127.0.0.1:{port}"]' for port in ports)

@@ -51,6 +51,17 @@ def test_every_service_of_the_chain_runs_with_its_platforms_file() -> None:
         assert service in written
 
 
+def test_two_c2_share_a_database_and_no_store() -> None:
+    first, second = blocks()["c2-first"], blocks()["c2-second"]
+    [address] = set(re.findall(r"SONARPOST_\w+__DATABASE: \"(\S+)\"", COMPOSE.read_text()))
+    assert address.startswith("postgresql://sonarpost:${DATABASE_PASSWORD:-}@database/")
+    assert "- shore-state:/var/lib/sonarpost/state" in first
+    assert "- shore-second-state:/var/lib/sonarpost/state" in second
+    for name in ("database", "c2-first", "c2-second", "console-shore-ha"):
+        assert "profiles: [shore-ha]" in blocks()[name]
+        assert "shore" in joins(blocks()[name])
+
+
 def test_networks_of_platforms_lead_nowhere_and_only_routers_meet() -> None:
     text = COMPOSE.read_text()
     networks = text.split("\nnetworks:\n")[1].split("\nvolumes:\n")[0]
@@ -62,8 +73,9 @@ def test_networks_of_platforms_lead_nowhere_and_only_routers_meet() -> None:
         "console",
         "router-shore",
         "console-shore",
+        "console-shore-ha",
     ]
-    for name in ("console", "console-shore"):
+    for name in ("console", "console-shore", "console-shore-ha"):
         # Pages are served to this host only, unless the environment names another address.
         assert re.search(r'ports: \["\$\{\w+:-127\.0\.0\.1:\d+\}:8470"\]', blocks()[name]), name
     for name, block in blocks().items():
@@ -116,7 +128,10 @@ def test_every_variable_is_in_the_example_with_its_default() -> None:
     for variable, (service, table, key) in overriding_variables().items():
         [platform] = re.findall(r"command: \[(\w+), ", blocks()[service])
         platform_table, own = load(
-            REPOSITORY / "config" / f"{platform}.toml", service.removesuffix("-shore"), configuration_type(service), {}
+            REPOSITORY / "config" / f"{platform}.toml",
+            service.removesuffix("-ha").removesuffix("-shore"),
+            configuration_type(service),
+            {},
         )
         value = getattr(platform_table if table == "platform" else own, key)
         shown = known[variable].strip()
@@ -124,7 +139,7 @@ def test_every_variable_is_in_the_example_with_its_default() -> None:
 
 
 def configuration_type(service: str) -> type[ServiceConfig]:
-    name = service.removesuffix("-shore")
+    name = service.removesuffix("-ha").removesuffix("-shore")
     module = importlib.import_module(f"sonarpost.services.{name}.config")
     found: type[ServiceConfig] = getattr(module, "".join(part.capitalize() for part in name.split("_")) + "Config")
     return found
@@ -154,6 +169,9 @@ def test_only_keys_of_the_containers_networks_are_always_set() -> None:
         "OP_MODEM__PORT",
         "CONSOLE__HOST",
         "CONSOLE__INSECURE",
+        "PLATFORM__ID",
+        "C2__DATABASE",
+        "CONSOLE__DATABASE",
     }
     page = (REPOSITORY / "docs" / "how-to" / "containers.md").read_text()
     for name in always:
@@ -191,7 +209,7 @@ def test_edited_configuration_holds_unless_env_overrides_it(tmp_path: Path) -> N
                 env={"PATH": os.environ["PATH"], "HOME": str(tmp_path)},
                 capture_output=True,
                 text=True,
-                timeout=60,
+                timeout=400,
                 check=True,
             )
             services = yaml.safe_load(done.stdout)["services"]
@@ -233,16 +251,24 @@ def test_compose_accepts_the_files(files: list[str]) -> None:
         pytest.skip("neither `docker compose` nor docker-compose is installed")
     for command in commands:
         options = [option for file in files for option in ("-f", file)]
-        profiles = [option for profile in PLATFORMS for option in ("--profile", profile)]
+        profiles = [option for profile in (*PLATFORMS, "shore-ha") for option in ("--profile", profile)]
         done = subprocess.run(
             [*command, *options, *profiles, "config", "--services"],
             cwd=REPOSITORY,
             env={**os.environ, "COMPOSE_DISABLE_ENV_FILE": "1"},
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=400,
             check=False,
         )
         assert done.returncode == 0, done.stderr
-        assert set(done.stdout.split()) >= {*SERVICES, "router-uuv", "router-vessel", "router-shore", "pki"}
+        assert set(done.stdout.split()) >= {
+            *SERVICES,
+            "router-uuv",
+            "router-vessel",
+            "router-shore",
+            "pki",
+            "database",
+            "c2-second",
+        }
         assert json.dumps(done.stderr).count("level=warning") == 0

@@ -17,6 +17,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,13 +33,13 @@ PAGES = sorted(
     for path in REPOSITORY.glob(pattern)
     if path.name != "CHANGELOG.md"
 )
-LANGUAGES = {"sh", "python", "text", "toml", "json", "json5", "yaml", "ini", "hex"}
+LANGUAGES = {"sh", "python", "text", "toml", "json", "json5", "yaml", "ini", "hex", "sql"}
 BLOCK = re.compile(
     r"(?:^<!-- example: (?P<mark>[^>]*) -->\n)?"
     r"^ *```(?P<language>\w*)(?: title=\"(?P<title>[^\"]*)\")?\n(?P<text>.*?)^ *```$",
     re.MULTILINE | re.DOTALL,
 )
-TIMEOUT_S = 150
+TIMEOUT_S = 500
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Block:
 
 def blocks(page: str) -> list[Block]:
     text = (REPOSITORY / page).read_text(encoding="utf-8")
-    return [Block(m["language"], m["title"], m["mark"] or "", m["text"]) for m in BLOCK.finditer(text)]
+    return [Block(m["language"], m["title"], m["mark"] or "", textwrap.dedent(m["text"])) for m in BLOCK.finditer(text)]
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -25,7 +25,10 @@ DOCS = REPOSITORY / "docs" / "explanation"
 RUNTIME = REPOSITORY / "common" / "sonarpost" / "runtime"
 BASE_GAUGES = {"inbox", "outbox", "refused", "disk_free_bytes"}
 # Counters whose names are composed of a record's type.
-COMPOSED_COUNTERS = {"relay": {"reconstructed_images_relayed", "decisions_relayed"}}
+COMPOSED_COUNTERS = {
+    "c2": {"short_contacts_received", "short_decisions_received"},
+    "relay": {"reconstructed_images_relayed", "decisions_relayed"},
+}
 
 
 def health_names(name: str) -> list[str]:
@@ -40,14 +43,23 @@ def counters_in_code(sources: list[str]) -> Iterator[str]:
     """Return the names given to `count`."""
     for source in sources:
         for node in ast.walk(ast.parse(source)):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "count":
+            if (
+                isinstance(node, ast.Call)
+                and isinstance(node.func, ast.Attribute)
+                and node.func.attr in ("count", "_count")
+            ):
                 for part in ast.walk(node.args[0]) if node.args and not isinstance(node.args[0], ast.JoinedStr) else ():
                     if isinstance(part, ast.Constant) and re.fullmatch("[a-z_]+", str(part.value)):
                         yield str(part.value)
 
 
-CONDITIONAL_GAUGES = {"atd_stub": {"expected_pd", "clutter_per_1000_m2", "ripple_strength", "worst_expected_pd"}}
-"""Gauges that a service has only after its first file."""
+CONDITIONAL_GAUGES = {
+    "atd_stub": {"expected_pd", "clutter_per_1000_m2", "ripple_strength", "worst_expected_pd"},
+    "relay": {
+        f"satellite_{name}_shore" for name in ("waiting", "unacknowledged", "bytes_today", "bytes", "messages", "cost")
+    },
+}
+"""Gauges that a service has only after its first file, or with a satellite upstream."""
 
 
 @pytest.mark.parametrize("name", [n for n in SERVICES if n != "acoustic_channel"])

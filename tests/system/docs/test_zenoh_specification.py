@@ -128,7 +128,7 @@ class Program:
             self.lines.put(line.strip())
 
     def wait(self) -> None:
-        assert self.process.wait(timeout=20) == 0, self.process.stderr and self.process.stderr.read()
+        assert self.process.wait(timeout=120) == 0, self.process.stderr and self.process.stderr.read()
 
     def close(self) -> None:
         self.process.kill()
@@ -159,13 +159,13 @@ def test_published_contact_reaches_consumer_and_watcher(run: Run, router: str, p
     consumer.start()
     try:
         watching = run("watch", router)
-        while not watching.lines.get(timeout=15).startswith("sonarpost/v1/uuv-1/health/compressor health"):
+        while not watching.lines.get(timeout=120).startswith("sonarpost/v1/uuv-1/health/compressor health"):
             pass
         run("detector.py", router).wait()
         eventually(lambda: len(consumer.received) == 1)
         line = ""
         while not line.startswith(keys.contact_detected("uuv-1")):
-            line = watching.lines.get(timeout=15)
+            line = watching.lines.get(timeout=120)
         assert line.split() == [keys.contact_detected("uuv-1"), "snippet"]
     finally:
         consumer.stop()
@@ -192,7 +192,7 @@ def test_delivery_program_waits_for_its_consumer(
     consumer.start()
     try:
         program.wait()
-        assert program.lines.get(timeout=5) == "stored"
+        assert program.lines.get(timeout=120) == "stored"
         eventually(lambda: consumer.received == [SAMPLES["decision-plain"]])
     finally:
         consumer.stop()
@@ -209,7 +209,8 @@ def test_delivery_program_sends_pieces_and_reports_a_refusal(
         program = run("deliver", router, RecordingConsumer.key, "compressor", str(tmp_path / "record"))
         program.wait()
         assert (
-            program.lines.get(timeout=5) == f"refused {RecordingConsumer.key}: contact: got 'nothing', expected a value"
+            program.lines.get(timeout=120)
+            == f"refused {RecordingConsumer.key}: contact: got 'nothing', expected a value"
         )
         assert consumer.store.refused_count() == 1
     finally:

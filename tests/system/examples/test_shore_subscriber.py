@@ -82,7 +82,7 @@ def test_example_prints_records_and_saves_images(router: str, c2: C2Service, tmp
         assert process.stdout is not None
         lines = [process.stdout.readline() for _ in range(3)]
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=10)
+        process.communicate(timeout=120)
     assert lines[0].startswith("reconstructed_image uuv-1 0001 None {'contact_id': 'uuv-1/0001'")
     assert "'lat_deg': 41.52513339" in lines[0]
     assert lines[1:] == ["reconstructed_image uuv-1 0002 None None\n", "decision uuv-1 0001 mine_like None\n"]

@@ -94,7 +94,7 @@ class TlsChain(Chain):
         context = ssl.create_default_context(cafile=str(files / "ca.pem"))
         context.load_cert_chain(files / "certificate.pem", files / "key.pem")
         with (
-            socket.create_connection(("localhost", self.tls_port), timeout=10) as plain,
+            socket.create_connection(("localhost", self.tls_port), timeout=120) as plain,
             context.wrap_socket(plain, server_hostname="localhost") as secured,
         ):
             der = secured.getpeercert(binary_form=True)

@@ -2,10 +2,12 @@
 
     python -m pip install 'sonarpost[fuzz]'       # x86-64 and Python 3.11 to 3.13: Atheris has no other wheels
     python tests/system/fuzz/run_atheris_survey.py -max_total_time=180
+    python tests/system/fuzz/run_atheris_survey.py --formats=jsf -max_total_time=180
 
-Options with one dash are those of libFuzzer. The first byte of an input selects the file (`survey_oracle.FILES`), and
-the rest is its content. The seeds are valid recordings. Interesting inputs are stored in `build/fuzz/survey`. An input
-that fails is written to the current folder; `run_atheris_survey.py crash-…` repeats it.
+Options with one dash are those of libFuzzer; `--formats` limits the run to some formats, separated by commas. The first
+byte of an input selects the file (`survey_oracle.FILES`), and the rest is its content. The seeds are valid recordings.
+Interesting inputs are stored in `build/fuzz/survey`. An input that fails is written to the current folder;
+`run_atheris_survey.py crash-…` with the same formats repeats it.
 """
 
 from __future__ import annotations
@@ -26,21 +28,24 @@ except ImportError:
 with atheris.instrument_imports(include=["sonarpost.sonar", "fuzz"]):
     from builders.survey_oracle import Readers
 
+FORMATS = "--formats="
 DEFAULTS = {"-max_len": 4096, "-timeout": 10, "-rss_limit_mb": 2048, "-print_final_stats": 1}
 
 
 def main() -> None:
     """Run until libFuzzer ends the process."""
-    arguments = sys.argv[1:]
-    WORK.mkdir(parents=True, exist_ok=True)
+    arguments = [argument for argument in sys.argv[1:] if not argument.startswith(FORMATS)]
+    formats = [argument.removeprefix(FORMATS) for argument in sys.argv[1:] if argument.startswith(FORMATS)]
+    work = WORK / formats[0] if formats else WORK
+    work.mkdir(parents=True, exist_ok=True)
     folder = Path(
         tempfile.mkdtemp(prefix="survey-", dir=WORK.parent)
     )  # not deleted, because libFuzzer ends the process
-    readers = Readers(folder)
+    readers = Readers(folder, formats[0].split(",")) if formats else Readers(folder)
     if not any(Path(argument).is_file() for argument in arguments):
         for number, seed in enumerate(readers.seeds()):
-            (WORK / f"seed-{number}").write_bytes(seed)
-        arguments.append(str(WORK))
+            (work / f"seed-{number}").write_bytes(seed)
+        arguments.append(str(work))
 
     def test_one_input(data: bytes) -> None:
         readers.check(data)

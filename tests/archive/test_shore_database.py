@@ -1,0 +1,295 @@
+"""Archive in PostgreSQL: schema, exactly-once writes of several c2, accepted records, verification."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import pytest
+from builders.common import free_port
+from builders.postgresql import PostgresServer
+from builders.records import decision_record, reconstructed_image
+
+from sonarpost.archive.postgresql import Database, DatabaseAddress
+from sonarpost.archive.shore_database import AcceptedRecord, ShoreDatabase, StoredImage
+from sonarpost.archive.shore_files import row_of_image
+from sonarpost.archive.shore_index import TaskingRow
+from sonarpost.errors import ConfigError, DatabaseUnavailableError, StoredFileError
+from sonarpost.messages import Contact, Pixels
+
+
+@pytest.fixture
+def open_(database: Database) -> Callable[..., ShoreDatabase]:
+    return lambda owner="c2-a", **options: ShoreDatabase(database, owner=owner, **options)
+
+
+@pytest.fixture
+def archive(open_: Callable[..., ShoreDatabase]) -> ShoreDatabase:
+    return open_()
+
+
+def stored(image_id: str = "AAAA", text: bytes = b"{}", accepted_utc_s: float = 5.0) -> StoredImage:
+    contact = Contact(contact_id="c", vehicle_id="uuv-1", lat_deg=56.0, lon_deg=-5.0, atd_class="clutter")
+    picture = Pixels(height_px=2, width_px=3, bits=8, data=bytes(6))
+    image = reconstructed_image(picture, image_id=image_id, contact=contact)
+    contents = (text, b"tiff", b"png")
+    row = row_of_image(f"name_{image_id}", image, 1.0, accepted_utc_s, contents)
+    return StoredImage(replace(row, conflict=False), tuple(zip((".json", ".tiff", ".png"), contents, strict=True)))
+
+
+def command_row(record_id: str = "c1", **changes: object) -> TaskingRow:
+    fields: dict[str, object] = {
+        "vessel_id": "vessel-1", "kind": "command", "record_id": record_id, "vehicle_id": "uuv-1", "image_id": None,
+        "summary": "refine", "author": "expert", "issued_utc_s": 1.0, "state": "waiting", "reason": "",
+        "changed_utc_s": 2.0,
+    }  # fmt: skip
+    return TaskingRow(**(fields | changes))  # type: ignore[arg-type]
+
+
+# Schema
+
+
+def test_concurrent_starts_create_one_schema(database_url: str) -> None:
+    made = [ShoreDatabase(Database(DatabaseAddress.parse(database_url)), site="shore") for _ in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda each: each.prepare(), made))
+    assert made[0].images() == []
+    for each in made:
+        each.close()
+
+
+def test_schema_of_a_later_version_is_refused(archive: ShoreDatabase, database: Database) -> None:
+    archive.prepare()
+    with database.transaction() as sql:
+        sql.rows("UPDATE archive SET version = 99")
+    with pytest.raises(StoredFileError, match="version: got 99, expected 2"):
+        ShoreDatabase(database).prepare()
+    with pytest.raises(DatabaseUnavailableError, match="version: got 99"):
+        ShoreDatabase(database).images()
+
+
+def test_database_without_an_archive_is_not_created_by_a_command(open_: Callable[..., ShoreDatabase]) -> None:
+    with pytest.raises(StoredFileError, match="version: got 0"):
+        open_(writable=False).prepare()
+
+
+def test_database_of_another_site_is_refused(open_: Callable[..., ShoreDatabase]) -> None:
+    open_(site="shore").prepare()
+    open_(site="shore").prepare()
+    with pytest.raises(ConfigError, match="site: got 'north', expected shore"):
+        open_(site="north").prepare()
+
+
+def test_postgis_is_required(postgresql_server: PostgresServer) -> None:
+    postgresql_server.execute("postgres", "CREATE DATABASE plain OWNER sonarpost")
+    address = DatabaseAddress.parse(f"postgresql://sonarpost@127.0.0.1:{postgresql_server.port}/plain")
+    database = Database(address)
+    with pytest.raises(DatabaseUnavailableError, match='create extension "postgis"'):
+        ShoreDatabase(database).prepare()
+    database.close()
+
+
+def test_positions_are_points_for_spatial_queries(archive: ShoreDatabase, database: Database) -> None:
+    archive.write([stored()])
+    with database.transaction() as sql:
+        near = "ST_DWithin(position::geography, ST_MakePoint(:lon, 56)::geography, 1000)"
+        assert sql.rows(f"SELECT image_id FROM image WHERE {near}", lon=-5.001) == [["AAAA"]]
+        assert sql.rows(f"SELECT image_id FROM image WHERE {near}", lon=-5.1) == []
+
+
+# Writes
+
+
+def test_rows_and_files_are_returned_as_written(archive: ShoreDatabase) -> None:
+    image = stored(text=b'{"remark": "\\u0000"}')
+    image = replace(image, row=replace(image.row, codec="e\0b", fault="", p_mine_like=0.1 + 0.2))
+    archive.write([image])
+    [row] = archive.images()
+    assert row == replace(image.row, codec="e\ufffdb")
+    assert archive.image_files(row.vessel_id, row.name) == dict(image.files)
+
+
+def test_same_image_of_several_c2_is_stored_once(open_: Callable[..., ShoreDatabase]) -> None:
+    images = [stored(f"{number:04d}") for number in range(20)]
+    start = threading.Barrier(4)
+
+    def write(number: int) -> None:
+        start.wait()
+        archive = open_(f"c2-{number}")
+        for first in range(0, 20, 5):
+            archive.write(images[first : first + 5][:: 1 if number % 2 else -1])
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write, range(4)))
+    assert len(open_().images()) == 20
+
+
+def test_another_image_under_a_name_is_not_written(archive: ShoreDatabase) -> None:
+    archive.write([stored("AAAA")])
+    with pytest.raises(DatabaseUnavailableError, match="another image under the same name"):
+        archive.write([stored("BBBB"), stored("AAAA", b"other")])
+    assert [row.image_id for row in archive.images()] == ["AAAA"]
+
+
+def test_removed_image_is_stored_again(archive: ShoreDatabase) -> None:
+    archive.write([stored()])
+    archive.mark("removed_utc_s", archive.images(), 9.0)
+    assert archive.images() == []
+    [removed] = archive.images(removed=True)
+    assert archive.image_files(removed.vessel_id, removed.name) == {}
+    archive.write([stored()])
+    assert len(archive.image_files("vessel-1", archive.images()[0].name)) == 3
+
+
+def test_changed_and_missing_files_are_found_on_the_server(archive: ShoreDatabase, database: Database) -> None:
+    archive.write([stored(f"{number:04d}") for number in range(3)])
+    with database.transaction() as sql:
+        sql.rows("UPDATE file SET content = 'x' WHERE name = 'name_0000' AND suffix = '.png'")
+        sql.rows("DELETE FROM file WHERE name = 'name_0001' AND suffix = '.png'")
+    assert {result.row.name: result.fault for result in archive.verify(1e9, 86400.0, 86400.0)} == {  # type: ignore[union-attr]
+        "name_0000": "changed",
+        "name_0001": "missing",
+        "name_0002": "",
+    }
+    assert archive.defect_counts() == {"missing": 1, "changed": 1, "unreadable": 0, "conflicting": 0}
+    assert archive.verify(1e9 + 60, 60.0, 86400.0) == []
+    archive.write([stored("0000"), stored("0001")])
+    assert set(archive.defect_counts().values()) == {0}
+    archive.verify(1e9 + 2 * 86400, 86400.0, 86400.0)
+    assert set(archive.defect_counts().values()) == {0}
+
+
+# Tasking
+
+
+def test_one_c2_claims_a_record_for_a_vessel(open_: Callable[..., ShoreDatabase]) -> None:
+    archives = [open_(f"c2-{number}") for number in range(4)]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda each: each.claim_tasking(command_row(), b"payload"), archives))
+    assert sorted(each is None for each in found) == [False, False, False, True]
+    owner = archives[found.index(None)]
+    assert owner.claim_tasking(command_row(), b"payload") is None
+    assert owner.foreign_tasking("vessel-1", "command", "c1") is None
+    assert next(a for a in archives if a is not owner).foreign_tasking("vessel-1", "command", "c1") == b"payload"
+
+
+def test_older_state_does_not_replace_a_newer_one(archive: ShoreDatabase) -> None:
+    archive.claim_tasking(command_row(), b"payload")
+    archive.put_tasking([command_row(state="delivered", changed_utc_s=5.0)])
+    archive.put_tasking([command_row(state="waiting", changed_utc_s=2.0)])
+    assert [(row.state, row.changed_utc_s) for row in archive.tasking()] == [("delivered", 5.0)]
+
+
+# Accepted records
+
+
+def test_accepted_record_of_another_c2_is_taken_over_once(open_: Callable[..., ShoreDatabase]) -> None:
+    first, second, third = (open_(name) for name in ("c2-a", "c2-b", "c2-c"))
+    record = AcceptedRecord("some/key", b"\x00payload")
+    first.accept([record, record])
+    taken: list[AcceptedRecord] = []
+    assert first.take_over(0.0, 10, taken.extend) == 0
+    assert second.take_over(60.0, 10, taken.extend) == 0
+    assert second.take_over(0.0, 10, taken.extend) == 1
+    assert taken == [record]
+    assert third.take_over(60.0, 10, taken.extend) == 0
+    second.write([stored()], handled=[record])
+    assert third.take_over(0.0, 10, taken.extend) == 0
+    assert first.accepted_count() == 0
+
+
+def test_record_stays_with_its_owner_if_it_cannot_be_taken_over(open_: Callable[..., ShoreDatabase]) -> None:
+    open_("c2-a").accept([AcceptedRecord("k", b"p")])
+
+    def fails(_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left"):
+        open_("c2-b").take_over(0.0, 10, fails)
+    taken: list[AcceptedRecord] = []
+    assert open_("c2-b").take_over(0.0, 10, taken.extend) == 1
+
+
+def test_decision_with_another_content_is_not_written(archive: ShoreDatabase) -> None:
+    from hashlib import sha256
+
+    from sonarpost.archive.shore_files import decision_text
+    from sonarpost.archive.shore_index import DecisionRow
+
+    def row(**changes: object) -> tuple[DecisionRow, bytes]:
+        decision = decision_record("d1", **changes)
+        text = decision_text(decision)
+        return DecisionRow.of(decision, 5.0, sha256(text).hexdigest()), text
+
+    archive.write([], [row()])
+    archive.write([], [row()])
+    with pytest.raises(DatabaseUnavailableError, match="another decision"):
+        archive.write([], [row(verdict="not_mine_like")])
+    [stored_row] = archive.decisions()
+    assert archive.decision_content(stored_row) == row()[1]
+
+
+# Connection
+
+
+def test_restarted_server_is_reached_again(database_url: str, postgresql_server: PostgresServer) -> None:
+    database = Database(DatabaseAddress.parse(database_url))
+    archive = ShoreDatabase(database, owner="c2-a")
+    archive.write([stored()])
+    postgresql_server.stop("immediate")
+    try:
+        for _ in range(3):
+            with pytest.raises(DatabaseUnavailableError, match=r"database postgresql://sonarpost@127\.0\.0\.1"):
+                archive.images()
+        assert database.fault
+    finally:
+        postgresql_server.start()
+    from builders.common import eventually
+
+    def is_reached() -> bool:
+        try:
+            return len(archive.images()) == 1
+        except DatabaseUnavailableError:
+            return False
+
+    eventually(is_reached)
+    assert not database.fault
+    archive.close()
+
+
+@pytest.mark.parametrize(
+    ("url", "expected"),
+    [
+        ("mysql://u:secret@h/d", "postgresql://USER:PASSWORD@HOST:PORT/DATABASE"),
+        ("postgresql://h/d", "postgresql://USER:PASSWORD@HOST:PORT/DATABASE"),
+        ("postgresql://u:secret@h", "postgresql://USER:PASSWORD@HOST:PORT/DATABASE"),
+        ("postgresql://u:secret@h:99999/d", "a port from 1 to 65535"),
+        ("postgresql://u:secret@h/d?sslmode=require", "sslmode=disable or verify-full"),
+        ("postgresql://u:secret@h/d?options=x", "not options"),
+    ],
+)
+def test_invalid_address_is_refused_without_its_password(url: str, expected: str) -> None:
+    with pytest.raises(ConfigError, match="c2: database") as caught:
+        DatabaseAddress.parse(url)
+    assert expected in str(caught.value)
+    assert "secret" not in str(caught.value)
+
+
+def test_address_has_tls_unless_the_server_is_local(tmp_path: object) -> None:
+    parse = DatabaseAddress.parse
+    assert parse("postgresql://u:p%40ss@db.example.org/shore").use_tls
+    assert parse("postgresql://u:p%40ss@db.example.org/shore").password == "p@ss"
+    assert not parse("postgresql://u@db/shore?sslmode=disable").use_tls
+    assert not parse("postgresql://u@/shore?host=/run/postgresql").use_tls
+    assert not parse("postgresql://u@127.0.0.1/shore").use_tls
+    assert "secret" not in repr(parse("postgresql://u:secret@db/shore"))
+
+
+def test_unreachable_server_is_named_without_the_password() -> None:
+    database = Database(DatabaseAddress.parse(f"postgresql://u:secret@127.0.0.1:{free_port()}/shore"))
+    with pytest.raises(DatabaseUnavailableError) as caught:
+        ShoreDatabase(database).images()
+    assert "127.0.0.1" in str(caught.value)
+    assert "secret" not in str(caught.value)

@@ -1,0 +1,208 @@
+"""Terminal, webhook and gateway against the emulated message service; hostile requests and replies."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from urllib.error import HTTPError
+from urllib.parse import urlencode
+from urllib.request import Request, urlopen
+
+import pytest
+from builders.common import eventually
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonarpost.bearers.iridium import (
+    ExchangeResult,
+    IridiumTerminal,
+    ReadBytes,
+    ReadLine,
+    TerminalError,
+    exchange_steps,
+)
+from sonarpost.bearers.rockblock import MAX_BODY_BYTES, RockBlockAccount, Webhook, WebhookError, parse_webhook
+from sonarpost.errors import BadInputError, ConfigError, DeliveryError, PortError
+from sonarpost.simulation.message_gateway import MessageGatewayEmulator
+
+IMEI = "300234010753370"
+TOKEN = "t0ken"
+
+
+@pytest.fixture
+def messages():
+    return []
+
+
+@pytest.fixture
+def webhook(messages):
+    webhook = Webhook("127.0.0.1", 0, TOKEN, messages.append)
+    yield webhook
+    webhook.close()
+
+
+@pytest.fixture
+def gateway(webhook):
+    gateway = MessageGatewayEmulator(f"http://127.0.0.1:{webhook.port}/{TOKEN}", [IMEI])
+    yield gateway
+    gateway.close()
+
+
+@pytest.fixture
+def terminal(gateway):
+    terminal = IridiumTerminal(gateway.terminal_url(IMEI))
+    yield terminal
+    terminal.close()
+
+
+@pytest.fixture
+def account(gateway):
+    return RockBlockAccount(gateway.mt_url, "user", "password")
+
+
+def test_messages_travel_in_both_directions(gateway, terminal, account, messages):
+    every_byte = bytes(range(256))
+    assert terminal.exchange(every_byte) == ExchangeResult(sent=True)
+    assert terminal.exchange(b"x" * 340).sent
+    eventually(lambda: len(messages) == 2)
+    assert [(m.imei, m.momsn, m.data) for m in messages] == [(IMEI, 1, every_byte), (IMEI, 2, b"x" * 340)]
+    account.send(IMEI, every_byte)
+    account.send(IMEI, b"second")
+    assert terminal.exchange(None) == ExchangeResult(sent=False, received=every_byte, waiting=1)
+    assert terminal.exchange(b"third") == ExchangeResult(sent=True, received=b"second", waiting=0)
+    assert gateway.messages == 3
+
+
+def test_gateway_refuses_wrong_credentials_and_unknown_terminals(account, gateway):
+    with pytest.raises(DeliveryError, match="Invalid login"):
+        RockBlockAccount(gateway.mt_url, "user", "wrong").send(IMEI, b"x")
+    with pytest.raises(DeliveryError, match="No RockBLOCK"):
+        account.send("300234010753371", b"x")
+    with pytest.raises(DeliveryError, match="271 bytes"):
+        account.send(IMEI, bytes(271))
+    with pytest.raises(ConfigError, match="url"):
+        RockBlockAccount("file:///etc/passwd", "", "")
+    with pytest.raises(DeliveryError, match="gateway"):
+        RockBlockAccount("http://127.0.0.1:1/MT", "", "").send(IMEI, b"x")
+
+
+def post(webhook, path, body, headers=None):
+    try:
+        with urlopen(Request(f"http://127.0.0.1:{webhook.port}{path}", body, headers or {}), timeout=10) as reply:
+            return reply.status
+    except HTTPError as error:
+        error.close()
+        return error.code
+
+
+def form(**changes):
+    return urlencode({"imei": IMEI, "momsn": "1", "data": "00ff"} | changes).encode()
+
+
+def test_webhook_refuses_what_is_not_a_message(webhook, messages):
+    assert post(webhook, f"/{TOKEN}", form()) == 200
+    for path in ("/", "/t0ke", "/t0kenx", "/%74oken", f"/{TOKEN}/x"):
+        assert post(webhook, path, form()) == 404
+    assert post(webhook, f"/{TOKEN}", form(data="0" * MAX_BODY_BYTES)) == 413
+    for wrong in (form(imei="1"), form(momsn="70000"), form(momsn="-1"), form(data="0"), form(data="zz"), b"\xff"):
+        assert post(webhook, f"/{TOKEN}", wrong) == 400
+    assert post(webhook, f"/{TOKEN}", form(data="00" * 341)) == 400
+    assert post(webhook, f"/{TOKEN}", b"&".join([b"a=1"] * 30)) == 400
+    with socket.create_connection(("127.0.0.1", webhook.port)) as client:
+        client.sendall(f"POST /{TOKEN} HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n".encode())
+        assert b" 413 " in client.recv(4096)
+    with socket.create_connection(("127.0.0.1", webhook.port)) as client:
+        client.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        assert b" 501 " in client.recv(4096)
+    assert len(messages) == 1
+
+
+def test_webhook_reports_that_a_message_has_to_be_repeated(messages):
+    errors = [DeliveryError("disk full"), WebhookError("webhook", "imei", IMEI, "a known terminal")]
+
+    def receive(message):
+        if errors:
+            raise errors.pop(0)
+        messages.append(message)
+
+    webhook = Webhook("127.0.0.1", 0, TOKEN, receive)
+    try:
+        assert [post(webhook, f"/{TOKEN}", form()) for _ in range(3)] == [503, 400, 200]
+    finally:
+        webhook.close()
+
+
+def test_idle_connections_do_not_block_the_webhook_for_ever(webhook, monkeypatch):
+    idle = [socket.create_connection(("127.0.0.1", webhook.port)) for _ in range(40)]
+    for connection in idle:
+        connection.close()
+    eventually(lambda: post_or_none(webhook) == 200)
+
+
+def post_or_none(webhook):
+    try:
+        return post(webhook, f"/{TOKEN}", form())
+    except OSError:
+        return None
+
+
+@given(st.binary(max_size=300) | st.text(max_size=100).map(lambda t: form(data=t)))
+def test_hostile_forms_raise_the_documented_error_only(body):
+    try:
+        parse_webhook(body)
+    except WebhookError:
+        return
+
+
+@given(st.lists(st.binary(max_size=30) | st.sampled_from([b"\r\nOK\r\n", b"\r\n0\r\n", b"READY\r\n"]), max_size=60))
+def test_hostile_replies_of_a_terminal_raise_the_documented_error_only(replies):
+    left = iter(replies)
+    steps = exchange_steps(b"x")
+    try:
+        action = next(steps)
+        while True:
+            data = next(left, b"") if isinstance(action, (ReadLine, ReadBytes)) else b""
+            action = steps.send(data[: action.size] if isinstance(action, ReadBytes) else data)
+    except (BadInputError, StopIteration):
+        return
+
+
+@pytest.mark.parametrize(
+    ("status", "problem"),
+    [
+        (b"+SBDIX: 0, 1, 1, 1, 400, 0\r\n", "MT length: got 400"),
+        (b"+SBDIX: 0, 1\r\n", "six numbers"),
+        (b"+SBDIX: a, b, c, d, e, f\r\n", "six numbers"),
+        (b"ERROR\r\n", "six numbers"),
+        (b"", "a line within"),
+    ],
+)
+def test_wrong_status_is_named(status, problem):
+    replies = iter([b"OK\r\n", b"READY\r\n", b"0\r\n", b"OK\r\n", b"SBDRING\r\n", status])
+    steps = exchange_steps(b"x")
+
+    def run():
+        action = next(steps)
+        while True:
+            action = steps.send(next(replies) if isinstance(action, ReadLine) else b"")
+
+    with pytest.raises(TerminalError, match=problem):
+        run()
+
+
+def test_terminal_that_refuses_or_is_absent():
+    with pytest.raises(PortError):
+        IridiumTerminal("socket://127.0.0.1:1").exchange(b"x")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer():
+            connection, _ = server.accept()
+            connection.recv(100)
+            connection.sendall(b"ERROR\r\n")
+            connection.close()
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with pytest.raises(TerminalError, match="ERROR"):
+            IridiumTerminal(f"socket://127.0.0.1:{server.getsockname()[1]}").exchange(b"x")
+        thread.join()

@@ -1,0 +1,10 @@
+"""A driver of another distribution, and an object that is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from sonarpost.modem.micromodem.plugin import DRIVER
+
+OTHER = replace(DRIVER, name="other")
+BROKEN = "not a driver"

@@ -1,0 +1,72 @@
+"""GeoPackage of contacts."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import struct
+import subprocess
+import xml.etree.ElementTree as ET
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from builders.exports import mission
+
+from sonarpost.export.contacts import load_contacts
+from sonarpost.export.geopackage import write_geopackage
+from sonarpost.export.tables import COLUMNS, contact_properties
+
+
+def test_rows_hold_properties_points_and_pictures(tmp_path: Path) -> None:
+    contacts = load_contacts(mission(tmp_path / "out"))
+    path = tmp_path / "contacts.gpkg"
+    assert write_geopackage(path, contacts) == []
+    with closing(sqlite3.connect(path)) as db:
+        assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        assert db.execute("PRAGMA application_id").fetchone() == (0x47504B47,)
+        names = ", ".join(f'"{name}"' for name in COLUMNS)
+        rows = db.execute(f"SELECT geom, picture, {names} FROM contacts ORDER BY fid").fetchall()
+        style = db.execute("SELECT styleQML FROM layer_styles WHERE f_table_name = 'contacts'").fetchone()[0]
+    states = [category.get("value") for category in ET.fromstring(style).iter("category")]
+    assert sorted(map(str, states)) == ["disputed", "mine_like", "not_mine_like", "unreviewed", "unsure"]
+    assert '<prop k="color" v="224,0,0,255"/>' in style  # mine-like, as in KML
+    assert len(rows) == len(contacts.contacts) > 0
+    for (geom, picture, *values), contact in zip(rows, contacts.contacts, strict=True):
+        assert values == list(contact_properties(contact).values())
+        assert picture == (contact.image_path.read_bytes() if contact.image_path else None)
+        point = None if geom is None else struct.unpack("<dd", geom[-16:])[::-1]
+        assert point == contact.position
+
+
+def test_unreadable_picture_is_reported(tmp_path: Path) -> None:
+    contacts = load_contacts(mission(tmp_path / "out"))
+    path = next(c.image_path for c in contacts.contacts if c.image_path)
+    path.unlink()
+    problems = write_geopackage(tmp_path / "contacts.gpkg", contacts)
+    assert [str(path) in str(problem) for problem in problems] == [True]
+
+
+@pytest.mark.skipif(shutil.which("ogrinfo") is None, reason="ogrinfo (gdal-bin) is not installed")
+def test_ogr_reads_the_layer(tmp_path: Path) -> None:
+    contacts = load_contacts(mission(tmp_path / "out"))
+    path = tmp_path / "contacts.gpkg"
+    write_geopackage(path, contacts)
+    result = subprocess.run(["ogrinfo", "-so", path, "contacts"], capture_output=True, text=True, check=True)
+    assert f"Feature Count: {len(contacts.contacts)}" in result.stdout
+    assert "Geometry: Point" in result.stdout
+
+
+def test_full_disk_leaves_the_former_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    contacts = load_contacts(mission(tmp_path / "out"))
+    path = tmp_path / "contacts.gpkg"
+    path.write_bytes(b"former")
+
+    def full(*_: object) -> bytes:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr("sonarpost.export.geopackage._point", full)
+    with pytest.raises(OSError, match="disk is full"):
+        write_geopackage(path, contacts)
+    assert path.read_bytes() == b"former"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["contacts.gpkg", "out"]

@@ -1,0 +1,67 @@
+"""UDP multicast ports on the loopback interface, and two stations that use them."""
+
+from __future__ import annotations
+
+import queue
+
+import pytest
+from builders.common import eventually
+
+from sonarpost.errors import ConfigError, PortError
+from sonarpost.runtime.modem_port import open_modem_port
+from sonarpost.runtime.serial_modem import SerialModem
+from sonarpost.runtime.serial_port import PortEvent, PortOpened, SerialPort
+from sonarpost.runtime.udp_port import UdpPort
+
+URL = "udp://239.255.77.1:15707?interface=127.0.0.1&ttl=0"
+
+
+def test_each_write_is_one_datagram_for_all() -> None:
+    events: list[queue.SimpleQueue[PortEvent]] = [queue.SimpleQueue(), queue.SimpleQueue()]
+    ports = [UdpPort(URL), UdpPort(URL)]
+    with pytest.raises(PortError, match="not open"):
+        ports[0].write(b"x")
+    for port, own in zip(ports, events, strict=True):
+        port.start(own.put)
+        assert isinstance(own.get(timeout=30), PortOpened)
+    with pytest.raises(PortError, match="already started"):
+        ports[0].start(events[0].put)
+    for data in (b"one", b"two"):
+        ports[0].write(data)
+    for own in events:
+        assert [own.get(timeout=30), own.get(timeout=30)] == [b"one", b"two"]
+    for port in ports:
+        port.close()
+        eventually(lambda port=port: not port.is_open)
+
+
+def test_two_stations_exchange_packets() -> None:
+    with SerialModem(URL, address=1, driver="udp") as vessel, SerialModem(URL, address=3, driver="udp") as vehicle:
+        sent = vehicle.send([b"hello", b"again"], destination=1, rate=1, ack=True)
+        assert sent.acknowledged == (1, 2)
+        packet = vessel.receive(timeout_s=30)
+        assert packet is not None
+        assert [frame.data for frame in packet.frames] == [b"hello", b"again"]
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "udp://192.0.2.1:5000",
+        "udp://239.255.7.1",
+        "udp://239.255.7.1:99999",
+        "udp://radio:5000",
+        "udp://239.255.7.1:5000/x",
+        "udp://239.255.7.1:5000?interface=eth0",
+        "udp://239.255.7.1:5000?ttl=256",
+        "udp://239.255.7.1:5000?speed=1",
+        "udp://239.255.7.1:5000?ttl",
+    ],
+)
+def test_invalid_url_is_refused(url: str) -> None:
+    with pytest.raises(ConfigError, match="modem port: url"):
+        open_modem_port(url, 19200)
+
+
+def test_other_urls_are_serial_ports() -> None:
+    assert isinstance(open_modem_port("/dev/ttyUSB0", 19200), SerialPort)

@@ -1,0 +1,157 @@
+"""atd_stub: recordings of several files are processed, deduplicated, quarantined and removed as one."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+from builders.common import eventually
+from builders.survey_oracle import tiny_survey
+from builders.surveys import make_humminbird, make_waterfall
+
+from sonarpost.services.atd_stub.config import AtdStubConfig
+from sonarpost.services.atd_stub.service import AtdStubService
+from sonarpost.sonar.readers import recording_parts
+
+MAKERS = {"humminbird": make_humminbird, "waterfall": make_waterfall}
+
+
+@pytest.fixture
+def incoming(tmp_path):
+    folder = tmp_path / "incoming"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def start_service(runner, platform, incoming):
+    def start(**changes):
+        config = AtdStubConfig(input_dir=incoming, poll_s=0.02, settle_s=0.0).model_copy(update=changes)
+        return runner.start(AtdStubService(platform("uuv-1"), config))
+
+    return start
+
+
+@pytest.fixture(params=sorted(MAKERS))
+def recording(request, tmp_path):
+    """Return the files of a recording outside the input folder, the one that names it first."""
+    folder = tmp_path / "made"
+    folder.mkdir()
+    return recording_parts(MAKERS[request.param](tiny_survey(40, 400), folder))
+
+
+def deposit(part, recording, incoming):
+    """Put a file into the input folder, complete when it appears."""
+    target = incoming / part.relative_to(recording[0].parent)
+    target.parent.mkdir(exist_ok=True)
+    hidden = target.with_name(f".{target.name}")
+    shutil.copyfile(part, hidden)
+    hidden.rename(target)
+    return target
+
+
+def counter(service, name):
+    return service.health().counters.get(name, 0)
+
+
+def polled(service):
+    """Wait for two more polls."""
+    seen = []
+    original = service._process_folder
+    service._process_folder = lambda: (original(), seen.append(1))
+    eventually(lambda: len(seen) >= 3)
+    service._process_folder = original
+
+
+def test_recording_is_processed_when_all_files_exist(start_service, recording, incoming):
+    service = start_service()
+    for part in recording[:-1]:
+        deposit(part, recording, incoming)
+        polled(service)
+        assert service.health().gauges["files_waiting"] == 1
+        assert counter(service, "files_processed") == counter(service, "files_quarantined") == 0
+    deposit(recording[-1], recording, incoming)
+    eventually(lambda: counter(service, "files_processed") == 1)
+    assert counter(service, "files_quarantined") == 0
+    eventually(lambda: service.health().gauges["files_waiting"] == 0)  # counted after the commit
+
+
+def test_other_files_may_arrive_first(start_service, recording, incoming):
+    service = start_service()
+    for part in reversed(recording):
+        deposit(part, recording, incoming)
+    eventually(lambda: counter(service, "files_processed") == 1)
+    assert counter(service, "files_quarantined") == 0
+
+
+def test_recording_is_processed_once_under_any_name(start_service, recording, incoming, tmp_path):
+    for part in recording:
+        deposit(part, recording, incoming)
+    service = start_service()
+    eventually(lambda: counter(service, "files_processed") == 1)
+    again = incoming / recording[0].name.replace("line", "again", 1)
+    if len(recording) == 3:  # the DAT file names its folder
+        shutil.copytree(incoming / "line", incoming / "again")
+    shutil.copyfile(recording[0], again)
+    eventually(lambda: len(service._processed) == 2)
+    assert counter(service, "files_processed") == 1
+
+
+def test_changed_part_makes_another_recording(start_service, recording, incoming):
+    for part in recording:
+        deposit(part, recording, incoming)
+    service = start_service()
+    eventually(lambda: counter(service, "files_processed") == 1)
+    damaged = incoming / recording[-1].relative_to(recording[0].parent)
+    damaged.write_bytes(b"not a file of a recording")
+    eventually(lambda: counter(service, "files_quarantined") == 1)
+
+
+def test_all_files_of_a_bad_recording_are_moved(start_service, recording, incoming):
+    recording[-1].write_bytes(b"not a file of a recording")
+    service = start_service()
+    for number in range(2):  # the second one differs, and has the same name
+        recording[-2].write_bytes(recording[-2].read_bytes() + bytes([number]))
+        targets = [deposit(part, recording, incoming) for part in reversed(recording)]
+        eventually(lambda number=number: counter(service, "files_quarantined") == number + 1)
+        eventually(lambda targets=targets: not any(target.exists() for target in targets))
+    aside = incoming / "quarantine"
+    names = [str(part.relative_to(recording[0].parent)) for part in recording]
+    assert [path.name for path in incoming.iterdir()] == ["quarantine"]
+    (other,) = (path for path in aside.iterdir() if path.is_dir() and path.name != "line")
+    for folder in (aside, other):
+        assert all((folder / name).is_file() for name in names)
+        assert (folder / f"{names[0]}.reason.txt").read_text()
+
+
+def test_done_marker_completes_a_recording_with_one_side(start_service, incoming, tmp_path):
+    path = make_humminbird(tiny_survey(40, 400), incoming)
+    (incoming / "line" / "B003.SON").unlink()
+    service = start_service()
+    polled(service)
+    assert counter(service, "files_processed") == 0
+    (incoming / f"{path.name}.done").touch()
+    eventually(lambda: counter(service, "files_processed") == 1)
+
+
+def test_files_outside_the_folder_and_of_other_recordings_stay(start_service, incoming, tmp_path):
+    """A description may name any file; only files in the folder that no other recording uses are moved."""
+    make_waterfall(tiny_survey(40, 400), incoming)
+    outside = tmp_path / "outside.csv"
+    outside.write_text("not the table of a recording")
+    bad = (incoming / "line.waterfall.toml").read_text().replace("line.csv", "../outside.csv")
+    (incoming / "bad.waterfall.toml").write_text(bad)
+    service = start_service()
+    eventually(lambda: counter(service, "files_quarantined") == 1 and counter(service, "files_processed") == 1)
+    eventually((incoming / "quarantine" / "bad.waterfall.toml").is_file)
+    assert outside.is_file()
+    assert all(part.is_file() for part in recording_parts(incoming / "line.waterfall.toml"))
+
+
+def test_retention_removes_all_files(start_service, recording, incoming):
+    for part in recording:
+        deposit(part, recording, incoming)
+    service = start_service(retain_days=1e-9)
+    eventually(lambda: counter(service, "files_processed") == 1)
+    service._retention_due_s = 0.0
+    eventually(lambda: not list(incoming.iterdir()), what="removal")

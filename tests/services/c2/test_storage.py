@@ -1,0 +1,165 @@
+"""Contract of the archives of c2: files with an index in SQLite, and PostgreSQL."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from builders.records import decision_record, reconstructed_image
+
+from sonarpost.archive.postgresql import DatabaseAddress
+from sonarpost.archive.shore_index import TaskingRow
+from sonarpost.errors import PayloadError
+from sonarpost.messages import Pixels, ReconstructedImage
+from sonarpost.services.c2.archive import Archive, Storage
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.shared_archive import SharedArchive
+
+START_S = 1_700_000_000.0
+DAY_S = 86400.0
+OpenArchive = Callable[..., Storage]
+
+
+def image(image_id: str = "AAAA", value: int = 1, start_s: float = START_S) -> ReconstructedImage:
+    picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([value]) * 600)
+    return reconstructed_image(
+        picture, vessel_id="vessel-1", image_id=image_id, first_frame_utc_s=start_s, last_frame_utc_s=start_s + 1
+    )
+
+
+@pytest.fixture(params=["files", "postgresql"])
+def open_archive(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[OpenArchive]:
+    made: list[Storage] = []
+    url = request.getfixturevalue("database_url") if request.param == "postgresql" else None
+
+    def open_(**options: Any) -> Storage:
+        config = C2Config(out_dir=tmp_path / "out", database=url, **options)
+        archive: Storage = Archive(config) if url is None else SharedArchive(config, DatabaseAddress.parse(url), "c2-a")
+        archive.open()
+        made.append(archive)
+        return archive
+
+    yield open_
+    for each in made:
+        each.close()
+
+
+@pytest.fixture
+def archive(open_archive: OpenArchive) -> Storage:
+    return open_archive()
+
+
+def test_records_are_read_after_the_flush_and_after_a_restart(open_archive: OpenArchive) -> None:
+    archive = open_archive()
+    sent = image()
+    assert archive.store_image(sent, 5.0)[1:] == (True, False)
+    assert archive.store_decision(decision_record("d1"))
+    archive.flush()
+    archive.close()
+    index = open_archive().index()
+    [row] = index.images()
+    assert (row.image_id, row.relayed_utc_s, row.conflict, len(row.files_sha256.split())) == ("AAAA", 5.0, False, 3)
+    assert [(each.decision_id, each.verdict) for each in index.decisions()] == [("d1", "mine_like")]
+
+
+def test_records_are_not_stored_before_the_flush(open_archive: OpenArchive) -> None:
+    archive = open_archive()
+    archive.store_image(image(), 5.0)
+    archive.store_decision(decision_record())
+    index = open_archive().index()
+    assert (index.images(), index.decisions()) == ([], [])
+
+
+def test_repeated_record_is_stored_once(archive: Storage) -> None:
+    for is_flushed in (False, True):
+        new = [archive.store_image(image(), 5.0).is_new, archive.store_decision(decision_record())]
+        assert new == [not is_flushed] * 2
+        assert not archive.store_image(image(), 5.0).is_new
+        assert not archive.store_decision(decision_record())
+        archive.flush()
+    assert len(archive.index().images()) == 1
+    assert len(archive.index().decisions()) == 1
+
+
+@pytest.mark.parametrize("flush_between", [False, True])
+def test_different_image_of_the_same_name_is_kept_as_a_conflict(archive: Storage, *, flush_between: bool) -> None:
+    assert archive.store_image(image(), 5.0)[1:] == (True, False)
+    if flush_between:
+        archive.flush()
+    assert archive.store_image(image(value=2), 5.0)[1:] == (True, True)
+    archive.flush()
+    assert archive.store_image(image(value=2), 5.0)[1:] == (False, True)
+    assert sorted(row.conflict for row in archive.index().images()) == [False, True]
+    archive.apply_retention(START_S)
+    assert archive.defect_counts()["conflicting"] == 1
+
+
+@pytest.mark.parametrize("flush_between", [False, True])
+def test_different_decision_of_the_same_identifier_is_refused(archive: Storage, *, flush_between: bool) -> None:
+    archive.store_decision(decision_record("d1"))
+    if flush_between:
+        archive.flush()
+    with pytest.raises(PayloadError, match="decision_id: got 'd1', expected an identifier that no other decision has"):
+        archive.store_decision(decision_record("d1", verdict="not_mine_like"))
+    archive.flush()
+    assert [row.verdict for row in archive.index().decisions()] == ["mine_like"]
+
+
+def test_text_that_a_database_cannot_store_is_kept_in_the_record(archive: Storage) -> None:
+    remark = "NUL \0, quote ', \\u0000, {}, \N{BLACK SQUARE}"
+    archive.store_decision(decision_record("d1", remark=remark))
+    archive.flush()
+    assert not archive.store_decision(decision_record("d1", remark=remark))
+    assert archive.index().decisions()[0].remark.endswith(remark[5:])
+
+
+def test_retention_removes_exported_images_first(open_archive: OpenArchive) -> None:
+    archive = open_archive()
+    for number in range(4):
+        archive.store_image(image(f"{number:04d}"), 5.0)
+    archive.flush()
+    size_bytes = archive.index().images()[0].size_bytes
+    archive.index().mark("exported_utc_s", [r for r in archive.index().images() if r.image_id == "0002"], 9.0)
+    small = open_archive(max_bytes=3 * size_bytes + 2)
+    small.index()
+    assert [row.image_id for row in small.apply_retention(time.time())] == ["0002"]
+    assert small.apply_retention(START_S) == []
+    assert [row.image_id for row in small.index().images()] == ["0000", "0001", "0003"]
+    assert [row.removed_utc_s is None for row in small.index().images(removed=True)] == [True, True, False, True]
+    # An image that arrives again is stored again.
+    assert archive.store_image(image("0002"), 5.0).is_new
+    archive.flush()
+    assert len(archive.index().images()) == 4
+
+
+def test_retention_removes_old_images(open_archive: OpenArchive) -> None:
+    archive = open_archive(retain_days=10.0)
+    archive.store_image(image(), 5.0)
+    archive.flush()
+    accepted_utc_s = archive.index().images()[0].accepted_utc_s
+    assert archive.apply_retention(accepted_utc_s + 9 * DAY_S) == []
+    assert len(archive.apply_retention(accepted_utc_s + 11 * DAY_S)) == 1
+    assert archive.index().images() == []
+
+
+def test_verification_compares_each_record_once_in_a_cycle(archive: Storage) -> None:
+    for number in range(10):
+        archive.store_image(image(f"{number:04d}"), 5.0)
+    archive.store_decision(decision_record())
+    archive.flush()
+    compared = [archive.verify(1e9 + hour * 3600.0, 3600.0 * 4) for hour in range(0, 24, 4)]
+    assert compared == [3, 2, 2, 2, 2, 0]
+    assert set(archive.defect_counts().values()) == {0}
+
+
+def test_state_of_a_command_is_replaced(archive: Storage) -> None:
+    row = TaskingRow("vessel-1", "command", "c1", "uuv-1", None, "refine", "expert", 1.0, "waiting", "", 2.0)
+    delivered = TaskingRow("vessel-1", "command", "c1", "uuv-1", None, "refine", "expert", 1.0, "delivered", "", 3.0)
+    assert archive.claim_tasking(row, b"payload") is None
+    for each in (row, delivered):
+        archive.store_tasking([each])
+    assert archive.foreign_tasking("vessel-1", "command", "c1") is None
+    assert archive.index().tasking() == [delivered]

@@ -1,0 +1,162 @@
+"""Codebooks that a shore site lacks: fetched from the vessel by their identity, refused if they have another one."""
+
+from __future__ import annotations
+
+import msgpack
+import pytest
+from builders.common import eventually
+from builders.vessel_frames import CONTACT
+
+from sonarpost import keys, wire
+from sonarpost.archive import codebook_transfer
+from sonarpost.archive.decoder import Decoder
+from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.codec.vq.codebook import open_codebook, to_bytes
+from sonarpost.link.received_image import received_image
+from sonarpost.link.receiver import ImageUpdate
+from sonarpost.messages import CodedImage, ReconstructedImage
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
+from sonarpost.services.relay.config import RelayConfig
+from sonarpost.services.relay.service import RelayService
+
+VESSEL = "vessel-1"
+CODEBOOK = open_codebook("nominal-10")
+MODEL = CODEBOOK.tiles.identity[:32]
+KEY = keys.codebook(VESSEL, MODEL)
+
+
+@pytest.fixture
+def image(texture):
+    """An image of the codebook nominal-10, as the vessel has decoded it, and the record of the decompressor."""
+    stream = default_registry().create("vq", CodecResources(CODEBOOK.tiles)).encode(texture())
+    size = len(stream)
+    update = ImageUpdate(3, "000A", 1, CONTACT, stream, (), True, size, size, 4, 0, 1.7e9, 1.7e9)
+    decoder, received = Decoder(("nominal-10",)), received_image(update, VESSEL, "uuv-1", authenticated=True)
+    decoded = decoder.decode(received)
+    return decoded, decoder.coded_image(received, decoded)
+
+
+@pytest.fixture
+def start_c2(runner, platform, tmp_path, monkeypatch):
+    """c2 without that codebook."""
+    monkeypatch.setattr(codebook_transfer, "RETRY_S", 0.2)
+    monkeypatch.setattr(codebook_transfer, "REPLY_TIMEOUT_S", 2.0)
+    config = C2Config(out_dir=tmp_path / "shore", codebooks=("nominal-20",))
+    return lambda: runner.start(C2Service(platform("shore-1"), config))
+
+
+@pytest.fixture
+def send(runner, platform):
+    """Send a coded image to the relay."""
+    runner.start(RelayService(platform(VESSEL), RelayConfig()))
+    peer = runner.peer(VESSEL, "decompressor")
+    return lambda coded: peer.send(keys.image_coded(VESSEL), "relay", coded)
+
+
+@pytest.fixture
+def answer(client):
+    """Reply to queries for codebooks of the vessel."""
+
+    def declare(reply):
+        return client.declare_queryable(keys.codebook_all(VESSEL), reply)
+
+    return declare
+
+
+def test_image_waits_for_its_codebook_and_is_decoded(image, start_c2, send, client, watch, refused):
+    decoded, coded = image
+    at_shore = watch(keys.shore_image(VESSEL))
+    c2 = start_c2()
+    send(coded)
+    eventually(lambda: f"1 images of {VESSEL} wait for codebook {MODEL}" in c2.health().detail)
+    eventually(lambda: f"{KEY}: reply: got 'none', expected a piece" in c2.health().detail)
+    assert at_shore == []
+    codebook_transfer.declare_codebooks(client, VESSEL, Decoder(("nominal-10",)))
+    eventually(lambda: at_shore)
+    assert wire.decode(ReconstructedImage, at_shore[0].payload.to_bytes(), "") == decoded
+    eventually(lambda: c2.health().gauges["images_undecoded"] == 0.0)
+    assert c2.health().detail == ""
+    assert refused(c2) == []
+
+
+def piece(data: bytes, size: int | None = None) -> bytes:
+    return msgpack.packb({"v": 1, "size": len(data) if size is None else size, "data": data})
+
+
+@pytest.mark.parametrize(
+    ("reply", "reason"),
+    [
+        (piece(b"x" * 100), "magic: got"),
+        (piece(b"x" * 32769), "data: got"),
+        (piece(b"x", 16 * 1024 * 1024 + 1), "size: got 16777217"),
+        (piece(b"xy", 1), "data: got '2 bytes', expected at most the 1 bytes"),
+        (piece(b"", 10), "data: got"),
+        (b"\xc1", "payload: got"),
+    ],
+    ids=["no codebook", "long piece", "long file", "beyond the end", "empty", "no msgpack"],
+)
+def test_hostile_replies_are_refused(reply, reason, image, start_c2, send, answer, watch):
+    at_shore = watch(keys.shore_image(VESSEL))
+
+    def on_query(query):
+        with query:
+            query.reply(query.key_expr, reply)
+
+    answer(on_query)
+    c2 = start_c2()
+    send(image[1])
+    eventually(lambda: reason in c2.health().detail)
+    assert at_shore == []
+    assert list((c2.platform.state_dir / "codebooks").rglob("*.tiles")) == []
+
+
+def test_another_codebook_is_refused(image, start_c2, send, answer, watch):
+    content = to_bytes(open_codebook("nominal-20"))
+    at_shore = watch(keys.shore_image(VESSEL))
+
+    def on_query(query):
+        offset = int(query.parameters.get("offset"))
+        with query:
+            query.reply(query.key_expr, piece(content[offset : offset + 32768], len(content)))
+
+    answer(on_query)
+    c2 = start_c2()
+    send(image[1])
+    eventually(lambda: f"expected {MODEL}…, which was requested" in c2.health().detail)
+    assert at_shore == []
+
+
+def test_vessel_has_a_limited_number_of_codebooks(image, start_c2, send, client):
+    c2 = start_c2()
+    folder = c2.platform.state_dir / "codebooks" / VESSEL
+    folder.mkdir(parents=True)
+    for number in range(codebook_transfer.MAX_CODEBOOKS):
+        (folder / f"{number:032x}.tiles").write_bytes(b"")
+    codebook_transfer.declare_codebooks(client, VESSEL, Decoder(("nominal-10",)))
+    send(image[1])
+    eventually(lambda: f"codebooks of {VESSEL}: got '8 files', expected fewer" in c2.health().detail)
+
+
+@pytest.mark.parametrize("offset", ["-1", "x", "9" * 30, str(len(to_bytes(CODEBOOK)))])
+def test_invalid_offset_is_an_error(offset, client):
+    codebook_transfer.declare_codebooks(client, VESSEL, Decoder(("nominal-10",)))
+    [reply] = client.get(f"{KEY}?offset={offset}", timeout=30)
+    assert reply.ok is None
+
+
+def test_unknown_codebook_is_an_error(client):
+    codebook_transfer.declare_codebooks(client, VESSEL, Decoder(("nominal-10",)))
+    [reply] = client.get(keys.codebook(VESSEL, "0" * 32), timeout=30)
+    assert reply.ok is None
+
+
+def test_images_that_wait_are_limited(image, start_c2, send, refused, monkeypatch):
+    monkeypatch.setattr("sonarpost.services.c2.decoding.MAX_WAITING", 2)
+    c2 = start_c2()
+    for number in range(3):
+        assert isinstance(image[1], CodedImage)
+        send(image[1].model_copy(update={"image_id": f"000{number}"}))
+    eventually(lambda: len(refused(c2)) == 1)
+    assert MODEL in refused(c2)[0][1]
+    assert c2.health().gauges["images_undecoded"] == 2.0

@@ -1,0 +1,269 @@
+"""From op_modem's record to the shore: decompressor, relay and c2 with coded streams and differences."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+
+import msgpack
+import numpy as np
+import pytest
+from builders.common import eventually
+from builders.vessel_frames import CONTACT
+
+from sonarpost import keys, wire
+from sonarpost.archive.image_parts import stream_of
+from sonarpost.codec.registry import default_registry
+from sonarpost.link.downlink.messages import image_of_number
+from sonarpost.link.received_image import received_image
+from sonarpost.link.receiver import ImageUpdate
+from sonarpost.messages import CodedImage, ImagePart, ReceivedImage, ReconstructedImage, Relayed
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
+from sonarpost.services.decompressor.config import DecompressorConfig
+from sonarpost.services.decompressor.service import DecompressorService
+from sonarpost.services.relay.config import RelayConfig
+from sonarpost.services.relay.service import RelayService
+from sonarpost.sonar.image_files import read_image
+
+VESSEL = "vessel-1"
+
+
+@pytest.fixture
+def stream(texture):
+    """A stream of spiht, whose prefixes are coarser images and which needs no compilation."""
+    return default_registry().create("spiht").encode(texture(), 600)
+
+
+def update(
+    stream: bytes, version: int = 1, number: int = 1, missing: tuple[tuple[int, int], ...] = ()
+) -> ReceivedImage:
+    zeroed = bytearray(stream)
+    for start, stop in missing:
+        zeroed[start:stop] = bytes(stop - start)
+    received = len(stream) - sum(stop - start for start, stop in missing)
+    found = ImageUpdate(
+        3,
+        image_of_number(number),
+        version,
+        CONTACT,
+        bytes(zeroed),
+        missing,
+        False,
+        received,
+        600,
+        4,
+        0,
+        1.7e9,
+        1.7e9 + version,
+    )
+    return received_image(found, VESSEL, "uuv-1", authenticated=True)
+
+
+@pytest.fixture
+def start_c2(runner, platform, tmp_path):
+    return lambda **options: runner.start(
+        C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "shore", **options))
+    )
+
+
+@pytest.fixture
+def start_relay(runner, platform):
+    return lambda: runner.start(RelayService(platform(VESSEL), RelayConfig()))
+
+
+@pytest.fixture
+def op_modem(runner, platform, tmp_path):
+    """Peer that feeds a running decompressor."""
+    config = DecompressorConfig(out_dir=tmp_path / "vessel", codebooks=("nominal-10",))
+    runner.start(DecompressorService(platform(VESSEL), config))
+    peer = runner.peer(VESSEL, "op_modem")
+
+    def send(*images: ReceivedImage) -> None:
+        peer.send(keys.acoustic_image(VESSEL), "decompressor", *images)
+
+    return send
+
+
+def images(samples):
+    return [wire.decode(ReconstructedImage, s.payload.to_bytes(), "") for s in samples]
+
+
+def test_shore_has_the_same_image_as_the_vessel(op_modem, start_relay, start_c2, watch, stream, tmp_path):
+    on_vessel, at_shore = watch(keys.image_reconstructed(VESSEL)), watch(keys.shore_image(VESSEL))
+    coded = watch(keys.shore_coded(VESSEL))
+    start_relay(), start_c2()
+    op_modem(update(stream[:200], missing=((100, 120),)))
+    eventually(lambda: on_vessel and at_shore and coded)
+    assert images(at_shore) == images(on_vessel)
+    record = wire.decode(CodedImage, coded[0].payload.to_bytes(), "")
+    assert (record.codec, record.bytes_received, record.missing) == ("spiht", 180, ((100, 120),))
+    [vessel_tiff], [shore_tiff] = (list((tmp_path / name).rglob("*.tiff")) for name in ("vessel", "shore"))
+    np.testing.assert_array_equal(read_image(shore_tiff), read_image(vessel_tiff))
+    assert shore_tiff.with_suffix(".json").read_bytes() == vessel_tiff.with_suffix(".json").read_bytes()
+
+
+def test_contact_without_a_stream_arrives(op_modem, start_relay, start_c2, watch):
+    at_shore = watch(keys.shore_image(VESSEL))
+    start_relay(), start_c2()
+    op_modem(update(b""))
+    eventually(lambda: at_shore)
+    [image] = images(at_shore)
+    assert (image.codec, image.missing_fraction, image.contact.lat_deg) == ("", 1.0, CONTACT.lat_deg)
+
+
+def test_later_versions_travel_as_differences(op_modem, start_relay, start_c2, watch, stream):
+    on_vessel, at_shore = watch(keys.image_reconstructed(VESSEL)), watch(keys.shore_image(VESSEL))
+    relay, c2 = start_relay(), start_c2()
+    for version, length in enumerate((200, 300, 400, 500), start=1):
+        op_modem(update(stream[:length], version))
+        eventually(lambda: len(at_shore) == version)  # noqa: B023 used in this iteration
+        eventually(lambda: relay.store.outbox_depth() == 0)
+    assert images(at_shore) == images(on_vessel)
+    counters = relay.health().counters
+    assert (counters["image_differences"], counters["coded_images_relayed"]) == (3, 4)
+    assert c2.health().counters["images_accepted"] == 4
+
+
+def test_site_that_lost_its_store_gets_the_whole(
+    op_modem, runner, start_relay, start_c2, watch, stream, platform, refused
+):
+    at_shore = watch(keys.shore_image(VESSEL))
+    relay, c2 = start_relay(), start_c2()
+    op_modem(update(stream[:200]))
+    eventually(lambda: len(at_shore) == 1)
+    eventually(lambda: relay.store.outbox_depth() == 0)
+    runner.stop(c2)
+    for file in platform("shore-1").state_dir.glob("c2.db*"):
+        file.unlink()
+    c2 = start_c2()
+    op_modem(update(stream[:300], 2))
+    eventually(lambda: len(at_shore) == 2)
+    assert images(at_shore)[1].bytes_received == 300
+    eventually(lambda: relay.store.outbox_depth() == 0)
+    assert relay.health().counters["image_differences_refused"] == 1
+    assert refused(relay) == refused(c2) == []
+    assert c2.health().counters.get("records_refused", 0) == 0
+
+
+def test_queued_difference_is_replaced_by_one_to_the_acknowledged_version(
+    op_modem, runner, start_relay, start_c2, watch, stream
+):
+    at_shore = watch(keys.shore_image(VESSEL))
+    relay, c2 = start_relay(), start_c2()
+    op_modem(update(stream[:200]))
+    eventually(lambda: at_shore and relay.store.outbox_depth() == 0)
+    runner.stop(c2)
+    op_modem(update(stream[:300], 2), update(stream[:400], 3), update(stream[:500], 4))
+    eventually(lambda: relay.health().counters.get("coded_images_relayed") == 4)
+    start_c2()
+    eventually(lambda: any(image.version == 4 for image in images(at_shore)))
+    assert images(at_shore)[-1].bytes_received == 500
+    eventually(lambda: relay.store.outbox_depth() == 0)
+    assert relay.health().counters.get("image_differences_refused", 0) == 0
+
+
+def test_records_of_the_relay_are_small(op_modem, runner, start_relay, stream):
+    received = {keys.shore_part_all(): ImagePart, keys.shore_inbox_all(): Relayed}
+    shore = runner.peer("shore-1", "c2", received)
+    relay = start_relay()
+    op_modem(update(stream[:200]))
+    eventually(lambda: len(shore.received) == 1 and relay.store.outbox_depth() == 0)
+    op_modem(update(stream[:300], 2))
+    eventually(lambda: len(shore.received) == 2)
+    whole, difference = shore.received
+    assert isinstance(whole, ImagePart)
+    assert stream_of(whole) == stream[:200]
+    assert len(wire.encode(whole)) <= 300
+    assert len(wire.encode(difference)) <= 220
+
+
+def test_stream_that_cannot_be_decoded_costs_that_image_only(runner, start_relay, start_c2, watch, stream, refused):
+    at_shore = watch(keys.shore_image(VESSEL))
+    relay, c2 = start_relay(), start_c2()
+    peer = runner.peer(VESSEL, "decompressor")
+
+    def coded(data: bytes, number: int) -> CodedImage:
+        return CodedImage(**dict(update(data, 1, number)), codec="", model="", picture_crc32=None)
+
+    peer.send(keys.image_coded(VESSEL), "relay", coded(b"\x7f" + bytes(50), 1), coded(stream, 2))
+    eventually(lambda: at_shore)
+    [(key, reason)] = refused(c2)
+    assert key == keys.shore_part(VESSEL)
+    assert "codec_id: got '0x7f'" in reason
+    assert c2.health().counters["images_undecodable"] == 1
+    eventually(lambda: relay.store.outbox_depth() == 0)
+
+
+def test_killed_decoder_is_started_again(op_modem, start_relay, start_c2, watch, stream):
+    at_shore = watch(keys.shore_image(VESSEL))
+    start_relay()
+    c2 = start_c2()
+    op_modem(update(stream[:200]))
+    eventually(lambda: len(at_shore) == 1)
+    [worker] = c2.decoding.workers
+    os.kill(worker.pid, signal.SIGKILL)
+    op_modem(update(stream[:200], 1, 2))
+    eventually(lambda: len(at_shore) == 2)
+
+
+def test_accepted_images_are_decoded_after_a_restart(
+    op_modem, runner, start_relay, start_c2, watch, stream, monkeypatch
+):
+    at_shore = watch(keys.shore_image(VESSEL))
+    relay = start_relay()
+    with monkeypatch.context() as patch:
+        patch.setattr("sonarpost.services.c2.decoding.Decoding.run", lambda self: None)
+        c2 = start_c2()
+        op_modem(*(update(stream[:200], 1, number) for number in (1, 2, 3)))
+        eventually(lambda: c2.health().gauges["images_undecoded"] == 3.0)
+        eventually(lambda: relay.store.outbox_depth() == 0)
+        runner.stop(c2)
+    c2 = start_c2()
+    eventually(lambda: len(at_shore) == 3)
+    eventually(lambda: c2.health().gauges["images_undecoded"] == 0.0)
+
+
+def test_other_pixels_than_on_the_vessel_are_noted(runner, start_relay, start_c2, watch, stream):
+    at_shore = watch(keys.shore_image(VESSEL))
+    start_relay()
+    c2 = start_c2()
+    image = CodedImage(**dict(update(stream)), codec="spiht", model="", picture_crc32=1)
+    runner.peer(VESSEL, "decompressor").send(keys.image_coded(VESSEL), "relay", image)
+    eventually(lambda: at_shore)
+    assert images(at_shore)[0].notes == ("decoded pixels differ from those of the vessel",)
+    assert c2.health().counters["images_differing"] == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"p": b"", "s": ((1, b"x"),)}, "s: got '1 bytes', expected every byte of the stream that is not in m"),
+        ({"c": b"\x81\xa7lat_deg\xcb\x40\x56\xc0\0\0\0\0\0"}, "lat_deg: got 91.0"),
+    ],
+)
+def test_invalid_part_is_refused(change, reason, runner, start_c2, refused):
+    c2 = start_c2()
+    relay = runner.peer(VESSEL, "relay")
+    part = ImagePart(u="uuv-1", i="000A", n=1, t=1.0, p=b"\x04\x30")
+    relay.send(keys.shore_part(VESSEL), "c2", ImagePart.model_validate(part.model_dump() | change))
+    eventually(lambda: refused(c2))
+    assert reason in refused(c2)[0][1]
+
+
+def test_site_keeps_a_limited_number_of_versions(runner, start_c2, platform, monkeypatch):
+    monkeypatch.setattr("sonarpost.archive.image_parts.MAX_VERSIONS", 10)
+    monkeypatch.setattr("sonarpost.archive.image_parts.PRUNE_EVERY", 1)
+    monkeypatch.setattr("sonarpost.services.c2.decoding.Decoding.run", lambda self: None)
+    c2 = start_c2()
+    relay = runner.peer(VESSEL, "relay")
+    parts = (ImagePart(u="uuv-1", i=image_of_number(n), n=1, t=1000.0 - n, p=b"\x04\x30") for n in range(1, 31))
+    relay.send(keys.shore_part(VESSEL), "c2", *parts)
+    eventually(lambda: relay.store.outbox_depth() == 0)
+    names = c2.store.state_names("version/")
+    assert len(names) <= 11
+    with sqlite3.connect(f"file:{platform('shore-1').state_dir / 'c2.db'}?mode=ro", uri=True) as db:
+        [count] = db.execute("SELECT COUNT(*) FROM state WHERE name LIKE 'undecoded/%'").fetchone()
+    assert count + c2.store.inbox_depth() == 30
+    assert msgpack.unpackb(c2.store.get_state(names[0]))["u"] == "uuv-1"

@@ -1,0 +1,225 @@
+"""Short messages from the relay of a vessel to c2, through an emulated gateway: both ends restarted, budget, radio."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from builders.common import eventually
+from builders.records import decision_record, reconstructed_image
+from builders.short_messages import decision
+from builders.short_messages import received as received_image
+from pydantic import ValidationError
+
+from sonarpost import keys
+from sonarpost.archive.image_files import PREVIEW_NOTE, image_file_name
+from sonarpost.codec.registry import CodecResources, default_registry
+from sonarpost.errors import ConfigError
+from sonarpost.messages import CodedImage, Pixels
+from sonarpost.services.c2.config import C2Config, ShortMessageOptions
+from sonarpost.services.c2.service import C2Service
+from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
+from sonarpost.services.relay.service import RelayService
+from sonarpost.simulation.message_gateway import MessageGatewayEmulator
+
+IMEI = "300234010753370"
+TOKEN = "0123456789abcdef"
+CODED, DECISIONS = keys.image_coded("vessel-1"), keys.contact_decision("vessel-1")
+
+
+def received(number):
+    """Return the record of the decompressor."""
+    image = received_image(number)
+    return CodedImage(**{**image.model_dump(), "contact": image.contact, "codec": "emb", "model": ""})
+
+
+@pytest.fixture(autouse=True)
+def fast(monkeypatch):
+    monkeypatch.setattr("sonarpost.bearers.receiver.ACKNOWLEDGE_AFTER_S", 0.2)
+    monkeypatch.setattr("sonarpost.bearers.sender.FIRST_TIMEOUT_S", 2.0)
+    monkeypatch.setattr("sonarpost.services.relay.satellite.POLL_S", 0.05)
+    monkeypatch.setattr("sonarpost.services.relay.satellite.RETRY_S", 0.1)
+    monkeypatch.setattr("sonarpost.services.c2.short_messages.CHECK_S", 0.05)
+    monkeypatch.setattr("sonarpost.services.c2.short_messages.RETRY_S", 0.1)
+
+
+@pytest.fixture
+def gateway():
+    gateway = MessageGatewayEmulator("http://127.0.0.1:1/", [IMEI], loss=0.2, max_delay_s=0.3, seed=3)
+    yield gateway
+    gateway.close()
+
+
+@pytest.fixture
+def begin_c2(runner, platform, tmp_path, gateway):
+    (tmp_path / "token").write_text(TOKEN + "\n")
+    (tmp_path / "password").write_text("password\n")
+
+    def begin(vessels=None):
+        messages = ShortMessageOptions(
+            vessels=vessels or {IMEI: "vessel-1"},
+            token_file=tmp_path / "token",
+            port=0,
+            gateway=gateway.mt_url,
+            username="user",
+            password_file=tmp_path / "password",
+        )
+        config = C2Config(out_dir=tmp_path / "out", short_messages=messages)
+        service = runner.start(C2Service(platform("shore-1"), config))
+        gateway.webhook_url = f"http://127.0.0.1:{service._short_messages.port}/{TOKEN}"
+        return service
+
+    return begin
+
+
+@pytest.fixture
+def begin_relay(runner, platform, gateway):
+    def begin(*upstreams, **options):
+        usual = {"bearer": "satellite", "terminal": gateway.terminal_url(IMEI), "check_interval_s": 1.0}
+        satellite = UpstreamOptions(**(usual | options))
+        return runner.start(RelayService(platform("vessel-1"), RelayConfig(upstreams=(*upstreams, satellite))))
+
+    return begin
+
+
+@pytest.fixture
+def source(runner):
+    return runner.peer("vessel-1", "decompressor")
+
+
+def side_cars(tmp_path):
+    found = [json.loads(path.read_text()) for path in (tmp_path / "out" / "vessel-1").glob("*.json")]
+    return {record["image_id"]: record for record in found if record.get("type") == "reconstructed_image"}
+
+
+def waits(service):
+    gauges = service.gauges()
+    return gauges["satellite_waiting_for_shore"] + gauges["satellite_unacknowledged_shore"]
+
+
+def test_all_records_arrive_once_over_losses_and_restarts_of_both_ends(
+    runner, source, begin_c2, begin_relay, tmp_path, gateway, texture
+):
+    stream = default_registry().create("emb", CodecResources()).encode(texture(80, 140))[:150]
+    # The contact record and 150 bytes of a stream are one message each.
+    fields = {"stream": stream, "bytes_received": len(stream), "bytes_total": len(stream)}
+    images = [received(n).model_copy(update=fields) for n in range(1, 13)]
+    images.append(received(13))  # its preview cannot be decoded: the contact arrives without it
+    decisions = [decision(f"d{n}", remark="long " * 120 if n == 1 else "") for n in range(3)]
+    c2, relay = begin_c2(), begin_relay()
+    source.send(CODED, "relay", *images)
+    source.send(DECISIONS, "relay", *decisions[:2])
+    eventually(lambda: gateway.messages >= 5)
+    runner.stop(relay)
+    runner.stop(c2)
+    c2, relay = begin_c2(), begin_relay()
+    source.send(DECISIONS, "relay", decisions[2])
+    eventually(lambda: len(side_cars(tmp_path)) == 13 and not waits(relay))
+    eventually(
+        lambda: len(list((tmp_path / "out" / "vessel-1").glob("**/*d?.json"))) >= 3 or c2.store.inbox_depth() == 0
+    )
+    found = side_cars(tmp_path)
+    assert sorted(found) == [image.image_id for image in images]
+    assert found["0001"]["contact"] == images[0].contact.model_dump()
+    assert (found["0001"]["notes"][0], found["0001"]["missing_fraction"] < 1) == (PREVIEW_NOTE, True)
+    assert gateway.lost > 0
+    assert relay.gauges()["satellite_bytes_shore"] == gateway.sent_bytes
+    assert relay.gauges()["satellite_messages_shore"] == gateway.messages
+    index = c2._archive.index()
+    eventually(lambda: len(index.decisions()) == 3)
+    assert len(index.images()) == 13
+    assert c2.gauges()["records_conflicting"] == 0
+
+
+def test_the_radio_goes_first_and_its_image_replaces_the_preview(
+    runner, source, begin_c2, begin_relay, tmp_path, gateway, texture
+):
+    c2 = begin_c2()
+    relay = begin_relay(UpstreamOptions(), after_s=3600.0)
+    picture = Pixels.from_array(texture(80, 140))
+    whole = reconstructed_image(picture, image_id="0001", first_frame_utc_s=received(1).first_frame_utc_s)
+    source.send(CODED, "relay", received(1))
+    source.send(DECISIONS, "relay", decision_record())
+    source.send(keys.image_reconstructed("vessel-1"), "relay", whole)
+    relayed = ("coded_images_relayed", "decisions_relayed", "reconstructed_images_relayed")
+    eventually(lambda: all(relay.health().counters.get(name) == 1 for name in relayed))
+    eventually(
+        lambda: not relay.store.state_names("short/shore/item/"), what="withdrawal of what the radio has delivered"
+    )
+    assert gateway.messages == 0
+    # The preview of a stored image changes nothing; a preview that came first is replaced.
+    runner.stop(relay)
+    relay = begin_relay()
+    source.send(CODED, "relay", received(1), received(2))
+    eventually(lambda: len(side_cars(tmp_path)) == 2 and not waits(relay))
+    assert side_cars(tmp_path)["0001"]["notes"] == []
+    assert side_cars(tmp_path)["0002"]["notes"][0] == PREVIEW_NOTE
+    later = whole.model_copy(update={"image_id": "0002", "first_frame_utc_s": received(2).first_frame_utc_s})
+    runner.stop(relay)
+    begin_relay(UpstreamOptions())
+    source.send(keys.image_reconstructed("vessel-1"), "relay", later)
+    eventually(lambda: side_cars(tmp_path)["0002"]["notes"] == [])
+    assert len(list((tmp_path / "out" / "vessel-1").glob(f"{image_file_name(later)}*"))) == 3
+    eventually(lambda: len(c2._archive.index().images()) == 2)
+    assert c2.gauges()["records_conflicting"] == 0
+
+
+def test_budget_of_the_day_is_kept_over_a_restart_and_shown(runner, source, begin_relay, gateway):
+    relay = begin_relay(bytes_per_day=1000, cost_per_kb=2.0)
+    source.send(CODED, "relay", *(received(n) for n in range(1, 7)))
+    eventually(lambda: gateway.messages == 3)
+    eventually(lambda: "1000 bytes of the day are used; 3 items wait" in relay.warning())
+    runner.stop(relay)
+    relay = begin_relay(bytes_per_day=1000, cost_per_kb=2.0)
+    eventually(lambda: "3 items wait" in relay.warning())
+    gauges = relay.gauges()
+    assert gateway.messages == 3
+    assert gauges["satellite_bytes_today_shore"] == gateway.sent_bytes <= 1000
+    assert gauges["satellite_cost_shore"] == pytest.approx(gateway.sent_bytes / 1000 * 2.0)
+
+
+def test_terminal_that_is_absent_is_reported_and_costs_nothing(source, begin_relay):
+    relay = begin_relay(terminal="socket://127.0.0.1:1")
+    source.send(CODED, "relay", received(1))
+    eventually(lambda: "by satellite: socket://127.0.0.1:1" in relay.warning())
+    assert relay.gauges()["satellite_bytes_shore"] == 0
+    assert relay.gauges()["satellite_unacknowledged_shore"] == 1
+
+
+def test_c2_refuses_unknown_terminals_and_invalid_messages(begin_c2, gateway):
+    c2 = begin_c2({"300234010753371": "vessel-2"})
+    gateway.from_terminal(IMEI, b"x")
+    eventually(lambda: c2.health().counters.get("short_messages_refused", 0) >= 1)
+    assert c2.health().counters.get("short_messages_received", 0) == 0
+    assert c2.store.inbox_depth() == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ({"bearer": "satellite"}, "a terminal"),
+        ({"terminal": "/dev/ttyUSB0"}, "no terminal with bearer radio"),
+        ({"bearer": "satellite", "terminal": "x", "max_bytes": 1}, "no max_bytes with bearer satellite"),
+        ({"bearer": "satellite", "terminal": "x", "windows": ("6-7",)}, "HH:MM"),
+        ({"bearer": "satellite", "terminal": "x", "bytes_per_day": 339}, "340"),
+    ],
+)
+def test_invalid_upstreams_are_refused(options, problem):
+    with pytest.raises(ValidationError, match=problem):
+        UpstreamOptions(**options)
+
+
+def test_site_has_one_upstream_of_each_kind():
+    satellite = UpstreamOptions(bearer="satellite", terminal="x")
+    config = RelayConfig(upstreams=(UpstreamOptions(), satellite))
+    assert (config.sites(), config.satellites()) == ((UpstreamOptions(),), (satellite,))
+    assert RelayConfig(upstreams=(satellite,)).sites() == ()
+    with pytest.raises(ValidationError, match="each site once by satellite"):
+        RelayConfig(upstreams=(satellite, satellite))
+
+
+@pytest.mark.parametrize("text", ["short", "0123456789abcdef/"])
+def test_token_has_to_be_long_and_plain(begin_c2, tmp_path, text):
+    (tmp_path / "token").write_text(text)
+    with pytest.raises(ConfigError, match="token"):
+        begin_c2()

@@ -1,0 +1,170 @@
+"""Covered seabed: place and area of the outline, gaps, turns, files. GDAL/OGR is the oracle."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import tracemalloc
+from dataclasses import replace
+
+import pytest
+from builders import gdal
+from builders.survey_lines import ALTITUDE_M, RANGE_M, line, with_turn
+from builders.surveys import make_xtf
+from pyproj import Geod
+
+from sonarpost.cli.main import main
+from sonarpost.errors import SurveyFileError
+from sonarpost.export.coverage import write_coverage_geojson
+from sonarpost.export.geopackage import write_coverage_geopackage
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.maps import track
+from sonarpost.sonar.maps.coverage import survey_coverage
+
+REACH_M = math.sqrt(RANGE_M**2 - ALTITUDE_M**2)
+GEOD = Geod(ellps="WGS84")
+
+
+def layer(path, *arguments):
+    """Return the features of a file as GeoJSON, by ogr2ogr."""
+    command = ["ogr2ogr", "-f", "GeoJSON", "/vsistdout/", path, *arguments]
+    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)["features"]
+
+
+def invalid_polygons(path):
+    """Return the number of features and of those that GEOS finds invalid."""
+    program = (
+        "from osgeo import ogr; import sys; ogr.UseExceptions(); source = ogr.Open(sys.argv[1]);"
+        "valid = [f.GetGeometryRef().IsValid() for f in source.GetLayer(0)]; print(len(valid), valid.count(False))"
+    )
+    ran = subprocess.run([gdal.SYSTEM_PYTHON, "-c", program, path], check=True, capture_output=True, text=True)
+    count, invalid = map(int, ran.stdout.split())
+    return count, invalid
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 30.0, 200.0])
+def test_corners_are_the_ends_of_the_swath(tmp_path, heading_deg):
+    survey = line(heading_deg, bright=None)
+    (polygon,) = survey_coverage([make_xtf(survey, tmp_path)]).polygons
+    assert (polygon.line, polygon.first_ping, polygon.last_ping) == ("line", 0, 119)
+    assert polygon.end_utc_s - polygon.start_utc_s == pytest.approx(119 * 0.2)
+    assert polygon.area_m2 == pytest.approx(119 * 0.25 * 2 * REACH_M, rel=2e-3)
+    assert polygon.ring[0] == polygon.ring[-1]
+    area_m2, _ = GEOD.polygon_area_perimeter(*zip(*((p.lon_deg, p.lat_deg) for p in polygon.ring), strict=True))
+    assert area_m2 == pytest.approx(polygon.area_m2, rel=2e-3)  # positive: counter-clockwise
+    for row in (0, 119):
+        for bearing_deg in (heading_deg + 90, heading_deg - 90):
+            ping = survey.pings[row]
+            lon_deg, lat_deg, _ = GEOD.fwd(ping.lon_deg, ping.lat_deg, bearing_deg, REACH_M)
+            assert min(GEOD.inv(lon_deg, lat_deg, p.lon_deg, p.lat_deg)[2] for p in polygon.ring) < 0.05
+
+
+def test_gap_ends_a_polygon_and_a_ping_without_position_does_not(tmp_path):
+    survey = line(bright=None)
+    pings = list(survey.pings)
+    pings[20] = replace(pings[20], lat_deg=None, lon_deg=None)
+    path = make_xtf(replace(survey, pings=(*pings[:40], *pings[90:])), tmp_path)
+    coverage = survey_coverage([path])
+    assert [(p.first_ping, p.last_ping) for p in coverage.polygons] == [(0, 39), (90, 119)]
+    assert (coverage.pings, coverage.left_out) == (69, 1)
+
+
+@gdal.needs_bindings
+@pytest.mark.parametrize("radius_m", [5.0, 25.0, 60.0])
+def test_polygons_of_turns_and_overlaps_are_valid(tmp_path, radius_m):
+    survey = with_turn(radius_m)
+    coverage = survey_coverage([make_xtf(survey, tmp_path)])
+    write_coverage_geopackage(tmp_path / "c.gpkg", coverage.polygons)
+    count, invalid = invalid_polygons(tmp_path / "c.gpkg")
+    assert (count, invalid) == (len(coverage.polygons), 0)
+    assert all(polygon.area_m2 > 0 for polygon in coverage.polygons)
+    # Each line is covered but for the 10 m at a turn.
+    lines_m2 = 2 * (119 * 0.5 - 10) * 2 * REACH_M
+    assert sum(polygon.area_m2 for polygon in coverage.polygons) > lines_m2
+
+
+@gdal.needs_bindings
+def test_errors_of_the_heading_leave_one_valid_polygon(tmp_path):
+    """Errors of up to 6 degrees at a reach of 29 m: neighbouring pings cross each other."""
+    survey = line(heading_deg=30.0, pings=240, bright=None)
+    pings = tuple(
+        replace(ping, heading_deg=30.0 + 6 * math.sin(row / 5)) if 40 <= row < 200 else ping
+        for row, ping in enumerate(survey.pings)
+    )
+    (polygon,) = survey_coverage([make_xtf(replace(survey, pings=pings), tmp_path)]).polygons
+    write_coverage_geopackage(tmp_path / "c.gpkg", [polygon])
+    assert invalid_polygons(tmp_path / "c.gpkg") == (1, 0)
+    assert (polygon.first_ping, polygon.last_ping) == (0, 239)
+    assert polygon.area_m2 == pytest.approx(239 * 0.25 * 2 * REACH_M, rel=0.05)
+
+
+def test_strips_do_not_change_the_outline(tmp_path, monkeypatch):
+    path = make_xtf(line(pings=400, bright=None), tmp_path)
+    whole = survey_coverage([path])
+    monkeypatch.setattr(track, "_STRIP_PINGS", 150)
+    assert survey_coverage([path]) == whole
+
+
+def test_memory_does_not_depend_on_the_length(tmp_path, monkeypatch):
+    monkeypatch.setattr(track, "_STRIP_PINGS", 150)
+    peaks = []
+    for pings in (600, 2400):
+        path = make_xtf(line(pings=pings, bright=None), tmp_path)
+        tracemalloc.start()
+        survey_coverage([path])
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.15 * peaks[0]
+
+
+@gdal.needs_ogr
+def test_ogr_reads_the_same_polygons_from_both_files(tmp_path):
+    survey = line(bright=None)
+    path = make_xtf(replace(survey, pings=(*survey.pings[:40], *survey.pings[90:])), tmp_path)
+    polygons = survey_coverage([path]).polygons
+    write_coverage_geojson(tmp_path / "c.geojson", polygons)
+    write_coverage_geopackage(tmp_path / "c.gpkg", polygons)
+    described = subprocess.run(["ogrinfo", "-so", tmp_path / "c.gpkg", "coverage"], check=True, capture_output=True)
+    assert "Geometry: Polygon" in described.stdout.decode()
+    features = json.loads((tmp_path / "c.geojson").read_text())["features"]
+    assert len(features) == 2
+    read = layer(tmp_path / "c.gpkg", "-lco", "COORDINATE_PRECISION=8")
+    assert [f["properties"] for f in read] == [f["properties"] for f in features]
+    for got, want in zip(read, features, strict=True):
+        (got_ring,), (want_ring,) = got["geometry"]["coordinates"], want["geometry"]["coordinates"]
+        assert len(got_ring) == len(want_ring)
+        for point, other in zip(got_ring, want_ring, strict=True):
+            assert point == pytest.approx(other, abs=2e-8)
+
+
+@gdal.needs_ogr
+def test_simulated_objects_are_covered(tmp_path):
+    simulated = simulate_survey(SurveySpec(seed=3, pings=400, targets=4, clutter=0))
+    write_coverage_geopackage(tmp_path / "c.gpkg", survey_coverage([make_xtf(simulated.survey, tmp_path)]).polygons)
+    for item in simulated.truth:
+        box = [f"{value:.9f}" for value in (item.lon_deg, item.lat_deg, item.lon_deg, item.lat_deg)]
+        assert len(layer(tmp_path / "c.gpkg", "-spat", *box)) == 1
+    assert layer(tmp_path / "c.gpkg", "-spat", "0", "0", "0", "0") == []
+
+
+def test_recording_without_navigation_is_rejected(tmp_path):
+    survey = line()
+    bare = tuple(replace(ping, heading_deg=None) for ping in survey.pings)
+    with pytest.raises(SurveyFileError, match="position, heading and altitude"):
+        survey_coverage([make_xtf(replace(survey, pings=bare), tmp_path)])
+
+
+def test_commands_write_the_format_of_the_suffix(tmp_path, capsys):
+    path = str(make_xtf(line(), tmp_path))
+    for name in ("new/c.gpkg", "c.geojson"):
+        assert main(["survey", "coverage", path, "--out", str(tmp_path / name)]) == 0
+        assert f"{name}: polygons 1, area 17" in capsys.readouterr().out
+    assert (tmp_path / "new" / "c.gpkg").read_bytes().startswith(b"SQLite format 3")
+    assert json.loads((tmp_path / "c.geojson").read_text())["type"] == "FeatureCollection"
+    mosaic = ["survey", "mosaic", path, "--out", str(tmp_path / "m.tif"), "--resolution-m", "1", "--coverage"]
+    assert main([*mosaic, str(tmp_path / "m.gpkg")]) == 0
+    assert (tmp_path / "m.gpkg").read_bytes()[68:72] == b"GPKG"
+    for command in (["survey", "coverage", path, "--out"], mosaic):
+        assert main([*command, str(tmp_path / "c.shp")]) == 2
+        assert "*.gpkg or *.geojson" in capsys.readouterr().err

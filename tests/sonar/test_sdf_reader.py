@@ -1,0 +1,203 @@
+"""Klein SDF: page versions, frequencies, sides, navigation, time, damage."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import numpy as np
+import pytest
+from builders.surveys import sdf_other, sdf_page
+
+from sonarpost.errors import SurveyFileError
+from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.survey import Side
+
+PORT = np.array([1, 2, 3, 4_000_000_000], np.uint32)
+STARBOARD = np.array([5, 6, 7, 8], np.uint32)
+NONE = np.array([], np.uint32)
+
+
+def recording(tmp_path, *pages):
+    path = tmp_path / "line.sdf"
+    path.write_bytes(b"".join(pages))
+    return path
+
+
+def read_one(tmp_path, **values):
+    (ping,) = read_survey(recording(tmp_path, sdf_page(7, PORT, STARBOARD, **values))).pings
+    return ping
+
+
+def test_samples_of_32_bits_are_nearest_first_on_both_sides(tmp_path):
+    ping = read_one(tmp_path, range_m=75)
+    assert [c.side for c in ping.channels] == [Side.PORT, Side.STARBOARD]
+    assert [c.samples.tolist() for c in ping.channels] == [PORT.tolist(), STARBOARD.tolist()]
+    assert [(c.slant_range_m, c.frequency_hz, c.scale) for c in ping.channels] == [(75.0, 900_000.0, 1.0)] * 2
+    assert read_one(tmp_path, khz=0).channels[0].frequency_hz is None
+
+
+def test_bytes_after_the_samples_are_skipped(tmp_path):
+    pages = [sdf_page(number, PORT, STARBOARD, rest=b"\xff" * 216) for number in range(3)]
+    survey = read_survey(recording(tmp_path, *pages))
+    assert [p.number for p in survey] == [0, 1, 2]
+    assert all(c.samples.size == 4 for p in survey for c in p.channels)
+
+
+def test_both_frequencies_are_in_one_ping(tmp_path):
+    """The version with the most pages is first in each ping, in any order of the pages."""
+    high, low = np.arange(6), np.arange(3)
+    pages = [sdf_page(1, high, high, 3502), sdf_page(2, low, low, 3501), sdf_page(2, high, high, 3502)]
+    pages += [sdf_page(3, high, high, 3502), sdf_page(3, low, low, 3501), sdf_page(9, low, low, 3501)]
+    pages.append(sdf_page(4, high, high, 3502))
+    survey = read_survey(recording(tmp_path, *pages))
+    assert [p.number for p in survey] == [1, 2, 3, 4]
+    assert [[c.samples.size for c in p.channels] for p in survey] == [[6, 6], [6, 6, 3, 3], [6, 6, 3, 3], [6, 6]]
+    assert "left out page of version 3501: none left of its number in version 3502 (1 times)" in survey.warnings
+
+
+def test_low_frequency_is_first_if_both_have_as_many_pages(tmp_path):
+    pages = [sdf_page(1, np.arange(6), NONE, 3502), sdf_page(1, np.arange(3), NONE, 3501)]
+    (ping,) = read_survey(recording(tmp_path, *pages)).pings
+    assert [c.samples.size for c in ping.channels] == [3, 6]
+
+
+def test_repeated_page_of_the_other_frequency_is_left_out(tmp_path):
+    pages = [sdf_page(1, PORT, NONE, 3501), sdf_page(1, PORT, NONE, 3502), sdf_page(1, PORT, NONE, 3502)]
+    pages += [sdf_page(number, PORT, NONE, 3501) for number in (2, 3)]
+    survey = read_survey(recording(tmp_path, *pages))
+    assert [len(p.channels) for p in survey] == [2, 1, 1]
+    assert "left out page of version 3502: none left of its number in version 3501 (1 times)" in survey.warnings
+
+
+def test_frequency_without_common_numbers_is_left_out(tmp_path):
+    pages = []
+    for number in range(40):
+        pages += [sdf_page(number, PORT, STARBOARD, 3501), sdf_page(number + 5000, PORT, STARBOARD, 3502)]
+    survey = read_survey(recording(tmp_path, *pages))
+    assert [p.number for p in survey] == list(range(40))
+    assert all(len(p.channels) == 2 for p in survey)
+    assert any("left out page of version 3502" in w and "(40 times)" in w for w in survey.warnings)
+
+
+@pytest.mark.parametrize("version", [3000, 3001, 3500, 3503, 5001, 5004])
+def test_file_of_another_page_version_is_refused_by_its_number(tmp_path, version):
+    path = recording(tmp_path, sdf_other(version, bytes(600)), sdf_other(version, bytes(600)))
+    want = rf"page version: got .{version} \(2 times\).*, expected 3501 or 3502"
+    with pytest.raises(SurveyFileError, match=want):
+        read_survey(path)
+
+
+def test_pages_of_other_versions_are_skipped_with_a_warning(tmp_path):
+    survey = read_survey(recording(tmp_path, sdf_other(3503, b""), sdf_page(1, PORT, STARBOARD)))
+    assert [p.number for p in survey] == [1]
+    assert "skipped page of version 3503: not side-scan of a UUV-3500 sonar (3501, 3502) (1 times)" in survey.warnings
+
+
+def test_page_of_one_side(tmp_path):
+    without_count = sdf_other(3502, sdf_page(1, PORT, NONE)[12:-4])
+    pages = [without_count, sdf_page(2, NONE, STARBOARD), sdf_page(3, NONE, NONE)]
+    survey = read_survey(recording(tmp_path, *pages))
+    assert [[c.side for c in p.channels] for p in survey] == [[Side.PORT], [Side.STARBOARD]]
+    assert "skipped page: no samples, or impossible range (1 times)" in survey.warnings
+
+
+@pytest.mark.parametrize("range_m", [0, 10_001, 2**32 - 1])
+def test_impossible_range_is_left_out(tmp_path, range_m):
+    pages = (sdf_page(1, PORT, STARBOARD, range_m=range_m), sdf_page(2, PORT, STARBOARD))
+    survey = read_survey(recording(tmp_path, *pages))
+    assert [p.number for p in survey] == [2]
+
+
+def test_number_of_samples_that_the_header_contradicts_is_left_out(tmp_path):
+    pages = (sdf_page(1, PORT, STARBOARD, count=3), sdf_page(2, PORT, STARBOARD))
+    survey = read_survey(recording(tmp_path, *pages))
+    assert [p.number for p in survey] == [2]
+    assert "skipped page: a side has another number of samples than its header (1 times)" in survey.warnings
+
+
+def test_navigation_of_the_vehicle(tmp_path):
+    names = ("lat_deg", "lon_deg", "altitude_m", "depth_m", "speed_mps", "heading_deg", "pitch_deg", "roll_deg")
+    none = read_one(tmp_path)
+    assert all(getattr(none, name) is None for name in names)
+    values = {"altitude": 6.0, "depth": 14.0, "speed": 103, "heading": 360.0, "pitch": 1.0, "roll": -1.0}
+    ping = read_one(tmp_path, lat=math.radians(48.3), lon=math.radians(-68.3), **values)
+    got = [getattr(ping, name) for name in names]
+    assert got == pytest.approx([48.3, -68.3, 6.0, 14.0, 1.03, 0.0, 1.0, -1.0])
+    # One of both angles may be 0.
+    level = read_one(tmp_path, roll=2.0)
+    assert (level.pitch_deg, level.roll_deg) == (0.0, 2.0)
+
+
+def test_implausible_navigation_is_unknown(tmp_path):
+    nan = float("nan")
+    values = {"altitude": -1.0, "depth": 1e9, "speed": 2**32 - 1, "heading": -5.0, "pitch": 91.0, "roll": nan}
+    ping = read_one(tmp_path, lat=2.0, lon=nan, **values)
+    names = ("lat_deg", "lon_deg", "altitude_m", "depth_m", "speed_mps", "heading_deg", "pitch_deg", "roll_deg")
+    assert all(getattr(ping, name) is None for name in names)
+
+
+def test_missing_position_and_heading_are_counted(tmp_path):
+    survey = read_survey(recording(tmp_path, sdf_page(1, PORT, STARBOARD)))
+    assert "no position fix in 1 of 1 pings, the first in row 0" in survey.warnings
+    assert "no heading in 1 of 1 pings, the first in row 0" in survey.warnings
+
+
+def test_time_with_fraction(tmp_path):
+    assert read_one(tmp_path, fraction=0.25).time_utc_s == 1_378_847_588.25
+    for value in (1.0, -0.5, float("nan")):
+        assert read_one(tmp_path, fraction=value).time_utc_s == 1_378_847_588
+
+
+@pytest.mark.parametrize("values", [{"year": 1969}, {"month": 13}, {"day": 0}, {"hour": 24}, {"year": 2**32 - 1}])
+def test_impossible_date_is_rejected(tmp_path, values):
+    with pytest.raises(SurveyFileError, match="date and time"):
+        read_one(tmp_path, **values)
+
+
+def test_cut_last_page_is_left_out(tmp_path):
+    path = recording(tmp_path, *(sdf_page(number, PORT, STARBOARD) for number in range(3)))
+    complete = path.read_bytes()
+    page_bytes = len(complete) // 3
+    for left in (1, 7, 12, 500, page_bytes - 1):
+        path.write_bytes(complete[: 2 * page_bytes + left])
+        survey = read_survey(path)
+        assert [p.number for p in survey] == [0, 1]
+        assert survey.warnings[0].startswith(f"the file ends inside its last page, as after a power failure: {left} ")
+
+
+def test_cut_only_page_is_rejected(tmp_path):
+    page = sdf_page(1, PORT, STARBOARD)
+    for length in (3, 9, 12, 516, len(page) - 1):
+        with pytest.raises(SurveyFileError, match=r"truncated|page version: got 'none'"):
+            read_survey(recording(tmp_path, page[:length]))
+
+
+@pytest.mark.parametrize(
+    ("offset", "value", "field"),
+    [
+        (0, 0xFFFFFFFE, "marker"),
+        (4, 7, "number of bytes"),
+        (4, (1 << 24) + 9, "number of bytes"),
+        (4, 5000, "truncated"),
+        (184, 256, "size of the header: got 256, expected 512"),
+        (516, 10, "number of port samples"),
+        (516, 2**32 - 1, "number of port samples"),
+        (536, 5, "number of starboard samples"),
+    ],
+)
+def test_damage_is_rejected(tmp_path, offset, value, field):
+    content = bytearray(sdf_page(1, PORT, STARBOARD))
+    struct.pack_into("<I", content, offset, value)
+    with pytest.raises(SurveyFileError, match=field):
+        read_survey(recording(tmp_path, content))
+
+
+def test_side_scan_page_shorter_than_its_header_is_rejected(tmp_path):
+    with pytest.raises(SurveyFileError, match="number of bytes: got 511, expected at least 512 for page version 3502"):
+        read_survey(recording(tmp_path, sdf_other(3502, bytes(511 - 8))))
+
+
+def test_empty_file_is_rejected(tmp_path):
+    with pytest.raises(SurveyFileError, match="page version: got 'none'"):
+        read_survey(recording(tmp_path))

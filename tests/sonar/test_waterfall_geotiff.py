@@ -1,0 +1,148 @@
+"""Georeferenced waterfall: position of echoes and objects, orientation, lines, memory. GDAL is the oracle."""
+
+from __future__ import annotations
+
+import math
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tifffile
+from builders import gdal
+from builders.survey_lines import ALTITUDE_M, RANGE_M, SAMPLES, course, line, with_turn
+from builders.surveys import make_xtf
+
+from sonarpost.cli.main import main
+from sonarpost.errors import SurveyFileError
+from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.sonar.geometry import georeference
+from sonarpost.sonar.maps import ground_canvas, track
+from sonarpost.sonar.maps.waterfall import write_waterfalls
+from sonarpost.sonar.options import SurveyOptions
+from sonarpost.sonar.survey import Side
+
+
+def brightest_px(image, column, row, radius_px):
+    """Return the middle of the brightest pixels around a place."""
+    left, top = int(column) - radius_px, int(row) - radius_px
+    window = image[top : top + 2 * radius_px + 1, left : left + 2 * radius_px + 1]
+    rows, columns = np.nonzero(window >= np.sort(window, axis=None)[-12])
+    return left + columns.mean() + 0.5, top + rows.mean() + 0.5
+
+
+@gdal.needs_gdal
+@pytest.mark.parametrize("heading_deg", [0.0, 30.0, 137.0, 290.0])
+@pytest.mark.parametrize("side", list(Side))
+def test_echo_is_at_its_georeferenced_position(tmp_path, heading_deg, side):
+    survey = line(heading_deg, bright=(60, side, 20.0))
+    (waterfall,) = write_waterfalls(make_xtf(survey, tmp_path), tmp_path, 0.1)
+    assert waterfall.path == tmp_path / "line-waterfall-1.tif"
+    assert (waterfall.first_ping, waterfall.last_ping) == (0, 119)
+    sample = math.hypot(20.0, ALTITUDE_M) / RANGE_M * SAMPLES - 0.5
+    want = georeference(survey.pings[60], side, sample, SurveyOptions()).position
+    places = [want, *(survey.pings[row] for row in (0, 60, 119))]
+    (column, row), first, middle, last = gdal.pixels(waterfall.path, [(p.lat_deg, p.lon_deg) for p in places])
+    image = tifffile.imread(waterfall.path)
+    found = brightest_px(image, column, row, 15)
+    assert math.dist(found, (column, row)) * 0.1 < 0.15
+    # The line goes straight up; port is on the left.
+    assert first[0] == pytest.approx(last[0], abs=0.5)
+    assert first[1] - last[1] == pytest.approx(119 * 0.25 / 0.1, rel=2e-3)
+    assert (column < middle[0]) is (side is Side.PORT)
+
+
+@gdal.needs_gdal
+@pytest.mark.parametrize("seed", [1, 2])
+def test_simulated_objects_are_within_1_m(tmp_path, seed):
+    """The track of the simulator is not straight; highlights are at the near edge of their object."""
+    simulated = simulate_survey(SurveySpec(seed=seed, pings=400, targets=4, clutter=0), speckle=False)
+    (waterfall,) = write_waterfalls(make_xtf(simulated.survey, tmp_path), tmp_path, 0.1)
+    image = tifffile.imread(waterfall.path)
+    places = gdal.pixels(waterfall.path, [(item.lat_deg, item.lon_deg) for item in simulated.truth])
+    assert len(places) == 4
+    for column, row in places:
+        assert math.dist(brightest_px(image, column, row, 15), (column, row)) * 0.1 < 1.0
+
+
+@gdal.needs_bindings
+def test_gdal_accepts_the_layout(tmp_path):
+    survey = line(pings=300, bright=None)
+    (waterfall,) = write_waterfalls(make_xtf(survey, tmp_path), tmp_path, 0.1)
+    assert max(waterfall.size_px) > 512
+    assert gdal.cloud_optimised_problems(waterfall.path) == "([], [])"
+    described = gdal.info(waterfall.path)
+    assert 'ID["EPSG",32619]' in described["coordinateSystem"]["wkt"]
+    # A rotation without reflection.
+    _, cx, rx, _, cy, ry = described["geoTransform"]
+    assert (cx, rx) == pytest.approx((-ry, cy))
+    assert math.hypot(cx, cy) == pytest.approx(0.1)
+
+
+def test_lines_are_separate_and_the_turn_is_left_out(tmp_path):
+    path = make_xtf(with_turn(radius_m=5.0), tmp_path)
+    first, second = write_waterfalls(path, tmp_path, 0.2)
+    assert [w.path.name for w in (first, second)] == ["line-waterfall-1.tif", "line-waterfall-2.tif"]
+    assert first.first_ping == 0
+    assert 119 <= first.last_ping <= 135
+    assert 135 <= second.first_ping <= 151
+    assert second.last_ping == 270
+    for waterfall in (first, second):
+        image = tifffile.imread(waterfall.path)
+        assert image.shape == waterfall.size_px
+        # Both sides of the swath but the nadir, over most of the length.
+        assert (image[: image.shape[0] * 3 // 4] > 0).any(axis=1).mean() > 0.9
+
+
+def test_gap_divides_a_line(tmp_path):
+    survey = line(pings=300, bright=None)
+    path = make_xtf(replace(survey, pings=(*survey.pings[:120], *survey.pings[170:])), tmp_path)
+    waterfalls = write_waterfalls(path, tmp_path, 0.5)
+    assert [(w.first_ping, w.last_ping) for w in waterfalls] == [(0, 119), (170, 299)]
+
+
+def test_single_wrong_heading_does_not_divide_a_line(tmp_path):
+    headings = [0.0] * 120
+    headings[60] = 90.0
+    survey = course([0.0] * 120)
+    pings = tuple(replace(p, heading_deg=h) for p, h in zip(survey.pings, headings, strict=True))
+    assert len(write_waterfalls(make_xtf(replace(survey, pings=pings), tmp_path), tmp_path, 0.5)) == 1
+
+
+def test_memory_does_not_depend_on_the_length(tmp_path, monkeypatch):
+    monkeypatch.setattr(ground_canvas, "_HELD_TILES", 4)
+    monkeypatch.setattr(track, "_STRIP_PINGS", 150)
+    peaks = []
+    for pings in (300, 1200):
+        path = make_xtf(line(pings=pings, bright=None), tmp_path)
+        tracemalloc.start()
+        (waterfall,) = write_waterfalls(path, tmp_path, 0.1)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert waterfall.last_ping == pings - 1
+        image = tifffile.imread(waterfall.path)
+        # No row is empty where strips join.
+        assert (image > 0).any(axis=1).sum() * 0.1 == pytest.approx((pings - 1) * 0.25, abs=0.5)
+    assert peaks[1] < 1.15 * peaks[0]
+
+
+def test_recording_without_line_is_rejected(tmp_path):
+    survey = line(pings=30)
+    with pytest.raises(SurveyFileError, match="straight line of at least 20 m"):
+        write_waterfalls(make_xtf(survey, tmp_path), tmp_path, 0.1)
+    bare = tuple(replace(ping, heading_deg=None) for ping in survey.pings)
+    with pytest.raises(SurveyFileError, match="position, heading and altitude"):
+        write_waterfalls(make_xtf(replace(survey, pings=bare), tmp_path), tmp_path, 0.1)
+    with pytest.raises(ValueError, match="at least"):
+        write_waterfalls(tmp_path / "line.xtf", tmp_path, 0.001)
+
+
+def test_command_prints_the_files(tmp_path, capsys):
+    path = make_xtf(line(), tmp_path)
+    arguments = ["survey", "waterfall", str(path), "--out", str(tmp_path / "new"), "--resolution-m", "0.5"]
+    assert main(arguments) == 0
+    out = capsys.readouterr().out
+    assert out.startswith(f"{tmp_path / 'new' / 'line-waterfall-1.tif'}: ")
+    assert out.endswith("px of 0.5 m, EPSG:32619, pings 0 to 119\n")
+    for resolution in ("0", "nan", "0.001"):
+        assert main([*arguments[:-1], resolution]) == 2
