@@ -38,7 +38,8 @@ test: setup
 # Tests of several minutes each: long outages, random faults in all processes for SONARPOST_CHAOS_S (1800) seconds,
 # SONARPOST_SOAK_CONTACTS (1200) contacts through all services.
 test-long: setup
-	$(BIN)/python -m pytest -m long -o faulthandler_timeout=7200 $(ARGS)
+	$(BIN)/python -m pytest -m long -o faulthandler_timeout=7200 \
+		--numprocesses 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 check: setup docs
 	$(BIN)/ruff format --check .
@@ -81,7 +82,7 @@ COMPILE = build/lock/bin/uv pip compile --quiet --upgrade --generate-hashes --py
 lock:
 	rm -rf build/lock && $(PYTHON) -m venv build/lock
 	build/lock/bin/python -m pip install --quiet --disable-pip-version-check uv
-	$(COMPILE) pyproject.toml --extra console --output-file requirements.lock
+	$(COMPILE) pyproject.toml --extra console --extra postgresql --output-file requirements.lock
 	$(COMPILE) --group build --constraint requirements.lock --output-file requirements-build.lock
 	$(COMPILE) pyproject.toml --group build --extra dev --extra docs \
 		--constraint requirements.lock --constraint requirements-build.lock --output-file requirements-dev.lock

@@ -11,11 +11,13 @@ import pkgutil
 import numpy as np
 
 import sonarpost
+from sonarpost.cli.parsing.commands import EXTRAS
 from sonarpost.codec import codec_names, decode, encode
 from sonarpost.codec.jit import compilation_log
 from sonarpost.codec.machine_code import prepare_machine_code
 
-OPTIONAL = ("matplotlib", "pillow_jxl")
+OPTIONAL = ("matplotlib", "pillow_jxl", *EXTRAS)
+"""Packages of extras, which the image need not have."""
 
 
 def import_everything() -> None:

@@ -19,7 +19,7 @@ from pydantic_core import PydanticUndefined
 from sonarpost import keys, messages
 from sonarpost.cli.deployment import config_files
 from sonarpost.cli.main import parser
-from sonarpost.config import SERVICES, PlatformConfig, ServiceConfig
+from sonarpost.config import TABLES, ModemTable, PlatformConfig, ServiceConfig
 from sonarpost.messages import Record
 from sonarpost.monitoring.fleet import FleetState
 from sonarpost.monitoring.metrics import FleetCollector
@@ -116,8 +116,14 @@ def records(_: str = "") -> str:
 
 
 def record_types() -> list[type[Record]]:
-    """Return every record of `sonarpost.messages`, in the order of the module."""
-    return [t for t in vars(messages).values() if inspect.isclass(t) and issubclass(t, Record) and t.TYPE]
+    """Return every record of `sonarpost.messages`, in the order of the modules, and of each module."""
+    modules = (messages.contact, messages.image, messages.acoustic, messages.vehicle, messages.review, messages.service)
+    return [
+        t
+        for module in modules
+        for t in vars(module).values()
+        if inspect.isclass(t) and issubclass(t, Record) and t.TYPE and t.__module__ == module.__name__
+    ]
 
 
 def key_table(service: str = "") -> str:
@@ -169,13 +175,14 @@ def configuration(service: str = "") -> str:
     """Return the tables of the configuration of one service, of `platform`, or of all of them with headings."""
     if service:
         return _configuration_tables(configuration_type(service), service)
-    names = ("platform", *SERVICES)
+    names = TABLES
     return "\n\n".join(f"## [{name}]\n\n{_configuration_tables(configuration_type(name), name)}" for name in names)
 
 
 def configuration_type(service: str) -> type[ServiceConfig]:
     """Return the model of a configuration table."""
-    return PlatformConfig if service == "platform" else config_files.configuration_type(service)
+    own: Mapping[str, type[ServiceConfig]] = {"platform": PlatformConfig, "modem": ModemTable}
+    return own.get(service) or config_files.configuration_type(service)
 
 
 def commands(_: str = "") -> str:
