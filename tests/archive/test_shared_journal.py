@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from builders.records import decision_record, reconstructed_image
 
-from sonarpost.archive import shore_database
+from sonarpost.archive import shore_schema
 from sonarpost.archive.journal import Accepted, Area, Criteria, Journal, JournalEntry, JournalRecord
 from sonarpost.archive.postgresql import Database, DatabaseAddress
 from sonarpost.archive.shore_database import ShoreDatabase, StoredImage
@@ -210,8 +210,8 @@ def test_database_of_version_1_is_migrated_and_its_records_have_no_number(
     database: Database, archive: ShoreDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as earlier:
-        earlier.setattr(shore_database, "SCHEMA_VERSION", 1)
-        earlier.setattr(shore_database, "_MIGRATIONS", shore_database._MIGRATIONS[:1])
+        earlier.setattr(shore_schema, "VERSION", 1)
+        earlier.setattr(shore_schema, "_MIGRATIONS", shore_schema._MIGRATIONS[:1])
         ShoreDatabase(database).prepare()
     with database.transaction() as sql:
         assert sql.number("SELECT version FROM sonarpost.archive") == 1
