@@ -25,8 +25,10 @@ __all__ = ["database", "database_url", "postgresql_server"]
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# The same examples in every run: a result depends on the code alone. Others: --hypothesis-profile random.
 # On a loaded machine an example may wait for the disk. pytest-timeout ends a test that hangs.
-settings.register_profile("sonarpost", deadline=None)
+settings.register_profile("sonarpost", deadline=None, derandomize=True)
+settings.register_profile("random", deadline=None)
 settings.load_profile("sonarpost")
 
 

@@ -315,6 +315,12 @@ def test_records_of_a_busy_c2_are_not_taken_over(
     relay.send(keys.shore_part(VESSEL), "c2", *parts)
     eventually(lambda: busy.health().gauges["images_undecoded"] == 4.0)
     second = begin("shore-2")
+
+    def members() -> int:
+        with archive.database.transaction() as sql:
+            return sql.number("SELECT count(*) FROM sonarpost.member")
+
+    eventually(lambda: members() == 2)
     with archive.database.transaction() as sql:
         # The records are old; their c2 is not.
         sql.rows("UPDATE sonarpost.accepted SET accepted_at = accepted_at - interval '1 day'")

@@ -196,6 +196,8 @@ def test_two_replies_to_one_query_are_one_page_for_a_subscriber(
     assert (len(records), end["records"]) == (10, 10)
     # Without a preferred one, both reply: for a short time after an outage of the database.
     with both_reply(hosts):
+        # The router learns of the change later.
+        eventually(lambda: len(page(client)[0]) == 20)
         records, end = page(client)
         assert (len(records), end["records"]) == (20, 10)
         identities = {(record["accepted"]["archive"], record["accepted"]["seq"]) for record in records}

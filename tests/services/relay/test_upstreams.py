@@ -135,7 +135,7 @@ def test_newer_version_replaces_unsent_ones(begin, c2, source, runner):
         source.send(IMAGES, "relay", image("AAAA", version))
         eventually(lambda version=version: service.health().counters.get("reconstructed_images_relayed") == version)
     source.send(IMAGES, "relay", image("BBBB", 1))
-    eventually(lambda: service.health().counters["reconstructed_images_relayed"] == 4)
+    eventually(lambda: service.health().counters.get("reconstructed_images_relayed") == 4)
     assert service.gauges()["waiting_for_shore"] == 3
     assert service.health().counters["records_superseded"] == 2
     runner.stop(service)
