@@ -14,10 +14,11 @@ RUN apt-get update -q \
     && apt-get clean \
     && rm -rf /var/lib/apt/lists/* /var/cache/debconf/*-old /var/log/apt /var/log/dpkg.log /var/log/alternatives.log
 
-# Everything that is downloaded. A release of sonarpost that needs nothing new leaves this layer as it is.
+# Everything that is downloaded, and a C compiler.
 FROM python AS dependencies
 RUN apt-get update -q \
-    && apt-get install -q -y --no-install-recommends python3-venv binutils ca-certificates \
+    && apt-get install -q -y --no-install-recommends python3-venv python3-dev python3-setuptools gcc libc6-dev \
+        ca-certificates \
     && rm -rf /var/lib/apt/lists/*
 # An index of one's own, or none at all with wheels in packaging/wheels; the certificate of a proxy in packaging/ca.
 ARG PIP_INDEX_URL
@@ -26,36 +27,44 @@ ENV PIP_CERT=/etc/ssl/certs/ca-certificates.crt PIP_FIND_LINKS=/src/packaging/wh
     PIP_NO_CACHE_DIR=1 PIP_NO_COMPILE=1
 COPY packaging/ca/ /usr/local/share/ca-certificates/
 COPY packaging/wheels/ /src/packaging/wheels/
-COPY packaging/trim.sh /src/packaging/
 COPY requirements.lock requirements-build.lock /src/
-# Byte code is never checked against the source: the root file system may be read-only, and dates may change on the way
-# through layers.
 RUN update-ca-certificates \
     && python3 -m venv /opt/build \
     && /opt/build/bin/pip install --require-hashes -r /src/requirements-build.lock \
     && python3 -m venv /opt/sonarpost \
     && /opt/sonarpost/bin/pip install --only-binary :all: --require-hashes -r /src/requirements.lock \
-    && sh /src/packaging/trim.sh /opt/sonarpost \
-    && echo /opt/app > "$(echo /opt/sonarpost/lib/python3*/site-packages)/sonarpost-app.pth" \
+    && echo /opt/app > "$(echo /opt/sonarpost/lib/python3*/site-packages)/sonarpost-app.pth"
+
+# What services need of it. A release of sonarpost that needs nothing new leaves this layer as it is. Byte code is never
+# checked against the source: the root file system may be read-only, and dates may change on the way through layers.
+FROM dependencies AS trimmed
+COPY packaging/trim.sh /src/packaging/
+RUN sh /src/packaging/trim.sh /opt/sonarpost --without-numba \
     && python3 -m compileall -q --invalidation-mode unchecked-hash /opt/sonarpost/lib
 
 FROM dependencies AS build
 COPY pyproject.toml README.md LICENSE NOTICE /src/
-COPY packaging/warm.py /src/packaging/
+COPY packaging/compile_codecs.py packaging/check_image.py /src/packaging/
 COPY common/ /src/common/
 COPY services/ /src/services/
 COPY config/ /src/config/
-# The codecs' machine code is made here, for any processor of this architecture, so that no service compiles at its start.
+# numba compiles the codecs' functions here, for any processor of this architecture. The image needs neither numba nor its
+# compiler LLVM, a third of its size. Its streams and pixels are those of numba.
 RUN cd /src && /opt/build/bin/python -m build --wheel --no-isolation --outdir /dist . \
     && /opt/build/bin/pip --python /opt/sonarpost/bin/python install --no-deps --no-index --target /opt/app /dist/*.whl \
-    && python3 -m compileall -q --invalidation-mode unchecked-hash /opt/app \
-    && NUMBA_CPU_NAME=generic /opt/sonarpost/bin/python -B packaging/warm.py
+    && export NUMBA_CPU_NAME=generic \
+    && PYTHONPATH=/usr/lib/python3/dist-packages /opt/sonarpost/bin/python -B packaging/compile_codecs.py \
+    && NUMBA_CACHE_DIR=/tmp/machine-code /opt/sonarpost/bin/python -B packaging/check_image.py > /dist/with-numba \
+    && python3 -m compileall -q --invalidation-mode unchecked-hash /opt/app
+COPY --from=trimmed /opt/sonarpost /opt/trimmed
+RUN rm -r /opt/sonarpost && mv /opt/trimmed /opt/sonarpost \
+    && /opt/sonarpost/bin/python -B /src/packaging/check_image.py > /dist/without-numba \
+    && cmp /dist/with-numba /dist/without-numba
 
 FROM python AS runtime
 ENV PATH=/opt/app/bin:/opt/sonarpost/bin:$PATH \
     PYTHONDONTWRITEBYTECODE=1 \
     PYTHONUNBUFFERED=1 \
-    NUMBA_CPU_NAME=generic \
     SONARPOST_HEARTBEAT=/tmp/heartbeat.json
 RUN groupadd --gid 10001 sonarpost \
     && useradd --uid 10001 --gid 10001 --no-create-home --home-dir /var/lib/sonarpost --shell /usr/sbin/nologin sonarpost \
@@ -64,7 +73,7 @@ RUN groupadd --gid 10001 sonarpost \
         /var/lib/sonarpost/pki /var/lib/sonarpost/tls \
         /var/lib/sonarpost/tls/shore /var/lib/sonarpost/tls/vessel \
         /var/lib/sonarpost/acoustic /var/lib/sonarpost/acoustic/uuv /var/lib/sonarpost/acoustic/vessel
-COPY --from=dependencies /opt/sonarpost /opt/sonarpost
+COPY --from=trimmed /opt/sonarpost /opt/sonarpost
 COPY packaging/bin/ /usr/local/bin/
 COPY config/ /etc/sonarpost/
 COPY --from=build /opt/app /opt/app

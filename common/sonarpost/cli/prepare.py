@@ -36,7 +36,7 @@ def run(_: argparse.Namespace) -> int:
 
         prepare_machine_code(show)
     if not compilation_log.compiled:
-        print("Machine code is ready: the cache holds all functions")
+        print("Machine code is ready: nothing to compile")
         return 0
     if not compilation_log.cache_folders:
         print(f"Machine code is not stored: {NO_FOLDER}", file=sys.stderr)

@@ -1,6 +1,7 @@
 """Compilation of codec functions to machine code with numba, stored on disk (see `sonarpost.codec.code_cache`).
 
-Importing numba takes about a second. Import modules that use `jit` at definition only when an image is coded.
+Importing numba takes about a second. Import modules that use `jit` at definition only when an image is coded. Without
+numba, the functions are those of `sonarpost.codec.compiled_library`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
+from sonarpost.codec import compiled_library
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -25,6 +28,9 @@ NO_FOLDER: Final = "no folder for it is writable; set NUMBA_CACHE_DIR or run `so
 
 service_folders: Final[list[Path]] = []
 """Folders of `use_code_folder`."""
+
+compiled_functions: Final[list[Any]] = []
+"""The results of `jit` in this process, for `packaging/compile_codecs.py`."""
 
 log = logging.getLogger(__name__)
 
@@ -52,16 +58,24 @@ def jit(function: Callable[P, R], *, reorder_sums: bool = False) -> Callable[P, 
     A cached function is compiled again when a module with compiled functions in the same folder changes. Compiled
     functions therefore use only functions and constants of such modules. With `reorder_sums`, the compiler may reorder
     sums of floating-point numbers.
+
+    Raises:
+        ModuleNotFoundError: Neither numba nor the compiled library is installed.
     """
+    if compiled_library.is_needed():
+        return cast(Callable[P, R], compiled_library.library_function(function))
     flags = {"reassoc", "contract", "nnan", "nsz"} if reorder_sums else False
     compiled = _numba().njit(fastmath=flags, error_model="numpy", no_cfunc_wrapper=True)(function)
     # numba has no public way to choose the cache; the attribute has had this name since 2016.
     compiled._cache = importlib.import_module("sonarpost.codec.code_cache").CodeCache(function)  # noqa: SLF001
+    compiled_functions.append(compiled)
     return cast(Callable[P, R], compiled)
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
     """Return `function`, compiled as a part of each function that calls it; for small ones or single calls."""
+    if compiled_library.is_needed():
+        return function  # the callers in the library contain it
     return cast(Callable[P, R], _numba().njit(error_model="numpy", inline="always")(function))
 
 
