@@ -12,12 +12,12 @@ FROM ${BASE} AS python
 RUN apt-get update -q \
     && apt-get install -q -y --no-install-recommends python3 \
     && apt-get clean \
-    && rm -rf /var/lib/apt/lists/* /var/cache/debconf/*-old /var/log/apt /var/log/dpkg.log /var/log/alternatives.log
+    && rm -rf /usr/lib/python3*/test /var/lib/apt/lists/* /var/cache/debconf/*-old /var/log/apt /var/log/dpkg.log /var/log/alternatives.log
 
 # Everything that is downloaded, and a C compiler.
 FROM python AS dependencies
 RUN apt-get update -q \
-    && apt-get install -q -y --no-install-recommends python3-venv python3-dev python3-setuptools gcc libc6-dev \
+    && apt-get install -q -y --no-install-recommends python3-venv python3-dev python3-setuptools g++ libc6-dev \
         ca-certificates \
     && rm -rf /var/lib/apt/lists/*
 # An index of one's own, or none at all with wheels in packaging/wheels; the certificate of a proxy in packaging/ca.
@@ -48,18 +48,20 @@ COPY packaging/compile_codecs.py packaging/check_image.py /src/packaging/
 COPY common/ /src/common/
 COPY services/ /src/services/
 COPY config/ /src/config/
-# numba compiles the codecs' functions here, for any processor of this architecture. The image needs neither numba nor its
-# compiler LLVM, a third of its size. Its streams and pixels are those of numba.
+# numba compiles the codecs' functions here, for any processor of this architecture. The image has neither numba nor its
+# compiler LLVM.
 RUN cd /src && /opt/build/bin/python -m build --wheel --no-isolation --outdir /dist . \
     && /opt/build/bin/pip --python /opt/sonarpost/bin/python install --no-deps --no-index --target /opt/app /dist/*.whl \
     && export NUMBA_CPU_NAME=generic \
     && PYTHONPATH=/usr/lib/python3/dist-packages /opt/sonarpost/bin/python -B packaging/compile_codecs.py \
     && NUMBA_CACHE_DIR=/tmp/machine-code /opt/sonarpost/bin/python -B packaging/check_image.py > /dist/with-numba \
     && python3 -m compileall -q --invalidation-mode unchecked-hash /opt/app
-COPY --from=trimmed /opt/sonarpost /opt/trimmed
-RUN rm -r /opt/sonarpost && mv /opt/trimmed /opt/sonarpost \
-    && /opt/sonarpost/bin/python -B /src/packaging/check_image.py > /dist/without-numba \
-    && cmp /dist/with-numba /dist/without-numba
+
+FROM trimmed AS checked
+COPY packaging/check_image.py /src/packaging/
+COPY --from=build /dist/with-numba /dist/
+COPY --from=build /opt/app /opt/app
+RUN /opt/sonarpost/bin/python -B /src/packaging/check_image.py | cmp - /dist/with-numba
 
 FROM python AS runtime
 ENV PATH=/opt/app/bin:/opt/sonarpost/bin:$PATH \
@@ -76,7 +78,7 @@ RUN groupadd --gid 10001 sonarpost \
 COPY --from=trimmed /opt/sonarpost /opt/sonarpost
 COPY packaging/bin/ /usr/local/bin/
 COPY config/ /etc/sonarpost/
-COPY --from=build /opt/app /opt/app
+COPY --from=checked /opt/app /opt/app
 USER 10001:10001
 WORKDIR /var/lib/sonarpost
 ENTRYPOINT ["sonarpost-entrypoint"]

@@ -1,6 +1,7 @@
 """Check the packages of the container image.
 
-Fails if a module of sonarpost cannot be imported or a codec does not work. Prints a digest of streams and pixels.
+Fails if a module of sonarpost cannot be imported or a codec does not work. Prints a digest of the streams and pixels of
+compiled codecs.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 import sonarpost
 from sonarpost.cli.parsing.commands import EXTRAS
 from sonarpost.codec import codec_names, decode, encode
+from sonarpost.codec.jit import COMPILE_S
 
 OPTIONAL = ("matplotlib", "numba", "pillow_jxl", *EXTRAS)
 """Packages that the image need not have."""
@@ -31,8 +33,8 @@ def import_everything() -> None:
                 raise
 
 
-def digest_of_every_codec() -> str:
-    """Return the digest of streams and pixels of every codec for 8 and 16 bits."""
+def try_every_codec() -> str:
+    """Encode and decode 8 and 16 bits with every codec; return the digest of the results of compiled ones."""
     digest = hashlib.sha256()
     image = np.random.default_rng(1).gamma(4.0, 25.0, size=(80, 140)).clip(0, 255).astype(np.uint8)
     for snippet in (image, image.astype(np.uint16) * 257):
@@ -41,14 +43,15 @@ def digest_of_every_codec() -> str:
             stream = encode(snippet, name, None if name == "vq" else 2048)
             pixels = decode(stream)
             assert pixels.shape == image.shape, name
-            digest.update(stream + pixels.tobytes())
+            if name in COMPILE_S:
+                digest.update(stream + pixels.tobytes())
     return digest.hexdigest()
 
 
 def main() -> None:
     """Check, and print the digest."""
     import_everything()
-    print(digest_of_every_codec())
+    print(try_every_codec())
 
 
 if __name__ == "__main__":

@@ -2,8 +2,9 @@
 
     python packaging/compile_codecs.py
 
-Needs numba, a C compiler, the headers of Python, and setuptools. With NUMBA_CPU_NAME=generic the module works on any
-processor of the architecture. Afterwards numba and llvmlite can be removed from the installation.
+Needs numba, compilers for C and C++ (numba tries both), the headers of Python, and setuptools. With
+NUMBA_CPU_NAME=generic the module works on any processor of the architecture. Afterwards numba and llvmlite can be
+removed from the installation.
 """
 
 from __future__ import annotations

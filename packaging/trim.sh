@@ -23,4 +23,13 @@ for part in cluster constants datasets differentiate fftpack integrate interpola
     spatial stats; do
     rm -rf "$packages/scipy/$part"
 done
+# Libraries that only the removed parts of SciPy used, and then those that only these libraries used.
+for _ in 1 2; do
+    for library in "$packages"/scipy.libs/*; do
+        name=$(basename "$library")
+        grep -rqF --include='*.so*' --exclude="$name" "$name" "$packages/scipy" "$packages/scipy.libs" || rm "$library"
+    done
+done
+# Rich needs pygments and markdown-it for source code and Markdown, Pillow libavif for a codec of comparisons.
+rm -rf "$packages"/pygments* "$packages"/markdown_it* "$packages"/mdurl* "$packages"/PIL/_avif.* "$packages"/pillow.libs/libavif*
 rm -rf "$packages"/pip "$packages"/pip-*.dist-info "$environment"/bin/pip* "$environment"/include
