@@ -61,7 +61,7 @@ class LibraryFunction:
 
 def argument_types(arguments: Sequence[object]) -> Types:
     """Return the types of arguments; those that are neither arrays nor tuples are integers of any kind."""
-    # An image needs some hundred calls with dozens of arrays: this takes 5 % of their time.
+    # Tuples instead of text: an image needs some hundred calls with dozens of arrays.
     types: list[Any] = []
     for argument in arguments:
         if isinstance(argument, np.ndarray):
