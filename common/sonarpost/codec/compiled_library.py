@@ -60,7 +60,7 @@ class LibraryFunction:
 
 
 def argument_types(arguments: Sequence[object]) -> Types:
-    """Return the types of arguments; those that are neither arrays nor tuples are integers of any kind."""
+    """Return the types of arguments; integers of any kind are `int`."""
     # Tuples instead of text: an image needs some hundred calls with dozens of arrays.
     types: list[Any] = []
     for argument in arguments:
