@@ -57,8 +57,9 @@ def test_transform_of_any_size_is_invertible_and_nearly_orthonormal(
     assert flat.shape == (image.size,)
     assert np.array_equal(inverse_transform(flat, mean, trees), image)
     energy = ((image.astype(float) - mean) ** 2).sum()
-    # Noise of odd sizes reaches 1.73.
-    assert 0.7 < ((flat / 2**FRACTION_BITS) ** 2).sum() / energy < 2.0
+    # Measured with 1000 images of each size: 0.92 to 1.37 for multiples of 8, up to 1.81 where bands have odd sizes.
+    limit = 1.5 if all(pixels % 8 == 0 for pixels in size) else 2.0
+    assert 0.7 < ((flat / 2**FRACTION_BITS) ** 2).sum() / energy < limit
 
 
 def test_smooth_slope_has_coarse_coefficients_only() -> None:
