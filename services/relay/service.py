@@ -276,7 +276,8 @@ class RelayService(Service[RelayConfig]):
                 whole = wire.encode(image_parts.expand(wire.decode(ImagePart, whole, item.key), base, item.key))
             except MissingBaseError as error:
                 # Only if the base was deleted for newer images: the site asks for the whole when it needs it.
-                log.warning("Difference without its base", extra=kv(site_queue=item.queue, reason=str(error)))
+                fields = kv(site_queue=item.queue, reason=str(error))
+                log.warning("Image version not stored: the base of its difference was deleted", extra=fields)
                 return False
         if reason is None:
             if known is None or image_parts.version_of(known) < image_parts.version_of(whole):

@@ -270,7 +270,7 @@ class Inbox:
                 raise
             except MissingBaseError as error:
                 # Not an error of the producer: it sends the whole record, and nothing has to be kept.
-                log.info("Difference refused; its producer sends the whole", extra=kv(reason=str(error)))
+                log.info("Difference refused; its sender sends the whole record", extra=kv(reason=str(error)))
                 return AckReply("refused", reason=str(error))
             except BadInputError as error:
                 self._on_refused(error)
