@@ -6,6 +6,9 @@ RUN_TIME := $(VENV)/.run-time
 STAMP := $(VENV)/.ready
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
+# Set on some machines; without cached byte code every test process would compile the whole package.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: setup demo test test-long check docs docs-serve fmt lock sbom audit clean images test-compose screenshots
 
 setup: $(STAMP)

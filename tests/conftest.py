@@ -1,4 +1,4 @@
-"""Fixtures of many tests (in-process Zenoh router, platforms in a temporary folder) and the order of the suite."""
+"""Fixtures of many tests (in-process Zenoh router, platforms in a temporary folder), tiers and order of the suite."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 import zenoh
 from builders.common import REPOSITORY, free_port
 from builders.postgresql import database, database_url, postgresql_server
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from xdist.remote import Producer
 from xdist.scheduler import LoadFileScheduling
 
@@ -21,17 +21,32 @@ from sonarpost.config import PlatformConfig
 
 __all__ = ["database", "database_url", "postgresql_server"]
 
+pytest_plugins = ["builders.times"]
+
 # SIGINT is ignored in a suite started in the background, and child processes would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The same examples in every run: a result depends on the code alone. Others: --hypothesis-profile random.
 # On a loaded machine an example may wait for the disk. pytest-timeout ends a test that hangs.
-settings.register_profile("sonarpost", deadline=None, derandomize=True)
-settings.register_profile("random", deadline=None)
-settings.load_profile("sonarpost")
+settings.register_profile(
+    "quick",
+    deadline=None,
+    derandomize=True,
+    max_examples=25,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+settings.register_profile("thorough", settings.get_profile("quick"), max_examples=150)
+settings.register_profile("random", settings.get_profile("thorough"), derandomize=False)
+settings.load_profile("quick")
 
+MEMORY = Path("/dev/shm")
+if MEMORY.is_dir() and os.access(MEMORY, os.W_OK):
+    # The stores of services flush each commit.
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 
+SYSTEM_TESTS = ("tests/research/", "tests/security/", "tests/system/")
+"""Folders of the tests of `make test-system`; other tests of it have the mark `system`, or use PostgreSQL."""
 PROCESS_TESTS = ("tests/system/chain/", "tests/system/faults/", "tests/system/compose/")
 """Folders of tests with many real processes."""
 
@@ -49,8 +64,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Process
     return ProcessTestsInOneWorker(config, log)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the tests of many real processes first: they take longest and mostly wait."""
+    """Mark the tests of `make test-system`. Run those of many real processes first: they take longest and mostly wait."""
+    for item in items:
+        quick = item.get_closest_marker("quick") is not None
+        fixtures = getattr(item, "fixturenames", ())
+        if not quick and (item.nodeid.startswith(SYSTEM_TESTS) or "postgresql_server" in fixtures):
+            item.add_marker("system")
     items.sort(key=lambda item: not item.nodeid.startswith(PROCESS_TESTS))
 
 

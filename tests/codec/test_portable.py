@@ -19,7 +19,7 @@ from builders.common import REPOSITORY
 ROOT = REPOSITORY
 
 
-@pytest.mark.long
+@pytest.mark.system
 @pytest.mark.timeout(900)  # compiles everything: 15 s on an idle machine
 def test_golden_streams_of_emb_on_a_generic_processor(tmp_path: Path) -> None:
     environment = os.environ | {

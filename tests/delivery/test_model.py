@@ -33,7 +33,7 @@ def test_all_states_satisfy_the_invariants(scenario: Scenario) -> None:
     assert not result.violation, str(result)
 
 
-@pytest.mark.long
+@pytest.mark.system
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("scenario", LARGE_SCENARIOS, ids=lambda scenario: scenario.__name__)
 def test_all_states_of_larger_configurations_satisfy_the_invariants(scenario: Scenario) -> None:
@@ -87,7 +87,7 @@ def test_search_finds_a_violation_without_a_rule(removal: Removal) -> None:
 @pytest.mark.parametrize("rule", sorted(DEPTH_RULES))
 @pytest.mark.parametrize(
     "scenario",
-    [hostile_with_origin, restore_large, pytest.param(restore, marks=pytest.mark.long)],
+    [hostile_with_origin, restore_large, pytest.param(restore, marks=pytest.mark.system)],
     ids=lambda scenario: scenario.__name__,
 )
 def test_other_rules_protect_when_a_rule_is_missing(rule: str, scenario: Scenario) -> None:

@@ -284,7 +284,7 @@ def test_random_faults_keep_the_invariants() -> None:
     run(max_examples=25, steps=40, derandomize=True)
 
 
-@pytest.mark.long
+@pytest.mark.system
 @pytest.mark.timeout(3600)
 def test_many_random_faults_keep_the_invariants() -> None:
     run(max_examples=500, steps=60, derandomize=False)
@@ -309,7 +309,7 @@ def init_for_all_keys(window: DuplicateWindow, connection: sqlite3.Connection, k
 @pytest.mark.parametrize(
     ("method", "replacement"),
     [
-        pytest.param("contains", contains_number, id="digest not compared", marks=pytest.mark.long),
+        pytest.param("contains", contains_number, id="digest not compared", marks=pytest.mark.system),
         pytest.param("__init__", init_for_all_keys, id="one window for all keys"),
     ],
 )

@@ -157,7 +157,7 @@ def test_error_names_the_option_out_of_range(options):
         bench(*options)
 
 
-@pytest.mark.long
+@pytest.mark.system
 def test_last_line_is_the_json_object(capsys):
     assert bench("--files", 1, "--json") == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])

@@ -120,7 +120,7 @@ def test_documented_deployment_accepts_no_forged_and_no_replayed_frame(tmp_path)
     assert found["replays"] >= 468
 
 
-@pytest.mark.long
+@pytest.mark.system
 @pytest.mark.timeout(1200)
 def test_documented_deployment_accepts_none_of_100000_forged_frames(tmp_path):
     found = run(tmp_path, 100_000, used_counters=1_044_000)

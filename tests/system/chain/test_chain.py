@@ -27,7 +27,7 @@ def assert_delivered_exactly_once(run: RunningChain) -> None:
     assert {i.contact.contact_id for i in run.watcher.encoded.values()} == set(run.watcher.snippets)
 
 
-@pytest.mark.parametrize("rate", [0, *(pytest.param(rate, marks=pytest.mark.long) for rate in (1, 4)), 5])
+@pytest.mark.parametrize("rate", [0, *(pytest.param(rate, marks=pytest.mark.system) for rate in (1, 4)), 5])
 def test_images_arrive_at_every_rate_of_the_papers_table(start_chain: StartChain, rate: int) -> None:
     run = start_chain(rate=rate)
     run.deposit(3)

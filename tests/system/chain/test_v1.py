@@ -31,7 +31,7 @@ def all_complete(run: RunningChain) -> bool:
 
 @pytest.mark.parametrize(
     "killed",
-    [pytest.param(None, marks=pytest.mark.long), "op_modem", pytest.param("uuv_modem", marks=pytest.mark.long)],
+    [pytest.param(None, marks=pytest.mark.system), "op_modem", pytest.param("uuv_modem", marks=pytest.mark.system)],
 )
 def test_every_image_is_complete_with_a_third_of_the_frames_lost(start_chain: StartChain, killed: str | None) -> None:
     run = start_chain(link="v1", loss=0.3)
@@ -81,7 +81,7 @@ def send_command():
         session.close()
 
 
-@pytest.mark.long
+@pytest.mark.system
 def test_refine_command_extends_an_image_from_uuv_modem_then_from_the_compressor(
     start_chain: StartChain, send_command: Callable[[RunningChain, str, str], None]
 ) -> None:
@@ -105,7 +105,7 @@ def test_refine_command_extends_an_image_from_uuv_modem_then_from_the_compressor
     run.until(lambda: has(int(1.9 * held), 2 * held + 2), 60, "the stream extended by the compressor")
 
 
-@pytest.mark.long
+@pytest.mark.system
 def test_expand_command_sends_an_image_of_twice_the_ground(
     start_chain: StartChain, send_command: Callable[[RunningChain, str, str], None]
 ) -> None:

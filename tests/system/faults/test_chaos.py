@@ -42,7 +42,7 @@ def test_number_of_a_snippet_is_read_from_its_pixels() -> None:
     assert number_of(damaged) is None
 
 
-@pytest.mark.long
+@pytest.mark.system
 @pytest.mark.timeout(DURATION_S + QUIESCENCE_S + 300)
 def test_random_faults_everywhere_lose_duplicate_and_change_nothing(tmp_path: Path) -> None:
     seed = int(os.environ.get("SONARPOST_CHAOS_SEED", str(time.time_ns() % 1_000_000)))

@@ -40,7 +40,7 @@ def libfaketime() -> str:
     pytest.skip("libfaketime is not installed (Debian package faketime)")
 
 
-@pytest.fixture(params=["python", pytest.param("libfaketime", marks=pytest.mark.long)])
+@pytest.fixture(params=["python", pytest.param("libfaketime", marks=pytest.mark.system)])
 def system_with_clocks(
     request: pytest.FixtureRequest, tmp_path: Path, start_system: Callable[..., VesselAndShore]
 ) -> tuple[VesselAndShore, dict[str, Clock]]:

@@ -59,7 +59,7 @@ def test_unreachable_vessel_fills_its_disk_to_the_reserve_and_recovers(
     system.wait_until(lambda: state_of(system, "relay") == "ok", 30, "relay has recovered")
 
 
-@pytest.mark.long
+@pytest.mark.system
 def test_sender_keeps_images_while_the_vessel_disk_is_full(
     disk: MakeDisk, start_system: Callable[..., VesselAndShore]
 ) -> None:
@@ -116,7 +116,7 @@ def test_images_stay_on_the_vessel_while_the_shore_store_disk_is_full(
     system.wait_until(lambda: state_of(system, "c2") == "ok", 30, "c2 has recovered")
 
 
-@pytest.mark.long
+@pytest.mark.system
 def test_shore_with_unwritable_images_fills_its_store_to_the_reserve_and_recovers(
     disk: MakeDisk, start_system: Callable[..., VesselAndShore]
 ) -> None:

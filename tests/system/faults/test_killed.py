@@ -66,7 +66,7 @@ def test_c2_killed_before_the_acknowledgement_stores_each_image_once(system: Ves
         system.assert_all_delivered_once()
 
 
-@pytest.mark.long
+@pytest.mark.system
 def test_c2_killed_while_its_store_grows_stores_each_image_once(system: VesselAndShore) -> None:
     system.send([make_image(n) for n in range(COUNT)])
     wal = system.shore_state / "c2.db-wal"
@@ -87,7 +87,7 @@ def test_c2_killed_while_its_store_grows_stores_each_image_once(system: VesselAn
     system.assert_all_delivered_once()
 
 
-@pytest.mark.parametrize("seconds", [20.0, pytest.param(300.0, marks=[pytest.mark.long, pytest.mark.timeout(700)])])
+@pytest.mark.parametrize("seconds", [20.0, pytest.param(300.0, marks=[pytest.mark.system, pytest.mark.timeout(700)])])
 def test_random_kills_of_all_processes_lose_and_duplicate_nothing(system: VesselAndShore, seconds: float) -> None:
     rng = random.Random(int(seconds))
     count = int(COUNT * max(1.0, seconds / 60))

@@ -9,7 +9,7 @@ from builders.image_source import make_image
 from builders.vessel_and_shore import VesselAndShore
 
 COUNT = 200
-LONG = [pytest.mark.long, pytest.mark.timeout(400)]
+LONG = [pytest.mark.system, pytest.mark.timeout(400)]
 
 
 def test_images_arrive_in_order_while_nothing_fails(system: VesselAndShore) -> None:
@@ -47,7 +47,7 @@ def test_outage_loses_duplicates_and_corrupts_nothing(system: VesselAndShore, ki
     system.assert_all_delivered_once()
 
 
-@pytest.mark.long
+@pytest.mark.system
 @pytest.mark.timeout(400)
 def test_repeated_short_outages_lose_nothing(system: VesselAndShore) -> None:
     link = system.link

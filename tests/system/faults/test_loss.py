@@ -60,7 +60,7 @@ def lossy_shore() -> Iterator[str]:
         yield name
 
 
-@pytest.mark.long
+@pytest.mark.system
 @pytest.mark.timeout(600)
 def test_delivery_at_20_percent_packet_loss_and_160_kb_per_s(
     lossy_shore: str, start_system: Callable[..., VesselAndShore]

@@ -160,7 +160,7 @@ def read_late(session: zenoh.Session) -> Counter[str]:
     return found
 
 
-@pytest.mark.long
+@pytest.mark.system
 @pytest.mark.timeout(1800)
 def test_two_c2_and_their_database_are_killed_and_nothing_is_lost_or_doubled(shore: SharedShore) -> None:  # noqa: C901, PLR0912
     vessels = [f"vessel-{number}" for number in range(VESSELS)]

@@ -167,7 +167,7 @@ def wait_until_started(chain: Chain, condition: Callable[[], bool]) -> None:
         time.sleep(0.2)
 
 
-@pytest.mark.long
+@pytest.mark.system
 @pytest.mark.timeout(LONG_S)
 def test_services_neither_grow_nor_lose_a_contact_over_a_long_mission(tmp_path: Path) -> None:
     uuv, vessel, shore = free_ports(3)

@@ -134,7 +134,7 @@ def interpreter(version: str) -> str | None:
     return found if works else str(installed[-1]) if installed else None
 
 
-@pytest.mark.long
+@pytest.mark.system
 @pytest.mark.timeout(TIMEOUT_S)
 @pytest.mark.parametrize("version", ["3.11", "3.12", "3.13"])
 def test_the_wheel_runs_with_the_locked_packages(version: str, wheel: Path, tmp_path: Path) -> None:
