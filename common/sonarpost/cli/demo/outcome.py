@@ -106,6 +106,16 @@ def read_images(folder: Path) -> dict[str, ImageFile]:
     return images
 
 
+def last_versions(images: Mapping[str, ImageFile]) -> list[ImageFile]:
+    """Return the last version of each image; an image with two sets of files, from two missions, has two."""
+    last: dict[str, tuple[int, ImageFile]] = {}
+    for name, image in images.items():
+        base, _, version = name.rpartition("_v")
+        if base not in last or int(version) > last[base][0]:
+            last[base] = int(version), image
+    return [image for _, image in last.values()]
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Figures of a run; the fields up to `out` are the JSON object that `--json` prints.
@@ -113,6 +123,8 @@ class Outcome:
     Attributes:
         images_vessel: Images at the vessel of which at least one pixel was received.
         images_shore: The same at the shore site.
+        sha256_match: Whether the last version of each image of the vessel is at the shore site, and all images there
+            are identical to those of the vessel. The relay may replace an earlier version that it has not sent yet.
         missing: Images that the channel delivered, at least in part, and that are not at the shore site.
         incomplete: Images at the shore site that v1 should have completed.
         not_sent: Contacts of which no image was encoded.
@@ -170,7 +182,8 @@ def evaluate(
         images_vessel=len({image.image_id for image in vessel.values() if image.has_pixels}),
         images_shore=len({image.image_id for image in shore.values() if image.has_pixels}),
         images_complete=len(complete),
-        sha256_match={n: i.sha256 for n, i in vessel.items()} == {n: i.sha256 for n, i in shore.items()},
+        sha256_match=all(name in vessel and vessel[name].sha256 == image.sha256 for name, image in shore.items())
+        and all(image.name in shore for image in last_versions(vessel)),
         acoustic_s=round(channel.acoustic_s, 1),
         elapsed_s=round(elapsed_s, 1),
         out=str(settings.folder),
