@@ -3,15 +3,17 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 RUN_TIME := $(VENV)/.run-time
-STAMP := $(VENV)/.ready
+TEST := $(VENV)/.test
+DEV := $(VENV)/.dev
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+PYTEST := $(BIN)/python -m pytest
 
-# Set on some machines; without cached byte code every test process would compile the whole package.
+# Set on some machines; without cached byte code every process of the tests would compile the whole package.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-long check docs docs-serve fmt lock sbom audit clean images test-compose screenshots
+.PHONY: setup demo test test-busy test-system check docs docs-serve fmt lock sbom audit clean images test-compose screenshots
 
-setup: $(STAMP)
+setup: $(TEST)
 
 # The locked run-time dependencies, sonarpost itself, editable, and the machine code of its codecs. Enough for `make demo`.
 $(RUN_TIME): requirements.lock requirements-build.lock pyproject.toml
@@ -25,26 +27,37 @@ $(RUN_TIME): requirements.lock requirements-build.lock pyproject.toml
 	@$(BIN)/sonarpost prepare
 	touch $@
 
-# The tools for tests, checks and documentation.
-$(STAMP): $(RUN_TIME) requirements-dev.lock
-	@echo "installing the tools for tests, checks and documentation: 300 MB to download, about 60 s and the download"
+# The packages of the quick tests.
+$(TEST): $(RUN_TIME) requirements-test.lock
+	@echo "installing the packages of the tests: 20 MB to download"
+	@$(PIP) install --require-hashes -r requirements-test.lock
+	touch $@
+
+# The packages of all tests, checks and the documentation.
+$(DEV): $(TEST) requirements-dev.lock
+	@echo "installing the tools for system tests, checks and documentation: 150 MB to download, about 40 s and the download"
 	@$(PIP) install --require-hashes -r requirements-dev.lock
 	touch $@
 
 demo: $(RUN_TIME)
 	$(BIN)/sonarpost demo $(ARGS)
 
-# Three workers: many tests wait for processes. Order and assignment to workers: tests/conftest.py.
+# The quick tests, at most five minutes on two cores. Order and assignment to workers: tests/conftest.py.
 test: setup
-	$(BIN)/python -m pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(PYTEST) --numprocesses 3 --dist loadfile --no-loadscope-reorder $(ARGS)
 
-# Tests of several minutes each: long outages, random faults in all processes for SONARPOST_CHAOS_S (1800) seconds,
-# SONARPOST_SOAK_CONTACTS (1200) contacts through all services.
-test-long: setup
-	$(BIN)/python -m pytest -m long -o faulthandler_timeout=7200 \
-		--numprocesses 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+# The quick tests beside four busy processes: no test may depend on the speed of the machine.
+test-busy: setup
+	@trap 'kill $$(jobs -p)' EXIT; for _ in 1 2 3 4; do while :; do :; done & done; $(MAKE) --no-print-directory test
 
-check: setup docs
+# Chains with faults, browsers, TLS, research commands, examples, PostgreSQL, containers, and all property tests with more
+# examples. Longer runs of the tests of faults: docs/research/faults.md.
+test-system: $(DEV)
+	$(PYTEST) -m "(system or hypothesis) and not containers" --hypothesis-profile thorough \
+		--numprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(MAKE) --no-print-directory test-compose ARGS=
+
+check: $(DEV) docs
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
@@ -57,29 +70,29 @@ images:
 	packaging/images.sh
 
 # The whole chain in containers: build, start, inject faults, remove. Needs a container engine.
-test-compose: setup
+test-compose: $(DEV)
 	PYTHON=$(BIN)/python packaging/test-compose.sh $(ARGS)
 
 # The screenshots in docs/explanation/console; needs Chromium.
-screenshots: setup
+screenshots: $(DEV)
 	$(BIN)/python packaging/screenshots.py
 
 # The documentation site, in build/site; a broken link or an undocumented name fails the build.
 docs: export NO_MKDOCS_2_WARNING = 1
-docs: setup
+docs: $(DEV)
 	$(BIN)/mkdocs build --strict
 
 docs-serve: export NO_MKDOCS_2_WARNING = 1
-docs-serve: setup
+docs-serve: $(DEV)
 	$(BIN)/mkdocs serve $(ARGS)
 
-fmt: setup
+fmt: $(DEV)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
 # Resolve the dependencies of pyproject.toml and write the newest versions with the hashes of all their files:
-# requirements.lock for the run time, requirements-build.lock to build and install sonarpost, requirements-dev.lock for
-# everything including tests, checks and documentation.
+# requirements.lock for the run time, requirements-build.lock to build and install sonarpost, requirements-test.lock for the
+# quick tests, requirements-dev.lock for all tests, checks and documentation, requirements-release.lock for sbom and audit.
 COMPILE = build/lock/bin/uv pip compile --quiet --upgrade --generate-hashes --python-version 3.11.5 \
 	--custom-compile-command 'make lock'
 lock:
@@ -87,18 +100,27 @@ lock:
 	build/lock/bin/python -m pip install --quiet --disable-pip-version-check uv
 	$(COMPILE) pyproject.toml --extra console --extra postgresql --output-file requirements.lock
 	$(COMPILE) --group build --constraint requirements.lock --output-file requirements-build.lock
-	$(COMPILE) pyproject.toml --group build --extra dev --extra docs \
-		--constraint requirements.lock --constraint requirements-build.lock --output-file requirements-dev.lock
+	$(COMPILE) pyproject.toml --extra dev --constraint requirements.lock --constraint requirements-build.lock \
+		--output-file requirements-dev.lock
+	$(COMPILE) pyproject.toml --extra test --constraint requirements-dev.lock --output-file requirements-test.lock
+	$(COMPILE) --group release --output-file requirements-release.lock
+
+# The tools of sbom and audit, in an environment of their own.
+RELEASE := build/release
+$(RELEASE)/.ready: requirements-release.lock
+	rm -rf $(RELEASE) && $(PYTHON) -m venv $(RELEASE)
+	$(RELEASE)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-release.lock
+	touch $@
 
 # The software bill of materials of the run time, in dist: from an environment that holds the locked packages only.
-sbom: setup
+sbom: $(RELEASE)/.ready
 	rm -rf build/sbom && $(PYTHON) -m venv --without-pip build/sbom
-	$(PIP) --python build/sbom install --require-hashes -r requirements.lock
-	$(BIN)/python packaging/sbom.py build/sbom requirements.lock dist/sonarpost.cdx.json
+	$(RELEASE)/bin/python -m pip --python build/sbom install --quiet --require-hashes -r requirements.lock
+	$(RELEASE)/bin/python packaging/sbom.py build/sbom requirements.lock dist/sonarpost.cdx.json
 
 # Known vulnerabilities of the locked packages. It needs PyPI's JSON interface, and prints which packages it has no data for.
-audit: setup
-	$(BIN)/python packaging/audit.py requirements.lock requirements-build.lock
+audit: $(RELEASE)/.ready
+	$(RELEASE)/bin/python packaging/audit.py requirements.lock requirements-build.lock
 
 clean:
 	rm -rf $(VENV) build dist demo-out .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
