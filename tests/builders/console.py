@@ -6,8 +6,10 @@ import json
 import shutil
 import ssl
 import threading
+import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from http.client import HTTPResponse
 from pathlib import Path
@@ -15,20 +17,36 @@ from typing import Any
 
 import httpx2
 import numpy as np
+import numpy.typing as npt
 import pytest
 from starlette.testclient import TestClient
 
 from builders.records import reconstructed_image
-from sonarpost.messages import Contact, Pixels, ReconstructedImage
+from sonarpost import keys, wire
+from sonarpost.config import TlsConfig
+from sonarpost.messages import (
+    AcousticFrame,
+    Advice,
+    Contact,
+    DownlinkState,
+    Health,
+    Pixels,
+    QueuedImage,
+    QueueState,
+    ReconstructedImage,
+)
+from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.store.contacts import ContactFilter
 from sonarpost.services.console.store.database import Database
 from sonarpost.services.console.store.users import Users
-from sonarpost.services.console.web.server import ConsoleApp
+from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 PASSWORD = "correct horse battery"
 ROLES_OF_USERS = {"watch": "observer", "anna": "operator", "bo": "operator", "eva": "expert"}
 FIRST_UTC_S = 1_700_000_000.0
+VESSEL = "vessel-1"
 
 
 def image_record(
@@ -83,6 +101,106 @@ def image_record(
     )
 
 
+def partial_record(
+    image_id: str = "00A7",
+    version: int = 1,
+    received: int = 30,
+    *,
+    complete: bool = False,
+    total: int = 0,
+    **fields: Any,
+) -> ReconstructedImage:
+    """A version as the v1 link delivers it: no frames, and no length before the plan has arrived."""
+    changes = {"complete": complete, "bytes_received": received, "bytes_total": received if complete else total}
+    record = image_record(image_id, version, **fields)
+    return record.model_copy(update={**changes, "frames_received": 0, "despeckle_strength": 1.0})
+
+
+def with_pixels(record: ReconstructedImage, pixels: npt.NDArray[np.uint8]) -> ReconstructedImage:
+    """The record with another image, all of it received."""
+    picture = Pixels.from_array(pixels)
+    return record.model_copy(update={"picture": picture, "picture_sha256": picture.sha256, "missing_mask": b""})
+
+
+def contact_id(image_id: str = "00A7", vehicle: str = "uuv-1") -> str:
+    """The contact of an `image_record` whose first frame was received at `FIRST_UTC_S`."""
+    return f"sonarpost.{VESSEL}.{vehicle}.20231114T221320Z.{image_id}"
+
+
+def contact_ids(state: ConsoleState) -> dict[str, str]:
+    """Contact identifiers by image identifier."""
+    return {row["image_id"]: row["id"] for row in state.list_contacts(ContactFilter(limit=500))["items"]}
+
+
+def received_frame(time_utc_s: float | None = None, packet: int = 1, number: int = 1, **changes: Any) -> AcousticFrame:
+    """A frame of three of a packet that a vehicle has sent; received now."""
+    fields = {
+        "direction": "rx",
+        "platform_id": VESSEL,
+        "time_utc_s": time.time() if time_utc_s is None else time_utc_s,
+        "source": 3,
+        "destination": 1,
+        "rate": 1,
+        "packet": packet,
+        "frame_number": number,
+        "frame_count": 3,
+        "data": b"x",
+    }
+    return AcousticFrame.model_validate(fields | changes)
+
+
+def queue_state(images: Sequence[tuple[str, int, float]], time_utc_s: float, waiting: int | None = None) -> QueueState:
+    """The queue of uuv-1 with images (identifier, bytes left, expected time)."""
+    queued = [
+        QueuedImage(image_id=name, contact_id="c", bytes_left=left, preview_utc_s=None, expected_utc_s=expected_utc_s)
+        for name, left, expected_utc_s in images
+    ]
+    return QueueState(
+        platform_id="uuv-1",
+        time_utc_s=time_utc_s,
+        rate=1,
+        frame_loss=None,
+        packet_interval_s=6.0,
+        messages_waiting=0,
+        message_bytes=0,
+        images_waiting=len(queued) if waiting is None else waiting,
+        images=tuple(queued),
+    )
+
+
+def downlink_state(kind: str, record_id: str, state: str, now_utc_s: float, **changes: Any) -> DownlinkState:
+    """State of a record that the vessel sends to uuv-1."""
+    fields = {"vessel_id": VESSEL, "vehicle_id": "uuv-1", "kind": kind, "record_id": record_id, "state": state}
+    times = {"times_sent": 1, "expires_utc_s": now_utc_s + 3600.0, "changed_utc_s": now_utc_s}
+    return DownlinkState.model_validate(fields | times | changes)
+
+
+def advice_record(image_id: str = "00A7", **changes: Any) -> Advice:
+    """A comment of eva on the first version of an image."""
+    names = {"vessel_id": VESSEL, "vehicle_id": "uuv-1", "image_id": image_id, "image_version": 1}
+    fields = {"advice_id": "a-1", "author": "eva", "advised_utc_s": FIRST_UTC_S + 50, "remark": "look again"}
+    return Advice.model_validate(names | fields | changes)
+
+
+def health_record(
+    service: str,
+    platform_id: str = VESSEL,
+    state: str = "ok",
+    detail: str = "",
+    time_utc_s: float = 1000.0,
+    **gauges: Any,
+) -> Health:
+    times = {"time_utc_s": time_utc_s, "started_utc_s": time_utc_s}
+    fields = {"platform_id": platform_id, "service": service, "state": state, "detail": detail, "counters": {}}
+    return Health.model_validate({**fields, **times, "gauges": gauges})
+
+
+def encoded_health(*words: Any, **fields: Any) -> tuple[str, bytes]:
+    """Key and payload of a `health_record`."""
+    record = health_record(*words, **fields)
+    return keys.health(record.platform_id, record.service), wire.encode(record)
+
+
 @dataclass
 class Browser:
     """A browser, with or without a session."""
@@ -105,21 +223,29 @@ class Browser:
     def contact(self, contact_id: str) -> Any:
         return self.get(f"/api/contacts/{contact_id}").json()
 
+    def displayed(self, contact_id: str) -> dict[str, Any]:
+        """What a decision states about the newest version of a contact's image."""
+        version = self.contact(contact_id)["versions"][-1]
+        return {"version": version["version"], "sha256": version["sha256"], "layer": "raw"}
+
     def decide(self, contact_id: str, **changes: Any) -> httpx2.Response:
         """Decide on the newest version of a contact's image."""
-        detail = self.contact(contact_id)
-        version = detail["versions"][-1]
         body = {
-            "revision": detail["contact"]["revision"],
-            "version": version["version"],
-            "sha256": version["sha256"],
-            "layer": "raw",
+            "revision": self.contact(contact_id)["contact"]["revision"],
             "verdict": "mine_like",
             "confidence": 0.8,
             "mlo_class": "manta",
             "remark": "clean edge",
         }
-        return self.post(f"/api/contacts/{contact_id}/decisions", {**body, **changes})
+        return self.post(f"/api/contacts/{contact_id}/decisions", {**body, **self.displayed(contact_id), **changes})
+
+    def undo(self, contact_id: str, decision_id: str, **changes: Any) -> httpx2.Response:
+        body = {"decision_id": decision_id, **self.displayed(contact_id), **changes}
+        return self.post(f"/api/contacts/{contact_id}/undo", body)
+
+    def rows(self, **parameters: Any) -> dict[str, Any]:
+        """Rows of the list of contacts by image identifier, in its order."""
+        return {row["image_id"]: row for row in self.get("/api/contacts", **parameters).json()["items"]}
 
 
 class EventReader:
@@ -166,6 +292,12 @@ class EventReader:
         self._stream.close()
 
 
+def server_certificate(folder: Path) -> TlsConfig:
+    """A certificate of a fleet for servers at 127.0.0.1."""
+    issued = Fleet.init(folder / "pki", "test").issue("vessel-1", "vessel", hosts=("127.0.0.1",)).folder
+    return TlsConfig(ca=issued / CA_CERTIFICATE, certificate=issued / CERTIFICATE, key=issued / KEY)
+
+
 @dataclass
 class Console:
     """A console with its users."""
@@ -184,32 +316,30 @@ class Console:
 ConsoleMaker = Callable[..., Console]
 
 
-@pytest.fixture(autouse=True)
-def fast_password_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="module")
+def fast_password_hashes() -> Iterator[None]:
     """Reduce the cost of password hashes."""
-    monkeypatch.setattr("sonarpost.services.console.store.users.SCRYPT_COST", 2**4)
-
-
-@pytest.fixture(scope="session")
-def users_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The file of users, made once for all tests."""
-    path = tmp_path_factory.mktemp("users") / "console-users.db"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sonarpost.services.console.store.users.SCRYPT_COST", 2**4)
-        users = Users(path)
-        for name, role in ROLES_OF_USERS.items():
-            users.add(name, role, PASSWORD)
-        users.close()
+        yield
+
+
+@pytest.fixture(scope="module")
+def users_file(fast_password_hashes: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of users, made once for the tests of a module."""
+    path = tmp_path_factory.mktemp("users") / "console-users.db"
+    users = Users(path)
+    for name, role in ROLES_OF_USERS.items():
+        users.add(name, role, PASSWORD)
+    users.close()
     return path
 
 
-@pytest.fixture
-def make_console(tmp_path: Path, users_file: Path) -> Iterator[ConsoleMaker]:
+def _console_maker(tmp_path_factory: pytest.TempPathFactory, users_file: Path) -> Iterator[ConsoleMaker]:
     consoles: list[Console] = []
 
     def make(**options: Any) -> Console:
-        folder = tmp_path / str(len(consoles))
-        folder.mkdir()
+        folder = tmp_path_factory.mktemp("console")
         shutil.copy(users_file, folder)
         config = ConsoleConfig(**options)
         users = Users(folder / users_file.name, config.session_s, config.session_max_s)
@@ -224,5 +354,28 @@ def make_console(tmp_path: Path, users_file: Path) -> Iterator[ConsoleMaker]:
 
 
 @pytest.fixture
+def make_console(tmp_path_factory: pytest.TempPathFactory, users_file: Path) -> Iterator[ConsoleMaker]:
+    yield from _console_maker(tmp_path_factory, users_file)
+
+
+@pytest.fixture(scope="module")
+def make_shared_console(tmp_path_factory: pytest.TempPathFactory, users_file: Path) -> Iterator[ConsoleMaker]:
+    """Makes consoles that the tests of a module only read."""
+    yield from _console_maker(tmp_path_factory, users_file)
+
+
+@pytest.fixture
 def console(make_console: ConsoleMaker) -> Console:
     return make_console()
+
+
+@contextmanager
+def web_server(console: Console, *words: Any, **options: Any) -> Iterator[WebServer]:
+    """A running server of a console."""
+    server = WebServer(console.app.asgi, "127.0.0.1", 0, *words, **options)
+    server.start()
+    try:
+        yield server
+    finally:
+        console.app.stop()
+        server.stop()

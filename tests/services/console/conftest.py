@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from builders.console import console, fast_password_hashes, make_console, users_file
+from builders.console import console, fast_password_hashes, make_console, make_shared_console, users_file
 
-__all__ = ["console", "fast_password_hashes", "make_console", "users_file"]
+__all__ = ["console", "fast_password_hashes", "make_console", "make_shared_console", "users_file"]

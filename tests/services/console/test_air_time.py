@@ -3,40 +3,18 @@
 from __future__ import annotations
 
 import pytest
-from builders.console import FIRST_UTC_S, image_record
+from builders.console import FIRST_UTC_S, contact_id, downlink_state, partial_record, queue_state
 
-from sonarpost.messages import Command, DownlinkState, Pixels, QueuedImage, QueueState
+from sonarpost.messages import Command, Pixels
 
-ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
-
-
-def preview(image_id="00A7", received=30, *, complete=False, **fields):
-    record = image_record(image_id, 1, **fields)
-    total = received if complete else 0
-    return record.model_copy(update={"complete": complete, "bytes_received": received, "bytes_total": total})
+ID = contact_id()
 
 
 def queue(console, *images):
     """Set the transmit queue of uuv-1: (image identifier, bytes left)."""
     now = console.state.clock()
-    queued = tuple(
-        QueuedImage(
-            image_id=image_id, contact_id="c", bytes_left=left, preview_utc_s=None, expected_utc_s=now + 10 * place
-        )
-        for place, (image_id, left) in enumerate(images, 1)
-    )
-    state = QueueState(
-        platform_id="uuv-1",
-        time_utc_s=now,
-        rate=1,
-        frame_loss=None,
-        packet_interval_s=6.1,
-        messages_waiting=0,
-        message_bytes=0,
-        images_waiting=len(queued),
-        images=queued,
-    )
-    console.state.fleet.set_queue(state)
+    queued = [(image_id, left, now + 10 * place) for place, (image_id, left) in enumerate(images, 1)]
+    console.state.fleet.set_queue(queue_state(queued, now))
 
 
 def air_time(console):
@@ -51,40 +29,14 @@ def ask(console, status=201, **body):
     return answer.json()
 
 
-def decide(console, verdict="not_mine_like"):
-    anna = console.browser("anna")
-    contact = anna.contact(ID)
-    shown = contact["versions"][-1]
-    body = {
-        "verdict": verdict,
-        "version": shown["version"],
-        "sha256": shown["sha256"],
-        "revision": contact["contact"]["revision"],
-    }
-    answer = anna.post(f"/api/contacts/{ID}/decisions", body)
-    assert answer.status_code == 201, answer.text
-    return answer.json()["decision"]
-
-
 def confirm(console, kind, record_id):
-    now = console.state.clock()
     console.state.unsent_records()
-    console.state.apply_downlink_state(
-        DownlinkState(
-            vessel_id="vessel-1",
-            vehicle_id="uuv-1",
-            kind=kind,
-            record_id=record_id,
-            state="confirmed",
-            times_sent=1,
-            expires_utc_s=now + 3600.0,
-            changed_utc_s=now,
-        )
-    )
+    console.state.apply_downlink_state(downlink_state(kind, record_id, "confirmed", console.state.clock()))
 
 
 def test_images_are_listed_in_the_order_of_the_queue_with_cost_and_gain(console):
-    console.state.store_images([preview("00A7"), preview("00A8", received=200, first_utc_s=FIRST_UTC_S + 60)])
+    later = partial_record("00A8", received=200, first_utc_s=FIRST_UTC_S + 60)
+    console.state.store_images([partial_record(), later])
     queue(console, ("00A8", 192), ("00A7", 192))
     [vehicle] = air_time(console)["vehicles"]
     assert (vehicle["vehicle_id"], vehicle["basis"]) == ("uuv-1", "queue")
@@ -96,9 +48,12 @@ def test_images_are_listed_in_the_order_of_the_queue_with_cost_and_gain(console)
 
 
 def test_final_verdict_gives_air_time_back_when_the_vehicle_confirms_it(console):
-    console.state.store_image(preview())
+    console.state.store_image(partial_record())
     queue(console, ("00A7", 384))
-    decision = decide(console)
+    anna = console.browser("anna")
+    assert anna.decide(ID, verdict="unsure").status_code == 201
+    assert air_time(console)["given_back"]["decisions"] == []
+    decision = anna.decide(ID, verdict="not_mine_like").json()["decision"]
     given_back = air_time(console)["given_back"]
     assert given_back["total_s"] == 0
     assert [each["bytes_left"] for each in given_back["decisions"]] == [384]
@@ -108,55 +63,37 @@ def test_final_verdict_gives_air_time_back_when_the_vehicle_confirms_it(console)
     assert given_back["total_s"] > 5
 
 
-def test_unsure_verdict_gives_no_air_time_back(console):
-    console.state.store_image(preview())
-    queue(console, ("00A7", 384))
-    decide(console, "unsure")
-    assert air_time(console)["given_back"]["decisions"] == []
-
-
 def test_request_for_a_place_in_the_queue_is_sent(console):
-    console.state.store_image(preview())
+    console.state.store_image(partial_record())
     request = ask(console, kind="prioritise", place="first")
     [item] = console.state.unsent_records()
-    assert isinstance(item.record, Command)
-    assert (item.record.kind, item.record.place, item.record.command_id) == (
-        "prioritise",
-        "first",
-        request["command_id"],
-    )
+    sent = item.record
+    assert isinstance(sent, Command)
+    assert (sent.kind, sent.place, sent.command_id) == ("prioritise", "first", request["command_id"])
     confirm(console, "prioritise", request["command_id"])
     ask(console, kind="prioritise", place="last")
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        {"kind": "prioritise"},
-        {"kind": "prioritise", "place": "second"},
-        {"kind": "region", "box": [0, 0, 32, 32]},
-        {"kind": "region", "stream_bytes": 96},
-        {"kind": "region", "box": [8, 0, 8, 32], "stream_bytes": 96},
-        {"kind": "region", "box": [0, 0, 33, 32], "stream_bytes": 96},
-        {"kind": "region", "box": [0, 0, 32, 32], "stream_bytes": 513},
-        {"kind": "region", "box": [0, 0, 32, 32], "stream_bytes": 23},
-    ],
-)
-def test_incomplete_and_invalid_requests_are_rejected(console, body):
-    console.state.store_image(preview())
-    ask(console, status=400, **body)
+def test_incomplete_and_invalid_requests_are_rejected(console):
+    console.state.store_image(partial_record())
+    whole, stream = {"box": [0, 0, 32, 32]}, {"stream_bytes": 96}
+    for body in ({}, {"place": "second"}):
+        ask(console, status=400, kind="prioritise", **body)
+    boxes = [{"box": box} | stream for box in ([8, 0, 8, 32], [0, 0, 33, 32])]
+    for body in (whole, stream, *boxes, whole | {"stream_bytes": 513}, whole | {"stream_bytes": 23}):
+        ask(console, status=400, kind="region", **body)
     assert console.state.unsent_records() == []
 
 
 def test_region_arrives_as_a_layer_with_its_place(console):
-    whole = preview(received=200, complete=True)
+    whole = partial_record(received=200, complete=True)
     console.state.store_image(whole)
     height, width = whole.picture.height_px, whole.picture.width_px
     ask(console, kind="region", box=[0, 16, 16, 32], stream_bytes=96)
     pixels = Pixels.from_array(whole.picture.to_array()[: -(-height // 2), width // 2 :])
-    part = preview("00B0", received=96, complete=True, first_utc_s=FIRST_UTC_S + 60)
+    part = partial_record("00B0", received=96, complete=True, first_utc_s=FIRST_UTC_S + 60)
     changes = {"contact": whole.contact, "picture": pixels, "picture_sha256": pixels.sha256, "missing_mask": b""}
-    console.state.store_image(part.model_copy(update=changes))
+    console.state.store_image(part.model_copy(update=changes | {"despeckle_strength": None}))
     detail = console.browser("watch").contact(ID)
     [layer] = detail["related"]
     assert (layer["relation"], layer["place_px"]) == ("region", [0, width // 2, -(-height // 2), width])

@@ -7,20 +7,15 @@ import gc
 import math
 import socket
 import ssl
-import time
-from collections.abc import Callable, Iterator
 from ipaddress import ip_network
-from typing import Any
 
 import httpx2
 import pytest
 from builders.common import eventually
-from builders.console import PASSWORD, Browser, Console, EventReader
+from builders.console import PASSWORD, Browser, EventReader, server_certificate
 from starlette.responses import PlainTextResponse, Response
 from starlette.testclient import TestClient
 
-from sonarpost.config import TlsConfig
-from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
 from sonarpost.services.console.web.connections import (
     CHUNK_BYTES,
     ConnectionDeadlines,
@@ -31,19 +26,35 @@ from sonarpost.services.console.web.connections import (
 from sonarpost.services.console.web.server import WebServer
 
 HALF_A_REQUEST = b"GET /login HTTP/1.1\r\nHost: 127.0.0.1\r\n"
-SHORT_S = 1.0
+HALF_A_BODY = b"POST /api/login HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 99999\r\n\r\n"
 LOCAL_PROXY = TrustedProxies([ip_network("127.0.0.1")])
+LARGE = bytes(40 * CHUNK_BYTES) + b"end"
+
+
+class Clock:
+    """The clock of the deadlines: only tests advance it."""
+
+    def __init__(self):
+        self.now_s = 0.0
+
+    def __call__(self):
+        return self.now_s
 
 
 @pytest.fixture
-def serve(console: Console) -> Iterator[Callable[..., WebServer]]:
-    servers: list[WebServer] = []
+def clock():
+    return Clock()
 
-    def make(app: Any = None, tls: TlsConfig | None = None, **limits: Any) -> WebServer:
-        server = WebServer(app or console.app.asgi, "127.0.0.1", 0, tls, ConnectionLimits(**limits))
-        servers.append(server)
-        server.start()
-        return server
+
+@pytest.fixture
+def serve(console, clock):
+    servers = []
+
+    def make(app=None, tls=None, **limits):
+        limits = ConnectionLimits(clock=clock, **limits)
+        servers.append(WebServer(app or console.app.asgi, "127.0.0.1", 0, tls, limits))
+        servers[-1].start()
+        return servers[-1]
 
     yield make
     console.app.stop()
@@ -52,12 +63,16 @@ def serve(console: Console) -> Iterator[Callable[..., WebServer]]:
 
 
 @pytest.fixture
-def connect() -> Iterator[Callable[..., socket.socket]]:
-    opened: list[socket.socket] = []
+def connect():
+    opened = []
 
-    def make(server: WebServer, sent: bytes = b"", source: str = "127.0.0.1") -> socket.socket:
-        client = socket.create_connection(("127.0.0.1", server.port), 20, (source, 0))
+    def make(server, sent=b"", source="127.0.0.1", *, buffer_bytes=65536):
+        client = socket.socket()
         opened.append(client)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer_bytes)
+        client.settimeout(120)
+        client.bind((source, 0))
+        client.connect(("127.0.0.1", server.port))
         client.sendall(sent)
         return client
 
@@ -67,12 +82,12 @@ def connect() -> Iterator[Callable[..., socket.socket]]:
 
 
 @pytest.fixture
-def browser_at() -> Iterator[Callable[[WebServer, str], Browser]]:
-    clients: list[httpx2.Client] = []
+def browser_at():
+    clients = []
 
-    def make(server: WebServer, source: str) -> Browser:
+    def make(server, source):
         transport = httpx2.HTTPTransport(local_address=source)
-        clients.append(httpx2.Client(base_url=server.address, transport=transport, timeout=20))
+        clients.append(httpx2.Client(base_url=server.address, transport=transport, timeout=120))
         return Browser(clients[-1])
 
     yield make
@@ -80,7 +95,7 @@ def browser_at() -> Iterator[Callable[[WebServer, str], Browser]]:
         client.close()
 
 
-def is_closed(client: socket.socket) -> bool:
+def is_closed(client):
     """Read what the server has sent; return whether it has closed the connection."""
     client.setblocking(False)
     try:
@@ -93,108 +108,123 @@ def is_closed(client: socket.socket) -> bool:
     return True
 
 
+def wait_for_end(clock, *clients, sent=b""):
+    """Let time pass, in which the clients send single bytes, until the server has closed all connections."""
+
+    def are_ended():
+        clock.now_s += 1.0
+        for client in clients:
+            try:
+                client.sendall(sent)
+            except OSError:
+                continue
+        return all(is_closed(client) for client in clients)
+
+    eventually(are_ended, what="end of the connections")
+
+
 @pytest.mark.parametrize("sent", [HALF_A_REQUEST, b""], ids=["half-requests", "idle"])
-def test_unfinished_requests_keep_no_one_out_and_are_closed(serve, connect, browser_at, sent):
+def test_unfinished_requests_keep_no_one_out_and_are_closed(serve, connect, browser_at, clock, sent):
     server = serve(request_s=3.0)
     anna = browser_at(server, "127.0.0.2")
     assert anna.login("anna").status_code == 200
-    held = [connect(server, sent) for _ in range(230)]
+    held = [connect(server, sent) for _ in range(130)]
     assert anna.get("/api/contacts").status_code == 200
     assert browser_at(server, "127.0.0.1").login("bo").status_code == 200
     assert server.limits.count <= 100 + 2
-    eventually(lambda: all(is_closed(client) for client in held), what="end of the connections")
+    wait_for_end(clock, *held)
     assert browser_at(server, "127.0.0.1").login("bo").status_code == 200
 
 
-@pytest.mark.parametrize(
-    "sent", [HALF_A_REQUEST, b"POST /api/login HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 99\r\n\r\n"]
-)
-def test_single_bytes_do_not_extend_the_time_for_a_request(serve, connect, sent):
-    client = connect(serve(request_s=SHORT_S), sent)
-
-    def is_ended() -> bool:
-        try:
-            client.sendall(b"x")
-        except OSError:
-            return True
-        return is_closed(client)
-
-    eventually(is_ended, what="end of the connection")
+def test_single_bytes_do_not_extend_the_time_for_a_request_and_answers_do(serve, connect, clock):
+    server = serve(request_s=10.0)
+    answered = connect(server, HALF_A_REQUEST + b"\r\n")
+    assert answered.recv(15) == b"HTTP/1.1 200 OK"
+    wait_for_end(clock, connect(server, HALF_A_REQUEST), connect(server, HALF_A_BODY), sent=b"x")
+    wait_for_end(clock, answered)
 
 
-def test_connection_is_closed_between_requests(serve, connect):
-    client = connect(serve(request_s=SHORT_S), HALF_A_REQUEST + b"\r\n")
-    assert client.recv(15) == b"HTTP/1.1 200 OK"
-    eventually(lambda: is_closed(client), what="end of the connection")
-
-
-def test_unfinished_tls_handshake_is_closed(serve, connect, make_console, tmp_path):
-    folder = Fleet.init(tmp_path / "pki", "test").issue("vessel-1", "vessel", hosts=("127.0.0.1",)).folder
-    tls = TlsConfig(ca=folder / CA_CERTIFICATE, certificate=folder / CERTIFICATE, key=folder / KEY)
-    server = serve(make_console(tls=True).app.asgi, tls, request_s=SHORT_S, max_of_address=2)
+def test_unfinished_tls_handshake_is_closed(serve, connect, make_console, clock, tmp_path):
+    tls = server_certificate(tmp_path)
+    server = serve(make_console(tls=True).app.asgi, tls, max_of_address=2)
     clients = [connect(server) for _ in range(5)]
     context = ssl.create_default_context(cafile=str(tls.ca))
     with httpx2.Client(base_url=server.address, verify=context, timeout=120) as client:
         assert client.post("api/login", json={"user": "anna", "password": PASSWORD}).status_code == 200
-    eventually(lambda: all(is_closed(one) for one in clients), what="end of the connections")
+    wait_for_end(clock, *clients)
 
 
-def test_event_stream_stays_open_between_events(serve, console):
-    server = serve(request_s=0.2, read_s=0.5)
+def test_event_stream_stays_open_between_events(serve, connect, console, clock):
+    server = serve()
     page = EventReader(server.address, console.users.start_session("anna").token)
     eventually(lambda: "hello" in page.names(), what="stream")
-    time.sleep(2.5)  # two checks of the deadlines
+    # The deadlines of other connections pass.
+    for _ in range(2):
+        wait_for_end(clock, connect(server))
     assert not page.ended
     console.state.events.publish("fleet", {})
     eventually(lambda: "fleet" in page.names(), what="event")
-    page.close()
 
 
-LARGE = bytes(40 * CHUNK_BYTES) + b"end"
-
-
-async def large(scope: Any, receive: Any, send: Any) -> None:
+async def large(scope, receive, send):
     await Response(LARGE)(scope, receive, send)
 
 
-def test_client_that_does_not_read_is_closed(serve, connect):
-    server = serve(large, request_s=60.0, read_s=SHORT_S)
-    client = socket.socket()
-    client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    client.connect(("127.0.0.1", server.port))
-    client.sendall(HALF_A_REQUEST + b"\r\n")
-    eventually(lambda: server.limits.count == 1, what="connection")
+def test_client_that_does_not_read_is_closed_and_one_that_reads_receives_everything(serve, connect, clock):
+    server = serve(large, request_s=1e9, read_s=30.0)
+    reading = connect(server, HALF_A_REQUEST + b"Connection: close\r\n\r\n")
+    received = bytearray()
+    while chunk := reading.recv(CHUNK_BYTES):
+        received += chunk
+    assert received.endswith(LARGE)
     eventually(lambda: server.limits.count == 0, what="end of the connection")
-    client.close()
+    connect(server, HALF_A_REQUEST + b"\r\n", buffer_bytes=4096)
+    eventually(lambda: server.limits.count == 1, what="connection")
+
+    def is_ended():
+        clock.now_s += 1.0
+        return server.limits.count == 0
+
+    eventually(is_ended, what="end of the connection")
 
 
-def test_server_that_ends_closes_a_client_that_does_not_read(serve):
-    async def endless(scope: Any, receive: Any, send: Any) -> None:
+@pytest.mark.parametrize(("chunk_s", "received"), [(29.0, True), (31.0, False)])
+def test_time_to_read_a_response_is_that_of_each_chunk(clock, chunk_s, received):
+    limits = ConnectionLimits(request_s=10.0, read_s=30.0, clock=clock)
+    ours, theirs = socket.socketpair()
+    limits.add(("a", 1), ours)
+    left = []
+
+    async def send(message):
+        clock.now_s += chunk_s
+        await limits.close_overdue()
+        left.append(("a", 1) in limits)
+
+    async def receive():
+        return {"type": "http.request"}
+
+    scope = {"type": "http", "method": "GET", "client": ("a", 1)}
+    asyncio.run(ConnectionDeadlines(large, limits)(scope, receive, send))
+    assert len(left) > 40
+    assert set(left) == {received}
+    for one in (ours, theirs):
+        one.close()
+
+
+def test_server_that_ends_closes_a_client_that_does_not_read(serve, connect):
+    async def endless(scope, receive, send):
         await Response(bytes(64 << 20))(scope, receive, send)
 
-    server = serve(endless, request_s=600.0, read_s=600.0)
-    client = socket.socket()
-    client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    client.connect(("127.0.0.1", server.port))
-    client.sendall(HALF_A_REQUEST + b"\r\n")
+    server = serve(endless)
+    client = connect(server, HALF_A_REQUEST + b"\r\n", buffer_bytes=4096)
     assert client.recv(1) == b"H"
     server.stop()
     # A transport that is not closed gives a ResourceWarning, which is an error in these tests.
     gc.collect()
-    client.close()
-
-
-def test_client_that_reads_slowly_receives_everything(serve, connect):
-    client = connect(serve(large, request_s=SHORT_S, read_s=20.0), HALF_A_REQUEST + b"Connection: close\r\n\r\n")
-    received = bytearray()
-    while chunk := client.recv(CHUNK_BYTES):
-        received += chunk
-        time.sleep(0.05)
-    assert received.endswith(LARGE)
 
 
 def test_connections_of_a_proxy_have_only_the_total_limit(serve, connect):
-    server = serve(proxies=LOCAL_PROXY, max_of_address=2, max_connections=6, request_s=20.0)
+    server = serve(proxies=LOCAL_PROXY, max_of_address=2, max_connections=6)
     clients = [connect(server) for _ in range(6)]
     eventually(lambda: server.limits.count == 6, what="connections")
     assert not any(is_closed(client) for client in clients)
@@ -211,14 +241,12 @@ def test_new_connection_is_refused_while_all_others_are_in_use(connect, serve, c
     eventually(lambda: is_closed(refused), what="refusal")
     assert connect(server, HALF_A_REQUEST + b"\r\n", "127.0.0.2").recv(15) == b"HTTP/1.1 200 OK"
     assert not any(page.ended for page in pages)
-    for page in pages:
-        page.close()
 
 
 def test_request_of_a_closed_connection_is_not_handled():
     handled = []
 
-    async def app(scope: Any, receive: Any, send: Any) -> None:
+    async def app(scope, receive, send):
         handled.append(scope["client"])
         await PlainTextResponse("")(scope, receive, send)
 
@@ -227,9 +255,8 @@ def test_request_of_a_closed_connection_is_not_handled():
     assert handled == []
 
 
-def test_deadlines_with_a_clock():
-    now = [0.0]
-    limits = ConnectionLimits(max_connections=3, max_of_address=2, request_s=10, clock=lambda: now[0])
+def test_deadlines_with_a_clock(clock):
+    limits = ConnectionLimits(max_connections=3, max_of_address=2, request_s=10, clock=clock)
     pairs = [socket.socketpair() for _ in range(4)]
     peers = [("a", 1), ("a", 2), ("b", 1), ("c", 1)]
     for peer, (ours, _) in zip(peers[:3], pairs, strict=False):
@@ -237,7 +264,7 @@ def test_deadlines_with_a_clock():
     limits.set_deadline(("a", 1), math.inf)
     assert limits.add(peers[3], pairs[3][0])
     assert ("a", 2) not in limits  # it waited longest of those that wait
-    now[0] = 11
+    clock.now_s = 11
     asyncio.run(limits.close_overdue())
     assert [peer in limits for peer in peers] == [True, False, False, False]
     limits.remove(("a", 1), pairs[1][0])

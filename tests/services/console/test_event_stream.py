@@ -8,21 +8,17 @@ import urllib.request
 
 import pytest
 from builders.common import eventually
-from builders.console import EventReader, image_record
+from builders.console import EventReader, image_record, web_server
 
 from sonarpost.services.console.events import EventHub, RateLimiter
 from sonarpost.services.console.web.event_stream import MAX_STREAMS_OF_USER
-from sonarpost.services.console.web.server import WebServer
 
 
 @pytest.fixture
 def served(console, monkeypatch):
     monkeypatch.setattr("sonarpost.services.console.web.event_stream.KEEP_ALIVE_S", 0.1)
-    server = WebServer(console.app.asgi, "127.0.0.1", 0)
-    server.start()
-    yield server
-    console.app.stop()
-    server.stop()
+    with web_server(console) as server:
+        yield server
 
 
 @pytest.fixture
@@ -32,9 +28,9 @@ def token(console):
 
 @pytest.fixture
 def open_stream(served, token):
-    readers: list[EventReader] = []
+    readers = []
 
-    def make(query: str = "", **headers: str) -> EventReader:
+    def make(query="", **headers):
         readers.append(EventReader(served.address, token, query, **headers))
         return readers[-1]
 
@@ -60,13 +56,9 @@ def test_page_receives_events_of_an_interruption(console, open_stream):
         assert "reset" not in again.names()
 
 
-def test_page_of_another_run_is_reset(open_stream):
+def test_page_of_another_run_is_reset_and_then_receives_the_time(open_stream):
     page = open_stream(**{"Last-Event-ID": "0000000-5"})
     eventually(lambda: page.names()[:2] == ["hello", "reset"], what="reset")
-
-
-def test_idle_stream_sends_the_time(open_stream):
-    page = open_stream()
     eventually(lambda: page.names().count("clock") >= 2, what="clock")
 
 
@@ -79,18 +71,28 @@ def test_stream_ends_with_its_session(console, token, open_stream):
     eventually(lambda: console.state.events.subscriber_count == 0, what="no subscriber")
 
 
-def test_number_of_streams_of_a_user_is_limited_over_all_sessions(console, served, open_stream):
+def refusal(served, console, user):
+    """Status, waiting time and error of a stream that is refused."""
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        EventReader(served.address, console.users.start_session(user).token)
+    with caught.value as answer:
+        return answer.code, int(answer.headers["retry-after"]), json.load(answer)["error"]
+
+
+def test_number_of_streams_of_a_user_is_limited_over_all_sessions_and_in_total(
+    console, served, open_stream, monkeypatch
+):
     pages = [open_stream() for _ in range(MAX_STREAMS_OF_USER)]
     eventually(lambda: all(page.names() for page in pages), what="streams")
-    with pytest.raises(urllib.error.HTTPError) as caught:
-        EventReader(served.address, console.users.start_session("anna").token)
-    assert caught.value.code == 429
-    assert int(caught.value.headers["retry-after"]) > 0
-    assert "close one" in json.load(caught.value)["error"]["message"]
-    caught.value.close()
+    code, retry_after_s, error = refusal(served, console, "anna")
+    assert (code, retry_after_s > 0) == (429, True)
+    assert "close one" in error["message"]
+    monkeypatch.setattr("sonarpost.services.console.web.event_stream.MAX_STREAMS", MAX_STREAMS_OF_USER)
+    code, retry_after_s, error = refusal(served, console, "bo")
+    assert (code, retry_after_s > 0, error["code"]) == (503, True, "busy")
     pages[0].close()
 
-    def is_accepted() -> bool:
+    def is_accepted():
         try:
             open_stream()
         except urllib.error.HTTPError as error:
@@ -101,18 +103,8 @@ def test_number_of_streams_of_a_user_is_limited_over_all_sessions(console, serve
     eventually(is_accepted, what="another stream")
 
 
-def test_total_number_of_streams_is_limited(console, served, open_stream, monkeypatch):
-    monkeypatch.setattr("sonarpost.services.console.web.event_stream.MAX_STREAMS", 1)
-    page = open_stream()
-    eventually(lambda: page.names() != [], what="stream")
-    with pytest.raises(urllib.error.HTTPError) as caught:
-        EventReader(served.address, console.users.start_session("bo").token)
-    assert (caught.value.code, json.load(caught.value)["error"]["code"]) == (503, "busy")
-    caught.value.close()
-
-
 def test_unhandled_exception_is_logged_and_answered(console, monkeypatch, caplog):
-    def fail(_query: object) -> None:
+    def fail(_query):
         raise RuntimeError("internal detail")
 
     monkeypatch.setattr(console.state, "list_contacts", fail)
@@ -125,10 +117,7 @@ def test_unhandled_exception_is_logged_and_answered(console, monkeypatch, caplog
 def test_event_buffer():
     hub = EventHub(buffered=3)
     notified = []
-
-    def notify() -> None:
-        notified.append(1)
-
+    notify = lambda: notified.append(1)  # noqa: E731
     hub.subscribe(notify)
     for number in range(5):
         hub.publish("contact", {"n": number})
