@@ -1,7 +1,5 @@
 """Files of reconstructed images: three consistent files with reproducible bytes."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json
@@ -12,7 +10,7 @@ import numpy as np
 import pytest
 from builders.record_samples import COMPLETE_IMAGE, DAMAGED_IMAGE
 from builders.record_strategies import images
-from hypothesis import given, settings
+from hypothesis import given
 
 from sonarpost.archive.image_files import add_image, image_file_name, side_car, write_image
 from sonarpost.files import AtomicFiles
@@ -22,17 +20,17 @@ from sonarpost.sonar.image_files import read_image
 NAME = "uuv-1_20161012T090001Z_00A7_v1"
 
 
-def with_pixels(pixels: np.ndarray, **more: object) -> ReconstructedImage:  # type: ignore[type-arg]
+def with_pixels(pixels, **more):
     picture = Pixels.from_array(pixels)
     fields = COMPLETE_IMAGE.model_dump() | {"picture": picture, "picture_sha256": picture.sha256} | more
     return ReconstructedImage(**fields)
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_name_holds_vehicle_time_image_and_version() -> None:
+def test_name_holds_vehicle_time_image_and_version():
     assert image_file_name(COMPLETE_IMAGE) == NAME
     assert image_file_name(DAMAGED_IMAGE) == "uuv-1_20161012T090001Z_00A7_v2"
     assert (
@@ -43,7 +41,7 @@ def test_name_holds_vehicle_time_image_and_version() -> None:
     assert image_file_name(last).split("_")[1] == "99991231T235959Z"
 
 
-def test_image_is_three_consistent_files(tmp_path: Path) -> None:
+def test_image_is_three_consistent_files(tmp_path):
     tiff, new, _ = write_image(tmp_path / "a" / "b", COMPLETE_IMAGE)
     assert new
     assert tiff == tmp_path / "a" / "b" / f"{NAME}.tiff"
@@ -63,7 +61,7 @@ def test_image_is_three_consistent_files(tmp_path: Path) -> None:
     assert "picture" not in stored
 
 
-def test_tiff_and_png_hold_16_bits(tmp_path: Path) -> None:
+def test_tiff_and_png_hold_16_bits(tmp_path):
     pixels = np.array([[0, 255, 256], [40_000, 65_535, 1]], np.uint16)
     tiff, _, _ = write_image(tmp_path, with_pixels(pixels))
     for suffix in (".tiff", ".png"):
@@ -81,7 +79,7 @@ def test_tiff_and_png_hold_16_bits(tmp_path: Path) -> None:
         ([[1, 0], [0, 0], [0, 1]], 2, [0, 3]),
     ],
 )
-def test_side_car_holds_the_missing_pixels_and_rows(mask: list[list[int]], pixels: int, rows: list[int]) -> None:
+def test_side_car_holds_the_missing_pixels_and_rows(mask, pixels, rows):
     missing = np.array(mask, np.bool_)
     stored = side_car(with_pixels(np.zeros((3, 2), np.uint8), missing_mask=np.packbits(missing).tobytes()))
     assert (stored["missing_pixels"], stored["missing_rows"]) == (pixels, rows)
@@ -89,10 +87,7 @@ def test_side_car_holds_the_missing_pixels_and_rows(mask: list[list[int]], pixel
 
 
 @given(images())
-@settings(max_examples=20)
-def test_files_are_written_once_and_reproducible(
-    tmp_path_factory: pytest.TempPathFactory, image: ReconstructedImage
-) -> None:
+def test_files_are_written_once_and_reproducible(tmp_path_factory, image):
     here, there = tmp_path_factory.mktemp("vessel"), tmp_path_factory.mktemp("shore")
     tiff, new, _ = write_image(here, image)
     assert new
@@ -104,7 +99,7 @@ def test_files_are_written_once_and_reproducible(
     assert {path.name: path.stat().st_mtime_ns for path in here.iterdir()} == before
 
 
-def test_versions_do_not_replace_each_other(tmp_path: Path) -> None:
+def test_versions_do_not_replace_each_other(tmp_path):
     write_image(tmp_path, COMPLETE_IMAGE)
     kept = contents(tmp_path)
     write_image(tmp_path, DAMAGED_IMAGE)
@@ -113,7 +108,7 @@ def test_versions_do_not_replace_each_other(tmp_path: Path) -> None:
     assert kept.items() <= now.items()
 
 
-def test_damaged_files_are_written_again(tmp_path: Path) -> None:
+def test_damaged_files_are_written_again(tmp_path):
     tiff, _, _ = write_image(tmp_path, COMPLETE_IMAGE)
     whole = contents(tmp_path)
     for damage in (
@@ -127,14 +122,12 @@ def test_damaged_files_are_written_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("after", [0, 1, 2, 3])
-def test_full_disk_leaves_no_side_car_without_its_image(
-    after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_leaves_no_side_car_without_its_image(after, tmp_path, monkeypatch):
     """The disk accepts `after` of the three files; with 3 it rejects their folder."""
     synced = 0
     fsync = os.fsync
 
-    def full(descriptor: int) -> None:
+    def full(descriptor):
         nonlocal synced
         synced += 1
         if synced > after:
@@ -151,11 +144,11 @@ def test_full_disk_leaves_no_side_car_without_its_image(
     assert len(contents(tmp_path)) == 3
 
 
-def test_side_car_is_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    order: list[str] = []
+def test_side_car_is_written_last(tmp_path, monkeypatch):
+    order = []
     replace = Path.replace
 
-    def rename(self: Path, target: Path) -> Path:
+    def rename(self, target):
         order.append(Path(target).suffix)
         return replace(self, target)
 
@@ -165,12 +158,12 @@ def test_side_car_is_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert sorted(order) == [".json", ".png", ".tiff"]
 
 
-def shifted(seconds: float, value: int = 7) -> ReconstructedImage:
+def shifted(seconds, value=7):
     """Return another image whose first frame arrived within the same second."""
     return with_pixels(np.full((2, 3), value, np.uint8), first_frame_utc_s=COMPLETE_IMAGE.first_frame_utc_s + seconds)
 
 
-def test_other_image_of_the_same_name_is_kept(tmp_path: Path) -> None:
+def test_other_image_of_the_same_name_is_kept(tmp_path):
     first, second, third = COMPLETE_IMAGE, shifted(0.4), shifted(0.4, value=8)
     assert image_file_name(first) == image_file_name(second)
     assert write_image(tmp_path, first) == (tmp_path / f"{NAME}.tiff", True, False)
@@ -187,7 +180,7 @@ def test_other_image_of_the_same_name_is_kept(tmp_path: Path) -> None:
     assert stored.items() <= now.items()
 
 
-def test_repeated_images_of_one_name_change_no_file(tmp_path: Path) -> None:
+def test_repeated_images_of_one_name_change_no_file(tmp_path):
     images = [COMPLETE_IMAGE, shifted(0.4), shifted(0.1)]
     written = [write_image(tmp_path, image) for image in images]
     before = contents(tmp_path)
@@ -196,7 +189,7 @@ def test_repeated_images_of_one_name_change_no_file(tmp_path: Path) -> None:
     assert contents(tmp_path) == before
 
 
-def test_conflicting_images_in_one_commit_are_kept(tmp_path: Path) -> None:
+def test_conflicting_images_in_one_commit_are_kept(tmp_path):
     files = AtomicFiles()
     images = [COMPLETE_IMAGE, shifted(0.4), COMPLETE_IMAGE, shifted(0.4)]
     written = [add_image(files, tmp_path, image) for image in images]

@@ -1,7 +1,5 @@
 """Coded images on thin links: whole records, differences, and what a site refuses."""
 
-from __future__ import annotations
-
 import msgpack
 import pytest
 from builders.record_samples import ACOUSTIC_CONTACT
@@ -19,13 +17,13 @@ from sonarpost.messages import CodedImage, ImagePart
 SUMMARY = ContactSummary.unpack(ACOUSTIC_CONTACT)
 
 
-def image(stream: bytes, version: int = 1, missing: tuple[tuple[int, int], ...] = (), **changes: object) -> CodedImage:
+def image(stream, version=1, missing=(), **changes):
     """Return an image of `emb` as op_modem and decompressor describe it."""
     zeroed = bytearray(stream)
     for start, stop in missing:
         zeroed[start:stop] = bytes(stop - start)
     received = len(stream) - sum(stop - start for start, stop in missing)
-    fields: dict[str, object] = {
+    fields = {
         "vessel_id": "vessel-1",
         "vehicle_id": "uuv-1",
         "image_id": "000A",
@@ -51,18 +49,18 @@ def image(stream: bytes, version: int = 1, missing: tuple[tuple[int, int], ...] 
     return CodedImage.model_validate(fields | changes)
 
 
-def noise(length: int) -> bytes:
+def noise(length):
     """Return the header of an emb stream and bytes that do not repeat."""
     return b"\x20\x01\x10" + bytes((7 * n * n + 13 * n + n // 256) % 251 + 1 for n in range(length - 3))
 
 
-def decoded(part: ImagePart) -> ImagePart:
+def decoded(part):
     """Return a record as its receiver reads it."""
     return wire.decode(ImagePart, wire.encode(part), "key")
 
 
 @given(sent=coded_images())
-def test_every_image_arrives_unchanged(sent: CodedImage) -> None:
+def test_every_image_arrives_unchanged(sent):
     arrived = coded_image(decoded(whole_part(sent)), sent.vessel_id, "key")
     zeroed = bytearray(sent.stream)
     for start, stop in sent.missing:
@@ -73,10 +71,10 @@ def test_every_image_arrives_unchanged(sent: CodedImage) -> None:
 
 
 @given(data=st.data(), length=st.integers(3, 900), more=st.integers(0, 900))
-def test_difference_to_any_earlier_version_gives_the_whole(data: st.DataObject, length: int, more: int) -> None:
+def test_difference_to_any_earlier_version_gives_the_whole(data, length, more):
     stream = noise(length + more)
 
-    def missing(size: int) -> tuple[tuple[int, int], ...]:
+    def missing(size):
         bounds = sorted(data.draw(st.sets(st.integers(3, size), max_size=6)))
         return tuple(zip(bounds[::2], bounds[1::2], strict=False))
 
@@ -90,25 +88,25 @@ def test_difference_to_any_earlier_version_gives_the_whole(data: st.DataObject, 
     assert expand(decoded(difference(second, first)), third, "key") == second
 
 
-def test_size_of_a_contact_with_200_bytes() -> None:
+def test_size_of_a_contact_with_200_bytes():
     """225 bytes are received acoustically: the stream and the contact record."""
     assert len(wire.encode(whole_part(image(noise(200))))) <= 301
 
 
 @pytest.mark.parametrize("missing", [(), ((250, 282),), ((200, 232), (300, 332))])
-def test_difference_costs_the_new_bytes_and_at_most_115_more(missing: tuple[tuple[int, int], ...]) -> None:
+def test_difference_costs_the_new_bytes_and_at_most_115_more(missing):
     first, second = whole_part(image(noise(200))), whole_part(image(noise(400), 2, missing))
     new = 200 - sum(stop - start for start, stop in missing)
     assert len(wire.encode(difference(second, first))) <= new + 115
 
 
-def test_contact_that_arrives_later_is_in_the_difference() -> None:
+def test_contact_that_arrives_later_is_in_the_difference():
     first = whole_part(image(noise(200), contact=None, height_px=None, width_px=None))
     second = whole_part(image(noise(232), 2))
     assert expand(decoded(difference(second, first)), first, "key") == second
 
 
-def test_changed_bytes_are_in_the_difference() -> None:
+def test_changed_bytes_are_in_the_difference():
     other = bytearray(noise(200))
     other[100:110] = b"0123456789"
     first, second = whole_part(image(noise(200))), whole_part(image(bytes(other), 2))
@@ -117,7 +115,7 @@ def test_changed_bytes_are_in_the_difference() -> None:
     assert stream_of(expand(sent, first, "key")) == bytes(other)
 
 
-def test_difference_without_its_base_is_refused() -> None:
+def test_difference_without_its_base_is_refused():
     first, second, third = (whole_part(image(noise(200 + 50 * n), n)) for n in (1, 2, 3))
     sent = difference(third, second)
     with pytest.raises(MissingBaseError, match="key: b: got 2, expected a version that this site has; send the whole"):
@@ -126,7 +124,7 @@ def test_difference_without_its_base_is_refused() -> None:
         expand(sent, first, "key")
 
 
-def test_difference_to_another_image_is_refused() -> None:
+def test_difference_to_another_image_is_refused():
     first, second = whole_part(image(noise(200))), whole_part(image(noise(250), 2))
     other = whole_part(image(bytes(reversed(noise(200)))))
     with pytest.raises(MissingBaseError, match="key: k: got"):
@@ -145,12 +143,12 @@ def test_difference_to_another_image_is_refused() -> None:
     ],
     ids=["length", "codes", "range", "no map", "hole", "both"],
 )
-def test_invalid_whole_image_is_refused(change: dict[str, object]) -> None:
+def test_invalid_whole_image_is_refused(change):
     part = ImagePart.model_validate(whole_part(image(noise(200))).model_dump() | change)
     with pytest.raises(PayloadError):
         coded_image(part, "vessel-1", "key")
 
 
-def test_versions_of_an_image_have_one_name() -> None:
+def test_versions_of_an_image_have_one_name():
     names = {version_name("x/", wire.encode(whole_part(image(noise(200 + n), n)))) for n in (1, 2)}
     assert names == {"x/uuv-1/000A/1764000000.123456"}

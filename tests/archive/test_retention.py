@@ -1,7 +1,5 @@
 """Retention of files in a folder."""
 
-from __future__ import annotations
-
 import os
 
 from builders.records import reconstructed_image
@@ -14,7 +12,7 @@ DAY_S = 86400.0
 NOW_UTC_S = 1_800_000_000.0
 
 
-def image(image_id: str, version: int = 1):
+def image(image_id, version=1):
     picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
     return reconstructed_image(picture, image_id=image_id, version=version)
 

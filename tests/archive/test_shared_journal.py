@@ -1,33 +1,29 @@
 """Journal in PostgreSQL: order of the numbers, searches as in SQLite, journals and databases of an earlier version."""
 
-from __future__ import annotations
-
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 from builders.records import decision_record, reconstructed_image
 
 from sonarpost.archive import shore_schema
-from sonarpost.archive.journal import Accepted, Area, Criteria, Journal, JournalEntry, JournalRecord
+from sonarpost.archive.journal import Area, Criteria, Journal, JournalEntry, JournalRecord
 from sonarpost.archive.postgresql import Database, DatabaseAddress
 from sonarpost.archive.shore_database import ShoreDatabase, StoredImage
 from sonarpost.archive.shore_files import row_of_image
-from sonarpost.messages import Contact, Decision, Pixels, ReconstructedImage
+from sonarpost.messages import Contact, Decision, Pixels
 
 IMAGES, DECISIONS = "sonarpost/v1/shore/contact/vessel-1/image", "sonarpost/v1/shore/contact/vessel-1/decision"
 ALL = Criteria()
 
 
-def image(image_id: str, version: int = 1, lat: float = 56.0, lon: float = -5.0) -> ReconstructedImage:
+def image(image_id, version=1, lat=56.0, lon=-5.0):
     contact = Contact(contact_id=image_id, vehicle_id="uuv-1", lat_deg=lat, lon_deg=lon)
     picture = Pixels(height_px=2, width_px=3, bits=8, data=bytes(range(6)))
     return reconstructed_image(picture, vessel_id="vessel-1", image_id=image_id, version=version, contact=contact)
 
 
-def entry(record: ReconstructedImage | Decision, name: str = "") -> JournalEntry:
+def entry(record, name=""):
     if isinstance(record, Decision):
         subject = record.decision_id
         return JournalEntry(DECISIONS, record, "vessel-1", record.vehicle_id, record.image_id, subject)
@@ -36,32 +32,32 @@ def entry(record: ReconstructedImage | Decision, name: str = "") -> JournalEntry
     return JournalEntry(IMAGES, record, "vessel-1", record.vehicle_id, record.image_id, subject, version, contact, name)
 
 
-def columns(*entries: JournalEntry) -> list[JournalRecord]:
+def columns(*entries):
     return [JournalRecord.of(each, 100.0 + number) for number, each in enumerate(entries)]
 
 
-def stored(record: ReconstructedImage, name: str) -> StoredImage:
+def stored(record, name):
     contents = (name.encode(), b"tiff", b"png")
     row = row_of_image(name, record, 1.0, 5.0, contents)
     return StoredImage(row, tuple(zip((".json", ".tiff", ".png"), contents, strict=True)))
 
 
 @pytest.fixture
-def archive(database: Database) -> ShoreDatabase:
+def archive(database):
     return ShoreDatabase(database, owner="c2-a")
 
 
-def seqs(numbered: list[Accepted]) -> list[int]:
+def seqs(numbered):
     return [accepted.seq for accepted in numbered]
 
 
-def read(archive: ShoreDatabase, criteria: Criteria = ALL) -> list[tuple[int, str]]:
+def read(archive, criteria=ALL):
     journal = archive.journal()
     rows = journal.page(journal.known_keys(), criteria, 0, 1000)
     return [(r.accepted.seq, str(r.fields.get("decision_id", r.fields["image_id"]))) for r in rows]
 
 
-def test_reader_of_pages_gets_every_record_once_while_several_c2_number(database_url: str) -> None:
+def test_reader_of_pages_gets_every_record_once_while_several_c2_number(database_url):
     """A number that becomes visible before a lower one would be lost for a reader whose cursor is above it."""
     each, hosts, batch = 60, 4, 3
     opened = [ShoreDatabase(Database(DatabaseAddress.parse(database_url)), owner=f"c2-{n}") for n in range(hosts + 1)]
@@ -69,13 +65,13 @@ def test_reader_of_pages_gets_every_record_once_while_several_c2_number(database
     reader = opened[-1].journal()
     ended = threading.Event()
 
-    def accept(host: int) -> None:
+    def accept(host):
         for first in range(0, each, batch):
             ids = [f"{host}{number:03d}" for number in range(first, first + batch)]
             opened[host].write([], numbered=columns(*(entry(decision_record(i, image_id=i)) for i in ids)))
 
-    def follow() -> list[str]:
-        found: list[str] = []
+    def follow():
+        found = []
         after = 0
         while True:
             last_round = ended.is_set()
@@ -101,7 +97,7 @@ def test_reader_of_pages_gets_every_record_once_while_several_c2_number(database
         each_host.close()
 
 
-def test_repeated_record_keeps_number_and_time(archive: ShoreDatabase) -> None:
+def test_repeated_record_keeps_number_and_time(archive):
     one, two = entry(image("0001"), "a"), entry(decision_record("d1", image_id="0001"))
     first = archive.write([], numbered=columns(one, two, one))
     assert seqs(first) == [1, 2, 1]
@@ -113,10 +109,10 @@ def test_repeated_record_keeps_number_and_time(archive: ShoreDatabase) -> None:
     assert archive.journal().position() == (first[0].archive, 3)
 
 
-def test_failed_write_leaves_no_number(archive: ShoreDatabase) -> None:
+def test_failed_write_leaves_no_number(archive):
     archive.write([], [], numbered=columns(entry(image("0001"), "a")))
     broken = stored(image("0002"), "b")
-    broken = StoredImage(broken.row, ((".json", None),))  # type: ignore[arg-type]
+    broken = StoredImage(broken.row, ((".json", None),))
     with pytest.raises(Exception, match="content"):
         archive.write([broken], numbered=columns(entry(image("0002"), "b")))
     assert read(archive) == [(1, "0001")]
@@ -124,7 +120,7 @@ def test_failed_write_leaves_no_number(archive: ShoreDatabase) -> None:
     assert seqs(archive.write([], numbered=columns(entry(image("0003"), "c")))) == [2]
 
 
-def test_searches_find_what_those_of_sqlite_find(archive: ShoreDatabase, tmp_path: Path) -> None:
+def test_searches_find_what_those_of_sqlite_find(archive, tmp_path):
     entries = [
         entry(image("0001"), "a"),
         entry(image("0001", version=2), "b"),
@@ -166,7 +162,7 @@ def test_searches_find_what_those_of_sqlite_find(archive: ShoreDatabase, tmp_pat
     journal.close()
 
 
-def test_removed_image_is_removed_from_the_journal(archive: ShoreDatabase) -> None:
+def test_removed_image_is_removed_from_the_journal(archive):
     archive.write(
         [stored(image("0001"), "a"), stored(image("0002"), "b")],
         numbered=columns(entry(image("0001"), "a"), entry(image("0002"), "b"), entry(decision_record("d1"))),
@@ -180,13 +176,11 @@ def test_removed_image_is_removed_from_the_journal(archive: ShoreDatabase) -> No
 
 
 @pytest.fixture
-def own(tmp_path: Path) -> Callable[[str], Journal]:
+def own(tmp_path):
     return lambda name: Journal(tmp_path / name)
 
 
-def test_first_journal_keeps_its_numbers_and_later_ones_follow(
-    archive: ShoreDatabase, own: Callable[[str], Journal]
-) -> None:
+def test_first_journal_keeps_its_numbers_and_later_ones_follow(archive, own):
     archive.write([stored(image("0001"), "a"), stored(image("0003"), "c")])
     first, second = own("first"), own("second")
     for number, each in enumerate((entry(image("0001"), "a"), entry(image("0002"), "removed"))):
@@ -206,9 +200,7 @@ def test_first_journal_keeps_its_numbers_and_later_ones_follow(
     second.close()
 
 
-def test_database_of_version_1_is_migrated_and_its_records_have_no_number(
-    database: Database, archive: ShoreDatabase, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_database_of_version_1_is_migrated_and_its_records_have_no_number(database, archive, monkeypatch):
     with monkeypatch.context() as earlier:
         earlier.setattr(shore_schema, "VERSION", 1)
         earlier.setattr(shore_schema, "_MIGRATIONS", shore_schema._MIGRATIONS[:1])

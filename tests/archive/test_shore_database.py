@@ -1,15 +1,11 @@
 """Archive in PostgreSQL: schema, exactly-once writes of several c2, accepted records, verification."""
 
-from __future__ import annotations
-
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
 from builders.common import free_port
-from builders.postgresql import PostgresServer
 from builders.records import decision_record, reconstructed_image
 
 from sonarpost.archive.postgresql import Database, DatabaseAddress
@@ -21,16 +17,16 @@ from sonarpost.messages import Contact, Pixels
 
 
 @pytest.fixture
-def open_(database: Database) -> Callable[..., ShoreDatabase]:
+def open_(database):
     return lambda owner="c2-a", **options: ShoreDatabase(database, owner=owner, **options)
 
 
 @pytest.fixture
-def archive(open_: Callable[..., ShoreDatabase]) -> ShoreDatabase:
+def archive(open_):
     return open_()
 
 
-def stored(image_id: str = "AAAA", text: bytes = b"{}", accepted_utc_s: float = 5.0) -> StoredImage:
+def stored(image_id="AAAA", text=b"{}", accepted_utc_s=5.0):
     contact = Contact(contact_id="c", vehicle_id="uuv-1", lat_deg=56.0, lon_deg=-5.0, atd_class="clutter")
     picture = Pixels(height_px=2, width_px=3, bits=8, data=bytes(6))
     image = reconstructed_image(picture, image_id=image_id, contact=contact)
@@ -39,19 +35,19 @@ def stored(image_id: str = "AAAA", text: bytes = b"{}", accepted_utc_s: float = 
     return StoredImage(replace(row, conflict=False), tuple(zip((".json", ".tiff", ".png"), contents, strict=True)))
 
 
-def command_row(record_id: str = "c1", **changes: object) -> TaskingRow:
-    fields: dict[str, object] = {
+def command_row(record_id="c1", **changes):
+    fields = {
         "vessel_id": "vessel-1", "kind": "command", "record_id": record_id, "vehicle_id": "uuv-1", "image_id": None,
         "summary": "refine", "author": "expert", "issued_utc_s": 1.0, "state": "waiting", "reason": "",
         "changed_utc_s": 2.0,
     }  # fmt: skip
-    return TaskingRow(**(fields | changes))  # type: ignore[arg-type]
+    return TaskingRow(**(fields | changes))
 
 
 # Schema
 
 
-def test_concurrent_starts_create_one_schema(database_url: str) -> None:
+def test_concurrent_starts_create_one_schema(database_url):
     made = [ShoreDatabase(Database(DatabaseAddress.parse(database_url)), site="shore") for _ in range(8)]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda each: each.prepare(), made))
@@ -60,7 +56,7 @@ def test_concurrent_starts_create_one_schema(database_url: str) -> None:
         each.close()
 
 
-def test_schema_of_a_later_version_is_refused(archive: ShoreDatabase, database: Database) -> None:
+def test_schema_of_a_later_version_is_refused(archive, database):
     archive.prepare()
     with database.transaction() as sql:
         sql.rows("UPDATE archive SET version = 99")
@@ -70,19 +66,19 @@ def test_schema_of_a_later_version_is_refused(archive: ShoreDatabase, database: 
         ShoreDatabase(database).images()
 
 
-def test_database_without_an_archive_is_not_created_by_a_command(open_: Callable[..., ShoreDatabase]) -> None:
+def test_database_without_an_archive_is_not_created_by_a_command(open_):
     with pytest.raises(StoredFileError, match="version: got 0"):
         open_(writable=False).prepare()
 
 
-def test_database_of_another_site_is_refused(open_: Callable[..., ShoreDatabase]) -> None:
+def test_database_of_another_site_is_refused(open_):
     open_(site="shore").prepare()
     open_(site="shore").prepare()
     with pytest.raises(ConfigError, match="site: got 'north', expected shore"):
         open_(site="north").prepare()
 
 
-def test_postgis_is_required(postgresql_server: PostgresServer) -> None:
+def test_postgis_is_required(postgresql_server):
     postgresql_server.execute("postgres", "CREATE DATABASE plain OWNER sonarpost")
     address = DatabaseAddress.parse(f"postgresql://sonarpost@127.0.0.1:{postgresql_server.port}/plain")
     database = Database(address)
@@ -91,7 +87,7 @@ def test_postgis_is_required(postgresql_server: PostgresServer) -> None:
     database.close()
 
 
-def test_positions_are_points_for_spatial_queries(archive: ShoreDatabase, database: Database) -> None:
+def test_positions_are_points_for_spatial_queries(archive, database):
     archive.write([stored()])
     with database.transaction() as sql:
         near = "ST_DWithin(position::geography, ST_MakePoint(:lon, 56)::geography, 1000)"
@@ -102,7 +98,7 @@ def test_positions_are_points_for_spatial_queries(archive: ShoreDatabase, databa
 # Writes
 
 
-def test_rows_and_files_are_returned_as_written(archive: ShoreDatabase) -> None:
+def test_rows_and_files_are_returned_as_written(archive):
     image = stored(text=b'{"remark": "\\u0000"}')
     image = replace(image, row=replace(image.row, codec="e\0b", fault="", p_mine_like=0.1 + 0.2))
     archive.write([image])
@@ -111,11 +107,11 @@ def test_rows_and_files_are_returned_as_written(archive: ShoreDatabase) -> None:
     assert archive.image_files(row.vessel_id, row.name) == dict(image.files)
 
 
-def test_same_image_of_several_c2_is_stored_once(open_: Callable[..., ShoreDatabase]) -> None:
+def test_same_image_of_several_c2_is_stored_once(open_):
     images = [stored(f"{number:04d}") for number in range(20)]
     start = threading.Barrier(4)
 
-    def write(number: int) -> None:
+    def write(number):
         start.wait()
         archive = open_(f"c2-{number}")
         for first in range(0, 20, 5):
@@ -126,14 +122,14 @@ def test_same_image_of_several_c2_is_stored_once(open_: Callable[..., ShoreDatab
     assert len(open_().images()) == 20
 
 
-def test_another_image_under_a_name_is_not_written(archive: ShoreDatabase) -> None:
+def test_another_image_under_a_name_is_not_written(archive):
     archive.write([stored("AAAA")])
     with pytest.raises(DatabaseUnavailableError, match="another image under the same name"):
         archive.write([stored("BBBB"), stored("AAAA", b"other")])
     assert [row.image_id for row in archive.images()] == ["AAAA"]
 
 
-def test_removed_image_is_stored_again(archive: ShoreDatabase) -> None:
+def test_removed_image_is_stored_again(archive):
     archive.write([stored()])
     archive.mark("removed_utc_s", archive.images(), 9.0)
     assert archive.images() == []
@@ -143,12 +139,12 @@ def test_removed_image_is_stored_again(archive: ShoreDatabase) -> None:
     assert len(archive.image_files("vessel-1", archive.images()[0].name)) == 3
 
 
-def test_changed_and_missing_files_are_found_on_the_server(archive: ShoreDatabase, database: Database) -> None:
+def test_changed_and_missing_files_are_found_on_the_server(archive, database):
     archive.write([stored(f"{number:04d}") for number in range(3)])
     with database.transaction() as sql:
         sql.rows("UPDATE file SET content = 'x' WHERE name = 'name_0000' AND suffix = '.png'")
         sql.rows("DELETE FROM file WHERE name = 'name_0001' AND suffix = '.png'")
-    assert {result.row.name: result.fault for result in archive.verify(1e9, 86400.0, 86400.0)} == {  # type: ignore[union-attr]
+    assert {result.row.name: result.fault for result in archive.verify(1e9, 86400.0, 86400.0)} == {
         "name_0000": "changed",
         "name_0001": "missing",
         "name_0002": "",
@@ -164,7 +160,7 @@ def test_changed_and_missing_files_are_found_on_the_server(archive: ShoreDatabas
 # Tasking
 
 
-def test_one_c2_claims_a_record_for_a_vessel(open_: Callable[..., ShoreDatabase]) -> None:
+def test_one_c2_claims_a_record_for_a_vessel(open_):
     archives = [open_(f"c2-{number}") for number in range(4)]
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda each: each.claim_tasking(command_row(), b"payload"), archives))
@@ -175,7 +171,7 @@ def test_one_c2_claims_a_record_for_a_vessel(open_: Callable[..., ShoreDatabase]
     assert next(a for a in archives if a is not owner).foreign_tasking("vessel-1", "command", "c1") == b"payload"
 
 
-def test_older_state_does_not_replace_a_newer_one(archive: ShoreDatabase) -> None:
+def test_older_state_does_not_replace_a_newer_one(archive):
     archive.claim_tasking(command_row(), b"payload")
     archive.put_tasking([command_row(state="delivered", changed_utc_s=5.0)])
     archive.put_tasking([command_row(state="waiting", changed_utc_s=2.0)])
@@ -185,11 +181,11 @@ def test_older_state_does_not_replace_a_newer_one(archive: ShoreDatabase) -> Non
 # Accepted records
 
 
-def test_accepted_record_of_another_c2_is_taken_over_once(open_: Callable[..., ShoreDatabase]) -> None:
+def test_accepted_record_of_another_c2_is_taken_over_once(open_):
     first, second, third = (open_(name) for name in ("c2-a", "c2-b", "c2-c"))
     record = AcceptedRecord("some/key", b"\x00payload")
     first.accept([record, record])
-    taken: list[AcceptedRecord] = []
+    taken = []
     assert first.take_over(0.0, 10, taken.extend) == 0
     assert second.take_over(60.0, 10, taken.extend) == 0
     assert second.take_over(0.0, 10, taken.extend) == 1
@@ -200,25 +196,25 @@ def test_accepted_record_of_another_c2_is_taken_over_once(open_: Callable[..., S
     assert first.accepted_count() == 0
 
 
-def test_record_stays_with_its_owner_if_it_cannot_be_taken_over(open_: Callable[..., ShoreDatabase]) -> None:
+def test_record_stays_with_its_owner_if_it_cannot_be_taken_over(open_):
     open_("c2-a").accept([AcceptedRecord("k", b"p")])
 
-    def fails(_: object) -> None:
+    def fails(_):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(OSError, match="No space left"):
         open_("c2-b").take_over(0.0, 10, fails)
-    taken: list[AcceptedRecord] = []
+    taken = []
     assert open_("c2-b").take_over(0.0, 10, taken.extend) == 1
 
 
-def test_decision_with_another_content_is_not_written(archive: ShoreDatabase) -> None:
+def test_decision_with_another_content_is_not_written(archive):
     from hashlib import sha256
 
     from sonarpost.archive.shore_files import decision_text
     from sonarpost.archive.shore_index import DecisionRow
 
-    def row(**changes: object) -> tuple[DecisionRow, bytes]:
+    def row(**changes):
         decision = decision_record("d1", **changes)
         text = decision_text(decision)
         return DecisionRow.of(decision, 5.0, sha256(text).hexdigest()), text
@@ -234,7 +230,7 @@ def test_decision_with_another_content_is_not_written(archive: ShoreDatabase) ->
 # Connection
 
 
-def test_restarted_server_is_reached_again(database_url: str, postgresql_server: PostgresServer) -> None:
+def test_restarted_server_is_reached_again(database_url, postgresql_server):
     database = Database(DatabaseAddress.parse(database_url))
     archive = ShoreDatabase(database, owner="c2-a")
     archive.write([stored()])
@@ -248,7 +244,7 @@ def test_restarted_server_is_reached_again(database_url: str, postgresql_server:
         postgresql_server.start()
     from builders.common import eventually
 
-    def is_reached() -> bool:
+    def is_reached():
         try:
             return len(archive.images()) == 1
         except DatabaseUnavailableError:
@@ -270,14 +266,14 @@ def test_restarted_server_is_reached_again(database_url: str, postgresql_server:
         ("postgresql://u:secret@h/d?options=x", "not options"),
     ],
 )
-def test_invalid_address_is_refused_without_its_password(url: str, expected: str) -> None:
+def test_invalid_address_is_refused_without_its_password(url, expected):
     with pytest.raises(ConfigError, match="c2: database") as caught:
         DatabaseAddress.parse(url)
     assert expected in str(caught.value)
     assert "secret" not in str(caught.value)
 
 
-def test_address_has_tls_unless_the_server_is_local(tmp_path: object) -> None:
+def test_address_has_tls_unless_the_server_is_local(tmp_path):
     parse = DatabaseAddress.parse
     assert parse("postgresql://u:p%40ss@db.example.org/shore").use_tls
     assert parse("postgresql://u:p%40ss@db.example.org/shore").password == "p@ss"
@@ -287,7 +283,7 @@ def test_address_has_tls_unless_the_server_is_local(tmp_path: object) -> None:
     assert "secret" not in repr(parse("postgresql://u:secret@db/shore"))
 
 
-def test_unreachable_server_is_named_without_the_password() -> None:
+def test_unreachable_server_is_named_without_the_password():
     database = Database(DatabaseAddress.parse(f"postgresql://u:secret@127.0.0.1:{free_port()}/shore"))
     with pytest.raises(DatabaseUnavailableError) as caught:
         ShoreDatabase(database).images()

@@ -1,12 +1,10 @@
 """Sender and receiver of short messages: loss, duplication, reordering, restarts, limits."""
 
-from __future__ import annotations
-
 import random
 
 import pytest
 from builders.short_messages import decision, received
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.bearers.receiver import ACKNOWLEDGE_AFTER_S, MessageReceiver
@@ -98,7 +96,6 @@ def test_100_contacts_with_previews_arrive_although_every_fifth_message_is_lost(
     assert [r for r in arrived if r in images]  # the whole stream of 200 bytes fits
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32), st.floats(0, 0.6), st.floats(0, 0.2), st.integers(0, 260))
 def test_every_record_arrives_once_with_any_loss_and_restarts(seed, loss, restarts, preview_bytes):
     exchange = Exchange(seed, loss, restarts, preview_bytes=preview_bytes)

@@ -1,7 +1,5 @@
 """Terminal, webhook and gateway against the emulated message service; hostile requests and replies."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from urllib.error import HTTPError

@@ -1,7 +1,5 @@
 """Budget of bytes a day and windows."""
 
-from __future__ import annotations
-
 import pytest
 
 from sonarpost.bearers.policy import ByteBudget, Window

@@ -1,7 +1,5 @@
 """Format of short messages: golden bytes, round trip, hostile input."""
 
-from __future__ import annotations
-
 import binascii
 import json
 import math

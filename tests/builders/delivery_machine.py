@@ -9,10 +9,8 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import msgpack
 import zenoh
@@ -23,7 +21,7 @@ from sonarpost.delivery.outbox import QueuePolicy, QueueSender, _NoReplyError
 from sonarpost.delivery.protocol import AckReply, watcher_origin
 from sonarpost.delivery.records import Topic
 from sonarpost.delivery.store import Store
-from sonarpost.errors import BadInputError, PayloadError
+from sonarpost.errors import PayloadError
 
 CONSUMER = "relay"
 WAIT_LIMIT = 60
@@ -36,7 +34,7 @@ class Bytes:
 
     content: bytes
 
-    def to_bytes(self) -> bytes:
+    def to_bytes(self):
         return self.content
 
 
@@ -47,18 +45,18 @@ class Received:
     payload: Bytes
 
     @property
-    def ok(self) -> Received:
+    def ok(self):
         return self
 
 
 class Handler:
     """Stands for the handler of a query: one reply, or an error after the time-out."""
 
-    def __init__(self) -> None:
-        self.reply: bytes | None = None
+    def __init__(self):
+        self.reply = None
         self.timed_out = False
 
-    def try_recv(self) -> Received | None:
+    def try_recv(self):
         if self.timed_out:
             raise zenoh.ZError("no reply")
         return None if self.reply is None else Received(Bytes(self.reply))
@@ -75,24 +73,24 @@ class SentQuery:
     replies: list[bytes] = field(default_factory=list)
 
     @property
-    def key_expr(self) -> str:
+    def key_expr(self):
         return self.key
 
     @property
-    def payload(self) -> Bytes:
+    def payload(self):
         return Bytes(self.content)
 
     @property
-    def attachment(self) -> Bytes:
+    def attachment(self):
         return Bytes(self.attached)
 
-    def __enter__(self) -> SentQuery:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         return
 
-    def reply(self, key: str, payload: bytes) -> None:
+    def reply(self, key, payload):
         assert key == self.key
         self.replies.append(payload)
 
@@ -100,16 +98,16 @@ class SentQuery:
 class Network:
     """Stands for the session of a producer."""
 
-    def __init__(self) -> None:
-        self.sent: list[SentQuery] = []
-        self.published: list[dict[str, Any]] = []
+    def __init__(self):
+        self.sent = []
+        self.published = []
 
-    def get(self, key: str, *, payload: bytes, attachment: bytes, **_: object) -> Handler:
+    def get(self, key, *, payload, attachment, **_):
         query = SentQuery(key, payload, attachment)
         self.sent.append(query)
         return query.handler
 
-    def put(self, key: str, payload: bytes, *, attachment: bytes, **_: object) -> None:
+    def put(self, key, payload, *, attachment, **_):
         del key, payload
         self.published.append(msgpack.unpackb(attachment))
 
@@ -117,17 +115,17 @@ class Network:
 class SteppedSender(QueueSender):
     """The product's sender; the test calls its parts in place of its thread."""
 
-    def _run(self) -> None:
+    def _run(self):
         return
 
 
 class SteppedInbox(Inbox):
     """The product's inbox; the test calls its parts in place of its thread."""
 
-    def _run(self) -> None:
+    def _run(self):
         return
 
-    def receive(self, queries: Sequence[SentQuery]) -> None:
+    def receive(self, queries):
         """Commit queries in one transaction and reply."""
         for query in queries:
             self._on_query(cast(zenoh.Query, query))
@@ -136,13 +134,13 @@ class SteppedInbox(Inbox):
             self._reply(messages, self._commit(messages))
 
 
-def validate(key: str, payload: bytes) -> None:
+def validate(key, payload):
     """Require that a record starts with its key and is not marked as invalid."""
     if not payload.startswith(key.encode() + b" valid"):
         raise PayloadError(key, "payload", payload[:60], "a valid record of this key")
 
 
-def copy_store(source: Path, target: Path) -> Path:
+def copy_store(source, target):
     """Copy the files of a store as they are after a kill: without the shared memory file."""
     target.mkdir()
     for path in source.parent.iterdir():
@@ -151,7 +149,7 @@ def copy_store(source: Path, target: Path) -> Path:
     return target / source.name
 
 
-def open_store(path: Path) -> Store:
+def open_store(path):
     """Open a store; commits need no flush, because only processes are killed here."""
     store = Store(path)
     store._db.execute("PRAGMA synchronous=OFF")
@@ -161,33 +159,33 @@ def open_store(path: Path) -> Store:
 class Sending:
     """A producer: its store, its sender and what the test expects of it."""
 
-    def __init__(self, path: Path, network: Network) -> None:
+    def __init__(self, path, network):
         path.parent.mkdir()
         self.network = network
         self.store = open_store(path)
         self.sender = self._new_sender()
-        self.backup: Path | None = None
+        self.backup = None
         self.was_restored = False
 
-    def _new_sender(self) -> SteppedSender:
+    def _new_sender(self):
         session = cast(zenoh.Session, self.network)
         return SteppedSender(session, self.store, CONSUMER, QueuePolicy(), None)
 
-    def reopen(self, path: Path) -> None:
+    def reopen(self, path):
         """Start with another copy of the store; what was in memory is lost."""
         self.store.close()
         self.store = open_store(path)
         self.sender = self._new_sender()
 
-    def queued(self) -> set[bytes]:
+    def queued(self):
         """Payloads of the outbox."""
         return {bytes(row[0]) for row in self.store._query("SELECT payload FROM outbox")}
 
-    def send(self) -> None:
+    def send(self):
         self.sender._load()
         self.sender._send_queries()
 
-    def use_replies(self) -> None:
+    def use_replies(self):
         try:
             self.sender._process_replies()
         except _NoReplyError as error:
@@ -197,7 +195,7 @@ class Sending:
 class Delivery:
     """Two producers and a consumer, with a ledger of all records."""
 
-    def __init__(self, folder: Path, producer_keys: Sequence[Sequence[str]], hostile_keys: Sequence[str]) -> None:
+    def __init__(self, folder, producer_keys, hostile_keys):
         self._folder = folder
         self._copies = 0
         self.network = Network()
@@ -206,24 +204,24 @@ class Delivery:
         self.producers = [Sending(folder / f"producer-{n}" / "p.db", self.network) for n in range(len(producer_keys))]
         (folder / "consumer").mkdir()
         self.store = open_store(folder / "consumer" / "c.db")
-        self.refused: list[BadInputError] = []
+        self.refused = []
         self.inbox = self._new_inbox()
-        self.handled: Counter[tuple[str, bytes]] = Counter()
-        self.valid: dict[bytes, str] = {}
-        self.excused: set[bytes] = set()
+        self.handled = Counter()
+        self.valid = {}
+        self.excused = set()
         self.serial = 0
 
-    def _new_inbox(self) -> SteppedInbox:
+    def _new_inbox(self):
         session = cast(zenoh.Session, None)  # no key expressions are declared
         return SteppedInbox(session, self.store, CONSUMER, (), validate, self.refused.append)
 
-    def _copy(self, store: Store) -> Path:
+    def _copy(self, store):
         self._copies += 1
         return copy_store(store.path, self._folder / f"copy-{self._copies}")
 
     # Producers
 
-    def queue(self, which: int, key: str, size_bytes: int, *, valid: bool = True, topic: str = "") -> None:
+    def queue(self, which, key, size_bytes, *, valid=True, topic=""):
         self.serial += 1
         mark = "valid" if valid else "invalid"
         payload = f"{key} {mark} {self.serial} ".encode()
@@ -237,14 +235,14 @@ class Delivery:
         if valid:
             self.valid[payload] = key
 
-    def kill_producer(self, which: int) -> None:
+    def kill_producer(self, which):
         producer = self.producers[which]
         producer.reopen(self._copy(producer.store))
 
-    def back_up(self, which: int) -> None:
+    def back_up(self, which):
         self.producers[which].backup = self._copy(self.producers[which].store)
 
-    def restore(self, which: int) -> None:
+    def restore(self, which):
         producer = self.producers[which]
         assert producer.backup is not None
         before = producer.queued()
@@ -255,24 +253,24 @@ class Delivery:
 
     # Consumer
 
-    def kill_consumer(self) -> None:
+    def kill_consumer(self):
         path = self._copy(self.store)
         self.store.close()
         self.store = open_store(path)
         self.inbox = self._new_inbox()
 
-    def receive(self, queries: Sequence[SentQuery]) -> None:
+    def receive(self, queries):
         self.inbox.receive(queries)
         assert not self.inbox.storage_failing
 
-    def handle(self, limit: int) -> None:
+    def handle(self, limit):
         items = self.store.inbox_items(limit)
         with self.store.transaction() as tx:
             for item in items:
                 tx.remove_handled(item)
         self.handled.update((item.key, item.payload) for item in items)
 
-    def consumer_state_of_producers(self) -> list[list[tuple[Any, ...]]]:
+    def consumer_state_of_producers(self):
         """Duplicate windows and chunks of all keys to which the hostile peer may not write."""
         allowed = tuple(self.hostile_keys)
         other_key = f"key NOT IN ({', '.join('?' * len(allowed))})"
@@ -285,7 +283,7 @@ class Delivery:
 
     # Invariants
 
-    def check(self) -> None:
+    def check(self):
         """Check I1 to I3, I6 and that no publication holds an origin."""
         accepted = self.handled.copy()
         accepted.update((str(key), bytes(p)) for key, p in self.store._query("SELECT key, payload FROM inbox"))
@@ -303,7 +301,7 @@ class Delivery:
             assert fields["origin"] not in origins
         self.network.published.clear()
 
-    def deliver_everything(self) -> None:
+    def deliver_everything(self):
         """Run without faults until all outboxes are empty."""
         for query in self.network.sent:
             query.handler.timed_out = query.handler.reply is None
@@ -321,21 +319,19 @@ class Delivery:
                 break
         assert not any(producer.queued() for producer in self.producers), "P1: records stay queued"
 
-    def close(self) -> None:
+    def close(self):
         self.store.close()
         for producer in self.producers:
             producer.store.close()
 
 
-def _status(reply: bytes) -> str:
+def _status(reply):
     if msgpack.unpackb(reply)["v"] != 1:
         return "batch"
     return AckReply.unpack(reply, "reply").status
 
 
-def query_of(
-    key: str, origin: bytes, records: Sequence[tuple[int, bytes, bytes]], settled: int, *, whole_bytes: int = 0
-) -> SentQuery:
+def query_of(key, origin, records, settled, *, whole_bytes=0):
     """Return a query of a peer that is not bound to the rules of a producer.
 
     Args:
@@ -348,7 +344,7 @@ def query_of(
     if len(records) == 1:
         seq, data, digest = records[0]
         size = max(whole_bytes, len(data))
-        fields: dict[str, Any] = {"v": 1, "seq": seq, "size": size, "sha256": digest, "offset": 0}
+        fields = {"v": 1, "seq": seq, "size": size, "sha256": digest, "offset": 0}
     else:
         fields = {"v": 2, "records": [(seq, len(data), digest) for seq, data, digest in records]}
     attached = msgpack.packb(fields | {"origin": origin, "consumer": CONSUMER, "settled": settled})
@@ -356,6 +352,6 @@ def query_of(
     return SentQuery(keys.delivery_query(key, CONSUMER), content, attached)
 
 
-def origin_for_watchers(query: SentQuery) -> bytes:
+def origin_for_watchers(query):
     """Return the origin that watchers receive for the records of a query."""
     return watcher_origin(msgpack.unpackb(query.attached)["origin"])

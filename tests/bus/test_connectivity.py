@@ -1,7 +1,5 @@
 """Presence replies."""
 
-from __future__ import annotations
-
 import msgpack
 import pytest
 
@@ -10,11 +8,11 @@ from sonarpost.bus.connectivity import PresenceReply
 from sonarpost.errors import PayloadError
 
 
-def parsed(payload: bytes) -> PresenceReply:
+def parsed(payload):
     return wire.validated(PresenceReply, wire.unpack_map(payload, "key"), "key")
 
 
-def test_presence_reply_round_trip() -> None:
+def test_presence_reply_round_trip():
     reply = PresenceReply(v=1, platform="shore-1", service="c2")
     assert parsed(reply.pack()) == reply
     assert msgpack.unpackb(reply.pack()) == {"v": 1, "platform": "shore-1", "service": "c2"}

@@ -1,15 +1,12 @@
 """The embedded router accepts zenohd's configuration files and options and reports errors in one line."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 import zenoh
@@ -33,11 +30,11 @@ CONFIG = """{
 
 
 @pytest.fixture
-def start() -> Iterator[Start]:
+def start():
     """Starts router processes and stops them after the test."""
-    started: list[subprocess.Popen[str]] = []
+    started = []
 
-    def start_one(*arguments: str) -> subprocess.Popen[str]:
+    def start_one(*arguments):
         process = subprocess.Popen(
             [sys.executable, "-m", "sonarpost.bus.router", *arguments],
             stdout=subprocess.PIPE,
@@ -57,11 +54,11 @@ def start() -> Iterator[Start]:
         process.stdout.close()
 
 
-def reach(endpoint: str) -> zenoh.Session:
+def reach(endpoint):
     """Open a client session as soon as the router listens."""
-    opened: list[zenoh.Session] = []
+    opened = []
 
-    def try_once() -> bool:
+    def try_once():
         try:
             opened.append(zenoh.open(client_config([endpoint])))
         except zenoh.ZError:
@@ -72,13 +69,13 @@ def reach(endpoint: str) -> zenoh.Session:
     return opened[0]
 
 
-def write_config(tmp_path: Path, text: str, name: str = "router.json5") -> Path:
+def write_config(tmp_path, text, name="router.json5"):
     path = tmp_path / name
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def test_linked_routers_with_files_forward_a_record(start: Start, tmp_path: Path) -> None:
+def test_linked_routers_with_files_forward_a_record(start, tmp_path):
     shore, vessel = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
     processes = [
         start("--config", str(write_config(tmp_path, CONFIG % shore, "shore.json5"))),
@@ -90,7 +87,7 @@ def test_linked_routers_with_files_forward_a_record(start: Start, tmp_path: Path
         publisher = aboard.declare_publisher("sonarpost/test")
         eventually(lambda: bool(publisher.matching_status.matching), 120, "the subscriber at the vessel's router")
 
-        def forwarded() -> bool:
+        def forwarded():
             publisher.put(b"here")
             return received.wait(0.2)
 
@@ -105,7 +102,7 @@ def test_linked_routers_with_files_forward_a_record(start: Start, tmp_path: Path
         assert "Router stopped" in output
 
 
-def test_command_line_endpoints_replace_those_of_the_file(tmp_path: Path) -> None:
+def test_command_line_endpoints_replace_those_of_the_file(tmp_path):
     path = write_config(tmp_path, CONFIG % "tcp/127.0.0.1:1")
     config = router.load(path, ["tcp/127.0.0.1:7001", "tcp/127.0.0.1:7002"], ["tcp/shore:7448"], [])
     assert json.loads(config.get_json("listen/endpoints")) == ["tcp/127.0.0.1:7001", "tcp/127.0.0.1:7002"]
@@ -114,19 +111,19 @@ def test_command_line_endpoints_replace_those_of_the_file(tmp_path: Path) -> Non
     assert json.loads(kept.get_json("listen/endpoints")) == ["tcp/127.0.0.1:1"]
 
 
-def test_default_mode_of_a_file_is_router(tmp_path: Path) -> None:
+def test_default_mode_of_a_file_is_router(tmp_path):
     config = router.load(write_config(tmp_path, "{}"), [], [], [])
     assert json.loads(config.get_json("mode")) == "router"
 
 
-def test_settings_are_applied_last(tmp_path: Path) -> None:
+def test_settings_are_applied_last(tmp_path):
     path = write_config(tmp_path, CONFIG % "tcp/127.0.0.1:1")
     config = router.load(path, [], [], ["transport/link/tx/lease:1234", "metadata:{name:'a'}"])
     assert json.loads(config.get_json("transport/link/tx/lease")) == 1234
     assert json.loads(config.get_json("metadata")) == {"name": "a"}
 
 
-def test_router_without_a_file_listens_on_loopback_only() -> None:
+def test_router_without_a_file_listens_on_loopback_only():
     config = router.load(None, [], [], [])
     assert json.loads(config.get_json("listen/endpoints")) == ["tcp/127.0.0.1:7447"]
     assert json.loads(config.get_json("scouting/multicast/enabled")) is False
@@ -145,9 +142,7 @@ def test_router_without_a_file_listens_on_loopback_only() -> None:
         ("{}", {"settings": ["no/such/key:1"]}, ("--cfg", "no/such/key")),
     ],
 )
-def test_error_names_the_invalid_setting(
-    tmp_path: Path, text: str | None, arguments: dict[str, list[str]], words: tuple[str, ...]
-) -> None:
+def test_error_names_the_invalid_setting(tmp_path, text, arguments, words):
     path = tmp_path / "router.json5"
     if text is not None:
         path.write_text(text)
@@ -158,12 +153,12 @@ def test_error_names_the_invalid_setting(
         assert word in str(caught.value)
 
 
-def test_error_names_invalid_endpoints_without_a_file() -> None:
+def test_error_names_invalid_endpoints_without_a_file():
     with pytest.raises(ConfigError, match="Zenoh endpoints"):
         router.load(None, ["nowhere"], [], [])
 
 
-def test_invalid_file_ends_the_process_with_one_line(start: Start, tmp_path: Path) -> None:
+def test_invalid_file_ends_the_process_with_one_line(start, tmp_path):
     process = start("--config", str(write_config(tmp_path, "{mode: 'router', lisen: {}}")))
     output = process.communicate(timeout=120)[0]
     assert process.returncode == router.EXIT_CANNOT_START
@@ -173,7 +168,7 @@ def test_invalid_file_ends_the_process_with_one_line(start: Start, tmp_path: Pat
 
 
 @pytest.mark.parametrize("path", sorted(REPOSITORY.glob("config/router-*.json5")), ids=lambda path: path.name)
-def test_router_files_of_the_project_disable_discovery(path: Path) -> None:
+def test_router_files_of_the_project_disable_discovery(path):
     config = router.load(path, [], [], [])
     assert json.loads(config.get_json("scouting/multicast/enabled")) is False
     assert json.loads(config.get_json("scouting/gossip/enabled")) is False
@@ -193,13 +188,11 @@ def test_router_files_of_the_project_disable_discovery(path: Path) -> None:
         ("{platform: 'shore-1', sites: ['shore', 'north']}", ("shore-1", ("shore", "north"))),
     ],
 )
-def test_configuration_names_the_platform_and_its_sites(
-    metadata: str, expected: tuple[str | None, tuple[str, ...]]
-) -> None:
+def test_configuration_names_the_platform_and_its_sites(metadata, expected):
     assert router.platform_and_sites(zenoh.Config.from_json5(f"{{metadata: {metadata}}}")) == expected
 
 
 @pytest.mark.parametrize("metadata", ["{platform: 7}", "{platform: 'No Name'}", "{platform: 'a', sites: 'shore'}"])
-def test_invalid_metadata_is_rejected(metadata: str) -> None:
+def test_invalid_metadata_is_rejected(metadata):
     with pytest.raises(BadInputError):
         router.platform_and_sites(zenoh.Config.from_json5(f"{{metadata: {metadata}}}"))

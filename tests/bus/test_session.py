@@ -1,7 +1,5 @@
 """Sessions: configuration without discovery, and opening with retries until success or stop."""
 
-from __future__ import annotations
-
 import json
 import logging
 import threading
@@ -15,21 +13,21 @@ from sonarpost.bus import session
 from sonarpost.bus.session import client_config, open_with_retry, router_config
 
 
-def setting(config: zenoh.Config, path: str) -> object:
+def setting(config, path):
     return json.loads(config.get_json(path))
 
 
 @pytest.mark.parametrize(
     "config", [client_config(["tcp/127.0.0.1:1"]), router_config(["tcp/127.0.0.1:1"], ["tcp/h:2"])]
 )
-def test_discovery_and_shared_memory_are_off(config: zenoh.Config) -> None:
+def test_discovery_and_shared_memory_are_off(config):
     assert setting(config, "scouting/multicast/enabled") is False
     assert setting(config, "scouting/gossip/enabled") is False
     assert setting(config, "transport/shared_memory/enabled") is False
     assert setting(config, "transport/link/tx/lease") == 3000
 
 
-def test_services_are_clients_and_hubs_are_routers() -> None:
+def test_services_are_clients_and_hubs_are_routers():
     client, router = client_config(["tcp/a:1", "tcp/b:2"]), router_config(["tcp/c:3"], ["tcp/d:4"])
     assert (setting(client, "mode"), setting(router, "mode")) == ("client", "router")
     assert setting(client, "connect/endpoints") == ["tcp/a:1", "tcp/b:2"]
@@ -38,14 +36,14 @@ def test_services_are_clients_and_hubs_are_routers() -> None:
     assert setting(router, "connect/endpoints") == ["tcp/d:4"]
 
 
-def test_available_router_is_joined_at_once(router: str) -> None:
+def test_available_router_is_joined_at_once(router):
     opened = open_with_retry([router], threading.Event())
     assert opened is not None
     assert len(opened.info.routers_zid()) == 1
     opened.close()
 
 
-def test_second_endpoint_is_used_if_the_first_is_unreachable(router: str) -> None:
+def test_second_endpoint_is_used_if_the_first_is_unreachable(router):
     stop = threading.Event()
     end = threading.Timer(3.0, stop.set)
     end.start()
@@ -55,10 +53,10 @@ def test_second_endpoint_is_used_if_the_first_is_unreachable(router: str) -> Non
     opened.close()
 
 
-def test_router_that_starts_later_is_joined(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_router_that_starts_later_is_joined(caplog, monkeypatch):
     monkeypatch.setattr(session, "RETRY_S", (0.02,))
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    opened: list[zenoh.Session | None] = []
+    opened = []
     stop = threading.Event()
     caplog.set_level(logging.WARNING)
     waiting = threading.Thread(target=lambda: opened.append(open_with_retry([endpoint], stop)))
@@ -80,10 +78,10 @@ def test_router_that_starts_later_is_joined(caplog: pytest.LogCaptureFixture, mo
     assert vars(warnings[0])["fields"]["router"] == endpoint
 
 
-def test_stop_ends_the_wait_between_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_ends_the_wait_between_attempts(monkeypatch):
     monkeypatch.setattr(session, "RETRY_S", (60.0,))
     stop = threading.Event()
-    opened: list[zenoh.Session | None] = []
+    opened = []
     dead = ["tcp/127.0.0.1:1"]
     waiting = threading.Thread(target=lambda: opened.append(open_with_retry(dead, stop)))
     waiting.start()
@@ -95,8 +93,8 @@ def test_stop_ends_the_wait_between_attempts(monkeypatch: pytest.MonkeyPatch) ->
     assert time.monotonic() - began < 3
 
 
-def test_no_attempt_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_open(_: zenoh.Config) -> zenoh.Session:
+def test_no_attempt_after_a_stop(monkeypatch):
+    def no_open(_):
         raise AssertionError("tried")
 
     monkeypatch.setattr(zenoh, "open", no_open)
@@ -105,11 +103,11 @@ def test_no_attempt_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     assert open_with_retry(["tcp/127.0.0.1:1"], stop) is None
 
 
-def test_linked_routers_forward_publications(router: str) -> None:
+def test_linked_routers_forward_publications(router):
     far_endpoint = f"tcp/127.0.0.1:{free_port()}"
     far = zenoh.open(router_config([far_endpoint], [router]))
     here, there = zenoh.open(client_config([router])), zenoh.open(client_config([far_endpoint]))
-    got: list[bytes] = []
+    got = []
     there.declare_subscriber("a/b", lambda sample: got.append(sample.payload.to_bytes()))
     publisher = here.declare_publisher("a/b")
     try:

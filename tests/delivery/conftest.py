@@ -1,17 +1,15 @@
-"""Fixture: a store in a temporary folder."""
-
-from __future__ import annotations
-
-from collections.abc import Iterator
-from pathlib import Path
+"""Fixtures: a store in a temporary folder, services as producers and consumers."""
 
 import pytest
+from builders.services import publish, refused, runner
 
 from sonarpost.delivery.store import Store
 
+__all__ = ["publish", "refused", "runner"]
+
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
+def store(tmp_path):
     opened = Store(tmp_path / "s.db")
     yield opened
     opened.close()

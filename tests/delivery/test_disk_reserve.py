@@ -1,7 +1,5 @@
 """Disk reserve, and free space inside the file of a store."""
 
-from __future__ import annotations
-
 from collections import namedtuple
 
 import pytest

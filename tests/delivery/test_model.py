@@ -3,8 +3,6 @@
 `PYTHONPATH=tests python -m builders.delivery_model` prints all configurations with the number of states.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import pytest
@@ -16,8 +14,6 @@ from builders.delivery_model.scenarios import (
     REMOVALS,
     SCENARIOS,
     WITH_SHARED_ORIGIN,
-    Removal,
-    Scenario,
     hostile,
     hostile_with_origin,
     restore,
@@ -27,7 +23,7 @@ from builders.delivery_model.search import explore
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda scenario: scenario.__name__)
-def test_all_states_satisfy_the_invariants(scenario: Scenario) -> None:
+def test_all_states_satisfy_the_invariants(scenario):
     result = explore(scenario(NEW))
     print(f"{scenario.__name__}: {result}")
     assert not result.violation, str(result)
@@ -36,18 +32,18 @@ def test_all_states_satisfy_the_invariants(scenario: Scenario) -> None:
 @pytest.mark.system
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("scenario", LARGE_SCENARIOS, ids=lambda scenario: scenario.__name__)
-def test_all_states_of_larger_configurations_satisfy_the_invariants(scenario: Scenario) -> None:
+def test_all_states_of_larger_configurations_satisfy_the_invariants(scenario):
     result = explore(scenario(NEW))
     print(f"{scenario.__name__}: {result}")
     assert not result.violation, str(result)
 
 
-def test_peer_with_the_same_key_and_origin_cannot_suppress_records() -> None:
+def test_peer_with_the_same_key_and_origin_cannot_suppress_records():
     result = explore(WITH_SHARED_ORIGIN(NEW), ("I1", "I2", "I3", "I4", "P1"))
     assert not result.violation, str(result)
 
 
-def test_search_finds_the_loss_by_a_peer_that_writes_another_key() -> None:
+def test_search_finds_the_loss_by_a_peer_that_writes_another_key():
     # A consumer with one window for all keys obeys an invalid record on key H; the record on key A is then lost.
     result = explore(hostile(OLD), "I1")
     print(f"one window for all keys: {result}")
@@ -57,7 +53,7 @@ def test_search_finds_the_loss_by_a_peer_that_writes_another_key() -> None:
     assert len(result.trace) == 5
 
 
-def test_search_finds_the_silent_loss_by_a_settled_number_of_another_key() -> None:
+def test_search_finds_the_silent_loss_by_a_settled_number_of_another_key():
     # Refused numbers are not remembered here, so that only `settled` of the refused query remains.
     world = replace(hostile(replace(OLD, forget_refused=True)), hostile_records=(JUNK,))
     result = explore(world, "I1")
@@ -68,7 +64,7 @@ def test_search_finds_the_silent_loss_by_a_settled_number_of_another_key() -> No
     assert result.trace[3].endswith("a1 on key A, settled 0: stored")
 
 
-def test_search_finds_the_loss_after_a_restore_from_a_backup() -> None:
+def test_search_finds_the_loss_after_a_restore_from_a_backup():
     result = explore(restore(OLD), "I1")
     print(f"identity without digest: {result}")
     assert result.violation == "I1: record a2 is lost"
@@ -77,7 +73,7 @@ def test_search_finds_the_loss_after_a_restore_from_a_backup() -> None:
 
 
 @pytest.mark.parametrize("removal", REMOVALS, ids=lambda removal: removal.name)
-def test_search_finds_a_violation_without_a_rule(removal: Removal) -> None:
+def test_search_finds_a_violation_without_a_rule(removal):
     result = explore(removal.world, removal.invariant)
     print(f"{removal.name}: {result}")
     assert result.violation.startswith(removal.invariant + ":")
@@ -90,12 +86,12 @@ def test_search_finds_a_violation_without_a_rule(removal: Removal) -> None:
     [hostile_with_origin, restore_large, pytest.param(restore, marks=pytest.mark.system)],
     ids=lambda scenario: scenario.__name__,
 )
-def test_other_rules_protect_when_a_rule_is_missing(rule: str, scenario: Scenario) -> None:
+def test_other_rules_protect_when_a_rule_is_missing(rule, scenario):
     # New origins (I6) depend on the window; the other invariants must hold.
     result = explore(scenario(replace(NEW, **{rule: False})), ("I1", "I2", "I3", "I4"))
     assert not result.violation, str(result)
 
 
-def test_each_rule_is_removed_in_a_test() -> None:
+def test_each_rule_is_removed_in_a_test():
     removed = {name for removal in REMOVALS for name in removal.changes}
     assert removed | set(DEPTH_RULES) == {field.name for field in fields(Rules)}

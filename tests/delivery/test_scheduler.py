@@ -1,9 +1,7 @@
 """Order and timing of chunks with a simulated clock: bandwidth limit, priority, windows, restart."""
 
-from __future__ import annotations
-
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.delivery.protocol import CHUNK_BYTES
@@ -17,25 +15,24 @@ from sonarpost.delivery.scheduler import (
     URGENT_RESERVE,
     WINDOW,
     WINDOW_BYTES,
-    Chunk,
     DeliveryScheduler,
     TokenBucket,
     chunk_bytes_for,
 )
 
 
-def item(seq: int, size: int = 100, priority: int = 6) -> OutboxItem:
+def item(seq, size=100, priority=6):
     return OutboxItem("c2", seq, "k", "", priority, bytes(size), bytes(32), position=seq)
 
 
-def schedule(*items: OutboxItem, bytes_per_s: float | None = None, responding: bool = True) -> DeliveryScheduler:
+def schedule(*items, bytes_per_s=None, responding=True):
     made = DeliveryScheduler(bytes_per_s, 0.0)
     made.probing = not responding
     made.update(items)
     return made
 
 
-def ask(scheduler: DeliveryScheduler, now_s: float = 0.0) -> Chunk:
+def ask(scheduler, now_s=0.0):
     chunk, _ = scheduler.next_chunk(now_s)
     assert chunk is not None
     scheduler.query_sent(chunk, now_s)
@@ -45,12 +42,12 @@ def ask(scheduler: DeliveryScheduler, now_s: float = 0.0) -> Chunk:
 class SlowLink:
     """Sends the scheduled chunks over a link of a given rate; each reply arrives when its chunk is transmitted."""
 
-    def __init__(self, scheduler: DeliveryScheduler) -> None:
+    def __init__(self, scheduler):
         self.scheduler = scheduler
         self.now_s = 0.0
-        self.sent: list[tuple[float, int, int]] = []
+        self.sent = []
 
-    def step(self) -> bool:
+    def step(self):
         chunk, wait_s = self.scheduler.next_chunk(self.now_s)
         if chunk is None:
             if wait_s is None:
@@ -67,14 +64,13 @@ class SlowLink:
             self.scheduler.confirm(chunk, chunk.end)
         return True
 
-    def run(self, until_s: float = 1e9) -> None:
+    def run(self, until_s=1e9):
         while self.now_s < until_s and self.step():
             pass
 
 
 @given(st.floats(50, 200_000), st.lists(st.integers(0, 60_000), min_size=1, max_size=8))
-@settings(max_examples=60)
-def test_bandwidth_limit_is_kept_and_fully_used(bytes_per_s: float, sizes: list[int]) -> None:
+def test_bandwidth_limit_is_kept_and_fully_used(bytes_per_s, sizes):
     link = SlowLink(schedule(*(item(n, size) for n, size in enumerate(sizes, 1)), bytes_per_s=bytes_per_s))
     link.run()
     assert sum(size for _, _, size in link.sent) == sum(sizes)
@@ -88,8 +84,7 @@ def test_bandwidth_limit_is_kept_and_fully_used(bytes_per_s: float, sizes: list[
 
 
 @given(st.floats(100, 50_000), st.floats(0.0, 30.0))
-@settings(max_examples=40)
-def test_urgent_record_waits_for_the_chunk_in_progress_only(bytes_per_s: float, at_s: float) -> None:
+def test_urgent_record_waits_for_the_chunk_in_progress_only(bytes_per_s, at_s):
     link = SlowLink(schedule(*(item(n, 30_000) for n in range(1, 9)), bytes_per_s=bytes_per_s))
     link.run(until_s=at_s)
     scheduler = link.scheduler
@@ -101,7 +96,7 @@ def test_urgent_record_waits_for_the_chunk_in_progress_only(bytes_per_s: float, 
     assert scheduler.chunk_bytes <= max(bytes_per_s * CHUNK_S, MIN_CHUNK_BYTES)
 
 
-def test_urgent_records_are_charged_to_the_limit() -> None:
+def test_urgent_records_are_charged_to_the_limit():
     scheduler = schedule(item(1, 10_000), bytes_per_s=1000)
     for seq in range(10, 20):
         scheduler.update([item(seq, 500, priority=1), item(1, 10_000)])
@@ -116,15 +111,14 @@ def test_urgent_records_are_charged_to_the_limit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("bytes_per_s", "expected"),
-    [(None, CHUNK_BYTES), (100, MIN_CHUNK_BYTES), (2000, 1000), (10_000_000, CHUNK_BYTES)],
+    ("bytes_per_s", "expected"), [(None, CHUNK_BYTES), (100, MIN_CHUNK_BYTES), (2000, 1000), (10_000_000, CHUNK_BYTES)]
 )
-def test_chunks_last_half_a_second(bytes_per_s: float | None, expected: int) -> None:
+def test_chunks_last_half_a_second(bytes_per_s, expected):
     assert chunk_bytes_for(bytes_per_s) == expected
 
 
 @given(st.lists(st.tuples(st.integers(1, 7), st.integers(0, 3)), min_size=1, max_size=20))
-def test_order_is_priority_then_position(wanted: list[tuple[int, int]]) -> None:
+def test_order_is_priority_then_position(wanted):
     scheduler = schedule(
         *(
             OutboxItem("c2", seq, "k", "", priority, b"x", bytes(32), position=place)
@@ -136,7 +130,7 @@ def test_order_is_priority_then_position(wanted: list[tuple[int, int]]) -> None:
     assert scheduler.next_chunk(0.0) == (None, None)
 
 
-def test_one_query_and_few_records_until_the_first_reply() -> None:
+def test_one_query_and_few_records_until_the_first_reply():
     scheduler = schedule(*(item(n) for n in range(1, 9)), responding=False)
     assert scheduler.lookahead == PROBE_WINDOW
     first = ask(scheduler)
@@ -147,7 +141,7 @@ def test_one_query_and_few_records_until_the_first_reply() -> None:
     assert ask(scheduler).transfer.item.seq == 2
 
 
-def test_full_window_has_a_reserve_for_urgent_records() -> None:
+def test_full_window_has_a_reserve_for_urgent_records():
     scheduler = schedule(*(item(n) for n in range(1, WINDOW + 1)))
     for _ in range(WINDOW - URGENT_RESERVE):
         ask(scheduler)
@@ -156,10 +150,10 @@ def test_full_window_has_a_reserve_for_urgent_records() -> None:
     assert ask(scheduler).transfer.item.seq == 999
 
 
-def test_bytes_in_flight_follow_the_reply_time() -> None:
+def test_bytes_in_flight_follow_the_reply_time():
     scheduler = schedule(*(item(n, 40 * CHUNK_BYTES) for n in range(1, 9)))
 
-    def in_flight(reply_after_s: float, rounds: int) -> int:
+    def in_flight(reply_after_s, rounds):
         now_s, most = 0.0, 0
         for _ in range(rounds):
             chunks = []
@@ -177,7 +171,7 @@ def test_bytes_in_flight_follow_the_reply_time() -> None:
     assert in_flight(2.0, 3) <= WINDOW_BYTES
 
 
-def test_bytes_in_flight_on_a_slow_link_fit_the_query_timeout() -> None:
+def test_bytes_in_flight_on_a_slow_link_fit_the_query_timeout():
     scheduler = schedule(item(1, 60_000), bytes_per_s=1000)
     for now_s in range(0, 40, 10):
         while scheduler.next_chunk(now_s)[0] is not None:
@@ -185,7 +179,7 @@ def test_bytes_in_flight_on_a_slow_link_fit_the_query_timeout() -> None:
     assert sum(size for size in [scheduler.active[1].sent]) <= 2 * 1000
 
 
-def test_equal_replies_rewind_a_transfer_once() -> None:
+def test_equal_replies_rewind_a_transfer_once():
     """Three chunks in flight, none accepted: the three equal replies rewind the transfer once."""
     scheduler = schedule(item(1, 5 * CHUNK_BYTES))
     chunks = [ask(scheduler) for _ in range(3)]
@@ -200,7 +194,7 @@ def test_equal_replies_rewind_a_transfer_once() -> None:
     assert ask(scheduler).start == 4 * CHUNK_BYTES
 
 
-def test_restart_continues_at_the_confirmed_offset() -> None:
+def test_restart_continues_at_the_confirmed_offset():
     scheduler = schedule(item(1, 3 * CHUNK_BYTES), item(2))
     chunks = [ask(scheduler) for _ in range(4)]
     scheduler.query_ended(chunks[0], 0.0)
@@ -214,7 +208,7 @@ def test_restart_continues_at_the_confirmed_offset() -> None:
     ]
 
 
-def test_update_removes_transfers_that_are_not_in_flight() -> None:
+def test_update_removes_transfers_that_are_not_in_flight():
     scheduler = schedule(item(1), item(2))
     ask(scheduler)
     scheduler.update([item(3, priority=1)])
@@ -222,7 +216,7 @@ def test_update_removes_transfers_that_are_not_in_flight() -> None:
 
 
 @given(st.floats(1, 1e6), st.floats(1, 1e5), st.lists(st.tuples(st.floats(0, 10), st.integers(0, 10_000)), max_size=30))
-def test_token_bucket_never_exceeds_burst_and_rate(rate: float, burst: float, takes: list[tuple[float, int]]) -> None:
+def test_token_bucket_never_exceeds_burst_and_rate(rate, burst, takes):
     bucket = TokenBucket(rate, burst, 0.0)
     now_s, taken, largest = 0.0, 0, 0
     for pause_s, size in takes:
@@ -233,7 +227,7 @@ def test_token_bucket_never_exceeds_burst_and_rate(rate: float, burst: float, ta
         assert taken <= burst + rate * now_s + largest + 1e-6 * (taken + burst + rate * (now_s + 1))
 
 
-def test_token_bucket_ignores_a_clock_that_goes_back() -> None:
+def test_token_bucket_ignores_a_clock_that_goes_back():
     bucket = TokenBucket(10, 10, 100.0)
     bucket.take(10, 100.0)
     assert bucket.wait_s(10, 50.0) == pytest.approx(1.0)
@@ -245,10 +239,7 @@ def test_token_bucket_ignores_a_clock_that_goes_back() -> None:
     st.integers(0, 40),
     st.one_of(st.none(), st.floats(500, 100_000)),
 )
-@settings(max_examples=80)
-def test_batches_keep_order_key_priority_and_chunk_size(
-    records: list[tuple[int, int, str]], takes: int, bytes_per_s: float | None
-) -> None:
+def test_batches_keep_order_key_priority_and_chunk_size(records, takes, bytes_per_s):
     items = [
         OutboxItem("c2", seq, key, "", priority, bytes(size), bytes(32), position=seq)
         for seq, (size, priority, key) in enumerate(records, 1)
@@ -256,7 +247,7 @@ def test_batches_keep_order_key_priority_and_chunk_size(
     scheduler = schedule(*items, bytes_per_s=bytes_per_s)
     scheduler.max_batch = takes
     now_s = charged = 0.0
-    sent: list[Chunk] = []
+    sent = []
     while scheduler.active:
         chunk, wait_s = scheduler.next_chunk(now_s)
         if chunk is None:
@@ -287,7 +278,7 @@ def test_batches_keep_order_key_priority_and_chunk_size(
     assert sum(p.size for p in sent) == sum(len(i.payload) for i in items)
 
 
-def test_restart_disables_batches_until_announced_again() -> None:
+def test_restart_disables_batches_until_announced_again():
     scheduler = schedule(item(1), item(2), item(3))
     scheduler.max_batch = 3
     first = ask(scheduler)

@@ -1,10 +1,7 @@
 """Random sequences of faults with the real store, outbox and inbox: invariants of `docs/specifications/delivery.md`."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
-import sqlite3
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,7 +9,7 @@ from unittest import mock
 
 import msgpack
 import pytest
-from builders.delivery_machine import Delivery, SentQuery, query_of
+from builders.delivery_machine import Delivery, query_of
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -48,7 +45,7 @@ class DeliveryFaults(RuleBasedStateMachine):
     """Faults of producers, consumer, network and a peer that may write to other keys and has all origins."""
 
     @initialize()
-    def start(self) -> None:
+    def start(self):
         # In memory where possible: opening a store flushes its files.
         memory = Path("/dev/shm")
         self.folder = Path(tempfile.mkdtemp(prefix="delivery-", dir=memory if memory.is_dir() else None))
@@ -56,7 +53,7 @@ class DeliveryFaults(RuleBasedStateMachine):
         self.restores = [0, 0]
         self.hostile_serial = 100
 
-    def teardown(self) -> None:
+    def teardown(self):
         if not hasattr(self, "delivery"):
             return
         try:
@@ -68,53 +65,53 @@ class DeliveryFaults(RuleBasedStateMachine):
             shutil.rmtree(self.folder)
 
     @property
-    def sent(self) -> list[SentQuery]:
+    def sent(self):
         return self.delivery.network.sent
 
     # Producers
 
     @rule(which=WHICH, second=st.booleans(), count=st.integers(1, 4), valid=st.integers(0, 9))
-    def queue(self, which: int, second: bool, count: int, valid: int) -> None:
+    def queue(self, which, second, count, valid):
         for _ in range(count):
             self.delivery.queue(which, PRODUCER_KEYS[which][second], 100, valid=valid > 0)
 
     @rule(which=WHICH, second=st.booleans(), size_bytes=st.sampled_from([32768, 32769, 70_000]))
-    def queue_large(self, which: int, second: bool, size_bytes: int) -> None:
+    def queue_large(self, which, second, size_bytes):
         self.delivery.queue(which, PRODUCER_KEYS[which][second], size_bytes)
 
     @rule(which=WHICH, topic=st.sampled_from(["t1", "t2"]))
-    def queue_edition(self, which: int, topic: str) -> None:
+    def queue_edition(self, which, topic):
         self.delivery.queue(which, PRODUCER_KEYS[which][0], 100, topic=topic)
 
     @rule(which=WHICH)
-    def send(self, which: int) -> None:
+    def send(self, which):
         self.delivery.producers[which].send()
 
     @rule(which=WHICH)
-    def use_replies(self, which: int) -> None:
+    def use_replies(self, which):
         self.delivery.producers[which].use_replies()
 
     @rule(which=WHICH)
-    def remove_acknowledged(self, which: int) -> None:
+    def remove_acknowledged(self, which):
         self.delivery.producers[which].sender._remove_acknowledged()
 
     @rule(which=WHICH)
-    def kill_producer(self, which: int) -> None:
+    def kill_producer(self, which):
         self.delivery.kill_producer(which)
 
     @rule(which=WHICH)
-    def back_up(self, which: int) -> None:
+    def back_up(self, which):
         self.delivery.back_up(which)
 
     @precondition(lambda self: any(producer.backup for producer in self.delivery.producers))
     @rule(which=WHICH)
-    def restore(self, which: int) -> None:
+    def restore(self, which):
         if self.delivery.producers[which].backup is not None and self.restores[which] < MAX_RESTORES:
             self.restores[which] += 1
             self.delivery.restore(which)
 
     @rule(which=WHICH, lost=st.booleans())
-    def exchange(self, which: int, lost: bool) -> None:
+    def exchange(self, which, lost):
         """Send, receive and reply without a fault; the process may be killed before it uses the replies."""
         producer, already = self.delivery.producers[which], len(self.sent)
         producer.send()
@@ -130,7 +127,7 @@ class DeliveryFaults(RuleBasedStateMachine):
             producer.sender._remove_acknowledged()
 
     @rule(which=WHICH, second=st.booleans(), before=st.integers(0, 2), after=st.integers(1, 3))
-    def restore_after_deliveries(self, which: int, second: bool, before: int, after: int) -> None:
+    def restore_after_deliveries(self, which, second, before, after):
         if self.restores[which] == MAX_RESTORES:
             return
         for _ in range(before):
@@ -146,35 +143,35 @@ class DeliveryFaults(RuleBasedStateMachine):
 
     @precondition(lambda self: self.sent)
     @rule(chosen=st.lists(ANY, min_size=1, max_size=6))
-    def deliver_any(self, chosen: list[int]) -> None:
+    def deliver_any(self, chosen):
         self.delivery.receive([self.sent[number % len(self.sent)] for number in chosen])
 
     @precondition(lambda self: self.sent)
     @rule(count=st.integers(1, 8))
-    def deliver_latest(self, count: int) -> None:
+    def deliver_latest(self, count):
         self.delivery.receive(self.sent[-count:])
 
     @precondition(lambda self: self.sent)
     @rule(count=st.integers(1, 12))
-    def reply_in_order(self, count: int) -> None:
+    def reply_in_order(self, count):
         open_queries = [q for q in self.sent if q.handler.reply is None and not q.handler.timed_out]
         for query in [q for q in open_queries if q.replies][:count]:
             query.handler.reply = query.replies[0]
 
     @precondition(lambda self: self.sent)
     @rule(number=ANY)
-    def lose_reply(self, number: int) -> None:
+    def lose_reply(self, number):
         query = self.sent[number % len(self.sent)]
         query.handler.timed_out = query.handler.reply is None
 
     # Consumer
 
     @rule()
-    def kill_consumer(self) -> None:
+    def kill_consumer(self):
         self.delivery.kill_consumer()
 
     @rule(limit=st.integers(1, 5))
-    def handle(self, limit: int) -> None:
+    def handle(self, limit):
         self.delivery.handle(limit)
 
     # A peer that may write to its own keys only. It has the origins, which watchers do not receive.
@@ -188,18 +185,9 @@ class DeliveryFaults(RuleBasedStateMachine):
         own_origin=st.one_of(st.none(), st.integers(0, 9)),
         with_producer=st.booleans(),
     )
-    def attack(
-        self,
-        key: str,
-        number: int,
-        seq_from: str,
-        settled_below_seq: bool,
-        content: str,
-        own_origin: int | None,
-        with_producer: bool,
-    ) -> None:
+    def attack(self, key, number, seq_from, settled_below_seq, content, own_origin, with_producer):
         origin, seq, payload = bytes([number % 5]) * 16, 1, b"x"
-        companions: list[SentQuery] = []
+        companions = []
         if self.sent:
             seen = self.sent[number % len(self.sent)]
             fields = msgpack.unpackb(seen.attached)
@@ -234,7 +222,7 @@ class DeliveryFaults(RuleBasedStateMachine):
             self.delivery.receive([query, *companions])
 
     @rule(key=st.sampled_from(HOSTILE_KEYS), more=st.integers(1, 3))
-    def send_from_many_origins(self, key: str, more: int) -> None:
+    def send_from_many_origins(self, key, more):
         """Fill the windows of a writer, then use new ones together with those that were used least recently."""
         limit = duplicate_window.MAX_WINDOWS
         for origins in (range(limit), [*range(limit, limit + more), *range(limit)]):
@@ -248,7 +236,7 @@ class DeliveryFaults(RuleBasedStateMachine):
 
     @precondition(lambda self: self.sent)
     @rule(number=ANY)
-    def attack_same_key(self, number: int) -> None:
+    def attack_same_key(self, number):
         """Send other bytes under the identity of a producer's record, on its own key."""
         seen = self.sent[number % len(self.sent)]
         fields = msgpack.unpackb(seen.attached)
@@ -260,12 +248,12 @@ class DeliveryFaults(RuleBasedStateMachine):
         assert (after[0], after[2]) == (windows, inbox)  # with the origin, it can interrupt a transfer in chunks
 
     @invariant()
-    def invariants_hold(self) -> None:
+    def invariants_hold(self):
         if hasattr(self, "delivery"):
             self.delivery.check()
 
 
-def run(max_examples: int, steps: int, *, derandomize: bool, only_generate: bool = False) -> None:
+def run(max_examples, steps, *, derandomize, only_generate=False):
     profile = settings(
         max_examples=max_examples,
         stateful_step_count=steps,
@@ -280,17 +268,17 @@ def run(max_examples: int, steps: int, *, derandomize: bool, only_generate: bool
         run_state_machine_as_test(DeliveryFaults, settings=profile)
 
 
-def test_random_faults_keep_the_invariants() -> None:
+def test_random_faults_keep_the_invariants():
     run(max_examples=25, steps=40, derandomize=True)
 
 
 @pytest.mark.system
 @pytest.mark.timeout(3600)
-def test_many_random_faults_keep_the_invariants() -> None:
+def test_many_random_faults_keep_the_invariants():
     run(max_examples=500, steps=60, derandomize=False)
 
 
-def contains_number(window: DuplicateWindow, seq: int, sha256: bytes) -> bool:
+def contains_number(window, seq, sha256):
     """Compare numbers only, as a consumer without digests does."""
     del sha256
     sql = "SELECT 1 FROM received WHERE window = ? AND seq = ?"
@@ -300,7 +288,7 @@ def contains_number(window: DuplicateWindow, seq: int, sha256: bytes) -> bool:
 original_init = DuplicateWindow.__init__
 
 
-def init_for_all_keys(window: DuplicateWindow, connection: sqlite3.Connection, key: str, origin: bytes) -> None:
+def init_for_all_keys(window, connection, key, origin):
     """Use one window for all keys."""
     del key
     original_init(window, connection, "all", origin)
@@ -313,6 +301,6 @@ def init_for_all_keys(window: DuplicateWindow, connection: sqlite3.Connection, k
         pytest.param("__init__", init_for_all_keys, id="one window for all keys"),
     ],
 )
-def test_random_faults_find_a_defect(method: str, replacement: object) -> None:
+def test_random_faults_find_a_defect(method, replacement):
     with mock.patch.object(DuplicateWindow, method, replacement), pytest.raises(AssertionError, match=r"I[1-4]: "):
         run(max_examples=200, steps=40, derandomize=True, only_generate=True)

@@ -1,15 +1,12 @@
 """Chunks of large records in the durable store: any order, repeated, lost, damaged, too many."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import random
 import time
 
-import pytest
 from builders.store_steps import ORIGIN
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.delivery import partial_records
@@ -20,31 +17,28 @@ KEY = "sonarpost/v1/shore/inbox/vessel-1"
 OTHER_KEY = "sonarpost/v1/shore/inbox/vessel-2"
 
 
-def chunks(data: bytes, *cuts: int, seq: int = 1, origin: bytes = ORIGIN) -> list[ReceivedChunk]:
+def chunks(data, *cuts, seq=1, origin=ORIGIN):
     sha = hashlib.sha256(data).digest()
     edges = [0, *cuts, len(data)]
     return [ReceivedChunk(origin, seq, len(data), sha, a, data[a:b]) for a, b in itertools.pairwise(edges)]
 
 
-def add(store: Store, chunk: ReceivedChunk, key: str = KEY) -> bytes | int:
+def add(store, chunk, key=KEY):
     with store.transaction() as tx:
         return tx.add_chunk(key, chunk)
 
 
-def partials(store: Store) -> int:
+def partials(store):
     return len(store._query("SELECT 1 FROM partial"))
 
 
 @given(data=st.binary(min_size=1, max_size=60), seed=st.integers(0, 2**32))
-@settings(max_examples=30)
-def test_chunks_in_any_order_and_number_complete_the_record(
-    tmp_path_factory: pytest.TempPathFactory, data: bytes, seed: int
-) -> None:
+def test_chunks_in_any_order_and_number_complete_the_record(tmp_path_factory, data, seed):
     """Behave like a producer: repeat or lose chunks, continue at the requested offset."""
     folder, chance = tmp_path_factory.mktemp("chunks"), random.Random(seed)
     store = Store(folder / "s.db")
     sha = hashlib.sha256(data).digest()
-    offset: bytes | int = 0
+    offset = 0
     for _ in range(1000):
         assert isinstance(offset, int)
         if chance.random() < 0.2:
@@ -61,7 +55,7 @@ def test_chunks_in_any_order_and_number_complete_the_record(
     store.close()
 
 
-def test_chunk_out_of_order_returns_the_required_offset(store: Store) -> None:
+def test_chunk_out_of_order_returns_the_required_offset(store):
     first, second, third = chunks(b"0123456789", 4, 8)
     assert add(store, second) == 0
     assert add(store, first) == 4
@@ -71,13 +65,13 @@ def test_chunk_out_of_order_returns_the_required_offset(store: Store) -> None:
     assert add(store, third) == b"0123456789"
 
 
-def test_chunks_of_two_records_do_not_mix(store: Store) -> None:
+def test_chunks_of_two_records_do_not_mix(store):
     a, b = chunks(b"aaaa", 2), chunks(b"bbbb", 2, seq=2)
     assert add(store, a[0]) == add(store, b[0]) == 2
     assert (add(store, a[1]), add(store, b[1])) == (b"aaaa", b"bbbb")
 
 
-def test_other_record_with_the_same_number_does_not_disturb_the_transfer(store: Store) -> None:
+def test_other_record_with_the_same_number_does_not_disturb_the_transfer(store):
     first, second = chunks(b"old record", 5), chunks(b"new record", 5)
     assert add(store, first[0]) == 5
     assert add(store, second[1]) == 0
@@ -88,7 +82,7 @@ def test_other_record_with_the_same_number_does_not_disturb_the_transfer(store: 
     assert add(store, first[1], OTHER_KEY) == b"old record"
 
 
-def test_complete_record_deletes_its_chunks_only_with_the_right_digest(store: Store) -> None:
+def test_complete_record_deletes_its_chunks_only_with_the_right_digest(store):
     first, second = chunks(b"0123456789", 5)
     assert add(store, first) == 5
     forged = ReceivedChunk(ORIGIN, 1, first.size, first.sha256, 0, b"x" * first.size)
@@ -100,7 +94,7 @@ def test_complete_record_deletes_its_chunks_only_with_the_right_digest(store: St
     assert partials(store) == 0
 
 
-def test_damaged_record_restarts_the_transfer(store: Store) -> None:
+def test_damaged_record_restarts_the_transfer(store):
     first, second = chunks(b"0123456789", 5)
     bad = ReceivedChunk(ORIGIN, 1, first.size, first.sha256, 0, b"0x234")
     assert add(store, bad) == 5
@@ -110,7 +104,7 @@ def test_damaged_record_restarts_the_transfer(store: Store) -> None:
     assert add(store, second) == b"0123456789"
 
 
-def test_only_the_most_recent_records_of_a_writer_are_kept(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_most_recent_records_of_a_writer_are_kept(store, monkeypatch):
     monkeypatch.setattr(partial_records, "MAX_WRITER_RECORDS", 3)
     firsts = {seq: chunks(b"0123456789", 4, seq=seq) for seq in range(1, 5)}
     for seq in (1, 2, 3):
@@ -123,7 +117,7 @@ def test_only_the_most_recent_records_of_a_writer_are_kept(store: Store, monkeyp
     assert add(store, firsts[1][1]) == b"0123456789"
 
 
-def test_size_of_incomplete_records_of_a_writer_is_limited(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_size_of_incomplete_records_of_a_writer_is_limited(store, monkeypatch):
     monkeypatch.setattr(partial_records, "MAX_WRITER_BYTES", 100)
     other = chunks(bytes(200), 90)
     assert add(store, other[0], OTHER_KEY) == 90
@@ -133,7 +127,7 @@ def test_size_of_incomplete_records_of_a_writer_is_limited(store: Store, monkeyp
     assert add(store, other[1], OTHER_KEY) == bytes(200)
 
 
-def test_origin_with_many_bytes_loses_its_records_first(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_origin_with_many_bytes_loses_its_records_first(store, monkeypatch):
     """On one key, a flood of incomplete records does not interrupt the transfer of another origin."""
     monkeypatch.setattr(partial_records, "MAX_WRITER_RECORDS", 4)
     first, second = chunks(b"0123456789", 4)
@@ -144,7 +138,7 @@ def test_origin_with_many_bytes_loses_its_records_first(store: Store, monkeypatc
     assert add(store, second) == b"0123456789"
 
 
-def test_many_names_below_one_prefix_count_as_one_writer(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_names_below_one_prefix_count_as_one_writer(store, monkeypatch):
     """A console may write below tasking under any name; the total limit then affects its own records only."""
     monkeypatch.setattr(partial_records, "MAX_RECORDS", 6)
     monkeypatch.setattr(partial_records, "MAX_WRITER_RECORDS", 5)
@@ -157,7 +151,7 @@ def test_many_names_below_one_prefix_count_as_one_writer(store: Store, monkeypat
     assert add(store, second) == bytes(100)
 
 
-def test_total_limit_deletes_records_of_the_largest_writer(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_total_limit_deletes_records_of_the_largest_writer(store, monkeypatch):
     monkeypatch.setattr(partial_records, "MAX_BYTES", 100)
     small = chunks(bytes(50), 10)
     assert add(store, small[0]) == 10
@@ -167,7 +161,7 @@ def test_total_limit_deletes_records_of_the_largest_writer(store: Store, monkeyp
     assert add(store, small[1]) == bytes(50)
 
 
-def test_incomplete_record_expires(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_incomplete_record_expires(store, monkeypatch):
     now_ns = time.time_ns()
     add(store, chunks(b"0123456789", 4)[0])
     monkeypatch.setattr(time, "time_ns", lambda: now_ns + (partial_records.EXPIRE_AFTER_S + 60) * 1_000_000_000)
@@ -176,7 +170,7 @@ def test_incomplete_record_expires(store: Store, monkeypatch: pytest.MonkeyPatch
     assert store._query("SELECT COUNT(*) FROM partial_piece") == [(1,)]
 
 
-def test_reclaim_deletes_the_records_of_the_largest_writer(store: Store) -> None:
+def test_reclaim_deletes_the_records_of_the_largest_writer(store):
     add(store, chunks(bytes(100), 40)[0])
     add(store, chunks(bytes(100), 60)[0], OTHER_KEY)
     for expected in (60, 40, 0):

@@ -1,7 +1,5 @@
 """File of the durable store: write mode, exclusive use, closed, other versions, other files."""
 
-from __future__ import annotations
-
 import sqlite3
 import subprocess
 import sys
@@ -14,20 +12,20 @@ from sonarpost.delivery.store import Store
 from sonarpost.errors import DeliveryError
 
 
-def test_write_to_a_closed_store_raises(tmp_path: Path) -> None:
+def test_write_to_a_closed_store_raises(tmp_path):
     store = Store(tmp_path / "s.db")
     store.close()
     with pytest.raises(DeliveryError, match="closed"), store.transaction():
         pass
 
 
-def test_commit_waits_for_the_disk(store: Store) -> None:
+def test_commit_waits_for_the_disk(store):
     """FULL (2) makes SQLite wait for the disk at each commit of a write-ahead log; NORMAL (1) does not."""
     assert store._query("PRAGMA synchronous") == [(2,)]
     assert store._query("PRAGMA journal_mode") == [("wal",)]
 
 
-def test_store_is_locked_by_one_process(tmp_path: Path) -> None:
+def test_store_is_locked_by_one_process(tmp_path):
     path = tmp_path / "s.db"
     script = f"from pathlib import Path; from sonarpost.delivery.store import Store; Store(Path({str(path)!r}))"
     store = Store(path)
@@ -39,7 +37,7 @@ def test_store_is_locked_by_one_process(tmp_path: Path) -> None:
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, check=False).returncode == 0
 
 
-def test_other_file_is_rejected_and_unchanged(tmp_path: Path) -> None:
+def test_other_file_is_rejected_and_unchanged(tmp_path):
     path = tmp_path / "s.db"
     path.write_bytes(b"not a database, but another file" * 100)
     before = path.read_bytes()
@@ -50,7 +48,7 @@ def test_other_file_is_rejected_and_unchanged(tmp_path: Path) -> None:
     assert path.read_bytes() == before
 
 
-def test_store_of_another_version_is_rejected(tmp_path: Path) -> None:
+def test_store_of_another_version_is_rejected(tmp_path):
     path = tmp_path / "s.db"
     Store(path).close()
     with sqlite3.connect(path) as db:
@@ -60,7 +58,7 @@ def test_store_of_another_version_is_rejected(tmp_path: Path) -> None:
         Store(path)
 
 
-def test_error_names_a_path_that_is_not_a_folder(tmp_path: Path) -> None:
+def test_error_names_a_path_that_is_not_a_folder(tmp_path):
     (tmp_path / "s.db").mkdir()
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "s.db", tmp_path / "file" / "s.db"):
@@ -68,18 +66,18 @@ def test_error_names_a_path_that_is_not_a_folder(tmp_path: Path) -> None:
             Store(path)
 
 
-def test_read_from_a_closed_store_raises(tmp_path: Path) -> None:
+def test_read_from_a_closed_store_raises(tmp_path):
     store = Store(tmp_path / "s.db")
     store.close()
     with pytest.raises(DeliveryError, match="closed"):
         queued_items(store, "c", 1)
 
 
-def test_deleted_records_are_not_overwritten_on_disk(store: Store) -> None:
+def test_deleted_records_are_not_overwritten_on_disk(store):
     assert store._query("PRAGMA secure_delete") == [(0,)]
 
 
-def test_store_of_an_older_layout_is_converted_with_its_content(tmp_path: Path) -> None:
+def test_store_of_an_older_layout_is_converted_with_its_content(tmp_path):
     path = tmp_path / "s.db"
     store = Store(path)
     send(store, b"queued")
@@ -102,7 +100,7 @@ def test_store_of_an_older_layout_is_converted_with_its_content(tmp_path: Path) 
     store.close()
 
 
-def test_store_without_space_for_a_conversion_keeps_its_page_size(tmp_path: Path, caplog) -> None:
+def test_store_without_space_for_a_conversion_keeps_its_page_size(tmp_path, caplog):
     path = tmp_path / "s.db"
     store = Store(path)
     send(store, b"queued")

@@ -1,20 +1,15 @@
 """Inbox of the durable store: duplicates, persistence until handled, limits of a read."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 from builders.store_steps import record
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.delivery import duplicate_window
-from sonarpost.delivery.records import ReceivedChunk
 from sonarpost.delivery.store import Store
 
 
-def test_record_stays_in_the_inbox_until_handled(tmp_path: Path) -> None:
+def test_record_stays_in_the_inbox_until_handled(tmp_path):
     store = Store(tmp_path / "s.db")
     with store.transaction() as tx:
         tx.accept("k", b"1")
@@ -40,12 +35,9 @@ ARRIVAL = st.tuples(
 
 
 @given(st.lists(ARRIVAL, max_size=80))
-@settings(max_examples=40)
-def test_record_is_a_duplicate_only_with_the_same_key_origin_number_and_digest(
-    tmp_path_factory: pytest.TempPathFactory, arrivals: list[tuple[str, bytes, int, bytes, int]]
-) -> None:
+def test_record_is_a_duplicate_only_with_the_same_key_origin_number_and_digest(tmp_path_factory, arrivals):
     store = Store(tmp_path_factory.mktemp("seen") / "s.db")
-    accepted: set[tuple[str, bytes, int, bytes]] = set()
+    accepted = set()
     for key, origin, seq, payload, done_up_to in arrivals:
         chunk = record(seq, payload, origin, done_up_to)
         with store.transaction() as tx:
@@ -62,23 +54,23 @@ def test_record_is_a_duplicate_only_with_the_same_key_origin_number_and_digest(
     store.close()
 
 
-def receive(store: Store, key: str, *chunks: ReceivedChunk) -> None:
+def receive(store, key, *chunks):
     with store.transaction() as tx:
         for chunk in chunks:
             tx.accept(key, chunk.data, chunk)
 
 
-def digests(store: Store) -> set[int]:
+def digests(store):
     return {int(row[0]) for row in store._query("SELECT seq FROM received")}
 
 
-def test_statement_of_the_producer_never_marks_a_number_as_received(store: Store) -> None:
+def test_statement_of_the_producer_never_marks_a_number_as_received(store):
     receive(store, "k", record(1 << 62, b"valid", done_up_to=(1 << 62) - 1))
     with store.transaction() as tx:
         assert not tx.was_received("k", record(1, b"later record"))
 
 
-def test_only_old_digests_below_the_statement_are_deleted(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_old_digests_below_the_statement_are_deleted(store, monkeypatch):
     monkeypatch.setattr(duplicate_window, "KEPT_DIGESTS", 10)
     monkeypatch.setattr(duplicate_window, "PRUNE_EVERY", 20)
     receive(store, "k", *(record(seq, b"x") for seq in range(1, 40)))
@@ -89,7 +81,7 @@ def test_only_old_digests_below_the_statement_are_deleted(store: Store, monkeypa
     assert digests(store) == set(range(56, 66))
 
 
-def test_number_of_digests_is_limited(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_digests_is_limited(store, monkeypatch):
     monkeypatch.setattr(duplicate_window, "MAX_DIGESTS", 30)
     monkeypatch.setattr(duplicate_window, "PRUNE_EVERY", 10)
     for first in range(1, 101, 10):
@@ -98,9 +90,7 @@ def test_number_of_digests_is_limited(store: Store, monkeypatch: pytest.MonkeyPa
     assert 100 in digests(store)
 
 
-def test_window_that_is_displaced_in_its_own_transaction_is_written_again(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_window_that_is_displaced_in_its_own_transaction_is_written_again(store, monkeypatch):
     """Records of other peers in the transaction are not affected."""
     monkeypatch.setattr(duplicate_window, "MAX_WINDOWS", 2)
     for number in (1, 2):
@@ -115,7 +105,7 @@ def test_window_that_is_displaced_in_its_own_transaction_is_written_again(
         assert tx.was_received("k", record(2, b"y", bytes([3]) * 16))
 
 
-def test_least_recently_used_window_of_a_writer_is_deleted(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_least_recently_used_window_of_a_writer_is_deleted(store, monkeypatch):
     """A console that writes under many names and origins does not displace the window of a vessel."""
     monkeypatch.setattr(duplicate_window, "MAX_WINDOWS", 3)
     vessel_key = "sonarpost/v1/shore/inbox/vessel-1"
@@ -132,7 +122,7 @@ def test_least_recently_used_window_of_a_writer_is_deleted(store: Store, monkeyp
 
 
 @pytest.mark.parametrize(("max_bytes", "count"), [(None, 4), (0, 1), (10, 1), (29, 2), (30, 3), (1000, 4)])
-def test_inbox_read_is_limited_in_bytes(store: Store, max_bytes: int | None, count: int) -> None:
+def test_inbox_read_is_limited_in_bytes(store, max_bytes, count):
     with store.transaction() as tx:
         for _ in range(4):
             tx.accept("k", bytes(10))

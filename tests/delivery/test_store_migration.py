@@ -1,10 +1,7 @@
 """Stores of version 2: origins of queued records, numbers that were received."""
 
-from __future__ import annotations
-
 import hashlib
 import sqlite3
-from pathlib import Path
 
 import pytest
 from builders.store_steps import queued_items, record
@@ -40,7 +37,7 @@ INSERT INTO outbox_next VALUES ('c2', 7), ('c2@north', 3), ('empty', 5);
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     path = tmp_path / "s.db"
     old = sqlite3.connect(path)
     old.executescript(VERSION_2)
@@ -56,7 +53,7 @@ def path(tmp_path: Path) -> Path:
     return path
 
 
-def test_queued_records_keep_their_origin_and_new_ones_get_another(path: Path) -> None:
+def test_queued_records_keep_their_origin_and_new_ones_get_another(path):
     for _ in range(2):
         Store(path).close()
     store = Store(path)
@@ -74,7 +71,7 @@ def test_queued_records_keep_their_origin_and_new_ones_get_another(path: Path) -
     store.close()
 
 
-def test_numbers_received_by_version_2_are_not_accepted_again(path: Path) -> None:
+def test_numbers_received_by_version_2_are_not_accepted_again(path):
     store = Store(path)
     with store.transaction() as tx:
         received = [seq for seq in range(1, 15) if tx.was_received("k", record(seq, b"x", PRODUCER))]
@@ -83,7 +80,7 @@ def test_numbers_received_by_version_2_are_not_accepted_again(path: Path) -> Non
     store.close()
 
 
-def test_numbers_that_no_producer_assigned_are_discarded(path: Path) -> None:
+def test_numbers_that_no_producer_assigned_are_discarded(path):
     store = Store(path)
     with store.transaction() as tx:
         assert not tx.was_received("k", record(5, b"x", POISONED))

@@ -1,21 +1,18 @@
 """Outbox of the durable store: consecutive numbers, priority order, quarantine, listeners."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
-from pathlib import Path
 
 import pytest
 from builders.store_steps import fail_within, queued_items, send
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.store import Store
 
 
-def test_queued_record_is_unchanged(store: Store) -> None:
+def test_queued_record_is_unchanged(store):
     assert send(store, b"payload") == [1]
     assert queued_items(store, "c", 9) == (
         OutboxItem("c", 1, "k", "e", 4, b"payload", hashlib.sha256(b"payload").digest()),
@@ -23,7 +20,7 @@ def test_queued_record_is_unchanged(store: Store) -> None:
     assert queued_items(store, "other", 9) == ()
 
 
-def test_numbers_are_consecutive_in_a_queue_and_never_reused(tmp_path: Path) -> None:
+def test_numbers_are_consecutive_in_a_queue_and_never_reused(tmp_path):
     store = Store(tmp_path / "s.db")
     assert send(store, b"1", b"2") == [1, 2]
     assert send(store, b"1", consumer="d") == [1]
@@ -38,7 +35,7 @@ def test_numbers_are_consecutive_in_a_queue_and_never_reused(tmp_path: Path) -> 
     store.close()
 
 
-def test_failed_transaction_uses_no_number(store: Store) -> None:
+def test_failed_transaction_uses_no_number(store):
     with pytest.raises(ZeroDivisionError):
         fail_within(store, lambda tx: tx.send("k", "c", b"lost", encoding="e"))
     assert send(store, b"1") == [1]
@@ -46,8 +43,7 @@ def test_failed_transaction_uses_no_number(store: Store) -> None:
 
 
 @given(st.lists(st.integers(1, 7), max_size=12))
-@settings(max_examples=20)
-def test_queue_order_is_priority_then_age(tmp_path_factory: pytest.TempPathFactory, priorities: list[int]) -> None:
+def test_queue_order_is_priority_then_age(tmp_path_factory, priorities):
     store = Store(tmp_path_factory.mktemp("order") / "s.db")
     for priority in priorities:
         send(store, b"x", priority=priority)
@@ -58,7 +54,7 @@ def test_queue_order_is_priority_then_age(tmp_path_factory: pytest.TempPathFacto
     store.close()
 
 
-def test_two_stores_have_different_origins(tmp_path: Path) -> None:
+def test_two_stores_have_different_origins(tmp_path):
     a, b = Store(tmp_path / "a.db"), Store(tmp_path / "b.db")
     assert a.origin != b.origin
     assert len(a.origin) == len(b.origin) == 16
@@ -71,7 +67,7 @@ def test_two_stores_have_different_origins(tmp_path: Path) -> None:
     b.close()
 
 
-def test_refused_record_is_quarantined_with_its_reason(store: Store) -> None:
+def test_refused_record_is_quarantined_with_its_reason(store):
     send(store, b"bad")
     with store.transaction() as tx:
         tx.quarantine_refused(queued_items(store, "c", 1)[0], "no such record")
@@ -81,7 +77,7 @@ def test_refused_record_is_quarantined_with_its_reason(store: Store) -> None:
     ]
 
 
-def test_quarantine_keeps_the_latest_records_truncated(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quarantine_keeps_the_latest_records_truncated(store, monkeypatch):
     monkeypatch.setattr("sonarpost.delivery.transaction.MAX_QUARANTINED", 5)
     monkeypatch.setattr("sonarpost.delivery.transaction.MAX_QUARANTINED_BYTES", 3)
     for number in range(12):
@@ -92,7 +88,7 @@ def test_quarantine_keeps_the_latest_records_truncated(store: Store, monkeypatch
     assert kept == [b"%02d " % number for number in range(7, 12)]
 
 
-def test_listeners_are_notified_of_commits_only(store: Store) -> None:
+def test_listeners_are_notified_of_commits_only(store):
     event = threading.Event()
     store.add_outbox_listener(event)
     with pytest.raises(ZeroDivisionError):

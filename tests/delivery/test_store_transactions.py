@@ -1,7 +1,5 @@
 """Transactions of the durable store: atomicity after kills and full disks, and with several threads."""
 
-from __future__ import annotations
-
 import itertools
 import random
 import signal
@@ -9,7 +7,6 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import pytest
 from builders.store_steps import fail_within, queued_items, record, send
@@ -17,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import ROWS_PER_STATEMENT, Transaction, UnitOfWork, runs
+from sonarpost.delivery.transaction import ROWS_PER_STATEMENT, UnitOfWork, runs
 from sonarpost.errors import DeliveryError
 
 
-def test_state_is_remembered_replaced_and_forgotten(tmp_path: Path) -> None:
+def test_state_is_remembered_replaced_and_forgotten(tmp_path):
     store = Store(tmp_path / "s.db")
     with store.transaction() as tx:
         tx.put_state("a", b"1")
@@ -40,7 +37,7 @@ def test_state_is_remembered_replaced_and_forgotten(tmp_path: Path) -> None:
     store.close()
 
 
-def test_states_below_a_prefix_are_changed_together_and_read_together(tmp_path: Path) -> None:
+def test_states_below_a_prefix_are_changed_together_and_read_together(tmp_path):
     store = Store(tmp_path / "s.db")
     effects = UnitOfWork()
     effects.put_states("part/", {"a": b"1", "b": b"", "c": b"3"})
@@ -81,7 +78,7 @@ for n in itertools.count(first):
 """
 
 
-def check_complete(path: Path, reported: int) -> None:
+def check_complete(path, reported):
     """Check that all transactions up to `reported` or the next one are complete."""
     store = Store(path)
     assert store._query("PRAGMA integrity_check") == [("ok",)]
@@ -99,7 +96,7 @@ def check_complete(path: Path, reported: int) -> None:
     store.close()
 
 
-def test_killed_process_leaves_complete_transactions_only(tmp_path: Path) -> None:
+def test_killed_process_leaves_complete_transactions_only(tmp_path):
     path, chance = tmp_path / "s.db", random.Random(7)
     for _ in range(6):
         writer = subprocess.Popen(
@@ -115,12 +112,12 @@ def test_killed_process_leaves_complete_transactions_only(tmp_path: Path) -> Non
         check_complete(path, int(complete_lines[-1]) if complete_lines else reported)
 
 
-def test_full_disk_rolls_back_the_transaction_only(store: Store) -> None:
+def test_full_disk_rolls_back_the_transaction_only(store):
     send(store, b"before")
     pages = store._query("PRAGMA page_count")[0][0]
     store._query(f"PRAGMA max_page_count={pages}")
 
-    def write() -> None:
+    def write():
         with store.transaction() as tx:
             tx.put_state("small", b"1")
             tx.accept("k", b"x" * 100_000)
@@ -135,8 +132,8 @@ def test_full_disk_rolls_back_the_transaction_only(store: Store) -> None:
     assert (store.get_state("small"), store.inbox_depth()) == (b"1", 1)
 
 
-def test_threads_write_one_at_a_time(store: Store) -> None:
-    def count() -> None:
+def test_threads_write_one_at_a_time(store):
+    def count():
         for _ in range(25):
             with store.transaction() as tx:
                 tx.put_state("n", str(int(store.get_state("n") or b"0") + 1).encode())
@@ -151,8 +148,8 @@ def test_threads_write_one_at_a_time(store: Store) -> None:
     assert [item.seq for item in queued_items(store, "c", 999)] == list(range(1, 101))
 
 
-def test_transaction_reads_its_own_writes(store: Store) -> None:
-    def write(tx: Transaction) -> None:
+def test_transaction_reads_its_own_writes(store):
+    def write(tx):
         tx.put_state("a", b"1")
         tx.accept("k", b"x", record(3, b"x"))
         assert store.get_state("a") == b"1"
@@ -166,13 +163,13 @@ def test_transaction_reads_its_own_writes(store: Store) -> None:
 
 
 @given(st.sets(st.integers(-50, 50)))
-def test_runs_cover_exactly_the_numbers(numbers: set[int]) -> None:
+def test_runs_cover_exactly_the_numbers(numbers):
     found = list(runs(numbers))
     assert [n for first, last in found for n in range(first, last + 1)] == sorted(numbers)
     assert all(last + 1 < first for (_, last), (first, _) in itertools.pairwise(found))
 
 
-def test_many_records_in_one_transaction_keep_order_and_numbers(store: Store) -> None:
+def test_many_records_in_one_transaction_keep_order_and_numbers(store):
     payloads = [str(n).encode() for n in range(3 * ROWS_PER_STATEMENT + 5)]
     with store.transaction() as tx:
         numbers = [tx.send("k", "c", payload, encoding="") for payload in payloads]
@@ -190,8 +187,8 @@ def test_many_records_in_one_transaction_keep_order_and_numbers(store: Store) ->
     assert [item.payload for item in store.inbox_items(1000)] == payloads[40:]
 
 
-def test_rollback_discards_collected_rows(store: Store) -> None:
-    def fail() -> None:
+def test_rollback_discards_collected_rows(store):
+    def fail():
         with store.transaction() as tx:
             tx.send("k", "c", b"x", encoding="")
             tx.accept("k", b"x", record(1, b"x"))

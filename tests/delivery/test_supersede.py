@@ -1,14 +1,11 @@
 """Editions, quotas and queues of a store, and gaps in the sequence numbers."""
 
-from __future__ import annotations
-
 import hashlib
 import sqlite3
-from pathlib import Path
 
 import pytest
 from builders.store_steps import queued_items
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.delivery.protocol import attachment, parse_query
@@ -17,17 +14,17 @@ from sonarpost.delivery.store import Store
 from sonarpost.errors import PayloadError
 
 
-def send(store: Store, topic: str, edition: int, *, priority: int = 6, queue: str = "c2", size: int = 3) -> int:
+def send(store, topic, edition, *, priority=6, queue="c2", size=3):
     with store.transaction() as tx:
         payload = f"{topic}{edition}".encode().ljust(size, b".")
         return tx.send("k", queue, payload, encoding="", priority=priority, topic=Topic(topic, edition))
 
 
-def queued(store: Store, queue: str = "c2") -> list[str]:
+def queued(store, queue="c2"):
     return [item.payload.decode().rstrip(".") for item in queued_items(store, queue, 99)]
 
 
-def test_newer_edition_inherits_position_and_priority(store: Store) -> None:
+def test_newer_edition_inherits_position_and_priority(store):
     send(store, "a", 1, priority=5)
     send(store, "b", 1, priority=5)
     send(store, "c", 1, priority=6)
@@ -36,7 +33,7 @@ def test_newer_edition_inherits_position_and_priority(store: Store) -> None:
     assert [item.priority for item in queued_items(store, "c2", 9)] == [5, 5, 6]
 
 
-def test_edition_in_flight_and_newest_edition_are_kept(store: Store) -> None:
+def test_edition_in_flight_and_newest_edition_are_kept(store):
     send(store, "a", 1)
     assert store.mark_in_flight("c2", (1,))
     send(store, "a", 2)
@@ -46,13 +43,13 @@ def test_edition_in_flight_and_newest_edition_are_kept(store: Store) -> None:
     assert not store.mark_in_flight("c2", (2,)), "a replaced edition must not be sent"
 
 
-def test_late_older_edition_is_not_queued(store: Store) -> None:
+def test_late_older_edition_is_not_queued(store):
     send(store, "a", 3)
     assert send(store, "a", 2) == 0
     assert queued(store) == ["a3"]
 
 
-def test_queues_and_topics_are_independent(store: Store) -> None:
+def test_queues_and_topics_are_independent(store):
     send(store, "a", 1)
     send(store, "a", 2, queue="c2@shore-2")
     send(store, "b", 5)
@@ -61,13 +58,10 @@ def test_queues_and_topics_are_independent(store: Store) -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(1, 6), st.booleans()), max_size=25))
-@settings(max_examples=40)
-def test_newest_edition_is_sent_for_any_order_of_arrival(
-    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int, bool]]
-) -> None:
+def test_newest_edition_is_sent_for_any_order_of_arrival(tmp_path_factory, steps):
     store = Store(tmp_path_factory.mktemp("editions") / "s.db")
-    newest: dict[str, int] = {}
-    sent: dict[str, set[int]] = {}
+    newest = {}
+    sent = {}
     for topic, edition, take_one in steps:
         send(store, topic, edition)
         newest[topic] = max(newest.get(topic, 0), edition)
@@ -85,7 +79,7 @@ def test_newest_edition_is_sent_for_any_order_of_arrival(
     store.close()
 
 
-def test_quota_drops_least_urgent_then_oldest_and_never_urgent_records(store: Store) -> None:
+def test_quota_drops_least_urgent_then_oldest_and_never_urgent_records(store):
     for seq, (topic, priority) in enumerate([("a", 5), ("b", 6), ("c", 6), ("d", 2), ("e", 5)], 1):
         assert send(store, topic, 1, priority=priority, size=100) == seq
     with store.transaction() as tx:
@@ -96,7 +90,7 @@ def test_quota_drops_least_urgent_then_oldest_and_never_urgent_records(store: St
     assert queued(store) == ["d1"]
 
 
-def test_quota_keeps_records_in_flight(store: Store) -> None:
+def test_quota_keeps_records_in_flight(store):
     send(store, "a", 1, size=100)
     send(store, "b", 1, size=100)
     assert store.mark_in_flight("c2", (1,))
@@ -105,7 +99,7 @@ def test_quota_keeps_records_in_flight(store: Store) -> None:
     assert queued(store) == ["a1"]
 
 
-def test_queue_depth_counts_records_and_bytes(store: Store) -> None:
+def test_queue_depth_counts_records_and_bytes(store):
     assert store.queue_depth("c2").oldest_utc_s is None
     send(store, "a", 1, size=70)
     send(store, "b", 1, size=30)
@@ -114,7 +108,7 @@ def test_queue_depth_counts_records_and_bytes(store: Store) -> None:
     assert depth.oldest_utc_s is not None
 
 
-def test_every_queue_has_its_own_random_origin(store: Store) -> None:
+def test_every_queue_has_its_own_random_origin(store):
     """A renamed site has a new queue that numbers from 1, with the same consumer."""
     with store.transaction() as tx:
         for queue in ("c2", "c2@a", "c2@b"):
@@ -125,7 +119,7 @@ def test_every_queue_has_its_own_random_origin(store: Store) -> None:
     assert {len(origin) for origin in origins} == {16}
 
 
-def test_renewed_origin_applies_to_new_records_only(store: Store) -> None:
+def test_renewed_origin_applies_to_new_records_only(store):
     send(store, "a", 1)
     with store.transaction() as tx:
         tx.renew_origin("c2")
@@ -135,13 +129,13 @@ def test_renewed_origin_applies_to_new_records_only(store: Store) -> None:
     assert old.origin != new.origin
 
 
-def test_origin_of_an_empty_queue_can_be_renewed(store: Store) -> None:
+def test_origin_of_an_empty_queue_can_be_renewed(store):
     with store.transaction() as tx:
         tx.renew_origin("c2")
     assert send(store, "a", 1) == 1
 
 
-def test_number_below_which_nothing_is_queued(store: Store) -> None:
+def test_number_below_which_nothing_is_queued(store):
     for edition in range(1, 8):
         send(store, "a", edition)
     assert store.done_up_to("c2") == 6
@@ -151,10 +145,10 @@ def test_number_below_which_nothing_is_queued(store: Store) -> None:
 
 
 @pytest.mark.parametrize("statement", [1, 2])
-def test_record_queued_during_the_read_is_not_reported_as_done(store: Store, statement: int) -> None:
+def test_record_queued_during_the_read_is_not_reported_as_done(store, statement):
     statements = 0
 
-    def queue_during_read(_: str) -> None:
+    def queue_during_read(_):
         nonlocal statements
         statements += 1
         if statements == statement:
@@ -166,14 +160,14 @@ def test_record_queued_during_the_read_is_not_reported_as_done(store: Store, sta
     assert all(done_up_to < item.seq for item in queued_items(store, "c2", 9))
 
 
-def test_done_up_to_must_be_below_the_sequence_number() -> None:
+def test_done_up_to_must_be_below_the_sequence_number():
     item = OutboxItem("c2", 5, "k", "", 4, b"data", hashlib.sha256(b"data").digest())
     assert parse_query(attachment(b"o" * 16, item, done_up_to=4), b"data", "k").done_up_to == 4
     with pytest.raises(PayloadError, match="settled: got 5, expected a number below seq"):
         parse_query(attachment(b"o" * 16, item, done_up_to=5), b"data", "k")
 
 
-def test_store_of_version_1_is_migrated(tmp_path: Path) -> None:
+def test_store_of_version_1_is_migrated(tmp_path):
     path = tmp_path / "s.db"
     old = sqlite3.connect(path)
     old.executescript(

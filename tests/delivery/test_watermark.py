@@ -1,14 +1,10 @@
 """Side-car of a store: lost commits are found at the next start, and only lost commits."""
 
-from __future__ import annotations
-
 import logging
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from builders.store_steps import fail_within, queued_items, send
@@ -35,7 +31,7 @@ os._exit(0)
 
 
 @pytest.fixture
-def killed(tmp_path: Path) -> Path:
+def killed(tmp_path):
     """Make a store with 30 queued and 3 accepted records in its write-ahead log, whose process was killed."""
     path = tmp_path / "relay.db"
     subprocess.run([sys.executable, "-c", KILLED.format(path=str(path))], check=True)
@@ -43,29 +39,27 @@ def killed(tmp_path: Path) -> Path:
     return path
 
 
-def delete_log(path: Path) -> None:
+def delete_log(path):
     path.with_name(f"{path.name}-wal").unlink()
 
 
-def overwrite_log(path: Path) -> None:
+def overwrite_log(path):
     log = path.with_name(f"{path.name}-wal")
     log.write_bytes(os.urandom(log.stat().st_size))
 
 
-def truncate_store(path: Path) -> None:
+def truncate_store(path):
     delete_log(path)
     path.write_bytes(b"")
 
 
-def delete_store(path: Path) -> None:
+def delete_store(path):
     delete_log(path)
     path.unlink()
 
 
 @pytest.mark.parametrize("damage", [delete_log, overwrite_log, truncate_store, delete_store])
-def test_lost_commits_are_logged_and_reported(
-    killed: Path, damage: Callable[[Path], None], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_lost_commits_are_logged_and_reported(killed, damage, caplog):
     damage(killed)
     store = Store(killed)
     assert store.outbox_depth() == 0
@@ -77,7 +71,7 @@ def test_lost_commits_are_logged_and_reported(
     store.close()
 
 
-def test_report_remains_after_a_restart_and_further_losses_are_added(killed: Path) -> None:
+def test_report_remains_after_a_restart_and_further_losses_are_added(killed):
     delete_store(killed)
     Store(killed).close()
     backup = killed.read_bytes()
@@ -93,7 +87,7 @@ def test_report_remains_after_a_restart_and_further_losses_are_added(killed: Pat
     store.close()
 
 
-def test_numbers_are_not_used_again_after_a_loss(killed: Path) -> None:
+def test_numbers_are_not_used_again_after_a_loss(killed):
     truncate_store(killed)
     store = Store(killed)
     assert send(store, b"new", consumer="c2") == [31]
@@ -101,7 +95,7 @@ def test_numbers_are_not_used_again_after_a_loss(killed: Path) -> None:
     store.close()
 
 
-def test_store_with_its_log_reports_no_loss(killed: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_store_with_its_log_reports_no_loss(killed, caplog):
     store = Store(killed)
     assert store.lost is None
     assert (store.outbox_depth(), store.inbox_depth()) == (30, 3)
@@ -109,7 +103,7 @@ def test_store_with_its_log_reports_no_loss(killed: Path, caplog: pytest.LogCapt
     store.close()
 
 
-def test_delivered_records_are_not_counted_as_lost(tmp_path: Path) -> None:
+def test_delivered_records_are_not_counted_as_lost(tmp_path):
     path = tmp_path / "relay.db"
     store = Store(path)
     for number in range(1, 11):
@@ -125,7 +119,7 @@ def test_delivered_records_are_not_counted_as_lost(tmp_path: Path) -> None:
     store.close()
 
 
-def test_older_side_car_is_no_loss(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_older_side_car_is_no_loss(tmp_path, caplog):
     path = tmp_path / "relay.db"
     side_car = path.with_name(path.name + SUFFIX)
     store = Store(path)
@@ -142,9 +136,7 @@ def test_older_side_car_is_no_loss(tmp_path: Path, caplog: pytest.LogCaptureFixt
 
 
 @pytest.mark.parametrize("content", [b"", b"{}\n", b'{"v":1}\nffffffff\n', b'{"v":2}\n5ded8eb5\n', os.urandom(5000)])
-def test_unreadable_side_car_is_logged_and_written_again(
-    content: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_unreadable_side_car_is_logged_and_written_again(content, tmp_path, caplog):
     path = tmp_path / "relay.db"
     store = Store(path)
     send(store, b"1", consumer="c2")
@@ -159,7 +151,7 @@ def test_unreadable_side_car_is_logged_and_written_again(
     store.close()
 
 
-def test_side_car_is_written_after_each_commit(store: Store) -> None:
+def test_side_car_is_written_after_each_commit(store):
     send(store, b"1", b"2", consumer="a")
     send(store, b"1", consumer="b@shore")
     assert read(store.path) == Marks(queues={"a": Numbers(2, 1), "b@shore": Numbers(1, 1)})
@@ -173,16 +165,14 @@ def test_side_car_is_written_after_each_commit(store: Store) -> None:
     assert read(store.path).inbox == Numbers(3, 2)
 
 
-def test_rolled_back_numbers_are_not_written(store: Store) -> None:
+def test_rolled_back_numbers_are_not_written(store):
     send(store, b"1")
     with pytest.raises(ZeroDivisionError):
         fail_within(store, lambda tx: tx.send("k", "c", b"2", encoding="e"))
     assert read(store.path).queues == {"c": Numbers(1, 1)}
 
 
-def test_side_car_that_cannot_be_written_does_not_stop_the_store(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_side_car_that_cannot_be_written_does_not_stop_the_store(tmp_path, caplog):
     path = tmp_path / "relay.db"
     path.with_name(path.name + SUFFIX).mkdir()
     store = Store(path)
@@ -194,7 +184,7 @@ def test_side_car_that_cannot_be_written_does_not_stop_the_store(
     store.close()
 
 
-def test_compare_counts_only_open_numbers_above_the_store() -> None:
+def test_compare_counts_only_open_numbers_above_the_store():
     side_car = Marks(Numbers(10, 8), {"a": Numbers(100, 91), "b": Numbers(5, 6), "c": Numbers(7, 1)})
     lost = compare(side_car, Marks(Numbers(9, 8), {"a": Numbers(20, 1), "c": Numbers(7, 7)}), 5.0)
     assert lost is not None

@@ -1,9 +1,5 @@
 """Fleet state: ages by the host's clock, validation of sources, limits, expiry."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import pytest
 
 from sonarpost import keys, wire
@@ -12,16 +8,16 @@ from sonarpost.monitoring import fleet as fleet_module
 from sonarpost.monitoring.fleet import FleetTracker
 
 
-def health(platform: str = "uuv-1", service: str = "c2", **changes: Any) -> Health:
+def health(platform="uuv-1", service="c2", **changes):
     fields = {"time_utc_s": 5.0, "started_utc_s": 1.0, "state": "ok", "counters": {}, "gauges": {}}
     return Health(platform_id=platform, service=service, **(fields | changes))
 
 
-def add(fleet: FleetTracker, record: Health, now_s: float, key: str = "") -> None:
+def add(fleet, record, now_s, key=""):
     fleet.add(key or keys.health(record.platform_id, record.service), wire.encode(record), now_s)
 
 
-def test_age_counts_from_arrival() -> None:
+def test_age_counts_from_arrival():
     fleet = FleetTracker()
     add(fleet, health(time_utc_s=4e9), 100.0)
     fleet.set_alive([keys.alive("uuv-1", "c2"), keys.alive("uuv-1", "relay")], 101.0)
@@ -29,7 +25,7 @@ def test_age_counts_from_arrival() -> None:
     assert (c2.age_s, c2.alive, relay.health, relay.age_s, relay.alive) == (3.0, True, None, None, True)
 
 
-def test_liveliness_is_unknown_without_a_router() -> None:
+def test_liveliness_is_unknown_without_a_router():
     fleet = FleetTracker()
     add(fleet, health(), 0.0)
     assert fleet.state(1.0).services[0].alive is None
@@ -50,20 +46,20 @@ def test_liveliness_is_unknown_without_a_router() -> None:
         ("other/v1/uuv-1/health/c2", wire.encode(health())),
     ],
 )
-def test_invalid_record_is_counted_and_dropped(key: str, payload: bytes, caplog: pytest.LogCaptureFixture) -> None:
+def test_invalid_record_is_counted_and_dropped(key, payload, caplog):
     fleet = FleetTracker()
     fleet.add(key, payload, 0.0)
     assert (fleet.state(0.0).services, fleet.state(0.0).rejected) == ((), 1)
     assert "expected" in vars(caplog.records[0])["fields"]["reason"]
 
 
-def test_invalid_tokens_are_ignored() -> None:
+def test_invalid_tokens_are_ignored():
     fleet = FleetTracker()
     fleet.set_alive(["sonarpost/v1/uuv-1/alive/c2", "sonarpost/v1/uuv-1/alive/a/b", "x"], 0.0)
     assert [(s.platform, s.service) for s in fleet.state(0.0).services] == [("uuv-1", "c2")]
 
 
-def test_service_without_a_token_expires() -> None:
+def test_service_without_a_token_expires():
     fleet = FleetTracker(expire_after_s=60.0)
     for service in ("c2", "relay"):
         add(fleet, health(service=service), 0.0)
@@ -73,7 +69,7 @@ def test_service_without_a_token_expires() -> None:
     assert [s.service for s in fleet.state(61.0).services] == ["c2"]
 
 
-def test_number_of_services_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_services_is_limited(monkeypatch):
     monkeypatch.setattr(fleet_module, "MAX_SERVICES", 3)
     fleet = FleetTracker()
     for number in range(5):

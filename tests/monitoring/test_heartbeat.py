@@ -1,29 +1,25 @@
 """Heartbeat file of a service, and the health check that reads it."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from builders.common import eventually
 
-from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.messages import Health, Record
+from sonarpost.config import ServiceConfig
+from sonarpost.messages import Health
 from sonarpost.monitoring import healthcheck, heartbeat
 from sonarpost.monitoring.healthcheck import check, health_problem
 from sonarpost.monitoring.heartbeat import Heartbeat
-from sonarpost.runtime.service import Service, UnitOfWork
+from sonarpost.runtime.service import Service
 
 NOW_S = 1000.0
 
 
-def health(state: str = "ok", detail: str = "", inbox: float = 0, handled: int = 0) -> Health:
+def health(state="ok", detail="", inbox=0, handled=0):
     return Health(
         platform_id="vessel-1",
         service="relay",
@@ -37,48 +33,48 @@ def health(state: str = "ok", detail: str = "", inbox: float = 0, handled: int =
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / "heartbeat.json"
 
 
 @pytest.fixture
-def heart(path: Path, tmp_path: Path) -> Heartbeat:
+def heart(path, tmp_path):
     return Heartbeat(path, tmp_path, 5.0)
 
 
-def test_both_modules_use_the_same_variable() -> None:
+def test_both_modules_use_the_same_variable():
     assert heartbeat.VARIABLE == healthcheck.VARIABLE
 
 
-def test_service_with_a_heartbeat_is_healthy(heart: Heartbeat, path: Path) -> None:
+def test_service_with_a_heartbeat_is_healthy(heart, path):
     heart.beat(health(), NOW_S)
     assert health_problem(path, NOW_S + 1) == ""
     assert check({"SONARPOST_HEARTBEAT": str(path)}, NOW_S + 1) == (0, "healthy")
 
 
-def test_missing_heartbeat_means_not_started(path: Path) -> None:
+def test_missing_heartbeat_means_not_started(path):
     assert "has not started" in health_problem(path, NOW_S)
 
 
-def test_old_heartbeat_means_a_hanging_process(heart: Heartbeat, path: Path) -> None:
+def test_old_heartbeat_means_a_hanging_process(heart, path):
     heart.beat(health(), NOW_S)
     assert health_problem(path, NOW_S + 15.0) == ""
     assert health_problem(path, NOW_S + 15.1).startswith("hangs: last heartbeat 15 s ago")
 
 
-def test_limit_follows_the_heartbeat_interval(path: Path, tmp_path: Path) -> None:
+def test_limit_follows_the_heartbeat_interval(path, tmp_path):
     Heartbeat(path, tmp_path, 60.0).beat(health(), NOW_S)
     assert health_problem(path, NOW_S + 180.0) == ""
     assert health_problem(path, NOW_S + 181.0).startswith("hangs")
 
 
 @pytest.mark.parametrize("state", ["degraded", "stopping"])
-def test_degraded_service_is_unhealthy_with_its_reason(heart: Heartbeat, path: Path, state: str) -> None:
+def test_degraded_service_is_unhealthy_with_its_reason(heart, path, state):
     heart.beat(health(state, "records cannot be stored"), NOW_S)
     assert health_problem(path, NOW_S) == f"{state}: records cannot be stored"
 
 
-def test_waiting_records_without_progress_are_a_stall(heart: Heartbeat, path: Path) -> None:
+def test_waiting_records_without_progress_are_a_stall(heart, path):
     heart.beat(health(inbox=3, handled=1), NOW_S)
     heart.beat(health(inbox=3, handled=1), NOW_S + 1800.0)
     assert health_problem(path, NOW_S + 1800.0) == ""
@@ -88,14 +84,14 @@ def test_waiting_records_without_progress_are_a_stall(heart: Heartbeat, path: Pa
     assert health_problem(path, NOW_S + 1810.0) == ""
 
 
-def test_idle_service_is_not_stalled(heart: Heartbeat, path: Path) -> None:
+def test_idle_service_is_not_stalled(heart, path):
     heart.beat(health(handled=1), NOW_S)
     heart.beat(health(handled=1), NOW_S + 9000.0)
     heart.beat(health(inbox=1, handled=1), NOW_S + 9005.0)
     assert health_problem(path, NOW_S + 9005.0) == ""
 
 
-def test_stall_limit_is_configurable(heart: Heartbeat, path: Path) -> None:
+def test_stall_limit_is_configurable(heart, path):
     heart.beat(health(inbox=1), NOW_S)
     heart.beat(health(inbox=1), NOW_S + 10.0)
     environment = {"SONARPOST_HEARTBEAT": str(path), "SONARPOST_STALLED_AFTER_S": "9"}
@@ -107,15 +103,13 @@ def test_stall_limit_is_configurable(heart: Heartbeat, path: Path) -> None:
     )
 
 
-def test_full_disk_is_reported_before_a_record_fails(
-    heart: Heartbeat, path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_is_reported_before_a_record_fails(heart, path, monkeypatch):
     heart.beat(health(), NOW_S)
     monkeypatch.setattr(healthcheck, "MIN_FREE_BYTES", 1 << 62)
     assert "B free, expected at least" in health_problem(path, NOW_S)
 
 
-def test_error_names_a_missing_store_folder(path: Path, tmp_path: Path) -> None:
+def test_error_names_a_missing_store_folder(path, tmp_path):
     Heartbeat(path, tmp_path / "gone", 5.0).beat(health(), NOW_S)
     assert health_problem(path, NOW_S) == f"{tmp_path / 'gone'}: No such file or directory"
 
@@ -123,19 +117,19 @@ def test_error_names_a_missing_store_folder(path: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"[]", b"{}", b"\xff", b'{"beat_monotonic_s": "x"}', b'{"beat_monotonic_s": []}']
 )
-def test_error_names_an_invalid_heartbeat_file(path: Path, content: bytes) -> None:
+def test_error_names_an_invalid_heartbeat_file(path, content):
     path.write_bytes(content)
     assert str(path) in health_problem(path, NOW_S)
     assert "expected a heartbeat file" in health_problem(path, NOW_S)
 
 
-def test_missing_variable_is_an_error() -> None:
+def test_missing_variable_is_an_error():
     status, line = check({}, NOW_S)
     assert status == 1
     assert line.startswith("SONARPOST_HEARTBEAT is not set")
 
 
-def test_unwritable_heartbeat_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_unwritable_heartbeat_is_logged_once(tmp_path, caplog):
     heart = Heartbeat(tmp_path / "no" / "heartbeat", tmp_path, 5.0)
     heart.beat(health(), NOW_S)
     heart.beat(health(), NOW_S + 5)
@@ -147,13 +141,11 @@ class Idle(Service[ServiceConfig]):
 
     NAME = "relay"
 
-    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+    def handle(self, key, record, effects):
         raise AssertionError(key)
 
 
-def test_command_reports_a_running_service_as_healthy(
-    platform: Callable[[str], PlatformConfig], path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_command_reports_a_running_service_as_healthy(platform, path, monkeypatch):
     monkeypatch.setenv(heartbeat.VARIABLE, str(path))
     service = Idle(platform("vessel-1"), ServiceConfig())
     assert service.start()

@@ -1,13 +1,10 @@
 """Metrics of a fleet, scraped over HTTP and parsed with Prometheus's parser."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
 import sys
 import urllib.request
-from collections.abc import Callable, Iterator
 
 import pytest
 from builders.common import eventually, free_port
@@ -16,7 +13,6 @@ from prometheus_client.openmetrics.exposition import generate_latest as openmetr
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
-from sonarpost.config import PlatformConfig
 from sonarpost.messages import Health
 from sonarpost.monitoring.fleet import FleetState, ServiceStatus
 from sonarpost.monitoring.metrics import MAX_VALUES, FleetCollector, registry_of
@@ -26,9 +22,9 @@ from sonarpost.services.c2.service import C2Service
 Samples = dict[tuple[str, ...], float]
 
 
-def samples(text: str) -> Samples:
+def samples(text):
     """Values by name and label values; a duplicate series is an error."""
-    found: Samples = {}
+    found = {}
     for family in text_string_to_metric_families(text):
         for sample in family.samples:
             key = (
@@ -40,20 +36,20 @@ def samples(text: str) -> Samples:
     return found
 
 
-def health(service: str = "op_modem", **changes: object) -> Health:
+def health(service="op_modem", **changes):
     fields = {"counters": {"frames_received": 7}, "gauges": {"inbox": 2.0, "snr_in_db": -1.5}}
     record = {"platform_id": "vessel-1", "service": service, "time_utc_s": 20.0, "started_utc_s": 10.0, "state": "ok"}
-    return Health(**(record | fields | changes))  # type: ignore[arg-type]
+    return Health(**(record | fields | changes))
 
 
-def scraped(*services: ServiceStatus, connected: bool = True, rejected: int = 0) -> Samples:
+def scraped(*services, connected=True, rejected=0):
     registry = registry_of(FleetCollector(lambda: FleetState(services, connected, rejected), stale_after_s=30.0))
     text = openmetrics(registry).decode()
     assert len(list(parse_openmetrics(text))) > 0  # strict about names, types and order
     return samples(generate_latest(registry).decode())
 
 
-def test_metrics_of_a_service() -> None:
+def test_metrics_of_a_service():
     found = scraped(ServiceStatus("vessel-1", "op_modem", health(), 1.5, True), rejected=3)
     who = ("vessel-1", "op_modem")
     assert found["sonarpost_up", *who] == 1
@@ -73,19 +69,19 @@ def test_metrics_of_a_service() -> None:
     assert found["sonarpost_exporter_records_rejected_total",] == 3
 
 
-def test_stale_values_are_omitted_except_those_for_alerts() -> None:
+def test_stale_values_are_omitted_except_those_for_alerts():
     found = scraped(ServiceStatus("vessel-1", "op_modem", health(), 30.1, False))
     assert {name for name, *who in found if who} == {"sonarpost_up", "sonarpost_health_age_seconds"}
     assert found["sonarpost_up", "vessel-1", "op_modem"] == 0
 
 
-def test_no_liveliness_metric_without_a_router() -> None:
+def test_no_liveliness_metric_without_a_router():
     found = scraped(ServiceStatus("vessel-1", "op_modem", health(), 1.0, None), connected=False)
     assert found["sonarpost_exporter_router_connected",] == 0
     assert not [name for name, *_ in found if name == "sonarpost_up"]
 
 
-def test_invalid_and_excess_names_are_omitted() -> None:
+def test_invalid_and_excess_names_are_omitted():
     hostile = {"a b": 1, 'x{y="z"}': 1, "": 1, "A": 1, "up": 1, "x_total": 1, "n\n# TYPE": 1, "fine": 1}
     many = {f"gauge_{n:04}": 1.0 for n in range(1000)} | {"fine": 2.0}
     found = scraped(ServiceStatus("vessel-1", "op_modem", health(counters=hostile, gauges=many), 1.0, True))
@@ -95,7 +91,7 @@ def test_invalid_and_excess_names_are_omitted() -> None:
 
 
 @pytest.fixture
-def exporter(router: str) -> Iterator[str]:
+def exporter(router):
     """Address of `sonarpost metrics`, run as a process."""
     port = free_port()
     command = [sys.executable, "-m", "sonarpost.cli.main", "metrics", "--router", router, "--port", str(port)]
@@ -105,7 +101,7 @@ def exporter(router: str) -> Iterator[str]:
         assert process.wait(10) == 0
 
 
-def scrape(url: str) -> Samples:
+def scrape(url):
     try:
         with urllib.request.urlopen(url, timeout=120) as reply:
             return samples(reply.read().decode())
@@ -113,9 +109,7 @@ def scrape(url: str) -> Samples:
         return {}
 
 
-def test_running_service_is_scraped_and_its_series_end_with_it(
-    exporter: str, platform: Callable[[str], PlatformConfig], tmp_path: object
-) -> None:
+def test_running_service_is_scraped_and_its_series_end_with_it(exporter, platform, tmp_path):
     service = C2Service(platform("shore-1"), C2Config(out_dir=platform("shore-1").state_dir / "out"))
     assert service.start()
     try:
@@ -131,7 +125,7 @@ def test_running_service_is_scraped_and_its_series_end_with_it(
     assert scrape(exporter)["sonarpost_up", *who] == 0
 
 
-def test_port_in_use_is_reported_in_one_line(exporter: str, router: str) -> None:
+def test_port_in_use_is_reported_in_one_line(exporter, router):
     eventually(lambda: scrape(exporter) != {})
     port = exporter.rpartition(":")[2].removesuffix("/metrics")
     command = [sys.executable, "-m", "sonarpost.cli.main", "metrics", "--router", router, "--port", port]

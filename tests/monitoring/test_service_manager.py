@@ -1,15 +1,11 @@
 """Messages to systemd, received on a socket like systemd's."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from builders.common import free_port
@@ -18,7 +14,7 @@ from sonarpost.monitoring.service_manager import ServiceManager
 
 
 @pytest.fixture
-def manager_socket(tmp_path: Path) -> Iterator[socket.socket]:
+def manager_socket(tmp_path):
     """Return systemd's end of the socket."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
         bound.bind(str(tmp_path / "notify"))
@@ -26,15 +22,15 @@ def manager_socket(tmp_path: Path) -> Iterator[socket.socket]:
         yield bound
 
 
-def sender(tmp_path: Path, interval_s: float = 5.0, **variables: str) -> ServiceManager:
+def sender(tmp_path, interval_s=5.0, **variables):
     return ServiceManager.from_environment({"NOTIFY_SOCKET": str(tmp_path / "notify"), **variables}, interval_s)
 
 
-def received(bound: socket.socket) -> list[str]:
+def received(bound):
     return bound.recv(4096).decode().splitlines()
 
 
-def test_messages_have_the_documented_fields(manager_socket: socket.socket, tmp_path: Path) -> None:
+def test_messages_have_the_documented_fields(manager_socket, tmp_path):
     manager = sender(tmp_path)
     manager.starting("waiting for the router tcp/a:1")
     assert received(manager_socket) == ["STATUS=waiting for the router tcp/a:1"]
@@ -48,21 +44,14 @@ def test_messages_have_the_documented_fields(manager_socket: socket.socket, tmp_
 
 @pytest.mark.parametrize(
     ("watchdog_us", "interval_s", "extended"),
-    [
-        ("60000000", 5.0, []),
-        ("60000000", 60.0, ["WATCHDOG_USEC=180000000"]),
-        ("", 60.0, []),
-        ("never", 60.0, []),
-    ],
+    [("60000000", 5.0, []), ("60000000", 60.0, ["WATCHDOG_USEC=180000000"]), ("", 60.0, []), ("never", 60.0, [])],
 )
-def test_a_watchdog_time_below_the_interval_is_extended(
-    watchdog_us: str, interval_s: float, extended: list[str], manager_socket: socket.socket, tmp_path: Path
-) -> None:
+def test_a_watchdog_time_below_the_interval_is_extended(watchdog_us, interval_s, extended, manager_socket, tmp_path):
     sender(tmp_path, interval_s, WATCHDOG_USEC=watchdog_us).ready("started")
     assert received(manager_socket)[2:] == extended
 
 
-def test_an_abstract_socket_is_supported(tmp_path: Path) -> None:
+def test_an_abstract_socket_is_supported(tmp_path):
     name = f"sonarpost-test-{os.getpid()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
         bound.bind(f"\0{name}")
@@ -70,7 +59,7 @@ def test_an_abstract_socket_is_supported(tmp_path: Path) -> None:
         assert received(bound)[0] == "STOPPING=1"
 
 
-def test_an_absent_manager_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_absent_manager_is_logged_once(tmp_path, caplog):
     manager = sender(tmp_path)
     with caplog.at_level(logging.WARNING):
         manager.alive("ok")
@@ -79,7 +68,7 @@ def test_an_absent_manager_is_logged_once(tmp_path: Path, caplog: pytest.LogCapt
     assert [record.message for record in caplog.records] == ["systemd not notified"]
 
 
-def test_a_router_notifies_systemd(manager_socket: socket.socket, tmp_path: Path) -> None:
+def test_a_router_notifies_systemd(manager_socket, tmp_path):
     command = [sys.executable, "-m", "sonarpost.bus.router", "--listen", f"tcp/127.0.0.1:{free_port()}"]
     environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify")}
     with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as process:

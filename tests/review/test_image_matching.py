@@ -1,7 +1,5 @@
 """Place of an image in an image of more seabed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter

@@ -1,7 +1,5 @@
 """Association of looks: which looks are one object."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import replace
 
@@ -42,8 +40,7 @@ def rate_of_whole_objects(spacing_m, sigma_m, runs=10):
 
 
 @pytest.mark.parametrize(
-    ("spacing_m", "sigma_m", "least"),
-    [(20.0, 1.0, 0.99), (20.0, 3.0, 0.9), (40.0, 5.0, 0.9), (60.0, 10.0, 0.75)],
+    ("spacing_m", "sigma_m", "least"), [(20.0, 1.0, 0.99), (20.0, 3.0, 0.9), (40.0, 5.0, 0.9), (60.0, 10.0, 0.75)]
 )
 def test_rate_of_whole_objects(spacing_m, sigma_m, least):
     assert rate_of_whole_objects(spacing_m, sigma_m) >= least

@@ -1,7 +1,5 @@
 """Score of operators: Pd, false alarms, intervals, groups by received bytes."""
 
-from __future__ import annotations
-
 import pytest
 from scipy.stats import binomtest
 

@@ -1,7 +1,5 @@
 """Images in true metres: shape, gain, scale bar, north."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -23,11 +21,11 @@ NOTHING_MISSING = np.zeros((79, 137), np.bool_)
 NOISE = np.random.default_rng(1).integers(20, 200, (79, 137), dtype=np.uint8)
 
 
-def contact(**fields: object) -> Contact:
+def contact(**fields):
     return Contact.model_validate({"contact_id": "c", "vehicle_id": "uuv-1", **fields})
 
 
-def test_shape_is_that_of_the_seabed() -> None:
+def test_shape_is_that_of_the_seabed():
     found = true_image(NOISE, NOTHING_MISSING, 0.12, 0.03, 900)
     height, width = found.pixels.shape
     assert height == 900
@@ -41,9 +39,7 @@ def test_shape_is_that_of_the_seabed() -> None:
     st.floats(0.01, 2.0),
     st.integers(32, 300),
 )
-def test_every_image_fits_and_is_true_within_a_pixel(
-    shape: tuple[int, int], along_m: float, across_m: float, longest_px: int
-) -> None:
+def test_every_image_fits_and_is_true_within_a_pixel(shape, along_m, across_m, longest_px):
     found = true_image(np.zeros(shape, np.uint8), np.zeros(shape, np.bool_), along_m, across_m, longest_px)
     assert max(found.pixels.shape) == longest_px
     assert found.px_per_m is not None
@@ -51,7 +47,7 @@ def test_every_image_fits_and_is_true_within_a_pixel(
         assert abs(size_px - size_m * found.px_per_m) <= 1
 
 
-def test_square_on_the_seabed_is_drawn_square() -> None:
+def test_square_on_the_seabed_is_drawn_square():
     image = np.zeros((100, 100), np.uint8)
     image[40:45, 30:50] = 255  # 0.5 m by 0.5 m
     found = true_image(image, np.zeros(image.shape, np.bool_), 0.1, 0.025, 1000)
@@ -59,7 +55,7 @@ def test_square_on_the_seabed_is_drawn_square() -> None:
     assert abs(int(bright.any(axis=1).sum()) - int(bright.any(axis=0).sum())) <= 2
 
 
-def test_reduction_is_anti_aliased() -> None:
+def test_reduction_is_anti_aliased():
     stripes = np.zeros((400, 400), np.uint8)
     stripes[:, ::2] = 255
     found = true_image(stripes, np.zeros(stripes.shape, np.bool_), 0.1, 0.1, 50)
@@ -69,14 +65,14 @@ def test_reduction_is_anti_aliased() -> None:
 
 
 @pytest.mark.parametrize("sizes", [(None, 0.1), (0.1, None), (None, None)])
-def test_unknown_scale_keeps_the_shape_of_the_pixels(sizes: tuple[float | None, float | None]) -> None:
+def test_unknown_scale_keeps_the_shape_of_the_pixels(sizes):
     found = true_image(NOISE, NOTHING_MISSING, *sizes, 274)
     assert (found.pixels.shape, found.px_per_m) == ((158, 274), None)
     # The strip says so: it differs from that of a known scale.
     assert not np.array_equal(scale_strip(274, 274, None), scale_strip(274, 274, 20.0))
 
 
-def test_gain_is_that_of_98_percent_of_the_received_pixels() -> None:
+def test_gain_is_that_of_98_percent_of_the_received_pixels():
     image = np.full((10, 100), 51, np.uint8)
     image[:, 50:] = 102
     image[0, 0], image[0, 99] = 0, 255  # 0.1 % each
@@ -92,7 +88,7 @@ def test_gain_is_that_of_98_percent_of_the_received_pixels() -> None:
     )
 
 
-def test_missing_area_is_hatched() -> None:
+def test_missing_area_is_hatched():
     missing = NOTHING_MISSING.copy()
     missing[40:] = True
     found = true_image(NOISE, missing, 0.1, 0.1, 137)
@@ -100,7 +96,7 @@ def test_missing_area_is_hatched() -> None:
     assert len(np.unique(found.pixels[:39])) > 20
 
 
-def test_thumbnail_has_the_shape_of_the_seabed() -> None:
+def test_thumbnail_has_the_shape_of_the_seabed():
     found = thumbnail(NOISE, NOTHING_MISSING, contact(pixel_along_m=0.12, pixel_across_m=0.03))
     assert found.shape == (96, 42)
     assert int(found.max()) - int(found.min()) > 190  # stretched; averaging narrows the range
@@ -108,13 +104,13 @@ def test_thumbnail_has_the_shape_of_the_seabed() -> None:
 
 
 @given(st.floats(0.01, 5000))
-def test_scale_bar_is_a_round_number(width_m: float) -> None:
+def test_scale_bar_is_a_round_number(width_m):
     length_m = bar_length_m(width_m)
     assert f"{length_m:e}"[0] in "125"
     assert width_m * 0.159 < length_m <= width_m * 0.4001
 
 
-def test_scale_bar_has_its_length() -> None:
+def test_scale_bar_has_its_length():
     strip = scale_strip(400, 400, 50.0)  # 8 m wide: a bar of 2 m, 100 px
     row = strip[9, :, 0]
     assert int((row[:60] == 0).sum()) == pytest.approx(52, abs=3)  # the black half and the outline
@@ -132,17 +128,17 @@ def test_scale_bar_has_its_length() -> None:
         (270.0, "starboard", (0, 1)),
     ],
 )
-def test_north(heading_deg: float, channel: str, down_right: tuple[float, float]) -> None:
+def test_north(heading_deg, channel, down_right):
     assert north_in_image(contact(heading_deg=heading_deg, channel=channel)) == pytest.approx(down_right, abs=1e-9)
 
 
-def test_north_is_unknown_without_heading_or_side() -> None:
+def test_north_is_unknown_without_heading_or_side():
     assert north_in_image(None) is None
     assert north_in_image(contact(heading_deg=1.0)) is None
     assert north_in_image(contact(channel="port")) is None
 
 
-def test_lines_are_drawn_at_their_place_in_their_colour() -> None:
+def test_lines_are_drawn_at_their_place_in_their_colour():
     image = true_image(np.zeros((40, 80), np.uint8), np.zeros((40, 80), np.bool_), 0.2, 0.1, 400)
     # The values are at the top, the line is below them.
     drawn = draw_lines(image, [PictureLine("length", (30.0, 20.0), (30.0, 60.0), "4.00 m")])
@@ -152,7 +148,7 @@ def test_lines_are_drawn_at_their_place_in_their_colour() -> None:
     assert (draw_lines(image) == 0).all()
 
 
-def test_mark_points_to_the_contact_and_leaves_it_free() -> None:
+def test_mark_points_to_the_contact_and_leaves_it_free():
     image = true_image(np.zeros((40, 80), np.uint8), np.zeros((40, 80), np.bool_), 0.1, 0.1, 400)
     drawn = draw_lines(image, mark=(10.0, 20.0))[:, :, 0]
     assert drawn[50, 2] == drawn[50, 397] == drawn[2, 100] == drawn[197, 100] == 255

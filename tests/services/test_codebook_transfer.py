@@ -1,7 +1,5 @@
 """Codebooks that a shore site lacks: fetched from the vessel by their identity, refused if they have another one."""
 
-from __future__ import annotations
-
 import msgpack
 import pytest
 from builders.common import eventually
@@ -80,7 +78,7 @@ def test_image_waits_for_its_codebook_and_is_decoded(image, start_c2, send, clie
     assert refused(c2) == []
 
 
-def piece(data: bytes, size: int | None = None) -> bytes:
+def piece(data, size=None):
     return msgpack.packb({"v": 1, "size": len(data) if size is None else size, "data": data})
 
 

@@ -1,7 +1,5 @@
 """From op_modem's record to the shore: decompressor, relay and c2 with coded streams and differences."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sqlite3
@@ -18,7 +16,7 @@ from sonarpost.codec.registry import default_registry
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
-from sonarpost.messages import CodedImage, ImagePart, ReceivedImage, ReconstructedImage, Relayed
+from sonarpost.messages import CodedImage, ImagePart, ReconstructedImage, Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.services.decompressor.config import DecompressorConfig
@@ -36,9 +34,7 @@ def stream(texture):
     return default_registry().create("spiht").encode(texture(), 600)
 
 
-def update(
-    stream: bytes, version: int = 1, number: int = 1, missing: tuple[tuple[int, int], ...] = ()
-) -> ReceivedImage:
+def update(stream, version=1, number=1, missing=()):
     zeroed = bytearray(stream)
     for start, stop in missing:
         zeroed[start:stop] = bytes(stop - start)
@@ -80,7 +76,7 @@ def op_modem(runner, platform, tmp_path):
     runner.start(DecompressorService(platform(VESSEL), config))
     peer = runner.peer(VESSEL, "op_modem")
 
-    def send(*images: ReceivedImage) -> None:
+    def send(*images):
         peer.send(keys.acoustic_image(VESSEL), "decompressor", *images)
 
     return send
@@ -184,7 +180,7 @@ def test_stream_that_cannot_be_decoded_costs_that_image_only(runner, start_relay
     relay, c2 = start_relay(), start_c2()
     peer = runner.peer(VESSEL, "decompressor")
 
-    def coded(data: bytes, number: int) -> CodedImage:
+    def coded(data, number):
         return CodedImage(**dict(update(data, 1, number)), codec="", model="", picture_crc32=None)
 
     peer.send(keys.image_coded(VESSEL), "relay", coded(b"\x7f" + bytes(50), 1), coded(stream, 2))

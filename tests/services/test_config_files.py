@@ -1,7 +1,5 @@
 """The project's configuration files load for every service; a mistake in them is named with its line."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import json
@@ -24,7 +22,7 @@ PLATFORMS = {
 PAIRS = [(file, service) for file, services in PLATFORMS.items() for service in services]
 
 
-def table_of(service: str) -> type[ServiceConfig]:
+def table_of(service):
     module = importlib.import_module(f"sonarpost.services.{service}.config")
     found = [
         t
@@ -35,7 +33,7 @@ def table_of(service: str) -> type[ServiceConfig]:
     return table
 
 
-def path_of(file: str):
+def path_of(file):
     return REPOSITORY / "config" / f"{file}.toml"
 
 

@@ -3,8 +3,6 @@
 It receives and decodes what services publish. Services refuse the invalid payloads that it publishes.
 """
 
-from __future__ import annotations
-
 import base64
 import queue
 import shutil
@@ -12,9 +10,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import msgpack
 import numpy as np
@@ -40,7 +37,7 @@ ACCEPTED = "sonarpost/v1/shore/contact/vessel-1/decision"
 DECISION_KEY = "sonarpost/v1/vessel-1/contact/decision"
 
 
-def command(router: str, *arguments: str) -> list[str]:
+def command(router, *arguments):
     program = str(ZENOH) if ZENOH.is_file() else str(shutil.which("zenoh"))
     quiet = ["--cfg", "scouting/multicast/enabled:false", "--cfg", "transport/shared_memory/enabled:false"]
     return [program, "--mode", "client", "--connect", router, *quiet, *arguments]
@@ -52,8 +49,8 @@ class Subscriber:
     One process for several keys may print two values at once on one line.
     """
 
-    def __init__(self, router: str, *key_expressions: str) -> None:
-        self._lines: queue.Queue[str] = queue.Queue()
+    def __init__(self, router, *key_expressions):
+        self._lines = queue.Queue()
         self._processes = [
             subprocess.Popen(
                 command(router, "subscribe", "-k", key, "--decoder", "base64", "--line", "{key} {value}"),
@@ -66,16 +63,16 @@ class Subscriber:
         for process in self._processes:
             threading.Thread(target=self._read, args=(process,), daemon=True).start()
 
-    def _read(self, process: subprocess.Popen[str]) -> None:
+    def _read(self, process):
         assert process.stdout is not None
         for line in process.stdout:
             self._lines.put(line)
 
-    def next(self) -> tuple[str, dict[str, Any]]:
+    def next(self):
         key, value = self._lines.get(timeout=120).split()
         return key, msgpack.unpackb(base64.b64decode(value))
 
-    def until(self, key: str) -> dict[str, Any]:
+    def until(self, key):
         deadline = time.monotonic() + 15
         while time.monotonic() < deadline:
             met, fields = self.next()
@@ -83,7 +80,7 @@ class Subscriber:
                 return fields
         pytest.fail(f"nothing on {key}")
 
-    def close(self) -> None:
+    def close(self):
         for process in self._processes:
             process.terminate()
         for process in self._processes:
@@ -91,10 +88,10 @@ class Subscriber:
 
 
 @pytest.fixture
-def subscribe(router: str) -> Iterator[Callable[..., Subscriber]]:
-    opened: list[Subscriber] = []
+def subscribe(router):
+    opened = []
 
-    def make(*key_expressions: str) -> Subscriber:
+    def make(*key_expressions):
         opened.append(Subscriber(router, *key_expressions))
         return opened[-1]
 
@@ -103,7 +100,7 @@ def subscribe(router: str) -> Iterator[Callable[..., Subscriber]]:
         subscriber.close()
 
 
-def put(router: str, key: str, payload: bytes) -> None:
+def put(router, key, payload):
     """Publish bytes, as `zenoh put` does: no attachment, no encoding."""
     value = base64.b64encode(payload).decode()
     done = subprocess.run(
@@ -116,9 +113,7 @@ def put(router: str, key: str, payload: bytes) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_a_subscriber_without_sonarpost_reads_what_a_service_publishes(
-    tmp_path: Path, router: str, platform: PlatformMaker, subscribe: Callable[..., Subscriber]
-) -> None:
+def test_a_subscriber_without_sonarpost_reads_what_a_service_publishes(tmp_path, router, platform, subscribe):
     pixels = np.arange(32 * 48, dtype=np.uint16).reshape(32, 48)
     incoming = tmp_path / "incoming"
     incoming.mkdir()
@@ -143,7 +138,7 @@ def test_a_subscriber_without_sonarpost_reads_what_a_service_publishes(
     assert np.frombuffer(picture["data"], "<u2").reshape(32, 48).tolist() == pixels.tolist()
 
 
-def decision(number: int) -> bytes:
+def decision(number):
     """Return a decision packed by hand, from the document alone."""
     return bytes(
         msgpack.packb(
@@ -163,7 +158,7 @@ def decision(number: int) -> bytes:
     )
 
 
-def envelope(payload: bytes, key: str = DECISION_KEY) -> bytes:
+def envelope(payload, key=DECISION_KEY):
     fields = {"type": "relayed", "v": 1, "vessel_id": "vessel-1", "key": key, "payload": payload, "relayed_utc_s": 0}
     return bytes(msgpack.packb(fields))
 
@@ -181,12 +176,8 @@ INVALID = {
 
 
 def test_invalid_payloads_are_refused_and_logged_and_the_service_continues(
-    tmp_path: Path,
-    router: str,
-    platform: PlatformMaker,
-    subscribe: Callable[..., Subscriber],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    tmp_path, router, platform, subscribe, caplog
+):
     service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out"))
     service.start()
     try:
@@ -196,7 +187,7 @@ def test_invalid_payloads_are_refused_and_logged_and_the_service_continues(
         assert watcher.until(ACCEPTED)["decision_id"] == "d1"
         for number, (payload, _) in enumerate(INVALID.values(), start=1):
             put(router, INBOX, payload)
-            eventually(lambda number=number: service.store.refused_count() == number)  # type: ignore[misc]
+            eventually(lambda number=number: service.store.refused_count() == number)
         # Valid records are still accepted.
         put(router, INBOX, envelope(decision(2)))
         assert watcher.until(ACCEPTED)["decision_id"] == "d2"

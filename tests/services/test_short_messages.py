@@ -1,7 +1,5 @@
 """Short messages from the relay of a vessel to c2, through an emulated gateway: both ends restarted, budget, radio."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,18 +1,14 @@
 """Codecs for a system user: no home folder, and an installation that the user cannot write."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 from builders.common import REPOSITORY, eventually
 from builders.images import snippet as snippet_pixels
-from builders.installation import NOBODY, Installation, installation
+from builders.installation import NOBODY, installation
 from builders.record_samples import SAMPLES
 
 from sonarpost import keys
@@ -31,13 +27,13 @@ print("decoded")
 
 
 @pytest.fixture
-def image_file(tmp_path: Path) -> Path:
+def image_file(tmp_path):
     path = tmp_path / "snippet.png"
     write_png(path, snippet_pixels(40, 60))
     return path
 
 
-def test_the_python_api_compiles_in_memory_and_warns_once(installation: Installation) -> None:
+def test_the_python_api_compiles_in_memory_and_warns_once(installation):
     done = installation.run("-c", PYTHON_API)
     assert done.stdout == "decoded\n", done.stderr
     [warning] = done.stderr.splitlines()
@@ -45,7 +41,7 @@ def test_the_python_api_compiles_in_memory_and_warns_once(installation: Installa
     assert "set NUMBA_CACHE_DIR" in warning
 
 
-def test_encode_compiles_in_memory_and_warns_once(installation, image_file, tmp_path) -> None:
+def test_encode_compiles_in_memory_and_warns_once(installation, image_file, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     out.chmod(0o777)
@@ -56,7 +52,7 @@ def test_encode_compiles_in_memory_and_warns_once(installation, image_file, tmp_
     assert warning.startswith(IN_MEMORY)
 
 
-def test_code_prepared_by_the_installing_user_is_loaded(installation, image_file) -> None:
+def test_code_prepared_by_the_installing_user_is_loaded(installation, image_file):
     encode = "import sys, numpy, sonarpost; from sonarpost.codec.jit import compilation_log as log; "
     encode += "sonarpost.encode(numpy.zeros((40, 60), 'uint8'), 'vq'); print(log.compiled)"
     for folder in installation._folder.rglob("*"):
@@ -71,15 +67,15 @@ def test_code_prepared_by_the_installing_user_is_loaded(installation, image_file
 
 
 @pytest.fixture
-def run_service(installation, router, tmp_path) -> Iterator[Callable[[str, str], Path]]:
+def run_service(installation, router, tmp_path):
     """Start a service with the shipped configuration of its platform; return its state folder."""
-    started: list[subprocess.Popen[bytes]] = []
+    started = []
     state = tmp_path / "services"
     state.mkdir()
     if os.getuid() == 0:
         os.chown(state, NOBODY, NOBODY)
 
-    def start(platform: str, service: str) -> Path:
+    def start(platform, service):
         changes = {
             "SONARPOST_PLATFORM__ROUTER": json.dumps([router]),
             "SONARPOST_PLATFORM__STATE_DIR": str(state),
@@ -101,7 +97,7 @@ def run_service(installation, router, tmp_path) -> Iterator[Callable[[str, str],
 @pytest.mark.timeout(600)  # compiles encoder and decoder of emb: 20 s on an idle machine
 def test_the_shipped_services_encode_and_decode_and_store_machine_code_in_the_state_folder(
     installation, run_service, runner, snippet, tmp_path
-) -> None:
+):
     modem = runner.peer("uuv-1", "uuv_modem", {keys.image_encoded("uuv-1"): EncodedImage})
     state = run_service("uuv", "compressor")
     runner.peer("uuv-1", "atd_stub").send(keys.contact_detected("uuv-1"), "compressor", snippet("c1"))

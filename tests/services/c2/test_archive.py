@@ -1,27 +1,20 @@
 """c2: conflicting images are kept, stored files are compared with the index, and old indexes are migrated."""
 
-from __future__ import annotations
-
 import logging
 import sqlite3
-from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 from builders.common import eventually
 from builders.records import decision_record, reconstructed_image
-from builders.services import ServiceRunner
 
 from sonarpost import keys, wire
 from sonarpost.archive.shore_files import image_paths
-from sonarpost.archive.shore_index import FILE_NAME, ImageRow, ShoreIndex
+from sonarpost.archive.shore_index import FILE_NAME, ShoreIndex
 from sonarpost.cli.main import main
-from sonarpost.config import PlatformConfig
 from sonarpost.export.contacts import load_contacts
-from sonarpost.messages import Contact, Pixels, ReconstructedImage, Relayed
+from sonarpost.messages import Contact, Pixels, Relayed
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
@@ -32,7 +25,7 @@ START_S = 1_700_000_000.0
 VESSEL = "vessel-1"
 
 
-def image(image_id: str = "AAAA", value: int = 1, start_s: float = START_S, version: int = 1) -> ReconstructedImage:
+def image(image_id="AAAA", value=1, start_s=START_S, version=1):
     picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([value]) * 600)
     return reconstructed_image(
         picture,
@@ -45,15 +38,15 @@ def image(image_id: str = "AAAA", value: int = 1, start_s: float = START_S, vers
 
 
 @pytest.fixture
-def out(tmp_path: Path) -> Path:
+def out(tmp_path):
     return tmp_path / "out"
 
 
 @pytest.fixture
-def archive(out: Path) -> Iterator[Callable[..., Archive]]:
-    made: list[Archive] = []
+def archive(out):
+    made = []
 
-    def open_(**options: Any) -> Archive:
+    def open_(**options):
         made.append(Archive(C2Config(out_dir=out, **options)))
         return made[-1]
 
@@ -63,7 +56,7 @@ def archive(out: Path) -> Iterator[Callable[..., Archive]]:
 
 
 @pytest.fixture
-def filled(archive: Callable[..., Archive]) -> Archive:
+def filled(archive):
     """Make an archive with ten images and a decision."""
     made = archive()
     for number in range(10):
@@ -73,16 +66,14 @@ def filled(archive: Callable[..., Archive]) -> Archive:
     return made
 
 
-def verify_all(archive: Archive, now_utc_s: float) -> int:
+def verify_all(archive, now_utc_s):
     return archive.verify(now_utc_s, DAY_S)
 
 
 # Images of one name
 
 
-def test_two_images_of_one_name_and_version_are_stored_and_reported(
-    archive: Callable[..., Archive], out: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_images_of_one_name_and_version_are_stored_and_reported(archive, out, caplog, capsys):
     kept = archive()
     first, second = image(), image(value=2, start_s=START_S + 0.4)
     assert kept.store_image(first, 5.0)[1:] == (True, False)
@@ -104,7 +95,7 @@ def test_two_images_of_one_name_and_version_are_stored_and_reported(
     assert ["1 (conflict)" in line for line in lines] == [False, True]
 
 
-def test_images_that_differ_only_in_their_pixels_are_both_listed(archive: Callable[..., Archive], out: Path) -> None:
+def test_images_that_differ_only_in_their_pixels_are_both_listed(archive, out):
     kept = archive()
     for value in (1, 2):
         kept.store_image(image(value=value), 5.0)
@@ -115,7 +106,7 @@ def test_images_that_differ_only_in_their_pixels_are_both_listed(archive: Callab
     assert "one image of this name and version" in str(contacts.problems[0])
 
 
-def test_index_made_from_the_files_has_the_conflict(archive: Callable[..., Archive], out: Path) -> None:
+def test_index_made_from_the_files_has_the_conflict(archive, out):
     kept = archive()
     for value in (1, 2):
         kept.store_image(image(value=value), 5.0)
@@ -130,7 +121,7 @@ def test_index_made_from_the_files_has_the_conflict(archive: Callable[..., Archi
 # Comparison of files and index
 
 
-def test_undamaged_files_are_compared_once_in_a_cycle(filled: Archive, caplog: pytest.LogCaptureFixture) -> None:
+def test_undamaged_files_are_compared_once_in_a_cycle(filled, caplog):
     caplog.clear()
     assert verify_all(filled, 1e9) == 11
     assert verify_all(filled, 1e9 + DAY_S / 2) == 0
@@ -139,21 +130,19 @@ def test_undamaged_files_are_compared_once_in_a_cycle(filled: Archive, caplog: p
     assert not caplog.records
 
 
-def test_comparison_is_spread_over_the_cycle(filled: Archive) -> None:
+def test_comparison_is_spread_over_the_cycle(filled):
     compared = [filled.verify(1e9 + hour * 3600.0, 3600.0 * 4) for hour in range(0, 24, 4)]
     assert compared == [3, 2, 2, 2, 2, 0]
 
 
-def test_comparison_can_be_disabled(archive: Callable[..., Archive]) -> None:
+def test_comparison_can_be_disabled(archive):
     kept = archive(verify_days=0)
     kept.store_image(image(), 5.0)
     kept.flush()
     assert verify_all(kept, 1e9) == 0
 
 
-def test_missing_and_changed_files_are_counted_logged_once_and_listed(
-    filled: Archive, out: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_and_changed_files_are_counted_logged_once_and_listed(filled, out, caplog, capsys):
     rows = filled.index().images()
     image_paths(out, rows[0])[1].unlink()
     image_paths(out, rows[1])[0].unlink()
@@ -173,7 +162,7 @@ def test_missing_and_changed_files_are_counted_logged_once_and_listed(
     assert text.count("1 (changed)") == 2
 
 
-def test_restored_files_are_no_longer_reported(filled: Archive, out: Path) -> None:
+def test_restored_files_are_no_longer_reported(filled, out):
     path = image_paths(out, filled.index().images()[0])[1]
     content = path.read_bytes()
     path.unlink()
@@ -184,7 +173,7 @@ def test_restored_files_are_no_longer_reported(filled: Archive, out: Path) -> No
     assert filled.defect_counts()["missing"] == 0
 
 
-def test_image_that_arrives_again_replaces_its_damaged_files(filled: Archive, out: Path) -> None:
+def test_image_that_arrives_again_replaces_its_damaged_files(filled, out):
     path = image_paths(out, filled.index().images()[0])[1]
     path.unlink()
     verify_all(filled, 1e9)
@@ -195,7 +184,7 @@ def test_image_that_arrives_again_replaces_its_damaged_files(filled: Archive, ou
     assert filled.defect_counts()["missing"] == 0
 
 
-def test_unreadable_file_is_reported_as_such(filled: Archive, out: Path) -> None:
+def test_unreadable_file_is_reported_as_such(filled, out):
     path = image_paths(out, filled.index().images()[0])[1]
     path.unlink()
     path.mkdir()
@@ -203,7 +192,7 @@ def test_unreadable_file_is_reported_as_such(filled: Archive, out: Path) -> None
     assert filled.defect_counts()["unreadable"] == 1
 
 
-def test_images_removed_by_retention_are_not_missing(archive: Callable[..., Archive]) -> None:
+def test_images_removed_by_retention_are_not_missing(archive):
     kept = archive(max_bytes=0)
     kept.store_image(image(), 5.0)
     kept.flush()
@@ -212,9 +201,7 @@ def test_images_removed_by_retention_are_not_missing(archive: Callable[..., Arch
     assert kept.defect_counts()["missing"] == 0
 
 
-def test_service_compares_its_files_and_warns(
-    runner: ServiceRunner, platform: Callable[[str], PlatformConfig], out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_service_compares_its_files_and_warns(runner, platform, out, monkeypatch):
     monkeypatch.setattr("sonarpost.services.c2.service.VERIFICATION_INTERVAL_S", 0.05)
     service = runner.start(C2Service(platform("shore-1"), C2Config(out_dir=out, verify_days=1e-6)))
     relay = runner.peer(VESSEL, "relay")
@@ -254,7 +241,7 @@ PRAGMA user_version = 1;
 
 
 @pytest.fixture
-def version_1(filled: Archive, out: Path) -> list[ImageRow]:
+def version_1(filled, out):
     """Turn the index into one of version 1; return its rows with the defaults of the new columns."""
     rows = filled.index().images()
     filled.close()
@@ -273,7 +260,7 @@ def version_1(filled: Archive, out: Path) -> list[ImageRow]:
     return [replace(row, files_sha256="") for row in rows]
 
 
-def test_index_of_version_1_is_read_without_a_migration(version_1: list[ImageRow], out: Path) -> None:
+def test_index_of_version_1_is_read_without_a_migration(version_1, out):
     before = (out / FILE_NAME).read_bytes()
     with closing(ShoreIndex(out, writable=False)) as index:
         assert index.images() == version_1
@@ -281,9 +268,7 @@ def test_index_of_version_1_is_read_without_a_migration(version_1: list[ImageRow
     assert (out / FILE_NAME).read_bytes() == before
 
 
-def test_index_of_version_1_is_migrated_and_gets_digests(
-    version_1: list[ImageRow], archive: Callable[..., Archive], out: Path
-) -> None:
+def test_index_of_version_1_is_migrated_and_gets_digests(version_1, archive, out):
     image_paths(out, version_1[0])[1].write_bytes(b"other size")
     migrated = archive()
     assert migrated.index().images() == version_1
@@ -295,9 +280,7 @@ def test_index_of_version_1_is_migrated_and_gets_digests(
     assert migrated.defect_counts()["changed"] == 2
 
 
-def test_index_of_version_2_gains_the_strength_of_despeckling(
-    archive: Callable[..., Archive], filled: Archive, out: Path
-) -> None:
+def test_index_of_version_2_gains_the_strength_of_despeckling(archive, filled, out):
     before = filled.index().images()
     filled.close()
     with closing(sqlite3.connect(out / FILE_NAME)) as db, db:
@@ -313,9 +296,7 @@ def test_index_of_version_2_gains_the_strength_of_despeckling(
     assert [row.despeckle_strength for row in migrated.index().images() if row.image_id == "000A"] == [0.5]
 
 
-def test_index_of_version_3_gains_the_probabilities(
-    archive: Callable[..., Archive], filled: Archive, out: Path
-) -> None:
+def test_index_of_version_3_gains_the_probabilities(archive, filled, out):
     before = filled.index().images()
     filled.close()
     with closing(sqlite3.connect(out / FILE_NAME)) as db, db:

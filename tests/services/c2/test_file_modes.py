@@ -1,34 +1,27 @@
 """Files of a service process: readable by its user only, whatever umask it inherits."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
-import pytest
 from builders.common import eventually
 from builders.records import decision_record, reconstructed_image
-from builders.services import ServiceRunner
 
 from sonarpost import keys, wire
 from sonarpost.cli.main import main
-from sonarpost.config import PlatformConfig
 from sonarpost.delivery.store import Store
 from sonarpost.messages import Pixels, Relayed
 
 VESSEL = "vessel-1"
 
 
-def modes(folder: Path) -> dict[str, int]:
+def modes(folder):
     paths = [folder, *folder.rglob("*")]
     return {str(path.relative_to(folder)): path.stat().st_mode & 0o777 for path in paths}
 
 
-def assert_private(folder: Path) -> set[str]:
+def assert_private(folder):
     """Require 0600 for every file and 0700 for every folder; return their names."""
     found = modes(folder)
     wrong = {name: oct(mode) for name, mode in found.items() if mode != (0o700 if (folder / name).is_dir() else 0o600)}
@@ -36,12 +29,7 @@ def assert_private(folder: Path) -> set[str]:
     return set(found)
 
 
-def test_files_of_c2_are_readable_by_its_user_only(
-    runner: ServiceRunner,
-    platform: Callable[[str], PlatformConfig],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_files_of_c2_are_readable_by_its_user_only(runner, platform, tmp_path, capsys):
     shore, out = platform("shore-1"), tmp_path / "deep" / "out"
     config = tmp_path / "shore.toml"
     config.write_text(
@@ -75,7 +63,7 @@ def test_files_of_c2_are_readable_by_its_user_only(
     assert_private(tmp_path / "deep")
 
 
-def test_store_of_an_earlier_version_is_restricted(tmp_path: Path) -> None:
+def test_store_of_an_earlier_version_is_restricted(tmp_path):
     path = tmp_path / "relay.db"
     Store(path).close()
     for each in tmp_path.iterdir():

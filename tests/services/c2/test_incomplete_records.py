@@ -1,7 +1,5 @@
 """Records that a vessel begins and never completes do not prevent others from delivering theirs."""
 
-from __future__ import annotations
-
 import hashlib
 
 import pytest
@@ -35,10 +33,7 @@ def begin_records(session, vessel, count):
         item = OutboxItem("c2", number, key, "", 6, bytes(SIZE), digest)
         for offset in range(0, SIZE - CHUNK_BYTES, CHUNK_BYTES):
             replies = session.get(
-                keys.delivery_query(key, "c2"),
-                payload=chunk,
-                attachment=attachment(b"f" * 16, item, offset),
-                timeout=5,
+                keys.delivery_query(key, "c2"), payload=chunk, attachment=attachment(b"f" * 16, item, offset), timeout=5
             )
             statuses = {AckReply.unpack(reply.ok.payload.to_bytes(), key).status for reply in replies if reply.ok}
             assert statuses <= {"more", "later"}

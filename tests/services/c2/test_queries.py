@@ -1,13 +1,10 @@
 """Queries to c2: filters, pages, limits, JSON, and a subscriber that catches up."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json
 import shutil
 import threading
-from typing import Any
 
 import msgpack
 import numpy as np
@@ -19,7 +16,7 @@ from PIL import Image
 
 from sonarpost import keys, wire
 from sonarpost.archive.journal import Journal
-from sonarpost.bus.catch_up import AcceptedRecord, CatchUpSubscriber
+from sonarpost.bus.catch_up import CatchUpSubscriber
 from sonarpost.bus.session import client_config
 from sonarpost.errors import BadInputError, QueryRefusedError
 from sonarpost.messages import Advice, Contact, Decision, Pixels, ReconstructedImage, Relayed
@@ -72,22 +69,22 @@ def envelope(record):
 class Shore:
     """A c2 whose records arrive without a relay."""
 
-    def __init__(self, service: C2Service, client: zenoh.Session) -> None:
+    def __init__(self, service, client):
         self.service = service
         self.client = client
         self._querier = client.declare_querier(CONTACTS)
         eventually(lambda: self._querier.matching_status.matching, what="queryable")
 
-    def handled(self) -> int:
+    def handled(self):
         return int(self.service.health().counters.get("records_handled", 0))
 
-    def accept(self, *records: ReconstructedImage | Decision) -> None:
+    def accept(self, *records):
         before = self.handled()
         for record in records:
             self.client.put(keys.shore_inbox(record.vessel_id), wire.encode(envelope(record)))
         eventually(lambda: self.handled() == before + len(records), what="acceptance")
 
-    def replies(self, selector: str) -> tuple[list[zenoh.Sample], Any]:
+    def replies(self, selector):
         """Return the replies of one page and the page."""
         found = list(self.client.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=60))
         errors = [reply.err.payload.to_string() for reply in found if reply.err is not None]
@@ -95,7 +92,7 @@ class Shore:
         samples = [reply.ok for reply in found]
         return samples[:-1], samples[-1]
 
-    def names(self, selector: str) -> list[str]:
+    def names(self, selector):
         samples, _ = self.replies(selector)
         records = [msgpack.unpackb(sample.payload.to_bytes()) for sample in samples]
         return [
@@ -103,7 +100,7 @@ class Shore:
             for r in records
         ]
 
-    def error(self, selector: str) -> str:
+    def error(self, selector):
         [reply] = list(self.client.get(selector, timeout=60))
         assert reply.err is not None
         assert reply.err.encoding == zenoh.Encoding.TEXT_PLAIN
@@ -120,7 +117,7 @@ def begin(runner, platform, out, client, monkeypatch):
     # These tests query faster than clients may.
     monkeypatch.setattr(queries, "BURST", 1e9)
 
-    def start(**options) -> Shore:
+    def start(**options):
         return Shore(runner.start(C2Service(platform("shore-1"), C2Config(out_dir=out, **options))), client)
 
     return start
@@ -450,21 +447,21 @@ def test_refused_rate_is_an_error_reply(shore, monkeypatch):
 class Reader:
     """Consumes a `CatchUpSubscriber` in a thread."""
 
-    def __init__(self, session: zenoh.Session, cursor: str = "", **options: Any) -> None:
+    def __init__(self, session, cursor="", **options):
         self.subscriber = CatchUpSubscriber(session, CONTACTS, cursor, **options)
-        self.records: list[AcceptedRecord] = []
-        self.error: Exception | None = None
+        self.records = []
+        self.error = None
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
-    def _run(self) -> None:
+    def _run(self):
         try:
             for record in self.subscriber:
                 self.records.append(record)
         except (QueryRefusedError, BadInputError) as error:
             self.error = error
 
-    def close(self) -> None:
+    def close(self):
         self.subscriber.close()
         self._thread.join(60)
         assert not self._thread.is_alive()
@@ -503,7 +500,7 @@ def test_subscriber_that_was_away_for_1000_contacts_has_each_once(shore, router,
     assert wire.decode(ReconstructedImage, again.records[-1].payload, "").image_id == "FFFE"
 
 
-def accept_directly(service: C2Service, images: list[ReconstructedImage]) -> None:
+def accept_directly(service, images):
     """Number images as c2 does, without image files and publication."""
     service._accepted.number([service._accepted.image(each, "") for each in images])
 

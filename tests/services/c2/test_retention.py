@@ -1,7 +1,5 @@
 """c2: index and retention of images."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 
@@ -221,10 +219,7 @@ def test_service_removes_counts_and_logs(runner, platform, tmp_path, caplog):
     service = runner.start(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out", max_bytes=0)))
     relay = runner.peer("vessel-1", "relay")
     envelope = Relayed(
-        vessel_id="vessel-1",
-        key=keys.image_reconstructed("vessel-1"),
-        payload=wire.encode(image()),
-        relayed_utc_s=5.0,
+        vessel_id="vessel-1", key=keys.image_reconstructed("vessel-1"), payload=wire.encode(image()), relayed_utc_s=5.0
     )
     relay.send(keys.shore_inbox("vessel-1"), "c2", envelope)
     eventually(lambda: service.health().counters.get("images_removed") == 1)

@@ -1,7 +1,5 @@
 """c2: records of vessels are committed, stored in files and published; a vessel cannot send for another one."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 

@@ -1,30 +1,20 @@
 """Two c2 share an archive in PostgreSQL: a record that one has acknowledged is stored exactly once by either."""
 
-from __future__ import annotations
-
 import shutil
 import threading
 import uuid
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
-import zenoh
 from builders.common import eventually, free_port
-from builders.postgresql import PostgresServer
 from builders.records import decision_record, reconstructed_image
-from builders.services import PeerService, ServiceRunner
 
 from sonarpost import keys, wire
 from sonarpost.archive.journal import Criteria
-from sonarpost.archive.postgresql import Database
-from sonarpost.archive.shore_database import AcceptedRecord, ShoreDatabase
+from sonarpost.archive.shore_database import ShoreDatabase
 from sonarpost.codec.registry import default_registry
-from sonarpost.config import PlatformConfig
 from sonarpost.delivery.client import deliver
 from sonarpost.errors import ConfigError, PayloadError
-from sonarpost.messages import Command, Decision, ImagePart, Pixels, ReconstructedImage, Relayed
+from sonarpost.messages import Command, ImagePart, Pixels, ReconstructedImage, Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 
@@ -32,62 +22,52 @@ VESSEL = "vessel-1"
 INBOX = keys.shore_inbox(VESSEL)
 
 
-def image(number: int, value: int = 1) -> ReconstructedImage:
+def image(number, value=1):
     picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([value]) * 600)
     return reconstructed_image(picture, vessel_id=VESSEL, image_id=f"{number:04d}")
 
 
-def envelope(record: ReconstructedImage | Decision) -> Relayed:
+def envelope(record):
     is_image = isinstance(record, ReconstructedImage)
     key = keys.image_reconstructed(VESSEL) if is_image else keys.contact_decision(VESSEL)
     return Relayed(vessel_id=VESSEL, key=key, payload=wire.encode(record), relayed_utc_s=5.0)
 
 
-def command(command_id: str, kind: str = "refine") -> Command:
+def command(command_id, kind="refine"):
     return Command(
-        command_id=command_id,
-        kind=kind,  # type: ignore[arg-type]
-        vehicle_id="uuv-1",
-        image_id="0001",
-        issued_by="expert",
-        issued_utc_s=1.0,
+        command_id=command_id, kind=kind, vehicle_id="uuv-1", image_id="0001", issued_by="expert", issued_utc_s=1.0
     )
 
 
 @pytest.fixture(autouse=True)
-def short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_intervals(monkeypatch):
     monkeypatch.setattr("sonarpost.services.c2.service.TAKE_OVER_INTERVAL_S", 0.1)
 
 
 @pytest.fixture
-def begin(
-    runner: ServiceRunner, platform: Callable[[str], PlatformConfig], database_url: str, tmp_path: Path
-) -> Callable[..., C2Service]:
-    def start(host: str, **options: Any) -> C2Service:
+def begin(runner, platform, database_url, tmp_path):
+    def start(host, **options):
         config = C2Config(**{"database": database_url, "out_dir": tmp_path / "unused", **options})
-        service: C2Service = runner.start(C2Service(platform(host), config))
-        return service
+        return runner.start(C2Service(platform(host), config))
 
     return start
 
 
 @pytest.fixture
-def relay(runner: ServiceRunner) -> PeerService:
+def relay(runner):
     return runner.peer(VESSEL, "relay")
 
 
 @pytest.fixture
-def archive(database: Database) -> ShoreDatabase:
+def archive(database):
     return ShoreDatabase(database)
 
 
-def counter(name: str, *services: C2Service) -> int:
+def counter(name, *services):
     return sum(service.health().counters.get(name, 0) for service in services)
 
 
-def test_record_goes_to_one_of_two_c2_and_is_stored_once(
-    begin: Callable[..., C2Service], relay: PeerService, archive: ShoreDatabase, tmp_path: Path
-) -> None:
+def test_record_goes_to_one_of_two_c2_and_is_stored_once(begin, relay, archive, tmp_path):
     hosts = [begin("shore-1"), begin("shore-2")]
     relay.send(INBOX, "c2", *(envelope(image(number)) for number in range(30)), envelope(decision_record()))
     eventually(lambda: relay.store.outbox_depth() == 0 and counter("records_handled", *hosts) == 31)
@@ -98,9 +78,7 @@ def test_record_goes_to_one_of_two_c2_and_is_stored_once(
     assert not (tmp_path / "unused").exists()
 
 
-def test_other_c2_receives_records_after_one_has_ended(
-    begin: Callable[..., C2Service], relay: PeerService, archive: ShoreDatabase, runner: ServiceRunner
-) -> None:
+def test_other_c2_receives_records_after_one_has_ended(begin, relay, archive, runner):
     first, second = begin("shore-1"), begin("shore-2")
     relay.send(INBOX, "c2", envelope(image(1)))
     eventually(lambda: len(archive.images()) == 1)
@@ -110,9 +88,7 @@ def test_other_c2_receives_records_after_one_has_ended(
     eventually(lambda: len(archive.images()) == 2)
 
 
-def test_other_c2_receives_records_while_one_does_not_reach_the_database(
-    begin: Callable[..., C2Service], relay: PeerService, archive: ShoreDatabase
-) -> None:
+def test_other_c2_receives_records_while_one_does_not_reach_the_database(begin, relay, archive):
     broken = begin("shore-1", database=f"postgresql://sonarpost@127.0.0.1:{free_port()}/shore")
     eventually(lambda: "127.0.0.1" in broken.health().detail)
     assert broken.health().state == "degraded"
@@ -123,12 +99,8 @@ def test_other_c2_receives_records_while_one_does_not_reach_the_database(
 
 
 def test_acknowledged_record_of_a_host_that_never_returns_is_handled_by_the_other(
-    begin: Callable[..., C2Service],
-    relay: PeerService,
-    archive: ShoreDatabase,
-    runner: ServiceRunner,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    begin, relay, archive, runner, monkeypatch
+):
     monkeypatch.setattr("sonarpost.services.c2.shared_archive.TAKE_OVER_AFTER_S", 0.5)
     lost = begin("shore-1")
     monkeypatch.setattr(lost, "_handle_batch", lambda _: lost.stopping.wait(0.05))
@@ -143,13 +115,7 @@ def test_acknowledged_record_of_a_host_that_never_returns_is_handled_by_the_othe
     assert counter("records_taken_over", second) == 6
 
 
-def test_host_that_returns_after_the_take_over_repeats_its_records(
-    begin: Callable[..., C2Service],
-    relay: PeerService,
-    archive: ShoreDatabase,
-    runner: ServiceRunner,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_host_that_returns_after_the_take_over_repeats_its_records(begin, relay, archive, runner, monkeypatch):
     monkeypatch.setattr("sonarpost.services.c2.shared_archive.TAKE_OVER_AFTER_S", 0.5)
     first = begin("shore-1")
     monkeypatch.setattr(first, "_handle_batch", lambda _: first.stopping.wait(0.05))
@@ -165,9 +131,7 @@ def test_host_that_returns_after_the_take_over_repeats_its_records(
     assert len(archive.images()) == 5
 
 
-def test_nothing_is_acknowledged_while_the_database_is_down(
-    begin: Callable[..., C2Service], relay: PeerService, archive: ShoreDatabase, postgresql_server: PostgresServer
-) -> None:
+def test_nothing_is_acknowledged_while_the_database_is_down(begin, relay, archive, postgresql_server):
     service = begin("shore-1")
     relay.send(INBOX, "c2", envelope(image(1)))
     eventually(lambda: len(archive.images()) == 1)
@@ -185,12 +149,7 @@ def test_nothing_is_acknowledged_while_the_database_is_down(
     assert archive.accepted_count() == 0
 
 
-def test_invalid_record_is_quarantined_and_not_taken_over(
-    begin: Callable[..., C2Service],
-    relay: PeerService,
-    archive: ShoreDatabase,
-    refused: Callable[[Any], list[tuple[str, str]]],
-) -> None:
+def test_invalid_record_is_quarantined_and_not_taken_over(begin, relay, archive, refused):
     service = begin("shore-1")
     relay.send(INBOX, "c2", envelope(decision_record("d1")), envelope(decision_record("d1", verdict="not_mine_like")))
     eventually(lambda: len(refused(service)) == 1)
@@ -198,15 +157,13 @@ def test_invalid_record_is_quarantined_and_not_taken_over(
     eventually(lambda: archive.accepted_count() == 0)
 
 
-def test_command_that_both_c2_have_accepted_is_sent_once(
-    begin: Callable[..., C2Service], client: zenoh.Session, runner: ServiceRunner, archive: ShoreDatabase
-) -> None:
+def test_command_that_both_c2_have_accepted_is_sent_once(begin, client, runner, archive):
     hosts = [begin("shore-1"), begin("shore-2")]
     received = runner.peer(VESSEL, "relay", {keys.command_all(VESSEL): Command}).received
     key, record = keys.tasking_command(VESSEL), command("c1")
     start = threading.Barrier(2)
 
-    def accept(host: C2Service) -> None:
+    def accept(host):
         start.wait()
         host.before_accepting([(key, wire.encode(record))])
         host._store_taken([(key, wire.encode(record))])
@@ -225,9 +182,7 @@ def test_command_that_both_c2_have_accepted_is_sent_once(
     assert counter("tasking_accepted", *hosts) == 2
 
 
-def test_another_command_under_the_identifier_of_the_other_c2_is_refused(
-    begin: Callable[..., C2Service], runner: ServiceRunner, client: zenoh.Session
-) -> None:
+def test_another_command_under_the_identifier_of_the_other_c2_is_refused(begin, runner, client):
     first = begin("shore-1")
     key = keys.tasking_command(VESSEL)
     deliver(client, key, "c2", command("c1"), 30.0)
@@ -239,11 +194,7 @@ def test_another_command_under_the_identifier_of_the_other_c2_is_refused(
         deliver(client, key, "c2", command("c1", "resend"), 30.0)
 
 
-def test_database_of_another_site_ends_the_start(
-    begin: Callable[..., C2Service],
-    platform: Callable[[str], PlatformConfig],
-    database_url: str,
-) -> None:
+def test_database_of_another_site_ends_the_start(begin, platform, database_url):
     begin("shore-1")
     service = C2Service(platform("shore-9"), C2Config(database=database_url, site="north"))
     with pytest.raises(ConfigError, match="site: got 'north', expected shore"):
@@ -251,7 +202,7 @@ def test_database_of_another_site_ends_the_start(
     service.store.close()
 
 
-def test_owner_is_the_same_after_a_restart(begin: Callable[..., C2Service], runner: ServiceRunner) -> None:
+def test_owner_is_the_same_after_a_restart(begin, runner):
     service = begin("shore-1")
     owner = service._owner()
     runner.stop(service)
@@ -264,7 +215,7 @@ def test_owner_is_the_same_after_a_restart(begin: Callable[..., C2Service], runn
 
 
 @pytest.fixture
-def parts(texture: Callable[..., Any]) -> list[ImagePart]:
+def parts(texture):
     """Coded images of spiht, which needs no compilation."""
     streams = [default_registry().create("spiht").encode(texture(seed=seed), 200) for seed in range(4)]
     return [
@@ -274,13 +225,8 @@ def parts(texture: Callable[..., Any]) -> list[ImagePart]:
 
 
 def test_coded_image_that_a_lost_host_has_not_decoded_is_decoded_by_the_other(
-    begin: Callable[..., C2Service],
-    relay: PeerService,
-    archive: ShoreDatabase,
-    runner: ServiceRunner,
-    parts: list[ImagePart],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    begin, relay, archive, runner, parts, monkeypatch
+):
     monkeypatch.setattr("sonarpost.services.c2.shared_archive.TAKE_OVER_AFTER_S", 0.5)
     with monkeypatch.context() as patch:
         patch.setattr("sonarpost.services.c2.decoding.Decoding.run", lambda _: None)
@@ -301,13 +247,7 @@ def test_coded_image_that_a_lost_host_has_not_decoded_is_decoded_by_the_other(
     assert [row.accepted.seq for row in rows] == list(range(1, 9))
 
 
-def test_records_of_a_busy_c2_are_not_taken_over(
-    begin: Callable[..., C2Service],
-    relay: PeerService,
-    archive: ShoreDatabase,
-    parts: list[ImagePart],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_records_of_a_busy_c2_are_not_taken_over(begin, relay, archive, parts, monkeypatch):
     monkeypatch.setattr("sonarpost.services.c2.shared_archive.TAKE_OVER_AFTER_S", 30.0)
     with monkeypatch.context() as patch:
         patch.setattr("sonarpost.services.c2.decoding.Decoding.run", lambda _: None)
@@ -316,7 +256,7 @@ def test_records_of_a_busy_c2_are_not_taken_over(
     eventually(lambda: busy.health().gauges["images_undecoded"] == 4.0)
     second = begin("shore-2")
 
-    def members() -> int:
+    def members():
         with archive.database.transaction() as sql:
             return sql.number("SELECT count(*) FROM sonarpost.member")
 
@@ -324,7 +264,7 @@ def test_records_of_a_busy_c2_are_not_taken_over(
     with archive.database.transaction() as sql:
         # The records are old; their c2 is not.
         sql.rows("UPDATE sonarpost.accepted SET accepted_at = accepted_at - interval '1 day'")
-    taken: list[AcceptedRecord] = []
+    taken = []
     assert archive.take_over(30.0, 10, taken.extend) == 0
     assert counter("records_taken_over", second) == 0
     assert archive.accepted_count() == 4

@@ -1,12 +1,8 @@
 """Two c2 with one archive in PostgreSQL: each replies to queries for the records of both."""
 
-from __future__ import annotations
-
 import shutil
 import threading
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import msgpack
 import numpy as np
@@ -14,15 +10,12 @@ import pytest
 import zenoh
 from builders.common import eventually, free_port
 from builders.records import decision_record, reconstructed_image
-from builders.services import ServiceRunner
 
 from sonarpost import keys, wire
 from sonarpost.archive.journal import FILE_NAME, Journal
-from sonarpost.archive.postgresql import Database
 from sonarpost.archive.shore_database import ShoreDatabase
-from sonarpost.bus.catch_up import AcceptedRecord, CatchUpSubscriber
-from sonarpost.config import PlatformConfig
-from sonarpost.messages import Decision, Pixels, ReconstructedImage, Relayed
+from sonarpost.bus.catch_up import CatchUpSubscriber
+from sonarpost.messages import Pixels, ReconstructedImage, Relayed
 from sonarpost.services.c2 import queries
 from sonarpost.services.c2.accepted import AcceptedRecords
 from sonarpost.services.c2.config import C2Config
@@ -32,13 +25,13 @@ VESSEL = "vessel-1"
 CONTACTS = "sonarpost/v1/shore/contact/*/*"
 
 
-def image(number: int) -> ReconstructedImage:
+def image(number):
     pixels = np.full((20, 30), number + 1, np.uint8)
     return reconstructed_image(Pixels.from_array(pixels), vessel_id=VESSEL, image_id=f"{number:04d}")
 
 
 @pytest.fixture(autouse=True)
-def short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_intervals(monkeypatch):
     monkeypatch.setattr("sonarpost.services.c2.service.TAKE_OVER_INTERVAL_S", 0.1)
     monkeypatch.setattr("sonarpost.services.c2.shared_archive.TAKE_OVER_AFTER_S", 0.5)
     # These tests query faster than clients may.
@@ -46,18 +39,15 @@ def short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def begin(
-    runner: ServiceRunner, platform: Callable[[str], PlatformConfig], database_url: str
-) -> Callable[..., C2Service]:
-    def start(host: str, **options: Any) -> C2Service:
+def begin(runner, platform, database_url):
+    def start(host, **options):
         config = C2Config(**{"database": database_url, **options})
-        service: C2Service = runner.start(C2Service(platform(host), config))
-        return service
+        return runner.start(C2Service(platform(host), config))
 
     return start
 
 
-def give(host: C2Service, *records: ReconstructedImage | Decision) -> None:
+def give(host, *records):
     """Let this c2 accept records, as its inbox does."""
     pairs = []
     for record in records:
@@ -69,11 +59,11 @@ def give(host: C2Service, *records: ReconstructedImage | Decision) -> None:
     host._store_taken(pairs)
 
 
-def handled(*hosts: C2Service) -> int:
+def handled(*hosts):
     return sum(host.health().counters.get("records_handled", 0) for host in hosts)
 
 
-def identity(payload: bytes) -> str:
+def identity(payload):
     fields = msgpack.unpackb(payload)
     return str(fields.get("decision_id", fields["image_id"]))
 
@@ -81,34 +71,34 @@ def identity(payload: bytes) -> str:
 class Reader:
     """A subscriber in a thread, with the records that it has received."""
 
-    def __init__(self, session: zenoh.Session, cursor: str = "") -> None:
-        self.records: list[AcceptedRecord] = []
+    def __init__(self, session, cursor=""):
+        self.records = []
         self.subscriber = CatchUpSubscriber(session, CONTACTS, cursor, refresh_s=0.5)
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
 
-    def _read(self) -> None:
+    def _read(self):
         self.records.extend(self.subscriber)
 
-    def identities(self) -> list[str]:
+    def identities(self):
         return [identity(record.payload) for record in self.records]
 
-    def wait_for(self, count: int) -> list[str]:
+    def wait_for(self, count):
         """Wait for so many records and for a complete query after them; return what was received."""
         eventually(lambda: len(self.records) >= count, what=f"{count} records")
         eventually(lambda: self.subscriber.is_caught_up)
         return self.identities()
 
-    def close(self) -> None:
+    def close(self):
         self.subscriber.close()
         self._thread.join()
 
 
 @pytest.fixture
-def reading(client: zenoh.Session) -> Iterator[Callable[..., Reader]]:
-    opened: list[Reader] = []
+def reading(client):
+    opened = []
 
-    def start(cursor: str = "") -> Reader:
+    def start(cursor=""):
         opened.append(Reader(client, cursor))
         return opened[-1]
 
@@ -117,15 +107,13 @@ def reading(client: zenoh.Session) -> Iterator[Callable[..., Reader]]:
         reader.close()
 
 
-def page(session: zenoh.Session, selector: str = CONTACTS) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def page(session, selector=CONTACTS):
     replies = list(session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=60))
     values = [msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
     return [v for v in values if v["type"] != "page"], values[-1]
 
 
-def test_late_subscriber_gets_the_records_of_a_c2_that_never_returns(
-    begin: Callable[..., C2Service], reading: Callable[..., Reader], runner: ServiceRunner, client: zenoh.Session
-) -> None:
+def test_late_subscriber_gets_the_records_of_a_c2_that_never_returns(begin, reading, runner, client):
     first, second = begin("shore-1"), begin("shore-2")
     early = reading()
     for number in range(0, 20, 2):
@@ -154,12 +142,8 @@ def test_late_subscriber_gets_the_records_of_a_c2_that_never_returns(
 
 
 def test_record_that_was_committed_and_not_published_is_available_from_the_other(
-    begin: Callable[..., C2Service],
-    reading: Callable[..., Reader],
-    runner: ServiceRunner,
-    database: Database,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    begin, reading, runner, database, monkeypatch
+):
     """The record, its number and the end of its acceptance are one transaction."""
     lost = begin("shore-1")
     monkeypatch.setattr(lost, "_publish_stored", lambda *_: (lost.stopping.wait(), lost.stopping.set()))
@@ -173,9 +157,7 @@ def test_record_that_was_committed_and_not_published_is_available_from_the_other
     assert reading().wait_for(2) == ["0001", "d1"]
 
 
-def test_repetition_has_the_number_of_the_first_publication(
-    begin: Callable[..., C2Service], watch: Callable[[str], list[zenoh.Sample]]
-) -> None:
+def test_repetition_has_the_number_of_the_first_publication(begin, watch):
     hosts = [begin("shore-1"), begin("shore-2")]
     seen = watch(CONTACTS)
     for host in hosts:
@@ -185,9 +167,7 @@ def test_repetition_has_the_number_of_the_first_publication(
     assert len(numbers) == 2
 
 
-def test_two_replies_to_one_query_are_one_page_for_a_subscriber(
-    begin: Callable[..., C2Service], reading: Callable[..., Reader], client: zenoh.Session
-) -> None:
+def test_two_replies_to_one_query_are_one_page_for_a_subscriber(begin, reading, client):
     hosts = [begin("shore-1"), begin("shore-2")]
     give(hosts[0], *(image(number) for number in range(10)))
     eventually(lambda: handled(hosts[0]) == 10)
@@ -206,7 +186,7 @@ def test_two_replies_to_one_query_are_one_page_for_a_subscriber(
 
 
 @contextmanager
-def both_reply(hosts: list[C2Service]) -> Iterator[None]:
+def both_reply(hosts):
     with pytest.MonkeyPatch.context() as patch:
         for host in hosts:
             patch.setattr(host, "_prefer_others", lambda **_: None)
@@ -214,7 +194,7 @@ def both_reply(hosts: list[C2Service]) -> Iterator[None]:
         yield
 
 
-def test_query_goes_to_the_c2_that_reaches_the_database(begin: Callable[..., C2Service], client: zenoh.Session) -> None:
+def test_query_goes_to_the_c2_that_reaches_the_database(begin, client):
     broken = begin("shore-1", database=f"postgresql://sonarpost@127.0.0.1:{free_port()}/shore")
     eventually(lambda: not broken._queries._is_preferred)
     second = begin("shore-2")
@@ -227,14 +207,9 @@ def test_query_goes_to_the_c2_that_reaches_the_database(begin: Callable[..., C2S
 
 
 def test_journals_of_an_earlier_version_are_imported_and_the_archive_is_numbered(
-    begin: Callable[..., C2Service],
-    platform: Callable[[str], PlatformConfig],
-    runner: ServiceRunner,
-    reading: Callable[..., Reader],
-    database: Database,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def stored_before(host: C2Service) -> list[tuple[ReconstructedImage | Decision, str]]:
+    begin, platform, runner, reading, database, monkeypatch
+):
+    def stored_before(host):
         """Store records without numbers, as an earlier version has done; return them with their names."""
         number = 1 if host.platform.id == "shore-1" else 2
         records = (image(number), decision_record(f"d{number}"))
@@ -270,9 +245,7 @@ def test_journals_of_an_earlier_version_are_imported_and_the_archive_is_numbered
     assert sorted(reading().wait_for(4)) == ["0001", "0002", "d1", "d2"]
 
 
-def test_image_that_retention_of_another_c2_has_removed_is_no_longer_sent(
-    begin: Callable[..., C2Service], client: zenoh.Session
-) -> None:
+def test_image_that_retention_of_another_c2_has_removed_is_no_longer_sent(begin, client):
     first = begin("shore-1", max_bytes=1)
     begin("shore-2", max_bytes=1)
     give(first, image(1), decision_record("d1"))

@@ -1,11 +1,7 @@
 """Contract of the archives of c2: files with an index in SQLite, and PostgreSQL."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
 
 import pytest
 from builders.records import decision_record, reconstructed_image
@@ -13,7 +9,7 @@ from builders.records import decision_record, reconstructed_image
 from sonarpost.archive.postgresql import DatabaseAddress
 from sonarpost.archive.shore_index import TaskingRow
 from sonarpost.errors import PayloadError
-from sonarpost.messages import Pixels, ReconstructedImage
+from sonarpost.messages import Pixels
 from sonarpost.services.c2.archive import Archive, Storage
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.shared_archive import SharedArchive
@@ -23,7 +19,7 @@ DAY_S = 86400.0
 OpenArchive = Callable[..., Storage]
 
 
-def image(image_id: str = "AAAA", value: int = 1, start_s: float = START_S) -> ReconstructedImage:
+def image(image_id="AAAA", value=1, start_s=START_S):
     picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([value]) * 600)
     return reconstructed_image(
         picture, vessel_id="vessel-1", image_id=image_id, first_frame_utc_s=start_s, last_frame_utc_s=start_s + 1
@@ -31,13 +27,13 @@ def image(image_id: str = "AAAA", value: int = 1, start_s: float = START_S) -> R
 
 
 @pytest.fixture(params=["files", "postgresql"])
-def open_archive(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[OpenArchive]:
-    made: list[Storage] = []
+def open_archive(request, tmp_path):
+    made = []
     url = request.getfixturevalue("database_url") if request.param == "postgresql" else None
 
-    def open_(**options: Any) -> Storage:
+    def open_(**options):
         config = C2Config(out_dir=tmp_path / "out", database=url, **options)
-        archive: Storage = Archive(config) if url is None else SharedArchive(config, DatabaseAddress.parse(url), "c2-a")
+        archive = Archive(config) if url is None else SharedArchive(config, DatabaseAddress.parse(url), "c2-a")
         archive.open()
         made.append(archive)
         return archive
@@ -48,11 +44,11 @@ def open_archive(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ope
 
 
 @pytest.fixture
-def archive(open_archive: OpenArchive) -> Storage:
+def archive(open_archive):
     return open_archive()
 
 
-def test_records_are_read_after_the_flush_and_after_a_restart(open_archive: OpenArchive) -> None:
+def test_records_are_read_after_the_flush_and_after_a_restart(open_archive):
     archive = open_archive()
     sent = image()
     assert archive.store_image(sent, 5.0)[1:] == (True, False)
@@ -65,7 +61,7 @@ def test_records_are_read_after_the_flush_and_after_a_restart(open_archive: Open
     assert [(each.decision_id, each.verdict) for each in index.decisions()] == [("d1", "mine_like")]
 
 
-def test_records_are_not_stored_before_the_flush(open_archive: OpenArchive) -> None:
+def test_records_are_not_stored_before_the_flush(open_archive):
     archive = open_archive()
     archive.store_image(image(), 5.0)
     archive.store_decision(decision_record())
@@ -73,7 +69,7 @@ def test_records_are_not_stored_before_the_flush(open_archive: OpenArchive) -> N
     assert (index.images(), index.decisions()) == ([], [])
 
 
-def test_repeated_record_is_stored_once(archive: Storage) -> None:
+def test_repeated_record_is_stored_once(archive):
     for is_flushed in (False, True):
         new = [archive.store_image(image(), 5.0).is_new, archive.store_decision(decision_record())]
         assert new == [not is_flushed] * 2
@@ -85,7 +81,7 @@ def test_repeated_record_is_stored_once(archive: Storage) -> None:
 
 
 @pytest.mark.parametrize("flush_between", [False, True])
-def test_different_image_of_the_same_name_is_kept_as_a_conflict(archive: Storage, *, flush_between: bool) -> None:
+def test_different_image_of_the_same_name_is_kept_as_a_conflict(archive, *, flush_between):
     assert archive.store_image(image(), 5.0)[1:] == (True, False)
     if flush_between:
         archive.flush()
@@ -98,7 +94,7 @@ def test_different_image_of_the_same_name_is_kept_as_a_conflict(archive: Storage
 
 
 @pytest.mark.parametrize("flush_between", [False, True])
-def test_different_decision_of_the_same_identifier_is_refused(archive: Storage, *, flush_between: bool) -> None:
+def test_different_decision_of_the_same_identifier_is_refused(archive, *, flush_between):
     archive.store_decision(decision_record("d1"))
     if flush_between:
         archive.flush()
@@ -108,7 +104,7 @@ def test_different_decision_of_the_same_identifier_is_refused(archive: Storage, 
     assert [row.verdict for row in archive.index().decisions()] == ["mine_like"]
 
 
-def test_text_that_a_database_cannot_store_is_kept_in_the_record(archive: Storage) -> None:
+def test_text_that_a_database_cannot_store_is_kept_in_the_record(archive):
     remark = "NUL \0, quote ', \\u0000, {}, \N{BLACK SQUARE}"
     archive.store_decision(decision_record("d1", remark=remark))
     archive.flush()
@@ -116,7 +112,7 @@ def test_text_that_a_database_cannot_store_is_kept_in_the_record(archive: Storag
     assert archive.index().decisions()[0].remark.endswith(remark[5:])
 
 
-def test_retention_removes_exported_images_first(open_archive: OpenArchive) -> None:
+def test_retention_removes_exported_images_first(open_archive):
     archive = open_archive()
     for number in range(4):
         archive.store_image(image(f"{number:04d}"), 5.0)
@@ -135,7 +131,7 @@ def test_retention_removes_exported_images_first(open_archive: OpenArchive) -> N
     assert len(archive.index().images()) == 4
 
 
-def test_retention_removes_old_images(open_archive: OpenArchive) -> None:
+def test_retention_removes_old_images(open_archive):
     archive = open_archive(retain_days=10.0)
     archive.store_image(image(), 5.0)
     archive.flush()
@@ -145,7 +141,7 @@ def test_retention_removes_old_images(open_archive: OpenArchive) -> None:
     assert archive.index().images() == []
 
 
-def test_verification_compares_each_record_once_in_a_cycle(archive: Storage) -> None:
+def test_verification_compares_each_record_once_in_a_cycle(archive):
     for number in range(10):
         archive.store_image(image(f"{number:04d}"), 5.0)
     archive.store_decision(decision_record())
@@ -155,7 +151,7 @@ def test_verification_compares_each_record_once_in_a_cycle(archive: Storage) -> 
     assert set(archive.defect_counts().values()) == {0}
 
 
-def test_state_of_a_command_is_replaced(archive: Storage) -> None:
+def test_state_of_a_command_is_replaced(archive):
     row = TaskingRow("vessel-1", "command", "c1", "uuv-1", None, "refine", "expert", 1.0, "waiting", "", 2.0)
     delivered = TaskingRow("vessel-1", "command", "c1", "uuv-1", None, "refine", "expert", 1.0, "delivered", "", 3.0)
     assert archive.claim_tasking(row, b"payload") is None

@@ -1,7 +1,5 @@
 """Advice and commands from the shore to the vessel: delivered exactly once, with their state shown at the shore."""
 
-from __future__ import annotations
-
 import msgpack
 import pytest
 import zenoh
@@ -189,11 +187,7 @@ def test_repeated_advice_is_accepted_once_and_a_conflicting_one_refused(begin, r
 
 @pytest.mark.parametrize(
     ("key", "record", "field"),
-    [
-        (ADVICE, advice(vessel="vessel-2"), "vessel_id"),
-        (ADVICE, command(), "type"),
-        (COMMAND, advice(), "type"),
-    ],
+    [(ADVICE, advice(vessel="vessel-2"), "vessel_id"), (ADVICE, command(), "type"), (COMMAND, advice(), "type")],
 )
 def test_record_for_another_vessel_than_the_key_is_refused(key, record, field, begin, expert, refused):
     service = begin()

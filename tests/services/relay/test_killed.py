@@ -1,7 +1,5 @@
 """The relay is killed (SIGKILL) repeatedly with two sites; each site receives every record exactly once."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import random

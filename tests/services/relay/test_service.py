@@ -1,7 +1,5 @@
 """relay: records of the vessel in envelopes, urgent ones first, stored until the shore has acknowledged them."""
 
-from __future__ import annotations
-
 import msgpack
 import pytest
 from builders.common import eventually
@@ -160,10 +158,7 @@ def test_latest_status_of_each_vehicle_waits_for_the_shore_and_precedes_images(
     eventually(lambda: len(shore.received) == 3)
     inner = [msgpack.unpackb(e.payload) for e in shore.received]
     assert [m["type"] for m in inner] == ["received_status", "received_status", "reconstructed_image"]
-    assert {m["vehicle_id"]: m["received_utc_s"] for m in inner[:2]} == {
-        "uuv-0": 1476262848.5,
-        "uuv-1": 1476262849.5,
-    }
+    assert {m["vehicle_id"]: m["received_utc_s"] for m in inner[:2]} == {"uuv-0": 1476262848.5, "uuv-1": 1476262849.5}
 
 
 def test_statuses_are_not_relayed_if_configured(runner, platform):

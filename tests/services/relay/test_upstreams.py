@@ -1,7 +1,5 @@
 """relay with several sites: queue, session, bandwidth limit and quota of each, and unreachable sites."""
 
-from __future__ import annotations
-
 import time
 from collections import namedtuple
 
