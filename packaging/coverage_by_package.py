@@ -1,4 +1,4 @@
-"""Print the coverage of each package and the modules below 70 %: python packaging/coverage_by_package.py COVERAGE.json."""
+"""Print the coverage of each package and the modules below 70 %: packaging/coverage_by_package.py COVERAGE.json."""
 
 from __future__ import annotations
 

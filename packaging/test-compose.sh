@@ -24,7 +24,7 @@ clear_up() {
 }
 trap clear_up EXIT
 status=0
-"$python" -m pytest tests/system/compose -q "$@" || status=$?
+"$python" -m pytest tests/system/compose -m containers -q "$@" || status=$?
 echo "test-compose: ${SECONDS} s in all"
 docker image ls --format 'test-compose: {{.Repository}}:{{.Tag}} {{.Size}}' "$SONARPOST_IMAGE"
 exit "$status"

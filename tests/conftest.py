@@ -66,12 +66,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Process
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of `make test-system`. Run those of many real processes first: they take longest and mostly wait."""
+    """Mark the tests of `make test-system`. Run those of many processes first: they take longest and mostly wait."""
     for item in items:
         quick = item.get_closest_marker("quick") is not None
         fixtures = getattr(item, "fixturenames", ())
         if not quick and (item.nodeid.startswith(SYSTEM_TESTS) or "postgresql_server" in fixtures):
             item.add_marker("system")
+        if item.nodeid.startswith("tests/system/compose/"):
+            item.add_marker("containers")
     items.sort(key=lambda item: not item.nodeid.startswith(PROCESS_TESTS))
 
 

@@ -1,7 +1,7 @@
-"""Measures every test and fixture: `pytest --times FILE` writes a JSON file, `python tests/builders/times.py FILE` prints it.
+"""Measures every test and fixture: `pytest --times FILE` writes JSON, `python tests/builders/times.py FILE` prints it.
 
 The file holds one entry a test, `{"test", "set_up_s", "call_s", "tear_down_s", "cpu_s", "outcome"}`, and one a fixture,
-`{"fixture", "count", "seconds"}`. Processor time is that of the worker and of the child processes that ended in the test.
+`{"fixture", "count", "seconds"}`. Processor time includes the child processes that ended in the test.
 """
 
 from __future__ import annotations
