@@ -1,26 +1,23 @@
 """Add golden vectors of the Zenoh wire: `PYTHONPATH=tests python -m builders.record_vectors` from the repository root.
 
 A vector holds the bytes of a record at the time of its creation. Older programs still use these bytes, so a vector is
-never changed or removed. This script adds missing vectors of `record_samples.py` and `delivery_samples()`, and fails if
-an existing one would change. When a record gains a field, give the sample a new name.
+never changed or removed. This script adds those of `record_samples.NEW_SAMPLES` and `delivery_samples()`, and fails if
+an existing one would change. A record that gains a field needs a new sample, with a new name.
 """
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import msgpack
 
-from builders.common import GOLDEN_FOLDER
-from builders.record_samples import SAMPLES
+from builders.record_samples import FOLDER, NEW_SAMPLES, vectors
 from sonarpost import wire
 from sonarpost.delivery import protocol
 from sonarpost.delivery.protocol import AckReply, attachment
 from sonarpost.delivery.records import OutboxItem
 
 BATCH = ((7, 1), (9, 0), (2**40, 300))
-FOLDER = GOLDEN_FOLDER / "zenoh"
 
 
 def plain(value: object) -> object:
@@ -72,27 +69,27 @@ def batch_samples() -> dict[str, dict[str, bytes]]:
     }
 
 
-def add(path: Path, name: str, payload: bytes) -> bool:
+def add(of: str, name: str, payload: bytes) -> bool:
     """Add a vector to its file; return whether it is new."""
-    vectors = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    present = vectors(of)
     vector = {"hex": payload.hex(), "fields": plain(msgpack.unpackb(payload))}
-    if name in vectors:
-        if vectors[name] != vector:
-            raise SystemExit(f"{path.name}: {name} would change; give the new one another name")
+    if name in present:
+        if present[name] != vector:
+            raise SystemExit(f"{of}: {name} would change; give the new one another name")
         return False
-    vectors[name] = vector
-    path.write_text(json.dumps(vectors, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    present[name] = vector
+    (FOLDER / f"{of}.json").write_text(json.dumps(present, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return True
 
 
 def main() -> None:
     """Add missing vectors."""
     added = 0
-    for name, record in SAMPLES.items():
-        added += add(FOLDER / f"{record.TYPE}.json", name, wire.encode(record))
+    for name, record in NEW_SAMPLES.items():
+        added += add(record.TYPE, name, wire.encode(record))
     for file, payloads in (delivery_samples() | batch_samples()).items():
         for name, payload in payloads.items():
-            added += add(FOLDER / f"{file}.json", name, payload)
+            added += add(file, name, payload)
     print(f"{added} vectors added")
 
 
