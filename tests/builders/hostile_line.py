@@ -31,7 +31,7 @@ class Subject:
         refusal: Kind of a message that accepts a command, and the message that refuses it instead.
         reception: Messages about a reception: its start, and a failed end.
         unknown: A message that no modem sends.
-        not_applicable: Conditions that make no sense for this driver, with the reason.
+        not_applicable: Conditions that make no sense for this driver, by reason.
         rate: Rate of the packets; None for the driver's first one.
     """
 
@@ -42,8 +42,13 @@ class Subject:
     refusal: tuple[str, bytes] = ("", b"")
     reception: tuple[bytes, bytes] = (b"", b"")
     unknown: bytes = b""
-    not_applicable: Mapping[str, str] = field(default_factory=dict)
+    not_applicable: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     rate: int | None = None
+
+    @property
+    def exceptions(self) -> set[str]:
+        """Names of the conditions that make no sense."""
+        return {name for names in self.not_applicable.values() for name in names}
 
     @property
     def name(self) -> str:

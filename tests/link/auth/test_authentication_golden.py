@@ -8,20 +8,27 @@ import json
 from typing import Any
 
 import pytest
-from builders import authentication_golden
-from builders.v1_golden import FOLDER
+from builders.common import GOLDEN_FOLDER
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
 from sonarpost.link.auth.authentication import RESERVED, WINDOW, FrameAuthenticator, ReplayWindow, SavedWindow
 from sonarpost.link.auth.key import AuthenticationSettings, Direction, parse_key
 from sonarpost.link.config import SenderConfig
-from sonarpost.link.frames.v1.frame import Segment, SegmentKind, Symbol, checksum, parse_frame
+from sonarpost.link.frames.v1.frame import (
+    Segment,
+    SegmentKind,
+    Symbol,
+    checksum,
+    pack_segments,
+    pack_symbol,
+    parse_frame,
+)
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.state import pack_part
 from sonarpost.modem.micromodem import RATES
 
-AUTHENTICATOR = FrameAuthenticator(parse_key(authentication_golden.KEY, "golden"), 3, Direction.FROM_VEHICLE)
-GOLDEN: dict[str, Any] = json.loads((FOLDER / "sealed.json").read_text(encoding="utf-8"))
+GOLDEN: dict[str, Any] = json.loads((GOLDEN_FOLDER / "acoustic-v1" / "sealed.json").read_text(encoding="utf-8"))
+KEY = parse_key(GOLDEN["key"], "golden")
 
 
 def hkdf(secret: bytes, info: bytes, length: int) -> bytes:
@@ -51,26 +58,32 @@ def ccm(key: bytes, nonce: bytes, head: bytes, data: bytes, tag_bytes: int) -> b
     return hidden + exclusive_or(state, stream(0))[:tag_bytes]
 
 
-def test_protected_frames_equal_the_golden_file() -> None:
-    assert json.loads(json.dumps(authentication_golden.make())) == GOLDEN
+def test_fingerprint_of_the_key_equals_the_golden_file() -> None:
+    assert KEY.fingerprint == GOLDEN["fingerprint"]
     assert hkdf(bytes.fromhex(GOLDEN["key"]), b"sonarpost acoustic v1 fingerprint", 4).hex() == GOLDEN["fingerprint"]
 
 
 @pytest.mark.parametrize("case", GOLDEN["frames"], ids=str)
-def test_independent_implementation_gives_the_same_frames(case: dict[str, Any]) -> None:
+def test_sender_and_independent_implementation_give_the_golden_frames(case: dict[str, Any]) -> None:
     frame = bytes.fromhex(case["frame"])
-    settings = AuthenticationSettings(case["counter_bytes"], case["tag_bytes"], case["encrypt"])
-    authenticator = FrameAuthenticator(
-        parse_key(GOLDEN["key"], "golden"), 99, Direction(case["direction"]).opposite, settings
+    settings, direction = (
+        AuthenticationSettings(case["counter_bytes"], case["tag_bytes"], case["encrypt"]),
+        case["direction"],
     )
+    authenticator = FrameAuthenticator(KEY, 99, Direction(direction).opposite, settings)
     # A receiver without a window accepts only counters near 0, so it gets a window near this one.
     newest = max(0, case["counter"] - 1)
     window = SavedWindow(case["source"], ReplayWindow(newest))
     assert not authenticator.restore({**authenticator.parts(), "window/0": pack_part(window)})
     content = parse_frame(frame, case["source"], authenticator)
     assert isinstance(content, Symbol) or content == (Segment(SegmentKind.MESSAGE, b"\x09go to 12"),)
+    sender = FrameAuthenticator(KEY, case["source"], Direction(direction), settings, first_counter=case["counter"])
+    sender.grant(case["counter"] + 1)
+    assert frame == (
+        pack_symbol(content, sender) if isinstance(content, Symbol) else pack_segments(content, 32, sender)
+    )
 
-    inputs = bytes([case["direction"], case["source"], case["counter_bytes"], case["tag_bytes"], case["encrypt"]])
+    inputs = bytes([direction, case["source"], case["counter_bytes"], case["tag_bytes"], case["encrypt"]])
     key = hkdf(bytes.fromhex(GOLDEN["key"]), b"sonarpost acoustic v1 seal" + inputs, 32)
     plain = (
         bytes([0x80 | content.head()[0]]) + content.head()[1:] + content.data
@@ -97,6 +110,6 @@ def test_sizes_and_forgery_probability_of_the_specification() -> None:
     for frame_bytes, symbol_bytes in ((32, (22, 27)), (64, (54, 59)), (256, (246, 251))):
         protected, bare = (
             V1Sender(SenderConfig(frame_bytes=frame_bytes), protection=authenticator).symbol_bytes
-            for authenticator in (AUTHENTICATOR, None)
+            for authenticator in (FrameAuthenticator(KEY, 3, Direction.FROM_VEHICLE), None)
         )
         assert (protected, bare) == symbol_bytes
