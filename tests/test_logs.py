@@ -18,28 +18,28 @@ from sonarpost.logs import IntervalLog, JsonFormatter, TextFormatter, context_of
 from sonarpost.messages import Contact, Decision, ImagePart, Pixels, Relayed, Snippet
 
 
-def record(message: str = "Picture stored", /, *args: object, **fields: object) -> logging.LogRecord:
+def record(message="Picture stored", /, *args, **fields):
     made = logging.LogRecord("n", logging.WARNING, "f.py", 1, message, args, None)
     made.created = 1476262800.25
     vars(made).update(kv(**fields))
     return made
 
 
-def text(*args: object, **fields: object) -> str:
-    return TextFormatter("relay").format(record(*args, **fields))  # type: ignore[arg-type]
+def text(*args, **fields):
+    return TextFormatter("relay").format(record(*args, **fields))
 
 
-def event(*args: object, **fields: object) -> dict[str, object]:
-    line = JsonFormatter("relay").format(record(*args, **fields))  # type: ignore[arg-type]
+def event(*args, **fields):
+    line = JsonFormatter("relay").format(record(*args, **fields))
     assert "\n" not in line
 
-    def no_constant(name: str) -> None:
+    def no_constant(name):
         raise AssertionError(f"{name} is no JSON")
 
     return dict(json.loads(line, parse_constant=no_constant))
 
 
-def test_text_line() -> None:
+def test_text_line():
     assert (
         text(image_id="0001", bytes=232)
         == "2016-10-12T09:00:00.250Z WARNING relay: Picture stored image_id=0001 bytes=232"
@@ -71,11 +71,11 @@ def test_text_line() -> None:
         (b"\xff\n", "\"b'\\\\xff\\\\n'\""),
     ],
 )
-def test_text_value_is_quoted_if_needed(value: object, shown: str) -> None:
+def test_text_value_is_quoted_if_needed(value, shown):
     assert text(x=value).endswith(f" x={shown}")
 
 
-def test_json_line() -> None:
+def test_json_line():
     assert event(image_id="0001", ratio=0.5, missing=None) == {
         "time": "2016-10-12T09:00:00.250Z",
         "level": "warning",
@@ -87,19 +87,19 @@ def test_json_line() -> None:
     }
 
 
-def test_json_value_of_another_type_is_text() -> None:
+def test_json_value_of_another_type_is_text():
     got = event(a=math.nan, b=-math.inf, c=b"x", d={1}, e=[math.nan], f=[1, "a"])
     assert [got[name] for name in "abcdef"] == ["nan", "-inf", "b'x'", "{1}", "[nan]", [1, "a"]]
 
 
-def test_field_does_not_replace_time_or_level() -> None:
+def test_field_does_not_replace_time_or_level():
     got = event(time=1, level="x", service="y", message="z")
     assert (got["level"], got["service"], got["message"]) == ("warning", "relay", "Picture stored")
     assert (got["time_"], got["level_"], got["service_"], got["message_"]) == (1, "x", "y", "z")
 
 
 @given(st.text(), st.text() | st.floats() | st.integers() | st.binary())
-def test_any_event_is_one_printable_line(message: str, value: object) -> None:
+def test_any_event_is_one_printable_line(message, value):
     made = record("%s", message, x=value)
     line = TextFormatter("relay").format(made)
     assert line.isprintable()
@@ -108,7 +108,7 @@ def test_any_event_is_one_printable_line(message: str, value: object) -> None:
     assert parsed["message"] == message
 
 
-def with_exception() -> logging.LogRecord:
+def with_exception():
     try:
         int("two\nlines")
     except ValueError as error:
@@ -117,7 +117,7 @@ def with_exception() -> logging.LogRecord:
     return made
 
 
-def test_traceback_follows_the_text_line_and_is_a_json_field() -> None:
+def test_traceback_follows_the_text_line_and_is_a_json_field():
     made = with_exception()
     lines = TextFormatter("relay").format(made).splitlines()
     assert lines[0].endswith("Picture stored")
@@ -129,14 +129,14 @@ def test_traceback_follows_the_text_line_and_is_a_json_field() -> None:
 
 
 @pytest.mark.parametrize("nothing", [None, False, ()])
-def test_no_traceback_without_an_exception(nothing: object) -> None:
+def test_no_traceback_without_an_exception(nothing):
     made = record()
-    made.exc_info = nothing  # type: ignore[assignment]  # what logging leaves there for exc_info=False
+    made.exc_info = nothing
     assert TextFormatter("relay").format(made).endswith("Picture stored")
     assert "traceback" not in json.loads(JsonFormatter("relay").format(made))
 
 
-def test_logs_are_written_to_standard_error_in_the_configured_format(capsys: pytest.CaptureFixture[str]) -> None:
+def test_logs_are_written_to_standard_error_in_the_configured_format(capsys):
     logs.configure_logging("relay", "warning", "json")
     logging.getLogger("a.b").info("Not shown")
     logging.getLogger("a.b").warning("Shown", extra=kv(n=1))
@@ -150,7 +150,7 @@ def test_logs_are_written_to_standard_error_in_the_configured_format(capsys: pyt
     assert len(logging.getLogger().handlers) == 1
 
 
-def test_log_context_is_in_both_formats() -> None:
+def test_log_context_is_in_both_formats():
     with logs.log_context(vehicle="uuv-1", image_id=None):
         with logs.log_context(image_id="00A7"):
             assert text("Sent", bytes=3).endswith(": Sent vehicle=uuv-1 image_id=00A7 bytes=3")
@@ -159,16 +159,16 @@ def test_log_context_is_in_both_formats() -> None:
     assert text("Sent").endswith(": Sent")
 
 
-def test_log_context_ends_with_an_exception() -> None:
+def test_log_context_ends_with_an_exception():
     with pytest.raises(ValueError, match="x"), logs.log_context(vehicle="uuv-1"):
         raise ValueError("x")
     assert text("Sent").endswith(": Sent")
 
 
-def test_context_of_a_record_is_read_once_and_only_for_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_context_of_a_record_is_read_once_and_only_for_a_line(monkeypatch):
     reads: list[bytes] = []
 
-    def read(payload: bytes) -> dict[str, str]:
+    def read(payload):
         reads.extend([payload] if payload else [])
         return {"image_id": "00A7"} if payload else {}
 
@@ -185,7 +185,7 @@ def test_context_of_a_record_is_read_once_and_only_for_a_line(monkeypatch: pytes
     assert reads == [b"record"]
 
 
-def test_context_holds_vehicle_image_and_contact_of_a_record() -> None:
+def test_context_holds_vehicle_image_and_contact_of_a_record():
     assert COMPLETE_IMAGE.contact is not None
     image = {"vehicle": "uuv-1", "image_id": "00A7", "contact_id": COMPLETE_IMAGE.contact.contact_id}
     contact = Contact(contact_id="line-7", vehicle_id="uuv-1")
@@ -197,13 +197,13 @@ def test_context_holds_vehicle_image_and_contact_of_a_record() -> None:
     assert context_of_payload(wire.encode(decision)) == {"vehicle": decision.vehicle_id, "image_id": decision.image_id}
 
 
-def relayed(payload: bytes) -> bytes:
+def relayed(payload):
     key = keys.image_reconstructed("vessel-1")
     return wire.encode(Relayed(vessel_id="vessel-1", key=key, payload=payload, relayed_utc_s=1.0))
 
 
 @pytest.mark.parametrize("payload", [b"", b"\xc1", relayed(b"\xc1"), relayed(relayed(wire.encode(COMPLETE_IMAGE)))])
-def test_invalid_payload_has_no_context(payload: bytes) -> None:
+def test_invalid_payload_has_no_context(payload):
     assert context_of_payload(payload) == {}
 
 
@@ -217,48 +217,43 @@ def test_invalid_payload_has_no_context(payload: bytes) -> None:
         | st.lists(st.integers(0, 9), max_size=2),
     )
 )
-def test_context_omits_fields_of_other_types(fields: dict[str, object]) -> None:
+def test_context_omits_fields_of_other_types(fields):
     assert all(isinstance(value, str) for value in context_of_payload(msgpack.packb(fields)).values())
 
 
-@pytest.mark.parametrize("name", SAMPLES)
-def test_context_of_every_record_type(name: str) -> None:
-    record = SAMPLES[name]
-    contact = getattr(record, "contact", None)
-    expected = {
-        "vehicle": getattr(record, "vehicle_id", None) or getattr(contact, "vehicle_id", None),
-        "image_id": getattr(record, "image_id", None),
-        "contact_id": getattr(contact, "contact_id", None),
-    }
-    if isinstance(record, ImagePart):
-        expected |= {"vehicle": record.u, "image_id": record.i}
-    if not isinstance(record, Relayed):
-        known = {field: value for field, value in expected.items() if value is not None}
-        assert context_of_payload(wire.encode(record)) == known
+def test_context_of_every_record_type():
+    for record in SAMPLES.values():
+        contact = getattr(record, "contact", None)
+        expected = {
+            "vehicle": getattr(record, "vehicle_id", None) or getattr(contact, "vehicle_id", None),
+            "image_id": getattr(record, "image_id", None),
+            "contact_id": getattr(contact, "contact_id", None),
+        }
+        if isinstance(record, ImagePart):
+            expected |= {"vehicle": record.u, "image_id": record.i}
+        if not isinstance(record, Relayed):
+            known = {field: value for field, value in expected.items() if value is not None}
+            assert context_of_payload(wire.encode(record)) == known
 
 
-def interval_log(now: list[float], interval_s: float = 60.0) -> IntervalLog:
+def interval_log(now, interval_s=60.0):
     return IntervalLog(logging.getLogger("n"), logging.WARNING, "Record refused", interval_s, lambda: now[0])
 
 
-def logged(caplog: pytest.LogCaptureFixture) -> list[object]:
+def logged(caplog):
     return [vars(r)["fields"] for r in caplog.records]
 
 
-def test_interval_log_writes_one_line_an_interval(caplog: pytest.LogCaptureFixture) -> None:
+def test_interval_log_writes_one_line_an_interval(caplog):
     now = [1000.0]
     refused = interval_log(now)
     for number in range(6001):
         now[0] = 1000.0 + number / 50
         refused.log(number=number)
-    assert logged(caplog) == [
-        {"number": 0},
-        {"number": 3000, "suppressed": 2999},
-        {"number": 6000, "suppressed": 2999},
-    ]
+    assert logged(caplog) == [{"number": 0}, {"number": 3000, "suppressed": 2999}, {"number": 6000, "suppressed": 2999}]
 
 
-def test_interval_log_writes_the_end_of_a_burst(caplog: pytest.LogCaptureFixture) -> None:
+def test_interval_log_writes_the_end_of_a_burst(caplog):
     now = [0.0]
     refused = interval_log(now)
     for number in range(5):
