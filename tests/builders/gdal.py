@@ -1,11 +1,12 @@
-"""GDAL as an independent reader: its programs and its Python bindings, which belong to the system's Python."""
+"""GDAL as an independent reader in `make test-system`: its programs and its bindings, of the system's Python."""
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,22 @@ import pytest
 
 SYSTEM_PYTHON = Path("/usr/bin/python3")
 
-needs_gdal = pytest.mark.skipif(shutil.which("gdaltransform") is None, reason="GDAL's programs are not installed")
-needs_ogr = pytest.mark.skipif(shutil.which("ogrinfo") is None, reason="ogrinfo (gdal-bin) is not installed")
+
+def _needs(condition: str | bool, what: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    absent = pytest.mark.skipif(condition, reason=f"{what} not installed")
+    return lambda test: pytest.mark.system(absent(test))
 
 
-def _has_bindings() -> bool:
+@functools.cache
+def has_bindings() -> bool:
     command = [SYSTEM_PYTHON, "-c", "import osgeo_utils.samples"]
     return SYSTEM_PYTHON.exists() and subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
-needs_bindings = pytest.mark.skipif(not _has_bindings(), reason="GDAL's Python programs are not installed")
+needs_gdal = _needs(shutil.which("gdaltransform") is None, "GDAL's programs are")
+needs_ogr = _needs(shutil.which("ogrinfo") is None, "ogrinfo (gdal-bin) is")
+# As text it is evaluated only where such a test runs.
+needs_bindings = _needs("not gdal.has_bindings()", "GDAL's Python programs are")
 
 _VALIDATE = (
     "from osgeo_utils.samples import validate_cloud_optimized_geotiff as v; import sys;"
@@ -46,14 +53,9 @@ def info(path: Path) -> dict[str, Any]:
 def pixels(path: Path, places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """Return column and row of positions, given as latitude and longitude, by `gdaltransform`."""
     lines = "".join(f"{lon_deg!r} {lat_deg!r}\n" for lat_deg, lon_deg in places)
-    command = ["gdaltransform", "-s_srs", "OGC:CRS84", "-t_srs", _wkt(path), "-output_xy"]
+    wkt = info(path)["coordinateSystem"]["wkt"]
+    command = ["gdaltransform", "-s_srs", "OGC:CRS84", "-t_srs", wkt, "-output_xy"]
     metres = subprocess.run(command, input=lines, check=True, capture_output=True, text=True).stdout
-    ran = subprocess.run(
-        ["gdaltransform", "-i", "-output_xy", path], input=metres, check=True, capture_output=True, text=True
-    )
+    command = ["gdaltransform", "-i", "-output_xy", path]
+    ran = subprocess.run(command, input=metres, check=True, capture_output=True, text=True)
     return [(float(column), float(row)) for column, row in map(str.split, ran.stdout.splitlines())]
-
-
-def _wkt(path: Path) -> str:
-    wkt: str = info(path)["coordinateSystem"]["wkt"]
-    return wkt

@@ -31,14 +31,10 @@ def synthetic_echo(altitude_m: np.ndarray, samples: int = 600, range_m: float = 
     return np.clip(level * rng.rayleigh(0.8, level.shape), 0, 255).astype(np.uint8)
 
 
-def test_tracker_follows_sloping_bottom():
+def test_tracker_follows_sloping_bottom_and_ignores_fish_and_gaps():
     altitude = np.linspace(4.0, 9.0, 200)
-    assert np.abs(track_bottom(survey_of(synthetic_echo(altitude))) - altitude).max() < 0.25
-
-
-def test_tracker_ignores_fish_and_gaps():
-    altitude = np.full(200, 7.0)
     rows = synthetic_echo(altitude)
+    assert np.abs(track_bottom(survey_of(rows)) - altitude).max() < 0.25
     rows[50:56, 60:66] = 255  # a school of fish at 3 m
     rows[100:110] = 0  # lost pings
     assert np.abs(track_bottom(survey_of(rows)) - altitude).max() < 0.25
@@ -47,13 +43,9 @@ def test_tracker_ignores_fish_and_gaps():
 def test_no_altitude_without_first_return():
     assert np.isnan(track_bottom(survey_of(np.full((60, 400), 80, np.uint8)))).all()
     assert np.isnan(track_bottom(survey_of(np.zeros((60, 400), np.uint8)))).all()
-    assert track_bottom(dataclasses.replace(survey_of(synthetic_echo(np.full(3, 5.0))), pings=())).shape == (0,)
-
-
-@pytest.mark.parametrize("range_m", [0.2, 0.4001, 0.41, 0.5])
-def test_range_of_the_ringing_alone_has_no_altitude(range_m):
-    tracked = track_bottom(survey_of(np.full((60, 12), 80, np.uint8), range_m))
-    assert np.isnan(tracked).all()
+    assert track_bottom(Survey(Path("x"), "x", "x", ())).shape == (0,)
+    for range_m in (0.2, 0.4001, 0.41, 0.5):  # the ringing alone
+        assert np.isnan(track_bottom(survey_of(np.full((60, 12), 80, np.uint8), range_m))).all()
 
 
 def test_long_gap_is_not_interpolated():
@@ -80,9 +72,9 @@ def test_even_window_is_rejected(window):
         track_bottom(survey_of(synthetic_echo(np.full(5, 5.0))), window_pings=window)
 
 
-@pytest.mark.parametrize("kind", list(SeabedKind))
+@pytest.mark.parametrize("kind", [SeabedKind.MUD, SeabedKind.ROCK])
 def test_tracked_altitude_matches_simulation(kind):
-    survey = simulate_survey(SurveySpec(seed=2, seabed=kind, pings=200, samples=512, targets=1, clutter=1)).survey
+    survey = simulate_survey(SurveySpec(seed=2, seabed=kind, pings=100, samples=256, targets=1, clutter=1)).survey
     truth = np.array([p.altitude_m for p in survey])
     assert np.median(np.abs(track_bottom(survey) - truth)) < 0.2
 

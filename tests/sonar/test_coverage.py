@@ -1,13 +1,16 @@
-"""Covered seabed: place and area of the outline, gaps, turns, files. GDAL/OGR is the oracle."""
+"""Covered seabed: place and area of the outline, gaps, turns, files."""
 
 from __future__ import annotations
 
 import json
 import math
+import sqlite3
 import subprocess
 import tracemalloc
+from contextlib import closing
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from builders import gdal
 from builders.survey_lines import ALTITUDE_M, RANGE_M, line, with_turn
@@ -43,7 +46,7 @@ def invalid_polygons(path):
     return count, invalid
 
 
-@pytest.mark.parametrize("heading_deg", [0.0, 30.0, 200.0])
+@pytest.mark.parametrize("heading_deg", [0.0, 200.0])
 def test_corners_are_the_ends_of_the_swath(tmp_path, heading_deg):
     survey = line(heading_deg, bright=None)
     (polygon,) = survey_coverage([make_xtf(survey, tmp_path)]).polygons
@@ -70,46 +73,49 @@ def test_gap_ends_a_polygon_and_a_ping_without_position_does_not(tmp_path):
     assert (coverage.pings, coverage.left_out) == (69, 1)
 
 
-@gdal.needs_bindings
-@pytest.mark.parametrize("radius_m", [5.0, 25.0, 60.0])
-def test_polygons_of_turns_and_overlaps_are_valid(tmp_path, radius_m):
-    survey = with_turn(radius_m)
-    coverage = survey_coverage([make_xtf(survey, tmp_path)])
-    write_coverage_geopackage(tmp_path / "c.gpkg", coverage.polygons)
-    count, invalid = invalid_polygons(tmp_path / "c.gpkg")
-    assert (count, invalid) == (len(coverage.polygons), 0)
-    assert all(polygon.area_m2 > 0 for polygon in coverage.polygons)
-    # Each line is covered but for the 10 m at a turn.
-    lines_m2 = 2 * (119 * 0.5 - 10) * 2 * REACH_M
-    assert sum(polygon.area_m2 for polygon in coverage.polygons) > lines_m2
+def polygons_of_turn(folder, radius_m):
+    return survey_coverage([make_xtf(with_turn(radius_m), folder)]).polygons
 
 
-@gdal.needs_bindings
-def test_errors_of_the_heading_leave_one_valid_polygon(tmp_path):
+def polygons_with_errors_of_the_heading(folder):
     """Errors of up to 6 degrees at a reach of 29 m: neighbouring pings cross each other."""
     survey = line(heading_deg=30.0, pings=240, bright=None)
     pings = tuple(
         replace(ping, heading_deg=30.0 + 6 * math.sin(row / 5)) if 40 <= row < 200 else ping
         for row, ping in enumerate(survey.pings)
     )
-    (polygon,) = survey_coverage([make_xtf(replace(survey, pings=pings), tmp_path)]).polygons
-    write_coverage_geopackage(tmp_path / "c.gpkg", [polygon])
-    assert invalid_polygons(tmp_path / "c.gpkg") == (1, 0)
+    return survey_coverage([make_xtf(replace(survey, pings=pings), folder)]).polygons
+
+
+@gdal.needs_bindings
+def test_polygons_of_turns_overlaps_and_errors_are_valid(tmp_path):
+    turns = [polygons_of_turn(tmp_path, radius_m) for radius_m in (5.0, 25.0, 60.0)]
+    for polygons in (*turns, polygons_with_errors_of_the_heading(tmp_path)):
+        write_coverage_geopackage(tmp_path / "c.gpkg", polygons)
+        assert invalid_polygons(tmp_path / "c.gpkg") == (len(polygons), 0)
+
+
+def test_lines_are_covered_at_a_turn_and_with_errors_of_the_heading(tmp_path):
+    polygons = polygons_of_turn(tmp_path, 5.0)
+    assert all(polygon.area_m2 > 0 for polygon in polygons)
+    # Each line is covered but for the 10 m at a turn.
+    assert sum(polygon.area_m2 for polygon in polygons) > 2 * (119 * 0.5 - 10) * 2 * REACH_M
+    (polygon,) = polygons_with_errors_of_the_heading(tmp_path)
     assert (polygon.first_ping, polygon.last_ping) == (0, 239)
     assert polygon.area_m2 == pytest.approx(239 * 0.25 * 2 * REACH_M, rel=0.05)
 
 
 def test_strips_do_not_change_the_outline(tmp_path, monkeypatch):
-    path = make_xtf(line(pings=400, bright=None), tmp_path)
-    whole = survey_coverage([path])
-    monkeypatch.setattr(track, "_STRIP_PINGS", 150)
-    assert survey_coverage([path]) == whole
+    whole = survey_coverage([make_xtf(line(pings=200, bright=None), tmp_path)])
+    monkeypatch.setattr(track, "_STRIP_PINGS", 100)
+    assert survey_coverage([tmp_path / "line.xtf"]) == whole
 
 
+@pytest.mark.system
 def test_memory_does_not_depend_on_the_length(tmp_path, monkeypatch):
     monkeypatch.setattr(track, "_STRIP_PINGS", 150)
     peaks = []
-    for pings in (600, 2400):
+    for pings in (600, 1800):
         path = make_xtf(line(pings=pings, bright=None), tmp_path)
         tracemalloc.start()
         survey_coverage([path])
@@ -118,17 +124,37 @@ def test_memory_does_not_depend_on_the_length(tmp_path, monkeypatch):
     assert peaks[1] < 1.15 * peaks[0]
 
 
+def write_both(folder, polygons):
+    write_coverage_geojson(folder / "c.geojson", polygons)
+    write_coverage_geopackage(folder / "c.gpkg", polygons)
+
+
+def test_both_files_hold_the_polygons(tmp_path):
+    survey = line(bright=None)
+    path = make_xtf(replace(survey, pings=(*survey.pings[:40], *survey.pings[90:])), tmp_path)
+    polygons = survey_coverage([path]).polygons
+    write_both(tmp_path, polygons)
+    features = json.loads((tmp_path / "c.geojson").read_text())["features"]
+    with closing(sqlite3.connect(tmp_path / "c.gpkg")) as db:
+        cursor = db.execute("SELECT * FROM coverage ORDER BY fid")
+        rows = [dict(zip([column[0] for column in cursor.description], row, strict=True)) for row in cursor]
+    assert len(features) == len(rows) == len(polygons) == 2
+    for feature, row, polygon in zip(features, rows, polygons, strict=True):
+        assert {name: row[name] for name in feature["properties"]} == feature["properties"]
+        (ring,) = feature["geometry"]["coordinates"]
+        points = np.frombuffer(row["geom"][-16 * len(ring) :], "<f8").reshape(-1, 2)
+        np.testing.assert_allclose(ring, points, atol=2e-8)
+        np.testing.assert_allclose(points, [(p.lon_deg, p.lat_deg) for p in polygon.ring], atol=1e-9)
+
+
 @gdal.needs_ogr
 def test_ogr_reads_the_same_polygons_from_both_files(tmp_path):
     survey = line(bright=None)
     path = make_xtf(replace(survey, pings=(*survey.pings[:40], *survey.pings[90:])), tmp_path)
-    polygons = survey_coverage([path]).polygons
-    write_coverage_geojson(tmp_path / "c.geojson", polygons)
-    write_coverage_geopackage(tmp_path / "c.gpkg", polygons)
+    write_both(tmp_path, survey_coverage([path]).polygons)
     described = subprocess.run(["ogrinfo", "-so", tmp_path / "c.gpkg", "coverage"], check=True, capture_output=True)
     assert "Geometry: Polygon" in described.stdout.decode()
     features = json.loads((tmp_path / "c.geojson").read_text())["features"]
-    assert len(features) == 2
     read = layer(tmp_path / "c.gpkg", "-lco", "COORDINATE_PRECISION=8")
     assert [f["properties"] for f in read] == [f["properties"] for f in features]
     for got, want in zip(read, features, strict=True):
@@ -140,7 +166,7 @@ def test_ogr_reads_the_same_polygons_from_both_files(tmp_path):
 
 @gdal.needs_ogr
 def test_simulated_objects_are_covered(tmp_path):
-    simulated = simulate_survey(SurveySpec(seed=3, pings=400, targets=4, clutter=0))
+    simulated = simulate_survey(SurveySpec(seed=3, pings=400, samples=256, targets=4, clutter=0))
     write_coverage_geopackage(tmp_path / "c.gpkg", survey_coverage([make_xtf(simulated.survey, tmp_path)]).polygons)
     for item in simulated.truth:
         box = [f"{value:.9f}" for value in (item.lon_deg, item.lat_deg, item.lon_deg, item.lat_deg)]

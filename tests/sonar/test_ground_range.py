@@ -46,23 +46,18 @@ def test_interval_mean_weights_partial_samples():
     samples = np.array([10, 20, 40, 80], np.uint8)
     edges = np.array([0.0, 0.5, 2.0, 2.25, 2.75, 4.0])
     np.testing.assert_allclose(interval_means(samples, edges), [10, (5 + 20) / 1.5, 40, 40, (10 + 80) / 1.25])
-
-
-def test_interval_beyond_samples_or_empty_is_nan():
-    samples = np.array([10, 20], np.uint16)
-    means = interval_means(samples, np.array([0.0, 0.0, 0.25, 1.0, 2.0, 2.5]))
+    # Beyond the samples, and for an empty interval.
+    means = interval_means(np.array([10, 20], np.uint16), np.array([0.0, 0.0, 0.25, 1.0, 2.0, 2.5]))
     np.testing.assert_array_equal(means, [np.nan, 10, 10, 20, np.nan])
 
 
-@pytest.mark.parametrize("spacing", [0.0, -1.0, 1e-9, float("nan")])
-def test_invalid_spacing_is_rejected(spacing):
-    with pytest.raises(ValueError, match="spacing"):
-        ground_range_image(survey_of(np.ones((2, 9), np.uint8)), Side.PORT, np.ones(2), spacing)
-
-
-def test_wrong_number_of_altitudes_is_rejected():
+def test_invalid_spacing_and_number_of_altitudes_are_rejected():
+    survey = survey_of(np.ones((2, 9), np.uint8))
+    for spacing_m in (0.0, -1.0, 1e-9, float("nan")):
+        with pytest.raises(ValueError, match="spacing"):
+            ground_range_image(survey, Side.PORT, np.ones(2), spacing_m)
     with pytest.raises(ValueError, match="one for each"):
-        ground_range_image(survey_of(np.ones((2, 9), np.uint8)), Side.PORT, np.ones(3), 1.0)
+        ground_range_image(survey, Side.PORT, np.ones(3), 1.0)
 
 
 def test_beam_normalisation_handles_changing_altitude():

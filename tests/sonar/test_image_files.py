@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image, ImageOps
@@ -31,7 +31,6 @@ def ramp(dtype: type = np.uint8) -> np.ndarray:
     return np.linspace(0, full_scale, 12 * 20).reshape(12, 20).astype(dtype)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(image=GREY)
 def test_both_formats_keep_every_pixel(tmp_path, image):
     for write, name in ((write_tiff, "a.tiff"), (write_png, "a.png")):
@@ -42,6 +41,9 @@ def test_both_formats_keep_every_pixel(tmp_path, image):
 
 
 def test_other_libraries_read_written_images(tmp_path):
+    write_tiff(tmp_path / "a.tiff", np.array([[1, 2, 3]], np.uint8))
+    raw = (tmp_path / "a.tiff").read_bytes()
+    assert (raw[:8], raw[-3:]) == (bytes.fromhex("49492a00 08000000"), b"\x01\x02\x03")
     for dtype in (np.uint8, np.uint16):
         write_tiff(tmp_path / "a.tiff", ramp(dtype), description="contact 7")
         with tifffile.TiffFile(tmp_path / "a.tiff") as file:
@@ -52,13 +54,6 @@ def test_other_libraries_read_written_images(tmp_path):
         write_png(tmp_path / "a.png", ramp(dtype))
         with Image.open(tmp_path / "a.png") as image:
             np.testing.assert_array_equal(np.asarray(image), ramp(dtype))
-
-
-def test_golden_bytes_of_tiff(tmp_path):
-    write_tiff(tmp_path / "a.tiff", np.array([[1, 2, 3]], np.uint8))
-    raw = (tmp_path / "a.tiff").read_bytes()
-    assert raw[:8] == bytes.fromhex("49492a00 08000000")
-    assert raw[-3:] == b"\x01\x02\x03"
 
 
 def test_same_image_gives_same_bytes(tmp_path):
@@ -97,38 +92,17 @@ def test_only_8_and_16_bit_grey_is_written(tmp_path, image, field):
     for write in (write_tiff, write_png):
         with pytest.raises(SurveyFileError, match=field):
             write(tmp_path / "a", image)
-    assert not list(tmp_path.iterdir())
-
-
-def test_description_must_be_ascii(tmp_path):
     with pytest.raises(SurveyFileError, match="description"):
         write_tiff(tmp_path / "a.tiff", ramp(), description="Øst")
-
-
-def test_format_is_detected_from_content(tmp_path):
-    write_png(tmp_path / "a.tiff", ramp())
-    np.testing.assert_array_equal(read_image(tmp_path / "a.tiff"), ramp())
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("byteorder", ["<", ">"])
 @pytest.mark.parametrize("options", [{}, {"compression": "zlib"}, {"tile": (16, 16)}, {"bigtiff": True}])
 def test_tiff_with_other_layouts(tmp_path, byteorder, options):
-    tifffile.imwrite(tmp_path / "a.tif", ramp(np.uint16), byteorder=byteorder, photometric="minisblack", **options)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), ramp(np.uint16))
-
-
-def test_white_is_zero_is_inverted(tmp_path):
-    tifffile.imwrite(tmp_path / "a.tif", ramp(), photometric="miniswhite")
-    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), 255 - ramp())
-
-
-@pytest.mark.parametrize("planar", ["contig", "separate"])
-def test_rgb_with_equal_channels_is_grey(tmp_path, planar):
-    axis = -1 if planar == "contig" else 0
-    tifffile.imwrite(tmp_path / "a.tif", np.stack([ramp()] * 3, axis), photometric="rgb", planarconfig=planar)
-    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), ramp())
-    Image.fromarray(np.stack([ramp()] * 3, -1)).save(tmp_path / "a.png")
-    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), ramp())
+    """The format is detected from the content, whatever the name."""
+    tifffile.imwrite(tmp_path / "a.png", ramp(np.uint16), byteorder=byteorder, photometric="minisblack", **options)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), ramp(np.uint16))
 
 
 def tiff_bytes(pixels: np.ndarray, **options: object) -> bytes:
@@ -149,16 +123,18 @@ def pillow_file(image: Image.Image, kind: str, **options: object) -> bytes:
     return buffer.getvalue()
 
 
-def png16(colour_type: int, pixels: np.ndarray) -> bytes:
-    """Return a PNG of 16 bits in a colour that Pillow does not write."""
-
+def png(columns: int, rows: int, bits: int, colour_type: int, lines: bytes) -> bytes:
     def chunk(kind: bytes, body: bytes) -> bytes:
         return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
-    rows, columns = pixels.shape[:2]
-    lines = b"".join(b"\0" + line.astype(">u2").tobytes() for line in pixels)
-    header = struct.pack(">IIBBBBB", columns, rows, 16, colour_type, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", columns, rows, bits, colour_type, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(lines)) + chunk(b"IEND", b"")
+
+
+def png16(colour_type: int, pixels: np.ndarray) -> bytes:
+    """Return a PNG of 16 bits in a colour that Pillow does not write."""
+    lines = b"".join(b"\0" + line.astype(">u2").tobytes() for line in pixels)
+    return png(pixels.shape[1], len(pixels), 16, colour_type, lines)
 
 
 def wide(pixels: np.ndarray) -> np.ndarray:
@@ -206,17 +182,11 @@ READABLE: dict[str, tuple[bytes, np.ndarray, str]] = {
     "PNG RGBA 16": (png16(6, wide(np.dstack([COLOUR, ALPHA * 0 + 255]))), GREY_OF_COLOUR, "reduced to 8 bits"),
     "PNG LA 16": (png16(4, wide(np.dstack([ramp(), ALPHA]))), HALF_BLACK, "reduced to 8 bits"),
     "TIFF 8": (tiff_bytes(ramp()), ramp(), ""),
+    "TIFF white is zero": (tiff_bytes(ramp(), photometric="miniswhite"), 255 - ramp(), ""),
+    "TIFF RGB equal": (tiff_bytes(np.stack([ramp()] * 3, -1), photometric="rgb"), ramp(), ""),
     "TIFF 16": (tiff_bytes(ramp(np.uint16)), ramp(np.uint16), ""),
-    "TIFF 16 LZW": (
-        pillow_file(Image.fromarray(ramp(np.uint16)), "TIFF", compression="tiff_lzw"),
-        ramp(np.uint16),
-        "",
-    ),
-    "TIFF RGB LZW": (
-        pillow_file(Image.fromarray(COLOUR), "TIFF", compression="tiff_lzw"),
-        GREY_OF_COLOUR,
-        COLOUR_NOTE,
-    ),
+    "TIFF 16 LZW": (pillow_file(Image.fromarray(ramp(np.uint16)), "TIFF", compression="tiff_lzw"), ramp(np.uint16), ""),
+    "TIFF RGB LZW": (pillow_file(Image.fromarray(COLOUR), "TIFF", compression="tiff_lzw"), GREY_OF_COLOUR, COLOUR_NOTE),
     "TIFF float LZW": (
         pillow_file(Image.fromarray(FLOAT), "TIFF", compression="tiff_lzw"),
         np.rint(np.nan_to_num((FLOAT + 3) * 7 - 1) / 254 * 65535).astype(np.uint16),
@@ -298,7 +268,6 @@ def test_every_format_depth_and_colour_is_read_by_one_rule(tmp_path, name):
         np.testing.assert_array_equal(read_image(tmp_path / "a"), image.pixels)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     colours=hnp.arrays(
         st.sampled_from([np.uint8, np.uint16]),
@@ -314,8 +283,9 @@ def test_grey_of_a_colour_is_its_documented_luminance(tmp_path, colours):
     assert np.abs(grey - expected).max() <= 0.5 + 1e-6
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
-@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "TIFF LZW"])
+@pytest.mark.parametrize(
+    ("kind", "orientation"), [*(("TIFF", value) for value in range(1, 9)), ("JPEG", 6), ("PNG", 5), ("TIFF LZW", 7)]
+)
 def test_orientation_is_applied_as_other_programs_apply_it(tmp_path, kind, orientation):
     pixels = np.kron(np.array([[0, 80, 160], [250, 30, 120]], np.uint8), np.ones((16, 16), np.uint8))
     exif = Image.Exif()
@@ -360,18 +330,8 @@ def test_error_names_unsupported_image(tmp_path, name):
         read_any_image(tmp_path / "a")
 
 
-def png_with_declared_size(columns: int, rows: int) -> bytes:
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-    header = struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(100))) + chunk(b"IEND", b"")
-    )
-
-
 def test_declared_size_is_checked_before_decoding(tmp_path):
-    (tmp_path / "a.png").write_bytes(png_with_declared_size(2**31 - 1, 2**31 - 1))
+    (tmp_path / "a.png").write_bytes(png(2**31 - 1, 2**31 - 1, 8, 0, bytes(100)))
     with pytest.raises(SurveyFileError, match="size"):
         read_image(tmp_path / "a.png")
     raw = bytearray(tiff_bytes(ramp(), photometric="minisblack", metadata=None))
@@ -395,16 +355,15 @@ def test_a_truncated_file_is_refused_or_lacks_no_pixel(tmp_path, name):
     (tmp_path / "a").write_bytes(raw)
     whole = read_any_image(tmp_path / "a").pixels
     refused = 0
-    for length in range(0, len(raw), 1 + len(raw) // 150):
+    for length in range(0, len(raw), 1 + len(raw) // 75):
         (tmp_path / "b").write_bytes(raw[:length])
         try:
             np.testing.assert_array_equal(read_any_image(tmp_path / "b").pixels, whole)
         except SurveyFileError:
             refused += 1
-    assert refused > 50
+    assert refused > 25
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     name=st.sampled_from(sorted(READABLE)),
     damage=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), min_size=1, max_size=8),
@@ -455,12 +414,9 @@ def test_folder_without_an_image_is_an_error_that_names_its_files(tmp_path):
     with pytest.raises(SurveyFileError, match="no such folder"):
         list_images(tmp_path / "absent")
 
-
-def test_missing_or_irregular_file_is_rejected(tmp_path):
-    with pytest.raises(SurveyFileError, match="absent"):
-        read_image(tmp_path / "absent.png")
-    with pytest.raises(SurveyFileError, match="absent"):
-        read_image(tmp_path)
+    for path in (tmp_path / "absent.png", tmp_path):
+        with pytest.raises(SurveyFileError, match="absent"):
+            read_image(path)
 
 
 @pytest.mark.realdata

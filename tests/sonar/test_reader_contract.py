@@ -5,29 +5,20 @@ from __future__ import annotations
 import dataclasses
 import os
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
 from builders.surveys import MAKERS
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
 from sonarpost.sonar.options import Mounting, SurveyOptions
 from sonarpost.sonar.readers import open_survey, read_survey, recording_parts
-from sonarpost.sonar.survey import Side, Survey
+from sonarpost.sonar.survey import Side
 
-STORED = {
-    "xtf": lambda path: path,
+STORED = dict.fromkeys(MAKERS, lambda path: path) | {
     "humminbird": lambda path: path.with_suffix("") / "B003.SON",
     "waterfall": lambda path: path.with_name("line.csv"),
-    "sl2": lambda path: path,
-    "sl3": lambda path: path,
-    "jsf": lambda path: path,
-    "sdf": lambda path: path,
-    "svlog": lambda path: path,
 }
 """The file with the navigation of the pings, by format."""
 
@@ -65,25 +56,16 @@ def test_info_matches_pings_and_iteration_can_be_repeated(kind, small_survey, tm
     assert all(a.number == b.number for a, b in together)
 
 
-def test_position_jump_and_decreasing_time_are_reported(kind, small_survey, tmp_path):
-    pings = list(small_survey(pings=12).pings)
+def test_jumps_of_position_and_time_are_reported_and_a_repeated_position_is_accepted(kind, small_survey, tmp_path):
+    pings = list(small_survey(pings=24).pings)
     pings[4] = dataclasses.replace(pings[4], lat_deg=49.9)
-    if kind != "humminbird":  # its channels are paired by an unsigned time
-        pings[8] = dataclasses.replace(pings[8], time_utc_s=pings[8].time_utc_s - 30)
+    pings[14:] = [dataclasses.replace(ping, lat_deg=ping.lat_deg + 1) for ping in pings[14:]]
+    goes_back = kind != "humminbird"  # its channels are paired by an unsigned time
+    pings[8] = dataclasses.replace(pings[8], time_utc_s=pings[8].time_utc_s - 30 * goes_back)
     read = read_survey(MAKERS[kind](dataclasses.replace(small_survey(), pings=tuple(pings)), tmp_path))
-    assert [p.lat_deg is None for p in read] == [row == 4 for row in range(12)]
-    assert any("too far from the one before, in 1 of 12 pings, the first in row 4" in w for w in read.warnings)
-    assert any("time goes back in 1 of 12 pings, the first in row 8" in w for w in read.warnings) is (
-        kind != "humminbird"
-    )
-
-
-def test_repeated_positions_after_jump_are_accepted(kind, small_survey, tmp_path):
-    pings = [
-        dataclasses.replace(p, lat_deg=p.lat_deg + (row >= 5)) for row, p in enumerate(small_survey(pings=15).pings)
-    ]
-    read = read_survey(MAKERS[kind](dataclasses.replace(small_survey(), pings=tuple(pings)), tmp_path))
-    assert [p.lat_deg is None for p in read] == [5 <= row < 9 for row in range(15)]
+    assert [row for row, ping in enumerate(read) if ping.lat_deg is None] == [4, 14, 15, 16, 17]
+    assert any("too far from the one before, in 5 of 24 pings, the first in row 4" in w for w in read.warnings)
+    assert any("time goes back in 1 of 24 pings, the first in row 8" in w for w in read.warnings) is goes_back
 
 
 def test_mounting_shifts_every_position(kind, small_survey, tmp_path):
@@ -100,47 +82,13 @@ def test_every_truncation_raises_error_or_gives_complete_pings(kind, small_surve
     path = MAKERS[kind](small_survey(), tmp_path)
     stored = STORED[kind](path)
     complete = stored.read_bytes()
-    for length in range(0, len(complete), max(len(complete) // 150, 1)):
+    for length in range(0, len(complete), max(len(complete) // 40, 1)):
         stored.write_bytes(complete[:length])
         try:
             survey = read_survey(path)
         except SurveyFileError:
             continue
         assert all(channel.samples.size == 40 for ping in survey for channel in ping.channels)
-
-
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_damaged_file_is_read_or_raises_survey_file_error(kind, small_survey, tmp_path, data):
-    folder = tmp_path / "damaged"
-    if not folder.exists():
-        folder.mkdir()
-        MAKERS[kind](small_survey(), folder)
-        (tmp_path / "complete").write_bytes(STORED[kind](_path(kind, folder)).read_bytes())
-    raw = bytearray((tmp_path / "complete").read_bytes())
-    for _ in range(data.draw(st.integers(1, 5))):
-        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
-    path = _path(kind, folder)
-    STORED[kind](path).write_bytes(raw)
-    try:
-        survey = read_survey(path)
-    except SurveyFileError:
-        return
-    check(survey)
-
-
-def _path(kind: str, folder: Path) -> Path:
-    return folder / {"humminbird": "line.DAT", "waterfall": "line.waterfall.toml"}.get(kind, f"line.{kind}")
-
-
-def check(survey: Survey) -> None:
-    for ping in survey:
-        assert (ping.lat_deg is None) == (ping.lon_deg is None)
-        assert ping.lat_deg is None or (abs(ping.lat_deg) <= 90 and abs(ping.lon_deg) <= 180)
-        assert ping.heading_deg is None or 0 <= ping.heading_deg < 360
-        assert ping.altitude_m is None or ping.altitude_m > 0
-        assert np.isfinite(ping.time_utc_s)
-        assert all(c.slant_range_m > 0 and c.samples.size for c in ping.channels)
 
 
 def test_file_modified_while_read_is_an_error(kind, small_survey, tmp_path):
@@ -155,18 +103,14 @@ def test_file_modified_while_read_is_an_error(kind, small_survey, tmp_path):
             list(pings)
 
 
-def test_replaced_file_is_read_to_its_end(kind, small_survey, tmp_path):
-    path = MAKERS[kind](small_survey(), tmp_path)
-    with open_survey(path) as source:
-        before = [p.time_utc_s for p in source.pings()]
-        STORED[kind](path).unlink()
-        STORED[kind](path).write_bytes(b"something else")
-        assert [p.time_utc_s for p in source.pings()] == before
-
-
-def test_missing_or_irregular_file_is_rejected(kind, small_survey, tmp_path):
+def test_replaced_file_is_read_to_its_end_and_a_missing_or_irregular_one_rejected(kind, small_survey, tmp_path):
     path = MAKERS[kind](small_survey(), tmp_path)
     stored = STORED[kind](path)
+    with open_survey(path) as source:
+        before = [p.time_utc_s for p in source.pings()]
+        stored.unlink()
+        stored.write_bytes(b"something else")
+        assert [p.time_utc_s for p in source.pings()] == before
     stored.unlink()
     if kind != "humminbird":  # one side alone is a valid recording
         with pytest.raises(SurveyFileError, match="No such file"):
@@ -176,12 +120,13 @@ def test_missing_or_irregular_file_is_rejected(kind, small_survey, tmp_path):
         open_survey(path)
 
 
+@pytest.mark.system
 def test_memory_is_independent_of_file_length(kind, small_survey, tmp_path):
-    """Reading a file of ten times the length needs no more memory; waterfall images are excluded."""
+    """Reading a file of three times the length needs no more memory; waterfall images are excluded."""
     if kind == "waterfall":
         pytest.skip("images are decoded completely, up to image_files.MAX_PIXELS")
     peaks = []
-    for number, pings in enumerate((300, 3000)):
+    for number, pings in enumerate((300, 900)):
         folder = tmp_path / str(number)
         folder.mkdir()
         path = MAKERS[kind](small_survey(pings=pings, samples=1000), folder)

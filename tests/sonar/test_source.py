@@ -17,8 +17,8 @@ def pings(count, samples=4):
     return [Ping(n, float(n), (ChannelPing(Side.PORT, np.zeros(samples, dtype=np.uint8), 10.0),)) for n in range(count)]
 
 
-@pytest.mark.parametrize("count", [1, 9, 10, 11, 14, 15, 16, 17, 30, 100, 101, 107])
-@pytest.mark.parametrize("overlap", [0, 1, 4, 9])
+@pytest.mark.parametrize("count", [1, 9, 10, 11, 15, 16, 30, 107])
+@pytest.mark.parametrize("overlap", [0, 4, 9])
 def test_strips_cover_stream_and_overlap(count, overlap):
     found = list(strips(pings(count), 10, overlap))
     assert [s.is_last for s in found] == [False] * (len(found) - 1) + [True]
@@ -33,27 +33,19 @@ def test_strips_cover_stream_and_overlap(count, overlap):
     assert len(found) == 1 or len(found[-1].pings) > overlap
 
 
-def test_empty_stream_has_no_strips():
-    assert list(strips([], 10, 2)) == []
-
-
 def test_byte_limit_shortens_strips():
+    assert list(strips([], 10, 2)) == []
     found = list(strips(pings(100, samples=1000), 50, 4, max_bytes=20_000))
     assert max(len(s.pings) for s in found) <= 21
     assert found[-1].first_row + len(found[-1].pings) == 100
     for one, other in pairwise(found):
         assert other.first_row == one.first_row + len(one.pings) - 4
 
-
-def test_error_names_row_where_pings_are_too_long():
     with pytest.raises(SurveyFileError, match=r"survey, row 4: samples: got 'over 4000 bytes in 5 pings'"):
         list(strips(pings(100, samples=1000), 50, 20, max_bytes=2000))
-
-
-@pytest.mark.parametrize(("length", "overlap"), [(0, 0), (10, 10), (10, -1)])
-def test_invalid_strip_lengths_are_rejected(length, overlap):
-    with pytest.raises(ValueError, match="expected more than the overlap"):
-        list(strips(pings(3), length, overlap))
+    for length, overlap in ((0, 0), (10, 10), (10, -1)):
+        with pytest.raises(ValueError, match="expected more than the overlap"):
+            list(strips(pings(3), length, overlap))
 
 
 def test_strips_read_stream_lazily():

@@ -14,6 +14,7 @@ from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Side
 
 RESULTS = np.array([0, 65_535])
+HUGE = 10**400
 
 
 def recording(tmp_path, *packets, session=None):
@@ -37,35 +38,26 @@ def nmea(text):
     return svlog_packet(109, f"${text}*{total:02X}\r\n".encode())
 
 
-def test_alternating_transducers_are_paired(tmp_path):
+def test_sides_are_paired_and_lost_profiles_leave_one_side(tmp_path):
     packets = [profile(n, 1_000_000 + 50 * n, n % 2) for n in range(8)]
     survey = read_survey(recording(tmp_path, *packets))
-    assert sides(survey) == ["ps"] * 4
-    assert [p.number for p in survey] == [0, 2, 4, 6]
-
-
-def test_lost_profiles_leave_one_side(tmp_path):
+    assert (sides(survey), [p.number for p in survey]) == (["ps"] * 4, [0, 2, 4, 6])
+    # A file that begins between two sides.
+    times = [(0, 1), *((100 * n, side) for n in range(1, 6) for side in (0, 1))]
+    survey = read_survey(recording(tmp_path, *(profile(t, 1_000_000 + t, c) for t, c in times)))
+    assert sides(survey)[-3:] == ["ps"] * 3
+    assert survey.pings[-1].time_utc_s - survey.pings[-2].time_utc_s == pytest.approx(0.1)
     times = [(0, 0), (0, 1), (100, 0), (200, 0), (200, 1), (300, 1), (400, 0), (400, 1)]
     survey = read_survey(recording(tmp_path, *(profile(t, 1_000_000 + t, c) for t, c in times)))
     assert sides(survey) == ["ps", "p", "ps", "s", "ps"]
     assert "only one side in 2 of 5 pings" in survey.warnings
 
 
-def test_pairing_recovers_from_a_file_that_begins_between_two_sides(tmp_path):
-    times = [(0, 1), *((100 * n, side) for n in range(1, 6) for side in (0, 1))]
-    survey = read_survey(recording(tmp_path, *(profile(t, 1_000_000 + t, c) for t, c in times)))
-    assert sides(survey)[-3:] == ["ps"] * 3
-    last = survey.pings[-1]
-    assert last.time_utc_s - survey.pings[-2].time_utc_s == pytest.approx(0.1)
-
-
 def test_time_is_that_of_the_session_and_its_uptime(tmp_path):
     path = recording(tmp_path, profile(clock_ms=1_000_500), session=svlog_session("2013-09-10T21:13:00Z", 1000.0))
     assert read_survey(path).pings[0].time_utc_s == pytest.approx(1_378_847_580.5)
-    path = recording(
-        tmp_path, profile(clock_ms=7), profile(clock_ms=1007), session=svlog_session("2013-09-10T21:13:00")
-    )
-    survey = read_survey(path)
+    session = svlog_session("2013-09-10T21:13:00")
+    survey = read_survey(recording(tmp_path, profile(clock_ms=7), profile(clock_ms=1007), session=session))
     assert [p.time_utc_s for p in survey] == pytest.approx([1_378_847_580, 1_378_847_581])
     assert any("another clock" in w for w in survey.warnings)
 
@@ -85,13 +77,10 @@ def test_file_without_a_date_is_rejected(tmp_path, session):
         read_survey(recording(tmp_path, profile(), session=session))
 
 
-def test_samples_are_amplitudes_of_decibels(tmp_path):
+def test_samples_are_amplitudes_of_decibels_and_the_start_is_padded(tmp_path):
     (ping,) = read_survey(recording(tmp_path, profile(min_db=20.0, max_db=60.0))).pings
     assert ping.channels[0].echo().tolist() == pytest.approx([10.0, 1000.0])
     assert ping.channels[0].samples.dtype == np.float32
-
-
-def test_start_of_the_profile_is_padded(tmp_path):
     (ping,) = read_survey(recording(tmp_path, profile(start_mm=10_000, length_mm=10_000))).pings
     assert ping.channels[0].samples.tolist()[:2] == [0, 0]
     assert ping.channels[0].slant_range_m == pytest.approx(20.0)
@@ -141,14 +130,7 @@ def test_nmea_navigation(tmp_path):
     [b"", b"\xff", b"[1]", b'{"message": 5}', b"[" * 9000]
     + [
         json.dumps({"message": {"type": "GLOBAL_POSITION_INT", "lat": lat, "lon": 5, "hdg": hdg}}).encode()
-        for lat, hdg in (
-            ("x", 65_535),
-            (None, []),
-            (1e300, 1e300),
-            (True, -5),
-            (10**400, 10**400),
-            (math.inf, math.nan),
-        )
+        for lat, hdg in (("x", 65_535), (None, []), (1e300, 1e300), (True, -5), (HUGE, HUGE), (math.inf, math.nan))
     ],
 )
 def test_hostile_mavlink_is_ignored(tmp_path, payload):
@@ -191,18 +173,10 @@ def test_damage_is_rejected(tmp_path):
         path.write_bytes(damaged)
         with pytest.raises(SurveyFileError, match=field):
             read_survey(path)
-    path.write_bytes(svlog_session() + profile(count=3))
-    with pytest.raises(SurveyFileError, match="number of results"):
-        read_survey(path)
-    path.write_bytes(svlog_session() + svlog_packet(2198, bytes(20)))
-    with pytest.raises(SurveyFileError, match="at least 52"):
-        read_survey(path)
-
-
-def test_cut_last_packet_is_left_out(tmp_path):
-    path = recording(tmp_path, profile(), profile(2))
-    path.write_bytes(path.read_bytes()[:-1])
+    for packet, field in ((profile(count=3), "number of results"), (svlog_packet(2198, bytes(20)), "at least 52")):
+        with pytest.raises(SurveyFileError, match=field):
+            read_survey(recording(tmp_path, packet))
+    path.write_bytes(complete[:-1])
     survey = read_survey(path)
-    assert survey.sides() == (Side.PORT,)
-    assert len(survey.pings) == 1
+    assert (survey.sides(), len(survey.pings)) == ((Side.PORT,), 1)
     assert survey.warnings[0].startswith("the file ends inside its last packet")

@@ -13,10 +13,6 @@ from sonarpost.sonar.readers import open_survey, read_survey
 from sonarpost.sonar.survey import Side
 
 
-def replace_text(path, old: str, new: str):
-    path.write_text(path.read_text().replace(old, new))
-
-
 def test_16_bit_tiff(small_survey, tmp_path):
     survey = small_survey(np.uint16)
     read = read_survey(make_waterfall(survey, tmp_path, tiff=True))
@@ -24,47 +20,41 @@ def test_16_bit_tiff(small_survey, tmp_path):
     assert (read.sonar_id, read.line_name, read.warnings) == ("HDS", "line", ())
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "field"),
-    [
-        ('port_order = "farthest_first"\n', "", "port_order"),
-        ('positions = "degrees"', 'positions = "metres"', "projected_crs"),
-        ('positions = "degrees"', 'positions = "degree"', "positions"),
-        ('positions = "degrees"', "", "positions"),
-        ("sonar_id", "sonarid", "sonarid"),
-        ("line.csv", "absent.csv", "No such file"),
-        ("line.port.png", "absent.png", "not a regular file"),
-        ("sonar_id =", "sonar_id", "TOML"),
-        ('positions = "degrees"\n', 'positions = "degrees"\n[columns]\nlat = "a"\n', "columns"),
-        ('positions = "degrees"\n', 'positions = "degrees"\n[columns]\nlat_deg = "y"\n', "no 'y'"),
-    ],
-)
-def test_error_names_invalid_description_field(small_survey, tmp_path, old, new, field):
-    path = make_waterfall(small_survey(), tmp_path)
-    replace_text(path, old, new)
-    with pytest.raises(SurveyFileError, match=field):
-        open_survey(path)
+DESCRIPTION_ERRORS = [
+    ('port_order = "farthest_first"\n', "", "port_order"),
+    ('positions = "degrees"', 'positions = "metres"', "projected_crs"),
+    ('positions = "degrees"', 'positions = "degree"', "positions"),
+    ('positions = "degrees"', "", "positions"),
+    ("sonar_id", "sonarid", "sonarid"),
+    ("line.csv", "absent.csv", "No such file"),
+    ("line.port.png", "absent.png", "not a regular file"),
+    ("sonar_id =", "sonar_id", "TOML"),
+    ('positions = "degrees"\n', 'positions = "degrees"\n[columns]\nlat = "a"\n', "columns"),
+    ('positions = "degrees"\n', 'positions = "degrees"\n[columns]\nlat_deg = "y"\n', "no 'y'"),
+]
+TABLE_ERRORS = [
+    ("25.0", "-25.0", "ping 0, slant_range_m"),
+    ("25.0", "nan", "ping 0, slant_range_m"),
+    ("25.0", "far", "ping 0, slant_range_m"),
+    ("1378847588.13", "yesterday", "ping 0, time_utc"),
+    ("1378847588.13", "nan", "ping 0, time_utc"),
+    ("1378847588.13", "1e300", "ping 0, time_utc"),
+    ("slant_range_m", "range", "no 'slant_range_m'"),
+    ("354.5", "35\x00", "heading_deg"),
+    ("354.5", '3"5', "heading_deg"),
+    ("354.5", "354,5", "fields"),
+    ("354.5", "9" * 70_000, "line|field"),
+]
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "field"),
-    [
-        ("25.0", "-25.0", "ping 0, slant_range_m"),
-        ("25.0", "nan", "ping 0, slant_range_m"),
-        ("25.0", "far", "ping 0, slant_range_m"),
-        ("1378847588.13", "yesterday", "ping 0, time_utc"),
-        ("1378847588.13", "nan", "ping 0, time_utc"),
-        ("1378847588.13", "1e300", "ping 0, time_utc"),
-        ("slant_range_m", "range", "no 'slant_range_m'"),
-        ("354.5", "35\x00", "heading_deg"),
-        ("354.5", '3"5', "heading_deg"),
-        ("354.5", "354,5", "fields"),
-        ("354.5", "9" * 70_000, "line|field"),
-    ],
+    ("name", "old", "new", "field"),
+    [*(("line.waterfall.toml", *each) for each in DESCRIPTION_ERRORS), *(("line.csv", *each) for each in TABLE_ERRORS)],
 )
-def test_error_names_invalid_table_field(small_survey, tmp_path, old, new, field):
+def test_error_names_the_invalid_field(small_survey, tmp_path, name, old, new, field):
     path = make_waterfall(small_survey(), tmp_path)
-    replace_text(tmp_path / "line.csv", old, new)
+    changed = path.with_name(name)
+    changed.write_text(changed.read_text().replace(old, new))
     with pytest.raises(SurveyFileError, match=field):
         open_survey(path)
 

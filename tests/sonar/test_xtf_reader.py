@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 import struct
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from pydantic import ValidationError
@@ -53,30 +52,22 @@ def put(raw: bytearray, offset: int, fmt: str, *values: float) -> bytearray:
     return raw
 
 
-def test_packet_size_of_small_survey(raw):
+def test_cut_after_the_first_packet_leaves_the_complete_pings_and_before_is_an_error(tmp_path, raw):
     assert len(raw) == HEADER + 5 * PACKET
-
-
-@pytest.mark.parametrize("length", [0, 1, 500, 1023])
-def test_file_shorter_than_header_is_rejected(tmp_path, raw, length):
-    with pytest.raises(SurveyFileError, match="file size"):
-        read(tmp_path, raw[:length])
-
-
-def test_cut_at_any_byte_after_the_first_packet_leaves_the_complete_pings(tmp_path, raw):
+    for length, field in ((0, "file size"), (1, "file size"), (HEADER - 1, "file size"), (HEADER, "pings")):
+        with pytest.raises(SurveyFileError, match=field):
+            read(tmp_path, raw[:length])
+    for length in range(HEADER + 1, HEADER + PACKET, 15):
+        with pytest.raises(SurveyFileError, match="truncated"):
+            read(tmp_path, raw[:length])
     complete = read(tmp_path, raw)
     assert complete.warnings == ()
-    for length in range(HEADER + PACKET, len(raw)):
+    boundaries = (HEADER + row * PACKET + off for row in range(1, 5) for off in (0, 1, 13, 14, 15, 255, 256, 257, 511))
+    for length in boundaries:
         count, left_bytes = divmod(length - HEADER, PACKET)
         survey = read(tmp_path, raw[:length])
         assert [p.number for p in survey] == [p.number for p in complete][:count]
         assert survey.warnings == ((CUT.format(left_bytes),) if left_bytes else ())
-
-
-def test_cut_in_the_only_packet_is_an_error(tmp_path, raw):
-    for length in range(HEADER + 1, HEADER + PACKET):
-        with pytest.raises(SurveyFileError, match="truncated"):
-            read(tmp_path, raw[:length])
 
 
 def test_damaged_length_is_not_taken_for_a_cut_file(tmp_path, raw):
@@ -92,7 +83,7 @@ def test_damaged_length_is_not_taken_for_a_cut_file(tmp_path, raw):
 
 def test_cut_of_other_packets_and_of_longer_ones(tmp_path, raw):
     packet = attitude((2013, 9, 10, 21, 13, 8, 100), 1.5, -2.5, 123.0)
-    for length in range(1, len(packet)):
+    for length in range(1, len(packet), 6):
         survey = read(tmp_path, raw + packet[:length])
         assert (len(survey.pings), survey.warnings) == (5, (CUT.format(length),))
     body = bytes(raw[: HEADER + PACKET]) + packet + bytes(raw[HEADER + PACKET :])
@@ -107,26 +98,22 @@ def with_samples(survey, *pings):
     return replace(survey, pings=tuple(changed))
 
 
-def test_float_samples_are_kept(tmp_path, small_survey):
-    samples = np.array([0.0, 0.25, 1e-9, 3e7], np.float32)
+def test_samples_of_32_bits_are_kept_and_impossible_ones_become_zero(tmp_path, small_survey):
     path = tmp_path / "line.xtf"
-    write_xtf(with_samples(small_survey(), samples, samples), path)
-    survey = read_survey(path)
-    assert survey.warnings == ()
-    for ping in survey:
-        for side in Side:
-            assert ping.channel(side).samples.dtype == np.float32
-            np.testing.assert_array_equal(ping.channel(side).echo(), samples)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, -float("inf"), 1e30])
-def test_impossible_float_samples_become_zero(tmp_path, small_survey, value):
-    samples = np.array([1.0, value, 2.0], np.float32)
-    path = tmp_path / "line.xtf"
-    write_xtf(with_samples(small_survey(), samples), path)
-    survey = read_survey(path)
-    assert [c.samples.tolist() for c in survey.pings[0].channels] == [[1.0, 0.0, 2.0]] * 2
-    assert survey.warnings == ("samples that are negative, not finite or above 1e+12 are read as 0 (2 times)",)
+    whole = np.array([2**32 - 1, 2**31 + 1, 2**24 + 1], np.uint32)
+    fractions = np.array([0.0, 0.25, 1e-9, 3e7], np.float32)
+    for samples in (whole, fractions):
+        write_xtf(with_samples(small_survey(), samples, samples), path)
+        survey = read_survey(path)
+        assert survey.warnings == ()
+        for channel in (channel for ping in survey for channel in ping.channels):
+            assert channel.samples.dtype == samples.dtype
+            np.testing.assert_array_equal(channel.samples, samples)
+    for value in (float("nan"), float("inf"), -1.0, -float("inf"), 1e30):
+        write_xtf(with_samples(small_survey(), np.array([1.0, value, 2.0], np.float32)), path)
+        survey = read_survey(path)
+        assert [c.samples.tolist() for c in survey.pings[0].channels] == [[1.0, 0.0, 2.0]] * 2
+        assert survey.warnings == ("samples that are negative, not finite or above 1e+12 are read as 0 (2 times)",)
 
 
 def as_ground_range(raw: bytearray) -> bytearray:
@@ -172,25 +159,10 @@ def test_recording_of_a_multibeam_alone_is_refused(data_dir):
         read_survey(data_dir / "surveys" / "negative" / "multibeam-only-r2sonic.xtf")
 
 
-@pytest.mark.realdata
-def test_recording_without_its_last_658_bytes(data_dir, tmp_path):
-    content = (data_dir / "surveys" / "scotsman-iver2.xtf").read_bytes()
-    assert len(read(tmp_path, content[:-658]).pings) == 460
-
-
-def test_file_without_pings_is_rejected(tmp_path, raw):
-    with pytest.raises(SurveyFileError, match="pings"):
-        read(tmp_path, raw[:HEADER])
-
-
-def test_other_file_format_is_rejected(tmp_path):
-    with pytest.raises(SurveyFileError, match=r"FileFormat: got '0x89', expected '?0x7b"):
-        read(tmp_path, b"\x89PNG" + bytes(2000))
-
-
 @pytest.mark.parametrize(
     ("offset", "fmt", "value", "field"),
     [
+        (0, "B", 0x89, "FileFormat: got '0x89', expected '?0x7b"),
         (HEADER, "H", 0xBEEF, "MagicNumber"),
         (HEADER + 10, "I", 0, "NumBytesThisRecord"),
         (HEADER + 10, "I", 0xFFFFFFFF, "NumBytesThisRecord"),
@@ -217,23 +189,6 @@ def test_error_names_invalid_field(tmp_path, raw, offset, fmt, value, field):
     assert caught.value.expected
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_damaged_file_is_read_or_raises_survey_file_error(tmp_path, raw, data):
-    damaged = bytearray(raw)
-    for _ in range(data.draw(st.integers(1, 6))):
-        damaged[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
-    try:
-        survey = read(tmp_path, bytes(damaged))
-    except SurveyFileError:
-        return
-    for ping in survey:
-        assert ping.lat_deg is None or -90 <= ping.lat_deg <= 90
-        assert ping.heading_deg is None or 0 <= ping.heading_deg < 360
-        assert all(c.slant_range_m > 0 and c.samples.size for c in ping.channels)
-
-
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(tail=st.binary(max_size=3000))
 def test_noise_after_valid_header_raises_survey_file_error(tmp_path, raw, tail):
     with pytest.raises(SurveyFileError):
@@ -262,12 +217,12 @@ def test_projected_coordinates_without_crs_give_no_positions(tmp_path, raw):
     assert survey.warnings == ("no positions: NavUnits is 7, expected 3 (degrees) or 0 (projected metres)",)
 
 
-@pytest.mark.parametrize("lat", [float("nan"), float("inf"), 90.5, -1e300])
-def test_invalid_position_is_unknown(tmp_path, raw, lat):
-    survey = read(tmp_path, put(raw, HEADER + PACKET + 160, "d", lat))
-    assert [p.lat_deg is None for p in survey] == [False, True, False, False, False]
-    assert survey.pings[1].lon_deg is None
-    assert survey.warnings == ("no position fix in 1 of 5 pings, the first in row 1",)
+def test_invalid_position_is_unknown(tmp_path, raw):
+    for lat in (float("nan"), float("inf"), 90.5, -1e300):
+        survey = read(tmp_path, put(raw, HEADER + PACKET + 160, "d", lat))
+        assert [p.lat_deg is None for p in survey] == [False, True, False, False, False]
+        assert survey.pings[1].lon_deg is None
+        assert survey.warnings == ("no position fix in 1 of 5 pings, the first in row 1",)
 
 
 def test_zero_altitude_is_unknown_and_negative_is_reported(tmp_path, raw):
@@ -323,16 +278,6 @@ def test_port_stored_nearest_first_is_reported(small_survey, tmp_path):
                 channel.samples[:] = channel.samples[::-1].copy()
     write_xtf(survey, tmp_path / "a.xtf")
     assert "port looks stored nearest" in read_survey(tmp_path / "a.xtf").warnings[0]
-
-
-def test_missing_or_irregular_file_is_rejected(tmp_path):
-    with pytest.raises(SurveyFileError, match="No such file"):
-        read_survey(tmp_path / "absent.xtf")
-    with pytest.raises(SurveyFileError, match=r"directory|regular"):
-        read_survey(tmp_path)
-    os.mkfifo(tmp_path / "pipe.xtf")
-    with pytest.raises(SurveyFileError, match="regular"):
-        read_survey(tmp_path / "pipe.xtf")
 
 
 def in_every_ping(raw: bytearray, offset: int, fmt: str, *values: float) -> bytearray:
@@ -396,23 +341,16 @@ def test_attitude_packets_fill_missing_attitude(raw, tmp_path):
     assert survey.warnings == ("heading_deg, pitch_deg, roll_deg from attitude packets (2 of them)",)
     old = attitude((2013, 9, 10, 21, 13, 7, 0), 1.5, -2.5, 123.0)
     assert read(tmp_path, raw[:HEADER] + old + raw[HEADER:]).pings[0].heading_deg is None
-
-
-def test_zero_heading_in_attitude_packets_is_unknown(raw, tmp_path):
-    in_every_ping(raw, 204, "fff", 0, 0, 0)
-    packet = attitude((2013, 9, 10, 21, 13, 8, 100), 1.5, -2.5, 0.0)
-    survey = read(tmp_path, raw[:HEADER] + packet + raw[HEADER:])
-    assert survey.pings[0].heading_deg is None
-    assert survey.pings[0].pitch_deg == 1.5
-
-
-def test_attitude_of_ping_has_precedence(raw, tmp_path):
-    packet = attitude((2013, 9, 10, 21, 13, 8, 100), 40.0, 40.0, 40.0)
-    survey = read(tmp_path, raw[:HEADER] + packet + raw[HEADER:])
-    assert (survey.pings[0].heading_deg, survey.pings[0].pitch_deg) == (354.5, -2.5)
+    without_heading = attitude((2013, 9, 10, 21, 13, 8, 100), 1.5, -2.5, 0.0)
+    ping = read(tmp_path, raw[:HEADER] + without_heading + raw[HEADER:]).pings[0]
+    assert (ping.heading_deg, ping.pitch_deg) == (None, 1.5)
+    in_every_ping(raw, 204, "fff", -2.5, 3.75, 354.5)
+    ping = read(tmp_path, raw[:HEADER] + first + raw[HEADER:]).pings[0]
+    assert (ping.heading_deg, ping.pitch_deg) == (354.5, -2.5), "the attitude of the ping has precedence"
 
 
 def test_projected_coordinates_require_crs(raw, tmp_path):
+    assert read(tmp_path, raw, projected_crs="EPSG:32619").pings[0].lat_deg == 48.44545, "degrees ignore it"
     to_utm = Transformer.from_crs(4326, 32619, always_xy=True)
     easting, northing = to_utm.transform(-68.827935, 48.44545)
     struct.pack_into("<H", raw, 164, 0)
@@ -426,6 +364,9 @@ def test_projected_coordinates_require_crs(raw, tmp_path):
     for wrong in ("EPSG:4326", "EPSG:999999", "nonsense", "EPSG:2225"):  # degrees, unknown, invalid, US feet
         with pytest.raises(ValidationError, match="projected_crs"):
             read(tmp_path, raw, projected_crs=wrong)
+    in_every_ping(raw, 160, "dd", 1e30, 1e30)
+    survey = read(tmp_path, raw, projected_crs="EPSG:32619")
+    assert survey.warnings == ("no position fix in 5 of 5 pings, the first in row 0",)
 
 
 def test_nav_units_decide_not_coordinate_values(raw, tmp_path):
@@ -437,27 +378,12 @@ def test_nav_units_decide_not_coordinate_values(raw, tmp_path):
     assert all(abs(p.lat_deg) < 1 for p in metres)
 
 
-def test_degrees_ignore_projected_crs(raw, tmp_path):
-    assert read(tmp_path, raw, projected_crs="EPSG:32619").pings[0].lat_deg == 48.44545
-
-
-def test_coordinates_outside_projection_give_no_position(raw, tmp_path):
-    struct.pack_into("<H", raw, 164, 0)
-    in_every_ping(raw, 160, "dd", 1e30, 1e30)
-    survey = read(tmp_path, raw, projected_crs="EPSG:32619")
-    assert survey.warnings == ("no position fix in 5 of 5 pings, the first in row 0",)
-
-
-def test_position_source_ship(raw, tmp_path):
-    in_every_ping(raw, XTFPingHeader.ShipYcoordinate.offset, "dd", 10.0, 20.0)
-    assert read(tmp_path, raw).pings[0].lat_deg == 48.44545
-    ship = read(tmp_path, raw, position_source="ship").pings[0]
-    assert (ship.lat_deg, ship.lon_deg) == (10.0, 20.0)
-
-
 @pytest.mark.parametrize(("source", "other", "offset"), [("sensor", "ship", 160), ("ship", "sensor", 128)])
 def test_position_in_the_other_field_is_reported(raw, tmp_path, source, other, offset):
     assert (XTFPingHeader.ShipYcoordinate.offset, XTFPingHeader.SensorYcoordinate.offset) == (128, 160)
+    in_every_ping(raw, 128, "dd", 10.0, 20.0)
+    ping = read(tmp_path, raw, position_source=source).pings[0]
+    assert (ping.lat_deg, ping.lon_deg) == ((10.0, 20.0) if source == "ship" else (48.44545, -68.827935))
     assert not read(tmp_path, raw, position_source=source).warnings
     in_every_ping(raw, offset, "dd", 0.0, 0.0)
     assert read(tmp_path, raw, position_source=source).warnings == (
@@ -473,30 +399,11 @@ def test_port_order_nearest_first(raw, tmp_path):
     np.testing.assert_array_equal(one, other[::-1])
 
 
-def test_32_bit_samples_keep_all_bits(small_survey, tmp_path):
-    survey = small_survey(np.uint32)
-    survey.pings[0].channels[0].samples[:3] = (2**32 - 1, 2**31 + 1, 2**24 + 1)
-    write_xtf(survey, tmp_path / "a.xtf")
-    channel: ChannelPing = read_survey(tmp_path / "a.xtf").pings[0].channels[0]
-    assert channel.samples[:3].tolist() == [2**32 - 1, 2**31 + 1, 2**24 + 1]
-
-
-def test_bathymetry_and_unknown_packets_are_skipped(raw, tmp_path):
-    packets = b"".join(
-        struct.pack("<HBBHHHI", 0xFACE, kind, 0, 0, 0, 0, 14 + 300) + bytes(range(256)) + bytes(44)
-        for kind in (1, 2, 8, 65, 107, 199, 255)
-    )
-    survey = read(tmp_path, raw[:HEADER] + packets + raw[HEADER:] + packets)
-    assert len(survey.pings) == 5
-    assert len(survey.warnings) == 7
-    assert all("(2 times)" in warning for warning in survey.warnings)
-
-
-@pytest.mark.parametrize("slant_range_m", [1e30, 10_001, float("nan"), float("inf"), -5])
-def test_implausible_slant_range_skips_channel(raw, tmp_path, slant_range_m):
-    survey = read(tmp_path, in_every_ping(raw, 256 + 4, "f", slant_range_m))
-    assert survey.sides() == (Side.STARBOARD,)
-    assert survey.warnings == ("skipped port channel: no samples or no slant range (5 times)",)
+def test_implausible_slant_range_skips_channel(raw, tmp_path):
+    for slant_range_m in (1e30, 10_001, float("nan"), float("inf"), -5):
+        survey = read(tmp_path, in_every_ping(raw, 256 + 4, "f", slant_range_m))
+        assert survey.sides() == (Side.STARBOARD,)
+        assert survey.warnings == ("skipped port channel: no samples or no slant range (5 times)",)
 
 
 @pytest.mark.realdata
@@ -505,6 +412,12 @@ def test_recordings_match_derived_images(data_dir, name, sonar):
     folder = data_dir / "surveys"
     survey = read_survey(folder / f"{name}.xtf")
     assert survey.sonar_id == sonar
+    fixless = ("no position fix in 1 of 461 pings, the first in row 0",) if sonar == "HDS" else ()
+    assert survey.warnings == fixless
+    # Index 0 is nearest to the vehicle: on both sides the dark water column is before the bright seabed.
+    for image in map(survey.waterfall, Side):
+        middle = image.shape[1] // 2
+        assert image[:200, 30:60].mean() * 5 < image[:200, middle : middle + 50].mean()
     # The images have the order of the file: port from far to near.
     for side, suffix, step in ((Side.PORT, "port", -1), (Side.STARBOARD, "stbd", 1)):
         image = np.asarray(Image.open(folder / "derived" / f"{name}.xtf.{suffix}.png"))
@@ -523,22 +436,3 @@ def test_recordings_match_derived_images(data_dir, name, sonar):
         assert (ping.heading_deg or 0.0) == pytest.approx(float(line["heading"]), abs=0.006)
         assert (ping.speed_mps or 0.0) / 0.514444 == pytest.approx(float(line["speed"]), abs=0.006)
         assert ping.channels[0].slant_range_m == pytest.approx(float(line["slant_range"]), abs=1e-3)
-
-
-@pytest.mark.realdata
-def test_recorded_ping_without_fix(data_dir):
-    survey = read_survey(data_dir / "surveys" / "scotsman-iver2.xtf")
-    assert [row for row, ping in enumerate(survey) if ping.lat_deg is None] == [0]
-    assert survey.warnings == ("no position fix in 1 of 461 pings, the first in row 0",)
-    assert read_survey(data_dir / "surveys" / "000_1236.xtf").pings[0].altitude_m is None
-
-
-@pytest.mark.realdata
-@pytest.mark.parametrize("name", ["scotsman-iver2", "000_1236"])
-def test_samples_of_recordings_start_in_water_column(data_dir, name):
-    """Index 0 is nearest to the vehicle: on both sides the dark water column is before the bright seabed."""
-    survey = read_survey(data_dir / "surveys" / f"{name}.xtf")
-    for side in Side:
-        image = survey.waterfall(side)
-        water = image[:200, 30:60].mean()
-        assert water * 5 < image[:200, image.shape[1] // 2 : image.shape[1] // 2 + 50].mean()

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import pyxtf
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import SurveyFileError
@@ -37,19 +35,13 @@ def assert_same(read: Survey, written: Survey) -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
-def test_written_survey_is_read_back(small_survey, tmp_path, dtype):
-    survey = small_survey(dtype)
-    write_xtf(survey, tmp_path / "line7.xtf")
-    read = read_survey(tmp_path / "line7.xtf")
-    assert_same(read, survey)
-    assert (read.sonar_id, read.line_name, read.warnings) == ("HDS", "line7", ())
-    assert read.path == tmp_path / "line7.xtf"
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
-def test_pyxtf_reads_written_survey(small_survey, tmp_path, dtype):
+def test_written_survey_is_read_back_and_by_pyxtf(small_survey, tmp_path, dtype):
     survey = small_survey(dtype)
     write_xtf(survey, tmp_path / "a.xtf")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.xtf"]
+    read = read_survey(tmp_path / "a.xtf")
+    assert_same(read, survey)
+    assert (read.path, read.sonar_id, read.line_name, read.warnings) == (tmp_path / "a.xtf", "HDS", "a", ())
     header, packets = pyxtf.xtf_read(str(tmp_path / "a.xtf"))
     assert header.SonarName == b"HDS"
     assert header.NavUnits == 3
@@ -61,14 +53,6 @@ def test_pyxtf_reads_written_survey(small_survey, tmp_path, dtype):
         assert got.get_time() == np.datetime64(round(want.time_utc_s * 100) * 10, "ms")
         assert got.SensorYcoordinate == want.lat_deg
         assert got.NumBytesThisRecord % 64 == 0
-
-
-def test_same_survey_gives_same_bytes_and_no_temporary_files(small_survey, tmp_path):
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        write_xtf(small_survey(), tmp_path / name / "x.xtf")
-    assert (tmp_path / "a/x.xtf").read_bytes() == (tmp_path / "b/x.xtf").read_bytes()
-    assert [p.name for p in (tmp_path / "a").iterdir()] == ["x.xtf"]
 
 
 def test_golden_bytes_of_ping(tmp_path):
@@ -95,22 +79,12 @@ def test_missing_navigation_is_read_as_none(small_survey, tmp_path):
     for ping in read:
         assert {ping.lat_deg, ping.lon_deg, ping.heading_deg, ping.altitude_m, ping.speed_mps} == {None}
     assert read.warnings == ("no position fix in 5 of 5 pings, the first in row 0",)
-
-
-def test_one_ping_without_navigation(small_survey, tmp_path):
-    survey = small_survey()
-    first = Ping(1, survey.pings[0].time_utc_s, survey.pings[0].channels)
-    write_xtf(dataclasses.replace(survey, pings=(first, *survey.pings[1:])), tmp_path / "a.xtf")
+    # One ping without navigation; a heading of 0 differs from an unknown one.
+    north = tuple(dataclasses.replace(ping, heading_deg=0.0) for ping in survey.pings[1:])
+    write_xtf(dataclasses.replace(survey, pings=(without_navigation[0], *north)), tmp_path / "a.xtf")
     read = read_survey(tmp_path / "a.xtf")
-    assert_same(dataclasses.replace(read, pings=read.pings[1:]), dataclasses.replace(survey, pings=survey.pings[1:]))
+    assert_same(dataclasses.replace(read, pings=read.pings[1:]), dataclasses.replace(survey, pings=north))
     assert (read.pings[0].lat_deg, read.pings[0].heading_deg, read.pings[0].pitch_deg) == (None, None, None)
-
-
-def test_heading_zero_differs_from_unknown_heading(small_survey, tmp_path):
-    survey = small_survey()
-    north = tuple(dataclasses.replace(p, heading_deg=0.0) for p in survey.pings)
-    write_xtf(dataclasses.replace(survey, pings=north), tmp_path / "a.xtf")
-    assert [p.heading_deg for p in read_survey(tmp_path / "a.xtf")] == [0.0] * 5
 
 
 def test_dual_frequency_and_ping_without_one_side(small_survey, tmp_path):
@@ -124,7 +98,6 @@ def test_dual_frequency_and_ping_without_one_side(small_survey, tmp_path):
     assert_same(read_survey(tmp_path / "a.xtf"), survey)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     lat=st.floats(-90, 90).filter(lambda v: v != 0),
     lon=st.floats(-180, 180),
@@ -166,6 +139,7 @@ def test_survey_outside_format_is_rejected(small_survey, tmp_path, change, field
         ({"channels": (ChannelPing(Side.PORT, np.zeros(3, np.uint8), 0.0),)}, "slant_range_m"),
         ({"channels": (ChannelPing(Side.PORT, np.zeros(0, np.uint8), 9.0),)}, "samples"),
         ({"channels": (ChannelPing(Side.PORT, np.zeros(3, np.uint16), 9.0),)}, "sample type"),
+        ({"channels": (ChannelPing(Side.PORT, np.zeros(3, np.float64), 9.0),)}, "sample type"),
     ],
 )
 def test_ping_outside_format_is_rejected(small_survey, tmp_path, change, field):
@@ -173,29 +147,3 @@ def test_ping_outside_format_is_rejected(small_survey, tmp_path, change, field):
     pings = (*survey.pings[:2], dataclasses.replace(survey.pings[2], **change))
     with pytest.raises(SurveyFileError, match=f"row 2, {field}"):
         write_xtf(dataclasses.replace(survey, pings=pings), tmp_path / "a.xtf")
-
-
-def test_other_sample_types_are_rejected(small_survey, tmp_path):
-    channel = ChannelPing(Side.PORT, np.zeros(3, np.float64), 9.0)
-    ping = dataclasses.replace(small_survey().pings[0], channels=(channel,))
-    with pytest.raises(SurveyFileError, match="uint8, uint16, uint32, float32"):
-        write_xtf(Survey(Path("x"), "A", "x", (ping,)), tmp_path / "a.xtf")
-
-
-def test_missing_folder_is_an_error(small_survey, tmp_path):
-    with pytest.raises(FileNotFoundError, match="No such file"):
-        write_xtf(small_survey(), tmp_path / "absent" / "a.xtf")
-
-
-def test_reading_prints_and_warns_nothing(small_survey, tmp_path, capfd):
-    write_xtf(small_survey(), tmp_path / "a.xtf")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        read_survey(tmp_path / "a.xtf")
-    assert caught == []
-    assert capfd.readouterr() == ("", "")
-
-
-def test_pyxtf_structures_have_format_sizes():
-    sizes = [ctypes.sizeof(c) for c in (pyxtf.XTFFileHeader, pyxtf.XTFPingHeader, pyxtf.XTFPingChanHeader)]
-    assert sizes == [1024, 256, 64]
