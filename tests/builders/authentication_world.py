@@ -32,9 +32,3 @@ def vessel_authenticator(
     settings: AuthenticationSettings | None = None, *, name: str = "fleet", address: int = VESSEL
 ) -> FrameAuthenticator:
     return FrameAuthenticator(key(name), address, Direction.TO_VEHICLE, settings)
-
-
-def skip(authenticator: FrameAuthenticator, frames: int) -> None:
-    """Protect frames that are lost."""
-    for _ in range(frames):
-        authenticator.protect(b"\x80lost")

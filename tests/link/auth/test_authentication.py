@@ -7,7 +7,7 @@ import random
 import re
 
 import pytest
-from builders.authentication_world import VEHICLE, VESSEL, key, skip, vehicle_authenticator, vessel_authenticator
+from builders.authentication_world import VEHICLE, VESSEL, key, vehicle_authenticator, vessel_authenticator
 from builders.link_state import group, with_fields
 from builders.v1_world import contact, feedback_frame, stream
 
@@ -18,7 +18,6 @@ from sonarpost.link.auth.authentication import (
     AuthenticationCounts,
     AuthenticationState,
     FrameAuthenticator,
-    ReplayWindow,
     SavedWindow,
 )
 from sonarpost.link.auth.key import AuthenticationSettings, Direction
@@ -62,8 +61,11 @@ def test_protected_frame_round_trip_and_overhead(settings: AuthenticationSetting
 
 @pytest.mark.parametrize("settings", [AuthenticationSettings(), AuthenticationSettings(encrypt=True)], ids=str)
 def test_all_bits_are_authenticated(settings: AuthenticationSettings) -> None:
-    protected = vehicle_authenticator(settings).protect(COVERED)
-    vessel = vessel_authenticator(settings)
+    # At the end of the key's lifetime the vessel has few counters to try.
+    vehicle, vessel = vehicle_authenticator(settings, first_counter=2**20 - 3), vessel_authenticator(settings)
+    assert rejected_field(vessel, vehicle.protect(COVERED)) == "counter"
+    vessel.verify(VEHICLE, vehicle.protect(COVERED))
+    protected = vehicle.protect(COVERED)
     for bit in range(8 * len(protected)):
         damaged = bytearray(protected)
         damaged[bit // 8] ^= 1 << bit % 8
@@ -100,33 +102,24 @@ def test_replay_is_distinguished_from_forgery_at_any_age() -> None:
     assert vessel.counts == AuthenticationCounts(genuine=3000, replayed=100, forged=1)
 
 
-def test_late_frames_within_the_window_pass_once() -> None:
-    vehicle, vessel = vehicle_authenticator(), vessel_authenticator()
-    protected = [vehicle.protect(bytes([0x80, n])) for n in range(WINDOW + 1)]
-    vessel.verify(VEHICLE, protected[WINDOW])
-    assert rejected_field(vessel, protected[0]) == "counter"
-    for late in reversed(protected[1:WINDOW]):
-        vessel.verify(VEHICLE, late)
-        assert rejected_field(vessel, late) == "counter"
-    assert vessel.counts.genuine == WINDOW
-
-
 @pytest.mark.parametrize(
     ("settings", "bridged"), [(AuthenticationSettings(), 191), (AuthenticationSettings(2), 65471)], ids=str
 )
 def test_long_losses_cost_one_frame_at_most(settings: AuthenticationSettings, bridged: int) -> None:
     assert bridged + 1 == settings.counter_step - WINDOW
-    vehicle, vessel = vehicle_authenticator(settings), vessel_authenticator(settings)
-    vessel.verify(VEHICLE, vehicle.protect(COVERED))
-    skip(vehicle, bridged)
-    assert vessel.verify(VEHICLE, vehicle.protect(COVERED)) == COVERED
-    skip(vehicle, bridged + 1)
-    first = vehicle.protect(COVERED)
-    assert rejected_field(vessel, first) == "counter"
-    assert rejected_field(vessel, first) == "counter"  # a repetition confirms nothing
-    skip(vehicle, bridged)  # the second need not follow directly
-    assert vessel.verify(VEHICLE, vehicle.protect(COVERED)) == COVERED
-    assert vessel.verify(VEHICLE, vehicle.protect(COVERED)) == COVERED
+    vessel = vessel_authenticator(settings)
+
+    def frame(counter: int) -> bytes:
+        return vehicle_authenticator(settings, first_counter=counter).protect(COVERED)
+
+    vessel.verify(VEHICLE, frame(0))
+    last = bridged + 1
+    assert vessel.verify(VEHICLE, frame(last)) == COVERED
+    first = last + bridged + 2
+    for _ in range(2):  # a repetition confirms nothing
+        assert rejected_field(vessel, frame(first)) == "counter"
+    for counter in (first + bridged + 1, first + bridged + 2):  # the second need not follow directly
+        assert vessel.verify(VEHICLE, frame(counter)) == COVERED
     assert vessel.counts == AuthenticationCounts(genuine=4, unconfirmed=2)
 
 
@@ -140,24 +133,6 @@ def test_receiver_without_state_finds_any_counter() -> None:
     assert (vehicle.frames_left, vehicle.requested_limit) == (0, None)
 
 
-def test_counters_are_used_once_over_crashes() -> None:
-    durable, used = 0, []
-    for frames_until_crash in (0, 1, 31, 32, 33, 64, 65, 200, 0, 5):
-        authenticator = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE, first_counter=durable)
-        for _ in range(frames_until_crash):
-            if (limit := authenticator.requested_limit) is not None:
-                durable = limit
-                authenticator.grant(limit)
-            used.append(authenticator.protect(COVERED)[-5:])
-        if (limit := authenticator.requested_limit) is not None:
-            durable = limit  # a crash between saving and granting
-    assert len(set(used)) == len(used)
-    vessel = vessel_authenticator()
-    for ending in used:
-        assert vessel.verify(VEHICLE, COVERED + ending) == COVERED
-    assert RESERVED < WINDOW * 2
-
-
 def test_protection_requires_a_reservation() -> None:
     authenticator = FrameAuthenticator(key("fleet"), VEHICLE, Direction.FROM_VEHICLE)
     with pytest.raises(FrameError, match="a granted limit above it"):
@@ -169,20 +144,6 @@ def test_protection_requires_a_reservation() -> None:
     for wrong in (0, AuthenticationSettings().lifetime_frames + 1):
         with pytest.raises(ConfigError, match="limit"):
             authenticator.grant(wrong)
-
-
-def test_restarted_receiver_rejects_replays() -> None:
-    vehicle, before = vehicle_authenticator(), vessel_authenticator()
-    accepted = [vehicle.protect(COVERED) for _ in range(50)]
-    for protected in accepted[::2]:
-        before.verify(VEHICLE, protected)
-    after = vessel_authenticator()
-    assert not after.restore(before.parts())
-    assert after.parts() == before.parts()
-    for protected in accepted[::2]:
-        assert rejected_field(after, protected) == "counter"
-    for protected in accepted[1:-2:2]:
-        after.verify(VEHICLE, protected)
 
 
 def test_restored_sender_continues_after_its_reservation() -> None:
@@ -246,13 +207,9 @@ def test_a_limit_beyond_the_lifetime_leaves_no_counter() -> None:
 
 def test_forged_frames_use_no_memory() -> None:
     vessel = vessel_authenticator(AuthenticationSettings(2))
-    for source in range(256):
+    for source in (0, VEHICLE, 255):
         assert rejected_field(vessel, COVERED + b"\0\0fake", source) == "tag"
     assert group(vessel.parts(), "window") == {}
-    window = ReplayWindow()
-    for counter in (0, 10**6, 10**9):
-        window.accept(counter)
-        assert window.seen < 1 << WINDOW
 
 
 @pytest.mark.parametrize("wrong", [{"counter_bytes": 3}, {"counter_bytes": 0}, {"tag_bytes": 5}, {"tag_bytes": 16}])
@@ -281,8 +238,10 @@ def test_damage_is_distinguished_from_forgery() -> None:
         parse_frame(frame, VEHICLE, vessel)
 
 
-@pytest.mark.parametrize("frame_bytes", [32, 64, 256])
-@pytest.mark.parametrize("settings", [AuthenticationSettings(), AuthenticationSettings(encrypt=True)], ids=str)
+@pytest.mark.parametrize(
+    ("frame_bytes", "settings"),
+    [(32, AuthenticationSettings()), (64, AuthenticationSettings(encrypt=True)), (256, AuthenticationSettings())],
+)
 def test_images_and_feedback_with_authentication(frame_bytes: int, settings: AuthenticationSettings) -> None:
     up, down = vehicle_authenticator(settings), vessel_authenticator(settings)
     down.grant(1000)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from builders.authentication_world import VEHICLE, key, vehicle_authenticator, vessel_authenticator
 from builders.link_state import group
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
@@ -88,8 +88,10 @@ class Attack(RuleBasedStateMachine):
         assert verified(self.vessel, VEHICLE, bytes(forged)) == (b"", "tag")
         assert group(self.vessel.parts(), "window") == before
 
-    @rule()
-    def the_vehicle_restarts(self) -> None:
+    @rule(saved=st.booleans())
+    def the_vehicle_restarts(self, saved: bool) -> None:
+        if saved and (limit := self.vehicle.requested_limit) is not None:
+            self.durable = limit  # a crash between saving and granting
         self.vehicle = self.start_vehicle()
 
     @rule()
@@ -113,11 +115,9 @@ class Attack(RuleBasedStateMachine):
         assert self.receive(*self.record(b"two"))
 
 
-Attack.TestCase.settings = settings(max_examples=80, stateful_step_count=30, deadline=None)
 TestAttack = Attack.TestCase
 
 
-@settings(max_examples=300, deadline=None)
 @given(st.lists(st.one_of(st.integers(-80, 80), st.integers(-80, 80), st.integers(100, 5000)), max_size=200))
 def test_replay_window_agrees_with_a_set(steps: list[int]) -> None:
     window, accepted = ReplayWindow(), set[int]()
@@ -132,23 +132,12 @@ def test_replay_window_agrees_with_a_set(steps: list[int]) -> None:
         assert window.seen < 1 << WINDOW
 
 
-def test_large_step_clears_the_window() -> None:
-    window = ReplayWindow()
-    for counter in range(WINDOW):
-        window.accept(counter)
-    window.accept(2 * WINDOW)
-    assert not window.is_new(WINDOW)
-    assert all(window.is_new(counter) for counter in range(WINDOW + 1, 2 * WINDOW))
-
-
-@settings(max_examples=300, deadline=None)
 @given(st.integers(-1, 2**20), st.sampled_from([256, 65536]), st.data())
 def test_nearest_counter_is_the_one_sent(newest: int, step: int, data: st.DataObject) -> None:
     sent = newest + data.draw(st.integers(1 - WINDOW, step - WINDOW))
     assert ReplayWindow(newest).nearest(sent % step, step) == sent
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=300), st.integers(-5, 200), st.booleans())
 def test_any_bytes_are_rejected(protected: bytes, source: int, encrypt: bool) -> None:
     chosen = AuthenticationSettings(encrypt=encrypt)

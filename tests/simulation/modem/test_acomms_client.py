@@ -25,7 +25,7 @@ with warnings.catch_warnings():
     acomms = pytest.importorskip("acomms", reason="acomms, WHOI's client, is not installed")
     from acomms.unifiedlog import UnifiedLog
 
-pytestmark = pytest.mark.filterwarnings("ignore:setDaemon:DeprecationWarning")
+pytestmark = [pytest.mark.system, pytest.mark.filterwarnings("ignore:setDaemon:DeprecationWarning")]
 
 RANGE_M = 150.0
 SCALE = 20.0
@@ -69,7 +69,7 @@ class Client:
             never.wait()
 
         connection.readline = sleep
-        assert asleep.wait(5.0)
+        assert asleep.wait(60.0)
         connection._serialport.close()
         self.log._log.removeHandler(self.log._file_handler)
         self.log._file_handler.close()

@@ -1,14 +1,11 @@
-"""The emulated nanomodem: its commands, its packets in the channel, and the driver on real ports."""
+"""The emulated nanomodem: its commands and its packets in the channel."""
 
 from __future__ import annotations
 
 import pytest
 
 from sonarpost.modem.nano.rates import airtime_s
-from sonarpost.runtime.serial_modem import SerialModem
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
-from sonarpost.simulation.channel.emulator import ChannelEmulator
 from sonarpost.simulation.channel.parameters import build_parameters
 from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
 from sonarpost.simulation.modem.packet_modem import PacketModemSettings
@@ -101,33 +98,3 @@ def test_refused_command(command: bytes) -> None:
     bench = Bench()
     bench.say(1, b"noise" + command + b"$?")
     assert bench.output(1, 5.0) == b"E\r\n#A001V21845\r\n"
-
-
-@pytest.mark.parametrize("tcp", [False, True])
-def test_driver_on_real_ports(tcp: bool, tmp_path_factory: pytest.TempPathFactory) -> None:
-    config = EmulatorConfig(
-        modem=(ModemSite(address=1), ModemSite(address=3, east_m=RANGE_M)),
-        driver="nano",
-        pty_dir=tmp_path_factory.mktemp("ports"),
-        tcp_ports=(0, 0) if tcp else (),
-        time_scale=20.0,
-    )
-    emulator = ChannelEmulator(config)
-    emulator.start()
-    try:
-        one, two = (device.device for device in emulator.devices())
-        with (
-            SerialModem(one, address=1, driver="nano") as vessel,
-            SerialModem(two, address=3, driver="nano") as vehicle,
-        ):
-            sent = vehicle.send([b"$B02#TO\r\n"], destination=1, rate=1, ack=True)
-            assert sent.acknowledged == (1,)
-            packet = vessel.receive(timeout_s=60)
-            assert packet is not None
-            assert [(frame.src, frame.dest, frame.data) for frame in packet.frames] == [(3, 1, b"$B02#TO\r\n")]
-            vessel.send([b"all"], destination=255, rate=1)
-            packet = vehicle.receive(timeout_s=60)
-            assert packet is not None
-            assert [(frame.src, frame.dest, frame.data) for frame in packet.frames] == [(1, 255, b"all")]
-    finally:
-        emulator.stop()

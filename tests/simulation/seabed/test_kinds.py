@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import cache
 
 import numpy as np
 import pytest
 
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.seabed.survey import SurveySpec, Track, echo_intensity, simulate_survey
+from sonarpost.simulation.seabed.survey import SimulatedSurvey, SurveySpec, Track, echo_intensity, simulate_survey
 from sonarpost.simulation.seabed.targets import (
     FURTHER_CLUTTER_KINDS,
     FURTHER_MINE_LIKE_KINDS,
@@ -44,6 +45,7 @@ def test_default_values_give_the_surveys_of_earlier_releases(kind):
     assert np.abs(image[5::18, 40::20].ravel() - EARLIER[kind.value]).max() <= 1
 
 
+@cache
 def flat_echo(*items: SeabedObject) -> np.ndarray:
     """Return the echo of a flat seabed with objects, starboard, 200 pings 0.1 m apart."""
     bed = Seabed(np.zeros((521, 1301), np.float32), np.full((521, 1301), 0.3, np.float32), 0.05, -3.0, -32.5)
@@ -98,15 +100,19 @@ def test_fish_school_is_bright_with_a_weak_shadow():
     assert 0.25 < shadow < 0.8
 
 
+@cache
+def clean_survey(spec: SurveySpec) -> SimulatedSurvey:
+    return simulate_survey(spec, speckle=False)
+
+
 @pytest.mark.parametrize("kind", STRUCTURE_KINDS)
 def test_structure_changes_a_large_area(kind):
     spec = dataclasses.replace(SPEC, pings=600, targets=(), clutter=(kind,), range_m=50.0, ping_rate_hz=10.0)
-    full = simulate_survey(spec, speckle=False)
+    full, empty = clean_survey(spec), clean_survey(dataclasses.replace(spec, clutter=()))
     (item,) = full.truth
     assert not item.is_mine_like
     assert item.length_m > 5
     assert item.height_m <= 0.6 * spec.altitude_m
-    empty = simulate_survey(dataclasses.replace(spec, clutter=()), speckle=False)
     before, after = (s.survey.waterfall(item.side).astype(float) for s in (empty, full))
     rows = np.flatnonzero((np.abs(after - before) > 0.3 * before.mean()).sum(axis=1) > 2)
     assert 10 < np.ptp(rows) <= (item.length_m * 1.3 + 4) / 0.15
@@ -149,6 +155,7 @@ def test_burial_tilt_and_scour_leave_positions_and_the_seabed():
         assert (np.abs(one - other) < 0.1 * one.mean()).mean() > 0.7
 
 
+@cache
 def images(**fields: object) -> tuple[np.ndarray, np.ndarray]:
     survey = simulate_survey(dataclasses.replace(SPEC, targets=0, clutter=0, **fields), speckle=False).survey
     return survey.waterfall(Side.PORT).astype(float), survey.waterfall(Side.STARBOARD).astype(float)
