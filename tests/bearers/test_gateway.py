@@ -86,7 +86,7 @@ def test_gateway_refuses_wrong_credentials_and_unknown_terminals(account, gatewa
 
 def post(webhook, path, body, headers=None):
     try:
-        with urlopen(Request(f"http://127.0.0.1:{webhook.port}{path}", body, headers or {}), timeout=10) as reply:
+        with urlopen(Request(f"http://127.0.0.1:{webhook.port}{path}", body, headers or {}), timeout=120) as reply:
             return reply.status
     except HTTPError as error:
         error.close()

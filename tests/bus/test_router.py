@@ -65,7 +65,7 @@ def reach(endpoint):
             return False
         return True
 
-    eventually(try_once, 120, f"a router at {endpoint}")
+    eventually(try_once, what=f"a router at {endpoint}")
     return opened[0]
 
 
@@ -85,14 +85,14 @@ def test_linked_routers_with_files_forward_a_record(start, tmp_path):
         received = threading.Event()
         subscriber = ashore.declare_subscriber("sonarpost/test", lambda _sample: received.set())
         publisher = aboard.declare_publisher("sonarpost/test")
-        eventually(lambda: bool(publisher.matching_status.matching), 120, "the subscriber at the vessel's router")
+        eventually(lambda: bool(publisher.matching_status.matching), what="the subscriber at the vessel's router")
 
         def forwarded():
             publisher.put(b"here")
             return received.wait(0.2)
 
         # Repeated: the vessel's router can report a subscriber before the link to it is complete.
-        eventually(forwarded, 120, "the record at the shore router")
+        eventually(forwarded, what="the record at the shore router")
         subscriber.undeclare()
     for process in processes:
         process.send_signal(signal.SIGTERM)

@@ -9,7 +9,21 @@ __all__ = ["publish", "refused", "runner"]
 
 
 @pytest.fixture
-def store(tmp_path):
-    opened = Store(tmp_path / "s.db")
-    yield opened
-    opened.close()
+def open_store(tmp_path):
+    """Opens the store of a file, `s.db` by default, as a start does; one that was opened before is closed first."""
+    opened = []
+
+    def open_(path=tmp_path / "s.db", **options):
+        while opened:
+            opened.pop().close()
+        opened.append(Store(path, **options))
+        return opened[-1]
+
+    yield open_
+    while opened:
+        opened.pop().close()
+
+
+@pytest.fixture
+def store(open_store):
+    return open_store()

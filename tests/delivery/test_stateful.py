@@ -253,14 +253,12 @@ class DeliveryFaults(RuleBasedStateMachine):
             self.delivery.check()
 
 
-def run(max_examples, steps, *, derandomize, only_generate=False):
+def run(max_examples, steps, *, only_generate=False):
     profile = settings(
         max_examples=max_examples,
         stateful_step_count=steps,
-        deadline=None,
-        derandomize=derandomize,
         phases=(Phase.generate,) if only_generate else tuple(Phase),
-        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
+        suppress_health_check=list(HealthCheck),
     )
     with ExitStack() as stack:
         for (module, name), value in SMALL_LIMITS.items():
@@ -268,14 +266,10 @@ def run(max_examples, steps, *, derandomize, only_generate=False):
         run_state_machine_as_test(DeliveryFaults, settings=profile)
 
 
-def test_random_faults_keep_the_invariants():
-    run(max_examples=25, steps=40, derandomize=True)
-
-
-@pytest.mark.system
 @pytest.mark.timeout(3600)
-def test_many_random_faults_keep_the_invariants():
-    run(max_examples=500, steps=60, derandomize=False)
+@pytest.mark.parametrize(("examples", "steps"), [(25, 40), pytest.param(500, 60, marks=pytest.mark.system)])
+def test_random_faults_keep_the_invariants(examples, steps):
+    run(examples, steps)
 
 
 def contains_number(window, seq, sha256):
@@ -303,4 +297,4 @@ def init_for_all_keys(window, connection, key, origin):
 )
 def test_random_faults_find_a_defect(method, replacement):
     with mock.patch.object(DuplicateWindow, method, replacement), pytest.raises(AssertionError, match=r"I[1-4]: "):
-        run(max_examples=200, steps=40, derandomize=True, only_generate=True)
+        run(200, 40, only_generate=True)

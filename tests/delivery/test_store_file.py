@@ -3,6 +3,7 @@
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -12,23 +13,22 @@ from sonarpost.delivery.store import Store
 from sonarpost.errors import DeliveryError
 
 
-def test_write_to_a_closed_store_raises(tmp_path):
-    store = Store(tmp_path / "s.db")
+def test_closed_store_raises(store):
     store.close()
     with pytest.raises(DeliveryError, match="closed"), store.transaction():
         pass
+    with pytest.raises(DeliveryError, match="closed"):
+        queued_items(store, "c", 1)
 
 
-def test_commit_waits_for_the_disk(store):
+def test_commit_waits_for_the_disk_and_deleted_records_are_not_overwritten(store):
     """FULL (2) makes SQLite wait for the disk at each commit of a write-ahead log; NORMAL (1) does not."""
-    assert store._query("PRAGMA synchronous") == [(2,)]
-    assert store._query("PRAGMA journal_mode") == [("wal",)]
+    settings = [store._query(f"PRAGMA {name}")[0][0] for name in ("synchronous", "journal_mode", "secure_delete")]
+    assert settings == [2, "wal", 0]
 
 
-def test_store_is_locked_by_one_process(tmp_path):
-    path = tmp_path / "s.db"
-    script = f"from pathlib import Path; from sonarpost.delivery.store import Store; Store(Path({str(path)!r}))"
-    store = Store(path)
+def test_store_is_locked_by_one_process(store):
+    script = f"from pathlib import Path; from sonarpost.delivery.store import Store; Store(Path({str(store.path)!r}))"
     other = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert "DeliveryError" in other.stderr
     assert "in use by another process" in other.stderr
@@ -48,14 +48,12 @@ def test_other_file_is_rejected_and_unchanged(tmp_path):
     assert path.read_bytes() == before
 
 
-def test_store_of_another_version_is_rejected(tmp_path):
-    path = tmp_path / "s.db"
-    Store(path).close()
-    with sqlite3.connect(path) as db:
+def test_store_of_another_version_is_rejected(store, open_store):
+    store.close()
+    with closing(sqlite3.connect(store.path)) as db, db:
         db.execute("UPDATE meta SET value = ? WHERE name = 'version'", (b"99",))
-    db.close()
     with pytest.raises(DeliveryError, match="store version b'99', expected 3"):
-        Store(path)
+        open_store()
 
 
 def test_error_names_a_path_that_is_not_a_folder(tmp_path):
@@ -66,51 +64,32 @@ def test_error_names_a_path_that_is_not_a_folder(tmp_path):
             Store(path)
 
 
-def test_read_from_a_closed_store_raises(tmp_path):
-    store = Store(tmp_path / "s.db")
-    store.close()
-    with pytest.raises(DeliveryError, match="closed"):
-        queued_items(store, "c", 1)
-
-
-def test_deleted_records_are_not_overwritten_on_disk(store):
-    assert store._query("PRAGMA secure_delete") == [(0,)]
-
-
-def test_store_of_an_older_layout_is_converted_with_its_content(tmp_path):
-    path = tmp_path / "s.db"
-    store = Store(path)
+def test_store_of_an_older_layout_is_converted_with_its_content(store, open_store):
     send(store, b"queued")
     with store.transaction() as tx:
         for number in range(100):
             tx.put_state(f"part/{number}", b"%d" % number)
     store.close()
-    with sqlite3.connect(path) as db:
+    with closing(sqlite3.connect(store.path)) as db:
         db.executescript(
             "CREATE TABLE old (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;"
             "INSERT INTO old SELECT * FROM state; DROP TABLE state; ALTER TABLE old RENAME TO state;"
         )
-    db.close()
-    store = Store(path, page_bytes=512)
+    store = open_store(page_bytes=512)
     assert store._query("PRAGMA page_size") == [(512,)]
     assert store._query("PRAGMA journal_mode") == [("wal",)]
     assert store._query("SELECT COUNT(rowid) FROM state") == [(100,)]
     assert store.states("part/") == {str(number): b"%d" % number for number in range(100)}
     assert [item.payload for item in queued_items(store, "c", 9)] == [b"queued"]
-    store.close()
 
 
-def test_store_without_space_for_a_conversion_keeps_its_page_size(tmp_path, caplog):
-    path = tmp_path / "s.db"
-    store = Store(path)
+def test_store_without_space_for_a_conversion_keeps_its_page_size(store, open_store, caplog):
     send(store, b"queued")
     store.close()
-    reader = sqlite3.connect(path)
-    reader.execute("BEGIN")
-    reader.execute("SELECT COUNT(*) FROM outbox").fetchone()  # the file cannot be replaced while it is read
-    store = Store(path, page_bytes=512)
-    reader.close()
+    with closing(sqlite3.connect(store.path)) as reader:
+        reader.execute("BEGIN")
+        reader.execute("SELECT COUNT(*) FROM outbox").fetchone()  # the file cannot be replaced while it is read
+        store = open_store(page_bytes=512)
     assert store._query("PRAGMA page_size") == [(4096,)]
     assert [item.payload for item in queued_items(store, "c", 9)] == [b"queued"]
     assert "Store keeps its page size" in caplog.text
-    store.close()

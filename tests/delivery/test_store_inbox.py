@@ -9,20 +9,17 @@ from sonarpost.delivery import duplicate_window
 from sonarpost.delivery.store import Store
 
 
-def test_record_stays_in_the_inbox_until_handled(tmp_path):
-    store = Store(tmp_path / "s.db")
+def test_record_stays_in_the_inbox_until_handled(store, open_store):
     with store.transaction() as tx:
         tx.accept("k", b"1")
         tx.accept("k", b"2")
-    store.close()
-    store = Store(tmp_path / "s.db")
+    store = open_store()
     first, second = store.inbox_items(9)
     assert (first.payload, second.payload) == (b"1", b"2")
     with store.transaction() as tx:
         tx.remove_handled(first)
     assert store.inbox_items(9) == (second,)
     assert store.inbox_depth() == 1
-    store.close()
 
 
 ARRIVAL = st.tuples(

@@ -20,26 +20,16 @@ def test_queued_record_is_unchanged(store):
     assert queued_items(store, "other", 9) == ()
 
 
-def test_numbers_are_consecutive_in_a_queue_and_never_reused(tmp_path):
-    store = Store(tmp_path / "s.db")
+def test_numbers_are_consecutive_in_a_queue_and_never_reused(store, open_store):
     assert send(store, b"1", b"2") == [1, 2]
     assert send(store, b"1", consumer="d") == [1]
     with store.transaction() as tx:
         tx.remove_acknowledged("c", (1,))
         tx.remove_acknowledged("c", (2,))
     origin = store.origin
-    store.close()
-    store = Store(tmp_path / "s.db")
+    store = open_store()
     assert send(store, b"3") == [3]
     assert store.origin == origin
-    store.close()
-
-
-def test_failed_transaction_uses_no_number(store):
-    with pytest.raises(ZeroDivisionError):
-        fail_within(store, lambda tx: tx.send("k", "c", b"lost", encoding="e"))
-    assert send(store, b"1") == [1]
-    assert [item.payload for item in queued_items(store, "c", 9)] == [b"1"]
 
 
 @given(st.lists(st.integers(1, 7), max_size=12))
@@ -52,19 +42,6 @@ def test_queue_order_is_priority_then_age(tmp_path_factory, priorities):
     assert len(order) == len(priorities)
     assert queued_items(store, "c", 3) == queued_items(store, "c", 99)[:3]
     store.close()
-
-
-def test_two_stores_have_different_origins(tmp_path):
-    a, b = Store(tmp_path / "a.db"), Store(tmp_path / "b.db")
-    assert a.origin != b.origin
-    assert len(a.origin) == len(b.origin) == 16
-    send(a, b"x")
-    send(b, b"x")
-    origins = {item.origin for store in (a, b) for item in queued_items(store, "c", 9)}
-    assert len(origins) == 2
-    assert not origins & {a.origin, b.origin}
-    a.close()
-    b.close()
 
 
 def test_refused_record_is_quarantined_with_its_reason(store):

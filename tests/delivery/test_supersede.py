@@ -1,17 +1,12 @@
 """Editions, quotas and queues of a store, and gaps in the sequence numbers."""
 
-import hashlib
-import sqlite3
-
 import pytest
 from builders.store_steps import queued_items
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.delivery.protocol import attachment, parse_query
-from sonarpost.delivery.records import OutboxItem, Topic, consumer_of, queue_of
+from sonarpost.delivery.records import Topic, consumer_of, queue_of
 from sonarpost.delivery.store import Store
-from sonarpost.errors import PayloadError
 
 
 def send(store, topic, edition, *, priority=6, queue="c2", size=3):
@@ -120,19 +115,15 @@ def test_every_queue_has_its_own_random_origin(store):
 
 
 def test_renewed_origin_applies_to_new_records_only(store):
-    send(store, "a", 1)
+    with store.transaction() as tx:
+        tx.renew_origin("c2")
+    assert send(store, "a", 1) == 1
     with store.transaction() as tx:
         tx.renew_origin("c2")
     send(store, "b", 1)
     old, new = queued_items(store, "c2", 9)
     assert (old.seq, new.seq) == (1, 2)
     assert old.origin != new.origin
-
-
-def test_origin_of_an_empty_queue_can_be_renewed(store):
-    with store.transaction() as tx:
-        tx.renew_origin("c2")
-    assert send(store, "a", 1) == 1
 
 
 def test_number_below_which_nothing_is_queued(store):
@@ -158,45 +149,3 @@ def test_record_queued_during_the_read_is_not_reported_as_done(store, statement)
     done_up_to = store.done_up_to("c2")
     store._reader.set_trace_callback(None)
     assert all(done_up_to < item.seq for item in queued_items(store, "c2", 9))
-
-
-def test_done_up_to_must_be_below_the_sequence_number():
-    item = OutboxItem("c2", 5, "k", "", 4, b"data", hashlib.sha256(b"data").digest())
-    assert parse_query(attachment(b"o" * 16, item, done_up_to=4), b"data", "k").done_up_to == 4
-    with pytest.raises(PayloadError, match="settled: got 5, expected a number below seq"):
-        parse_query(attachment(b"o" * 16, item, done_up_to=5), b"data", "k")
-
-
-def test_store_of_version_1_is_migrated(tmp_path):
-    path = tmp_path / "s.db"
-    old = sqlite3.connect(path)
-    old.executescript(
-        """
-        CREATE TABLE meta (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
-        CREATE TABLE outbox (
-            consumer TEXT NOT NULL, seq INTEGER NOT NULL, key TEXT NOT NULL, encoding TEXT NOT NULL,
-            priority INTEGER NOT NULL, payload BLOB NOT NULL, sha256 BLOB NOT NULL, created_utc_s REAL NOT NULL,
-            PRIMARY KEY (consumer, seq));
-        CREATE INDEX outbox_order ON outbox (consumer, priority, seq);
-        CREATE TABLE outbox_next (consumer TEXT PRIMARY KEY, seq INTEGER NOT NULL) WITHOUT ROWID;
-        INSERT INTO outbox_next VALUES ('c2', 3);
-        """
-    )
-    old.execute("INSERT INTO meta VALUES ('origin', ?), ('version', ?)", (b"o" * 16, b"1"))
-    for seq in (1, 2, 3):
-        row = ("c2", seq, "k", "e", 6, f"p{seq}".encode(), bytes(32), 1.0)
-        old.execute("INSERT INTO outbox VALUES (?, ?, ?, ?, ?, ?, ?, ?)", row)
-    old.commit()
-    old.close()
-    for _ in range(2):
-        store = Store(path)
-        assert store.origin == b"o" * 16
-        assert queued(store)[:3] == ["p1", "p2", "p3"]
-        store.close()
-    store = Store(path)
-    assert send(store, "a", 1) == 4
-    assert queued(store) == ["p1", "p2", "p3", "a1"]
-    origins = [item.origin for item in queued_items(store, "c2", 9)]
-    assert origins[:3] == [b"o" * 16] * 3
-    assert origins[3] not in (b"o" * 16, b"")
-    store.close()

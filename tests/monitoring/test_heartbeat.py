@@ -150,7 +150,7 @@ def test_command_reports_a_running_service_as_healthy(platform, path, monkeypatc
     service = Idle(platform("vessel-1"), ServiceConfig())
     assert service.start()
     try:
-        eventually(path.exists, 120, "a heartbeat")
+        eventually(path.exists, what="a heartbeat")
         done = subprocess.run(
             [sys.executable, "-m", "sonarpost.monitoring.healthcheck"],
             env={**os.environ, heartbeat.VARIABLE: str(path)},
@@ -161,7 +161,7 @@ def test_command_reports_a_running_service_as_healthy(platform, path, monkeypatc
         assert (done.returncode, done.stdout) == (0, "healthy\n")
         service.set_degraded("the disk is full")
         eventually(
-            lambda: health_problem(path, time.monotonic()) == "degraded: the disk is full", 10, "the degraded state"
+            lambda: health_problem(path, time.monotonic()) == "degraded: the disk is full", what="the degraded state"
         )
     finally:
         service.stop()

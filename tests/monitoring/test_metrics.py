@@ -98,7 +98,7 @@ def exporter(router):
     with subprocess.Popen([*command, "--stale-after", "1"], stderr=subprocess.PIPE, env=os.environ) as process:
         yield f"http://127.0.0.1:{port}/metrics"
         process.send_signal(signal.SIGTERM)
-        assert process.wait(10) == 0
+        assert process.wait(120) == 0
 
 
 def scrape(url):

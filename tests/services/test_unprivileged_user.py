@@ -91,7 +91,7 @@ def run_service(installation, router, tmp_path):
     yield start
     for process in started:
         process.terminate()
-    assert [process.wait(20) for process in started] == [0] * len(started)
+    assert [process.wait(120) for process in started] == [0] * len(started)
 
 
 @pytest.mark.timeout(600)  # compiles encoder and decoder of emb: 20 s on an idle machine

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
-from builders.delivery_model.rules import NEW, OLD
-from builders.delivery_model.scenarios import LARGE_SCENARIOS, REMOVALS, SCENARIOS, hostile, restore
+from builders.delivery_model.rules import OLD
+from builders.delivery_model.scenarios import HOSTILE, LARGE_SCENARIOS, REMOVALS, RESTORE, SCENARIOS
 from builders.delivery_model.search import Result, explore
 
 
@@ -14,9 +15,9 @@ def _print(name: str, result: Result) -> None:
     sys.stdout.flush()
 
 
-for world in (hostile(OLD), restore(OLD)):
-    _print("identity by origin and number only", explore(world, "I1"))
-for scenario in (*SCENARIOS, *LARGE_SCENARIOS):
-    _print(scenario.__name__, explore(scenario(NEW)))
+for world in (HOSTILE, RESTORE):
+    _print("identity by origin and number only", explore(replace(world, rules=OLD), "I1"))
+for name, world in (SCENARIOS | LARGE_SCENARIOS).items():
+    _print(name, explore(world))
 for removal in REMOVALS:
     _print(removal.name, explore(removal.world, removal.invariant))

@@ -59,7 +59,7 @@ def test_files_of_c2_are_readable_by_its_user_only(runner, platform, tmp_path, c
         assert "1 images" in capsys.readouterr().out
     finally:
         process.send_signal(signal.SIGTERM)
-        assert process.wait(20) == 0
+        assert process.wait(120) == 0
     assert_private(tmp_path / "deep")
 
 

@@ -33,7 +33,10 @@ def begin_records(session, vessel, count):
         item = OutboxItem("c2", number, key, "", 6, bytes(SIZE), digest)
         for offset in range(0, SIZE - CHUNK_BYTES, CHUNK_BYTES):
             replies = session.get(
-                keys.delivery_query(key, "c2"), payload=chunk, attachment=attachment(b"f" * 16, item, offset), timeout=5
+                keys.delivery_query(key, "c2"),
+                payload=chunk,
+                attachment=attachment(b"f" * 16, item, offset),
+                timeout=60,
             )
             statuses = {AckReply.unpack(reply.ok.payload.to_bytes(), key).status for reply in replies if reply.ok}
             assert statuses <= {"more", "later"}
@@ -55,6 +58,6 @@ def test_incomplete_records_are_deleted_when_the_disk_reserve_is_reached(
         key = keys.image_reconstructed("vessel-1")
         envelope = Relayed(vessel_id="vessel-1", key=key, payload=wire.encode(image), relayed_utc_s=5.0)
         relay.send(keys.shore_inbox("vessel-1"), "c2", envelope)
-    eventually(lambda: service.health().counters.get("images_stored", 0) == 20, timeout_s=120)
+    eventually(lambda: service.health().counters.get("images_stored", 0) == 20)
     (stored,) = service.store._query("SELECT COALESCE(SUM(has), 0) FROM partial")[0]
     assert stored <= 2 * SIZE

@@ -1,46 +1,17 @@
 """Contract of the archives of c2: files with an index in SQLite, and PostgreSQL."""
 
 import time
-from collections.abc import Callable
 
 import pytest
-from builders.records import decision_record, reconstructed_image
+from builders.records import decision_record
+from builders.shore import image
 
-from sonarpost.archive.postgresql import DatabaseAddress
 from sonarpost.archive.shore_index import TaskingRow
 from sonarpost.errors import PayloadError
-from sonarpost.messages import Pixels
-from sonarpost.services.c2.archive import Archive, Storage
 from sonarpost.services.c2.config import C2Config
-from sonarpost.services.c2.shared_archive import SharedArchive
 
 START_S = 1_700_000_000.0
 DAY_S = 86400.0
-OpenArchive = Callable[..., Storage]
-
-
-def image(image_id="AAAA", value=1, start_s=START_S):
-    picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([value]) * 600)
-    return reconstructed_image(
-        picture, vessel_id="vessel-1", image_id=image_id, first_frame_utc_s=start_s, last_frame_utc_s=start_s + 1
-    )
-
-
-@pytest.fixture(params=["files", "postgresql"])
-def open_archive(request, tmp_path):
-    made = []
-    url = request.getfixturevalue("database_url") if request.param == "postgresql" else None
-
-    def open_(**options):
-        config = C2Config(out_dir=tmp_path / "out", database=url, **options)
-        archive = Archive(config) if url is None else SharedArchive(config, DatabaseAddress.parse(url), "c2-a")
-        archive.open()
-        made.append(archive)
-        return archive
-
-    yield open_
-    for each in made:
-        each.close()
 
 
 @pytest.fixture
@@ -50,23 +21,17 @@ def archive(open_archive):
 
 def test_records_are_read_after_the_flush_and_after_a_restart(open_archive):
     archive = open_archive()
-    sent = image()
-    assert archive.store_image(sent, 5.0)[1:] == (True, False)
+    assert archive.store_image(image(), 5.0)[1:] == (True, False)
     assert archive.store_decision(decision_record("d1"))
     archive.flush()
     archive.close()
+    archive = open_archive()
+    archive.store_image(image("BBBB"), 5.0)
+    archive.store_decision(decision_record("d2"))
     index = open_archive().index()
     [row] = index.images()
     assert (row.image_id, row.relayed_utc_s, row.conflict, len(row.files_sha256.split())) == ("AAAA", 5.0, False, 3)
     assert [(each.decision_id, each.verdict) for each in index.decisions()] == [("d1", "mine_like")]
-
-
-def test_records_are_not_stored_before_the_flush(open_archive):
-    archive = open_archive()
-    archive.store_image(image(), 5.0)
-    archive.store_decision(decision_record())
-    index = open_archive().index()
-    assert (index.images(), index.decisions()) == ([], [])
 
 
 def test_repeated_record_is_stored_once(archive):
@@ -81,27 +46,25 @@ def test_repeated_record_is_stored_once(archive):
 
 
 @pytest.mark.parametrize("flush_between", [False, True])
-def test_different_image_of_the_same_name_is_kept_as_a_conflict(archive, *, flush_between):
-    assert archive.store_image(image(), 5.0)[1:] == (True, False)
-    if flush_between:
-        archive.flush()
-    assert archive.store_image(image(value=2), 5.0)[1:] == (True, True)
-    archive.flush()
-    assert archive.store_image(image(value=2), 5.0)[1:] == (False, True)
-    assert sorted(row.conflict for row in archive.index().images()) == [False, True]
-    archive.apply_retention(START_S)
-    assert archive.defect_counts()["conflicting"] == 1
-
-
-@pytest.mark.parametrize("flush_between", [False, True])
-def test_different_decision_of_the_same_identifier_is_refused(archive, *, flush_between):
+def test_different_record_of_the_same_name_is_a_conflict(archive, flush_between):
+    first, second = image(), image(value=2, start_s=START_S + 0.4)
+    assert archive.store_image(first, 5.0)[1:] == (True, False)
     archive.store_decision(decision_record("d1"))
     if flush_between:
         archive.flush()
+    assert archive.store_image(second, 5.0)[1:] == (True, True)
     with pytest.raises(PayloadError, match="decision_id: got 'd1', expected an identifier that no other decision has"):
         archive.store_decision(decision_record("d1", verdict="not_mine_like"))
     archive.flush()
+    for repeated, is_conflict in ((first, False), (second, True)):
+        assert archive.store_image(repeated, 6.0)[1:] == (False, is_conflict)
+    archive.flush()
+    rows = archive.index().images()
+    assert [(row.first_frame_utc_s, row.conflict) for row in rows] == [(START_S, False), (START_S + 0.4, True)]
+    assert [archive.read_pixels(row.vessel_id, row.name)[0, 0] for row in rows] == [1, 2]
     assert [row.verdict for row in archive.index().decisions()] == ["mine_like"]
+    archive.apply_retention(START_S)
+    assert archive.defect_counts()["conflicting"] == 1
 
 
 def test_text_that_a_database_cannot_store_is_kept_in_the_record(archive):
@@ -125,30 +88,39 @@ def test_retention_removes_exported_images_first(open_archive):
     assert small.apply_retention(START_S) == []
     assert [row.image_id for row in small.index().images()] == ["0000", "0001", "0003"]
     assert [row.removed_utc_s is None for row in small.index().images(removed=True)] == [True, True, False, True]
+    assert small.images_bytes() == sum(row.size_bytes for row in small.index().images())
+    small.verify(1e9, DAY_S)
+    assert small.defect_counts()["missing"] == 0
     # An image that arrives again is stored again.
     assert archive.store_image(image("0002"), 5.0).is_new
     archive.flush()
     assert len(archive.index().images()) == 4
+    assert not archive.store_image(image("0002"), 5.0).is_new
 
 
-def test_retention_removes_old_images(open_archive):
-    archive = open_archive(retain_days=10.0)
+def test_old_images_are_removed_by_default(archive):
     archive.store_image(image(), 5.0)
     archive.flush()
     accepted_utc_s = archive.index().images()[0].accepted_utc_s
-    assert archive.apply_retention(accepted_utc_s + 9 * DAY_S) == []
-    assert len(archive.apply_retention(accepted_utc_s + 11 * DAY_S)) == 1
+    assert archive.apply_retention(accepted_utc_s + 364 * DAY_S) == []
+    assert len(archive.apply_retention(accepted_utc_s + 366 * DAY_S)) == 1
     assert archive.index().images() == []
+    assert C2Config().max_bytes == 50_000_000_000
 
 
-def test_verification_compares_each_record_once_in_a_cycle(archive):
+def test_verification_compares_each_record_once_in_a_cycle_unless_disabled(open_archive, caplog):
+    archive = open_archive()
     for number in range(10):
         archive.store_image(image(f"{number:04d}"), 5.0)
     archive.store_decision(decision_record())
     archive.flush()
+    caplog.clear()
+    assert open_archive(verify_days=0).verify(1e9, DAY_S) == 0
     compared = [archive.verify(1e9 + hour * 3600.0, 3600.0 * 4) for hour in range(0, 24, 4)]
     assert compared == [3, 2, 2, 2, 2, 0]
+    assert archive.verify(1e9 + 2.1 * DAY_S, DAY_S) == 11
     assert set(archive.defect_counts().values()) == {0}
+    assert not caplog.records
 
 
 def test_state_of_a_command_is_replaced(archive):

@@ -5,29 +5,16 @@ import pytest
 import zenoh
 from builders.common import eventually, free_port
 from builders.faulty_link import FaultyLink
-from builders.records import decision_record
 
 from sonarpost import keys
 from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.bus.session import router_config
 from sonarpost.errors import StoredFileError
 from sonarpost.messages import Advice, Command, TaskingState
-from sonarpost.services.c2.config import C2Config
-from sonarpost.services.c2.service import C2Service
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
 ADVICE, COMMAND = keys.tasking_advice("vessel-1"), keys.tasking_command("vessel-1")
-
-
-@pytest.fixture
-def out(tmp_path):
-    return tmp_path / "out"
-
-
-@pytest.fixture
-def begin(runner, platform, out):
-    return lambda **options: runner.start(C2Service(platform("shore-1"), C2Config(out_dir=out, **options)))
 
 
 @pytest.fixture
@@ -137,10 +124,10 @@ def test_advice_arrives_once_after_a_link_cut(begin, runner, platform, expert, o
         link.cut()
         expert.send(ADVICE, "c2", advice("later"))
         eventually(lambda: states(out).get(("vessel-1", "advice", "later")) == "waiting")
-        eventually(lambda: not service.is_responding("relay@vessel-1"), timeout_s=120)
+        eventually(lambda: not service.is_responding("relay@vessel-1"))
         assert [a.advice_id for a in screen.received] == ["before"]
         link.mend()
-        eventually(lambda: [a.advice_id for a in screen.received] == ["before", "later"], timeout_s=120)
+        eventually(lambda: [a.advice_id for a in screen.received] == ["before", "later"])
         eventually(lambda: states(out).get(("vessel-1", "advice", "later")) == "delivered")
     finally:
         runner.stop_all()
@@ -217,18 +204,3 @@ def test_publication_on_the_vessel_is_ignored_by_the_relay(relay, console, publi
     eventually(lambda: len(screen.received) == 1)
     assert "advice_taken" not in service.health().counters
     assert service.store.inbox_depth() == 0
-
-
-def test_envelope_of_another_vessel_is_refused_to_its_sender(begin, runner, refused):
-    from sonarpost import wire
-    from sonarpost.messages import Relayed
-
-    service, sender = begin(), runner.peer("vessel-1", "relay")
-    inner = decision_record("d", vessel_id="vessel-2")
-    forged = Relayed(
-        vessel_id="vessel-2", key=keys.contact_decision("vessel-2"), payload=wire.encode(inner), relayed_utc_s=1.0
-    )
-    sender.send(keys.shore_inbox("vessel-1"), "c2", forged)
-    eventually(lambda: len(refused(sender)) == 1)
-    assert "vessel_id: got 'vessel-2', expected the vessel in the key" in refused(sender)[0][1]
-    assert service.health().counters == {"records_refused": 1}

@@ -1,0 +1,301 @@
+"""Archive of files of c2: comparison with the index, retention, and indexes of earlier versions."""
+
+import logging
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
+
+import pytest
+from builders.common import eventually
+from builders.records import decision_record
+from builders.shore import image, relayed
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonarpost import keys
+from sonarpost.archive.shore_files import find_image, image_paths, select_images
+from sonarpost.archive.shore_index import FILE_NAME, DecisionRow, ImageRow, ShoreIndex
+from sonarpost.cli.main import main
+from sonarpost.errors import StoredFileError
+from sonarpost.export.contacts import load_contacts
+from sonarpost.messages import Contact
+
+DAY_S = 86400.0
+START_S = 1_700_000_000.0
+INBOX = keys.shore_inbox("vessel-1")
+
+
+@pytest.fixture
+def filled(open_files):
+    """Make an archive with ten images and a decision."""
+    made = open_files()
+    for number in range(10):
+        made.store_image(image(f"{number:04d}"), 5.0)
+    made.store_decision(decision_record())
+    made.flush()
+    return made
+
+
+def delete_index(out):
+    for path in out.glob(f"{FILE_NAME}*"):
+        path.unlink()
+
+
+def test_two_images_of_one_name_and_version_are_reported(open_files, out, caplog, capsys):
+    kept = open_files()
+    for value in (1, 2):
+        kept.store_image(image(value=value), 5.0)
+        kept.flush()
+    assert [record.levelno for record in caplog.records if "conflicts" in record.message] == [logging.WARNING]
+    assert main(["c2", "ls", "--archive", str(out)]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "uuv-1/AAAA" in line]
+    assert ["1 (conflict)" in line for line in lines] == [False, True]
+    contacts = load_contacts(out)
+    assert len(contacts.contacts) == 1
+    assert "one image of this name and version" in str(contacts.problems[0])
+
+
+def test_index_is_completed_from_the_files(open_files, out):
+    first = open_files()
+    for each in (image(), image(value=2), image(version=2)):
+        first.store_image(each, 5.0)
+        first.flush()
+    first.store_decision(decision_record())
+    first.flush()
+    before = [replace(row, relayed_utc_s=None, accepted_utc_s=0.0) for row in first.index().images()]
+    assert [row.conflict for row in before].count(True) == 1
+    first.close()
+    delete_index(out)
+    (out / "vessel-1" / "broken.json").write_text("{")
+    again = open_files().index()
+    assert [replace(row, accepted_utc_s=0.0) for row in again.images()] == before
+    assert [d.decision_id for d in again.decisions()] == ["d1"]
+
+
+# Comparison of files and index
+
+
+def test_missing_and_changed_files_are_counted_logged_once_and_listed(filled, out, caplog, capsys):
+    rows = filled.index().images()
+    first = image_paths(out, rows[0])[1]
+    content = first.read_bytes()
+    first.unlink()
+    image_paths(out, rows[1])[0].unlink()
+    tiff = image_paths(out, rows[2])[1]
+    tiff.write_bytes(tiff.read_bytes()[:-1] + b"\xff")
+    image_paths(out, rows[3])[2].write_bytes(b"")
+    unreadable = image_paths(out, rows[4])[1]
+    unreadable.unlink()
+    unreadable.mkdir()
+    decision = next(out.glob("*/decisions/*.json"))
+    decision.write_bytes(decision.read_bytes() + b" ")
+    caplog.clear()
+    filled.verify(1e9, DAY_S)
+    assert filled.defect_counts() == {"missing": 2, "changed": 3, "unreadable": 1, "conflicting": 0}
+    filled.verify(1e9 + 2 * DAY_S, DAY_S)
+    assert [record.message for record in caplog.records] == ["Stored files differ from the index"]
+    assert main(["c2", "ls", "--archive", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert [text.count(f"1 ({fault})") for fault in ("missing", "changed", "unreadable")] == [2, 2, 1]
+    # Restored files, and those of an image that arrives again, are no longer reported.
+    first.write_bytes(content)
+    assert filled.store_image(image("0001"), 5.0).is_new
+    filled.flush()
+    assert filled.defect_counts()["missing"] == 1
+    filled.verify(1e9 + 4 * DAY_S, DAY_S)
+    assert filled.defect_counts()["missing"] == 0
+
+
+def test_service_compares_its_files_and_warns(begin, relay, out, monkeypatch):
+    monkeypatch.setattr("sonarpost.services.c2.service.VERIFICATION_INTERVAL_S", 0.05)
+    service = begin(verify_days=1e-6)
+    relay.send(INBOX, "c2", *(relayed(image(value=n, start_s=START_S + 0.4 * n)) for n in (0, 1)))
+    eventually(lambda: service.health().counters.get("images_conflicting") == 1)
+    assert service.health().state == "ok"
+    assert service.health().detail == f"{out}: stored records 1 conflicting"
+    next(out.glob("*/*.png")).unlink()
+    eventually(lambda: service.health().gauges["records_missing"] == 1)
+    assert service.health().detail == f"{out}: stored records 1 missing, 1 conflicting"
+
+
+# Retention
+
+
+def row(name, accepted_utc_s=0.0, size_bytes=100, exported_utc_s=None, **changes):
+    fields = dict.fromkeys(("relayed_utc_s", "lat_deg", "lon_deg", "atd_class", "atd_confidence"))
+    fields |= dict.fromkeys(("first_frame_utc_s", "last_frame_utc_s", "missing_fraction"), 0.0)
+    fields |= {"vessel_id": "vessel-1", "vehicle_id": "uuv-1", "image_id": "AAAA", "version": 1, "complete": True}
+    fields |= {"height_px": 1, "width_px": 1, "codec": "vq", "accepted_utc_s": accepted_utc_s}
+    return ImageRow(name=name, size_bytes=size_bytes, exported_utc_s=exported_utc_s, **fields | changes)
+
+
+def test_retention_removes_exported_images_first_then_the_oldest():
+    rows = [row("a", 1), row("b", 2), row("c", 3, exported_utc_s=9.0), row("d", 4, exported_utc_s=9.0)]
+    assert [r.name for r in select_images(rows, (), 10.0, None, 250)] == ["c", "d"]
+    assert [r.name for r in select_images(rows, (), 10.0, None, 100)] == ["c", "d", "a"]
+    assert select_images(rows, (), 10.0, None, 400) == []
+
+
+def test_images_without_a_decision_are_removed_last():
+    decision = DecisionRow.of(decision_record(vehicle_id="uuv-1", image_id="BBBB"), 5.0)
+    rows = [row("a", 1), row("b", 2, image_id="BBBB"), row("c", 3, exported_utc_s=9.0)]
+    assert [r.name for r in select_images(rows, [decision], 10.0, None, 100)] == ["c", "b"]
+    assert [r.name for r in select_images(rows, [decision], 10.0, None, 0)] == ["c", "b", "a"]
+
+
+def test_retention_removes_old_images_below_the_size_limit():
+    rows = [row("old", START_S), row("new", START_S + 5 * DAY_S)]
+    now_utc_s = START_S + 6 * DAY_S
+    assert [r.name for r in select_images(rows, (), now_utc_s, 3.0, None)] == ["old"]
+    assert [r.name for r in select_images(rows, (), now_utc_s, 3.0, 10)] == ["old", "new"]
+
+
+@given(
+    st.lists(st.tuples(st.floats(0, 1e6), st.integers(0, 1000), st.booleans()), max_size=20),
+    st.none() | st.floats(0.001, 20),
+    st.none() | st.integers(0, 5000),
+)
+def test_retention_keeps_the_limits_and_removes_no_more_than_needed(pictures, days, limit):
+    rows = [row(str(n), START_S + at, size, 1.0 if done else None) for n, (at, size, done) in enumerate(pictures)]
+    now_utc_s = START_S + 1e6
+    removed = select_images(rows, (), now_utc_s, days, limit)
+    kept = [r for r in rows if r not in removed]
+    assert len(removed) == len(set(removed))
+    if days is not None:
+        assert all(now_utc_s - r.accepted_utc_s <= days * DAY_S for r in kept)
+    if limit is not None:
+        assert sum(r.size_bytes for r in kept) <= limit
+    if removed and limit is not None and (days is None or now_utc_s - removed[-1].accepted_utc_s <= days * DAY_S):
+        assert sum(r.size_bytes for r in kept) + removed[-1].size_bytes > limit
+    if days is None and limit is None:
+        assert removed == []
+
+
+def test_retention_deletes_files_and_keeps_decisions(open_files, out):
+    kept = open_files(max_bytes=0)
+    for image_id in ("AAAA", "BBBB"):
+        kept.store_image(image(image_id), 5.0)
+    kept.store_decision(decision_record())
+    kept.flush()
+    assert [r.image_id for r in kept.apply_retention(1e9)] == ["AAAA", "BBBB"]
+    assert [p.name for p in out.rglob("*") if p.is_file() and FILE_NAME not in p.name] == [f"{b'd1'.hex()}.json"]
+    assert kept.images_bytes() == 0
+    assert [r.removed_utc_s for r in kept.index().images(removed=True)] == [1e9, 1e9]
+    assert len(kept.index().decisions()) == 1
+    assert kept.apply_retention(2e9) == []
+
+
+def test_service_removes_counts_and_logs(begin, relay, out, caplog):
+    service = begin(max_bytes=0)
+    relay.send(INBOX, "c2", relayed(image()))
+    eventually(lambda: service.health().counters.get("images_removed") == 1)
+    assert service.health().gauges["pictures_bytes"] == 0
+    assert list(out.glob("*/*.tiff")) == []
+    assert "Image removed by retention" in [record.message for record in caplog.records]
+
+
+# Index
+
+
+def test_index_of_another_version_or_other_file_is_rejected(tmp_path):
+    with pytest.raises(StoredFileError, match="no such file"):
+        ShoreIndex(tmp_path, writable=False)
+    (tmp_path / FILE_NAME).write_bytes(b"no database" * 100)
+    for writable in (True, False):
+        with pytest.raises(StoredFileError, match=r"index\.db"):
+            ShoreIndex(tmp_path, writable=writable)
+
+
+def test_image_is_found_by_name_and_newest_version():
+    rows = [row("f1", version=1), row("f2", version=2), row("g", vessel_id="vessel-2", vehicle_id="uuv-2")]
+    assert find_image(rows, "uuv-1/AAAA", None, None).name == "f2"
+    assert find_image(rows, "uuv-1/AAAA", None, 1).name == "f1"
+    assert find_image(rows, "g", None, None).name == "g"
+    with pytest.raises(StoredFileError, match="an image that"):
+        find_image(rows, "uuv-1/ZZZZ", None, None)
+    twice = [*rows, row("h", first_frame_utc_s=9.0)]
+    with pytest.raises(StoredFileError, match="one image, with --vessel or by the name of its files"):
+        find_image(twice, "uuv-1/AAAA", None, None)
+
+
+VERSION_1 = """
+CREATE TABLE picture (
+    vessel_id TEXT NOT NULL, name TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
+    version INTEGER NOT NULL, first_frame_utc_s REAL NOT NULL, last_frame_utc_s REAL NOT NULL,
+    relayed_utc_s REAL, accepted_utc_s REAL NOT NULL, complete INTEGER NOT NULL, missing_fraction REAL NOT NULL,
+    height_px INTEGER NOT NULL, width_px INTEGER NOT NULL, codec TEXT NOT NULL, lat_deg REAL, lon_deg REAL,
+    atd_class TEXT, atd_confidence REAL, size_bytes INTEGER NOT NULL, exported_utc_s REAL, removed_utc_s REAL,
+    PRIMARY KEY (vessel_id, name)) WITHOUT ROWID;
+CREATE TABLE decision (
+    vessel_id TEXT NOT NULL, decision_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
+    image_version INTEGER NOT NULL, verdict TEXT NOT NULL, confidence REAL, mlo_class TEXT, remark TEXT NOT NULL,
+    operator TEXT NOT NULL, decided_utc_s REAL NOT NULL, accepted_utc_s REAL NOT NULL,
+    PRIMARY KEY (vessel_id, decision_id)) WITHOUT ROWID;
+CREATE TABLE tasking (
+    vessel_id TEXT NOT NULL, kind TEXT NOT NULL, record_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT,
+    summary TEXT NOT NULL, author TEXT NOT NULL, issued_utc_s REAL NOT NULL, state TEXT NOT NULL, reason TEXT NOT NULL,
+    changed_utc_s REAL NOT NULL, PRIMARY KEY (vessel_id, kind, record_id)) WITHOUT ROWID;
+PRAGMA user_version = 1;
+"""
+
+
+@pytest.fixture
+def version_1(filled, out):
+    """Turn the index into one of version 1; return its rows with the defaults of the new columns."""
+    rows = filled.index().images()
+    filled.close()
+    path = out / FILE_NAME
+    with closing(sqlite3.connect(path)) as db:
+        old = {t: [r[1] for r in db.execute(f"PRAGMA table_info({t})")] for t in ("picture", "decision")}
+        data = {t: db.execute(f"SELECT * FROM {t}").fetchall() for t in old}
+    path.unlink()
+    new = {"conflict", "files_sha256", "verified_utc_s", "fault", "despeckle_strength", "p_mine_like", "p_other_object"}
+    with closing(sqlite3.connect(path)) as db, db:
+        db.executescript(VERSION_1)
+        for table, columns in old.items():
+            kept = [n for n, column in enumerate(columns) if column not in new]
+            marks = ", ".join("?" * len(kept))
+            db.executemany(f"INSERT INTO {table} VALUES ({marks})", [[r[n] for n in kept] for r in data[table]])
+    return [replace(row, files_sha256="") for row in rows]
+
+
+def test_index_of_version_1_is_read_without_a_migration(version_1, out):
+    before = (out / FILE_NAME).read_bytes()
+    with closing(ShoreIndex(out, writable=False)) as index:
+        assert index.images() == version_1
+        assert len(index.decisions()) == 1
+    assert (out / FILE_NAME).read_bytes() == before
+
+
+def test_index_of_version_1_is_migrated_and_gets_digests(version_1, open_files, out):
+    image_paths(out, version_1[0])[1].write_bytes(b"other size")
+    migrated = open_files()
+    assert migrated.index().images() == version_1
+    assert migrated.verify(1e9, DAY_S) == 11
+    assert migrated.defect_counts() == {"missing": 0, "changed": 1, "unreadable": 0, "conflicting": 0}
+    tiff = image_paths(out, version_1[1])[1]
+    tiff.write_bytes(tiff.read_bytes()[:-1] + b"\xff")
+    migrated.verify(1e9 + 2 * DAY_S, DAY_S)
+    assert migrated.defect_counts()["changed"] == 2
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_index_of_a_later_version_gains_its_columns(version, open_files, filled, out):
+    before = filled.index().images()
+    filled.close()
+    with closing(sqlite3.connect(out / FILE_NAME)) as db, db:
+        for column in ("p_mine_like", "p_other_object", *["despeckle_strength"] * (version < 3)):
+            db.execute(f"ALTER TABLE picture DROP COLUMN {column}")
+        db.execute(f"PRAGMA user_version = {version}")
+    with closing(ShoreIndex(out, writable=False)) as index:
+        assert index.images() == before
+    migrated = open_files()
+    assert migrated.index().images() == before
+    contact = Contact(
+        contact_id="uuv-1/000A", vehicle_id="uuv-1", atd_class="structure", p_mine_like=0.05, p_other_object=0.9
+    )
+    migrated.store_image(image("000A", despeckle_strength=0.5, contact=contact), 5.0)
+    migrated.flush()
+    [added] = [row for row in migrated.index().images() if row.image_id == "000A"]
+    assert (added.despeckle_strength, added.atd_class) == (0.5, "structure")
+    assert (added.p_mine_like, added.p_other_object) == (0.05, 0.9)
