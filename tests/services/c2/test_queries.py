@@ -12,20 +12,16 @@ import pytest
 import zenoh
 from builders.common import eventually
 from builders.records import decision_record, reconstructed_image
+from builders.shore import CONTACTS, relayed
 from PIL import Image
 
 from sonarpost import keys, wire
 from sonarpost.archive.journal import Journal
 from sonarpost.bus.catch_up import CatchUpSubscriber
-from sonarpost.bus.session import client_config
-from sonarpost.errors import BadInputError, QueryRefusedError
-from sonarpost.messages import Advice, Contact, Decision, Pixels, ReconstructedImage, Relayed
+from sonarpost.errors import QueryRefusedError
+from sonarpost.messages import Advice, Contact, Decision, Pixels, ReconstructedImage
 from sonarpost.services.c2 import queries
 from sonarpost.services.c2.accepted import AcceptedRecords
-from sonarpost.services.c2.config import C2Config
-from sonarpost.services.c2.service import C2Service
-
-CONTACTS = "sonarpost/v1/shore/contact/*/*"
 
 
 def image(image_id="0001", *, version=1, vehicle="uuv-1", vessel="vessel-1", lat=56.4, lon=-5.6, size=4, **changes):
@@ -59,13 +55,6 @@ def partial_image(image_id="0001", **changes):
     )
 
 
-def envelope(record):
-    vessel = record.vessel_id
-    is_image = isinstance(record, ReconstructedImage)
-    key = keys.image_reconstructed(vessel) if is_image else keys.contact_decision(vessel)
-    return Relayed(vessel_id=vessel, key=key, payload=wire.encode(record), relayed_utc_s=5.0)
-
-
 class Shore:
     """A c2 whose records arrive without a relay."""
 
@@ -81,7 +70,7 @@ class Shore:
     def accept(self, *records):
         before = self.handled()
         for record in records:
-            self.client.put(keys.shore_inbox(record.vessel_id), wire.encode(envelope(record)))
+            self.client.put(keys.shore_inbox(record.vessel_id), wire.encode(relayed(record)))
         eventually(lambda: self.handled() == before + len(records), what="acceptance")
 
     def replies(self, selector):
@@ -91,6 +80,17 @@ class Shore:
         assert errors == []
         samples = [reply.ok for reply in found]
         return samples[:-1], samples[-1]
+
+    def pages(self, parameters=""):
+        """Return the replies of each page of the contacts, the last cursor included."""
+        found, cursor, more = [], "", True
+        while more:
+            samples, page = self.replies(f"{CONTACTS}?{parameters}after={cursor}")
+            fields = msgpack.unpackb(page.payload.to_bytes())
+            assert fields["records"] == len(samples)
+            found.append([msgpack.unpackb(s.payload.to_bytes())["image_id"] for s in samples])
+            cursor, more = fields["next"], fields["more"]
+        return found, cursor
 
     def names(self, selector):
         samples, _ = self.replies(selector)
@@ -108,19 +108,8 @@ class Shore:
 
 
 @pytest.fixture
-def out(tmp_path):
-    return tmp_path / "out"
-
-
-@pytest.fixture
-def begin(runner, platform, out, client, monkeypatch):
-    # These tests query faster than clients may.
-    monkeypatch.setattr(queries, "BURST", 1e9)
-
-    def start(**options):
-        return Shore(runner.start(C2Service(platform("shore-1"), C2Config(out_dir=out, **options))), client)
-
-    return start
+def begin(begin, client, fast_queries):
+    return lambda **options: Shore(begin(**options), client)
 
 
 @pytest.fixture
@@ -196,15 +185,9 @@ def test_time_range_is_half_open(shore):
 
 def test_pages_hold_every_record_once(shore):
     shore.accept(*(image(f"{n:04X}") for n in range(1, 26)))
-    names, cursor, more, pages = [], "", True, 0
-    while more:
-        pages += 1
-        samples, page = shore.replies(f"{CONTACTS}?limit=10;after={cursor}")
-        fields = msgpack.unpackb(page.payload.to_bytes())
-        assert fields["records"] == len(samples)
-        names += [msgpack.unpackb(s.payload.to_bytes())["image_id"] for s in samples]
-        cursor, more = fields["next"], fields["more"]
-    assert (pages, names) == (3, [f"{n:04X}" for n in range(1, 26)])
+    pages, cursor = shore.pages("limit=10;")
+    assert [len(page) for page in pages] == [10, 10, 5]
+    assert [name for page in pages for name in page] == [f"{n:04X}" for n in range(1, 26)]
     assert shore.names(f"{CONTACTS}?after={cursor}") == []
     shore.accept(image("00AA"))
     assert shore.names(f"{CONTACTS}?after={cursor}") == ["00AA.1"]
@@ -213,47 +196,42 @@ def test_pages_hold_every_record_once(shore):
 def test_page_is_limited_in_bytes_but_has_at_least_one_record(shore, monkeypatch):
     monkeypatch.setattr(queries, "MAX_BYTES", 30_000)
     shore.accept(image("0001", size=250), image("0002", size=100), image("0003", size=100), image("0004", size=100))
-    pages, cursor, more = [], "", True
-    while more:
-        samples, page = shore.replies(f"{CONTACTS}?after={cursor}")
-        fields = msgpack.unpackb(page.payload.to_bytes())
-        pages.append(len(samples))
-        cursor, more = fields["next"], fields["more"]
-    assert pages == [1, 2, 1]
+    assert shore.pages()[0] == [["0001"], ["0002", "0003"], ["0004"]]
 
 
-@pytest.mark.parametrize(
-    ("selector", "field", "expected"),
-    [
-        (f"{CONTACTS}?limit=0", "limit", "1 to 256"),
-        (f"{CONTACTS}?limit=257", "limit", "1 to 256"),
-        (f"{CONTACTS}?limit=1;limit=2", "limit", "one value"),
-        (f"{CONTACTS}?vehicle=UUV", "vehicle", "1 to 32 of a-z"),
-        (f"{CONTACTS}?vessel=", "vessel", "1 to 32 of a-z"),
-        (f"{CONTACTS}?area=1,2,3", "area", "SOUTH,WEST,NORTH,EAST"),
-        (f"{CONTACTS}?area=1,2,0,4", "area", "SOUTH,WEST,NORTH,EAST"),
-        (f"{CONTACTS}?area=nan,0,1,1", "area", "SOUTH,WEST,NORTH,EAST"),
-        (f"{CONTACTS}?area=0,0,91,1", "area", "SOUTH,WEST,NORTH,EAST"),
-        (f"{CONTACTS}?review=maybe", "review", "unreviewed or mine_like"),
-        (f"{CONTACTS}?version=2", "version", "latest or all"),
-        (f"{CONTACTS}?after=5", "after", "the `next` of an earlier page"),
-        (f"{CONTACTS}?after=00000000.5", "after", "a cursor of "),
-        (f"{CONTACTS}?format=xml", "format", "msgpack or json"),
-        (f"{CONTACTS}?picture=png", "picture", "raw, unless format is json"),
-        (f"{CONTACTS}?_time=yesterday", "_time", "[START..END["),
-        (f"{CONTACTS}?_time=[2023-11-14T22:13:20..]", "_time", "[START..END["),
-        (f"{CONTACTS}?_time=[now(99999999999999w)..]", "_time", "[START..END["),
-        (f"{CONTACTS}?vehical=uuv-1", "vehical", "one of the parameters _time, vessel"),
-        (f"{CONTACTS}?' OR 1=1 --", "' OR 1", "one of the parameters"),
-        (f"{CONTACTS}?vehicle={'a' * 1000}", "parameters", "at most 1000 characters"),
-        ("sonarpost/v1/shore/contact/**", "key", "a key expression within sonarpost/v1/shore/contact/*/*"),
-    ],
-)
-def test_invalid_query_gets_one_error(shore, selector, field, expected):
-    text = shore.error(selector)
-    where = selector.partition("?")[0]
-    assert text.startswith(f"{where}: {field}: got ")
-    assert f", expected {expected}" in text
+INVALID = [
+    ("limit=0", "limit", "1 to 256"),
+    ("limit=257", "limit", "1 to 256"),
+    ("limit=1;limit=2", "limit", "one value"),
+    ("vehicle=UUV", "vehicle", "1 to 32 of a-z"),
+    ("vessel=", "vessel", "1 to 32 of a-z"),
+    ("area=1,2,3", "area", "SOUTH,WEST,NORTH,EAST"),
+    ("area=1,2,0,4", "area", "SOUTH,WEST,NORTH,EAST"),
+    ("area=nan,0,1,1", "area", "SOUTH,WEST,NORTH,EAST"),
+    ("area=0,0,91,1", "area", "SOUTH,WEST,NORTH,EAST"),
+    ("review=maybe", "review", "unreviewed or mine_like"),
+    ("version=2", "version", "latest or all"),
+    ("after=5", "after", "the `next` of an earlier page"),
+    ("after=00000000.5", "after", "a cursor of "),
+    ("format=xml", "format", "msgpack or json"),
+    ("picture=png", "picture", "raw, unless format is json"),
+    ("_time=yesterday", "_time", "[START..END["),
+    ("_time=[2023-11-14T22:13:20..]", "_time", "[START..END["),
+    ("_time=[now(99999999999999w)..]", "_time", "[START..END["),
+    ("vehical=uuv-1", "vehical", "one of the parameters _time, vessel"),
+    ("' OR 1=1 --", "' OR 1", "one of the parameters"),
+    ("vehicle=" + "a" * 1000, "parameters", "at most 1000 characters"),
+]
+
+
+def test_invalid_query_gets_one_error(shore):
+    selectors = [(f"{CONTACTS}?{parameters}", field, expected) for parameters, field, expected in INVALID]
+    outside = "sonarpost/v1/shore/contact/**"
+    selectors.append((outside, "key", "a key expression within sonarpost/v1/shore/contact/*/*"))
+    for selector, field, expected in selectors:
+        text = shore.error(selector)
+        assert text.startswith(f"{selector.partition('?')[0]}: {field}: got ")
+        assert f", expected {expected}" in text
 
 
 def test_tasking_states_are_all_in_order_or_the_latest(shore, runner):
@@ -444,122 +422,70 @@ def test_refused_rate_is_an_error_reply(shore, monkeypatch):
 # Catch up
 
 
-class Reader:
-    """Consumes a `CatchUpSubscriber` in a thread."""
-
-    def __init__(self, session, cursor="", **options):
-        self.subscriber = CatchUpSubscriber(session, CONTACTS, cursor, **options)
-        self.records = []
-        self.error = None
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self):
-        try:
-            for record in self.subscriber:
-                self.records.append(record)
-        except (QueryRefusedError, BadInputError) as error:
-            self.error = error
-
-    def close(self):
-        self.subscriber.close()
-        self._thread.join(60)
-        assert not self._thread.is_alive()
-
-
-def test_subscriber_that_was_away_for_1000_contacts_has_each_once(shore, router, out):
-    """Contacts arrive before, during and after the queries; some publications are repeated."""
-    service = shore.service
-    first = [image(f"{n:04X}") for n in range(1, 1001)]
-    accept_directly(service, first)
-    with zenoh.open(client_config([router])) as session:
-        reader = Reader(session)
-        try:
-            eventually(lambda: len(reader.records) >= 100, what="first records")
-            shore.accept(*(image(f"{n:04X}") for n in range(1001, 1021)), *first[:3])
-            eventually(lambda: len(reader.records) >= 1020 and reader.subscriber.is_caught_up, what="all records")
-            shore.accept(image("FFFF"), first[0])
-            eventually(lambda: len(reader.records) >= 1021, what="the last record")
-        finally:
-            reader.close()
-    assert reader.error is None
-    got = [wire.decode(ReconstructedImage, r.payload, r.key).image_id for r in reader.records]
-    assert sorted(got) == sorted([f"{n:04X}" for n in range(1, 1021)] + ["FFFF"])
-    assert len({r.seq for r in reader.records}) == 1021
-    assert {r.archive for r in reader.records} == {service._accepted.journal().archive}
-    # A later subscription continues at the cursor: again nothing twice.
-    shore.accept(image("FFFE"))
-    with zenoh.open(client_config([router])) as session:
-        again = Reader(session, reader.subscriber.cursor)
-        try:
-            eventually(lambda: again.subscriber.is_caught_up and bool(again.records), what="the record missed")
-        finally:
-            again.close()
-    cursor_seq = int(reader.subscriber.cursor.split(".")[1])
-    assert [r.seq for r in again.records] == list(range(cursor_seq + 1, 1023))
-    assert wire.decode(ReconstructedImage, again.records[-1].payload, "").image_id == "FFFE"
-
-
 def accept_directly(service, images):
     """Number images as c2 does, without image files and publication."""
     service._accepted.number([service._accepted.image(each, "") for each in images])
 
 
-def test_lost_publications_are_fetched_by_the_next_query(shore, router):
-    with zenoh.open(client_config([router])) as session:
-        reader = Reader(session, refresh_s=0.2)
-        try:
-            eventually(lambda: reader.subscriber.is_caught_up)
-            accept_directly(shore.service, [image("0001"), image("0002")])  # not published
-            eventually(lambda: len(reader.records) == 2)
-        finally:
-            reader.close()
+def test_subscriber_that_was_away_for_300_contacts_has_each_once(shore, reading):
+    """Contacts arrive before, during and after the queries; some publications are repeated."""
+    first = [image(f"{n:04X}") for n in range(1, 301)]
+    accept_directly(shore.service, first)
+    reader = reading()
+    eventually(lambda: len(reader.records) >= 100, what="first records")
+    shore.accept(*(image(f"{n:04X}") for n in range(301, 321)), *first[:3])
+    reader.wait_for(320)
+    shore.accept(image("FFFF"), first[0])
+    got = reader.wait_for(321)
+    assert sorted(got) == sorted([f"{n:04X}" for n in range(1, 321)] + ["FFFF"])
+    assert len({r.seq for r in reader.records}) == 321
+    assert {r.archive for r in reader.records} == {shore.service._accepted.journal().archive}
+    # A later subscription continues at the cursor: again nothing twice.
+    reader.close()
+    shore.accept(image("FFFE"))
+    again = reading(reader.subscriber.cursor)
+    assert again.wait_for(1)[-1] == "FFFE"
+    cursor_seq = int(reader.subscriber.cursor.split(".")[1])
+    assert [r.seq for r in again.records] == list(range(cursor_seq + 1, 323))
 
 
-def test_overflow_of_the_buffer_leads_to_a_query(shore, router, monkeypatch):
+def test_lost_publications_are_fetched_by_the_next_query(shore, reading):
+    reader = reading(refresh_s=0.2)
+    eventually(lambda: reader.subscriber.is_caught_up)
+    accept_directly(shore.service, [image("0001"), image("0002")])  # not published
+    eventually(lambda: len(reader.records) == 2)
+
+
+def test_overflow_of_the_buffer_leads_to_a_query(shore, client, monkeypatch):
     monkeypatch.setattr("sonarpost.bus.catch_up.MAX_BUFFERED", 2)
-    with zenoh.open(client_config([router])) as session:
-        subscriber = CatchUpSubscriber(session, CONTACTS, refresh_s=3600.0)
-        publisher = shore.client.declare_publisher(keys.shore_image("vessel-1"))
-        eventually(lambda: publisher.matching_status.matching)
+    with CatchUpSubscriber(client, CONTACTS, refresh_s=3600.0) as subscriber:
+        eventually(
+            lambda: shore.service.session.declare_publisher(keys.shore_image("vessel-1")).matching_status.matching
+        )
         shore.accept(*(image(f"{n:04X}") for n in range(1, 11)))
         eventually(lambda: subscriber._overflowed)
         records = iter(subscriber)
-        seqs = [next(records).seq for _ in range(10)]
-        subscriber.close()
-    assert sorted(seqs) == list(range(1, 11))
+        assert sorted(next(records).seq for _ in range(10)) == list(range(1, 11))
 
 
-def test_subscriber_waits_for_c2_and_refused_cursor_is_reported(begin, router, runner, monkeypatch):
+def test_subscriber_waits_for_c2_and_refused_cursor_is_reported(begin, reading, client, monkeypatch):
     monkeypatch.setattr("sonarpost.bus.catch_up.RETRY_S", 0.05)
-    with zenoh.open(client_config([router])) as session:
-        reader = Reader(session)
-        try:
-            shore = begin()
-            shore.accept(image("0001"))
-            eventually(lambda: reader.subscriber.is_caught_up and len(reader.records) == 1)
-        finally:
-            reader.close()
-        with (
-            CatchUpSubscriber(session, CONTACTS, "00000000.7") as other,
-            pytest.raises(QueryRefusedError, match=r"after: got '00000000\.7', expected a cursor of"),
-        ):
-            next(iter(other))
+    reader = reading()
+    begin().accept(image("0001"))
+    assert reader.wait_for(1) == ["0001"]
+    with (
+        CatchUpSubscriber(client, CONTACTS, "00000000.7") as other,
+        pytest.raises(QueryRefusedError, match=r"after: got '00000000\.7', expected a cursor of"),
+    ):
+        next(iter(other))
 
 
-def test_journal_that_cannot_be_written_degrades_c2_until_it_can(shore, out, monkeypatch):
-    real = Journal.append_dated
-
+def test_journal_that_cannot_be_written_degrades_c2_until_it_can(shore, monkeypatch):
     def full(self, entries):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Journal, "append_dated", full)
-    shore.client.put(keys.shore_inbox("vessel-1"), wire.encode(envelope(image("0001"))))
-    eventually(lambda: shore.service.health().state == "degraded")
-    monkeypatch.setattr(Journal, "append_dated", real)
+    with monkeypatch.context() as patch:
+        patch.setattr(Journal, "append_dated", full)
+        shore.client.put(keys.shore_inbox("vessel-1"), wire.encode(relayed(image("0001"))))
+        eventually(lambda: shore.service.health().state == "degraded")
     eventually(lambda: shore.names(CONTACTS) == ["0001.1"])
-
-
-def test_files_of_the_journal_are_private(shore, out):
-    shore.accept(image("0001"))
-    assert {path.stat().st_mode & 0o777 for path in out.glob("journal.db*")} == {0o600}

@@ -38,8 +38,8 @@ def image(texture):
     return make
 
 
-def test_records_are_relayed_unchanged_in_an_envelope(begin, c2, source, image, check_monitoring):
-    shore, service = c2(), begin()
+def test_records_are_relayed_unchanged_in_an_envelope(begin, c2, source, image, watch, check_monitoring):
+    seen, shore, service = watch(INBOX), c2(), begin()
     records = {IMAGES: image(), DECISIONS: decision_record()}
     for key, record in records.items():
         source.send(key, "relay", record)
@@ -47,11 +47,12 @@ def test_records_are_relayed_unchanged_in_an_envelope(begin, c2, source, image, 
     for envelope in shore.received:
         assert envelope.vessel_id == "vessel-1"
         assert envelope.payload == wire.encode(records[envelope.key])
-        assert 0 <= envelope.relayed_utc_s - service.started_utc_s < 60
+        assert envelope.relayed_utc_s >= service.started_utc_s
     eventually(lambda: service.health().gauges["waiting_for_shore"] == 0.0)
     counters = service.health().counters
     assert (counters["reconstructed_images_relayed"], counters["decisions_relayed"]) == (1, 1)
     check_monitoring(service)
+    assert seen == [], "envelopes are not published"
 
 
 def test_records_wait_for_the_shore_and_decisions_are_first(begin, runner, c2, source, image):
@@ -68,37 +69,30 @@ def test_records_wait_for_the_shore_and_decisions_are_first(begin, runner, c2, s
     assert [m.get("decision_id", m["image_id"]) for m in inner] == ["d1", "d2", "0000", "0001", "0002"]
 
 
-def test_envelopes_are_not_published(begin, c2, source, watch):
-    seen = watch(INBOX)
-    shore = c2()
-    begin()
-    source.send(DECISIONS, "relay", decision_record())
-    eventually(lambda: len(shore.received) == 1)
-    assert seen == []
-
-
-def test_record_of_another_vessel_is_refused_to_its_sender(begin, c2, source, image, refused):
+def test_record_of_another_vessel_is_refused_to_its_sender_and_logged(begin, c2, source, image, refused, capsys):
+    logs.configure_logging("relay")
     shore, service = c2(), begin()
+    source.send(IMAGES, "relay", image("00A7", vessel="vessel-2"))
     source.send(DECISIONS, "relay", decision_record("strange", vessel_id="vessel-2"))
-    source.send(IMAGES, "relay", image("BBBB", vessel="vessel-2"))
     source.send(DECISIONS, "relay", decision_record("own"))
     eventually(lambda: len(shore.received) == 1)
     assert msgpack.unpackb(shore.received[0].payload)["decision_id"] == "own"
     eventually(lambda: len(refused(source)) == 2)
     assert all("vessel_id: got 'vessel-2', expected vessel-1" in reason for _, reason in refused(service))
     assert service.health().counters["records_refused"] == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if "Record refused vehicle=" in line]
+    assert "vehicle=uuv-1 image_id=00A7" in lines[0]
 
 
-@pytest.mark.parametrize(
-    "payload", [b"", b"\xff", msgpack.packb({"type": "decision", "v": 1}), wire.encode(decision_record())[:-1]]
-)
-def test_invalid_record_is_refused_and_the_next_one_relayed(payload, begin, c2, source, refused):
+def test_invalid_records_are_refused_and_the_next_one_relayed(begin, c2, source, refused):
     shore, service = c2(), begin()
-    source.send_bytes(DECISIONS, "relay", payload)
+    invalid = [b"", b"\xff", msgpack.packb({"type": "decision", "v": 1}), wire.encode(decision_record())[:-1]]
+    for payload in invalid:
+        source.send_bytes(DECISIONS, "relay", payload)
     source.send(DECISIONS, "relay", decision_record())
     eventually(lambda: len(shore.received) == 1)
-    assert [key for key, _ in refused(service)] == [DECISIONS]
-    assert "expected" in refused(service)[0][1]
+    assert [key for key, _ in refused(service)] == [DECISIONS] * len(invalid)
+    assert all("expected" in reason for _, reason in refused(service))
     assert service.health().state == "ok"
 
 
@@ -124,15 +118,6 @@ def test_sender_keeps_the_record_while_the_disk_is_full(begin, c2, source, image
     service.store._db.execute("PRAGMA max_page_count=1000000")
     eventually(lambda: len(shore.received) == 6)
     eventually(lambda: service.health().state == "ok")
-
-
-def test_log_line_of_a_refused_record_names_vehicle_and_image(begin, source, image, capsys):
-    logs.configure_logging("relay")
-    service = begin()
-    source.send(IMAGES, "relay", image("00A7", vessel="vessel-2"))
-    eventually(lambda: service.health().counters.get("records_refused") == 1)
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if "Record refused vehicle=" in line]
-    assert "vehicle=uuv-1 image_id=00A7" in line
 
 
 def test_latest_status_of_each_vehicle_waits_for_the_shore_and_precedes_images(

@@ -1,6 +1,5 @@
 """relay with several sites: queue, session, bandwidth limit and quota of each, and unreachable sites."""
 
-import time
 from collections import namedtuple
 
 import msgpack
@@ -154,14 +153,12 @@ def test_image_of_another_mission_is_not_a_version_of_the_first():
 
 def test_decision_overtakes_an_image_at_a_bandwidth_limit(begin, c2, source):
     shore = c2()
-    begin(UpstreamOptions(bandwidth_bytes_per_s=20_000))
-    started_s = time.monotonic()
+    begin(UpstreamOptions(bandwidth_bytes_per_s=400))  # the image takes 100 s
     source.send(IMAGES, "relay", image("AAAA", height_px=400))
     eventually(lambda: shore.store._query("SELECT COUNT(*) FROM partial") == [(1,)])
     source.send(DECISIONS, "relay", decision_record())
-    eventually(lambda: len(shore.received) == 2)
-    assert names(shore) == ["d1", "AAAAv1"]
-    assert time.monotonic() - started_s > 1.0, "40 kB at 20 kB/s, of which half a second's worth goes at once"
+    eventually(lambda: names(shore) == ["d1"])
+    assert shore.store._query("SELECT COUNT(*) FROM partial") == [(1,)]
 
 
 DiskUsage = namedtuple("DiskUsage", "total used free")
