@@ -147,21 +147,6 @@ def check_bounds(receiver: V1Receiver) -> None:
     assert all(n <= 16 for group, n in groups.items() if group.startswith(("block-symbols/", "rival-symbols/")))
 
 
-def one_input(data: bytes) -> None:
-    """Pass the frames in one string (a length byte, then a frame), with and without a correct checksum."""
-    receiver, at, now = V1Receiver(SMALL), 0, 0.0
-    while at < len(data):
-        covered = data[at + 1 : at + 1 + data[at]]
-        at += 1 + data[at]
-        now += 1.0
-        receiver.accept(3, bytes(with_checksum(covered)), now)
-        receiver.accept(3, covered, now)
-    receiver.feedback(3, now)
-    receiver.mini_feedback(3)
-    check_bounds(receiver)
-    assert not V1Receiver(SMALL).restore(receiver.parts())
-
-
 def main(arguments: list[str]) -> None:
     started = time.process_time()
     seed = int(arguments[1]) if len(arguments) > 1 else 0

@@ -78,15 +78,6 @@ def test_checksum_has_the_published_check_value() -> None:
     assert checksum(b"123456789") == 0x29B1
 
 
-@given(st.binary(max_size=300))
-def test_random_bytes_parse_or_raise_frame_error(data: bytes) -> None:
-    try:
-        frame = parse_frame(data)
-    except FrameError:
-        return
-    assert data.startswith(frame.pack())
-
-
 @given(
     st.sampled_from([b"T", b"B", b"C"]),
     st.binary(max_size=60),
@@ -103,20 +94,6 @@ def test_plausible_bytes_parse_or_raise_frame_error(
         except FrameError:
             continue
         assert data.startswith(frame.pack())
-
-
-@given(
-    st.binary(min_size=CONTACT_FRAME_SIZE - 7, max_size=CONTACT_FRAME_SIZE - 7),
-    st.text("0123456789AZ", min_size=4, max_size=4),
-)
-def test_contact_bytes_with_a_correct_checksum_parse_or_raise_frame_error(record: bytes, image_id: str) -> None:
-    body = b"C" + image_id.encode() + record
-    data = body + checksum(body).to_bytes(2, "big")
-    try:
-        frame = parse_frame(data)
-    except FrameError:
-        return
-    assert frame.pack() == data
 
 
 @st.composite
@@ -143,26 +120,16 @@ def test_half_frame_round_trip_without_padding(frame: HalfFrame, tail: bytes) ->
         assert parse_frame(packed + tail) == frame
 
 
-@given(half_frames(), st.integers(0, 300))
-def test_cut_half_frame_keeps_its_bytes(frame: HalfFrame, length: int) -> None:
-    head = HALF_PREFIX_SIZE + frame.header.size
-    assume(length < head + len(frame.payload))
-    cut = frame.pack()[:length]
-    if length < head:
-        with pytest.raises(FrameError):
-            parse_frame(cut)
-    else:
-        assert parse_frame(cut) == dataclasses.replace(frame, payload=frame.payload[: length - head])
-
-
 @given(half_frames())
-def test_half_frame_cut_in_its_header_is_rejected(frame: HalfFrame) -> None:
-    packed = frame.pack()
-    for length in range(HALF_PREFIX_SIZE + frame.header.size):
+def test_half_frame_cut_in_its_header_is_rejected_and_later_keeps_its_bytes(frame: HalfFrame) -> None:
+    packed, head = frame.pack(), HALF_PREFIX_SIZE + frame.header.size
+    for length in range(head):
         with pytest.raises(FrameError) as caught:
             parse_frame(packed[:length])
         expected = "type" if length == 0 else "length" if length < HALF_PREFIX_SIZE else "header"
         assert caught.value.field == expected
+    for length in range(head, len(packed)):
+        assert parse_frame(packed[:length]) == dataclasses.replace(frame, payload=frame.payload[: length - head])
 
 
 @given(st.integers(0, 8 * CONTACT_FRAME_SIZE - 1), st.integers(1, 16), st.integers(1, 2**16 - 1))

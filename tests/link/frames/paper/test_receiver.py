@@ -106,17 +106,7 @@ def test_update_has_times_stream_and_mask() -> None:
     assert (event.first_frame_s, event.last_frame_s) == (10, 12)
     assert event.contact == CONTACT
     assert event.stream == HEADER.pack() + BODY[:2] + bytes(3) + BODY[5:8] + bytes(1)
-    assert received_mask(event.stream, event.missing).tolist() == [
-        True,
-        True,
-        False,
-        False,
-        False,
-        True,
-        True,
-        True,
-        False,
-    ]
+    assert received_mask(event.stream, event.missing).tolist() == [n in (0, 1, 5, 6, 7) for n in range(9)]
     assert event.missing_halves == ()
     assert receiver.next_deadline() is None
 
@@ -159,13 +149,6 @@ def test_image_reopened_by_a_late_frame_is_reported_with_the_next_image() -> Non
     assert receiver.accept(2, piece(2, 3), 2) == []
     given = images(receiver.accept(2, half("top", "00A9"), 3))
     assert [(e.image_id, e.version) for e in given] == [("00A8", 1), ("00A7", 2)]
-
-
-@pytest.mark.parametrize("image_ids", [["00A7"], ["00A8"]])
-def test_contact_frame_reports_no_other_image(image_ids: list[str]) -> None:
-    receiver = PaperReceiver(60)
-    receiver.accept(2, half("top"), 0)
-    assert [e for i in image_ids for e in receiver.accept(2, contact(i), 1)] == []
 
 
 def test_half_frame_of_another_image_does_not_report_a_contact_record() -> None:
@@ -231,34 +214,17 @@ def test_outvoted_header_is_corrected_by_a_new_version() -> None:
     assert (event.version, header_of(event), body_of(event), event.complete) == (2, HEADER, BODY, True)
 
 
-def test_fourth_stream_header_is_rejected() -> None:
-    receiver = PaperReceiver(60)
-    for width in (49, 50, 51):
-        assert receiver.accept(2, half("top", header=dataclasses.replace(HEADER, width_px=width)), 0) == []
-    (event,) = receiver.accept(2, half("top", header=dataclasses.replace(HEADER, width_px=52)), 1)
+@pytest.mark.parametrize("changed", ["width", "length"])
+def test_fourth_stream_header_or_body_length_is_rejected(changed: str) -> None:
+    receiver, found = PaperReceiver(60), []
+    for n in range(4):
+        header = dataclasses.replace(HEADER, width_px=49 + n) if changed == "width" else HEADER
+        length = 9 + n if changed == "length" else 9
+        found.append(receiver.accept(2, HalfFrame("top", "00A7", 0, length, header, b"x").pack(), 0))
+    assert found[:3] == [[]] * 3
+    [event] = found[3]
     assert isinstance(event, FrameRejected)
-    assert event.source == 2
-    assert event.reason.field == "stream header"
-    assert receiver.counts == PaperReceiverCounts(frames=4, rejected=1, conflicts=3)
-
-
-def test_different_body_lengths_form_separate_candidates() -> None:
-    receiver = PaperReceiver(60)
-    longer = HalfFrame("top", "00A7", 0, 300, HEADER, bytes(16)).pack()
-    assert receiver.accept(2, longer, 0) == []
-    assert receiver.accept(2, half("top"), 1) == []
-    (event,) = images(receiver.accept(2, half("bottom"), 2))
-    assert (header_of(event), body_of(event), event.complete) == (HEADER, BODY, True)
-    assert event.conflicts == 2
-    assert receiver.counts.rejected == 0
-
-
-def test_fourth_body_length_is_rejected() -> None:
-    receiver = PaperReceiver(60)
-    for length in (9, 10, 11):
-        assert receiver.accept(2, HalfFrame("top", "00A7", 0, length, HEADER, b"x").pack(), 0) == []
-    (event,) = receiver.accept(2, HalfFrame("top", "00A7", 0, 12, HEADER, b"x").pack(), 1)
-    assert isinstance(event, FrameRejected)
+    assert (event.source, changed == "width" and event.reason.field) in ((2, "stream header"), (2, False))
     assert receiver.counts == PaperReceiverCounts(frames=4, rejected=1, conflicts=3)
 
 
@@ -292,17 +258,11 @@ def test_clock_set_back_does_not_delay_an_image() -> None:
     receiver = PaperReceiver(60)
     receiver.accept(2, half("top"), 1_000_000)
     assert receiver.poll(500) == []
-    assert receiver.next_deadline() == 560
-    assert len(images(receiver.poll(560))) == 1
-
-
-def test_clock_set_back_before_a_restart_does_not_delay_an_image() -> None:
-    receiver = PaperReceiver(60)
-    receiver.accept(2, half("top"), 1_000_000)
-    receiver.poll(500)
-    other = PaperReceiver(60)
-    assert not other.restore(receiver.parts())
-    assert other.next_deadline() == 560
+    restarted = PaperReceiver(60)
+    assert not restarted.restore(receiver.parts())
+    for each in (receiver, restarted):
+        assert each.next_deadline() == 560
+        assert len(images(each.poll(560))) == 1
 
 
 def test_clock_set_back_does_not_extend_the_memory() -> None:
@@ -370,15 +330,6 @@ def busy_receiver() -> PaperReceiver:
     return receiver
 
 
-def test_restored_state_is_equal() -> None:
-    receiver = busy_receiver()
-    other = PaperReceiver(60)
-    assert other.restore(receiver.parts()) == {}
-    assert other.parts() == receiver.parts()
-    assert other.counts == receiver.counts
-    assert other.next_deadline() == receiver.next_deadline()
-
-
 IMAGE = "image/2/00A7"
 
 
@@ -392,39 +343,19 @@ def _wrong_fields() -> list[tuple[str, dict[str, Any]]]:
         {"header": b"\x10sh"},
         {"header": HEADER.pack() + b"\0"},
         {"header": b"\x10\xbe\xef\xe1"},
-        {"body": None},
-        {"body": "9"},
-        {"body": packed_body(-1)},
-        {"body": packed_body(65536)},
         {"body": packed_body(8, [5, bytes(5)])},
-        {"body": packed_body(9, [-1, b"x"])},
-        {"body": packed_body(9, ["0", b"x"])},
         {"body": packed_body(9, [3, b"x"], [0, b"x"])},
-        {"frames": 1.5},
     ]
     values: list[tuple[str, Any]] = [
-        ("version", "1"),
-        ("source", "2"),
         ("image_id", "a7"),
-        ("image_id", 7),
-        ("first_frame_s", "1"),
         ("wait_from_s", math.nan),
-        ("last_seen_s", None),
         ("candidates", []),
-        ("candidates", None),
         ("candidates", [candidate] * 4),
         *(("candidates", [{**candidate, **c} if isinstance(c, dict) else c]) for c in wrong_candidates),
         ("contact", bytes(24)),
-        ("contact", "text"),
-        ("conflicts", None),
         ("reported", [0, 9]),
-        ("reported", "reported"),
     ]
-    return [
-        *((IMAGE, {name: value}) for name, value in values),
-        ("counts", {"format version": 3}),
-        ("counts", {"frames": None}),
-    ]
+    return [*((IMAGE, {name: value}) for name, value in values), ("counts", {"format version": 3})]
 
 
 def packed_body(length: int, *pieces: object) -> bytes:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
-from builders.link_state import field_names, group, plain_of
+from builders.link_state import comparable, field_names, group, plain_of
 from builders.paper_images import body_of, header_of, received_of
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.codec.interface import StreamHeader
@@ -153,7 +152,6 @@ def knowledge(event: ImageUpdate) -> tuple[int, ...]:
     return int(event.contact is not None) + len(positions(received_of(event))), int(event.contact is not None)
 
 
-@settings(max_examples=250, deadline=None)
 @given(deliveries())
 def test_any_frames_in_any_order_give_correct_bytes_and_each_version_once(
     delivery: tuple[list[Sent], list[Step]],
@@ -181,7 +179,6 @@ def test_any_frames_in_any_order_give_correct_bytes_and_each_version_once(
     assert set(ledger.versions) == set(ledger.bytes_there) | set(ledger.contact_there)
 
 
-@settings(max_examples=120, deadline=None)
 @given(deliveries(), st.integers(1, 4))
 def test_a_restart_at_every_point_changes_nothing(delivery: tuple[list[Sent], list[Step]], max_images: int) -> None:
     steps = [*delivery[1], Step(1e9, 0, None)]
@@ -197,11 +194,6 @@ def test_a_restart_at_every_point_changes_nothing(delivery: tuple[list[Sent], li
         assert restarted.parts() == steady.parts()
 
 
-def comparable(events: list[Event]) -> list[Any]:
-    """Return the events with errors as text, because errors cannot be compared."""
-    return [(e.source, e.received_s, str(e.reason)) if isinstance(e, FrameRejected) else e for e in events]
-
-
 @st.composite
 def hostile_frames(draw: st.DrawFn) -> bytes:
     header = StreamHeader(draw(st.sampled_from([0, 0x10, 0x20])), 0, 80, draw(st.integers(16, 18)))
@@ -214,7 +206,6 @@ def hostile_frames(draw: st.DrawFn) -> bytes:
     return draw(st.sampled_from([half_frame, half_frame, contact, draw(st.binary(max_size=40))]))
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(-1, 2), hostile_frames(), st.floats(-100, 1e6)), max_size=40))
 def test_hostile_frames_and_times_never_raise_and_memory_is_bounded(
     arrivals: list[tuple[int, bytes, float]],

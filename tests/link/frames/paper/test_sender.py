@@ -195,11 +195,6 @@ def test_invalid_stream_is_rejected(stream: bytes, field: str) -> None:
     assert caught.value.field == field
 
 
-def test_plan_with_one_body_byte_per_frame() -> None:
-    plan = plan_packets("0K3P", make_stream(3, 7), None, 1, 17)
-    assert [len(packet[0]) for packet in plan] == [17, 17, 17]
-
-
 def test_shorter_header_leaves_more_room_for_the_body() -> None:
     longest = {n: len(plan_packets("0K3P", make_stream(700, n), None, 3, 64)[0][0]) - 9 - n for n in HEADERS}
     assert longest == {2: 53, 3: 52, 4: 51, 5: 50, 6: 49, 7: 48}

@@ -23,11 +23,10 @@ from sonarpost.link.frames.v1.frame import (
     pack_symbol,
     parse_frame,
 )
-from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
+from sonarpost.link.frames.v1.payload_objects import RefineRequest
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import SenderState, V1Sender, WaitingImages
 from sonarpost.link.receiver import FrameRejected, ImageUpdate
-from sonarpost.link.state import SavedParts
 
 SIZES = (32, 64, 256, 100)
 
@@ -42,8 +41,7 @@ def test_broadcast_without_loss_delivers_all_contacts_with_the_planned_frames(fr
     assert world.frames == 6 * 30
 
 
-@pytest.mark.parametrize("frame_bytes", SIZES)
-@pytest.mark.parametrize("count", [1, 2, 7, 30])
+@pytest.mark.parametrize(("frame_bytes", "count"), [(32, 30), (64, 2), (64, 30), (256, 7), (256, 30), (100, 1)])
 def test_broadcast_at_30_percent_loss_delivers_contacts_and_most_images(frame_bytes: int, count: int) -> None:
     world = World.make(0.3, seed=count, frame_bytes=frame_bytes, frames_per_image=8.0)
     world.add(count, 900)
@@ -97,26 +95,18 @@ def test_one_frame_gives_a_contact_and_a_coarse_image() -> None:
         assert receiver.accept(VEHICLE, frame, 0.0)
 
 
-@pytest.mark.parametrize(("loss", "limit"), [(0.1, 1.15), (0.5, 1.15)])
-def test_feedback_completes_all_images_close_to_the_erasure_bound(loss: float, limit: float) -> None:
-    ratios = []
-    for seed in range(3):
-        world = World.make(
-            loss,
-            seed,
-            channels=(LossChannel(loss),),
-            feedback=True,
-            stream_bytes=420,
-            max_defer_s=600.0,
-            frame_bytes=64,
-        )
+@pytest.mark.parametrize("loss", [0.1, 0.5])
+def test_feedback_completes_all_images_close_to_the_erasure_bound(loss: float) -> None:
+    ratios, channels = [], (LossChannel(loss),)
+    for seed in range(2):
+        world = World.make(loss, seed, channels=channels, feedback=True, stream_bytes=420, max_defer_s=600.0)
         world.add(120, 500)
         world.run()
         assert len(world.latest) == 120
         assert all(e.complete and len(e.stream) >= 420 for e in world.latest.values())
         payload = sum(25 + len(e.stream) for e in world.latest.values())
         ratios.append((world.frames + world.feedback_frames) / (payload / (64 * (1 - loss))))
-    assert sum(ratios) / len(ratios) <= limit
+    assert sum(ratios) / len(ratios) <= 1.15
 
 
 @pytest.mark.parametrize("frame_bytes", [32, 256])
@@ -225,22 +215,19 @@ def test_another_frame_length_restarts_only_blocks_that_do_not_fit() -> None:
 
 def test_block_and_contact_numbers_wrap_around() -> None:
     world = World.make(0.2, 3, channels=(LossChannel(0.2),), group_images=2, frames_per_image=9.0)
-    number = 65500
-    for _ in range(60):
+    number = 65520
+    for _ in range(24):
         world.add(2, 200, first=number)
         number = 1 if number >= 65534 else number + 2
         world.run()
         world.now += 60.0
-    assert len(world.sent) == 120
-    assert len(world.latest) >= 116
+    assert len(world.sent) == 48
+    assert len(world.latest) >= 46
 
 
 def test_restarted_contact_numbers_do_not_mix_images() -> None:
     receiver = V1Receiver()
-    first, second = (
-        V1Sender(SenderConfig(channels=(LossChannel(0.0),))),
-        V1Sender(SenderConfig(channels=(LossChannel(0.0),))),
-    )
+    first, second = (V1Sender(SenderConfig(channels=(LossChannel(0.0),))) for _ in range(2))
     for number in range(1, 6):
         first.add_image(number, contact(number), stream(number, 400), 0.0)
         second.add_image(number, contact(number + 100), stream(number + 100, 400), 0.0)
@@ -258,44 +245,6 @@ def test_restarted_contact_numbers_do_not_mix_images() -> None:
                 latest[number] = event
     assert len(latest) == 5
     assert all(e.complete for e in latest.values())
-
-
-def test_vehicles_are_independent() -> None:
-    receiver, senders = V1Receiver(), {}
-    for address in (3, 4, 5):
-        senders[address] = V1Sender(SenderConfig(channels=(LossChannel(0.0),)))
-        for number in (1, 2):
-            senders[address].add_image(number, contact(10 * address + number), stream(10 * address + number, 300), 0.0)
-    latest = {}
-    for _ in range(40):
-        for address, sender in senders.items():
-            for event in receiver.accept(address, f, 0.0) if (f := sender.next_frame(0.0)) else []:
-                assert isinstance(event, ImageUpdate)
-                latest[event.source, number_of_image(event.image_id)] = event
-    assert {k: v.contact for k, v in latest.items()} == {(a, n): contact(10 * a + n) for a in (3, 4, 5) for n in (1, 2)}
-    assert all(stream(10 * a + n, 300).startswith(e.stream) and e.complete for (a, n), e in latest.items())
-
-
-def test_sender_continues_after_a_restart_at_every_frame() -> None:
-    def add_all(sender: V1Sender) -> None:
-        for number in range(1, 6):
-            sender.add_image(number, contact(number), stream(number, 300), 0.0)
-        sender.add_message(b"hello", 0.0)
-        sender.add_message(stream(7, 200), 0.0)
-
-    config = SenderConfig(feedback=True, channels=(LossChannel(0.3),))
-    steady, restarted = V1Sender(config), V1Sender(config)
-    add_all(steady)
-    add_all(restarted)
-    for step in range(90):
-        if step == 40:
-            for sender in (steady, restarted):
-                sender.on_feedback(Feedback(1, 30, (5, 2)), 40.0)
-        parts = restarted.parts()
-        restarted = V1Sender(config)
-        assert not restarted.restore(parts)
-        assert restarted.next_frame(float(step)) == steady.next_frame(float(step))
-    assert restarted.parts() == steady.parts()
 
 
 @pytest.mark.parametrize(
@@ -413,32 +362,6 @@ def test_clock_set_back_by_a_day_delays_neither_a_group_nor_a_reminder() -> None
     while sender.next_frame(0.0) is not None:
         pass
     assert sender.next_frame(config.max_defer_s) is not None, "a reminder"
-
-
-def test_state_to_save_for_a_frame_does_not_grow_with_the_contacts() -> None:
-    channel = LossChannel(0.2)
-    sender = V1Sender(SenderConfig(frame_bytes=60, channels=(channel,), kept_images=725))
-    receiver, generator = V1Receiver(ReceiverConfig(max_contacts=725)), np.random.default_rng(1)
-    for number in range(1, 726):
-        sender.add_image(number, contact(number), stream(number, 300), 0.0)
-    written: list[int] = []
-    saved, now = SavedParts({}), 0.0
-    while (frame := sender.next_frame(now)) is not None:
-        now += 1.0
-        if generator.random() < channel.loss:
-            continue
-        sampled = now % 50 < 5  # of 50 frames, compare five with the state before
-        if sampled:
-            saved.commit(receiver.parts())
-        receiver.accept(VEHICLE, frame, now)
-        if sampled:
-            changes = saved.changes(receiver.parts())
-            written.append(sum(len(name) + len(data or b"") for name, data in changes.items()))
-    assert len(group(receiver.parts(), f"image/{VEHICLE}")) == 725
-    assert len(written) > 200
-    assert max(written) <= 8000
-    quarter = len(written) // 4
-    assert np.mean(written[-quarter:]) < 1.2 * np.mean(written[:quarter])
 
 
 def test_old_blocks_and_contacts_are_deleted() -> None:

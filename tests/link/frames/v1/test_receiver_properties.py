@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgpack
 import pytest
 from builders import v1_fuzz
-from builders.link_state import plain_of, with_fields
+from builders.link_state import comparable, plain_of, replace_a_value, with_fields
 from builders.v1_world import VEHICLE, contact, stream
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.link.coding.block_decoder import BlockDecoder, SymbolChunk
@@ -18,7 +16,7 @@ from sonarpost.link.config import ReceiverConfig, SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.v1.receiver import AssembledImage, PeerState, V1Receiver, V1ReceiverCounts
 from sonarpost.link.frames.v1.sender import V1Sender
-from sonarpost.link.receiver import Event, FrameRejected, ImageUpdate, MessageReceived
+from sonarpost.link.receiver import ImageUpdate, MessageReceived
 
 
 @st.composite
@@ -53,12 +51,6 @@ def deliveries(draw: st.DrawFn) -> list[tuple[float, bytes]]:
     return found
 
 
-def comparable(events: list[Event]) -> list[Any]:
-    """Return the events with errors as text, because errors cannot be compared."""
-    return [(e.source, e.received_s, str(e.reason)) if isinstance(e, FrameRejected) else e for e in events]
-
-
-@settings(max_examples=40, deadline=None)
 @given(deliveries())
 def test_updates_hold_only_sent_bytes_and_grow(delivery: list[tuple[float, bytes]]) -> None:
     receiver, known = V1Receiver(), dict[int, ImageUpdate]()
@@ -80,15 +72,15 @@ def test_updates_hold_only_sent_bytes_and_grow(delivery: list[tuple[float, bytes
     assert receiver.counts.frames == len(delivery)
 
 
-@settings(max_examples=25, deadline=None)
 @given(deliveries())
-def test_a_restart_at_every_frame_changes_nothing(delivery: list[tuple[float, bytes]]) -> None:
+def test_a_restart_at_any_frame_changes_nothing(delivery: list[tuple[float, bytes]]) -> None:
     config = ReceiverConfig(max_contacts=4, block_memory_s=120.0)
     steady, restarted = V1Receiver(config), V1Receiver(config)
-    for now, frame in delivery:
-        parts = restarted.parts()
-        restarted = V1Receiver(config)
-        assert not restarted.restore(parts)
+    for place, (now, frame) in enumerate(delivery):
+        if place % 4 == 0:
+            parts = restarted.parts()
+            restarted = V1Receiver(config)
+            assert not restarted.restore(parts)
         assert comparable(restarted.accept(VEHICLE, frame, now)) == comparable(steady.accept(VEHICLE, frame, now))
         assert restarted.feedback_is_due(VEHICLE, now) == steady.feedback_is_due(VEHICLE, now)
         assert restarted.feedback(VEHICLE, now) == steady.feedback(VEHICLE, now)
@@ -96,16 +88,10 @@ def test_a_restart_at_every_frame_changes_nothing(delivery: list[tuple[float, by
     assert restarted.counts == steady.counts
 
 
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.binary(max_size=120), max_size=30).map(lambda parts: b"".join(bytes([len(p)]) + p for p in parts)))
-def test_any_bytes_with_correct_checksums_raise_nothing(data: bytes) -> None:
-    v1_fuzz.one_input(data)
-
-
 def test_hostile_frames_give_no_wrong_image_or_message() -> None:
-    counts = v1_fuzz.run(5_000, seed=1)
+    counts = v1_fuzz.run(1_500, seed=1)
     assert counts["wrong"] == 0
-    assert counts["shown"] > 400
+    assert counts["shown"] > 120
 
 
 def busy_receiver() -> tuple[V1Sender, V1Receiver]:
@@ -152,24 +138,13 @@ def test_a_malformed_part_is_reported_and_the_others_are_restored(name: str, cha
     assert {part: data for part, data in restored.parts().items() if part in expected} == expected
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.data())
 def test_a_replaced_value_in_a_state_is_reported_or_accepted_and_raises_nothing(data: st.DataObject) -> None:
     sender, receiver = busy_receiver()
     parts = receiver.parts()
     name = data.draw(st.sampled_from(sorted(parts)))
     plain = plain_of(parts, name)
-    place: Any = plain
-    while True:
-        keys = list(place) if isinstance(place, dict) else list(range(len(place)))
-        key = data.draw(st.sampled_from(keys))
-        if isinstance(place[key], dict | list) and place[key] and data.draw(st.booleans()):
-            place = place[key]
-            continue
-        place[key] = data.draw(
-            st.sampled_from([None, -1, 3, 2.5, float("nan"), b"", b"xx", "x", [], {}, True, 2**63, b"\x92\x05\xc3"])
-        )
-        break
+    replace_a_value(plain, data)
     fresh = V1Receiver()
     errors = fresh.restore({**parts, name: msgpack.packb(plain)})
     assert all(part == name or ("block" in name and part.startswith("block-symbols/")) for part in errors)
@@ -178,7 +153,6 @@ def test_a_replaced_value_in_a_state_is_reported_or_accepted_and_raises_nothing(
     fresh.feedback(VEHICLE, 1.0)
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.dictionaries(st.sampled_from(["counts", "peer/3", "image/3/1", "block/3/1", "x", "image/a/b"]), st.binary()))
 def test_any_bytes_as_parts_raise_nothing(parts: dict[str, bytes]) -> None:
     receiver = V1Receiver()
