@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
-from pathlib import Path
 
 import pytest
 from builders.records import decision_record, reconstructed_image
 from PIL import Image
 
 from sonarpost.archive.journal import Criteria, Journal
-from sonarpost.archive.postgresql import Database
 from sonarpost.archive.shore_database import ShoreDatabase
 from sonarpost.archive.shore_files import image_paths
 from sonarpost.archive.shore_index import TaskingRow
 from sonarpost.cli.main import main
 from sonarpost.errors import DatabaseUnavailableError
-from sonarpost.messages import Contact, Pixels, ReconstructedImage
+from sonarpost.messages import Contact, Pixels
 from sonarpost.services.c2.accepted import AcceptedRecords
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
@@ -26,7 +24,7 @@ from sonarpost.services.console.service import stored_records
 COUNT = 40
 
 
-def image(number: int, value: int = 1, version: int = 1) -> ReconstructedImage:
+def image(number, value=1, version=1):
     picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([value]) * 600)
     contact = Contact(contact_id="c", vehicle_id="uuv-1", lat_deg=56.0, lon_deg=-5.0 + number / 100)
     return reconstructed_image(
@@ -35,7 +33,7 @@ def image(number: int, value: int = 1, version: int = 1) -> ReconstructedImage:
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> Archive:
+def files(tmp_path):
     """An archive of files, with a conflict, a removed image, an exported one, decisions and a command."""
     archive = Archive(C2Config(out_dir=tmp_path / "out"))
     for number in range(COUNT):
@@ -58,20 +56,18 @@ def files(tmp_path: Path) -> Archive:
 
 
 @pytest.fixture
-def config(tmp_path: Path, database_url: str) -> Path:
+def config(tmp_path, database_url):
     path = tmp_path / "shore.toml"
     path.write_text(f'[platform]\nid = "shore-1"\n[c2]\nout_dir = "{tmp_path / "out"}"\ndatabase = "{database_url}"\n')
     return path
 
 
 @pytest.fixture
-def archive(database: Database) -> ShoreDatabase:
+def archive(database):
     return ShoreDatabase(database)
 
 
-def test_migration_copies_everything_once(
-    files: Archive, config: Path, archive: ShoreDatabase, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_migration_copies_everything_once(files, config, archive, capsys):
     before = files.index()
     files.verify(1e9, 86400.0)
     assert main(["c2", "migrate", "--config", str(config)]) == 0
@@ -92,9 +88,7 @@ def test_migration_copies_everything_once(
     assert len(archive.images(removed=True)) == COUNT + 2
 
 
-def test_migration_keeps_the_numbers_of_the_journal(
-    files: Archive, config: Path, archive: ShoreDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_migration_keeps_the_numbers_of_the_journal(files, config, archive, tmp_path, capsys):
     """A subscriber's cursor stays valid; records that c2 has numbered after the first copy keep their numbers, too."""
     records = AcceptedRecords(files, tmp_path / "out", "shore")
     first = records.journal()
@@ -115,17 +109,15 @@ def test_migration_keeps_the_numbers_of_the_journal(
     records.close()
 
 
-def test_interrupted_migration_is_completed_by_the_next_one(
-    files: Archive, config: Path, archive: ShoreDatabase, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_migration_is_completed_by_the_next_one(files, config, archive, monkeypatch):
     write = ShoreDatabase.write
     calls: list[int] = []
 
-    def fails_second(self: ShoreDatabase, *arguments: object) -> None:
+    def fails_second(self, *arguments):
         calls.append(1)
         if len(calls) == 2:
             raise DatabaseUnavailableError("database: connection lost")
-        write(self, *arguments)  # type: ignore[arg-type]
+        write(self, *arguments)
 
     monkeypatch.setattr(ShoreDatabase, "write", fails_second)
     assert main(["c2", "migrate", "--config", str(config)]) == 2
@@ -134,9 +126,7 @@ def test_interrupted_migration_is_completed_by_the_next_one(
     assert len(archive.images(removed=True)) == COUNT + 2
 
 
-def test_damaged_and_different_records_are_rejected_by_name(
-    files: Archive, config: Path, archive: ShoreDatabase, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_and_different_records_are_rejected_by_name(files, config, archive, tmp_path, capsys):
     [row] = [row for row in files.index().images() if row.image_id == "0009"]
     image_paths(tmp_path / "out", row)[1].write_bytes(b"damaged")
     [row] = [row for row in files.index().images() if row.image_id == "0010"]
@@ -149,9 +139,7 @@ def test_damaged_and_different_records_are_rejected_by_name(
     assert len(archive.images()) == COUNT - 1
 
 
-def test_change_in_the_database_is_found_by_the_comparison(
-    files: Archive, config: Path, archive: ShoreDatabase, database: Database, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_change_in_the_database_is_found_by_the_comparison(files, config, archive, database, capsys):
     assert main(["c2", "migrate", "--config", str(config)]) == 0
     with database.transaction() as sql:
         sql.rows("UPDATE file SET content = 'x' WHERE suffix = '.png' AND name LIKE '%0007%'")
@@ -159,16 +147,14 @@ def test_change_in_the_database_is_found_by_the_comparison(
     assert "0007_v1: the files in the database differ" in capsys.readouterr().err
 
 
-def test_image_that_the_database_has_removed_is_not_restored(
-    files: Archive, config: Path, archive: ShoreDatabase
-) -> None:
+def test_image_that_the_database_has_removed_is_not_restored(files, config, archive):
     assert main(["c2", "migrate", "--config", str(config)]) == 0
     archive.mark("removed_utc_s", [row for row in archive.images() if row.image_id == "0007"], 9.0)
     assert main(["c2", "migrate", "--config", str(config)]) == 0
     assert "0007" not in {row.image_id for row in archive.images()}
 
 
-def test_file_without_a_database_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_file_without_a_database_is_refused(tmp_path, capsys):
     path = tmp_path / "shore.toml"
     path.write_text('[platform]\nid = "shore-1"\n[c2]\n')
     assert main(["c2", "migrate", "--config", str(path)]) == 2
@@ -176,15 +162,13 @@ def test_file_without_a_database_is_refused(tmp_path: Path, capsys: pytest.Captu
 
 
 @pytest.fixture
-def places(files: Archive, config: Path, tmp_path: Path, database_url: str, capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
+def places(files, config, tmp_path, database_url, capsys):
     assert main(["c2", "migrate", "--config", str(config)]) == 0
     capsys.readouterr()
     return [["--archive", str(tmp_path / "out")], ["--archive", database_url], ["--config", str(config)]]
 
 
-def test_list_and_export_are_the_same_from_files_and_database(
-    places: list[list[str]], tmp_path: Path, capsys: pytest.CaptureFixture[str], archive: ShoreDatabase
-) -> None:
+def test_list_and_export_are_the_same_from_files_and_database(places, tmp_path, capsys, archive):
     listed, exported = [], []
     for number, options in enumerate(places):
         for more in (["--all-versions"], ["--undecided", "--json"], ["--tasking"]):
@@ -203,7 +187,7 @@ def test_list_and_export_are_the_same_from_files_and_database(
     assert all(row.exported_utc_s is not None for row in archive.images())
 
 
-def test_files_of_an_image_are_copied_from_the_database(places: list[list[str]], tmp_path: Path) -> None:
+def test_files_of_an_image_are_copied_from_the_database(places, tmp_path):
     copies = []
     for number, options in enumerate(places):
         out = tmp_path / f"copy-{number}"
@@ -215,9 +199,7 @@ def test_files_of_an_image_are_copied_from_the_database(places: list[list[str]],
     assert side_car["version"] == 2
 
 
-def test_data_set_is_written_from_the_database(
-    places: list[list[str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_data_set_is_written_from_the_database(places, tmp_path, capsys):
     out = tmp_path / "dataset"
     assert main(["dataset", "export", *places[1], "--out", str(out)]) == 1  # the conflict
     [labelled, _] = sorted(out.rglob("*.png"))
@@ -225,10 +207,10 @@ def test_data_set_is_written_from_the_database(
         assert opened.size == (30, 20)
 
 
-def test_console_reads_the_records_of_the_database(places: list[list[str]], tmp_path: Path, database_url: str) -> None:
+def test_console_reads_the_records_of_the_database(places, tmp_path, database_url):
     from sonarpost.archive.postgresql import DatabaseAddress
 
-    def read(place: Path | DatabaseAddress) -> list[object]:
+    def read(place):
         return sorted(record.model_dump_json() for record in stored_records(place))
 
     from_files = read(tmp_path / "out")
@@ -236,7 +218,7 @@ def test_console_reads_the_records_of_the_database(places: list[list[str]], tmp_
     assert len(from_files) == COUNT + 3
 
 
-def test_database_that_is_not_reached_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+def test_database_that_is_not_reached_is_named(capsys):
     assert main(["c2", "ls", "--archive", "postgresql://u:secret@127.0.0.1:9/shore"]) == 2
     captured = capsys.readouterr().err
     assert "database postgresql://u@127.0.0.1:9/shore" in captured

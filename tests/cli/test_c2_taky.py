@@ -14,8 +14,7 @@ import subprocess
 import sys
 import threading
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from urllib.parse import urlsplit
 from xml.etree import ElementTree as ET
@@ -28,23 +27,26 @@ TAKY = shutil.which("taky", path=os.environ.get("SONARPOST_TAKY"))
 COT_PORT, FILES_PORT = 8089, 8443
 """The ports of taky; that of its files cannot be changed."""
 
-pytestmark = pytest.mark.skipif(TAKY is None, reason="no taky: pip install taky, or set SONARPOST_TAKY to its folder")
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(TAKY is None, reason="no taky: pip install taky, or set SONARPOST_TAKY to its folder"),
+]
 
 
-def is_open(port: int) -> bool:
+def is_open(port):
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 @pytest.fixture
-def certificates(tmp_path: Path) -> Iterator[tuple[Path, Path, Path]]:
+def certificates(tmp_path):
     """Run a TAK server; the fixture is its authority, and certificate and key of a client."""
     if is_open(COT_PORT) or is_open(FILES_PORT):
         pytest.skip(f"port {COT_PORT} or {FILES_PORT} is in use")
     assert TAKY is not None
     programs, folder = Path(TAKY).parent, tmp_path / "taky"
 
-    def takyctl(where: Path, *arguments: str) -> None:
+    def takyctl(where, *arguments):
         subprocess.run([programs / "takyctl", *arguments], cwd=where, check=True, capture_output=True)
 
     takyctl(tmp_path, "setup", "--host", "localhost", "--bind-ip", "127.0.0.1", "--public-ip", "127.0.0.1", "taky")
@@ -63,7 +65,7 @@ def certificates(tmp_path: Path) -> Iterator[tuple[Path, Path, Path]]:
 class TakClient:
     """A client of the server that collects events in a thread."""
 
-    def __init__(self, context: ssl.SSLContext) -> None:
+    def __init__(self, context):
         connection = socket.create_connection(("127.0.0.1", COT_PORT))
         self._socket = context.wrap_socket(connection, server_hostname="localhost")
         self._received = b""
@@ -75,58 +77,40 @@ class TakClient:
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
 
-    def _read(self) -> None:
+    def _read(self):
         while data := self._socket.recv(1 << 16):
             self._received += data
 
-    def events(self, kind: str) -> list[ET.Element]:
+    def events(self, kind):
         whole, separator, _ = self._received.rpartition(b"</event>")
         found = ET.fromstring(b"<events>" + whole + separator + b"</events>")
         return [event for event in found if event.attrib["type"] == kind]
 
-    def close(self) -> None:
+    def close(self):
         self._socket.shutdown(socket.SHUT_RDWR)
         self._thread.join()
         self._socket.close()
 
 
-@pytest.fixture
-def tak_client(certificates: tuple[Path, Path, Path]) -> Iterator[Callable[[], TakClient]]:
+def context_of(certificates):
     authority, certificate, key = certificates
     context = ssl.create_default_context(cafile=authority)
     context.load_cert_chain(certificate, key)
-    with ExitStack() as stack:
-
-        def connect() -> TakClient:
-            client = TakClient(context)
-            stack.callback(client.close)
-            return client
-
-        yield connect
+    return context
 
 
-def download(url: str, certificates: tuple[Path, Path, Path]) -> bytes:
-    authority, certificate, key = certificates
-    context = ssl.create_default_context(cafile=authority)
-    context.load_cert_chain(certificate, key)
+def download(url, certificates):
     parts = urlsplit(url)
-    connection = http.client.HTTPSConnection("localhost", parts.port, context=context)
-    connection.request("GET", f"{parts.path}?{parts.query}")
-    reply = connection.getresponse()
-    content = reply.read()
-    connection.close()
-    assert reply.status == 200
-    return content
+    with closing(http.client.HTTPSConnection("localhost", parts.port, context=context_of(certificates))) as connection:
+        connection.request("GET", f"{parts.path}?{parts.query}")
+        reply = connection.getresponse()
+        assert reply.status == 200
+        return reply.read()
 
 
-def test_clients_of_a_tak_server_receive_contacts_and_images(
-    router: str,
-    tmp_path: Path,
-    certificates: tuple[Path, Path, Path],
-    tak_client: Callable[[], TakClient],
-) -> None:
+def test_clients_of_a_tak_server_receive_contacts_and_images(router, tmp_path, certificates):
     folder = store(tmp_path / "out", image("0001"), image("0002"))
-    watcher = tak_client()
+    watcher = TakClient(context_of(certificates))
     authority, certificate, key = map(str, certificates)
     server = [f"tls://localhost:{COT_PORT}", "--cot-ca", authority, "--cot-certificate", certificate, "--cot-key", key]
     files = ["--tak-api", f"https://localhost:{FILES_PORT}", "--archive", str(folder)]
@@ -144,7 +128,8 @@ def test_clients_of_a_tak_server_receive_contacts_and_images(
             names = zipfile.ZipFile(io.BytesIO(package)).namelist()
             assert sum(name.endswith(".png") for name in names) == 1
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=60) == 0
+        assert process.wait() == 0
     finally:
         process.kill()
         process.wait()
+        watcher.close()

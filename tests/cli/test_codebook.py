@@ -25,13 +25,13 @@ Run = Callable[..., int]
 
 
 @pytest.fixture
-def run() -> Run:
+def run():
     parser = argparse.ArgumentParser()
     subparsers = parser.add_subparsers()
     codebook.add_parser(subparsers)
     encode.add_parser(subparsers)
 
-    def run_command(*arguments: object) -> int:
+    def run_command(*arguments):
         parsed = parser.parse_args([str(argument) for argument in arguments])
         status: int = parsed.run(parsed)
         return status
@@ -39,7 +39,7 @@ def run() -> Run:
     return run_command
 
 
-def snippet(seed: int, height_px: int = 60, width_px: int = 45) -> np.ndarray:
+def snippet(seed, height_px=60, width_px=45):
     image = 50 * np.random.default_rng(seed).rayleigh(1.0, (height_px, width_px))
     image[20:40, 10:20] *= 4
     image[20:40, 20:40] *= 0.1
@@ -47,7 +47,7 @@ def snippet(seed: int, height_px: int = 60, width_px: int = 45) -> np.ndarray:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     images = tmp_path / "images"
     images.mkdir()
     write_tiff(images / "a.tiff", snippet(0))
@@ -57,12 +57,14 @@ def folder(tmp_path: Path) -> Path:
     return images
 
 
-@pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize("packing", ["14bit", "2byte", "3byte", "ascii5"])
-def test_folder_is_encoded_and_decoded(run: Run, folder: Path, text: bool, packing: str) -> None:
-    assert run("encode", folder, "--codec", "vq", "--packing", packing, *(["--text"] if text else [])) == 0
-    suffix = ".txt" if text else ".vq"
-    streams = sorted((folder / "streams").glob(f"*{suffix}"))
+@pytest.mark.parametrize(
+    "options",
+    [["--packing", "14bit"], ["--packing", "2byte", "--text"], ["--packing", "3byte"], ["--packing", "ascii5"]],
+)
+def test_folder_is_encoded_and_decoded(run, folder, options):
+    assert run("encode", folder, "--codec", "vq", *options) == 0
+    text = "--text" in options
+    streams = sorted((folder / "streams").glob(f"*{'.txt' if text else '.vq'}"))
     assert [stream.stem for stream in streams] == ["a", "b", "c"]
     if text:
         assert set(streams[0].read_text()) <= set("0123456789abcdef\n")
@@ -76,7 +78,7 @@ def test_folder_is_encoded_and_decoded(run: Run, folder: Path, text: bool, packi
     assert not list((folder / "out").glob("*missing*"))
 
 
-def test_one_file_with_another_codebook_and_output_folder(run: Run, folder: Path, tmp_path: Path) -> None:
+def test_one_file_with_another_codebook_and_output_folder(run, folder, tmp_path):
     out = tmp_path / "new" / "deeper"
     assert run("encode", folder / "b.png", "--codec", "vq", "--codebook", "nominal-20", "--out", out) == 0
     assert [path.name for path in out.iterdir()] == ["b.vq"]
@@ -87,9 +89,7 @@ def test_one_file_with_another_codebook_and_output_folder(run: Run, folder: Path
         run("decode", out / "b.vq", "--codebook", "nominal-10")
 
 
-def test_invalid_files_of_a_folder_are_reported_and_the_others_processed(
-    run: Run, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_files_of_a_folder_are_reported_and_the_others_processed(run, folder, capsys):
     (folder / "0bad.png").write_bytes(b"\x89PNG\r\n\x1a\n but no more")
     write_png(folder / "small.png", np.zeros((8, 8), np.uint8))
     write_png(folder / "a.png", snippet(5))  # the stem of a.tiff: one stream would overwrite the other
@@ -114,11 +114,11 @@ def test_invalid_files_of_a_folder_are_reported_and_the_others_processed(
 
 
 @pytest.fixture
-def own_images(tmp_path: Path) -> Path:
+def own_images(tmp_path):
     """Make a folder as a person has it: a large JPEG of a phone, a colour PNG, a small TIFF, a side-car, a note."""
     images = tmp_path / "own"
     images.mkdir()
-    large = Image.fromarray(np.kron(snippet(3, 90, 120), np.ones((8, 8), np.uint8))).convert("RGB")
+    large = Image.fromarray(np.kron(snippet(3, 20, 120), np.ones((8, 8), np.uint8))).convert("RGB")
     exif = Image.Exif()
     exif[0x0112] = 6
     large.save(images / "phone.jpg", exif=exif)
@@ -129,24 +129,18 @@ def own_images(tmp_path: Path) -> Path:
     return images
 
 
-def test_own_images_are_refused_with_the_way_out(
-    run: Run, own_images: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run("encode", own_images, "--codec", "vq") == 1
-    output = capsys.readouterr()
-    assert "1 of 3 files done" in output.out
-    assert "phone.jpg: size: got '720 × 960 px', expected 16 to 512 px a side; --fit crop or --fit resize" in output.err
-    with pytest.raises(SonarpostError, match="--fit resize"):
+def test_own_images_are_refused_with_the_way_out(run, own_images, capsys):
+    with pytest.raises(SonarpostError, match="got '160 × 960 px', expected 16 to 512 px a side; --fit crop or"):
         run("encode", own_images / "phone.jpg", "--codec", "vq")
+    assert run("encode", own_images, "--codec", "vq") == 1
+    assert "1 of 3 files done" in capsys.readouterr().out
 
 
-def test_own_images_are_encoded_with_a_note_for_each_change(
-    run: Run, own_images: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_own_images_are_encoded_with_a_note_for_each_change(run, own_images, capsys):
     assert run("encode", own_images, "--codec", "vq", "--fit", "resize") == 0
     output = capsys.readouterr()
     lines = {Path(line.split(" ->")[0]).name: line for line in output.out.splitlines() if " -> " in line}
-    assert lines["phone.jpg"].endswith("turned by its orientation tag (6); 720 × 960 px resized to 384 × 512 px")
+    assert lines["phone.jpg"].endswith("turned by its orientation tag (6); 160 × 960 px resized to 85 × 512 px")
     assert "colour converted to grey (0.299 R + 0.587 G + 0.114 B)" in lines["colour.png"]
     assert "20 × 12 px resized to 27 × 16 px" in lines["small.tiff"]
     assert "heron.heic: not used" in output.err
@@ -154,13 +148,13 @@ def test_own_images_are_encoded_with_a_note_for_each_change(
     assert f"sonarpost decode {own_images}\n" in output.out
     assert sorted(path.name for path in (own_images / "streams").iterdir()) == ["colour.vq", "phone.vq", "small.vq"]
     assert run("decode", own_images) == 0
-    assert "384 × 512 px" in capsys.readouterr().out
-    assert read_image(own_images / "out" / "phone.tiff").shape == (512, 384)
+    assert "85 × 512 px" in capsys.readouterr().out
+    assert read_image(own_images / "out" / "phone.tiff").shape == (512, 85)
     assert run("encode", own_images, "--codec", "vq", "--fit", "resize") == 0
     assert "a folder, not searched" not in capsys.readouterr().err
 
 
-def test_input_that_cannot_be_read_leaves_no_folder(run: Run, tmp_path: Path) -> None:
+def test_input_that_cannot_be_read_leaves_no_folder(run, tmp_path):
     (tmp_path / "empty.png").touch()
     for name in ("absent.png", "empty.png"):
         with pytest.raises(SonarpostError):
@@ -171,15 +165,13 @@ def test_input_that_cannot_be_read_leaves_no_folder(run: Run, tmp_path: Path) ->
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
 
 
-def test_crop_encodes_the_centre(run: Run, own_images: Path) -> None:
+def test_crop_encodes_the_centre(run, own_images):
     assert run("encode", own_images / "phone.jpg", "--codec", "vq", "--fit", "crop", "--out", own_images / "s") == 0
     assert run("decode", own_images / "s" / "phone.vq") == 0
-    assert read_image(own_images / "s" / "out" / "phone.tiff").shape == (512, 512)
+    assert read_image(own_images / "s" / "out" / "phone.tiff").shape == (512, 160)
 
 
-def test_codebook_is_built_from_own_images(
-    run: Run, own_images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_codebook_is_built_from_own_images(run, own_images, tmp_path, capsys):
     out = tmp_path / "own.tiles"
     assert run("codebook", "build", "--images", own_images, "--tile", 8, "--out", out, "--rounds", "90:40") == 0
     assert load(out).notes["images"] == "3"
@@ -188,7 +180,7 @@ def test_codebook_is_built_from_own_images(
         assert text in said
 
 
-def test_redirected_output_does_not_go_to_the_progress_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_redirected_output_does_not_go_to_the_progress_bar(monkeypatch):
     terminal, output = io.StringIO(), io.StringIO()
     monkeypatch.setattr("sys.stdout", output)
     with ProgressDisplay(Console(file=terminal, force_terminal=True)) as display:
@@ -198,9 +190,7 @@ def test_redirected_output_does_not_go_to_the_progress_bar(monkeypatch: pytest.M
     assert "encoding" in terminal.getvalue()
 
 
-def test_missing_pixels_are_written_as_a_mask_and_reported(
-    run: Run, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_pixels_are_written_as_a_mask_and_reported(run, folder, capsys):
     run("encode", folder / "a.tiff", "--codec", "vq")
     folder /= "streams"
     stream = folder / "a.vq"
@@ -213,7 +203,7 @@ def test_missing_pixels_are_written_as_a_mask_and_reported(
     assert not read_image(folder / "out" / "a.tiff")[mask == 255].any()
 
 
-def test_invalid_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Path) -> None:
+def test_invalid_input_is_a_sonarpost_error(run, folder, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     (tmp_path / "big.vq").write_bytes(bytes(1 << 19))
@@ -238,16 +228,14 @@ def test_invalid_input_is_a_sonarpost_error(run: Run, folder: Path, tmp_path: Pa
     assert not (tmp_path / "x.tiles").exists()
 
 
-def test_info_prints_a_shipped_codebook(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_prints_a_shipped_codebook(run, capsys):
     assert run("codebook", "info", "nominal-10") == 0
     output = capsys.readouterr().out
     assert load_default(10).tiles.identity in output
     assert "10 × 10 px" in output
-    assert run("codebook") == 0
-    assert "build" in capsys.readouterr().out
 
 
-def test_codebook_is_built_from_a_folder_and_used(run: Run, folder: Path, tmp_path: Path) -> None:
+def test_codebook_is_built_from_a_folder_and_used(run, folder, tmp_path):
     out = tmp_path / "new" / "mine.tiles"
     (folder / "broken.tif").write_bytes(b"II*\0")
     assert run("codebook", "build", "--images", folder, "--tile", 8, "--out", out, "--rounds", "90:8,99:1:2") == 1
@@ -261,19 +249,16 @@ def test_codebook_is_built_from_a_folder_and_used(run: Run, folder: Path, tmp_pa
     assert run("decode", folder / "streams" / "a.vq", "--codebook", out) == 0
     # The codebook holds all tiles of the first image, so it is reconstructed exactly.
     assert np.array_equal(read_image(folder / "streams" / "out" / "a.tiff"), snippet(0))
-    more = tmp_path / "more.tiles"
-    assert run("codebook", "build", "--images", folder / "b.png", "--tile", 8, "--out", more, "--core", out) == 0
-    assert np.array_equal(load(more).tiles.tiles[: len(built.tiles)], built.tiles.tiles)
 
 
-def test_interrupted_build_is_resumed_only_with_the_option(run: Run, folder: Path, tmp_path: Path, monkeypatch) -> None:
+def test_interrupted_build_is_resumed_only_with_the_option(run, folder, tmp_path, monkeypatch):
     out = tmp_path / "mine.tiles"
     arguments = ("codebook", "build", "--images", folder, "--out", out, "--rounds", "90:4", "--refine", 1)
     assert run(*arguments) == 0
     expected = out.read_bytes()
     out.unlink()
 
-    def stop(display: ProgressDisplay, progress: object) -> None:
+    def stop(display, progress):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
@@ -287,7 +272,7 @@ def test_interrupted_build_is_resumed_only_with_the_option(run: Run, folder: Pat
     assert out.read_bytes() == expected
 
 
-def test_rounds_are_parsed_in_grey_levels() -> None:
+def test_rounds_are_parsed_in_grey_levels():
     assert parse_rounds("39:16", 20) == (Round(39.0, 320.0, None),)
     assert parse_rounds("30:40.5:500, 60:8", 10) == (Round(30.0, 405.0, 500), Round(60.0, 80.0, None))
     for text in ("", "39", "39:", "39:16:", "39:16:1.5", "39:-1", "nan:1", "39:16,", "39:16:5:5", "٣٩:16"):
@@ -295,7 +280,7 @@ def test_rounds_are_parsed_in_grey_levels() -> None:
             parse_rounds(text, 10)
 
 
-def test_codebooks_are_compared(run: Run, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_codebooks_are_compared(run, folder, tmp_path, capsys):
     one, other = tmp_path / "one.tiles", tmp_path / "other.tiles"
     assert run("codebook", "build", "--images", folder / "a.tiff", "--tile", 8, "--out", one) == 0
     assert run("codebook", "build", "--images", folder / "b.png", "--tile", 8, "--out", other, "--core", one) == 0
@@ -306,6 +291,7 @@ def test_codebooks_are_compared(run: Run, folder: Path, tmp_path: Path, capsys: 
     assert "principal angles up to 0.00 deg" in output
     assert run("codebook", "diff", one, other) == 1
     output = capsys.readouterr().out
+    assert np.array_equal(load(other).tiles.tiles[: len(load(one).tiles)], load(one).tiles.tiles)
     assert load(one).tiles.identity in output
     assert load(other).tiles.identity in output
     assert "only in A      0 tiles" in output
@@ -314,7 +300,7 @@ def test_codebooks_are_compared(run: Run, folder: Path, tmp_path: Path, capsys: 
         run("codebook", "diff", one, "nominal-10")
 
 
-def test_codebook_is_adapted_to_a_folder(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_codebook_is_adapted_to_a_folder(run, tmp_path, capsys):
     images = tmp_path / "images"
     images.mkdir()
     for seed in range(8):
@@ -339,12 +325,11 @@ def test_codebook_is_adapted_to_a_folder(run: Run, tmp_path: Path, capsys: pytes
         run("codebook", "adapt", base, "--images", images / "0.png", "--out", out)
 
 
-def test_missing_gain_is_reported(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    images = tmp_path / "images"
+def test_missing_gain_is_reported(run, tmp_path, capsys):
+    images, base = tmp_path / "images", tmp_path / "base.tiles"
     images.mkdir()
     for number in range(2):
         write_png(images / f"{number}.png", np.full((24, 24), 90, np.uint8))
-    base = tmp_path / "base.tiles"
     run("codebook", "build", "--images", images / "0.png", "--tile", 8, "--out", base)
     capsys.readouterr()
     assert run("codebook", "adapt", base, "--images", images, "--out", tmp_path / "out.tiles") == 0

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
 
 from sonarpost.cli.main import COMMANDS, main
 
 
-def script(shell: str, capsys: pytest.CaptureFixture[str]) -> str:
+def script(shell, capsys):
     assert main(["completion", shell]) == 0
     return capsys.readouterr().out
 
 
-def completed(text: str, folder: Path, *words: str) -> list[str]:
+def completed(text, folder, *words):
     """Return what bash offers after `sonarpost WORDS`; the last word is the one to complete."""
     (folder / "script").write_text(text)
     program = 'source ./script; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _sonarpost; printf "%s\\n" "${COMPREPLY[@]}"'
@@ -24,7 +23,7 @@ def completed(text: str, folder: Path, *words: str) -> list[str]:
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout.split()
 
 
-def test_bash_completes_commands_actions_options_and_values(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bash_completes_commands_actions_options_and_values(tmp_path, capsys):
     text = script("bash", capsys)
     assert set(completed(text, tmp_path, "")) >= {*COMMANDS, "--version", "-v"}
     assert completed(text, tmp_path, "enc") == ["encode"]
@@ -37,7 +36,7 @@ def test_bash_completes_commands_actions_options_and_values(tmp_path: Path, caps
     assert "task" not in completed(text, tmp_path, "c2", ""), "a refused former name"
 
 
-def test_bash_loads_the_script_and_registers_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bash_loads_the_script_and_registers_it(tmp_path, capsys):
     (tmp_path / "script").write_text(script("bash", capsys))
     command = ["bash", "-euc", "source ./script; complete -p sonarpost"]
     printed = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
@@ -45,7 +44,7 @@ def test_bash_loads_the_script_and_registers_it(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize("shell", ["zsh", "fish"])
-def test_zsh_and_fish_accept_their_script(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_zsh_and_fish_accept_their_script(shell, tmp_path, capsys):
     text = script(shell, capsys)
     assert "router-config" in text
     assert "nominal" not in text
@@ -60,7 +59,7 @@ def test_zsh_and_fish_accept_their_script(shell: str, tmp_path: Path, capsys: py
         assert printed.split() == ["passwd"]
 
 
-def test_an_unknown_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_shell_is_refused(capsys):
     with pytest.raises(SystemExit, match="2"):
         main(["completion", "zhs"])
     assert "did you mean zsh?" in capsys.readouterr().err

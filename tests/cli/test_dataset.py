@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,7 +53,7 @@ def export(archive, *options, status=0):
     return out, json.loads(file.read_text()) if file.exists() else None
 
 
-def check_coco(out: Path, document) -> None:
+def check_coco(out, document):
     """Check the structure that https://cocodataset.org/#format-data describes for object detection."""
     assert set(document) == {"info", "licenses", "images", "annotations", "categories"}
     info = {"year": int, "version": str, "description": str, "contributor": str, "url": str, "date_created": str}

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
+import signal
 import sys
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
 import zenoh
-from builders.common import eventually
+from builders.common import eventually, publish_once
 from builders.exports import decision, image
 from mcap.reader import make_reader
 
@@ -31,7 +30,7 @@ from sonarpost.services.c2.service import C2Service
 IMAGES = 3
 
 
-def record_file(path: Path) -> Path:
+def record_file(path):
     """A file of a vessel: images, a decision, a message of another key, an invalid image."""
     recording = McapRecording(path)
     encoding = wire.encoding_of(ReconstructedImage)
@@ -45,32 +44,30 @@ def record_file(path: Path) -> Path:
     return path
 
 
-def test_recorded_file_has_records_and_foxglove_channels(router, client, tmp_path, capsys):
-    path = tmp_path / "new" / "a.mcap"
-    status = []
+def test_recorded_file_has_records_and_foxglove_channels(router, client, tmp_path, capsys, monkeypatch):
+    path, last = tmp_path / "new" / "a.mcap", "sonarpost/v1/uuv-1/own/key"
+    expected = [keys.shore_decision("vessel-1"), keys.shore_image("vessel-1"), last]
+    write = McapRecording.write
 
-    def publish_until_recorded():
-        record = image()
-        publisher = client.declare_publisher(
-            keys.shore_image("vessel-1"), encoding=wire.encoding_of(ReconstructedImage)
-        )
-        eventually(lambda: publisher.matching_status.matching, what="recorder")
-        publisher.put(wire.encode(record))
-        client.put(keys.shore_decision("vessel-1"), wire.encode(decision()), encoding=wire.encoding_of(Decision))
-        client.put("sonarpost/v1/uuv-1/own/key", b"abc")
+    def write_until_last(recording, key, *rest):
+        is_written = write(recording, key, *rest)
+        if key == last:
+            signal.raise_signal(signal.SIGINT)
+        return is_written
+
+    def publish():
+        publish_once(client, expected[1], wire.encode(image()), wire.encoding_of(ReconstructedImage))
+        client.put(expected[0], wire.encode(decision()), encoding=wire.encoding_of(Decision))
         client.put("another/key", b"not recorded")
-        publisher.undeclare()
+        client.put(last, b"abc")
 
-    publishing = threading.Thread(target=publish_until_recorded)
+    monkeypatch.setattr(McapRecording, "write", write_until_last)
+    publishing = threading.Thread(target=publish)
     publishing.start()
-    status.append(main(["record", str(path), "--router", router, "--duration", "5"]))
+    assert main(["record", str(path), "--router", router]) == 0
     publishing.join()
-    assert status == [0]
     assert "3 records, 0 dropped" in capsys.readouterr().out
-    found = list(read_messages(path))
-    assert sorted(m.key for m in found) == sorted(
-        [keys.shore_image("vessel-1"), keys.shore_decision("vessel-1"), "sonarpost/v1/uuv-1/own/key"]
-    )
+    assert sorted(m.key for m in read_messages(path)) == expected
     with path.open("rb") as file:
         names = {schema.name for schema, _, _ in make_reader(file).iter_messages() if schema}
     assert {COMPRESSED_IMAGE, LOCATION_FIX, GEOJSON} <= names
@@ -94,7 +91,7 @@ def test_replay_to_c2_stores_every_record_once(platform, router, tmp_path, capsy
         service.stop()
 
 
-def coded(number: int) -> tuple[CodedImage, ReconstructedImage]:
+def coded(number):
     """A coded image of spiht and its decoded form, the first one with a contact and a range that has not arrived."""
     pixels = (np.arange(48 * 40).reshape(48, 40) * (number + 1) % 251).astype(np.uint8)
     stream = default_registry().create("spiht").encode(pixels, 300)
@@ -258,7 +255,7 @@ def test_map_is_written_at_most_every_ten_seconds(tmp_path):
     assert maps == [0, 10, 20, 31]
 
 
-@pytest.mark.parametrize("missing", ["lz4", "mcap", "zstandard"])
+@pytest.mark.parametrize("missing", ["mcap", "zstandard"])
 def test_missing_extra_is_one_line(missing, tmp_path, monkeypatch, capsys):
     for name in [n for n in sys.modules if n.partition(".")[0] == missing or n == "sonarpost.export.mcap_file"]:
         monkeypatch.delitem(sys.modules, name)
@@ -266,9 +263,3 @@ def test_missing_extra_is_one_line(missing, tmp_path, monkeypatch, capsys):
     assert main(["replay", str(tmp_path / "a.mcap")]) == 2
     expected = "sonarpost replay: needs the extra mcap: pip install 'sonarpost[mcap]'\n"
     assert capsys.readouterr().err == expected
-
-
-def test_other_commands_do_not_import_mcap():
-    code = "import sys, sonarpost.cli.main as m; m.parser(); print('mcap' in sys.modules)"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout == "False\n"

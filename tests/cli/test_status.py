@@ -14,9 +14,6 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 import zenoh
@@ -28,9 +25,8 @@ from sonarpost import keys, wire
 from sonarpost.bus.session import router_config
 from sonarpost.cli.main import main
 from sonarpost.cli.status import age_text, as_json, bytes_text, is_ok, plain_text, rows_of, vehicle_text
-from sonarpost.config import PlatformConfig
 from sonarpost.messages import ReceivedStatus, VehicleRange, VehicleStatus
-from sonarpost.monitoring.fleet import MAX_VEHICLES, FleetState, FleetTracker, ServiceStatus, VehicleState
+from sonarpost.monitoring.fleet import MAX_VEHICLES, FleetState, FleetTracker, VehicleState
 
 RECEIVED_STATUS = SAMPLES["received-status"]
 assert isinstance(RECEIVED_STATUS, ReceivedStatus)
@@ -38,7 +34,7 @@ assert isinstance(RECEIVED_STATUS, ReceivedStatus)
 NAMES = ("uuv_modem", "acoustic_channel", "op_modem", "decompressor")
 
 
-def test_table_fits_eighty_columns() -> None:
+def test_table_fits_eighty_columns():
     lines = on_terminal(FLEET)
     assert max(len(line) for line in lines) <= 80
     assert lines[0] == "tcp/127.0.0.1:7447: 5 of 7 services alive on 3 platforms, 2 records rejected"
@@ -56,7 +52,7 @@ def test_table_fits_eighty_columns() -> None:
     assert lines[-1] == "! uuv-1/uuv_modem: /dev/ttyUSB0: not open yet"
 
 
-def test_long_names_are_folded() -> None:
+def test_long_names_are_folded():
     long = health("a" * 32, "b" * 40, detail="c" * 200)
     lines = on_terminal(FleetState((seen(long),), connected=True, rejected=0))
     assert max(len(line) for line in lines) <= 80
@@ -64,8 +60,8 @@ def test_long_names_are_folded() -> None:
     assert "".join(lines).count("c") >= 200
 
 
-def test_row_severity() -> None:
-    def severity(state: ServiceStatus, *, connected: bool = True) -> tuple[str, str]:
+def test_row_severity():
+    def severity(state, *, connected=True):
         (row,) = rows_of(FleetState((state,), connected, 0), 15.0)
         return row.state, row.severity
 
@@ -77,8 +73,8 @@ def test_row_severity() -> None:
     assert severity(seen(health(), alive=False)) == ("gone", "gone")
 
 
-def test_fleet_is_ok_if_services_run_and_all_are_ok() -> None:
-    def ok(*services: ServiceStatus, connected: bool = True) -> bool:
+def test_fleet_is_ok_if_services_run_and_all_are_ok():
+    def ok(*services, connected=True):
         state = FleetState(services, connected, 0)
         return is_ok(rows_of(state, 15.0), state)
 
@@ -88,7 +84,7 @@ def test_fleet_is_ok_if_services_run_and_all_are_ok() -> None:
     assert not ok(seen(health()), seen(BROKEN))
 
 
-def test_plain_text_is_complete_and_has_no_control_characters() -> None:
+def test_plain_text_is_complete_and_has_no_control_characters():
     hostile = health("uuv-1", "uuv_modem", state="degraded", detail="\x1b[2J\r\nall is well")
     state = FleetState((seen(hostile), seen(health("a" * 32, "b" * 40))), connected=True, rejected=0)
     text = plain_text(state, rows_of(state, 15.0), "tcp/127.0.0.1:7447")
@@ -101,25 +97,25 @@ def test_plain_text_is_complete_and_has_no_control_characters() -> None:
 @pytest.mark.parametrize(
     ("age_s", "text"), [(None, "-"), (0.0, "0 s"), (59.9, "59 s"), (60, "1 min"), (7199, "1 h"), (1e6, "11 d")]
 )
-def test_age_text(age_s: float | None, text: str) -> None:
+def test_age_text(age_s, text):
     assert age_text(age_s) == text
 
 
 @pytest.mark.parametrize(
     ("size", "text"), [(None, "-"), (0, "0 B"), (999, "999 B"), (3400, "3.4 kB"), (1.2e10, "12 GB"), (9e15, "9000 TB")]
 )
-def test_bytes_text(size: float | None, text: str) -> None:
+def test_bytes_text(size, text):
     assert bytes_text(size) == text
 
 
 @pytest.fixture
-def platforms(client: zenoh.Session) -> Any:
+def platforms(client):
     platforms = Platforms(client)
     yield platforms
     platforms.close()
 
 
-def test_once_as_text_and_as_json(router: str, platforms: Platforms, capsys: pytest.CaptureFixture[str]) -> None:
+def test_once_as_text_and_as_json(router, platforms, capsys):
     platforms.run(health())
     assert main(["status", "--once", "--router", router]) == 0
     out = capsys.readouterr().out
@@ -135,7 +131,7 @@ def test_once_as_text_and_as_json(router: str, platforms: Platforms, capsys: pyt
     assert [s["well"] for s in services.values()] == [False, True]
 
 
-def test_once_ends_without_a_router(capsys: pytest.CaptureFixture[str]) -> None:
+def test_once_ends_without_a_router(capsys):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     started = time.monotonic()
     assert main(["status", "--once", "--wait", "0.3", "--router", endpoint]) == 1
@@ -143,9 +139,7 @@ def test_once_ends_without_a_router(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.splitlines()[0] == f"{endpoint}: router not reached yet"
 
 
-def test_router_from_the_configuration_file(
-    tmp_path: Path, router: str, platforms: Platforms, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_router_from_the_configuration_file(tmp_path, router, platforms, capsys):
     platforms.run(health())
     config = tmp_path / "shore.toml"
     config.write_text(f'[platform]\nid = "shore-1"\nrouter = ["{router}"]\n')
@@ -162,7 +156,7 @@ def test_router_from_the_configuration_file(
         (["--config", "nowhere.toml"], "nowhere.toml"),
     ],
 )
-def test_invalid_option_gives_one_line(arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_option_gives_one_line(arguments, text, capsys):
     assert main(["status", "--once", *arguments]) == 2
     error = capsys.readouterr().err
     assert text in error
@@ -172,7 +166,7 @@ def test_invalid_option_gives_one_line(arguments: list[str], text: str, capsys: 
 class Terminal:
     """`sonarpost status` in a terminal of 80 columns and 24 lines."""
 
-    def __init__(self, *arguments: str) -> None:
+    def __init__(self, *arguments):
         self.master, slave = pty.openpty()
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
         environment = {**os.environ, "TERM": "xterm-256color"}
@@ -187,7 +181,7 @@ class Terminal:
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
-    def _read(self) -> None:
+    def _read(self):
         while True:
             try:
                 data = os.read(self.master, 65536)
@@ -195,25 +189,25 @@ class Terminal:
                 return
             self.text += data.decode(errors="replace")
 
-    def screen(self) -> str:
+    def screen(self):
         """Return the last screen: the text after the last cursor-home sequence."""
         return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.text.rpartition("\x1b[H")[2])
 
-    def wait(self) -> int:
+    def wait(self):
         status = self.process.wait(10)
         self._thread.join(5)
         os.close(self.master)
         return status
 
 
-def ended_cleanly(terminal: Terminal) -> None:
+def ended_cleanly(terminal):
     assert "Traceback" not in terminal.text
     # The main screen and the cursor are restored.
     assert terminal.text.rindex("\x1b[?1049l") > terminal.text.rindex("\x1b[?1049h")
     assert terminal.text.rindex("\x1b[?25h") > terminal.text.rindex("\x1b[?25l")
 
 
-def test_sigterm_restores_the_terminal() -> None:
+def test_sigterm_restores_the_terminal():
     terminal = Terminal("--router", f"tcp/127.0.0.1:{free_port()}", "--interval", "0.1")
     try:
         eventually(lambda: "not reached yet" in terminal.screen(), what="the first screen")
@@ -224,7 +218,7 @@ def test_sigterm_restores_the_terminal() -> None:
     ended_cleanly(terminal)
 
 
-def test_live_table_shows_lost_and_restored_router_until_ctrl_c() -> None:
+def test_live_table_shows_lost_and_restored_router_until_ctrl_c():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     terminal = Terminal("--router", endpoint, "--interval", "0.1", "--stale-after", "2")
     try:
@@ -253,7 +247,7 @@ def test_live_table_shows_lost_and_restored_router_until_ctrl_c() -> None:
     ended_cleanly(terminal)
 
 
-def test_json_lines_on_a_pipe(router: str, platforms: Platforms, platform: Callable[[str], PlatformConfig]) -> None:
+def test_json_lines_on_a_pipe(router, platforms, platform):
     platforms.run(health())
     command = [sys.executable, "-m", "sonarpost.cli.main", "status", "--router", router, "--json", "--interval", "0.1"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -264,7 +258,7 @@ def test_json_lines_on_a_pipe(router: str, platforms: Platforms, platform: Calla
         assert process.wait(120) == 0
 
 
-def test_position_and_age_of_a_vehicle() -> None:
+def test_position_and_age_of_a_vehicle():
     state = FleetState((), True, 0, (VehicleState(RECEIVED_STATUS, 65.0),))
     line = (
         "uuv-1: 41.52510, -70.67120 at 2016-10-12T09:00:00Z, heading 272°, speed 1.5 m/s, depth 12.2 m, altitude 3.5 m,"
@@ -283,7 +277,7 @@ def test_position_and_age_of_a_vehicle() -> None:
     assert vehicle_text(VehicleState(bare, 0.0)) == "uuv-1: no position, received 0 s ago by vessel-1"
 
 
-def test_statuses_of_vehicles_are_checked_and_limited() -> None:
+def test_statuses_of_vehicles_are_checked_and_limited():
     fleet = FleetTracker()
     key = keys.acoustic_status("vessel-1")
     fleet.add_status(key, b"malformed", 0.0)

@@ -8,7 +8,6 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -23,13 +22,13 @@ PAGE = 4096
 RECORDS = 300
 
 
-def payload(number: int) -> bytes:
+def payload(number):
     """Return 1 kB that no other record has."""
     return (b"%06d" % number) * 170
 
 
 @pytest.fixture
-def relay(tmp_path: Path) -> Path:
+def relay(tmp_path):
     """Make a closed store with records in all tables; one record has overflow pages."""
     path = tmp_path / "relay.db"
     store = Store(path)
@@ -45,22 +44,22 @@ def relay(tmp_path: Path) -> Path:
     return path
 
 
-def pages_with(content: bytes, data: bytes) -> list[int]:
+def pages_with(content, data):
     """Return the pages with `content`, numbered from 0."""
     return [n for n in range(len(data) // PAGE) if content in data[n * PAGE : (n + 1) * PAGE]]
 
 
-def overwrite_page(path: Path, page: int, data: bytes = b"\xa5" * PAGE) -> None:
+def overwrite_page(path, page, data=b"\xa5" * PAGE):
     with path.open("r+b") as file:
         file.seek(page * PAGE)
         file.write(data)
 
 
-def run(*arguments: object) -> int:
+def run(*arguments):
     return main(["store", *map(str, arguments)])
 
 
-def test_sound_store(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sound_store(relay, capsys):
     before = relay.read_bytes()
     assert run("check", relay) == 0
     text = capsys.readouterr().out
@@ -73,7 +72,7 @@ def test_sound_store(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert relay.read_bytes() == before
 
 
-def test_write_ahead_log_of_a_killed_service_is_read_and_stays(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_write_ahead_log_of_a_killed_service_is_read_and_stays(relay, capsys):
     script = (
         "import os; from pathlib import Path; from sonarpost.delivery.store import Store\n"
         f"store = Store(Path({str(relay)!r}))\n"
@@ -91,7 +90,7 @@ def test_write_ahead_log_of_a_killed_service_is_read_and_stays(relay: Path, caps
         assert queued_items(new, "c2", 999)[-1].payload == b"in the log"
 
 
-def test_lost_commits_are_shown_and_cleared(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lost_commits_are_shown_and_cleared(relay, capsys):
     relay.write_bytes(b"")
     with closing(sqlite3.connect(relay)) as empty:
         empty.execute("CREATE TABLE meta (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID")
@@ -108,7 +107,7 @@ def test_lost_commits_are_shown_and_cleared(relay: Path, capsys: pytest.CaptureF
         assert store.lost is None
 
 
-def test_loss_that_no_service_has_reported_yet(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_loss_that_no_service_has_reported_yet(relay, capsys):
     backup = relay.read_bytes()
     with closing(Store(relay)) as store:
         send(store, b"after the backup", consumer="c2")
@@ -119,7 +118,7 @@ def test_loss_that_no_service_has_reported_yet(relay: Path, capsys: pytest.Captu
     assert "records possibly lost: c2 1; not yet reported by the service" in text
 
 
-def test_store_in_use_is_refused(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_store_in_use_is_refused(relay, capsys):
     with closing(Store(relay)):
         for command in (["check", relay], ["check", relay, "--clear"], ["salvage", relay, "--out", f"{relay}.new"]):
             assert run(*command) == 2
@@ -127,7 +126,7 @@ def test_store_in_use_is_refused(relay: Path, capsys: pytest.CaptureFixture[str]
     assert not Path(f"{relay}.new").exists()
 
 
-def test_missing_store_and_existing_output(relay: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_store_and_existing_output(relay, tmp_path, capsys):
     for command in (["check", tmp_path / "no.db"], ["salvage", tmp_path / "no.db", "--out", tmp_path / "new.db"]):
         assert run(*command) == 2
         assert "no.db: got 'no such file'" in capsys.readouterr().err
@@ -137,11 +136,11 @@ def test_missing_store_and_existing_output(relay: Path, tmp_path: Path, capsys: 
 
 
 @pytest.fixture
-def salvaged(relay: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., Iterator[Store]]:
+def salvaged(relay, capsys):
     """Salvage a damaged store and open the new one; fails if the damaged one was changed."""
     opened = []
 
-    def salvage(status: int = 1) -> tuple[Store, str]:
+    def salvage(status=1):
         before = relay.read_bytes()
         out = relay.with_name("new.db")
         assert run("salvage", relay, "--out", out) == status
@@ -155,13 +154,13 @@ def salvaged(relay: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., I
         store.close()
 
 
-def numbers(store: Store) -> set[int]:
+def numbers(store):
     items = queued_items(store, "c2", 9999)
     assert all(item.payload == payload(item.seq - 1) for item in items)
     return {item.seq for item in items}
 
 
-def test_salvage_of_a_sound_store_copies_everything(relay: Path, salvaged: Callable[..., tuple[Store, str]]) -> None:
+def test_salvage_of_a_sound_store_copies_everything(relay, salvaged):
     with closing(Store(relay)) as old:
         origin = old.origin
     new, text = salvaged(0)
@@ -177,7 +176,7 @@ def test_salvage_of_a_sound_store_copies_everything(relay: Path, salvaged: Calla
     assert re.search(rf"^outbox +{RECORDS + 1} +0 +-$", text, re.MULTILINE)
 
 
-def test_salvage_around_damaged_pages(relay: Path, salvaged: Callable[..., tuple[Store, str]]) -> None:
+def test_salvage_around_damaged_pages(relay, salvaged):
     lost: set[int] = set()
     data = relay.read_bytes()
     for number in (20, 100, 101, 102, 250):
@@ -197,7 +196,7 @@ def test_salvage_around_damaged_pages(relay: Path, salvaged: Callable[..., tuple
     assert re.search(r"^outbox +\d+ +0 +row \d+ to \d+, ", text, re.MULTILINE)
 
 
-def test_record_with_a_wrong_digest_is_quarantined(relay: Path, salvaged: Callable[..., tuple[Store, str]]) -> None:
+def test_record_with_a_wrong_digest_is_quarantined(relay, salvaged):
     page = pages_with(b"large" * 500, relay.read_bytes())[2]
     overwrite_page(relay, page, relay.read_bytes()[page * PAGE :][:PAGE].replace(b"large", b"other"))
     new, text = salvaged()
@@ -209,9 +208,7 @@ def test_record_with_a_wrong_digest_is_quarantined(relay: Path, salvaged: Callab
 
 
 @pytest.mark.parametrize(("size", "part"), [(100, "header of the first page"), (PAGE, "first page")])
-def test_first_page_is_replaced(
-    size: int, part: str, relay: Path, salvaged: Callable[..., tuple[Store, str]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_first_page_is_replaced(size, part, relay, salvaged, capsys):
     overwrite_page(relay, 0, os.urandom(size))
     with pytest.raises(DeliveryError, match=r"file is not a database; .*sonarpost store salvage"):
         Store(relay)
@@ -223,7 +220,7 @@ def test_first_page_is_replaced(
     assert new.inbox_depth() == 40
 
 
-def test_other_file_is_not_salvaged(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_file_is_not_salvaged(relay, capsys):
     relay.write_bytes(os.urandom(20 * PAGE))
     out = relay.with_name("new.db")
     status = run("salvage", relay, "--out", out)
@@ -234,7 +231,7 @@ def test_other_file_is_not_salvaged(relay: Path, capsys: pytest.CaptureFixture[s
     assert "relay.db: got " in capsys.readouterr().err
 
 
-def test_old_records_have_an_age(relay: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_old_records_have_an_age(relay, capsys):
     with closing(sqlite3.connect(relay)) as db, db:
         db.execute("UPDATE outbox SET created_utc_s = ? WHERE consumer = 'c2'", (time.time() - 1000.0,))
     assert run("check", relay) == 0

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from sonarpost.cli.demo import command
 from sonarpost.cli.main import main
 
 
-def test_a_foreign_output_folder_is_refused_before_the_survey_is_simulated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_foreign_output_folder_is_refused_before_the_survey_is_simulated(tmp_path, monkeypatch, capsys):
     simulated: list[object] = []
     monkeypatch.setattr(command, "simulate_survey", simulated.append)
     (tmp_path / "notes.txt").write_text("not of a demo")
@@ -33,9 +29,7 @@ def test_a_foreign_output_folder_is_refused_before_the_survey_is_simulated(
         ("absent.xtf", "absent.xtf: got 'no such file or folder'"),
     ],
 )
-def test_a_file_that_cannot_be_read_is_refused_before_anything_is_started(
-    name: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_cannot_be_read_is_refused_before_anything_is_started(name, message, tmp_path, capsys):
     if name != "absent.xtf":
         (tmp_path / name).write_bytes(b"this is no survey\n" * 200)
     assert main(["demo", "--survey", str(tmp_path / name), "--out", str(tmp_path / "out")]) == 2
@@ -44,10 +38,15 @@ def test_a_file_that_cannot_be_read_is_refused_before_anything_is_started(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("threshold", ["2.1", "-0.1", "nan"])
-def test_a_threshold_out_of_range_is_refused(
-    threshold: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["demo", f"--threshold={threshold}", "--out", str(tmp_path / "out")]) == 2
-    assert "--threshold: got" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        *((f"--threshold={value}", "--threshold: got") for value in ("2.1", "-0.1", "nan")),
+        ("--rate=9", "--rate: got 9, expected one of [0, 1, 2, 3, 4, 5, 6]"),
+        ("--loss=1.5", "expected 0 to 1"),
+    ],
+)
+def test_an_option_out_of_range_is_refused(option, message, tmp_path, capsys):
+    assert main(["demo", option, "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

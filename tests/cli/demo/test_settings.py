@@ -9,7 +9,7 @@ from builders.common import free_port
 from sonarpost.cli.demo.settings import reserved_ports
 
 
-def test_free_port_is_reserved_and_can_be_listened_on() -> None:
+def test_free_port_is_reserved_and_can_be_listened_on():
     wanted = free_port()
     with reserved_ports(wanted) as (port,), socket.socket() as listener:
         assert port == wanted
@@ -21,7 +21,7 @@ def test_free_port_is_reserved_and_can_be_listened_on() -> None:
         assert again == wanted
 
 
-def test_port_of_another_program_is_skipped() -> None:
+def test_port_of_another_program_is_skipped():
     with socket.create_server(("127.0.0.1", 0)) as listener:
         taken = listener.getsockname()[1]
         with reserved_ports(taken, taken) as ports:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from PIL import Image
 
 from sonarpost.cli.demo.sheet import MARGIN, SheetCell, SheetContact, write_sheet
 
 
-def test_small_images_are_drawn_twice_as_large_and_large_ones_as_they_are(tmp_path: Path) -> None:
+def test_small_images_are_drawn_twice_as_large_and_large_ones_as_they_are(tmp_path):
     small, large = np.full((80, 140), 255, np.uint8), np.full((300, 512), 255, np.uint8)
     contacts = [SheetContact("a", "", (SheetCell("s", small),)), SheetContact("b", "", (SheetCell("l", large),))]
     write_sheet(tmp_path / "sheet.png", "title", "subtitle", ("original",), contacts)

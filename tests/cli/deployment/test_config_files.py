@@ -5,8 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from builders.common import REPOSITORY
@@ -18,12 +16,12 @@ from sonarpost.security.fleet import Fleet
 
 
 @pytest.fixture(autouse=True)
-def _no_overrides(monkeypatch: pytest.MonkeyPatch) -> None:
+def _no_overrides(monkeypatch):
     for name in [name for name in os.environ if name.startswith("SONARPOST_")]:
         monkeypatch.delenv(name)
 
 
-def example(tmp_path: Path, name: str) -> Path:
+def example(tmp_path, name):
     """Write an example whose folders are in `tmp_path`, and the acoustic key that it names."""
     path = tmp_path / f"{name}.toml"
     path.write_text(config_files.example_text(name).replace("/var/lib/sonarpost", str(tmp_path)))
@@ -32,7 +30,7 @@ def example(tmp_path: Path, name: str) -> Path:
     return path
 
 
-def check(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, list[str], list[str]]:
+def check(path, capsys):
     """Run `config check`; return status, lines of standard output, lines of standard error."""
     status = main(["config", "check", str(path)])
     captured = capsys.readouterr()
@@ -40,12 +38,12 @@ def check(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, list[str
 
 
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "config").iterdir()), ids=lambda path: path.name)
-def test_every_shipped_configuration_is_printed_unchanged(path: Path, capsys) -> None:
+def test_every_shipped_configuration_is_printed_unchanged(path, capsys):
     assert main(["config", "example", path.stem]) == 0
     assert capsys.readouterr().out == path.read_text(encoding="utf-8")
 
 
-def test_an_example_is_written_once_readable_for_the_services(tmp_path, capsys) -> None:
+def test_an_example_is_written_once_readable_for_the_services(tmp_path, capsys):
     path = tmp_path / "etc" / "vessel.toml"
     before = os.umask(0o077)
     try:
@@ -70,14 +68,14 @@ def test_an_example_is_written_once_readable_for_the_services(tmp_path, capsys) 
         ("sim", ["acoustic_channel"]),
     ],
 )
-def test_examples_are_valid_with_a_line_for_each_service(name, services, tmp_path, capsys) -> None:
+def test_examples_are_valid_with_a_line_for_each_service(name, services, tmp_path, capsys):
     status, out, _ = check(example(tmp_path, name), capsys)
     assert status == 0
     assert [line.partition(":")[0] for line in out[1:]] == [f"[{service}]" for service in services]
     assert re.search(r"valid, platform \S+, router tcp/127.0.0.1:7447$", out[0])
 
 
-def test_an_absent_serial_device_is_a_warning(tmp_path, capsys) -> None:
+def test_an_absent_serial_device_is_a_warning(tmp_path, capsys):
     path = example(tmp_path, "vessel")
     path.write_text(path.read_text().replace("/dev/ttyUSB0", str(tmp_path / "ttyUSB7")))
     line = path.read_text().splitlines().index(f'port = "{tmp_path}/ttyUSB7"') + 1
@@ -87,7 +85,7 @@ def test_an_absent_serial_device_is_a_warning(tmp_path, capsys) -> None:
     assert err[0].endswith("this one is absent now (warning)")
 
 
-def test_all_errors_of_all_tables_are_reported(tmp_path, capsys, monkeypatch) -> None:
+def test_all_errors_of_all_tables_are_reported(tmp_path, capsys, monkeypatch):
     path = tmp_path / "bad.toml"
     path.write_text(
         '[platform]\nid = "Vessel 1"\nnaem = 3\n[op_modem]\nport = "/dev/null"\naddress = 300\nframe_s = 3\n'
@@ -111,20 +109,20 @@ def test_all_errors_of_all_tables_are_reported(tmp_path, capsys, monkeypatch) ->
     }
 
 
-def without_key(path: Path) -> str:
+def without_key(path):
     (path.parent / "acoustic" / "acoustic.key").unlink()
     return f"platform.acoustic_key_file: {path.parent}/acoustic/acoustic.key: got 'No such file or directory'"
 
 
-def readable_key(path: Path) -> str:
+def readable_key(path):
     (path.parent / "acoustic" / "acoustic.key").chmod(0o644)
     return f"platform.acoustic_key_file: {path.parent}/acoustic/acoustic.key: got '0644', expected 0600"
 
 
-def with_change(old: str, new: str, expected: str) -> Callable[[Path], str]:
+def with_change(old, new, expected):
     """Return a defect: a replaced text, and the start of the error."""
 
-    def change(path: Path) -> str:
+    def change(path):
         path.write_text(path.read_text().replace(old, new))
         return expected
 
@@ -141,9 +139,7 @@ DEFECTS = {
         'model = "standard"', 'model = "small"', "compressor.model: got 'small', expected standard or structure"
     ),
     "unsupported_port": with_change(
-        '"/dev/ttyUSB0"',
-        '"carrier://pigeon"',
-        "uuv_modem.port: got 'carrier://pigeon 19200', expected a device path",
+        '"/dev/ttyUSB0"', '"carrier://pigeon"', "uuv_modem.port: got 'carrier://pigeon 19200', expected a device path"
     ),
     "no_certificate": with_change("tcp/127.0.0.1", "tls/127.0.0.1", "platform.tls: got 'nothing'"),
     "absent_certificate": with_change('id = "uuv-1"', f'id = "uuv-1"\n{TLS}', "platform.tls."),
@@ -151,7 +147,7 @@ DEFECTS = {
 
 
 @pytest.mark.parametrize("defect", DEFECTS.values(), ids=DEFECTS)
-def test_values_that_a_service_would_refuse_at_its_start_are_located(defect, tmp_path, capsys) -> None:
+def test_values_that_a_service_would_refuse_at_its_start_are_located(defect, tmp_path, capsys):
     path = example(tmp_path, "uuv")
     expected = defect(path)
     status, _, err = check(path, capsys)
@@ -160,7 +156,7 @@ def test_values_that_a_service_would_refuse_at_its_start_are_located(defect, tmp
     assert re.match(rf"{re.escape(str(path))}:\d+: {re.escape(expected)}", line), line
 
 
-def test_an_absent_codebook_is_an_error(tmp_path, capsys) -> None:
+def test_an_absent_codebook_is_an_error(tmp_path, capsys):
     path = example(tmp_path, "vessel")
     path.write_text(path.read_text().replace('"nominal-20"', f'"{tmp_path}/own.tiles"'))
     status, _, err = check(path, capsys)
@@ -168,7 +164,7 @@ def test_an_absent_codebook_is_an_error(tmp_path, capsys) -> None:
     assert any(line.startswith(f"{tmp_path}/own.tiles: ") for line in err)
 
 
-def test_a_console_without_its_extra_is_an_error(tmp_path, capsys, monkeypatch) -> None:
+def test_a_console_without_its_extra_is_an_error(tmp_path, capsys, monkeypatch):
     path = example(tmp_path, "shore")
     found = importlib.util.find_spec
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "uvicorn" else found(name))
@@ -178,7 +174,7 @@ def test_a_console_without_its_extra_is_an_error(tmp_path, capsys, monkeypatch) 
     assert err[0].startswith(f"{path}:{line}: console: got 'no web server installed', expected the extra console: pip")
 
 
-def test_an_invalid_file_of_survey_options_hides_no_other_error(tmp_path, capsys) -> None:
+def test_an_invalid_file_of_survey_options_hides_no_other_error(tmp_path, capsys):
     path = example(tmp_path, "uuv")
     text = path.read_text().replace("[atd_stub]", f'[atd_stub]\nsurvey_options = "{tmp_path}/absent.toml"')
     path.write_text(text.replace('codec = "emb"', "codec = 3"))
@@ -188,7 +184,7 @@ def test_an_invalid_file_of_survey_options_hides_no_other_error(tmp_path, capsys
     assert any("compressor.codec: got 3" in line for line in err)
 
 
-def test_certificates_of_a_fleet_are_valid(tmp_path, capsys) -> None:
+def test_certificates_of_a_fleet_are_valid(tmp_path, capsys):
     folder = Fleet.init(tmp_path / "pki", "test").issue("vessel-1", "vessel").folder
     path = example(tmp_path, "vessel")
     tls = f'tls = {{ ca = "{folder}/ca.pem", certificate = "{folder}/certificate.pem", key = "{folder}/key.pem" }}'
@@ -197,7 +193,7 @@ def test_certificates_of_a_fleet_are_valid(tmp_path, capsys) -> None:
     assert check(path, capsys)[0] == 0
 
 
-def test_a_file_without_a_service_and_an_unreadable_file_are_errors(tmp_path, capsys) -> None:
+def test_a_file_without_a_service_and_an_unreadable_file_are_errors(tmp_path, capsys):
     path = tmp_path / "empty.toml"
     path.write_text('[platform]\nid = "uuv-1"\n')
     assert "no table of a service" in check(path, capsys)[2][0]

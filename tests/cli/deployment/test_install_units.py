@@ -7,8 +7,6 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
-from pathlib import Path
 
 import pytest
 
@@ -23,7 +21,7 @@ SERVICES = {
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     """Return a root of a file system with an installed command."""
     command = tmp_path / "root" / "opt" / "sonarpost" / "bin" / "sonarpost"
     command.parent.mkdir(parents=True)
@@ -32,19 +30,19 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "root"
 
 
-def install(root: Path, platform: str, *options: str, executable: str = "/opt/sonarpost/bin/sonarpost") -> int:
+def install(root, platform, *options, executable="/opt/sonarpost/bin/sonarpost"):
     return main(["install-units", platform, "--root", str(root), "--executable", executable, *options])
 
 
-def units(root: Path) -> Path:
+def units(root):
     return root / "etc" / "systemd" / "system"
 
 
-def settings(path: Path, key: str) -> list[str]:
+def settings(path, key):
     return re.findall(rf"^{key}=(.*)$", path.read_text(), re.MULTILINE)
 
 
-def test_the_target_starts_the_router_and_the_services_of_the_platform(root: Path, capsys) -> None:
+def test_the_target_starts_the_router_and_the_services_of_the_platform(root, capsys):
     for platform in PLATFORMS:
         assert install(root, platform, "--force") == 0
         wanted = settings(units(root) / f"sonarpost-{platform}.target", "Wants")[0].split()
@@ -53,7 +51,7 @@ def test_the_target_starts_the_router_and_the_services_of_the_platform(root: Pat
         assert f"systemctl enable --now sonarpost-{platform}.target" in capsys.readouterr().out
 
 
-def test_the_tables_of_an_existing_configuration_select_the_services(root: Path) -> None:
+def test_the_tables_of_an_existing_configuration_select_the_services(root):
     (root / "etc" / "sonarpost").mkdir(parents=True)
     (root / "etc" / "sonarpost" / "vessel.toml").write_text('[platform]\nid = "v"\n[relay]\n[op_modem]\n')
     assert install(root, "vessel") == 0
@@ -62,7 +60,7 @@ def test_the_tables_of_an_existing_configuration_select_the_services(root: Path)
     assert not (units(root) / "sonarpost@decompressor.service.d").exists()
 
 
-def test_paths_and_user_are_in_the_units(root: Path, capsys) -> None:
+def test_paths_and_user_are_in_the_units(root, capsys):
     odd = root / "opt" / "a b%c$d" / "sonarpost"
     odd.parent.mkdir()
     shutil.copy(root / "opt" / "sonarpost" / "bin" / "sonarpost", odd)
@@ -80,14 +78,14 @@ def test_paths_and_user_are_in_the_units(root: Path, capsys) -> None:
             assert path.stat().st_mode & 0o777 == 0o644
 
 
-def test_a_second_installation_changes_nothing(root: Path, capsys) -> None:
+def test_a_second_installation_changes_nothing(root, capsys):
     install(root, "uuv")
     assert ": unchanged" not in capsys.readouterr().out
     assert install(root, "uuv") == 0
     assert ": written" not in capsys.readouterr().out
 
 
-def test_an_edited_file_is_kept_without_force(root: Path, capsys) -> None:
+def test_an_edited_file_is_kept_without_force(root, capsys):
     install(root, "uuv")
     template, router = units(root) / "sonarpost@.service", units(root) / "sonarpost-router.service"
     edited = template.read_text().replace("WatchdogSec=60", "WatchdogSec=90")
@@ -104,20 +102,20 @@ def test_an_edited_file_is_kept_without_force(root: Path, capsys) -> None:
     assert settings(template, "WatchdogSec") == ["60"]
 
 
-def test_an_unedited_file_of_another_version_is_replaced(root: Path) -> None:
+def test_an_unedited_file_of_another_version_is_replaced(root):
     install(root, "uuv")
     assert install(root, "uuv", "--user", "other") == 0
     assert settings(units(root) / "sonarpost@.service", "User") == ["other"]
 
 
-def test_units_of_another_platform_are_refused(root: Path, capsys) -> None:
+def test_units_of_another_platform_are_refused(root, capsys):
     install(root, "uuv")
     assert install(root, "vessel") == 2
     assert "got 'units of the platform uuv'" in capsys.readouterr().err
     assert not (units(root) / "sonarpost-vessel.target").exists()
 
 
-def test_dry_run_prints_the_files_and_writes_none(root: Path, capsys) -> None:
+def test_dry_run_prints_the_files_and_writes_none(root, capsys):
     assert install(root, "vessel", "--dry-run") == 0
     out = capsys.readouterr().out
     assert f"==> {units(root)}/sonarpost@.service\n" in out
@@ -137,15 +135,13 @@ def test_dry_run_prints_the_files_and_writes_none(root: Path, capsys) -> None:
         (["--executable", "/opt/absent"], "opt/absent', expected the path of the sonarpost command"),
     ],
 )
-def test_values_with_which_no_service_would_start_are_refused(
-    options: Sequence[str], message: str, root: Path, capsys
-) -> None:
+def test_values_with_which_no_service_would_start_are_refused(options, message, root, capsys):
     assert install(root, "vessel", *options) == 2
     assert message in capsys.readouterr().err
     assert not (root / "etc").exists()
 
 
-def test_the_running_command_is_the_default(root: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_the_running_command_is_the_default(root, monkeypatch, capsys):
     command = root / "opt" / "sonarpost" / "bin" / "sonarpost"
     monkeypatch.setattr(sys, "argv", [str(command)])
     monkeypatch.setattr(sys, "executable", "/usr/bin/python3")
@@ -161,7 +157,7 @@ needs_systemd = pytest.mark.skipif(
 )
 
 
-def analyze(root: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def analyze(root, *arguments):
     # The colon at the end adds systemd's own folders, for targets such as multi-user.target.
     environment = {**os.environ, "SYSTEMD_UNIT_PATH": f"{units(root)}:", "SYSTEMD_COLORS": "0"}
     return subprocess.run(
@@ -170,7 +166,7 @@ def analyze(root: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture
-def real_root(tmp_path: Path) -> Path:
+def real_root(tmp_path):
     """Return a root whose command exists outside of it, for systemd's check of ExecStart."""
     shutil.copy("/bin/true", tmp_path / "sonarpost")
     seen_in_root = tmp_path / "root" / (tmp_path / "sonarpost").relative_to("/")
@@ -181,7 +177,7 @@ def real_root(tmp_path: Path) -> Path:
 
 @needs_systemd
 @pytest.mark.parametrize("platform", PLATFORMS)
-def test_systemd_accepts_every_unit(platform: str, real_root: Path, tmp_path: Path) -> None:
+def test_systemd_accepts_every_unit(platform, real_root, tmp_path):
     assert install(real_root, platform, executable=str(tmp_path / "sonarpost")) == 0
     names = [f"sonarpost-{platform}.target", "sonarpost-router.service"]
     names += [f"sonarpost@{service}.service" for service in SERVICES[platform]]
@@ -190,7 +186,7 @@ def test_systemd_accepts_every_unit(platform: str, real_root: Path, tmp_path: Pa
 
 
 @needs_systemd
-def test_systemd_reports_an_unknown_key(real_root: Path, tmp_path: Path) -> None:
+def test_systemd_reports_an_unknown_key(real_root, tmp_path):
     """The check above would fail for a misspelled setting."""
     install(real_root, "shore", executable=str(tmp_path / "sonarpost"))
     path = units(real_root) / "sonarpost@.service"
@@ -200,7 +196,7 @@ def test_systemd_reports_an_unknown_key(real_root: Path, tmp_path: Path) -> None
 
 @needs_systemd
 @pytest.mark.parametrize("platform", PLATFORMS)
-def test_exposure_is_low(platform: str, real_root: Path, tmp_path: Path) -> None:
+def test_exposure_is_low(platform, real_root, tmp_path):
     install(real_root, platform, executable=str(tmp_path / "sonarpost"))
     for name in ("-router", *(f"@{service}" for service in SERVICES[platform])):
         result = analyze(real_root, "security", "--offline=true", "--threshold=30", f"sonarpost{name}.service")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
@@ -17,11 +17,11 @@ Emulate = Callable[..., list[str]]
 
 
 @pytest.fixture
-def emulate() -> Iterator[Emulate]:
+def emulate():
     """Start emulated modems with addresses 1, 2, … 300 m apart; return their URLs."""
     started: list[ChannelEmulator] = []
 
-    def start(count: int = 2, **settings: object) -> list[str]:
+    def start(count=2, **settings):
         modems = [{"address": number + 1, "east_m": 300.0 * number} for number in range(count)]
         values = {"modem": modems, "tcp_ports": (0,) * count, "time_scale": 20.0, **settings}
         emulator = ChannelEmulator(EmulatorConfig.model_validate(values))
@@ -35,11 +35,11 @@ def emulate() -> Iterator[Emulate]:
         emulator.stop()
 
 
-def ping(port: str, *options: str, destination: int = 2) -> int:
+def ping(port, *options, destination=2):
     return main(["modem", "ping", "--port", port, "--address", "1", "--destination", str(destination), *options])
 
 
-def test_the_travel_time_to_the_other_modem_is_printed(emulate: Emulate, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_travel_time_to_the_other_modem_is_printed(emulate, capsys):
     assert ping(emulate()[0], "--count", "2") == 0
     lines = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"modem ready: address 1, firmware (unknown|[\d.]+)", lines[0])
@@ -50,7 +50,7 @@ def test_the_travel_time_to_the_other_modem_is_printed(emulate: Emulate, capsys:
     assert lines[3] == "2 of 2 pings answered"
 
 
-def test_a_modem_that_does_not_answer_is_status_1(emulate: Emulate, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_modem_that_does_not_answer_is_status_1(emulate, capsys):
     assert ping(emulate()[0], "--count", "1", destination=9) == 1
     assert capsys.readouterr().out.splitlines()[1:] == [
         "ping 1: not answered (no answer from the far modem)",
@@ -58,25 +58,25 @@ def test_a_modem_that_does_not_answer_is_status_1(emulate: Emulate, capsys: pyte
     ]
 
 
-def test_a_silent_serial_line_is_status_2(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_silent_serial_line_is_status_2(capsys):
     with socket.create_server(("127.0.0.1", 0)) as server:  # accepts connections in its backlog, and sends nothing
         url = f"socket://127.0.0.1:{server.getsockname()[1]}"
         assert ping(url, "--wait", "2") == 2
     assert capsys.readouterr().err == f"sonarpost: {url}: the modem does not reply\n"
 
 
-def test_an_absent_port_is_status_2(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_absent_port_is_status_2(capsys):
     assert ping("/dev/absent", "--wait", "1") == 2
     assert "sonarpost: /dev/absent: " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("destination", [1, 128, -1])
-def test_an_invalid_destination_is_refused(destination: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_destination_is_refused(destination, capsys):
     assert ping("loop://", destination=destination) == 2
     assert f"--destination: got {destination}, expected 0..127, another one" in capsys.readouterr().err
 
 
-def test_a_ping_without_any_event_ends(monkeypatch: pytest.MonkeyPatch, emulate: Emulate, capsys) -> None:
+def test_a_ping_without_any_event_ends(monkeypatch, emulate, capsys):
     monkeypatch.setattr(modem_ping, "PING_TIMEOUT_S", 0.0)
     assert ping(emulate()[0], "--count", "1") == 1
     assert "ping 1: not answered (no end of the request)" in capsys.readouterr().out

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,7 +23,7 @@ from sonarpost.errors import ConfigError
 class RunAll:
     """A running `sonarpost run all` for one service, and its output."""
 
-    def __init__(self, folder: Path, endpoint: str) -> None:
+    def __init__(self, folder, endpoint):
         self.folder = folder
         self.config = folder / "vessel.toml"
         self.config.write_text(
@@ -31,7 +31,7 @@ class RunAll:
         )
         self.process: subprocess.Popen[bytes] | None = None
 
-    def start(self) -> subprocess.Popen[bytes]:
+    def start(self):
         command = [sys.executable, "-m", "sonarpost.cli.main", "run", "all", "--config", str(self.config)]
         environment = {**os.environ, "NOTIFY_SOCKET": "/nonexistent", "SONARPOST_HEARTBEAT": "/nonexistent/beat"}
         with (self.folder / "log").open("wb") as log:
@@ -39,13 +39,13 @@ class RunAll:
         return self.process
 
     @property
-    def log(self) -> str:
+    def log(self):
         return (self.folder / "log").read_text()
 
-    def wait_for(self, text: str, count: int = 1) -> None:
+    def wait_for(self, text, count=1):
         eventually(lambda: self.log.count(text) >= count, 120, f"{text!r} in {self.folder}/log")
 
-    def child(self, module: str) -> int:
+    def child(self, module):
         """Return the process identifier of a module."""
         assert self.process is not None
         children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
@@ -57,10 +57,10 @@ Start = Callable[[str], RunAll]
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Start]:
+def bench(tmp_path):
     made: list[RunAll] = []
 
-    def make(endpoint: str) -> RunAll:
+    def make(endpoint):
         made.append(RunAll(tmp_path, endpoint))
         return made[-1]
 
@@ -71,7 +71,7 @@ def bench(tmp_path: Path) -> Iterator[Start]:
             each.process.wait()
 
 
-def test_a_killed_service_is_restarted_and_ctrl_c_stops_all(bench: Start) -> None:
+def test_a_killed_service_is_restarted_and_ctrl_c_stops_all(bench):
     run = bench(f"tcp/127.0.0.1:{free_port()}")
     process = run.start()
     run.wait_for("Service started")
@@ -89,7 +89,7 @@ def test_a_killed_service_is_restarted_and_ctrl_c_stops_all(bench: Start) -> Non
     assert "Heartbeat not written" not in run.log
 
 
-def test_a_router_that_runs_already_is_used(bench: Start, router: str) -> None:
+def test_a_router_that_runs_already_is_used(bench, router):
     run = bench(router)
     process = run.start()
     run.wait_for("Service started")
@@ -99,7 +99,7 @@ def test_a_router_that_runs_already_is_used(bench: Start, router: str) -> None:
     assert run.log.startswith(f"router | not started: {router} has a router already, or is on another host\n")
 
 
-def test_status_2_of_a_service_stops_all_with_status_2(bench: Start) -> None:
+def test_status_2_of_a_service_stops_all_with_status_2(bench):
     run = bench(f"tcp/127.0.0.1:{free_port()}")
     (run.folder / "state").mkdir()
     (run.folder / "state" / "relay.db").write_bytes(b"no database" * 1000)
@@ -109,7 +109,7 @@ def test_status_2_of_a_service_stops_all_with_status_2(bench: Start) -> None:
     assert run.log.rstrip().endswith("Router stopped")
 
 
-def test_an_invalid_configuration_starts_nothing(bench: Start, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_configuration_starts_nothing(bench, capsys):
     run = bench(f"tcp/127.0.0.1:{free_port()}")
     run.config.write_text(run.config.read_text() + "x = 1\n[op_modem]\naddress = 300\n")
     assert main(["run", "all", "--config", str(run.config)]) == 2
@@ -122,7 +122,7 @@ def test_an_invalid_configuration_starts_nothing(bench: Start, capsys: pytest.Ca
     assert captured.out == ""
 
 
-def test_options_of_all_are_refused_for_one_service(capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_of_all_are_refused_for_one_service(capsys):
     assert main(["run", "relay", "--config", "x.toml", "--listen", "tcp/0.0.0.0:7448"]) == 2
     assert "got 'relay', expected the service all" in capsys.readouterr().err
 
@@ -130,11 +130,11 @@ def test_options_of_all_are_refused_for_one_service(capsys: pytest.CaptureFixtur
 # The router
 
 
-def platform(*router: str, upstream: tuple[str, ...] = ()) -> PlatformConfig:
+def platform(*router, upstream=()):
     return PlatformConfig(id="vessel-1", router=router, upstream=upstream)
 
 
-def test_the_router_listens_on_the_endpoints_of_this_host_and_connects_upstream() -> None:
+def test_the_router_listens_on_the_endpoints_of_this_host_and_connects_upstream():
     here = f"tcp/127.0.0.1:{free_port()}"
     assert router_module(platform(here, "tcp/192.0.2.1:7447"), None, []) == ["sonarpost.bus.router", "--listen", here]
     assert router_module(platform(here, upstream=("tcp/192.0.2.9:7448",)), None, ["tcp/0.0.0.0:7448"]) == [
@@ -143,15 +143,15 @@ def test_the_router_listens_on_the_endpoints_of_this_host_and_connects_upstream(
     ]
     assert router_module(platform(here), Path("r.json5"), []) == ["sonarpost.bus.router", "--config", "r.json5"]
     assert router_module(platform(here), Path("r.json5"), ["tcp/0.0.0.0:7448"]) == [
-        *("sonarpost.bus.router", "--config", "r.json5", "--listen", here, "tcp/0.0.0.0:7448"),
+        *("sonarpost.bus.router", "--config", "r.json5", "--listen", here, "tcp/0.0.0.0:7448")
     ]
 
 
-def test_no_router_is_started_for_an_endpoint_of_another_host() -> None:
+def test_no_router_is_started_for_an_endpoint_of_another_host():
     assert router_module(platform("tcp/192.0.2.1:7447"), None, []) is None
 
 
-def test_a_router_with_certificates_needs_a_file() -> None:
+def test_a_router_with_certificates_needs_a_file():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with pytest.raises(ConfigError, match="--router-config FILE"):
         router_module(platform(endpoint, upstream=("tls/192.0.2.9:7448",)), None, [])
@@ -161,16 +161,14 @@ def test_a_router_with_certificates_needs_a_file() -> None:
 
 
 @pytest.fixture
-def ending_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def ending_module(tmp_path, monkeypatch):
     """Return a module that ends at once with status 1."""
     (tmp_path / "ends_at_once.py").write_text("import sys\nprint('begun')\nsys.exit(1)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     return "ends_at_once"
 
 
-def test_the_wait_before_a_restart_doubles(
-    ending_module: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_wait_before_a_restart_doubles(ending_module, monkeypatch, capsys):
     monkeypatch.setattr(run_all, "FIRST_RESTART_S", 0.01)
     monkeypatch.setattr(run_all, "LAST_RESTART_S", 0.04)
     stop = threading.Event()
@@ -178,7 +176,7 @@ def test_the_wait_before_a_restart_doubles(
     waits: list[float] = []
     schedule = supervisor._schedule_restart
 
-    def count_restart(name: str, status: int, now_s: float) -> None:
+    def count_restart(name, status, now_s):
         schedule(name, status, now_s)
         waits.append(supervisor._restart_at_s[name] - now_s)
         if len(waits) == 4:
@@ -192,7 +190,7 @@ def test_the_wait_before_a_restart_doubles(
     assert "ends | begun" in capsys.readouterr().out
 
 
-def test_a_process_that_was_stable_is_restarted_soon(ending_module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_was_stable_is_restarted_soon(ending_module, monkeypatch):
     supervisor = Supervisor(threading.Event(), width=4)
     supervisor.start("ends", [ending_module])
     supervisor.stop()
