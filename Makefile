@@ -1,4 +1,4 @@
-# sonarpost: `make demo` runs the whole chain, `make test` the whole test suite. Both install what they need.
+# sonarpost: `make demo` runs the whole chain, `make test` the quick tests. Both install what they need.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
