@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import reedsolo
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
@@ -36,7 +36,6 @@ def test_recovery_equals_reedsolo(count: int) -> None:
     assert bytes(message) == fec.recover(count, keep, symbols[keep]).tobytes() == source.tobytes()
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_any_k_symbols_recover_the_source(data: st.DataObject) -> None:
     count = data.draw(st.integers(1, 60))

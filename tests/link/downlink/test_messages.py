@@ -116,7 +116,7 @@ def test_command_round_trip_in_32_bytes(command: dl.DownlinkCommand) -> None:
     assert dl.unpack(segment.data[1:]) == command
 
 
-@given(st.text(max_size=60), st.integers(14, 60))
+@given(st.text("aZ0 \0é\u0663€\U0001f600", max_size=60), st.integers(14, 60))
 def test_class_is_cut_between_characters(text: str, room_bytes: int) -> None:
     packed = dl.pack(dl.DecisionMessage(1, 2, 3, 1, "unsure", None, text), room_bytes)
     found = dl.unpack(packed)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from builders.link_state import group, with_fields
 from builders.v1_world import queue_config, take_packet
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import ConfigError
@@ -227,7 +227,6 @@ def copy_of(queue: TransmitQueue, protection=None) -> TransmitQueue:
     return again
 
 
-@settings(max_examples=25)
 @given(st.data())
 def test_restored_queue_sends_the_same(data):
     queue = filled(TransmitQueue(queue_config(rates=(0, 1), first_rate=1)), data.draw(st.integers(0, 30)))
@@ -246,15 +245,15 @@ def test_restored_queue_sends_the_same(data):
 
 def test_a_packet_changes_few_small_parts():
     queue = filled(TransmitQueue(queue_config()), 30)
-    for n in range(300):
+    for n in range(100):
         queue.add_message(f"m{n}", "s", b"%3d" % n * 10, 0.0, lifetime_s=1e5)
     take_packet(queue, 0.0)
     saved = SavedParts(queue.parts())
-    for now in range(7, 700, 7):
+    for now in range(7, 140, 7):
         queue.next_packet(float(now))
         changes = saved.changes(queue.parts())
         assert {"queue", "sender", "packet"} <= changes.keys()
-        assert sum(len(name) + len(data or b"") for name, data in changes.items()) < 8_000
+        assert sum(len(name) + len(data or b"") for name, data in changes.items()) < 4_000
         saved.commit(queue.parts())
         queue.sent(queue.in_flight.frames, 6.1)
 
@@ -301,16 +300,6 @@ def test_foreign_parts_are_reported_and_nothing_is_restored():
     assert again.next_packet(0.0) is None
 
 
-def test_images_are_sent_again_when_their_progress_is_unknown():
-    queue = filled(TransmitQueue(queue_config(expected_loss=0.0)), 5)
-    take_packet(queue, 0.0)
-    parts = {name: data for name, data in queue.parts().items() if name.startswith(("image/", "message"))}
-    again = TransmitQueue(queue_config(expected_loss=0.0), first_block=20)
-    assert again.restore(parts) == {}
-    events, _ = run(again, 600.0)
-    assert {e.image_id for e in events if isinstance(e, ImageUpdate)} == {image_of_number(n) for n in range(1, 6)}
-
-
 def test_rate_that_is_not_configured_any_more_is_replaced():
     queue = filled(TransmitQueue(queue_config(rates=(5,), first_rate=5)), 5)
     take_packet(queue, 0.0)
@@ -336,9 +325,6 @@ def test_rate_that_is_not_configured_any_more_is_replaced():
 def test_error_names_the_invalid_value(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         queue_config(**wrong)
-
-
-def test_error_names_an_unknown_rate():
     with pytest.raises(ConfigError, match="rate"):
         TransmitQueue(queue_config(rates=(1,), first_rate=4))
 

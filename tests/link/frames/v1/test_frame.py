@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
@@ -31,7 +31,6 @@ def symbols(draw: st.DrawFn) -> Symbol:
     return Symbol(kind, draw(st.integers(0, 31)), draw(st.integers(0, 254)), parameter, data)
 
 
-@settings(max_examples=150, deadline=None)
 @given(symbols())
 def test_symbol_round_trip(symbol: Symbol) -> None:
     frame = pack_symbol(symbol)
@@ -39,7 +38,6 @@ def test_symbol_round_trip(symbol: Symbol) -> None:
     assert parse_frame(frame) == symbol
 
 
-@settings(max_examples=150, deadline=None)
 @given(symbols(), st.sampled_from([n for n in PADDED_LENGTHS if n >= 32]), st.integers(0, 300))
 def test_padding_is_detected_after_any_symbol(symbol: Symbol, length: int, padding: int) -> None:
     data = symbol.data.ljust(length - 5, b"\0")[: length - 5]
@@ -59,7 +57,6 @@ def test_segments_share_a_frame_and_32_bytes_hold_a_contact() -> None:
     assert parse_frame(pack_segments(listed, 64) + bytes(100)) == listed
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     st.lists(
         st.builds(Segment, st.sampled_from([1, 3, 4, 5, 6, 17, 31]), st.binary(max_size=30)), min_size=1, max_size=6
@@ -69,7 +66,6 @@ def test_segments_round_trip(listed: list[Segment]) -> None:
     assert parse_frame(pack_segments(listed, 256)) == tuple(listed)
 
 
-@settings(max_examples=100, deadline=None)
 @given(symbols(), st.data())
 def test_burst_of_up_to_16_wrong_bits_is_detected(symbol: Symbol, data: st.DataObject) -> None:
     frame = bytearray(pack_symbol(symbol))

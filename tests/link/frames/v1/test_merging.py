@@ -8,7 +8,7 @@ from itertools import product
 import pytest
 from builders.authentication_world import VEHICLE, vehicle_authenticator, vessel_authenticator
 from builders.v1_world import contact, stream
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.link.auth.authentication import WINDOW
@@ -64,7 +64,6 @@ def messages(events: Sequence[Event]) -> list[bytes]:
     return [event.data for event in events if isinstance(event, MessageReceived)]
 
 
-@settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_any_split_gives_what_one_vessel_receives_from_all(data: st.DataObject) -> None:
     frames = FRAMES[data.draw(st.sampled_from(sorted(FRAMES)))]

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
@@ -31,7 +31,6 @@ from sonarpost.link.frames.v1.payload_objects import (
 CONTACT = ContactSummary(lat_deg=44.7, lon_deg=-63.6, confidence=1.0).rounded()
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.integers(1, 65535), st.binary(max_size=60), st.integers(29, 100))
 def test_preview_round_trip(number: int, stream: bytes, entry_bytes: int) -> None:
     room = entry_bytes - 29
@@ -73,7 +72,6 @@ pieces = st.lists(
 )
 
 
-@settings(max_examples=150, deadline=None)
 @given(pieces, st.booleans(), st.integers(0, 50), st.data())
 def test_pieces_and_the_layer_above_round_trip(
     listed: list[StreamPiece], final: bool, spare: int, data: st.DataObject
@@ -137,7 +135,6 @@ def layerings(draw: st.DrawFn) -> Layering:
     return Layering(draw(st.integers(4, 60)), step, tuple(b - a for a, b in pairwise(edges)))
 
 
-@settings(max_examples=80, deadline=None)
 @given(layerings(), st.integers(16, 80), st.randoms(use_true_random=False))
 def test_each_layer_is_recovered_from_its_required_symbols(
     layering: Layering, symbol_bytes: int, random: np.random.Generator
