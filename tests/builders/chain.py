@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +15,10 @@ import numpy.typing as npt
 import pytest
 
 from builders.history import History
+from builders.progress import wait_while_progressing
 from sonarpost import keys
 from sonarpost.cli.demo.chain import Chain
-from sonarpost.cli.demo.outcome import ImageFile, Outcome, evaluate, read_images
+from sonarpost.cli.demo.outcome import ImageFile, Outcome, evaluate, last_versions, read_images
 from sonarpost.cli.demo.settings import VESSEL, ChainSettings, free_ports
 from sonarpost.cli.demo.watch import Watcher
 from sonarpost.link.frames.paper.frame import parse_frame
@@ -37,12 +40,7 @@ def snippet(number: int) -> npt.NDArray[np.uint8]:
 
 def latest_versions(folder: Path) -> list[ImageFile]:
     """Return the last version of each image of a folder, an image that has two sets of files twice."""
-    latest: dict[str, ImageFile] = {}
-    for name, image in read_images(folder).items():
-        base, _, version = name.rpartition("_v")
-        if base not in latest or int(version) > int(latest[base].name.rpartition("_v")[2]):
-            latest[base] = image
-    return list(latest.values())
+    return last_versions(read_images(folder))
 
 
 class VesselWatcher(Watcher):
@@ -116,19 +114,26 @@ class RunningChain:
         """Return the outcome so far."""
         return evaluate(self.settings, self.watcher.snippets, self.watcher.contact_of_image, 0.0)
 
-    def until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-        """Wait for `condition()`; after `timeout_s` fail with what keeps the chain busy."""
-        deadline = time.monotonic() + timeout_s
-        while not condition():
-            if time.monotonic() > deadline:
-                pytest.fail(f"{what}: not within {timeout_s} s; busy: {self.busy()}")
-            time.sleep(0.05)
+    def until(self, condition: Callable[[], bool], what: str) -> None:
+        """Wait for `condition()`; fail with what keeps the chain busy when no record and no counter changes."""
+        wait_while_progressing(condition, self._progress, what, lambda: f"busy: {self.busy()}")
+
+    def _progress(self) -> object:
+        watcher = self.watcher
+        counters = [sum(report.counters.values()) for report in list(watcher.health.values())]
+        return watcher.changes, len(watcher.images_received), counters
+
+    def terminate(self, name: str) -> int | None:
+        """End a process (SIGTERM); return its exit status."""
+        os.kill(self.chain.pid(name), signal.SIGTERM)
+        self.until(lambda: self.chain.status(name) is not None, f"end of {name}")
+        return self.chain.status(name)
 
     def busy(self) -> str:
         """Return what keeps the chain busy, an empty text if nothing does."""
-        return self.watcher.busy(0, time.time() - 3.0)
+        return self.watcher.busy(0, time.time() - 30.0)
 
-    def until_idle(self, timeout_s: float = 60.0) -> None:
+    def until_idle(self) -> None:
         """Wait until the chain has been idle for longer than a packet, by reports made after it became idle."""
         idle_since_utc_s = 0.0
 
@@ -140,10 +145,7 @@ class RunningChain:
             idle_since_utc_s = idle_since_utc_s or time.time()
             return time.time() - idle_since_utc_s > 1.5 and not self.watcher.busy(0, idle_since_utc_s)
 
-        self.until(quiet, timeout_s, "chain idle")
-
-
-ChainMaker = Callable[..., "contextmanager[RunningChain]"]
+        self.until(quiet, "chain idle")
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ import selectors
 import socket
 import struct
 import threading
-import time
 from collections.abc import Callable
 
 CHUNK_BYTES = 4096
@@ -22,6 +21,10 @@ class FaultyLink:
     - `stall` is a black hole: no data passes, without an error. Data in transit arrives after `mend`, as TCP
       retransmits it, unless an end has closed the connection.
 
+    Attributes:
+        attempts: Connections that were opened or refused so far.
+        passed_bytes: Bytes that each direction has forwarded.
+
     Args:
         target_port: Port of the target.
         bytes_per_s: Bandwidth of each direction; None for no limit.
@@ -29,10 +32,7 @@ class FaultyLink:
     """
 
     def __init__(
-        self,
-        target_port: int,
-        bytes_per_s: float | None = None,
-        on_fault: Callable[[str], None] = lambda _: None,
+        self, target_port: int, bytes_per_s: float | None = None, on_fault: Callable[[str], None] = lambda _: None
     ) -> None:
         self._on_fault = on_fault
         self._target_port = target_port
@@ -44,6 +44,7 @@ class FaultyLink:
         self._stalled = {"up": threading.Event(), "down": threading.Event()}
         self._sockets: set[socket.socket] = set()
         self._lock = threading.Lock()
+        self.attempts = 0
         self.passed_bytes = {"up": 0, "down": 0}
         threading.Thread(target=self._accept, daemon=True).start()
 
@@ -91,6 +92,7 @@ class FaultyLink:
                 near, _ = self._listener.accept()
             except OSError:
                 return
+            self.attempts += 1
             try:
                 if self._refusing.is_set():
                     raise ConnectionRefusedError
@@ -127,13 +129,13 @@ class FaultyLink:
                         continue
                     data = source.recv(CHUNK_BYTES)
                     while self._stalled[direction].is_set() and not self._closing.is_set():
-                        time.sleep(POLL_S)
+                        self._closing.wait(POLL_S)
                     if not data:
                         break
                     target.sendall(data)
                     self.passed_bytes[direction] += len(data)
                     if self._bytes_per_s is not None:
-                        time.sleep(len(data) / self._bytes_per_s)
+                        self._closing.wait(len(data) / self._bytes_per_s)
             except OSError:
                 pass  # one end is closed; the other one is closed below
         for end in (source, target):

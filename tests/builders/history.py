@@ -28,7 +28,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 Kind = Literal["consumer", "queued", "acknowledged", "accepted", "handled", "seen", "fault"]
 SHOWN = 5
@@ -92,23 +92,11 @@ class History:
         self._lock = threading.Lock()
         self._start_s = time.monotonic()
 
-    def add(
-        self,
-        operation: Kind,
-        process: str,
-        record: str = "",
-        *,
-        key: str = "",
-        sha256: str = "",
-        count: int = 1,
-        ordered: bool = False,
-        delivery: Literal["once", "any"] = "once",
-        detail: str = "",
-    ) -> None:
+    def add(self, operation: Kind, process: str, record: str = "", **fields: Any) -> None:
         """Append an operation; the parameters are the attributes of `Operation`."""
         with self._lock:
             at_s = round(time.monotonic() - self._start_s, 3)
-            done = Operation(operation, process, at_s, key, record, sha256, count, ordered, delivery, detail)
+            done = Operation(operation, process, at_s, record=record, **fields)
             self._operations.append(done)
             if not self._file.closed:
                 self._file.write(done.as_json() + "\n")

@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Literal
 
-import pytest
 import zenoh
 
 from builders.common import REPOSITORY, free_port
@@ -28,6 +27,7 @@ from builders.faulty_link import FaultyLink
 from builders.history import History
 from builders.image_archive import ArchiveLog, name_of, side_cars
 from builders.image_source import VESSEL, ImageSource
+from builders.progress import wait_while_progressing
 from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig
@@ -224,7 +224,7 @@ class VesselAndShore:
                 process.terminate()
         for process in self._processes.values():
             try:
-                process.wait(timeout=20)
+                process.wait(timeout=60)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
@@ -246,6 +246,15 @@ class VesselAndShore:
         image = wire.decode(ReconstructedImage, sample.payload.to_bytes(), str(sample.key_expr))
         self._log("seen", "subscriber", image)
 
+    def wait_for_state(self, service: str, state: str, detail: str = "") -> None:
+        """Wait until relay or c2 reports a state, and a detail that contains a pattern; needs `watch_health`."""
+
+        def reports() -> bool:
+            health = self.health.get(service)
+            return health is not None and health.state == state and re.search(detail, health.detail) is not None
+
+        self.wait_until(reports, f"{service} reports {state} {detail}")
+
     def watch_health(self) -> None:
         """Subscribe to the health of relay and c2, each at its own router."""
         for router in ("router-vessel", "router-shore"):
@@ -258,13 +267,14 @@ class VesselAndShore:
         health = wire.decode(Health, sample.payload.to_bytes(), str(sample.key_expr))
         self.health[health.service] = health
 
-    def wait_until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-        """Wait for a condition; fail with the state of all processes after the time-out."""
-        deadline = time.monotonic() + timeout_s
-        while not condition():
-            if time.monotonic() > deadline:
-                pytest.fail(f"{what}: not within {timeout_s} s; {self.describe()}")
-            time.sleep(0.02)
+    def wait_until(self, condition: Callable[[], bool], what: str) -> None:
+        """Wait for a condition; fail with the state of all processes when no count changes."""
+        wait_while_progressing(condition, self._progress, what, self.describe)
+
+    def _progress(self) -> object:
+        stores = [self.depths(service) for service in ("relay", "c2")]
+        outbox = self._source.store.outbox_depth() if self._source else 0
+        return stores, self.accepted_count("c2"), outbox, self.shore_image_count()
 
     def describe(self) -> str:
         """Return the state of all processes as text."""
@@ -276,8 +286,7 @@ class VesselAndShore:
 
     def log_tail(self, name: str, lines: int = 6) -> str:
         """Return the last lines of a process's log."""
-        path = self.folder / f"{name}.log"
-        return "\n".join(path.read_text(errors="replace").splitlines()[-lines:]) if path.is_file() else ""
+        return "\n".join(self.log_text(name).splitlines()[-lines:]) if name in self._processes else ""
 
     def log_text(self, name: str) -> str:
         """Return the log of a process."""
@@ -318,9 +327,9 @@ class VesselAndShore:
             and all(self.depths(s)[t] == 0 for s in ("relay", "c2") for t in ("inbox", "outbox"))
         )
 
-    def assert_all_delivered_once(self, timeout_s: float = 120.0) -> None:
+    def assert_all_delivered_once(self) -> None:
         """Wait until all images are delivered, then let the checker of the operation log decide."""
-        self.wait_until(self.is_complete, timeout_s, "all images at the shore")
+        self.wait_until(self.is_complete, "all images at the shore")
         assert self.depths("c2")["refused"] == self.depths("relay")["refused"] == 0
         self._archive_log.update()
         accepted = self.accepted_count("c2")

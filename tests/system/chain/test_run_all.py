@@ -3,20 +3,17 @@
 The user has no home folder and cannot write the installation, as a system user of a host.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from builders.chain import snippet
 from builders.common import eventually, free_port
-from builders.installation import NOBODY, Installation, installation
+from builders.installation import NOBODY, installation
 
 from sonarpost.cli.demo.outcome import read_images
 from sonarpost.security.acoustic_key import create_key
@@ -34,10 +31,10 @@ PLATFORMS = ("uuv", "vessel", "shore")
 class Bench:
     """Three platforms on one host, each with the shipped configuration in a folder instead of /var/lib/sonarpost."""
 
-    def __init__(self, folder: Path, installed: Installation) -> None:
+    def __init__(self, folder, installed):
         self.folder = folder
         self._installed = installed
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.processes = {}
         for name in PLATFORMS:
             home = folder / name
             home.mkdir()
@@ -54,7 +51,7 @@ class Bench:
             for path in (folder, *folder.rglob("*")):
                 os.chown(path, NOBODY, NOBODY)
 
-    def start(self, name: str, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
+    def start(self, name, *arguments, **environment):
         """Start a sonarpost command as the user without a home; its output goes to NAME.log."""
         with (self.folder / f"{name}.log").open("wb") as log:
             process = subprocess.Popen(
@@ -67,20 +64,20 @@ class Bench:
         self.processes[name] = process
         return process
 
-    def log(self, name: str) -> str:
+    def log(self, name):
         return (self.folder / f"{name}.log").read_text(errors="replace")
 
-    def run_all(self, name: str, **environment: str) -> None:
+    def run_all(self, name, **environment):
         config = str(self.folder / name / "platform.toml")
         self.start(name, "run", "all", "--config", config, SONARPOST_CONSOLE__PORT="0", **environment)
 
-    def children(self, name: str) -> list[int]:
+    def children(self, name):
         pid = self.processes[name].pid
         return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 @pytest.fixture
-def bench(tmp_path: Path, installation: Installation) -> Iterator[Bench]:
+def bench(tmp_path, installation):
     tmp_path.chmod(0o755)
     folder = tmp_path / "bench"
     folder.mkdir()
@@ -93,25 +90,19 @@ def bench(tmp_path: Path, installation: Installation) -> Iterator[Bench]:
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 @pytest.mark.timeout(900)  # compiles the codec for encoder and decoder
-def test_contacts_reach_the_shore_site_from_the_shipped_configurations(bench: Bench) -> None:
+def test_contacts_reach_the_shore_site_from_the_shipped_configurations(bench):
     emulator = bench.start("modems", "modem-emulator", "--modems", "2", "--tcp", "--time-scale", str(TIME_SCALE))
-    eventually(lambda: bench.log("modems").count("\n") >= 1, 120, "the emulated modems")
+    eventually(lambda: bench.log("modems").count("\n") >= 1, what="the emulated modems")
     first, second = (modem["device"] for modem in json.loads(bench.log("modems").splitlines()[0])["modems"])
     ports = [free_port() for _ in range(3)]
     uuv, vessel, shore = (f'["tcp/127.0.0.1:{port}"]' for port in ports)
 
     bench.run_all("shore", SONARPOST_PLATFORM__ROUTER=shore)
     bench.run_all(
-        "vessel",
-        SONARPOST_PLATFORM__ROUTER=vessel,
-        SONARPOST_PLATFORM__UPSTREAM=shore,
-        SONARPOST_OP_MODEM__PORT=second,
+        "vessel", SONARPOST_PLATFORM__ROUTER=vessel, SONARPOST_PLATFORM__UPSTREAM=shore, SONARPOST_OP_MODEM__PORT=second
     )
     bench.run_all(
-        "uuv",
-        SONARPOST_PLATFORM__ROUTER=uuv,
-        SONARPOST_UUV_MODEM__PORT=first,
-        SONARPOST_ATD_STUB__MODE="snippets",
+        "uuv", SONARPOST_PLATFORM__ROUTER=uuv, SONARPOST_UUV_MODEM__PORT=first, SONARPOST_ATD_STUB__MODE="snippets"
     )
     for number in range(IMAGES):
         hidden = bench.folder / "uuv" / "incoming" / f".{number}.png"
@@ -120,7 +111,7 @@ def test_contacts_reach_the_shore_site_from_the_shipped_configurations(bench: Be
 
     pictures = bench.folder / "shore" / "pictures" / "vessel-1"
 
-    def complete() -> int:
+    def complete():
         return len({image.image_id for image in read_images(pictures).values() if image.complete})
 
     eventually(lambda: complete() == IMAGES, 600, f"complete images at the shore site; see {bench.folder}")
@@ -137,7 +128,7 @@ def test_contacts_reach_the_shore_site_from_the_shipped_configurations(bench: Be
     for name in PLATFORMS:
         bench.processes[name].send_signal(signal.SIGINT)
     for name in PLATFORMS:
-        assert bench.processes[name].wait(60) == 0, bench.log(name)[-2000:]
+        assert bench.processes[name].wait(120) == 0, bench.log(name)[-2000:]
         # The services stop before the router.
         assert bench.log(name).rstrip().splitlines()[-1].endswith("Router stopped")
     assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]

@@ -1,16 +1,13 @@
 """Clock jumps, and a vessel whose disk is replaced."""
 
-from __future__ import annotations
-
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from builders.common import REPOSITORY
 from builders.image_source import make_image
-from builders.vessel_and_shore import PROCESSES, VesselAndShore
+from builders.vessel_and_shore import PROCESSES
 
 COUNT = 200
 DAY_S = 86400.0
@@ -19,19 +16,19 @@ DAY_S = 86400.0
 class Clock:
     """Clock of several processes; `jump` sets it while they run."""
 
-    def __init__(self, file: Path, text: Callable[[float], str]) -> None:
+    def __init__(self, file, text):
         self._file = file
         self._text = text
         self.jump(0.0)
 
-    def jump(self, offset_s: float) -> None:
+    def jump(self, offset_s):
         """Set the offset from the true time."""
         temporary = self._file.with_suffix(".new")
         temporary.write_text(self._text(offset_s))
         temporary.replace(self._file)
 
 
-def libfaketime() -> str:
+def libfaketime():
     """Return the path of the library, or skip."""
     for folder in ("x86_64-linux-gnu", "aarch64-linux-gnu"):
         path = Path(f"/usr/lib/{folder}/faketime/libfaketime.so.1")
@@ -40,10 +37,8 @@ def libfaketime() -> str:
     pytest.skip("libfaketime is not installed (Debian package faketime)")
 
 
-@pytest.fixture(params=["python", pytest.param("libfaketime", marks=pytest.mark.system)])
-def system_with_clocks(
-    request: pytest.FixtureRequest, tmp_path: Path, start_system: Callable[..., VesselAndShore]
-) -> tuple[VesselAndShore, dict[str, Clock]]:
+@pytest.fixture(params=["python", "libfaketime"])
+def system_with_clocks(request, tmp_path, start_system):
     """A system with clocks of vessel and shore: of relay and c2 in Python, or of all four processes in libc."""
     clocks = {side: tmp_path / f"clock-{side}" for side in ("vessel", "shore")}
     if request.param == "python":
@@ -69,23 +64,22 @@ def system_with_clocks(
     return start_system(environment=environment), made
 
 
-def test_clock_jumps_lose_and_duplicate_nothing(system_with_clocks: tuple[VesselAndShore, dict[str, Clock]]) -> None:
+def test_clock_jumps_lose_and_duplicate_nothing(system_with_clocks):
     system, clocks = system_with_clocks
     system.watch_health()
     jumps = [("vessel", 30 * DAY_S), ("shore", -365 * DAY_S), ("vessel", -2 * DAY_S), ("shore", 3600.0)]
     for part, (side, offset_s) in enumerate(jumps):
         first = 50 * part
         system.send([make_image(n) for n in range(first, first + 50)])
-        system.wait_until(lambda first=first: system.shore_image_count() > first, 60, "some images at the shore")
+        system.wait_until(lambda first=first: system.shore_image_count() > first, "some images at the shore")
         clocks[side].jump(offset_s)
         system.history.fault(f"clock of {side}", f"{offset_s:+.0f} s")
         service = "relay" if side == "vessel" else "c2"
         expected_utc_s = time.time() + offset_s
         system.wait_until(
             lambda service=service, expected=expected_utc_s: (
-                service in system.health and abs(system.health[service].time_utc_s - expected) < 120
+                service in system.health and abs(system.health[service].time_utc_s - expected) < 1800
             ),
-            30,
             f"{service} reports the new time",
         )
         if part == 1:
@@ -96,7 +90,7 @@ def test_clock_jumps_lose_and_duplicate_nothing(system_with_clocks: tuple[Vessel
     system.assert_all_delivered_once()
 
 
-def test_vessel_with_a_new_disk_is_accepted_without_duplicates(system: VesselAndShore) -> None:
+def test_vessel_with_a_new_disk_is_accepted_without_duplicates(system):
     old = [make_image(n) for n in range(COUNT)]
     system.send(old)
     system.assert_all_delivered_once()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import time
 from collections.abc import Collection, Mapping, Sequence
@@ -56,13 +55,6 @@ class Processes:
         """End a process at once (SIGKILL), as a power cut would."""
         self._processes[name].kill()
         self._processes[name].wait()
-
-    def terminate(self, name: str) -> float:
-        """Stop a process (SIGTERM); return the seconds it took."""
-        started = time.monotonic()
-        self._processes[name].send_signal(signal.SIGTERM)
-        self._processes[name].wait(timeout=STOP_S)
-        return time.monotonic() - started
 
     def status(self, name: str) -> int | None:
         """Return the exit status of a process, None while it runs."""
