@@ -13,24 +13,11 @@ from dataclasses import dataclass, field
 import pytest
 
 from builders.common import REPOSITORY
+from sonarpost.cli.demo.settings import PLATFORM_OF
 
 PROFILES = ("sim", "uuv", "vessel", "shore")
-SERVICES = (
-    "atd_stub",
-    "compressor",
-    "uuv_modem",
-    "acoustic_channel",
-    "op_modem",
-    "decompressor",
-    "relay",
-    "c2",
-    "console",
-    "console-shore",
-    "router-uuv",
-    "router-vessel",
-    "router-shore",
-    "router-sim",
-)
+ROUTERS = ("router-uuv", "router-vessel", "router-shore", "router-sim")
+SERVICES = (*PLATFORM_OF, "console", "console-shore", *ROUTERS)
 # Prints {file name: SHA-256} of the pictures under a folder, each in its latest version, and how many are complete.
 # Earlier versions need not be ashore: a newer one may take their place on the way. A picture's JSON is written last:
 # where it is, the files are whole.
@@ -110,16 +97,9 @@ class Project:
 
     def container(self, service: str) -> str:
         """Return the identifier of a service's container."""
-        found = docker(
-            "ps",
-            "-aq",
-            "--filter",
-            f"label=com.docker.compose.project={self.name}",
-            "--filter",
-            f"label=com.docker.compose.service={service}",
-            "--filter",
-            "label=com.docker.compose.oneoff=False",
-        ).split()
+        labels = (f"project={self.name}", f"service={service}", "oneoff=False")
+        filters = [option for label in labels for option in ("--filter", f"label=com.docker.compose.{label}")]
+        found = docker("ps", "-aq", *filters).split()
         assert len(found) == 1, (service, found)
         return found[0]
 
@@ -178,19 +158,19 @@ class Project:
             docker("run", "--rm", "-v", mount, self.environment["SONARPOST_IMAGE"], "python", "-c", PICTURES)
         )
 
-    def wait_until_healthy(self, services: Sequence[str] = SERVICES, within_s: float = 150) -> None:
+    def wait_until_healthy(self, services: Sequence[str] = SERVICES) -> None:
         """Wait until every service says that it is well."""
         for service in services:
-            until(lambda s=service: self.health(s).startswith("healthy"), within_s, f"{service} healthy")
+            until(lambda s=service: self.health(s).startswith("healthy"), f"{service} healthy")
 
 
-def until(condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+def until(condition: Callable[[], bool], what: str, within_s: float = 400.0) -> None:
     """Wait until `condition()` holds; a look costs a process in a container, so there is one a second."""
-    deadline = time.monotonic() + timeout_s
+    deadline = time.monotonic() + within_s
     while not condition():
         if time.monotonic() > deadline:
-            pytest.fail(f"{what} did not come true within {timeout_s} s")
-        time.sleep(1.0)
+            pytest.fail(f"{what} did not come true within {within_s} s")
+        time.sleep(1.0)  # noqa: TID251 polls
 
 
 def read_pictures(text: str) -> tuple[dict[str, str], int]:

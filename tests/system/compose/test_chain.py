@@ -3,20 +3,16 @@
 Each test starts from the state in which the previous one left the chain, as in a deployment.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
 import subprocess
-import time
-from pathlib import Path
 
 import pytest
 from builders.common import REPOSITORY
 from builders.compose import KILL, LOG_IN, SERVICES, Project, compose_command, docker, until
 
-ARRIVAL_S = 300.0
+pytestmark = pytest.mark.timeout(1500)
 
 REACHES = """
 import concurrent.futures, socket
@@ -44,28 +40,23 @@ except zenoh.ZError as error:
 """
 
 
-def wait_for_surveys(project: Project, number: int) -> int:
+def wait_for_surveys(project, number):
     """Wait until so many surveys are dealt with and their contacts are with the compressor; how many contacts."""
-    until(lambda: project.surveys_done() >= number, ARRIVAL_S, f"{number} surveys dealt with")
+    until(lambda: project.surveys_done() >= number, f"{number} surveys dealt with")
     return project.contacts()
 
 
-def wait_ashore(project: Project, number: int) -> dict[str, str]:
+def wait_ashore(project, number):
     """Wait until so many complete pictures are ashore; name to SHA-256."""
-    until(lambda: project.pictures("c2")[1] >= number, ARRIVAL_S, f"{number} pictures ashore")
+    until(lambda: project.pictures("c2")[1] >= number, f"{number} pictures ashore")
     pictures, complete = project.pictures("c2")
     assert complete == len(pictures) == number
     return pictures
 
 
-@pytest.mark.timeout(600)
-def test_every_container_is_well(project: Project) -> None:
+def test_every_container_is_healthy_and_a_simulated_survey_arrives(project):
     project.wait_until_healthy()
-    assert project.state("pki")["State"]["ExitCode"] == 0  # type: ignore[index]
-
-
-@pytest.mark.timeout(600)
-def test_a_simulated_survey_is_ashore_as_it_is_aboard(project: Project) -> None:
+    assert project.state("pki")["State"]["ExitCode"] == 0
     contacts = wait_for_surveys(project, 1)
     assert contacts >= 4  # as many mine-like objects as the simulator has put there
     ashore = wait_ashore(project, contacts)
@@ -74,26 +65,17 @@ def test_a_simulated_survey_is_ashore_as_it_is_aboard(project: Project) -> None:
     assert complete == contacts
 
 
-def test_commands_of_the_page_show_and_copy_the_images(project: Project, tmp_path: Path) -> None:
+def test_commands_of_the_page_show_and_copy_the_images(project, tmp_path):
     page = (REPOSITORY / "docs" / "how-to" / "view-images.md").read_text()
     [commands] = re.findall(r"^```sh\n(docker-compose exec .*?)^```$", page, re.MULTILINE | re.DOTALL)
     assert commands in (REPOSITORY / "docs" / "how-to" / "containers.md").read_text()
-    # The folder of docker-compose.yml is the project's: only the names differ from those of a user.
     text = commands.replace("docker-compose ", " ".join(compose_command()) + " ")
     text = text.replace(" exec ", " exec -T ").replace(" ./pictures", f" {tmp_path}/pictures")
+    names = {"COMPOSE_PROJECT_NAME": project.name, "COMPOSE_FILE": ":".join(project.files)}
+    environment = os.environ | project.environment | names
+    command = ["bash", "-euc", text]
     done = subprocess.run(
-        ["bash", "-euc", text],
-        cwd=REPOSITORY,
-        env={
-            **os.environ,
-            **project.environment,
-            "COMPOSE_PROJECT_NAME": project.name,
-            "COMPOSE_FILE": ":".join(project.files),
-        },
-        capture_output=True,
-        text=True,
-        timeout=400,
-        check=False,
+        command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=400, check=False
     )
     assert done.returncode == 0, done.stderr
     count = len(project.pictures("c2")[0])
@@ -111,7 +93,7 @@ print(platform.id, platform.log_level, table.codec, table.budget_bytes)
 """
 
 
-def test_edited_configuration_holds_unless_a_variable_overrides_it(project: Project, tmp_path: Path) -> None:
+def test_edited_configuration_holds_unless_a_variable_overrides_it(project, tmp_path):
     text = (REPOSITORY / "config" / "uuv.toml").read_text()
     for key, value in (("id", '"uuv-7"'), ("codec", '"vq"'), ("budget_bytes", "300")):
         text, count = re.subn(rf"^{key} = \S+", f"{key} = {value}", text, flags=re.MULTILINE)
@@ -133,7 +115,7 @@ def test_edited_configuration_holds_unless_a_variable_overrides_it(project: Proj
     assert "platform.id" not in log
 
 
-def test_people_see_the_contacts_on_both_consoles_after_logging_in(project: Project) -> None:
+def test_people_see_the_contacts_on_both_consoles_after_logging_in(project):
     contacts = project.contacts()
     password = "not-a-real-password"
     for service, platform in (("console", "vessel"), ("console-shore", "shore")):
@@ -144,18 +126,15 @@ def test_people_see_the_contacts_on_both_consoles_after_logging_in(project: Proj
         assert json.loads(said) == [contacts, 401], service
 
 
-def test_no_container_has_more_rights_than_it_needs(project: Project) -> None:
+def test_no_container_has_more_rights_than_it_needs_and_the_image_no_key_and_no_compiler(project):
     for service in SERVICES:
         state = project.state(service)
         host = state["HostConfig"]
-        assert host["ReadonlyRootfs"], service  # type: ignore[index]
-        assert host["CapDrop"] == ["ALL"], service  # type: ignore[index]
-        assert host["RestartPolicy"]["Name"] == "unless-stopped", service  # type: ignore[index]
-        assert 0 < host["Memory"] <= 1 << 30, service  # type: ignore[index]
-        assert state["Config"]["User"] == "10001:10001", service  # type: ignore[index]
-
-
-def test_the_image_holds_no_key_and_no_compiler(project: Project) -> None:
+        assert host["ReadonlyRootfs"], service
+        assert host["CapDrop"] == ["ALL"], service
+        assert host["RestartPolicy"]["Name"] == "unless-stopped", service
+        assert 0 < host["Memory"] <= 1 << 30, service
+        assert state["Config"]["User"] == "10001:10001", service
     script = (
         "find / -xdev \\( -name '*.key' -o -name 'key.pem' -o -name 'gcc*' -o -name 'cc1' -o -name pip \\) "
         "-not -path '/proc/*' -not -path '/usr/share/*' -not -path '/var/lib/dpkg/*' 2>/dev/null; true"
@@ -163,7 +142,7 @@ def test_the_image_holds_no_key_and_no_compiler(project: Project) -> None:
     assert docker("run", "--rm", project.environment["SONARPOST_IMAGE"], "sh", "-c", script) == ""
 
 
-def test_the_vehicle_reaches_nothing_but_its_modems_line(project: Project) -> None:
+def test_the_vehicle_reaches_nothing_but_its_modems_line(project):
     others = ("router-vessel", "op_modem", "decompressor", "relay", "router-shore", "c2", "router-sim")
     targets = [(a, p) for s in others for a in project.addresses(s).values() for p in (7447, 7448)]
     # On the emulator's own address in the vessel's network, too.
@@ -175,7 +154,7 @@ def test_the_vehicle_reaches_nothing_but_its_modems_line(project: Project) -> No
     assert "reached" not in project.inside("atd_stub", REACHES.format(targets=[*targets, ("water", 4001)]))
 
 
-def test_the_shore_lets_in_nobody_without_a_certificate(project: Project) -> None:
+def test_the_shore_lets_in_nobody_without_a_certificate(project):
     shore = project.addresses("router-shore")["link"]
     vessel = project.inside("router-vessel", REACHES.format(targets=[("router-shore", 7447), ("router-shore", 7448)]))
     # In the clear it listens in the shore's own network only.
@@ -184,20 +163,12 @@ def test_the_shore_lets_in_nobody_without_a_certificate(project: Project) -> Non
     # It even knows the fleet's authority.
     options = ["--network", f"{project.name}_link", "-v", f"{project.name}_vessel-tls:/var/lib/sonarpost/tls:ro"]
     for endpoint in (f"tls/{shore}:7448", f"tcp/{shore}:7448", "tls/router-shore:7448"):
-        rogue = docker(
-            "run",
-            "--rm",
-            *options,
-            project.environment["SONARPOST_IMAGE"],
-            "python",
-            "-c",
-            ROGUE.format(endpoint=endpoint),
-        )
+        script = ROGUE.format(endpoint=endpoint)
+        rogue = docker("run", "--rm", *options, project.environment["SONARPOST_IMAGE"], "python", "-c", script)
         assert rogue.startswith("refused"), endpoint
 
 
-@pytest.mark.timeout(600)
-def test_killed_services_come_back_and_lose_nothing(project: Project) -> None:
+def test_killed_services_come_back_and_lose_nothing(project):
     project.survey(2)
     wait_for_surveys(project, 1)
     starts = {}
@@ -209,21 +180,18 @@ def test_killed_services_come_back_and_lose_nothing(project: Project) -> None:
     ashore = wait_ashore(project, contacts)
     assert project.pictures("decompressor")[0] == ashore
     for service, count in starts.items():
-        assert project.state(service)["RestartCount"] == count + 1, service  # type: ignore[operator]
+        assert project.state(service)["RestartCount"] == count + 1, service
 
 
-@pytest.mark.timeout(600)
-def test_a_link_cut_for_ten_seconds_delays_and_loses_nothing(project: Project) -> None:
+def test_a_cut_link_delays_and_loses_nothing(project):
     before = project.pictures("c2")[1]
     link, vessel = f"{project.name}_link", project.container("router-vessel")
     docker("network", "disconnect", link, vessel)
     try:
-        cut_at = time.monotonic()
         project.survey(3)
         contacts = wait_for_surveys(project, 3)
         assert contacts > before
-        until(lambda: project.pictures("decompressor")[1] == contacts, ARRIVAL_S, "all pictures aboard")
-        until(lambda: time.monotonic() - cut_at > 10, 12, "ten seconds")
+        until(lambda: project.pictures("decompressor")[1] == contacts, "all pictures aboard")
         assert project.pictures("c2")[1] == before
     finally:
         docker("network", "connect", "--alias", "router-vessel", link, vessel)
@@ -231,8 +199,7 @@ def test_a_link_cut_for_ten_seconds_delays_and_loses_nothing(project: Project) -
     assert project.pictures("decompressor")[0] == ashore
 
 
-@pytest.mark.timeout(600)
-def test_down_and_up_again_with_a_newer_image_loses_nothing(project: Project) -> None:
+def test_down_and_up_again_with_a_newer_image_loses_nothing(project):
     aboard, ashore = project.pictures("decompressor")[0], project.pictures("c2")[0]
     project.compose("down", "-t", "5")
     assert project.kept("vessel-pictures")[0] == aboard
@@ -246,14 +213,13 @@ def test_down_and_up_again_with_a_newer_image_loses_nothing(project: Project) ->
     project.environment |= {"SONARPOST_IMAGE": upgrade, "VESSEL_PICTURES": "small-pictures"}
     project.compose("up", "-d", "--no-build")
     project.wait_until_healthy()
-    assert project.state("c2")["Config"]["Labels"]["release"] == "next"  # type: ignore[index]
+    assert project.state("c2")["Config"]["Labels"]["release"] == "next"
     assert project.pictures("c2")[0] == ashore
     # The same surveys are known, and not sent again.
     assert project.surveys_done() == 3
 
 
-@pytest.mark.timeout(600)
-def test_a_full_disk_is_told_and_nothing_is_lost_by_it(project: Project) -> None:
+def test_a_full_disk_is_told_and_nothing_is_lost_by_it(project):
     before = project.pictures("c2")[1]
     ballast = "/var/lib/sonarpost/pictures/ballast"
     project.inside(
@@ -264,7 +230,7 @@ def test_a_full_disk_is_told_and_nothing_is_lost_by_it(project: Project) -> None
     project.survey(4)
     contacts = wait_for_surveys(project, 4)
     assert contacts > before
-    until(lambda: project.health("decompressor").startswith("unhealthy: degraded"), ARRIVAL_S, "the full disk told")
+    until(lambda: project.health("decompressor").startswith("unhealthy: degraded"), "the full disk told")
     assert "No space left" in project.health("decompressor")
     assert project.pictures("c2")[1] == before
     project.inside("decompressor", f"import os; os.unlink('{ballast}')")

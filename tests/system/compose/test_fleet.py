@@ -1,7 +1,5 @@
 """`sonarpost-fleet`, which creates the certificates for the containers."""
 
-from __future__ import annotations
-
 import importlib.util
 import io
 import json
@@ -9,8 +7,6 @@ import stat
 import sys
 import tarfile
 from importlib.machinery import SourceFileLoader
-from pathlib import Path
-from types import ModuleType
 
 import pytest
 from builders.common import REPOSITORY
@@ -24,12 +20,10 @@ FILES = {"ca.pem": 0o644, "certificate.pem": 0o644, "key.pem": 0o600, "router.js
 
 
 @pytest.fixture(scope="module")
-def script() -> ModuleType:
+def script():
     # Its name has no .py: it is a command.
     loader = SourceFileLoader("fleet_script", str(REPOSITORY / "packaging" / "bin" / "sonarpost-fleet"))
     spec = importlib.util.spec_from_loader(loader.name, loader)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
@@ -37,14 +31,16 @@ def script() -> ModuleType:
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     for name in ("pki", "tls/shore", "tls/vessel", "acoustic/uuv", "acoustic/vessel"):
         (tmp_path / name).mkdir(parents=True)
     return tmp_path
 
 
-def test_make_writes_the_files_of_both_routers(script: ModuleType, root: Path) -> None:
+def test_make_writes_the_files_of_both_routers(script, root, capsys):
     assert script.run(["make"], {}, root) == 0
+    assert b"ENCRYPTED" not in (root / "pki" / "fleet" / "ca.key").read_bytes()
+    assert "its key has no passphrase: keep the volume pki off the hosts that run services" in capsys.readouterr().out
     for platform, listens in (("shore", "shore-1"), ("vessel", "vessel-1")):
         folder = root / "tls" / platform
         assert {path.name: stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == FILES
@@ -58,15 +54,27 @@ def test_make_writes_the_files_of_both_routers(script: ModuleType, root: Path) -
     assert connect == ["tls/router-shore:7448"]
 
 
-def test_repeated_make_changes_no_certificate(script: ModuleType, root: Path) -> None:
+def key_of(root, platform):
+    path = root / "acoustic" / platform / "acoustic.key"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    return path.read_text()
+
+
+def test_repeated_make_adds_a_platform_and_changes_no_key_and_no_certificate(script, root):
     script.run(["make"], {}, root)
-    before = (root / "tls" / "vessel" / "certificate.pem").read_bytes()
+    key = key_of(root, "uuv")
+    parse_key(key, "acoustic.key")
+    files = [root / "tls" / "vessel" / "certificate.pem", root / "pki" / "fleet" / "ca.key"]
+    before = [file.read_bytes() for file in files]
+    assert Fleet(root / "pki" / "fleet", lambda: b"").authority_days_left() > 3000
     script.run(["make"], {"FLEET_OBSERVERS": "desk-1"}, root)
-    assert (root / "tls" / "vessel" / "certificate.pem").read_bytes() == before
+    assert [file.read_bytes() for file in files] == before
+    assert key_of(root, "uuv") == key_of(root, "vessel") == key
+    assert not list((root / "tls" / "shore").glob("acoustic*"))
     assert "desk-1" in (root / "tls" / "shore" / "router.json5").read_text()
 
 
-def test_make_installs_the_renewed_certificate(script: ModuleType, root: Path) -> None:
+def test_make_installs_the_renewed_certificate(script, root):
     script.run(["make"], {}, root)
     before = (root / "tls" / "vessel" / "certificate.pem").read_bytes()
     assert script.run(["pki", "renew", "vessel-1"], {}, root) == 0
@@ -74,9 +82,7 @@ def test_make_installs_the_renewed_certificate(script: ModuleType, root: Path) -
     assert (root / "tls" / "vessel" / "certificate.pem").read_bytes() != before
 
 
-def test_revoked_platform_gets_no_new_certificate(
-    script: ModuleType, root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_revoked_platform_gets_no_new_certificate(script, root, capsys):
     script.run(["make"], {}, root)
     script.run(["pki", "revoke", "vessel-1"], {}, root)
     script.run(["make"], {}, root)
@@ -87,9 +93,7 @@ def test_revoked_platform_gets_no_new_certificate(
         script.Depot(root, script.Plan.from_environment({})).files("vessel-1")
 
 
-def test_bundle_is_installed_on_another_host(
-    script: ModuleType, root: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bundle_is_installed_on_another_host(script, root, tmp_path_factory, monkeypatch):
     environment = {"FLEET_VESSELS": "vessel-1 vessel-2", "SHORE_HOST": "c2.example", "SHORE_PORT": "9448"}
     script.run(["make"], environment, root)
     archive = script.pack(script.Depot(root, script.Plan.from_environment(environment)).files("vessel-2"))
@@ -105,39 +109,17 @@ def test_bundle_is_installed_on_another_host(
     assert not (aboard / "acoustic" / "uuv").exists()
     index = FleetIndex.read(root / "pki" / "fleet")
     shore = index.current("shore-1")
-    assert shore is not None
     assert shore.hosts == ("c2.example",)
 
 
-def key_of(root: Path, platform: str) -> str:
-    path = root / "acoustic" / platform / "acoustic.key"
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    return path.read_text()
-
-
-def test_make_gives_vehicle_and_vessel_one_acoustic_key(script: ModuleType, root: Path) -> None:
-    script.run(["make"], {}, root)
-    key = key_of(root, "uuv")
-    assert key_of(root, "vessel") == key
-    parse_key(key, "acoustic.key")
-    script.run(["make"], {}, root)
-    assert key_of(root, "uuv") == key, "another run keeps the key"
-    assert not list((root / "tls" / "shore").glob("acoustic*"))
-    assert script.run(["pki", "acoustic", "--replace"], {}, root) == 0
-    script.run(["make"], {}, root)
-    assert key_of(root, "uuv") == key_of(root, "vessel") != key
-
-
-def test_make_without_folders_for_the_key_writes_none(script: ModuleType, tmp_path: Path) -> None:
+def test_make_without_folders_for_the_key_writes_none(script, tmp_path):
     for name in ("pki", "tls/shore", "tls/vessel"):
         (tmp_path / name).mkdir(parents=True)
     script.run(["make"], {}, tmp_path)
     assert not (tmp_path / "acoustic").exists()
 
 
-def test_bundle_of_a_vehicle_holds_the_acoustic_key_only(
-    script: ModuleType, root: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bundle_of_a_vehicle_holds_the_acoustic_key_only(script, root, tmp_path_factory, monkeypatch):
     environment = {"FLEET_VEHICLES": "uuv-1 uuv-2"}
     script.run(["make"], environment, root)
     depot = script.Depot(root, script.Plan.from_environment(environment))
@@ -152,7 +134,7 @@ def test_bundle_of_a_vehicle_holds_the_acoustic_key_only(
     assert not (aboard / "tls").exists()
 
 
-def tar_of(name: str, kind: bytes = tarfile.REGTYPE) -> bytes:
+def tar_of(name, kind=tarfile.REGTYPE):
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as archive:
         entry = tarfile.TarInfo(name)
@@ -164,12 +146,12 @@ def tar_of(name: str, kind: bytes = tarfile.REGTYPE) -> bytes:
 @pytest.mark.parametrize(
     "data", [b"", b"not a tar", tar_of("../../etc/passwd"), tar_of("key.pem", tarfile.SYMTYPE), tar_of("ca.pem")]
 )
-def test_invalid_bundle_is_rejected(script: ModuleType, data: bytes) -> None:
+def test_invalid_bundle_is_rejected(script, data):
     with pytest.raises(ConfigError, match="bundle"):
         script.unpack(data)
 
 
-def test_error_names_the_environment_variable(script: ModuleType) -> None:
+def test_error_names_the_environment_variable(script):
     with pytest.raises(ConfigError, match="SHORE_PORT: got 'x'"):
         script.Plan.from_environment({"SHORE_PORT": "x"})
     with pytest.raises(ConfigError, match="observer: got 'vessel-1', expected a name that no vessel has"):
@@ -178,23 +160,13 @@ def test_error_names_the_environment_variable(script: ModuleType) -> None:
         script.Plan.from_environment({"FLEET_VEHICLES": "vessel-1"})
 
 
-def test_unknown_arguments_show_the_usage(script: ModuleType, root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_arguments_show_the_usage(script, root, capsys):
     assert script.run(["mak"], {}, root) == 2
     assert "got 'mak'" in capsys.readouterr().err
 
 
-def test_authority_is_created_once(script: ModuleType, root: Path) -> None:
-    script.run(["make"], {}, root)
-    key = (root / "pki" / "fleet" / "ca.key").read_bytes()
-    script.run(["make"], {}, root)
-    assert (root / "pki" / "fleet" / "ca.key").read_bytes() == key
-    assert Fleet(root / "pki" / "fleet", lambda: b"").authority_days_left() > 3000
-
-
-def test_make_at_a_terminal_encrypts_the_key_of_the_authority(
-    script: ModuleType, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    prompts: list[str] = []
+def test_make_at_a_terminal_encrypts_the_key_of_the_authority(script, root, monkeypatch, capsys):
+    prompts = []
     monkeypatch.setattr(script, "ask_at_terminal", lambda prompt: prompts.append(prompt) or b"correct horse battery")
     assert script.run(["make"], {}, root) == 0
     assert b"ENCRYPTED" in (root / "pki" / "fleet" / "ca.key").read_bytes()
@@ -212,15 +184,7 @@ def test_make_at_a_terminal_encrypts_the_key_of_the_authority(
         script.Depot(root, script.Plan.from_environment({"FLEET_CONSOLES": "c-1"}), lambda _: b"wrong").make()
 
 
-def test_make_without_a_terminal_reports_the_key_without_passphrase(
-    script: ModuleType, root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert script.run(["make"], {}, root) == 0
-    assert b"ENCRYPTED" not in (root / "pki" / "fleet" / "ca.key").read_bytes()
-    assert "its key has no passphrase: keep the volume pki off the hosts that run services" in capsys.readouterr().out
-
-
-def test_names_come_from_the_configuration_unless_variables_set_them(script: ModuleType, tmp_path: Path) -> None:
+def test_names_come_from_the_configuration_unless_variables_set_them(script, tmp_path):
     for platform, name in (("uuv", "uuv-5"), ("vessel", "vessel-5"), ("shore", "shore-5")):
         (tmp_path / f"{platform}.toml").write_text(f'[platform]\nid = "{name}"\n')
     environment = {"VESSEL_ID": "vessel-6", "SHORE_ID": "", "FLEET_OBSERVERS": "desk-1"}

@@ -1,7 +1,5 @@
 """The examples of docs/specifications/acoustic-paper.md and acoustic-v1.md: bytes and packet plans."""
 
-from __future__ import annotations
-
 import re
 import zlib
 
@@ -13,13 +11,7 @@ from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import HALF_PREFIX_SIZE, ContactFrame, HalfFrame
 from sonarpost.link.frames.paper.frame import parse_frame as parse_paper_frame
 from sonarpost.link.frames.paper.sender import plan_packets
-from sonarpost.link.frames.v1.frame import (
-    Segment,
-    SegmentKind,
-    Symbol,
-    checksum,
-    parse_frame,
-)
+from sonarpost.link.frames.v1.frame import Segment, SegmentKind, Symbol, checksum, parse_frame
 from sonarpost.link.frames.v1.payload_objects import Feedback, Preview, entry_shape
 
 SPECIFICATIONS = REPOSITORY / "docs" / "specifications"
@@ -28,7 +20,7 @@ V1 = (SPECIFICATIONS / "acoustic-v1.md").read_text(encoding="utf-8")
 RATES = {0: (1, 32), 1: (3, 64), 2: (3, 64), 3: (2, 256), 4: (2, 256), 5: (8, 256), 6: (6, 32)}
 
 
-def test_paper_example_frames_parse_to_the_stated_fields() -> None:
+def test_paper_example_frames_parse_to_the_stated_fields():
     lines = re.findall(r"^(?:[0-9A-F]{2} ?){15,}$", PAPER, re.MULTILINE)
     top, bottom, common_top, common_bottom, contact, nothing, classified = (
         parse_paper_frame(bytes.fromhex(line)) for line in lines
@@ -50,7 +42,7 @@ def test_paper_example_frames_parse_to_the_stated_fields() -> None:
     assert record.position_sigma_m == pytest.approx(3.1, rel=0.02)
 
 
-def test_paper_example_stream_headers_equal_the_packed_bytes() -> None:
+def test_paper_example_stream_headers_equal_the_packed_bytes():
     rows = re.findall(
         r"^\| 0x(\w\w) \| (?:none|0x(\w+)) \| (\d+) \u00d7 (\d+) px \| `([0-9A-F ]+)` \|$", PAPER, re.MULTILINE
     )
@@ -61,7 +53,7 @@ def test_paper_example_stream_headers_equal_the_packed_bytes() -> None:
     assert sorted(len(bytes.fromhex(row[-1])) for row in rows) == [2, 3, 4, 5, 6, 7]
 
 
-def test_paper_rate_table_equals_capacities_and_packet_plans() -> None:
+def test_paper_rate_table_equals_capacities_and_packet_plans():
     rows = re.findall(r"^\| ([\d, ]+) \| (\d) \u00d7 (\d+) \| (\d+) \| (\d+) \| \d \((.*)\) \|$", PAPER, re.MULTILINE)
     seen = []
     for rates, frames, size, with_contact, without, layout in rows:
@@ -79,7 +71,7 @@ def test_paper_rate_table_equals_capacities_and_packet_plans() -> None:
     assert seen == sorted(RATES)
 
 
-def test_v1_example_frames_parse_to_the_stated_fields() -> None:
+def test_v1_example_frames_parse_to_the_stated_fields():
     lines = [bytes.fromhex(line) for line in re.findall(r"^(?:[0-9A-F]{2} ?){30,}$", V1, re.MULTILINE)]
     (contact,), (message, other), preview, (report,) = (parse_frame(line) for line in lines)
     assert isinstance(contact, Segment)
@@ -95,12 +87,12 @@ def test_v1_example_frames_parse_to_the_stated_fields() -> None:
     assert Feedback.unpack(report.data) == Feedback(3, 1000, (12, 0, 255))
 
 
-def test_v1_checksums_have_the_stated_check_values() -> None:
+def test_v1_checksums_have_the_stated_check_values():
     assert f"`123456789` it is 0x{checksum(b'123456789'):04X}" in V1
     assert f"`123456789` it is 0x{zlib.crc32(b'123456789'):08X}" in V1
 
 
-def test_v1_preview_entries_follow_the_table() -> None:
+def test_v1_preview_entries_follow_the_table():
     for s in range(22, 252):
         shape, entries = entry_shape(s), max(1, s // 56)
         expected = (1, 2, 2 * s) if s <= 43 else (entries, 1, s // entries)

@@ -18,7 +18,6 @@ import signal
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,36 +51,37 @@ class Block:
     text: str
 
     @property
-    def runs(self) -> bool:
+    def runs(self):
         """Whether the block is executed by this test."""
         return self.language in ("sh", "python") and not self.title and self.mark in ("", "stop")
 
 
-def blocks(page: str) -> list[Block]:
+def blocks(page):
     text = (REPOSITORY / page).read_text(encoding="utf-8")
     return [Block(m["language"], m["title"], m["mark"] or "", textwrap.dedent(m["text"])) for m in BLOCK.finditer(text)]
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_blocks_have_a_language_and_valid_marks(page: str) -> None:
-    text = (REPOSITORY / page).read_text(encoding="utf-8")
-    assert len(re.findall(r"^ *```", text, re.MULTILINE)) == 2 * len(blocks(page))
-    assert text.count("<!-- example: ") == sum(bool(block.mark) for block in blocks(page))
-    assert not re.findall(r"^ {4,}(?:sonarpost|python|make|docker|pip) .*$", text, re.MULTILINE), "use a ```sh block"
-    for block in blocks(page):
-        assert block.language in LANGUAGES, block.text
-        if block.mark.startswith("run by "):
-            assert (REPOSITORY / block.mark.removeprefix("run by ")).exists()
-        else:
-            assert re.fullmatch(r"|stop|not run, .{10,}", block.mark), block.mark
+def test_blocks_have_a_language_and_valid_marks():
+    for page in PAGES:
+        text = (REPOSITORY / page).read_text(encoding="utf-8")
+        assert len(re.findall(r"^ *```", text, re.MULTILINE)) == 2 * len(blocks(page)), page
+        assert text.count("<!-- example: ") == sum(bool(block.mark) for block in blocks(page)), page
+        indented = re.findall(r"^ {4,}(?:sonarpost|python|make|docker|pip) .*$", text, re.MULTILINE)
+        assert not indented, f"{page}: use a ```sh block"
+        for block in blocks(page):
+            assert block.language in LANGUAGES, (page, block.text)
+            if block.mark.startswith("run by "):
+                assert (REPOSITORY / block.mark.removeprefix("run by ")).exists(), page
+            else:
+                assert re.fullmatch(r"|stop|not run, .{10,}", block.mark), (page, block.mark)
 
 
-def commands(text: str) -> Iterator[list[str]]:
+def commands(text):
     """Yield every `sonarpost` and `research` command of a shell text with its arguments."""
     for line in text.replace("\\\n", " ").splitlines():
         lexer = shlex.shlex(line, posix=True, punctuation_chars="|&;<>()")
         lexer.whitespace_split = True
-        words: list[str] = []
+        words = []
         for word in [*lexer, ";"]:
             if not set(word) <= set("|&;<>()"):
                 words.append(word)
@@ -97,7 +97,7 @@ def commands(text: str) -> Iterator[list[str]]:
             words = []
 
 
-def usage_error(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+def usage_error(arguments, capsys):
     """Return the error of the `sonarpost` command for its arguments; empty if only required ones are missing."""
     try:
         parser(arguments[0] if arguments else "").parse_args(arguments)
@@ -107,26 +107,27 @@ def usage_error(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str
     return ""
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_commands_have_valid_arguments(page: str, capsys: pytest.CaptureFixture[str]) -> None:
-    text = (REPOSITORY / page).read_text(encoding="utf-8")
-    shells = [block.text for block in blocks(page) if block.language == "sh"]
+def test_commands_have_valid_arguments(capsys):
     names = "|".join(COMMANDS)
-    spans = re.findall(rf"`(sonarpost (?:{names})\b[^`\[…|{{]*|python -m research\.[^`\[…|{{]*)`", BLOCK.sub("", text))
-    for words in commands("\n".join([*shells, *(" ".join(span.split()) for span in spans)])):
-        if words[0].startswith("research."):
-            assert importlib.util.find_spec(words[0]) is not None, words[0]
-        else:
-            assert usage_error(words[1:], capsys) == "", shlex.join(words)
+    span = re.compile(rf"`(sonarpost (?:{names})\b[^`\[…|{{]*|python -m research\.[^`\[…|{{]*)`")
+    for page in PAGES:
+        text = (REPOSITORY / page).read_text(encoding="utf-8")
+        shells = [block.text for block in blocks(page) if block.language == "sh"]
+        spans = [" ".join(found.split()) for found in span.findall(BLOCK.sub("", text))]
+        for words in commands("\n".join([*shells, *spans])):
+            if words[0].startswith("research."):
+                assert importlib.util.find_spec(words[0]) is not None, (page, words[0])
+            else:
+                assert usage_error(words[1:], capsys) == "", (page, shlex.join(words))
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if any(block.runs for block in blocks(p))])
-def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
-    namespace: dict[str, object] = {"__name__": "example"}
+    namespace = {"__name__": "example"}
     modules = set(sys.modules)
     try:
         for block in blocks(page):
@@ -143,7 +144,7 @@ def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
                 del sys.modules[name]
 
 
-def run_shell(block: Block) -> None:
+def run_shell(block):
     process = subprocess.Popen(
         ["bash", "-euo", "pipefail", "-c", block.text],
         stdout=subprocess.PIPE,
@@ -153,7 +154,6 @@ def run_shell(block: Block) -> None:
     )
     with process:
         try:
-            assert process.stdout is not None
             output = process.stdout.readline() if block.mark == "stop" else ""
             if block.mark == "stop":
                 os.killpg(process.pid, signal.SIGINT)

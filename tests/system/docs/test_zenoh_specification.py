@@ -3,43 +3,32 @@
 from __future__ import annotations
 
 import hashlib
-import queue
 import re
-import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
 
 import msgpack
 import pytest
-import zenoh
 from builders.common import REPOSITORY, eventually
+from builders.line_program import LineProgram, run_program
 from builders.record_samples import SAMPLES
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery import protocol
-from sonarpost.delivery import scheduler as schedule
 from sonarpost.delivery.protocol import AckReply, attachment
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.messages import Contact, Decision, Record, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
+
+__all__ = ["run_program"]
 
 PlatformMaker = Callable[[str], PlatformConfig]
 TEXT = (REPOSITORY / "docs" / "specifications" / "zenoh.md").read_text(encoding="utf-8")
 TUTORIAL = (REPOSITORY / "docs" / "tutorials" / "own-detector.md").read_text(encoding="utf-8")
 
 
-def test_limits_of_the_wire_format() -> None:
-    assert protocol.CHUNK_BYTES == 32_768
-    assert protocol.MAX_RECORD_BYTES == 8_388_608
-    assert protocol.MAX_BATCH_RECORDS == 128
-    assert wire.MAX_PAYLOAD_BYTES == 41_943_040
-
-
-def test_example_of_an_error_message() -> None:
+def test_example_of_an_error_message():
     snippet = SAMPLES["snippet-classified"].model_dump()
     snippet["contact"]["lat_deg"] = 91.0
     with pytest.raises(wire.PayloadError) as caught:
@@ -49,15 +38,15 @@ def test_example_of_an_error_message() -> None:
     assert f"\n{caught.value}\n" in TEXT
 
 
-def blocks(language: str) -> dict[str, str]:
+def blocks(language):
     return dict(re.findall(rf'^```{language} title="([\w.]+)"\n(.*?)^```$', TEXT + TUTORIAL, re.MULTILINE | re.DOTALL))
 
 
-def hex_block(name: str) -> bytes:
+def hex_block(name):
     return bytes.fromhex("".join(line.split("#")[0] for line in blocks("hex")[name].splitlines()))
 
 
-def test_hex_examples_equal_the_encoded_records() -> None:
+def test_hex_examples_equal_the_encoded_records():
     decision = wire.encode(SAMPLES["decision-plain"])
     item = OutboxItem("relay", 1, "k", "", 4, decision, hashlib.sha256(decision).digest())
     assert {name: hex_block(name) for name in blocks("hex")} == {
@@ -71,12 +60,11 @@ def test_hex_examples_equal_the_encoded_records() -> None:
     assert f"with those {len(decision)} bytes" in TEXT
 
 
-@pytest.mark.parametrize("name", blocks("hex"))
-def test_comments_of_hex_examples_equal_the_decoded_fields(name: str) -> None:
+def test_comments_of_hex_examples_equal_the_decoded_fields():
     """Every line after the first has one field, and its name and value as a comment."""
-    first, *lines = blocks("hex")[name].splitlines()
-    assert first.endswith(f"# map of {len(lines)}")
-    for line in lines:
+    texts = [block.splitlines() for block in blocks("hex").values()]
+    assert all(first.endswith(f"# map of {len(lines)}") for first, *lines in texts)
+    for line in [line for _, *lines in texts for line in lines]:
         comment = line.split("# ")[1]
         (field, value), *_ = msgpack.unpackb(b"\x81" + bytes.fromhex(line.split("#")[0])).items()
         if isinstance(value, bytes):
@@ -93,14 +81,14 @@ class RecordingConsumer(Service[ServiceConfig]):
     record_type: type[Record] = Snippet
     NAME = "compressor"
 
-    def __init__(self, platform: PlatformConfig) -> None:
+    def __init__(self, platform):
         super().__init__(platform, ServiceConfig())
-        self.received: list[Any] = []
+        self.received = []
 
-    def consumed_keys(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self):
         return {self.key: self.record_type}
 
-    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+    def handle(self, key, record, effects):
         self.received.append(record)
 
 
@@ -110,51 +98,22 @@ class DecisionConsumer(RecordingConsumer):
     NAME = "relay"
 
 
-class Program:
-    """A program of the page, run as a process that cannot import sonarpost."""
-
-    def __init__(self, tmp_path: Path, name: str, *arguments: str) -> None:
-        path = tmp_path / f"{name}.py"
-        path.write_text("import sys\nsys.modules['sonarpost'] = None\n" + blocks("python")[name], encoding="utf-8")
-        self.process = subprocess.Popen(
-            [sys.executable, str(path), *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        self.lines: queue.Queue[str] = queue.Queue()
-        threading.Thread(target=self._read, daemon=True).start()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.lines.put(line.strip())
-
-    def wait(self) -> None:
-        assert self.process.wait(timeout=120) == 0, self.process.stderr and self.process.stderr.read()
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        for stream in (self.process.stdout, self.process.stderr):
-            assert stream is not None
-            stream.close()
-
-
-Run = Callable[..., Program]
+Run = Callable[..., LineProgram]
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Iterator[Run]:
-    programs: list[Program] = []
+def run(tmp_path, run_program):
+    """Runs a program of the page as a process that cannot import sonarpost."""
 
-    def start(name: str, *arguments: str) -> Program:
-        programs.append(Program(tmp_path, name, *arguments))
-        return programs[-1]
+    def start(name, *arguments):
+        path = tmp_path / f"{name}.py"
+        path.write_text("import sys\nsys.modules['sonarpost'] = None\n" + blocks("python")[name], encoding="utf-8")
+        return run_program(sys.executable, str(path), *arguments)
 
-    yield start
-    for program in programs:
-        program.close()
+    return start
 
 
-def test_published_contact_reaches_consumer_and_watcher(run: Run, router: str, platform: PlatformMaker) -> None:
+def test_published_contact_reaches_consumer_and_watcher(run, router, platform):
     consumer = RecordingConsumer(platform("uuv-1"))
     consumer.start()
     try:
@@ -181,13 +140,15 @@ def test_published_contact_reaches_consumer_and_watcher(run: Run, router: str, p
     assert snippet.picture.to_array()[5].tolist() == list(range(0, 192, 2))
 
 
-def test_delivery_program_waits_for_its_consumer(
-    run: Run, router: str, platform: PlatformMaker, tmp_path: Path
-) -> None:
+def test_delivery_program_waits_for_its_consumer(run, router, client, platform, tmp_path):
     (tmp_path / "record").write_bytes(hex_block("decision"))
+    asked = []
+    silent = client.declare_queryable(
+        f"{DecisionConsumer.key}/handoff/relay", lambda q: asked.append(q.payload.to_bytes())
+    )
     program = run("deliver", router, DecisionConsumer.key, "relay", str(tmp_path / "record"))
-    with pytest.raises(queue.Empty):
-        program.lines.get(timeout=0.5)
+    eventually(lambda: hex_block("decision") in asked, what="an attempt without a reply")
+    silent.undeclare()
     consumer = DecisionConsumer(platform("vessel-1"))
     consumer.start()
     try:
@@ -198,9 +159,7 @@ def test_delivery_program_waits_for_its_consumer(
         consumer.stop()
 
 
-def test_delivery_program_sends_pieces_and_reports_a_refusal(
-    run: Run, router: str, platform: PlatformMaker, tmp_path: Path
-) -> None:
+def test_delivery_program_sends_pieces_and_reports_a_refusal(run, router, platform, tmp_path):
     """100 kB that are not a snippet: the consumer refuses them after the last piece."""
     (tmp_path / "record").write_bytes(msgpack.packb({"type": "snippet", "v": 1, "filler": b"x" * 100_000}))
     consumer = RecordingConsumer(platform("uuv-1"))
@@ -221,45 +180,22 @@ def test_delivery_program_sends_pieces_and_reports_a_refusal(
 class Producer(Service[ServiceConfig]):
     NAME = "decider"
 
-    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+    def handle(self, key, record, effects):
         raise AssertionError("consumes nothing")
 
 
-def queue_decision(producer: Producer, consumer: str, number: int) -> None:
+def queue_decision(producer, consumer, number):
     effects = UnitOfWork()
     fields = SAMPLES["decision-plain"].model_dump() | {"decision_id": f"d{number}"}
     effects.send(DecisionConsumer.key, consumer, Decision(**fields))
     producer.commit(effects)
 
 
-def test_watcher_receives_the_probe_window_until_the_consumer_answers(
-    client: zenoh.Session, platform: PlatformMaker
-) -> None:
-    seen: list[dict[str, Any]] = []
-    client.declare_subscriber(DecisionConsumer.key, lambda s: seen.append(msgpack.unpackb(s.attachment.to_bytes())))
-    producer = Producer(platform("vessel-1"), ServiceConfig())
-    for number in range(20):
-        queue_decision(producer, "relay", number)
-    producer.start()
-    consumer = DecisionConsumer(platform("vessel-1"))
-    try:
-        eventually(lambda: len(seen) == schedule.PROBE_WINDOW)
-        consumer.start()
-        eventually(lambda: len(seen) == 20)
-        eventually(lambda: producer.store.outbox_depth() == 0)
-        assert sorted(fields["seq"] for fields in seen) == list(range(1, 21))
-    finally:
-        producer.stop()
-        consumer.stop()
+def test_record_for_two_consumers_is_published_with_both_sequence_numbers(client, platform):
+    seen = []
 
-
-def test_record_for_two_consumers_is_published_with_both_sequence_numbers(
-    client: zenoh.Session, platform: PlatformMaker
-) -> None:
-    seen: list[tuple[str, int, str]] = []
-
-    def show(sample: zenoh.Sample) -> None:
-        fields = msgpack.unpackb(sample.attachment.to_bytes())  # type: ignore[union-attr]
+    def show(sample):
+        fields = msgpack.unpackb(sample.attachment.to_bytes())
         seen.append((fields["consumer"], fields["seq"], msgpack.unpackb(sample.payload.to_bytes())["decision_id"]))
 
     client.declare_subscriber(DecisionConsumer.key, show)
@@ -275,7 +211,7 @@ def test_record_for_two_consumers_is_published_with_both_sequence_numbers(
         producer.stop()
 
 
-def test_consumer_ignores_publications_with_an_attachment(client: zenoh.Session, platform: PlatformMaker) -> None:
+def test_consumer_ignores_publications_with_an_attachment(client, platform):
     consumer = DecisionConsumer(platform("vessel-1"))
     consumer.start()
     try:
@@ -291,17 +227,14 @@ def test_consumer_ignores_publications_with_an_attachment(client: zenoh.Session,
         consumer.stop()
 
 
-def test_service_answers_the_example_query_with_the_example_reply(
-    client: zenoh.Session, platform: PlatformMaker
-) -> None:
+def test_service_answers_the_example_query_with_the_example_reply(client, platform):
     consumer = DecisionConsumer(platform("vessel-1"))
     consumer.start()
     selector = "sonarpost/v1/vessel-1/contact/decision/handoff/relay"
 
-    def ask(payload: bytes, attached: bytes | None) -> bytes:
+    def ask(payload, attached):
         replies = client.get(selector, payload=payload, attachment=attached, timeout=5)
         received = replies.recv()
-        assert received.ok is not None
         assert str(received.ok.key_expr) == selector
         return received.ok.payload.to_bytes()
 

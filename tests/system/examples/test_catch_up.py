@@ -4,80 +4,35 @@ Rust is tested where the program has been built: in `examples/rust/target`, or i
 `SONARPOST_EXAMPLES_TARGET` names. JavaScript is tested where Node is installed.
 """
 
-from __future__ import annotations
-
 import os
-import queue
 import re
 import shutil
-import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 import zenoh
 from builders.common import REPOSITORY, eventually
 from builders.exports import decision, image
+from builders.line_program import run_program
 from builders.rest_interface import rest_interface
 
 from sonarpost import keys, wire
-from sonarpost.config import PlatformConfig
-from sonarpost.messages import Decision, ReconstructedImage, Relayed
+from sonarpost.bus.session import client_config
+from sonarpost.messages import ReconstructedImage, Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
+
+__all__ = ["run_program"]
 
 EXAMPLES = REPOSITORY / "examples"
 PYTHON = EXAMPLES / "catch_up.py"
 JAVASCRIPT = EXAMPLES / "javascript" / "catch_up.mjs"
 
 
-class Program:
-    """A running example and its lines."""
-
-    def __init__(self, *command: str) -> None:
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        self.lines: queue.Queue[str] = queue.Queue()
-        self._thread = threading.Thread(target=self._read)
-        self._thread.start()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.lines.put(line.strip())
-
-    def read(self, count: int) -> list[str]:
-        return [self.lines.get(timeout=120) for _ in range(count)]
-
-    def stop(self) -> None:
-        """End the program."""
-        self.process.kill()
-        self.process.wait()
-        self._thread.join()
-        for stream in (self.process.stdout, self.process.stderr):
-            assert stream is not None
-            stream.close()
-
-
-Run = Callable[..., Program]
-
-
 @pytest.fixture
-def run() -> Iterator[Run]:
-    programs: list[Program] = []
-
-    def start(*command: str) -> Program:
-        programs.append(Program(*command))
-        return programs[-1]
-
-    yield start
-    for program in programs:
-        program.stop()
-
-
-@pytest.fixture
-def c2(platform: Callable[[str], PlatformConfig], tmp_path: Path) -> Iterator[C2Service]:
+def c2(platform, tmp_path):
     service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out", json_mirror=True))
     assert service.start()
     yield service
@@ -85,9 +40,7 @@ def c2(platform: Callable[[str], PlatformConfig], tmp_path: Path) -> Iterator[C2
 
 
 @pytest.fixture
-def pair(
-    platform: Callable[[str], PlatformConfig], database_url: str, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[list[C2Service]]:
+def pair(platform, database_url, monkeypatch):
     """Two c2 with one archive that both reply to a query, as for a short time after an outage of the database."""
     monkeypatch.setattr(C2Service, "_prefer_others", lambda *_, **__: None)
     pair = [C2Service(platform(f"shore-{n}"), C2Config(database=database_url, json_mirror=True)) for n in range(1, 3)]
@@ -99,7 +52,7 @@ def pair(
         service.stop()
 
 
-def accept(c2: C2Service, *records: ReconstructedImage | Decision) -> None:
+def accept(c2, *records):
     before = c2.health().counters.get("records_handled", 0)
     for record in records:
         is_image = isinstance(record, ReconstructedImage)
@@ -109,7 +62,7 @@ def accept(c2: C2Service, *records: ReconstructedImage | Decision) -> None:
     eventually(lambda: c2.health().counters.get("records_handled", 0) == before + len(records), what="acceptance")
 
 
-def rust_program() -> str:
+def rust_program():
     folder = Path(os.environ.get("SONARPOST_EXAMPLES_TARGET", EXAMPLES / "rust" / "target"))
     for kind in ("release", "debug"):
         if (folder / kind / "catch_up").is_file():
@@ -117,7 +70,7 @@ def rust_program() -> str:
     pytest.skip("examples/rust has not been built")
 
 
-def check(c2: C2Service, start: Callable[[str], Program]) -> None:
+def check(c2, start):
     """Check a program: 300 records missed, then new ones, a repeated one, then a restart with a cursor."""
     c2._accepted.number([c2._accepted.image(image(f"{n:04X}"), "") for n in range(1, 301)])
     program = start("")
@@ -133,12 +86,10 @@ def check(c2: C2Service, start: Callable[[str], Program]) -> None:
     assert again.read(2) == ["302 decision uuv-1 0AAA - mine_like", "303 reconstructed_image uuv-1 0BBB 1 -"]
     again.stop()
     refused = start("00000000.5")
-    assert refused.process.wait(120) == 1
-    assert refused.process.stderr is not None
-    assert "after: got '00000000.5', expected a cursor of" in refused.process.stderr.read()
+    assert "after: got '00000000.5', expected a cursor of" in refused.wait(1)
 
 
-def check_pair(pair: list[C2Service], start: Callable[[str], Program]) -> None:
+def check_pair(pair, start):
     """Check a program with two c2: 300 records missed, half of each c2, then one of them ends."""
     for first in range(1, 301, 10):
         service = pair[first // 10 % 2]
@@ -157,44 +108,41 @@ def check_pair(pair: list[C2Service], start: Callable[[str], Program]) -> None:
         assert each.lines.empty()
 
 
-def test_python(run: Run, c2: C2Service, router: str, tmp_path: Path) -> None:
-    text = PYTHON.read_text()
-    modules = set(re.findall(r"^(?:import|from) (\w+)", text, re.MULTILINE))
+def programs(language, run, router, folder, stack):
+    """Return a function that starts the example with a cursor."""
+    if language == "rust":
+        rust = rust_program()
+        return lambda cursor: run(rust, router, cursor)
+    if language == "python":
+
+        def start(cursor):
+            saved = folder / f"cursor-{len(list(folder.iterdir()))}"
+            saved.write_text(cursor)
+            return run(sys.executable, "-I", str(PYTHON), router, str(saved))
+
+        return start
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed")
+    server = stack.enter_context(rest_interface(stack.enter_context(zenoh.open(client_config([router])))))
+    return lambda cursor: run(node, str(JAVASCRIPT), server, cursor)
+
+
+LANGUAGES = pytest.mark.parametrize("language", ["python", "rust", "javascript"])
+
+
+@LANGUAGES
+def test_program_with_one_c2(language, run_program, c2, router, tmp_path):
+    with ExitStack() as stack:
+        check(c2, programs(language, run_program, router, tmp_path, stack))
+
+
+@LANGUAGES
+def test_program_with_two_c2(language, run_program, pair, router, tmp_path):
+    with ExitStack() as stack:
+        check_pair(pair, programs(language, run_program, router, tmp_path, stack))
+
+
+def test_python_needs_only_zenoh_and_msgpack():
+    modules = set(re.findall(r"^(?:import|from) (\w+)", PYTHON.read_text(), re.MULTILINE))
     assert modules - set(sys.stdlib_module_names) == {"zenoh", "msgpack"}
-    saved = tmp_path / "cursor"
-
-    def start(cursor: str) -> Program:
-        saved.write_text(cursor)
-        return run(sys.executable, "-I", str(PYTHON), router, str(saved))
-
-    check(c2, start)
-
-
-def test_python_with_two_c2(run: Run, pair: list[C2Service], router: str) -> None:
-    check_pair(pair, lambda _: run(sys.executable, "-I", str(PYTHON), router))
-
-
-def test_rust(run: Run, c2: C2Service, router: str) -> None:
-    program = rust_program()
-    check(c2, lambda cursor: run(program, router, cursor))
-
-
-def test_rust_with_two_c2(run: Run, pair: list[C2Service], router: str) -> None:
-    program = rust_program()
-    check_pair(pair, lambda _: run(program, router))
-
-
-def test_javascript(run: Run, c2: C2Service, client: zenoh.Session) -> None:
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("node is not installed")
-    with rest_interface(client) as server:
-        check(c2, lambda cursor: run(node, str(JAVASCRIPT), server, cursor))
-
-
-def test_javascript_with_two_c2(run: Run, pair: list[C2Service], client: zenoh.Session) -> None:
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("node is not installed")
-    with rest_interface(client) as server:
-        check_pair(pair, lambda _: run(node, str(JAVASCRIPT), server))

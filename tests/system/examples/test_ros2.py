@@ -1,15 +1,11 @@
 """Examples for ROS 2: the mirror with a router, the node as far as its syntax (ROS is not installed here)."""
 
-from __future__ import annotations
-
 import json
 import py_compile
 import struct
 import subprocess
 import sys
-from pathlib import Path
 
-import zenoh
 from builders.common import REPOSITORY, eventually, publish_once
 from builders.exports import decision, image
 
@@ -18,7 +14,7 @@ from sonarpost import keys, wire
 EXAMPLES = REPOSITORY / "examples"
 
 
-def text_of(data: bytes) -> str:
+def text_of(data):
     """Decode std_msgs/String as CDR of XCDR1, little endian."""
     header, length = struct.unpack_from("<4sI", data)
     assert (header, length) == (b"\0\1\0\0", len(data) - 8)
@@ -26,8 +22,8 @@ def text_of(data: bytes) -> str:
     return data[8:-1].decode()
 
 
-def test_mirror_publishes_records_as_ros_strings(router: str, client: zenoh.Session) -> None:
-    received: list[bytes] = []
+def test_mirror_publishes_records_as_ros_strings(router, client):
+    received = []
     client.declare_subscriber("sonarpost/contacts", lambda sample: received.append(sample.payload.to_bytes()))
     process = subprocess.Popen([sys.executable, EXAMPLES / "ros2_mirror.py", router], stderr=subprocess.DEVNULL)
     try:
@@ -43,5 +39,5 @@ def test_mirror_publishes_records_as_ros_strings(router: str, client: zenoh.Sess
     assert (second["type"], second["remark"]) == ("decision", "ü")
 
 
-def test_node_compiles(tmp_path: Path) -> None:
+def test_node_compiles(tmp_path):
     py_compile.compile(str(EXAMPLES / "ros2_contacts.py"), cfile=str(tmp_path / "node.pyc"), doraise=True)

@@ -1,13 +1,9 @@
 """The example program as a separate process, with a router and c2."""
 
-from __future__ import annotations
-
 import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,8 +14,7 @@ from PIL import Image
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config
-from sonarpost.config import PlatformConfig
-from sonarpost.messages import Decision, Pixels, ReconstructedImage, Relayed
+from sonarpost.messages import Pixels, ReconstructedImage, Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 
@@ -27,13 +22,13 @@ EXAMPLE = REPOSITORY / "examples" / "shore_subscriber.py"
 
 
 @pytest.fixture
-def router() -> Iterator[str]:
+def router():
     """A router in a separate process."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     command = [sys.executable, "-m", "sonarpost.bus.router", "--listen", endpoint]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
 
-        def answers() -> bool:
+        def answers():
             try:
                 zenoh.open(client_config([endpoint])).close()
             except zenoh.ZError:
@@ -46,28 +41,28 @@ def router() -> Iterator[str]:
 
 
 @pytest.fixture
-def c2(router: str, platform: Callable[[str], PlatformConfig], tmp_path: Path) -> Iterator[C2Service]:
+def c2(router, platform, tmp_path):
     service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out"))
     assert service.start()
     yield service
     service.stop()
 
 
-def relay(c2: C2Service, record: ReconstructedImage | Decision) -> None:
+def relay(c2, record):
     is_image = isinstance(record, ReconstructedImage)
     key = keys.image_reconstructed("vessel-1") if is_image else keys.contact_decision("vessel-1")
     envelope = Relayed(vessel_id="vessel-1", key=key, payload=wire.encode(record), relayed_utc_s=1.0)
     c2.session.put(keys.shore_inbox("vessel-1"), wire.encode(envelope))
 
 
-def test_example_is_short_and_needs_only_zenoh_and_msgpack() -> None:
+def test_example_is_short_and_needs_only_zenoh_and_msgpack():
     text = EXAMPLE.read_text()
     assert len(text.splitlines()) <= 25
     modules = set(re.findall(r"^(?:import|from) (\w+)", text, re.MULTILINE))
     assert modules - set(sys.stdlib_module_names) == {"zenoh", "msgpack"}
 
 
-def test_example_prints_records_and_saves_images(router: str, c2: C2Service, tmp_path: Path) -> None:
+def test_example_prints_records_and_saves_images(router, c2, tmp_path):
     saved = tmp_path / "saved"
     saved.mkdir()
     wide = np.array([[0, 255, 256], [40_000, 65_535, 1]], np.uint16)
@@ -79,7 +74,6 @@ def test_example_prints_records_and_saves_images(router: str, c2: C2Service, tmp
         relay(c2, image("0001", picture=Pixels.from_array(wide)))
         relay(c2, image("0002", picture=Pixels.from_array(grey), version=2).model_copy(update={"contact": None}))
         relay(c2, decision("0001", verdict="mine_like"))
-        assert process.stdout is not None
         lines = [process.stdout.readline() for _ in range(3)]
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=120)

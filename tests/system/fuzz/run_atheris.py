@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[3]
@@ -39,14 +40,12 @@ COMPILED = [
 ]
 
 with atheris.instrument_imports(include=["sonarpost", "fuzz"], exclude=COMPILED):
+    from builders.atheris_run import fuzz
     from builders.codec_oracle import check, codec_for, codec_ids, stream_of
     from builders.fuzz_seeds import as_input, golden_streams, new_streams
 
     from sonarpost.codec.emb import codec as emb  # noqa: F401
     from sonarpost.codec.vq import codec as vq  # noqa: F401
-
-MAX_INPUT_BYTES = 1200
-DEFAULTS = {"-max_len": MAX_INPUT_BYTES, "-timeout": 10, "-rss_limit_mb": 2048, "-print_final_stats": 1}
 
 
 def main() -> None:
@@ -58,24 +57,17 @@ def main() -> None:
         names = arguments[place + 1].split(",")
         del arguments[place : place + 2]
     ids = codec_ids(names)
-    corpus = WORK / ("-".join(names) if names else "all")
-    corpus.mkdir(parents=True, exist_ok=True)
-    if not any(Path(argument).is_file() for argument in arguments):
-        streams = [*golden_streams(ids), *new_streams(ids)]
-        for number, stream in enumerate(streams):
-            for flags in range(4):
-                (corpus / f"seed-{number:03}-{flags}").write_bytes(as_input(stream, flags, ids)[:MAX_INPUT_BYTES])
-        arguments.append(str(corpus))
     for codec_id in ids:
         codec_for(codec_id)  # loading is not part of the time of an input
 
-    def test_one_input(data: bytes) -> None:
-        stream, received = stream_of(data, ids)
-        check(stream, received, ids)
+    def seeds() -> Iterator[bytes]:
+        for stream in (*golden_streams(ids), *new_streams(ids)):
+            yield from (as_input(stream, flags, ids) for flags in range(4))
 
-    options = [f"{name}={value}" for name, value in DEFAULTS.items() if not any(a.startswith(name) for a in arguments)]
-    atheris.Setup([sys.argv[0], *options, *arguments], test_one_input)
-    atheris.Fuzz()
+    def check_input(data: bytes) -> None:
+        check(*stream_of(data, ids), ids)
+
+    fuzz(check_input, WORK / ("-".join(names) if names else "all"), seeds, 1200, *arguments)
 
 
 if __name__ == "__main__":

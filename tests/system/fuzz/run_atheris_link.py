@@ -25,30 +25,12 @@ except ImportError:
     sys.exit("run_atheris_link: Atheris is not installed here: python -m pip install 'sonarpost[fuzz]'")
 
 with atheris.instrument_imports(include=["sonarpost.link", "sonarpost.modem"]):
+    from builders.atheris_run import fuzz
     from builders.link_oracle import CHECKS, seeds
-
-DEFAULTS = {"-max_len": 4096, "-timeout": 20, "-rss_limit_mb": 2048, "-print_final_stats": 1}
-
-
-def main() -> None:
-    """Run until libFuzzer ends the process."""
-    name, *arguments = sys.argv[1:] or [""]
-    if name not in CHECKS:
-        sys.exit(f"run_atheris_link: {name!r} is not one of {', '.join(CHECKS)}")
-    corpus = WORK / f"link-{name}"
-    corpus.mkdir(parents=True, exist_ok=True)
-    if not any(Path(argument).is_file() for argument in arguments):
-        for number, seed in enumerate(seeds(name)):
-            (corpus / f"seed-{number:03}").write_bytes(seed)
-        arguments.append(str(corpus))
-
-    def test_one_input(data: bytes) -> None:
-        CHECKS[name](data)
-
-    options = [f"{key}={value}" for key, value in DEFAULTS.items() if not any(a.startswith(key) for a in arguments)]
-    atheris.Setup([sys.argv[0], *options, *arguments], test_one_input)
-    atheris.Fuzz()
 
 
 if __name__ == "__main__":
-    main()
+    name, *arguments = sys.argv[1:] or [""]
+    if name not in CHECKS:
+        sys.exit(f"run_atheris_link: {name!r} is not one of {', '.join(CHECKS)}")
+    fuzz(CHECKS[name], WORK / f"link-{name}", lambda: seeds(name), 4096, *arguments)

@@ -26,33 +26,21 @@ except ImportError:
     sys.exit("run_atheris_survey: Atheris is not installed here: python -m pip install 'sonarpost[fuzz]'")
 
 with atheris.instrument_imports(include=["sonarpost.sonar", "fuzz"]):
+    from builders.atheris_run import fuzz
     from builders.survey_oracle import Readers
 
 FORMATS = "--formats="
-DEFAULTS = {"-max_len": 4096, "-timeout": 10, "-rss_limit_mb": 2048, "-print_final_stats": 1}
 
 
 def main() -> None:
     """Run until libFuzzer ends the process."""
     arguments = [argument for argument in sys.argv[1:] if not argument.startswith(FORMATS)]
     formats = [argument.removeprefix(FORMATS) for argument in sys.argv[1:] if argument.startswith(FORMATS)]
-    work = WORK / formats[0] if formats else WORK
-    work.mkdir(parents=True, exist_ok=True)
-    folder = Path(
-        tempfile.mkdtemp(prefix="survey-", dir=WORK.parent)
-    )  # not deleted, because libFuzzer ends the process
+    WORK.mkdir(parents=True, exist_ok=True)
+    # Not deleted, because libFuzzer ends the process.
+    folder = Path(tempfile.mkdtemp(prefix="survey-", dir=WORK.parent))
     readers = Readers(folder, formats[0].split(",")) if formats else Readers(folder)
-    if not any(Path(argument).is_file() for argument in arguments):
-        for number, seed in enumerate(readers.seeds()):
-            (work / f"seed-{number}").write_bytes(seed)
-        arguments.append(str(work))
-
-    def test_one_input(data: bytes) -> None:
-        readers.check(data)
-
-    options = [f"{name}={value}" for name, value in DEFAULTS.items() if not any(a.startswith(name) for a in arguments)]
-    atheris.Setup([sys.argv[0], *options, *arguments], test_one_input)
-    atheris.Fuzz()
+    fuzz(readers.check, WORK / formats[0] if formats else WORK, readers.seeds, 4096, *arguments)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """The checks of `run_atheris_link.py` on genuine traffic and on a fixed set of damaged inputs."""
 
-from __future__ import annotations
-
 import random
 
 import pytest
@@ -9,12 +7,12 @@ from builders.link_oracle import CHECKS, seeds
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_genuine_traffic_passes_and_reaches_the_checks(name: str) -> None:
+def test_genuine_traffic_passes_and_reaches_the_checks(name):
     assert sum(CHECKS[name](seed) for seed in seeds(name)) > 100
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_damaged_traffic_passes_the_checks(name: str) -> None:
+def test_damaged_traffic_passes_the_checks(name):
     rng, genuine = random.Random(7), list(seeds(name))
     for _ in range(60):
         data = bytearray(rng.choice(genuine) + rng.choice(genuine))

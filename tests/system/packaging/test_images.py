@@ -1,7 +1,5 @@
 """`make images`: its progress, and that it installs nothing on the host without consent."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -13,7 +11,7 @@ from builders.common import REPOSITORY
 NEEDED = ("bash", "sh", "sed", "head", "tail", "mktemp", "rm", "timeout", "dirname", "awk", "ls", "cat")
 
 
-def program(folder: Path, name: str, script: str) -> None:
+def program(folder, name, script):
     path = folder / name
     assert not path.is_symlink(), "writing would change a program of this host"
     path.write_text(f"#!/bin/sh\n{script}\n")
@@ -21,7 +19,7 @@ def program(folder: Path, name: str, script: str) -> None:
 
 
 @pytest.fixture
-def host(tmp_path: Path) -> Path:
+def host(tmp_path):
     """Programs of a host without debootstrap, whose container engine has no image and reaches no registry."""
     folder = tmp_path / "bin"
     folder.mkdir()
@@ -34,7 +32,7 @@ def host(tmp_path: Path) -> Path:
     return folder
 
 
-def images(host: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+def images(host, **variables):
     return subprocess.run(
         ["bash", "packaging/images.sh"],
         cwd=REPOSITORY,
@@ -47,7 +45,7 @@ def images(host: Path, **variables: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_nothing_is_installed_without_consent(host: Path, tmp_path: Path) -> None:
+def test_nothing_is_installed_without_consent(host, tmp_path):
     done = images(host)
     assert done.returncode == 2, done.stderr
     assert (
@@ -57,12 +55,12 @@ def test_nothing_is_installed_without_consent(host: Path, tmp_path: Path) -> Non
     assert not (tmp_path / "apt-get.txt").exists()
 
 
-def test_consent_installs(host: Path, tmp_path: Path) -> None:
+def test_consent_installs(host, tmp_path):
     assert images(host, INSTALL="yes").returncode == 7
     assert (tmp_path / "apt-get.txt").read_text() == "update\n"
 
 
-def test_missing_engine_and_missing_rights_are_named(host: Path) -> None:
+def test_missing_engine_and_missing_rights_are_named(host):
     program(host, "id", 'case "$1" in -u) echo 1000 ;; -un) echo anna ;; esac')
     done = images(host)
     assert done.returncode == 2
@@ -73,9 +71,9 @@ def test_missing_engine_and_missing_rights_are_named(host: Path) -> None:
     assert "docker: got no such program" in done.stderr
 
 
-def progress(script: str, **variables: str) -> subprocess.CompletedProcess[str]:
+def progress(before, script, **variables):
     return subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", f". packaging/progress.sh; progress images sh -c '{script}'"],
+        ["bash", "-euo", "pipefail", "-c", f". packaging/progress.sh; {before}progress images sh -c '{script}'"],
         cwd=REPOSITORY,
         env={**os.environ, **variables},
         capture_output=True,
@@ -85,20 +83,23 @@ def progress(script: str, **variables: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_steps_are_shown_and_no_step_is_silent() -> None:
-    done = progress(
-        'echo "Step 1/2 : FROM base"; echo "Step 2/2 : RUN pip"; echo Collecting numpy; sleep 4.5', PROGRESS_S="1"
-    )
+def test_steps_are_shown_and_no_step_is_silent(tmp_path):
+    """The last step lasts until its line was shown three times."""
+    shown = tmp_path / "shown"
+    shown.touch()
+    step = f'until [ "$(grep -c Collecting {shown})" -ge 3 ]; do sleep 0.1; done'
+    script = f'echo "Step 1/2 : FROM base"; echo "Step 2/2 : RUN pip"; echo Collecting numpy; {step}'
+    done = progress(f"exec > >(tee {shown}); ", script, PROGRESS_S="1")
     assert done.returncode == 0
     first, second, *others = done.stdout.splitlines()
     assert re.fullmatch(r"images: \d+ s: Step 1/2 : FROM base", first)
     assert re.fullmatch(r"images: \d+ s: Step 2/2 : RUN pip", second)
-    assert len(others) >= 2
+    assert len(others) >= 3
     assert all(line.startswith("images: ") and line.endswith(" s: Collecting numpy") for line in others)
     assert len(set(others)) >= 2, "with the elapsed time"
 
 
-def test_failure_shows_the_last_lines_and_returns_the_status() -> None:
-    done = progress("seq 100; exit 9", FAILURE_LINES="3")
+def test_failure_shows_the_last_lines_and_returns_the_status():
+    done = progress("", "seq 100; exit 9", FAILURE_LINES="3")
     assert done.returncode == 9
     assert done.stderr == "images: 98\nimages: 99\nimages: 100\n"
