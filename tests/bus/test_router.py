@@ -176,6 +176,10 @@ def test_router_files_of_the_project_disable_discovery(path):
     assert json.loads(config.get_json("transport/link/tx/lease")) == 3000
     wait = "transport/link/tx/queue/congestion_control/block/wait_before_close"
     assert json.loads(config.get_json(wait)) == 60_000_000
+    # Without authentication, they listen on the loopback address only.
+    endpoints = json.loads(config.get_json("listen/endpoints"))
+    assert endpoints
+    assert all(endpoint.startswith("tcp/127.0.0.1:") for endpoint in endpoints)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,9 +25,13 @@ from sonarpost.services.c2.service import C2Service
 from sonarpost.sonar.image_files import write_tiff
 
 ZENOH = Path(sys.executable).with_name("zenoh")
-pytestmark = pytest.mark.skipif(
-    not ZENOH.is_file() and shutil.which("zenoh") is None, reason="zenoh-cli is not installed (pip install zenoh-cli)"
-)
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(
+        not ZENOH.is_file() and shutil.which("zenoh") is None,
+        reason="zenoh-cli is not installed (pip install zenoh-cli)",
+    ),
+]
 
 PlatformMaker = Callable[[str], PlatformConfig]
 DETECTED = "sonarpost/v1/uuv-1/contact/detected"
@@ -64,7 +67,6 @@ class Subscriber:
             threading.Thread(target=self._read, args=(process,), daemon=True).start()
 
     def _read(self, process):
-        assert process.stdout is not None
         for line in process.stdout:
             self._lines.put(line)
 
@@ -73,12 +75,10 @@ class Subscriber:
         return key, msgpack.unpackb(base64.b64decode(value))
 
     def until(self, key):
-        deadline = time.monotonic() + 15
-        while time.monotonic() < deadline:
-            met, fields = self.next()
-            if met == key:
-                return fields
-        pytest.fail(f"nothing on {key}")
+        """Return the next record on a key."""
+        while (met := self.next())[0] != key:
+            pass
+        return met[1]
 
     def close(self):
         for process in self._processes:

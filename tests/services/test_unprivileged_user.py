@@ -17,6 +17,8 @@ from sonarpost.sonar.image_files import write_png
 
 __all__ = ["installation"]
 
+pytestmark = pytest.mark.system
+
 IN_MEMORY = "Preparing machine code for the vq codec: about 2 s, in each process: no folder for it is writable"
 PYTHON_API = """
 import numpy, sonarpost
