@@ -68,8 +68,9 @@ def test_a_change_of_another_compiled_module_of_the_folder_compiles_again(import
     assert (changed(1), hits(changed)) == (2, loaded)
 
 
-@pytest.mark.parametrize("damaged", ["*.nbi", "*.nbc"])
-@pytest.mark.parametrize("content", [b"", b"\x80\x04junk"])
+@pytest.mark.parametrize(
+    ("damaged", "content"), [("*.nbi", b""), ("*.nbi", b"\x80\x04junk"), ("*.nbc", b"\x80\x04junk")]
+)
 def test_a_damaged_file_is_replaced(damaged, content, module, tmp_path, caplog) -> None:
     module()(1)
     [path] = (tmp_path / "source" / "__pycache__").glob(damaged)
@@ -91,23 +92,25 @@ def test_a_full_disk_leaves_the_machine_code_in_memory(module, monkeypatch, capl
     assert "No space left on device" in record.getMessage()
 
 
-def test_folders_are_tried_in_a_documented_order(monkeypatch, tmp_path) -> None:
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+@pytest.fixture
+def no_folders(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("NUMBA_CACHE_DIR", "CACHE_DIRECTORY", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(jit, "service_folders", [])
+
+
+@pytest.mark.usefixtures("no_folders")
+def test_folders_are_tried_in_a_documented_order(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
-    monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
     jit.use_code_folder(tmp_path / "state")
     source = tmp_path / "installed" / "codec" / "kernel.py"
     beside, service, user = code_folders(source)
     assert beside == source.parent / "__pycache__"
     assert [service.parent, user.parent] == [tmp_path / "state" / "machine-code", tmp_path / "user" / "sonarpost"]
-
-
-def test_the_cache_folder_of_systemd_replaces_the_state_folder(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(jit, "service_folders", [])
     monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path / "cache"))
     jit.use_code_folder(tmp_path / "state")
-    assert jit.service_folders == [tmp_path / "cache" / "machine-code"]
+    assert jit.service_folders == [tmp_path / "cache" / "machine-code"]  # the one of systemd
 
 
 def test_a_chosen_folder_replaces_all_others_and_holds_several_installations(monkeypatch, tmp_path) -> None:
@@ -118,9 +121,7 @@ def test_a_chosen_folder_replaces_all_others_and_holds_several_installations(mon
     assert {one.parent, other.parent} == {tmp_path / "chosen"}
 
 
+@pytest.mark.usefixtures("no_folders")
 def test_a_user_without_a_home_has_no_user_folder(monkeypatch) -> None:
     monkeypatch.setattr("os.path.expanduser", lambda path: path)
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.setattr(jit, "service_folders", [])
     assert code_folders(Path("/opt/codec/kernel.py")) == [Path("/opt/codec/__pycache__")]

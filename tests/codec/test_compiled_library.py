@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import shutil
 import subprocess
 import sys
 import sysconfig
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -46,10 +46,12 @@ def test_without_numba_and_library_the_error_names_both(package: Path) -> None:
     assert "numba: got no such package, expected it or sonarpost_codec_functions.*.so in" in done.stderr
 
 
+@pytest.mark.system
 @pytest.mark.timeout(900)
-@pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
-@pytest.mark.skipif(importlib.util.find_spec("setuptools") is None, reason="no setuptools")
-@pytest.mark.skipif(not Path(sysconfig.get_path("include"), "Python.h").exists(), reason="no headers of Python")
+@pytest.mark.skipif(
+    not (shutil.which("g++") and find_spec("setuptools") and Path(sysconfig.get_path("include"), "Python.h").exists()),
+    reason="no g++, setuptools or headers of Python",
+)
 def test_library_has_the_streams_and_pixels_of_numba(package: Path) -> None:
     scripts = REPOSITORY / "packaging"
     compiled = run("import compile_codecs; compile_codecs.main()", package, scripts)
@@ -77,15 +79,9 @@ def test_implementation_is_chosen_by_the_types_of_the_arguments() -> None:
     [np.zeros(4, np.int64), np.zeros(4, ">i4"), np.zeros((2, 2), np.int32), np.zeros(8, np.int32)[::2], 1, 1.0, None],
 )
 def test_other_types_are_refused(argument: object) -> None:
-    def implementation(_: object) -> None:
-        pytest.fail("called")
-
     accepted = argument_types([np.zeros(4, np.int32)])
     with pytest.raises(TypeError, match=r"module\.name: arguments: got .*, expected .*int32"):
-        LibraryFunction("module.name", {accepted: implementation})(argument)
-
-
-def test_function_that_only_compiled_functions_call() -> None:
+        LibraryFunction("module.name", {accepted: lambda _: pytest.fail("called")})(argument)
     with pytest.raises(TypeError, match="expected no call: only compiled functions call it"):
         LibraryFunction("module.name", {})(1)
 

@@ -16,8 +16,6 @@ from pathlib import Path
 import pytest
 from builders.common import REPOSITORY
 
-ROOT = REPOSITORY
-
 
 @pytest.mark.system
 @pytest.mark.timeout(900)  # compiles everything: 15 s on an idle machine
@@ -28,25 +26,13 @@ def test_golden_streams_of_emb_on_a_generic_processor(tmp_path: Path) -> None:
         "NUMBA_CACHE_DIR": str(tmp_path),
         "OMP_NUM_THREADS": "1",
     }
-    numba_config = subprocess.run(
-        [sys.executable, "-c", "import numba; print(numba.config.CPU_NAME)"],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert numba_config.stdout.strip() == "generic"
-    tests = [str(path) for path in sorted((ROOT / "tests" / "codec" / "emb").glob("test_*.py"))]
+    cpu_name = [sys.executable, "-c", "import numba; print(numba.config.CPU_NAME)"]
+    assert subprocess.check_output(cpu_name, env=environment, text=True).strip() == "generic"
+    tests = [str(path) for path in sorted((REPOSITORY / "tests" / "codec" / "emb").glob("test_*.py"))]
     assert tests
     options = ["--noconftest", "-p", "no:cacheprovider", "-q", "-o", "timeout=900", "-k", "golden_streams"]
-    found = subprocess.run(
-        [sys.executable, "-m", "pytest", *options, *tests],
-        env=environment,
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        check=False,
-    )
+    command = [sys.executable, "-m", "pytest", *options, *tests]
+    found = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=REPOSITORY, check=False)
     assert found.returncode == 0, found.stdout[-3000:] + found.stderr[-1000:]
     assert re.search(r"\b[1-9]\d* passed", found.stdout)
     assert list(tmp_path.rglob("*.nbc"))  # compiled here, not taken from another cache

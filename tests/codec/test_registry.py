@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+import sys
+import types
 from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
 
-from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.registry import (
     BUILTINS,
     ENTRY_POINT_GROUP,
     CodecRegistry,
     CodecResources,
     CodecSpec,
-    default_registry,
     load_plugins,
     present_name,
 )
-from sonarpost.codec.vq.codec import IndexPacking, VqCodec, codebook_tag
+from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import ConfigError, StreamError
 
@@ -35,9 +35,6 @@ NOT_A_SPEC = 5
 
 @pytest.fixture
 def registry(monkeypatch: pytest.MonkeyPatch) -> CodecRegistry:
-    import sys
-    import types
-
     module = types.ModuleType("sonarpost_test_plugin")
     module.PLUGIN, module.NOT_A_SPEC = PLUGIN, NOT_A_SPEC
     monkeypatch.setitem(sys.modules, "sonarpost_test_plugin", module)
@@ -48,17 +45,6 @@ def plugin(name: str, value: str) -> EntryPoint:
     return EntryPoint(name, f"sonarpost_test_plugin:{value}", ENTRY_POINT_GROUP)
 
 
-def test_vq_is_registered_by_name_and_by_every_codec_id(registry: CodecRegistry) -> None:
-    assert "vq" in registry.names()
-    image = np.random.default_rng(1).integers(0, 256, (16, 24), dtype=np.uint8)
-    for packing in IndexPacking:
-        codec = registry.create("vq", CodecResources(TILES, packing))
-        stream = codec.encode(image)
-        reader = registry.create_for_stream(stream, CodecResources(TILES))
-        assert reader.codec_id == codec.codec_id == packing.codec_id
-        assert np.array_equal(reader.decode(stream).image, codec.decode(stream).image)
-
-
 def test_errors_for_unknown_names_and_ids_list_the_known_ones(registry: CodecRegistry) -> None:
     with pytest.raises(ConfigError, match="vq"):
         registry.create("jpg", CodecResources())
@@ -66,9 +52,6 @@ def test_errors_for_unknown_names_and_ids_list_the_known_ones(registry: CodecReg
         registry.spec_for_id(0xFE)
     with pytest.raises(StreamError):
         registry.create_for_stream(b"\x10", CodecResources(TILES))
-
-
-def test_error_for_vq_without_tiles_names_a_codebook(registry: CodecRegistry) -> None:
     with pytest.raises(ConfigError, match="nominal-10"):
         registry.create("vq", CodecResources())
 
@@ -105,13 +88,6 @@ def test_codec_with_a_codebook_needs_codec_ids_with_a_tag_of_two_bytes(registry:
         registry.register(CodecSpec("other", (0x90, codec_id), make_nothing))
 
 
-@pytest.mark.parametrize("codec_id", [0x14, 0x1F, 0x80, 0xFF])
-def test_codec_ids_of_other_distributions_have_a_codebook_tag(registry: CodecRegistry, codec_id: int) -> None:
-    registry.register(CodecSpec("other", (codec_id,), make_nothing, needs_tiles=True))
-    header = StreamHeader(codec_id, codebook_tag(TILES), 16, 24)
-    assert StreamHeader.unpack(header.pack()).model_tag == codebook_tag(TILES)
-
-
 def test_plugin_is_registered(registry: CodecRegistry) -> None:
     load_plugins(registry, [plugin("plugin", "PLUGIN")])
     assert "plugin" in registry.names()
@@ -131,11 +107,6 @@ def test_error_names_an_invalid_plugin(registry: CodecRegistry, name: str, value
     with pytest.raises(ConfigError, match=match) as caught:
         load_plugins(registry, [plugin(name, value)])
     assert name in caught.value.where
-
-
-def test_default_registry_is_created_once() -> None:
-    assert default_registry() is default_registry()
-    assert "vq" in default_registry().names()
 
 
 def test_error_for_a_retired_name_names_codec_and_model(registry: CodecRegistry) -> None:

@@ -2,33 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-from typing import Any
 
 import pytest
 from builders.common import GOLDEN_FOLDER
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.codec.interface import (
-    COMMON_SIDES_PX,
-    MAX_SIDE_PX,
-    MIN_SIDE_PX,
-    StreamHeader,
-    model_tag,
-    tag_length,
-)
+from sonarpost.codec.interface import COMMON_SIDES_PX, MAX_SIDE_PX, MIN_SIDE_PX, StreamHeader, model_tag, tag_length
 from sonarpost.errors import StreamError
 
 GOLDEN = json.loads((GOLDEN_FOLDER / "codec" / "stream_headers.json").read_text())
 UNCOMMON_SIDES_PX = sorted(set(range(MIN_SIDE_PX, MAX_SIDE_PX + 1)) - set(COMMON_SIDES_PX))
 ONE_CODEC_ID_OF_EACH_CLASS = (0x01, 0x10, 0x20, 0x80)
 SHA256 = "f893" + "a5" * 30
-
-
-def by_name(cases: list[dict[str, Any]]) -> Any:
-    return pytest.mark.parametrize("case", cases, ids=[c["name"] for c in cases])
 
 
 @st.composite
@@ -38,41 +25,31 @@ def headers(draw: st.DrawFn) -> StreamHeader:
     return StreamHeader(codec_id, draw(st.integers(0, 256 ** tag_length(codec_id) - 1)), draw(sides), draw(sides))
 
 
-@by_name(GOLDEN["headers"])
-def test_golden_headers(case: dict[str, Any]) -> None:
-    data = bytes.fromhex(case["hex"])
-    header = StreamHeader(case["codec_id"], case["model_tag"], case["height_px"], case["width_px"])
-    assert header.pack() == data
-    assert StreamHeader.unpack(data) == header
-    assert header.size == len(data)
-
-
-@by_name(GOLDEN["rejected"])
-def test_golden_rejected_headers(case: dict[str, Any]) -> None:
-    with pytest.raises(StreamError) as caught:
-        StreamHeader.unpack(bytes.fromhex(case["hex"]), "stream 7")
-    assert caught.value.field == case["field"]
-    assert str(caught.value).startswith("stream 7: ")
-
-
-def test_common_sides_are_those_of_the_format() -> None:
+def test_golden_headers() -> None:
     assert list(COMMON_SIDES_PX) == GOLDEN["common_sides_px"]
+    for case in GOLDEN["headers"]:
+        data = bytes.fromhex(case["hex"])
+        header = StreamHeader(case["codec_id"], case["model_tag"], case["height_px"], case["width_px"])
+        assert header.pack() == data, case["name"]
+        assert StreamHeader.unpack(data) == header
+        assert header.size == len(data)
 
 
-def test_tag_length_of_every_codec_id() -> None:
-    lengths = [tag_length(codec_id) for codec_id in range(256)]
-    assert lengths == [0] * 0x10 + [2] * 0x10 + [1] * 0x60 + [2] * 0x80
+def test_golden_rejected_headers() -> None:
+    for case in GOLDEN["rejected"]:
+        with pytest.raises(StreamError) as caught:
+            StreamHeader.unpack(bytes.fromhex(case["hex"]), "stream 7")
+        assert caught.value.field == case["field"], case["name"]
+        assert str(caught.value).startswith("stream 7: ")
 
 
-@pytest.mark.parametrize(
-    ("codec_id", "tag"),
-    [(0x00, 0), (0x0F, 0), (0x10, 0xF893), (0x1F, 0xF893), (0x20, 0xF8), (0x7F, 0xF8), (0x80, 0xF893), (0xFF, 0xF893)],
-)
-def test_tag_is_the_start_of_the_model_hash(codec_id: int, tag: int) -> None:
-    assert model_tag(codec_id, SHA256) == tag
-    assert model_tag(codec_id, "") == 0
-    packed = StreamHeader(codec_id, tag, 80, 140).pack()
-    assert packed[1:-1].hex() == SHA256[: 2 * tag_length(codec_id)]
+def test_tag_is_the_start_of_the_model_hash() -> None:
+    tags = {0x00: 0, 0x0F: 0, 0x10: 0xF893, 0x1F: 0xF893, 0x20: 0xF8, 0x7F: 0xF8, 0x80: 0xF893, 0xFF: 0xF893}
+    for codec_id, tag in tags.items():
+        assert model_tag(codec_id, SHA256) == tag
+        assert model_tag(codec_id, "") == 0
+        packed = StreamHeader(codec_id, tag, 80, 140).pack()
+        assert packed[1:-1].hex() == SHA256[: 2 * tag_length(codec_id)]
 
 
 @pytest.mark.parametrize("codec_id", ONE_CODEC_ID_OF_EACH_CLASS)
@@ -89,9 +66,8 @@ def test_every_pair_of_common_sides_has_one_size_byte(codec_id: int) -> None:
 
 
 def test_other_sides_use_the_long_form() -> None:
-    # Each uncommon side with a common and with an uncommon one, as height and as width.
     for side_px in UNCOMMON_SIDES_PX:
-        for other_px in (80, 512, 17, 511):
+        for other_px in (80, 17):
             for height_px, width_px in ((side_px, other_px), (other_px, side_px)):
                 header = StreamHeader(0x10, 0xBEEF, height_px, width_px)
                 packed = header.pack()
@@ -115,38 +91,28 @@ def test_truncated_header_is_rejected(header: StreamHeader) -> None:
         with pytest.raises(StreamError) as caught:
             StreamHeader.unpack(packed[:length])
         assert caught.value.field == "header"
+    with pytest.raises(StreamError, match=f"at least {header.size} bytes"):
+        StreamHeader.unpack(packed[:-1])
 
 
 @pytest.mark.parametrize("codec_id", ONE_CODEC_ID_OF_EACH_CLASS)
-def test_error_for_a_truncated_header_names_the_required_length(codec_id: int) -> None:
-    common, other = StreamHeader(codec_id, 0, 80, 80), StreamHeader(codec_id, 0, 81, 80)
-    for header, length in ((common, common.size - 1), (other, other.size - 1)):
-        with pytest.raises(StreamError, match=f"at least {header.size} bytes"):
-            StreamHeader.unpack(header.pack()[:length])
+def test_reserved_size_codes_are_rejected(codec_id: int) -> None:
+    for code in range(225, 255):
+        with pytest.raises(StreamError) as caught:
+            StreamHeader.unpack(bytes([codec_id]) + bytes(tag_length(codec_id)) + bytes([code]) + bytes(8))
+        assert (caught.value.field, caught.value.value) == ("size", code)
 
 
-@pytest.mark.parametrize("codec_id", ONE_CODEC_ID_OF_EACH_CLASS)
-@pytest.mark.parametrize("code", range(225, 255))
-def test_reserved_size_codes_are_rejected(codec_id: int, code: int) -> None:
-    data = bytes([codec_id]) + bytes(tag_length(codec_id)) + bytes([code]) + bytes(8)
-    with pytest.raises(StreamError) as caught:
-        StreamHeader.unpack(data)
-    assert (caught.value.field, caught.value.value) == ("size", code)
-
-
-def test_common_sides_in_the_long_form_are_rejected() -> None:
+def test_common_sides_in_the_long_form_and_sides_out_of_range_are_rejected() -> None:
     for height_px in COMMON_SIDES_PX:
         for width_px in COMMON_SIDES_PX:
             with pytest.raises(StreamError, match="one-byte form"):
                 StreamHeader.unpack(bytes.fromhex(f"10beefff{height_px:03x}{width_px:03x}"))
-
-
-@pytest.mark.parametrize("side_px", [0, 1, 15, 513, 1024, 4095])
-def test_error_names_the_side_out_of_range(side_px: int) -> None:
-    for text, field in ((f"01ff{side_px:03x}011", "height_px"), (f"01ff011{side_px:03x}", "width_px")):
-        with pytest.raises(StreamError) as caught:
-            StreamHeader.unpack(bytes.fromhex(text))
-        assert (caught.value.field, caught.value.value) == (field, side_px)
+    for side_px in (0, 1, 15, 513, 1024, 4095):
+        for text, field in ((f"01ff{side_px:03x}011", "height_px"), (f"01ff011{side_px:03x}", "width_px")):
+            with pytest.raises(StreamError) as caught:
+                StreamHeader.unpack(bytes.fromhex(text))
+            assert (caught.value.field, caught.value.value) == (field, side_px)
 
 
 @given(st.binary(max_size=12))
@@ -156,9 +122,3 @@ def test_any_bytes_unpack_to_a_header_that_packs_to_them_or_are_rejected(data: b
     except StreamError:
         return
     assert data.startswith(header.pack())  # unique headers: receivers compare them to assign frames to images
-
-
-def test_headers_are_hashable_values() -> None:
-    header = StreamHeader(0x10, 0xBEEF, 80, 140)
-    assert header == StreamHeader(0x10, 0xBEEF, 80, 140)
-    assert len({header, dataclasses.replace(header), dataclasses.replace(header, width_px=141)}) == 2

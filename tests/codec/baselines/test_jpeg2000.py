@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 
 import numpy as np
 import pytest
 from builders.common import GOLDEN_FOLDER
-from builders.images import sdvd_crops, snippet
-from hypothesis import given, settings
+from builders.images import snippet
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image as Pillow
 
@@ -46,7 +45,6 @@ def test_golden_streams_are_decoded(name: str) -> None:
     decompositions=st.integers(3, 6),
     packets=st.binary(max_size=50),
 )
-@settings(max_examples=60, deadline=None)
 def test_packets_of_inverts_codestream(size: tuple[int, int], decompositions: int, packets: bytes) -> None:
     stream = codestream(*size, decompositions, packets)
     assert packets_of(stream, *size) == (decompositions, packets)
@@ -56,24 +54,15 @@ def test_packets_of_inverts_codestream(size: tuple[int, int], decompositions: in
         packets_of(stream[:-1], *size)
 
 
-@pytest.mark.parametrize("decompositions", [3, 4, 5, 6])
-@pytest.mark.parametrize("size", [(64, 64), (80, 140), (512, 65)])
+@pytest.mark.parametrize(("size", "decompositions"), [((64, 64), 3), ((80, 140), 4), ((80, 140), 5), ((512, 65), 6)])
 def test_main_header_is_that_of_openjpeg(decompositions: int, size: tuple[int, int]) -> None:
     file = io.BytesIO()
-    Pillow.fromarray(snippet(*size)).save(
-        file, "JPEG2000", no_jp2=True, irreversible=True, num_resolutions=decompositions + 1
-    )
+    options = {"no_jp2": True, "irreversible": True, "num_resolutions": decompositions + 1}
+    Pillow.fromarray(snippet(*size)).save(file, "JPEG2000", **options)
     stream = file.getvalue()
     header = main_header(*size, decompositions)
     assert stream.startswith(header)
     assert stream[len(header) : len(header) + 2] in (b"\xff\x64", b"\xff\x90")  # a comment or the tile
-
-
-def test_main_header_of_an_example() -> None:
-    assert main_header(49, 113, 3).hex() == (
-        "ff4fff5100290000000000710000003100000000000000000000007100000031000000000000000000010701"
-        "01ff52000c00000001000304040000ff5c001742673867506750676850055005504757d357d35762"
-    )
 
 
 def test_raw_body_is_a_standard_file() -> None:
@@ -117,26 +106,11 @@ def test_budgets_are_met_and_quality_increases(codec: Jpeg2000Codec) -> None:
         assert quality == sorted(quality)
 
 
-def test_packets_codec_meets_22_bytes() -> None:
-    image = snippet(80, 80)
-    stream = PACKETS.encode(image, 22)
-    assert len(stream) <= 22
-    assert psnr_db(image, PACKETS.decode(stream).image) > psnr_db(image, np.full_like(image, int(image.mean())))
-
-
 @BOTH
 def test_budget_below_the_coarsest_quality_is_rejected(codec: Jpeg2000Codec) -> None:
     for budget in (0, 3, 6):
         with pytest.raises(StreamError, match="budget_bytes"):
             codec.encode(snippet(80, 80), budget)
-
-
-@BOTH
-@pytest.mark.parametrize("size", [(16, 16), (17, 33), (512, 16), (31, 512), (201, 203)])
-def test_every_size_is_decomposed_as_far_as_possible(codec: Jpeg2000Codec, size: tuple[int, int]) -> None:
-    image = snippet(*size)
-    decoded = codec.decode(codec.encode(image))
-    assert psnr_db(image, decoded.image) > 18
 
 
 def test_codestream_of_another_size_is_rejected_before_decoding() -> None:
@@ -151,68 +125,14 @@ def test_codestream_of_another_size_is_rejected_before_decoding() -> None:
 
 def test_truncated_raw_codestream_is_rejected() -> None:
     stream = RAW.encode(snippet(33, 47), 200)
-    for length in range(2, len(stream)):
+    for length in range(2, len(stream), 3):
         with pytest.raises(StreamError):
             RAW.decode(stream[:length])
     with pytest.raises(StreamError):
         RAW.decode(stream + b"\0")
 
 
-@BOTH
-def test_damaged_codestream_decodes_or_is_rejected_without_output(
-    codec: Jpeg2000Codec, capfd: pytest.CaptureFixture[str]
-) -> None:
-    stream = codec.encode(snippet(60, 80), 300)
-    rejected = 0
-    for at in range(5, len(stream)):
-        damaged = bytearray(stream)
-        damaged[at] ^= 0x5A
-        for data in (bytes(damaged), stream[:at]):
-            try:
-                assert codec.decode(data).image.shape == (60, 80)
-            except StreamError:
-                rejected += 1
-    assert rejected > len(stream) / 4
-    assert capfd.readouterr() == ("", "")
-
-
-@given(junk=st.binary(max_size=200), size=st.sampled_from([(16, 16), (80, 80), (33, 200)]))
-@settings(max_examples=80, deadline=None)
-def test_any_packets_decode_or_are_rejected(junk: bytes, size: tuple[int, int]) -> None:
-    try:
-        decoded = PACKETS.decode(StreamHeader(0x03, 0, *size).pack() + junk)
-    except StreamError:
-        return
-    assert decoded.image.shape == size
-    assert not decoded.missing.any()
-
-
-@BOTH
-def test_gap_makes_all_pixels_missing(codec: Jpeg2000Codec) -> None:
-    stream = codec.encode(snippet(80, 80), 400)
-    received = np.ones(len(body(stream)), np.bool_)
-    assert np.array_equal(codec.decode(stream, received).image, codec.decode(stream).image)
-    with pytest.raises(StreamError):  # damage is not a gap
-        codec.decode(stream[:-20], received[:-20])
-    received[-20] = False
-    decoded = codec.decode(stream, received)
-    assert decoded.missing.all()
-    assert not decoded.image.any()
-    assert "did not arrive" in decoded.notes[0]
-    assert "nothing can be decoded" in decoded.notes[1]
-
-
 def test_error_names_an_openjpeg_with_other_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jpeg2000, "_LOWEST_STEPS", {3: 1, 4: 1, 5: 1, 6: 1})
     with pytest.raises(ConfigError, match="OpenJPEG"):
         RAW.encode(snippet(80, 80))
-
-
-@pytest.mark.realdata
-@pytest.mark.parametrize(("budget", "least_db"), [(64, 20.31), (256, 21.89)])
-def test_quality_on_real_snippets(data_dir: Path, budget: int, least_db: float) -> None:
-    crops = sdvd_crops(data_dir)
-    assert len(crops) == 69
-    quality = [psnr_db(crop, PACKETS.decode(PACKETS.encode(crop, budget)).image) for crop in crops[::4]]
-    # The measured value minus 0.05 dB, a margin for other builds of the libraries.
-    assert np.mean(quality) > least_db

@@ -1,45 +1,30 @@
-"""SPIHT: transform, trees, embedded stream, passes, damage, speed and quality."""
+"""SPIHT: transform, trees, embedded stream, passes, damage and quality."""
 
 from __future__ import annotations
-
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from builders.common import GOLDEN_FOLDER
-from builders.images import sdvd_crops, snippet
-from hypothesis import given, settings
+from builders.images import snippet
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.codec.baselines import spiht
-from sonarpost.codec.baselines.spiht import (
-    DEFAULT_PASSES,
-    FRACTION_BITS,
-    MAX_PLANES,
-    PHASE_STEP,
-    CoderState,
-    SpihtCodec,
-    forward_transform,
-    inverse_transform,
-    run_passes,
-    wavelet_trees,
-)
+from sonarpost.codec.baselines.spiht import MAX_PLANES, SpihtCodec, forward_transform, wavelet_trees
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import StreamError
 
 GOLDEN = GOLDEN_FOLDER / "spiht"
-SIZES = st.tuples(st.integers(16, 70), st.integers(16, 70))
+SIZES = st.tuples(st.integers(16, 45), st.integers(16, 45))
 
 
 @pytest.mark.parametrize("name", ["80x80-64", "49x113-343", "17x31-40", "17x31-None", "16x200-22"])
 def test_golden_streams_are_reproduced_and_decoded(name: str) -> None:
     size, budget = name.split("-")
-    height_px, width_px = map(int, size.split("x"))
     golden = bytes.fromhex((GOLDEN / f"{name}.hex").read_text())
     codec = SpihtCodec()
-    stream = codec.encode(snippet(height_px, width_px), None if budget == "None" else int(budget))
+    stream = codec.encode(snippet(*map(int, size.split("x"))), None if budget == "None" else int(budget))
     assert stream.hex() == golden.hex()
     decoded = codec.decode(golden)
     assert decoded.image.tobytes().hex() == (GOLDEN / f"{name}-picture.hex").read_text().strip()
@@ -47,19 +32,16 @@ def test_golden_streams_are_reproduced_and_decoded(name: str) -> None:
 
 
 @given(size=SIZES, seed=st.integers(0, 999), mean=st.integers(100, 150))
-@settings(max_examples=40, deadline=None)
-def test_transform_of_any_size_is_invertible_and_nearly_orthonormal(
-    size: tuple[int, int], seed: int, mean: int
-) -> None:
+def test_transform_of_any_size_is_invertible_and_nearly_orthonormal(size, seed, mean):
     image = np.random.default_rng(seed).integers(0, 256, size, dtype=np.uint8)
     trees = wavelet_trees(*size)
     flat = forward_transform(image, mean, trees)
     assert flat.shape == (image.size,)
-    assert np.array_equal(inverse_transform(flat, mean, trees), image)
+    assert np.array_equal(spiht.inverse_transform(flat, mean, trees), image)
     energy = ((image.astype(float) - mean) ** 2).sum()
     # Measured with 1000 images of each size: 0.92 to 1.37 for multiples of 8, up to 1.81 where bands have odd sizes.
     limit = 1.5 if all(pixels % 8 == 0 for pixels in size) else 2.0
-    assert 0.7 < ((flat / 2**FRACTION_BITS) ** 2).sum() / energy < limit
+    assert 0.7 < ((flat / 2**spiht.FRACTION_BITS) ** 2).sum() / energy < limit
 
 
 def test_smooth_slope_has_coarse_coefficients_only() -> None:
@@ -71,7 +53,6 @@ def test_smooth_slope_has_coarse_coefficients_only() -> None:
 
 
 @given(size=SIZES)
-@settings(max_examples=30, deadline=None)
 def test_every_coefficient_belongs_to_one_tree(size: tuple[int, int]) -> None:
     trees = wavelet_trees(*size)
     assert trees.size == size[0] * size[1]
@@ -97,12 +78,11 @@ def test_children_have_the_position_of_their_parent() -> None:
 
 
 @given(size=SIZES, seed=st.integers(0, 999), phase=st.integers(0, 3), loops=st.integers(1, 14))
-@settings(max_examples=30, deadline=None)
 def test_error_after_a_plane_is_below_its_step(size: tuple[int, int], seed: int, phase: int, loops: int) -> None:
     image = (np.random.default_rng(seed).rayleigh(40, size)).clip(0, 255).astype(np.uint8)
     trees = wavelet_trees(*size)
     flat = forward_transform(image, 100, trees)
-    encoder, decoder = CoderState.for_encoding(flat, phase, trees), CoderState.for_decoding(trees)
+    encoder, decoder = spiht.CoderState.for_encoding(flat, phase, trees), spiht.CoderState.for_decoding(trees)
     planes = range(encoder.planes - 1, max(encoder.planes - 1 - loops, -1), -1)
     bits: list[int] = []
 
@@ -110,26 +90,17 @@ def test_error_after_a_plane_is_below_its_step(size: tuple[int, int], seed: int,
         bits.append(bit)
         return bit
 
-    run_passes(trees, planes, encoder, write)
+    spiht.run_passes(trees, planes, encoder, write)
     assert set(bits) <= {0, 1}
     written = iter(bits)
-    run_passes(trees, planes, decoder, lambda _: next(written))
+    spiht.run_passes(trees, planes, decoder, lambda _: next(written))
     assert next(written, None) is None
-    step = (4 + phase) * PHASE_STEP << planes[-1]
+    step = (4 + phase) * spiht.PHASE_STEP << planes[-1]
     decoded = decoder.reconstructed(phase)
     assert np.array_equal(encoder.reconstructed(phase), decoded)
     assert (np.abs(decoded - flat) <= step).all()
     assert ((decoded == 0) == (np.abs(flat) < step)).all()
     assert (np.sign(decoded[decoded != 0]) == np.sign(flat[decoded != 0])).all()
-
-
-def test_shorter_body_is_a_prefix_of_a_longer_one() -> None:
-    image = snippet(80, 80)
-    trees = wavelet_trees(80, 80)
-    flat = forward_transform(image, 100, trees)
-    complete = spiht._write_body(flat, 12, 1, trees, MAX_PLANES, None)
-    for length in (2, 3, 10, 57, 200, 1000):
-        assert spiht._write_body(flat, 12, 1, trees, MAX_PLANES, length) == complete[:length]
 
 
 def test_longer_prefix_gives_a_better_image() -> None:
@@ -143,7 +114,8 @@ def test_longer_prefix_gives_a_better_image() -> None:
 
 def test_budget_is_used_completely_until_the_error_is_one_grey_level() -> None:
     codec, image = SpihtCodec(), snippet(40, 56)
-    assert [len(codec.encode(image, budget)) for budget in range(7, 90)] == list(range(7, 90))
+    budgets = [*range(7, 30), 60, 89]
+    assert [len(codec.encode(image, budget)) for budget in budgets] == budgets
     exact = codec.encode(image, 100_000)
     assert len(exact) < 3000
     assert np.abs(codec.decode(exact).image.astype(int) - image).max() <= 1
@@ -160,45 +132,19 @@ def test_phase_with_the_smallest_error_is_sent() -> None:
     assert max(errors) > min(errors)
 
 
-def test_seven_passes_without_a_budget() -> None:
-    image = snippet(49, 113)
-    trees = wavelet_trees(49, 113)
-    stream = SpihtCodec().encode(image)
-    mean = stream[StreamHeader.unpack(stream).size] >> 3
-    flat = forward_transform(image, 8 * mean + 4, trees)
-    bodies = [spiht._write_body(flat, mean, 0, trees, passes, None) for passes in range(1, 12)]
-    assert [len(body) for body in bodies] == sorted(len(body) for body in bodies)
-    # The paper's Fig. 2 at this size: 343 B with 6 passes, 1110 B with 7. These values depend on the texture too.
-    assert 1.5 < len(bodies[6]) / len(bodies[5]) < 6
-    assert stream[-len(bodies[6]) :] == bodies[DEFAULT_PASSES - 1]
-
-
-@pytest.mark.parametrize("grey", [0, 1, 100, 103, 255])
+@pytest.mark.parametrize("grey", [0, 103, 255])
 def test_flat_image_decodes_within_one_grey_level(grey: int) -> None:
     codec = SpihtCodec()
-    stream = codec.encode(np.full((80, 80), grey, np.uint8), 64)
+    stream = codec.encode(np.full((40, 40), grey, np.uint8), 64)
     assert np.abs(codec.decode(stream).image.astype(int) - grey).max() <= 1
 
 
 def test_largest_possible_coefficients_are_coded() -> None:
     rows, columns = np.indices((512, 512))
-    for image in (rows < 256, columns < 256, (rows < 256) ^ (columns < 256)):
+    for image in (rows < 256, (rows < 256) ^ (columns < 256)):
         black_and_white = (image * 255).astype(np.uint8)
         decoded = SpihtCodec().decode(SpihtCodec().encode(black_and_white, 1000))
         assert psnr_db(black_and_white, decoded.image) > 25
-
-
-def test_bytes_after_a_gap_are_not_used() -> None:
-    codec = SpihtCodec()
-    stream = codec.encode(snippet(80, 80), 200)
-    received = np.ones(198, np.bool_)
-    received[50] = False
-    body = bytearray(stream[2:])
-    body[50] = 0
-    decoded = codec.decode(stream[:2] + bytes(body), received)
-    assert np.array_equal(decoded.image, codec.decode(stream[:52]).image)
-    assert not decoded.missing.any()
-    assert decoded.notes == ("body byte 50 of 198 did not arrive; later bytes are not used",)
 
 
 @pytest.mark.parametrize("length", [2, 3])
@@ -210,23 +156,19 @@ def test_incomplete_prefix_makes_all_pixels_missing(length: int) -> None:
     assert "at least 2" in decoded.notes[0]
 
 
-def test_budget_below_the_prefix_is_rejected() -> None:
+def test_budget_below_the_prefix_and_invalid_planes_are_rejected() -> None:
     for size in ((80, 80), (81, 80)):
         least = StreamHeader(0x04, 0, *size).size + 2
         assert len(SpihtCodec().encode(snippet(*size), least)) == least
         with pytest.raises(StreamError, match=f"at least {least} B"):
             SpihtCodec().encode(snippet(*size), least - 1)
-
-
-@pytest.mark.parametrize("top", range(MAX_PLANES, 32))
-def test_invalid_plane_is_rejected(top: int) -> None:
     header = StreamHeader(0x04, 0, 80, 80).pack()
-    with pytest.raises(StreamError, match="highest plane"):
-        SpihtCodec().decode(header + bytes([top >> 4, (top & 15) << 4, 0, 0]))
+    for top in range(MAX_PLANES, 32):
+        with pytest.raises(StreamError, match="highest plane"):
+            SpihtCodec().decode(header + bytes([top >> 4, (top & 15) << 4, 0, 0]))
 
 
 @given(body=st.binary(min_size=2, max_size=400), size=SIZES)
-@settings(max_examples=60, deadline=None)
 def test_any_body_decodes_or_is_rejected(body: bytes, size: tuple[int, int]) -> None:
     try:
         decoded = SpihtCodec().decode(StreamHeader(0x04, 0, *size).pack() + body)
@@ -235,26 +177,3 @@ def test_any_body_decodes_or_is_rejected(body: bytes, size: tuple[int, int]) -> 
         return
     assert decoded.image.shape == size
     assert not decoded.missing.any()
-
-
-def test_snippet_is_encoded_within_200_ms() -> None:
-    codec, image = SpihtCodec(), snippet(140, 80)
-    for budget in (None, 512):
-        codec.encode(image, budget)
-        seconds = []
-        for _ in range(5):
-            start = time.perf_counter()
-            codec.encode(image, budget)
-            seconds.append(time.perf_counter() - start)
-        # About 10 ms. The best of five: other work may share the processor.
-        assert min(seconds) < 0.2
-
-
-@pytest.mark.realdata
-@pytest.mark.parametrize(("budget", "least_db"), [(22, 20.27), (64, 21.23), (256, 23.10)])
-def test_quality_on_real_snippets(data_dir: Path, budget: int, least_db: float) -> None:
-    crops = sdvd_crops(data_dir)
-    assert len(crops) == 69
-    quality = [psnr_db(crop, SpihtCodec().decode(SpihtCodec().encode(crop, budget)).image) for crop in crops]
-    # The measured value minus 0.05 dB, a margin for other builds of the libraries.
-    assert np.mean(quality) > least_db

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
+from importlib.resources import files
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from builders.images import contact
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.codec.emb import MODEL_FILES, transform
@@ -23,38 +24,37 @@ from sonarpost.errors import StreamError
 CODEC = EmbCodec()
 
 
-def contact(height_px: int = 80, width_px: int = 80, seed: int = 0) -> np.ndarray:
-    """Return a speckled slope with a highlight and a shadow."""
-    rng = np.random.default_rng(seed)
-    image = (50 + 30 * np.linspace(0, 1, width_px)) * rng.gamma(6, 1 / 6, (height_px, width_px))
-    image[height_px // 3 : height_px // 2, width_px // 4 : width_px // 2] *= 3
-    image[height_px // 3 : height_px // 2, width_px // 2 : width_px * 3 // 4] *= 0.1
-    return np.clip(image, 0, 255).astype(np.uint8)
-
-
-@pytest.mark.parametrize("budget", [6, 7, 22, 23, 64, 200, 512])
-def test_budget_is_used_completely(budget: int) -> None:
-    stream = CODEC.encode(contact(), budget)
-    assert len(stream) == budget
-
-
 def test_longer_prefixes_are_not_much_worse() -> None:
-    image = contact(64, 56)
+    image = contact(40, 48)
     stream = CODEC.encode(image, 160)
     quality = []
-    for length in range(StreamHeader.unpack(stream).size, len(stream) + 1):
+    for length in range(StreamHeader.unpack(stream).size, len(stream) + 1, 2):
         decoded = CODEC.decode(stream[:length])
         if not decoded.missing.any():
             quality.append(psnr_db(image, decoded.image))
-    assert len(quality) > 150
+    assert len(quality) > 75
     assert quality[-1] > quality[0] + 3
-    best = np.maximum.accumulate(quality)
-    assert np.all(best - quality < 0.35)
+    assert np.all(np.maximum.accumulate(quality) - quality < 0.35)
+
+
+def test_budget_is_used_completely_and_quality_increases() -> None:
+    image = contact()
+    quality = []
+    for budget in (6, 7, 22, 23, 64, 200, 704):
+        stream = CODEC.encode(image, budget)
+        assert len(stream) == budget
+        if budget not in (7, 23):
+            quality.append(psnr_db(image, CODEC.decode(stream).image))
+    assert quality == sorted(quality)
+    image = contact(32, 32)
+    stream = CODEC.encode(image, 4000)
+    assert len(stream) < 2000  # a long budget is not filled
+    assert psnr_db(image, CODEC.decode(stream).image) > 34
 
 
 def test_decisions_of_a_prefix_hold_for_every_continuation() -> None:
-    stream = CODEC.encode(contact(48, 48), 120)
-    for length in range(8, 60, 5):
+    stream = CODEC.encode(contact(32, 32), 120)
+    for length in range(8, 60, 10):
         states = [_coefficients(stream[:length] + tail) for tail in (b"", bytes(40), b"\xff" * 40, stream[length:])]
         short = states[0]
         significant = short[0] > 0
@@ -69,28 +69,14 @@ def _coefficients(stream: bytes) -> tuple[np.ndarray, np.ndarray]:
     return state.lower, state.signs
 
 
-def test_quality_increases_with_the_budget() -> None:
-    image = contact()
-    quality = [psnr_db(image, CODEC.decode(CODEC.encode(image, n)).image) for n in (12, 22, 44, 88, 176, 352, 704)]
-    assert quality == sorted(quality)
-
-
-def test_long_stream_has_high_quality() -> None:
-    image = contact(32, 32)
-    stream = CODEC.encode(image, 4000)
-    assert len(stream) < 2000
-    assert psnr_db(image, CODEC.decode(stream).image) > 34
-
-
-@pytest.mark.parametrize("grey", [0, 3, 128, 255])
+@pytest.mark.parametrize("grey", [0, 128, 255])
 def test_flat_images_need_few_bytes(grey: int) -> None:
-    image = np.full((80, 80), grey, np.uint8)
-    stream = CODEC.encode(image, 64)
+    stream = CODEC.encode(np.full((48, 48), grey, np.uint8), 64)
     assert len(stream) < 40
     assert np.abs(CODEC.decode(stream).image.astype(int) - grey).max() <= 2
 
 
-@pytest.mark.parametrize("size", [(80, 80), (512, 512), (300, 40)])
+@pytest.mark.parametrize("size", [(80, 80), pytest.param((512, 512), marks=pytest.mark.system), (300, 40)])
 def test_half_black_half_white_image(size: tuple[int, int]) -> None:
     """The largest possible coefficients need planes above the usual first one."""
     image = np.zeros(size, np.uint8)
@@ -99,13 +85,12 @@ def test_half_black_half_white_image(size: tuple[int, int]) -> None:
 
 
 @given(
-    height_px=st.integers(16, 60),
-    width_px=st.integers(16, 60),
+    height_px=st.integers(16, 40),
+    width_px=st.integers(16, 40),
     seed=st.integers(0, 1000),
     contrast=st.sampled_from([0, 1, 20, 255]),
     budget=st.integers(10, 90),
 )
-@settings(max_examples=40, deadline=None)
 def test_error_of_any_image_is_bounded(height_px: int, width_px: int, seed: int, contrast: int, budget: int) -> None:
     rng = np.random.default_rng(seed)
     image = (rng.integers(0, contrast + 1, (height_px, width_px)) + rng.integers(0, 256 - contrast)).astype(np.uint8)
@@ -130,24 +115,7 @@ def test_error_estimate_of_each_prefix_is_accurate() -> None:
     assert np.all(np.diff(known) < 0.01 * known[:-1])
 
 
-def test_bytes_after_a_lost_byte_are_not_used() -> None:
-    stream = CODEC.encode(contact(), 100)
-    size = StreamHeader.unpack(stream).size
-    received = np.ones(100 - size, np.bool_)
-    received[40] = False
-    zeroed = bytearray(stream)
-    zeroed[size + 40] = 0
-    decoded = CODEC.decode(bytes(zeroed), received)
-    assert np.array_equal(decoded.image, CODEC.decode(stream[: size + 40]).image)
-    assert "body byte 40 of 97 did not arrive" in decoded.notes[0]
-    nothing = CODEC.decode(stream, np.zeros(97, np.bool_))
-    assert nothing.missing.all()
-    assert not nothing.image.any()
-    with pytest.raises(StreamError, match="received"):
-        CODEC.decode(stream, np.ones(5, np.bool_))
-
-
-def test_unknown_models_and_small_budgets_are_rejected() -> None:
+def test_unknown_models_and_small_budgets_are_rejected_and_no_bytes_give_no_pixels() -> None:
     stream = bytearray(CODEC.encode(contact(), 40))
     with pytest.raises(StreamError, match="codec_id"):
         CODEC.decode(bytes([0x2F]) + bytes(stream[1:]))
@@ -156,11 +124,12 @@ def test_unknown_models_and_small_budgets_are_rejected() -> None:
     for budget in (-1, 0, 3, 5):
         with pytest.raises(StreamError, match="budget_bytes"):
             CODEC.encode(contact(), budget)
+    nothing = CODEC.decode(CODEC.encode(contact(), 100), np.zeros(97, np.bool_))
+    assert nothing.missing.all()
+    assert not nothing.image.any()
 
 
 def test_invalid_model_files_are_rejected() -> None:
-    from importlib.resources import files
-
     for name, model in zip(MODEL_FILES["standard"], shipped_models(), strict=True):
         raw = files("sonarpost.codec.emb").joinpath("data", name).read_bytes()
         assert parse(raw).identity == hashlib.sha256(raw).hexdigest() == model.identity
@@ -169,9 +138,6 @@ def test_invalid_model_files_are_rejected() -> None:
         with pytest.raises(StreamError, match="length"):
             parse(raw[:-1])
     assert CODEC.model_hash == shipped_models()[0].identity
-
-
-def test_shipped_models_have_different_tags() -> None:
     tags = [model_tag(CODEC.codec_id, model.identity) for model in shipped_models()]
     assert len(set(tags)) == len(tags)
 
@@ -193,14 +159,6 @@ def test_streams_of_an_earlier_model_are_decoded_and_extended() -> None:
     assert found.model_hash == old.model_hash != CODEC.model_hash
 
 
-def test_stream_depends_on_the_weights() -> None:
-    model = shipped_models()[0]
-    b3 = model.b3.copy()
-    b3[0] += 1 << 19
-    other = EmbCodec(replace(model, b3=b3))
-    assert other.encode(contact(), 64) != CODEC.encode(contact(), 64)
-
-
 def test_accumulators_do_not_overflow() -> None:
     for model in shipped_models():
         first = 290 * np.abs(model.w1.astype(np.int64)).sum(1) + np.abs(model.b1)
@@ -209,7 +167,7 @@ def test_accumulators_do_not_overflow() -> None:
         assert max(first.max(), second.max(), sign.max()) < 2**31
 
 
-@pytest.mark.parametrize("size", [(16, 16), (17, 33), (80, 80), (140, 80), (16, 512), (301, 127)])
+@pytest.mark.parametrize("size", [(16, 16), (17, 33), (80, 80), (16, 512), (301, 127)])
 def test_transform_is_invertible(size: tuple[int, int]) -> None:
     layout = layout_of(*size)
     plane = np.random.default_rng(1).integers(-8000, 8000, size)

@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from sonarpost.codec.emb import codec as emb_codec
 from sonarpost.codec.emb.codec import EmbCodec
@@ -36,29 +34,29 @@ def speckled(image: np.ndarray, seed: int = 0) -> np.ndarray:
     return grey(image * noise)
 
 
-def test_the_estimate_is_nearer_to_the_scene() -> None:
-    noisy = speckled(scene())
-    estimate = despeckled(noisy)
+@pytest.fixture(scope="module")
+def noisy() -> np.ndarray:
+    return speckled(scene())
+
+
+@pytest.fixture(scope="module")
+def estimate(noisy: np.ndarray) -> np.ndarray:
+    return despeckled(noisy)
+
+
+def test_the_estimate_is_nearer_to_the_scene_and_the_same_on_every_machine(noisy, estimate) -> None:
     assert psnr_db(grey(scene()), estimate) > psnr_db(grey(scene()), noisy) + 6
     assert estimate[30:36, 37:44].mean() > 180  # the highlight
     assert estimate[30:36, 50:66].mean() < 40  # the shadow
+    digest = hashlib.sha256(estimate.tobytes()).hexdigest()
+    assert digest == "942339c03a955cd07d0d43b0fcba33f2b67c28d9037aae6e105e36687aa0913c"
 
 
-def test_strength_0_returns_the_image_and_a_half_lies_between() -> None:
-    noisy = speckled(scene())
+def test_strength_0_returns_the_image_and_a_half_lies_between(noisy, estimate) -> None:
     assert despeckled(noisy, 0.0) is noisy
-    whole, half = despeckled(noisy).astype(int), despeckled(noisy, 0.5).astype(int)
+    whole, half = estimate.astype(int), despeckled(noisy, 0.5).astype(int)
     inside = (whole > 0) & (whole < 255)
     assert np.abs(half - (noisy.astype(int) + whole) / 2)[inside].max() <= 1
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.integers(16, 90), st.integers(16, 90), st.integers(0, 2**32 - 1))
-def test_every_size(height_px: int, width_px: int, seed: int) -> None:
-    image = np.random.default_rng(seed).integers(0, 256, (height_px, width_px)).astype(np.uint8)
-    estimate = despeckled(image)
-    assert estimate.shape == image.shape
-    assert estimate.dtype == np.uint8
 
 
 def test_constant_images_stay_almost_constant() -> None:
@@ -73,28 +71,20 @@ def test_sums_of_products_cannot_overflow() -> None:
         assert largest * (ACTIVATION_LIMIT if number else INPUT_LIMIT) < 2**31
 
 
-def test_the_same_estimate_on_every_machine() -> None:
-    digest = hashlib.sha256(despeckled(speckled(scene())).tobytes()).hexdigest()
-    assert digest == "942339c03a955cd07d0d43b0fcba33f2b67c28d9037aae6e105e36687aa0913c"
+def test_strengths_are_rounded_to_sixteenths_and_others_rejected() -> None:
+    for strength, rounded in ((0, 0), (1e-9, 1 / 16), (0.3, 5 / 16), (0.5, 0.5), (1, 1)):
+        assert check_strength(strength) == EmbCodec(strength=strength).strength == rounded
+    for strength in (-0.1, 1.01, float("nan"), float("inf")):
+        with pytest.raises(ConfigError, match=r"codec emb: strength: got .*, expected 0\.\.1"):
+            EmbCodec(strength=strength)
 
 
-@pytest.mark.parametrize(("strength", "rounded"), [(0, 0), (1e-9, 1 / 16), (0.3, 5 / 16), (0.5, 0.5), (1, 1)])
-def test_strengths_are_rounded_to_sixteenths(strength: float, rounded: float) -> None:
-    assert check_strength(strength) == rounded
-    assert EmbCodec(strength=strength).strength == rounded
-
-
-@pytest.mark.parametrize("strength", [-0.1, 1.01, float("nan"), float("inf")])
-def test_other_strengths_are_rejected(strength: float) -> None:
-    with pytest.raises(ConfigError, match=r"codec emb: strength: got .*, expected 0\.\.1"):
-        EmbCodec(strength=strength)
-
-
-@pytest.mark.parametrize("model", ["standard", "structure"])
-@pytest.mark.parametrize("strength", [0.0, 0.25, 1.0])
+@pytest.mark.parametrize(
+    ("model", "strength"), [("standard", 0.0), ("standard", 0.25), ("structure", 0.25), ("structure", 1.0)]
+)
 def test_the_stream_carries_the_strength(model: str, strength: float) -> None:
     codec = EmbCodec(model, strength)
-    stream = codec.encode(speckled(scene(48, 64)), 64)
+    stream = codec.encode(speckled(scene(32, 48)), 64)
     for reader in (EmbCodec(), EmbCodec("structure", 1.0)):
         assert reader.decode(stream).despeckle_strength == strength
     assert codec.decode(stream[:3]).despeckle_strength is None
@@ -113,9 +103,7 @@ def test_a_longer_stream_continues_with_the_strength_of_the_stream() -> None:
 
 def test_texture_is_measured_on_the_image_before_despeckling(monkeypatch: pytest.MonkeyPatch) -> None:
     noisy, measured = speckled(scene(48, 64)), []
-    original = emb_codec.measure_speckle
-    monkeypatch.setattr(
-        emb_codec, "measure_speckle", lambda grey, layout: measured.append(grey) or original(grey, layout)
-    )
+    inner = emb_codec.measure_speckle
+    monkeypatch.setattr(emb_codec, "measure_speckle", lambda grey, layout: measured.append(grey) or inner(grey, layout))
     replace(EmbCodec(strength=1.0), send_texture=True).encode(noisy, 100)
     assert np.array_equal(measured[0], noisy)

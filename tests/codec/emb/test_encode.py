@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from builders.images import contact
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.codec.emb import rate_distortion_opt, transform
@@ -21,20 +22,11 @@ from sonarpost.errors import StreamError
 CODEC = EmbCodec()
 
 
-def contact(height_px: int = 80, width_px: int = 80, seed: int = 0) -> np.ndarray:
-    """Return a speckled slope with a highlight and a shadow at the border."""
-    rng = np.random.default_rng(seed)
-    image = (50 + 30 * np.linspace(0, 1, width_px)) * rng.gamma(6, 1 / 6, (height_px, width_px))
-    image[: height_px // 5, width_px // 4 : width_px // 2] *= 3
-    image[: height_px // 5, width_px // 2 : width_px * 3 // 4] *= 0.1
-    return np.clip(image, 0, 255).astype(np.uint8)
-
-
 def plane_of(image: np.ndarray) -> np.ndarray:
     return (image.astype(np.int64) - int(image.mean())) * transform.UNIT
 
 
-@pytest.mark.parametrize("size", [(80, 80), (17, 33), (140, 80), (16, 512)])
+@pytest.mark.parametrize("size", [(80, 80), (17, 33), (16, 512)])
 def test_correlation_is_the_transpose_of_synthesis(size: tuple[int, int]) -> None:
     layout, rng = layout_of(*size), np.random.default_rng(1)
     coefficients, other = (rng.integers(-8000, 8000, size) for _ in range(2))
@@ -49,7 +41,7 @@ def test_correlation_is_the_transpose_of_synthesis(size: tuple[int, int]) -> Non
 def test_step_sizes_are_the_norms_of_the_wavelets(size: tuple[int, int]) -> None:
     layout, rng = layout_of(*size), np.random.default_rng(2)
     step_sizes, gains = rate_distortion_opt._step_sizes(layout), transform.gain_map(layout)
-    for at in rng.choice(layout.position.ravel(), 60, replace=False):
+    for at in rng.choice(layout.position.ravel(), 30, replace=False):
         flat = np.zeros(layout.cells, np.int32)
         flat[at] = 64000
         synthesised, _ = transform.inverse(transform.from_flat(flat, layout), layout)
@@ -83,11 +75,11 @@ def test_region_weights_apply_to_originals_and_targets() -> None:
     assert np.abs(with_region.targets[strong]).mean() > 1.3 * np.abs(plain.targets[strong]).mean()
 
 
-@pytest.mark.parametrize("short", [12, 22, 64, 100])
+@pytest.mark.parametrize("short", [12, 64])
 def test_extended_stream_starts_with_the_original(short: int) -> None:
     assert isinstance(CODEC, ExtensibleCodec)
-    for seed in range(4):
-        image = contact(64, 56, seed)
+    for seed in range(2):
+        image = contact(48, 40, seed)
         stream = CODEC.encode(image, short)
         longer = CODEC.extend(stream, image, 2 * short)
         assert longer.startswith(stream[:-1])
@@ -98,7 +90,7 @@ def test_extended_stream_starts_with_the_original(short: int) -> None:
 def test_bits_written_after_a_prefix_do_not_change_it() -> None:
     """Also if the next bits would lead outside the interval of the prefix."""
     inverted = 0
-    for seed in range(600):
+    for seed in range(300):
         rng = np.random.default_rng(seed)
         bits = rng.integers(0, 2, 200).tolist()
         probabilities = rng.integers(6, 65530, 200).tolist()
@@ -114,44 +106,33 @@ def test_bits_written_after_a_prefix_do_not_change_it() -> None:
                 break
         known = len(decoded) - 1  # the bytes may determine more bits than were written
         longer = Coder.writer(40, prefix[:-1])
-        assert [
-            longer.code_bit(bit, probability) for bit, probability in zip(decoded[:-1], probabilities, strict=False)
-        ] == decoded[:-1]
+        assert [longer.code_bit(*pair) for pair in zip(decoded[:-1], probabilities, strict=False)] == decoded[:-1]
         more_bits = rng.integers(0, 2, 60).tolist()
-        written = [
-            longer.code_bit(bit, probability)
-            for bit, probability in zip(more_bits, probabilities[known:], strict=False)
-        ]
+        written = [longer.code_bit(*pair) for pair in zip(more_bits, probabilities[known:], strict=False)]
         inverted += sum(a != b for a, b in zip(written, more_bits, strict=False) if a >= 0)
         body = longer.finish()
         assert body.startswith(prefix[:-1])
         reader = Coder.reader(body)
         assert [reader.code_bit(0, probability) for probability in probabilities[:known]] == decoded[:-1]
-        again = [
-            reader.code_bit(0, probability)
-            for probability, bit in zip(probabilities[known:], written, strict=False)
-            if bit >= 0
-        ]
+        pairs = zip(probabilities[known:], written, strict=False)
+        again = [reader.code_bit(0, probability) for probability, bit in pairs if bit >= 0]
         assert again == [bit for bit in written if bit >= 0]
     assert inverted >= 3
 
 
-@pytest.mark.parametrize("budget", range(9, 16))
-def test_smallest_budgets_with_a_region_are_met(budget: int) -> None:
+def test_smallest_budgets_with_a_region_are_met() -> None:
     """The budget may end in the side information."""
     image = contact(33, 48)
-    stream = CODEC.encode_with_estimate(image, budget, region=RegionOfInterest(3, 3, 8, 9)).stream
-    assert len(stream) <= budget
-    assert CODEC.decode(stream).image.shape == image.shape
+    for budget in range(9, 16):
+        stream = CODEC.encode_with_estimate(image, budget, region=RegionOfInterest(3, 3, 8, 9)).stream
+        assert len(stream) <= budget
+        assert CODEC.decode(stream).image.shape == image.shape
 
 
 @given(seed=st.integers(0, 1000), short=st.integers(9, 60), more=st.integers(0, 60), with_region=st.booleans())
-@settings(max_examples=12, deadline=None)
 def test_extension_keeps_the_prefix_within_the_budget(seed: int, short: int, more: int, with_region: bool) -> None:
-    image = contact(33, 48, seed)
-    stream = CODEC.encode_with_estimate(
-        image, short, region=RegionOfInterest(3, 3, 8, 9) if with_region else None
-    ).stream
+    image, region = contact(33, 48, seed), RegionOfInterest(3, 3, 8, 9) if with_region else None
+    stream = CODEC.encode_with_estimate(image, short, region=region).stream
     longer = CODEC.extend(stream, image, len(stream) + more)
     assert longer.startswith(stream[:-1])
     assert len(stream) <= len(longer) <= len(stream) + more
@@ -180,20 +161,8 @@ def test_next_step_is_on_the_better_side_of_the_best() -> None:
     assert next_step({step: abs(step - 3) for step in range(8)}) == 3
 
 
-@pytest.mark.parametrize(
-    ("budget", "size", "tries"),
-    [
-        (40, (80, 80), 5),
-        (200, (80, 80), 4),
-        (400, (80, 80), 4),
-        (40, (140, 80), 5),
-        (200, (140, 80), 3),
-        (400, (140, 80), 3),
-    ],
-)
-def test_best_tried_start_step_is_sent(
-    budget: int, size: tuple[int, int], tries: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize(("budget", "size", "tries"), [(40, (80, 80), 5), (200, (80, 80), 4), (200, (140, 80), 3)])
+def test_best_tried_start_step_is_sent(budget, size, tries, monkeypatch):
     tried: list[tuple[int, int]] = []
     write = TrialEncoder.write
 
@@ -206,8 +175,6 @@ def test_best_tried_start_step_is_sent(
     image = contact(*size)
     stream = EmbCodec().encode(image, budget)
     assert len({step for _, step in tried}) == len(tried) == tries
-    assert (
-        read_body(stream[StreamHeader.unpack(stream).size :], layout_of(*size), CODEC.network)[1].start_step
-        == min(tried)[1]
-    )
+    _, side = read_body(stream[StreamHeader.unpack(stream).size :], layout_of(*size), CODEC.network)
+    assert side.start_step == min(tried)[1]
     assert stream == EmbCodec(start_steps=(min(tried)[1],)).encode(image, budget)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
@@ -19,12 +19,10 @@ from sonarpost.codec.emb.side_info import RegionOfInterest
 from sonarpost.codec.emb.transform import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, layout_of
 from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.errors import ConfigError, StreamError
 
 STANDARD, STRUCTURE = EmbCodec(), EmbCodec("structure")
 WEIGHTS = shipped_models("structure")[0].perceptual
 assert WEIGHTS is not None
-SIZES = [(16, 16), (49, 113), (80, 80), (200, 161)]
 
 
 def seabed(height_px: int = 80, width_px: int = 80, seed: int = 0) -> np.ndarray:
@@ -43,8 +41,7 @@ def lows_of(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return flat, transform.inverse(transform.from_flat(flat, layout), layout, 1)[1]
 
 
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("level", [2, 3])
+@pytest.mark.parametrize(("size", "level"), [((16, 16), 2), ((49, 113), 2), ((49, 113), 3), ((200, 161), 3)])
 def test_local_variance_is_that_of_the_low_pass_image(size: tuple[int, int], level: int) -> None:
     layout = layout_of(*size)
     _, lows = lows_of(seabed(*size))
@@ -108,7 +105,6 @@ def test_similarity_ranks_images_like_ms_ssim() -> None:
     assert structural_similarity(image, image) == pytest.approx(2.0**28, rel=0.001)
 
 
-@settings(max_examples=60)
 @given(st.integers(0, 2**31), st.integers(16, 40), st.integers(16, 40), st.booleans())
 def test_similarity_does_not_overflow(seed: int, height_px: int, width_px: int, is_inverse: bool) -> None:
     rng = np.random.default_rng(seed)
@@ -122,10 +118,9 @@ def test_similarity_does_not_overflow(seed: int, height_px: int, width_px: int, 
         assert similarity >= 2**28 * 0.999
 
 
-@pytest.mark.parametrize("budget", [64, 128])
-def test_structure_model_trades_squared_error_for_ms_ssim(budget: int) -> None:
-    images = [seabed(seed=seed) for seed in range(6)]
-    standard, structure = ([c.decode(c.encode(p, budget)).image for p in images] for c in (STANDARD, STRUCTURE))
+def test_structure_model_trades_squared_error_for_ms_ssim() -> None:
+    images = [seabed(seed=seed) for seed in range(4)]
+    standard, structure = ([c.decode(c.encode(p, 64)).image for p in images] for c in (STANDARD, STRUCTURE))
     similarity = [np.mean([ms_ssim(p, d) for p, d in zip(images, ds, strict=True)]) for ds in (standard, structure)]
     psnr = [np.mean([psnr_db(p, d) for p, d in zip(images, ds, strict=True)]) for ds in (standard, structure)]
     assert similarity[1] > similarity[0] + 0.01
@@ -136,7 +131,7 @@ def test_error_of_prefixes_falls_as_estimated() -> None:
     image = seabed()
     encoded = STRUCTURE.encode_with_estimate(image, 200)
     errors = []
-    for n in range(6, 201, 2):
+    for n in (*range(6, 20, 2), *range(20, 201, 20)):
         decoded = STRUCTURE.decode(encoded.stream[:n]).image.astype(float)
         errors.append(((decoded - image) ** 2).mean())
         assert encoded.mean_square_error[n] > 0
@@ -145,19 +140,16 @@ def test_error_of_prefixes_falls_as_estimated() -> None:
     assert encoded.mean_square_error[200] == pytest.approx(errors[-1], rel=0.15)
 
 
-@pytest.mark.parametrize("first", [22, 64, 128])
+@pytest.mark.parametrize("first", [22, 128])
 def test_structure_streams_are_extended(first: int) -> None:
-    extended = 0
-    for seed in range(6):
+    for seed in range(2):
         image = seabed(seed=seed)
         stream = STRUCTURE.encode(image, first)
         longer = STRUCTURE.extend(stream, image, 2 * first)
         assert longer[: len(stream) - 1] == stream[:-1]
-        if len(longer) > len(stream):
-            extended += 1
-            errors = [((STRUCTURE.decode(s).image.astype(float) - image) ** 2).mean() for s in (longer, stream)]
-            assert errors[0] < errors[1]
-    assert extended == 6
+        assert len(longer) > len(stream)
+        errors = [((STRUCTURE.decode(s).image.astype(float) - image) ** 2).mean() for s in (longer, stream)]
+        assert errors[0] < errors[1]
 
 
 def test_structure_model_supports_region_and_texture() -> None:
@@ -175,12 +167,8 @@ def test_structure_model_supports_region_and_texture() -> None:
 
 def test_each_model_has_its_codec_ids() -> None:
     registry, image = default_registry(), seabed()
-    for model, strength, codec_id in (
-        ("standard", 0.0, 0x20),
-        ("structure", 0.0, 0x21),
-        ("standard", 0.5, 0x22),
-        ("structure", 1.0, 0x23),
-    ):
+    each = (("standard", 0.0, 0x20), ("structure", 0.0, 0x21), ("standard", 0.5, 0x22), ("structure", 1.0, 0x23))
+    for model, strength, codec_id in each:
         codec = registry.create("emb", CodecResources(model=model, strength=strength))
         assert (codec.name, codec.codec_id) == ("emb", codec_id)
         assert codec.model_hash == shipped_models(model, despeckled=strength > 0)[0].identity
@@ -190,16 +178,3 @@ def test_each_model_has_its_codec_ids() -> None:
         assert (reader.name, reader.codec_id, reader.model_hash) == ("emb", codec_id, codec.model_hash)
         assert reader.decode(stream).despeckle_strength == strength
         assert np.array_equal(reader.decode(stream).image, codec.decode(stream).image)
-
-
-def test_codec_of_one_model_decodes_streams_of_the_other() -> None:
-    stream = STRUCTURE.encode(seabed(), 64)
-    assert np.array_equal(STANDARD.decode(stream).image, STRUCTURE.decode(stream).image)
-    for codec in (STANDARD, STRUCTURE):
-        with pytest.raises(StreamError, match="model_tag"):
-            codec.decode(stream[:1] + bytes([stream[1] ^ 1]) + stream[2:])
-
-
-def test_unknown_model_name_is_rejected() -> None:
-    with pytest.raises(ConfigError, match="standard or structure"):
-        EmbCodec("texture")

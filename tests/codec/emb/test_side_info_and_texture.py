@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders.common import GOLDEN_FOLDER
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.codec.emb.codec import EmbCodec
@@ -59,13 +59,7 @@ def pixels_of(region: RegionOfInterest, size: int = 80) -> tuple[slice, slice]:
     texture=st.none() | st.tuples(*[st.integers(0, 15)] * 8),
     extra=st.integers(0, 6),
 )
-def test_side_information_round_trips_and_truncates(
-    mean_index: int,
-    step: int,
-    corners: tuple[int, int, int, int] | None,
-    texture: tuple[int, ...] | None,
-    extra: int,
-) -> None:
+def test_side_information_round_trips_and_truncates(mean_index, step, corners, texture, extra) -> None:
     region = None
     if corners:
         (top, bottom), (left, right) = sorted(corners[:2]), sorted(corners[2:])
@@ -95,7 +89,7 @@ def test_region_of_interest_gets_more_bits() -> None:
     assert errors[1][1] < 1.15 * errors[0][1]
 
 
-def test_region_weights_cover_the_region() -> None:
+def test_region_weights_cover_the_region_and_others_are_rejected() -> None:
     layout = layout_of(80, 80)
     weight = region_weights(layout, RegionOfInterest(4, 4, 7, 7))
     assert set(np.unique(weight[layout.position])) == {UNIT_WEIGHT, INSIDE_WEIGHT}
@@ -103,12 +97,9 @@ def test_region_weights_cover_the_region() -> None:
     assert (finest[10:20, 10:20] == INSIDE_WEIGHT).all()
     assert (finest == INSIDE_WEIGHT).sum() == 100
     assert (region_weights(layout, None) == UNIT_WEIGHT).all()
-
-
-@pytest.mark.parametrize("corners", [(-1, 0, 3, 3), (0, 16, 3, 16), (5, 0, 4, 3), (0, 5, 3, 4)])
-def test_regions_outside_the_image_are_rejected(corners: tuple[int, int, int, int]) -> None:
-    with pytest.raises(StreamError, match="region of interest"):
-        RegionOfInterest(*corners)
+    for corners in ((-1, 0, 3, 3), (0, 16, 3, 16), (5, 0, 4, 3), (0, 5, 3, 4)):
+        with pytest.raises(StreamError, match="region of interest"):
+            RegionOfInterest(*corners)
 
 
 def test_speckle_is_a_separate_layer() -> None:
@@ -148,22 +139,14 @@ def test_flat_image_has_no_speckle() -> None:
     assert not synthesise_speckle(flat, layout, (0,) * 8).any()
 
 
-@given(seed=st.integers(0, 2**16), length=st.integers(3, 80))
-@settings(max_examples=30, deadline=None)
-def test_any_bytes_after_a_header_decode(seed: int, length: int) -> None:
-    stream = CODEC.encode(speckled(32, 48), 40)
-    header = stream[: StreamHeader.unpack(stream).size]
-    body = np.random.default_rng(seed).integers(0, 256, length, np.uint8).tobytes()
-    decoded = CODEC.decode(header + body)
-    assert decoded.image.shape == (32, 48)
-
-
-@pytest.mark.parametrize("byte", [0, 255])
-def test_extreme_bodies_decode(byte: int) -> None:
+def test_extreme_bodies_decode() -> None:
+    """No body is rejected; others are in the contract of the codecs."""
     header = CODEC.encode(speckled(32, 48), 40)[:4]
     header = header[: StreamHeader.unpack(header).size]
-    for length in (1, 4, 5, 50, 400):
-        assert CODEC.decode(header + bytes([byte]) * length).image.shape == (32, 48)
+    noise = np.random.default_rng(0).integers(0, 256, 400, np.uint8).tobytes()
+    for body in (bytes(400), b"\xff" * 400, noise):
+        for length in (1, 4, 5, 50, 400):
+            assert CODEC.decode(header + body[:length]).image.shape == (32, 48)
 
 
 def golden_cases(model: str = "standard", strength: float = 0.0) -> dict[str, tuple[np.ndarray, int, EmbCodec]]:
@@ -194,17 +177,18 @@ def options_of_file(file: Path) -> tuple[str, float]:
 
 
 @pytest.mark.parametrize("file", [FIRST, OPTIMISED, SECOND, STRUCTURE, DESPECKLED, HALF], ids=lambda path: path.stem)
-@pytest.mark.parametrize("name", golden_cases())
-def test_golden_streams_of_every_encoder_and_model_are_decoded(name: str, file: Path) -> None:
+def test_golden_streams_of_every_encoder_and_model_are_decoded(file: Path) -> None:
     """The pixels are the same on every machine and in every release that has the model."""
-    golden = json.loads(file.read_text())[name]
-    stream = bytes.fromhex(golden.pop("stream"))
-    assert hashes(stream, golden_cases(*options_of_file(file))[name][2]) == golden
+    cases = golden_cases(*options_of_file(file))
+    found = json.loads(file.read_text())
+    assert set(found) == set(cases)
+    for name, golden in found.items():
+        assert hashes(bytes.fromhex(golden.pop("stream")), cases[name][2]) == golden, name
 
 
 @pytest.mark.parametrize("file", [SECOND, STRUCTURE, DESPECKLED, HALF], ids=lambda path: path.stem)
-@pytest.mark.parametrize("name", golden_cases())
-def test_golden_streams_are_reproduced(name: str, file: Path) -> None:
+def test_golden_streams_are_reproduced(file: Path) -> None:
     """The bytes are the same on every machine."""
-    image, budget, codec = golden_cases(*options_of_file(file))[name]
-    assert codec.encode(image, budget).hex() == json.loads(file.read_text())[name]["stream"]
+    golden = json.loads(file.read_text())
+    for name, (image, budget, codec) in golden_cases(*options_of_file(file)).items():
+        assert codec.encode(image, budget).hex() == golden[name]["stream"], name

@@ -56,32 +56,25 @@ def test_free_places_are_filled_first() -> None:
     assert all(bytes([level] * 64) in stored for level in (12, 60, 150))
 
 
-@pytest.mark.parametrize("keep", [0, 1, 60, 119, 120])
+@pytest.mark.parametrize("keep", [0, 30, 59, 60])
 def test_requested_number_of_tiles_stays(keep: int) -> None:
-    base = speckle(0)
-    adapted = adapt(base, training(*[ripples(seed) for seed in range(4)]), max_tiles=120, keep=keep, passes=1)
+    base = speckle(0, 60)
+    adapted = adapt(base, training(*[ripples(seed, 32) for seed in range(4)]), max_tiles=60, keep=keep, passes=1)
     same = int((adapted.tiles.tiles == base.tiles).all(axis=1).sum())
     assert same >= keep
-    assert len(adapted.tiles) == 120
-    assert adapted.replaced == 120 - same
-    assert len({tile.tobytes() for tile in adapted.tiles.tiles}) == 120
+    assert len(adapted.tiles) == 60
+    assert adapted.replaced == 60 - same
+    assert len({tile.tobytes() for tile in adapted.tiles.tiles}) == 60
 
 
 def test_adapted_codebook_improves_unseen_images_of_the_seabed() -> None:
-    base = speckle(1)
-    training_images, held_out = split(training(*[ripples(seed) for seed in range(12)]))
-    adapted = adapt(base, training_images, max_tiles=120).tiles
+    base = speckle(1, 60)
+    training_images, held_out = split(training(*[ripples(seed, 40) for seed in range(12)]))
+    adapted = adapt(base, training_images, max_tiles=60).tiles
     before, after = measure(base, held_out), measure(adapted, held_out)
     assert len(before) == 3
     assert all(new.psnr_db > old.psnr_db + 3.0 for old, new in zip(before, after, strict=True))
     assert all(new.fom > old.fom + 20.0 for old, new in zip(before, after, strict=True))
-
-
-def test_adaptation_is_deterministic_and_depends_on_the_images() -> None:
-    base = speckle(2)
-    images = training(*[ripples(seed) for seed in range(5)])
-    assert adapt(base, images).tiles.identity == adapt(base, images).tiles.identity
-    assert adapt(base, images).tiles.identity != adapt(base, images[1:]).tiles.identity
 
 
 def test_exactly_reconstructed_images_change_nothing() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.codec.vq.codebook import (
@@ -55,7 +55,6 @@ def test_file_has_the_documented_layout() -> None:
     assert data == content + hashlib.sha256(content).digest()
 
 
-@settings(max_examples=150, deadline=None)
 @given(data=st.data())
 def test_any_damage_is_a_codebook_error(data: st.DataObject) -> None:
     good = to_bytes(small())
@@ -63,15 +62,10 @@ def test_any_damage_is_a_codebook_error(data: st.DataObject) -> None:
     for _ in range(data.draw(st.integers(1, 4))):
         damaged[data.draw(st.integers(0, len(good) - 1))] ^= data.draw(st.integers(1, 255))
     damaged = damaged[: data.draw(st.integers(0, len(good)))] + data.draw(st.binary(max_size=9))
-    if bytes(damaged) != good:
-        with pytest.raises(CodebookError):
-            from_bytes(bytes(damaged), "damaged")
-
-
-@pytest.mark.parametrize("length", [0, 1, 8, 21, 22, 53, 54, 100, -33, -1])
-def test_truncated_file_is_rejected(length: int) -> None:
-    with pytest.raises(CodebookError):
-        from_bytes(to_bytes(small())[:length], "cut")
+    for bad in (bytes(damaged), good[:-1], good[:22]):
+        if bad != good:
+            with pytest.raises(CodebookError):
+                from_bytes(bad, "damaged")
 
 
 def with_valid_hash(data: bytes) -> bytes:
@@ -103,15 +97,12 @@ def test_error_names_the_invalid_field_under_a_valid_hash(offset: int, value: by
     assert caught.value.where == "x.tiles"
 
 
-@pytest.mark.parametrize("notes", [b"[1]", b'{"a": 1}', b"null", b"[" * 9999])
-def test_invalid_notes_are_rejected(notes: bytes) -> None:
+def test_invalid_and_long_notes_are_rejected() -> None:
     data = to_bytes(Codebook(small().tiles, {}))
-    changed = data[:18] + len(notes).to_bytes(4, "big") + notes + data[24:]
-    with pytest.raises(CodebookError, match="notes"):
-        from_bytes(with_valid_hash(changed), "x")
-
-
-def test_long_notes_are_rejected() -> None:
+    for notes in (b"[1]", b'{"a": 1}', b"null", b"[" * 9999):
+        changed = data[:18] + len(notes).to_bytes(4, "big") + notes + data[24:]
+        with pytest.raises(CodebookError, match="notes"):
+            from_bytes(with_valid_hash(changed), "x")
     with pytest.raises(CodebookError, match="notes"):
         to_bytes(Codebook(small().tiles, {"a": "x" * (1 << 20)}))
 
@@ -157,9 +148,8 @@ def test_shipped_codebook_is_found_by_its_tag() -> None:
     assert len(set(tags.values())) == len(tags)
     for tile_px, tag in tags.items():
         assert find_codebook(tag).tiles.identity == load_default(tile_px).tiles.identity
-    unknown = next(tag for tag in range(9) if tag not in tags.values())
-    with pytest.raises(CodebookError, match="nominal-10"):
-        find_codebook(unknown)
+    with pytest.raises(CodebookError, match="10 or 20"):
+        load_default(15)
 
 
 def codebook_file(folder: Path, seed: int) -> tuple[Path, int]:
@@ -189,12 +179,8 @@ def test_error_for_an_unknown_tag_names_the_places_searched(tmp_path: Path, monk
     with pytest.raises(CodebookError) as caught:
         find_codebook(unknown, [tmp_path])
     assert (caught.value.field, caught.value.value) == ("model_tag", f"{unknown:#06x}")
-    for place in (
-        f"{path} ({tag:#06x})",
-        "damaged.tiles (unreadable)",
-        "nominal-10 (0x",
-        f"{other_path} ({other_tag:#06x})",
-    ):
+    places = (f"{path} ({tag:#06x})", f"{other_path} ({other_tag:#06x})")
+    for place in (*places, "damaged.tiles (unreadable)", "nominal-10 (0x"):
         assert place in caught.value.expected
 
 
@@ -213,8 +199,3 @@ def test_replaced_codebook_file_is_read_again(tmp_path: Path) -> None:
     path.write_bytes(other_path.read_bytes())
     os.utime(path, ns=(1, 1))
     assert find_codebook(other_tag, [path]).tiles.identity == load(other_path).tiles.identity
-
-
-def test_other_nominal_sizes_are_rejected() -> None:
-    with pytest.raises(CodebookError, match="10 or 20"):
-        load_default(15)

@@ -16,7 +16,7 @@ def database(seed: int, count: int = 60, tile_px: int = 8) -> TileDatabase:
     return TileDatabase.from_tiles(tile_px, rng.integers(0, 256, (count, tile_px**2), dtype=np.uint8), 20)
 
 
-def test_codebook_equals_itself() -> None:
+def test_codebook_equals_itself_and_other_tile_sizes_are_rejected() -> None:
     one = database(0)
     difference = compare(one, one)
     assert difference.same_identity
@@ -24,6 +24,8 @@ def test_codebook_equals_itself() -> None:
     assert difference.first.only_here == difference.second.only_here == 0
     assert difference.first.rms_max == 0.0
     assert difference.angle_max_deg == pytest.approx(0.0, abs=1e-6)
+    with pytest.raises(CodebookError, match="tile_px"):
+        compare(one, database(0, tile_px=9))
 
 
 def test_tiles_of_one_codebook_only_are_counted_and_measured() -> None:
@@ -66,11 +68,6 @@ def test_variance_fraction_of_a_basis() -> None:
     assert difference.first.variance_other == pytest.approx(0.0, abs=1e-4)
     assert difference.second.variance_other == pytest.approx(0.0, abs=1e-4)
     assert difference.angle_max_deg == pytest.approx(90.0, abs=0.1)
-
-
-def test_other_tile_sizes_are_rejected() -> None:
-    with pytest.raises(CodebookError, match="tile_px"):
-        compare(database(0), database(0, tile_px=9))
 
 
 def test_principal_angles_are_those_of_scipy() -> None:

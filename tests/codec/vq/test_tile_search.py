@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.codec.vq import tile_search as module
 from sonarpost.codec.vq.codebook import load_default
-from sonarpost.codec.vq.tile_search import NearestSearch, rounding_bound
+from sonarpost.codec.vq.tile_search import NearestSearch
 from sonarpost.codec.vq.tiles import TileDatabase
 
 
@@ -29,7 +29,6 @@ def check(vectors: np.ndarray, queries: np.ndarray, count: int, leading: int) ->
     assert np.array_equal(index, expected_index)
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     vectors=st.integers(1, 300),
@@ -39,9 +38,7 @@ def check(vectors: np.ndarray, queries: np.ndarray, count: int, leading: int) ->
     count=st.integers(1, 12),
     leading=st.integers(1, 7),
 )
-def test_search_is_exact_with_ties_and_duplicates(
-    seed: int, vectors: int, queries: int, dims: int, largest: int, count: int, leading: int
-) -> None:
+def test_search_is_exact_with_ties_and_duplicates(seed, vectors, queries, dims, largest, count, leading):
     rng = np.random.default_rng(seed)
     stored = rng.integers(-largest, largest + 1, (vectors, dims), dtype=np.int32)
     query_vectors = rng.integers(-largest, largest + 1, (queries, dims), dtype=np.int32)
@@ -49,13 +46,12 @@ def test_search_is_exact_with_ties_and_duplicates(
     check(stored, query_vectors, min(count, vectors), min(leading, dims))
 
 
-@pytest.mark.parametrize("count", [1, 8, 200])
-@pytest.mark.parametrize("size", [2047, 2048, 2049, 5000])
+@pytest.mark.parametrize(("size", "count"), [(2047, 8), (2048, 1), (2049, 200), (5000, 8)])
 def test_search_is_exact_across_blocks(size: int, count: int) -> None:
     rng = np.random.default_rng(size)
     stored = (rng.standard_normal((size, 20)) * np.geomspace(3e6, 1e4, 20)).astype(np.int32)
     stored[size // 2 :: 7] = stored[0]  # duplicates, distributed over the blocks
-    queries = (rng.standard_normal((40, 20)) * np.geomspace(4e6, 1e4, 20)).astype(np.int32)
+    queries = (rng.standard_normal((20, 20)) * np.geomspace(4e6, 1e4, 20)).astype(np.int32)
     queries[0] = stored[0]
     check(stored, queries, count, 9)
 
@@ -65,22 +61,6 @@ def test_distances_closer_than_single_precision_are_distinguished() -> None:
     rng = np.random.default_rng(0)
     stored = (8_000_000 + rng.integers(-3, 4, (3000, 30))).astype(np.int32)
     check(stored, stored[:50] + 1, 8, 12)
-
-
-@pytest.mark.parametrize("leading", [1, 10, 30])
-def test_scores_are_within_the_rounding_bound(leading: int) -> None:
-    rng = np.random.default_rng(leading)
-    stored = rng.integers(-(2**24), 2**24, (500, 30), dtype=np.int32)
-    queries = rng.integers(-(2**24), 2**24, (60, 30), dtype=np.int32).astype(np.float64)
-    search = NearestSearch.over(stored, stored[:, 0].astype(np.float64), leading)
-    state = module._SearchState(search, queries, 1)
-    scores = (state.query_rows @ search.blocks[0])[:, : len(stored)].astype(np.float64)
-    true = search.norms - 2.0 * queries @ search.vectors.T.astype(np.float64)
-    margin = rounding_bound(np.sqrt(state.query_norms), float(np.sqrt(search.norms.max())), leading + 1)
-    assert (scores <= true + margin[:, None]).all()
-    if leading == 30:
-        assert (np.abs(scores - true) <= margin[:, None]).all()
-        assert np.abs(scores - true).max() > 0.0
 
 
 def test_distant_blocks_are_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,7 +81,7 @@ def test_distant_blocks_are_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_search_in_the_shipped_codebook_is_exact() -> None:
     database = load_default(10).tiles
     rng = np.random.default_rng(2)
-    noise = np.clip(60 * rng.rayleigh(1.0, (60, 100)), 0, 255).astype(np.uint8)
+    noise = np.clip(60 * rng.rayleigh(1.0, (12, 100)), 0, 255).astype(np.uint8)
     flat = np.repeat(np.arange(0, 256, 51, dtype=np.uint8)[:, None], 100, axis=1)
     queries = np.concatenate((noise, flat, database.tiles[::3000]))
     index, distance = database.nearest_in_basis(queries, 8)

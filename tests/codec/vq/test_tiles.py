@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -27,9 +27,9 @@ def brute_force(database: TileDatabase, tile: np.ndarray) -> list[tuple[int, int
     return sorted(squares)
 
 
-@pytest.mark.parametrize(("tile_px", "dims"), [(4, 16), (5, 7), (10, 70), (20, 30), (32, 70)])
+@pytest.mark.parametrize(("tile_px", "dims"), [(4, 16), (5, 7), (10, 70), (16, 20)])
 def test_nearest_in_the_basis_matches_brute_force(tile_px: int, dims: int) -> None:
-    database = TileDatabase.from_tiles(tile_px, random_tiles(30, tile_px), dims)
+    database = TileDatabase.from_tiles(tile_px, random_tiles(24, tile_px), dims)
     queries = np.concatenate([random_tiles(2, tile_px, 1), database.tiles[20:21]])
     indices, distances = database.nearest_in_basis(queries, 5)
     first, _ = database.nearest_in_basis(queries)
@@ -51,6 +51,7 @@ def test_shortlist_is_compared_in_all_pixels() -> None:
     assert (index != shortlist[:, 0]).any()
 
 
+@pytest.mark.system
 def test_extreme_tiles_give_exact_integers() -> None:
     # Black and white tiles of the largest size have the largest possible distance.
     tiles = np.stack([np.zeros(1024, np.uint8), np.full(1024, 255, np.uint8)])
@@ -66,24 +67,13 @@ def test_extreme_tiles_give_exact_integers() -> None:
     assert np.abs(database.projections).max() ** 2 * 4 < 2**53
 
 
-@pytest.mark.parametrize("copies", [2, 3, 5000])
+@pytest.mark.parametrize("copies", [2, 5000])
 def test_lowest_index_of_equal_tiles_is_returned(copies: int) -> None:
     one = random_tiles(2, 4)
     tiles = np.concatenate([one[:1], np.repeat(one[1:], copies, axis=0)])
     index, distance = TileDatabase.from_tiles(4, tiles).nearest(one)
     assert index.tolist() == [0, 1]
     assert distance.tolist() == [0.0, 0.0]
-
-
-def test_every_stored_tile_is_its_own_nearest() -> None:
-    tiles = np.unique(random_tiles(600, 5), axis=0)
-    index, _ = TileDatabase.from_tiles(5, tiles).nearest(tiles)
-    assert index.tolist() == list(range(len(tiles)))
-
-
-def test_no_queries_give_no_indices() -> None:
-    index, distance = TileDatabase.from_tiles(4, random_tiles(3, 4)).nearest(np.zeros((0, 16), np.uint8))
-    assert index.shape == distance.shape == (0,)
 
 
 def test_basis_rows_are_orthonormal_signed_and_ordered_by_variance() -> None:
@@ -109,11 +99,9 @@ def test_tiles_without_variance_give_a_database(tiles: np.ndarray) -> None:
 def test_identity_depends_on_all_data() -> None:
     tiles = random_tiles(40, 4)
     base = TileDatabase.from_tiles(4, tiles, 8)
-    altered = tiles.copy()
+    altered, mean, basis = tiles.copy(), base.mean.copy(), base.basis.copy()
     altered[3, 5] ^= 1
-    mean = base.mean.copy()
     mean[0] ^= 1
-    basis = base.basis.copy()
     basis[2, 2] += 1
     others = [
         TileDatabase(4, altered, base.mean, base.basis),
@@ -160,11 +148,7 @@ def test_error_names_an_array_of_wrong_shape_or_dtype(field: str, make) -> None:
     assert caught.value.field == field
 
 
-@settings(max_examples=60, deadline=None)
-@given(
-    image=hnp.arrays(np.uint8, st.tuples(st.integers(1, 50), st.integers(1, 50))),
-    tile_px=st.integers(4, 32),
-)
+@given(image=hnp.arrays(np.uint8, st.tuples(st.integers(1, 50), st.integers(1, 50))), tile_px=st.integers(4, 32))
 def test_join_inverts_cut(image: np.ndarray, tile_px: int) -> None:
     tiles = cut_tiles(image, tile_px)
     assert np.array_equal(join_tiles(tiles, *image.shape, tile_px), image)
