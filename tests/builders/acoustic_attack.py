@@ -125,17 +125,17 @@ def attack(link: VesselLink, frames: int, replays: Sequence[bytes], seed: int = 
     }
 
 
-def run(folder: Path, frames: int, *, used_counters: int = 0, seed: int = 0) -> dict[str, float]:
-    """Set up a deployment, receive a vehicle's images, then attack.
+def run(key_file: Path, frames: int, *, used_counters: int = 0, seed: int = 0) -> dict[str, float]:
+    """Receive a vehicle's images, then attack.
 
     Args:
-        folder: An empty folder.
+        key_file: The acoustic key of the deployment.
         frames: Number of frames without the key.
         used_counters: Frames that the vehicle has sent before. The receiver tries all later counters for each forged
             frame, so a high number makes it faster.
         seed: Seed of the attacker.
     """
-    platform, config = shipped(set_up(folder))
+    platform, config = shipped(key_file)
     key = link_key(platform)
     assert key is not None
     link = VesselLink(platform.id, config, FrameAuthenticator(key, config.address, Direction.TO_VEHICLE))
@@ -153,7 +153,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parsed = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        found = run(Path(folder), parsed.frames, used_counters=parsed.used_counters, seed=parsed.seed)
+        found = run(set_up(Path(folder)), parsed.frames, used_counters=parsed.used_counters, seed=parsed.seed)
     print(json.dumps(found))
     sys.exit(bool(found["forged_accepted"] or found["replays_accepted"]))
 

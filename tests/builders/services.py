@@ -8,6 +8,7 @@ import threading
 import tty
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,10 @@ class PeerService(Service[ServiceConfig]):
 def short_retry_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten the delays before retries; these tests count retries, not seconds."""
     monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.05)
+    monkeypatch.setattr("sonarpost.services.atd_stub.release.RELEASE_INTERVAL_S", 0.05)
     monkeypatch.setattr("sonarpost.services.op_modem.service.SAVE_RETRY_S", 0.05)
+    monkeypatch.setattr("sonarpost.services.op_modem.service.TICK_S", 0.03)
+    monkeypatch.setattr("sonarpost.services.uuv_modem.service._STATE_INTERVAL_S", 0.05)
     monkeypatch.setattr("sonarpost.services.uuv_modem.service.SAVE_AGAIN_S", 0.05)
 
 
@@ -137,6 +141,34 @@ def refused() -> Callable[[Service[Any]], list[tuple[str, str]]]:
     return read
 
 
+@contextmanager
+def _full_disk(service: Service[Any]) -> Iterator[None]:
+    service.store._db.execute("PRAGMA max_page_count=1")
+    yield
+    service.store._db.execute("PRAGMA max_page_count=1000000")
+
+
+@pytest.fixture
+def full_disk() -> Callable[[Service[Any]], AbstractContextManager[None]]:
+    """Let the store of a service grow no further."""
+    return _full_disk
+
+
+@contextmanager
+def _unwritable(service: Service[Any]) -> Iterator[None]:
+    with service.store._lock:
+        service.store._db.execute("PRAGMA query_only=ON")
+    yield
+    with service.store._lock:
+        service.store._db.execute("PRAGMA query_only=OFF")
+
+
+@pytest.fixture
+def unwritable() -> Callable[[Service[Any]], AbstractContextManager[None]]:
+    """Make every write to the store of a service fail."""
+    return _unwritable
+
+
 @pytest.fixture
 def publish(client: zenoh.Session) -> Callable[[str, bytes], None]:
     """Publish without an outbox, as soon as a subscriber exists."""
@@ -199,7 +231,7 @@ def snippet(texture: Callable[..., np.ndarray]) -> Callable[..., Snippet]:
 def put_file(tmp_path: Path) -> Callable[[str, bytes], Path]:
     """Put a complete file into the polled folder: written under a hidden name, then renamed."""
     folder = tmp_path / "incoming"
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
 
     def put(name: str, data: bytes) -> Path:
         hidden = folder / f".{name}.part"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from builders.services import (
     check_monitoring,
+    full_disk,
     modem_pair,
     publish,
     put_file,
@@ -14,11 +15,13 @@ from builders.services import (
     snippet,
     survey_bytes,
     texture,
+    unwritable,
     watch,
 )
 
 __all__ = [
     "check_monitoring",
+    "full_disk",
     "modem_pair",
     "publish",
     "put_file",
@@ -29,5 +32,6 @@ __all__ = [
     "snippet",
     "survey_bytes",
     "texture",
+    "unwritable",
     "watch",
 ]

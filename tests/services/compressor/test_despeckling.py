@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-import logging
-
-import msgpack
 import pytest
 from builders.common import eventually
-from builders.records import command_record
 
-from sonarpost import keys
 from sonarpost.codec import emb
 from sonarpost.codec.emb.codec import EmbCodec
-from sonarpost.link.downlink import messages as dl
 from sonarpost.messages import Contact, Snippet
 from sonarpost.services.compressor.config import CompressorConfig
 from sonarpost.services.compressor.encoding import encode, transmit_part
-from sonarpost.services.op_modem.vessel_endpoint import message_of
-from sonarpost.services.uuv_modem.config import UuvModemConfig
-from sonarpost.services.uuv_modem.received_commands import ReceivedCommands
 
-IN = keys.contact_detected("uuv-1")
 BUDGET_BYTES = 150
-
-
-@pytest.fixture
-def start_emb(start_service):
-    return lambda **options: start_service(**{"codec": "emb", "budget_bytes": BUDGET_BYTES, **options})
+EMB = {"codec": "emb", "budget_bytes": BUDGET_BYTES}
 
 
 def strength_of(image):
@@ -38,155 +24,112 @@ def expected_stream(snippet, strength):
     return transmit_part(codec, encode(codec, snippet.picture.to_array(), BUDGET_BYTES, 0))
 
 
-@pytest.mark.parametrize("strength", [0.0, 0.25, 1.0])
-def test_strength_is_passed_to_the_codec_and_logged(strength, start_emb, atd, modem, snippet, caplog):
-    caplog.set_level(logging.INFO)
-    start_emb(despeckle_strength=strength)
+@pytest.mark.parametrize("strength", [0.0, 0.25, None])
+def test_strength_is_passed_to_the_codec_and_logged(strength, start_service, encoded, snippet, caplog):
+    caplog.set_level("INFO")
+    assert CompressorConfig().despeckle_strength == emb.DEFAULT_STRENGTH == 1.0
+    start_service(**EMB, **({} if strength is None else {"despeckle_strength": strength}))
+    strength = emb.DEFAULT_STRENGTH if strength is None else strength
     sent = snippet("c1", 64, 64)
-    atd.send(IN, "compressor", sent)
-    eventually(lambda: len(modem.received) == 1)
-    assert strength_of(modem.received[0]) == strength
-    assert modem.received[0].stream == expected_stream(sent, strength)
+    [image] = encoded(sent)
+    assert strength_of(image) == strength
+    assert image.stream == expected_stream(sent, strength)
     [line] = [record for record in caplog.records if record.message == "Image encoded"]
     assert line.fields["despeckle_strength"] == strength
 
 
-def test_default_strength_is_that_of_the_codec(start_emb, atd, modem, snippet):
-    assert CompressorConfig().despeckle_strength == emb.DEFAULT_STRENGTH
-    start_emb()
-    atd.send(IN, "compressor", snippet("c1", 64, 64))
-    eventually(lambda: len(modem.received) == 1)
-    assert strength_of(modem.received[0]) == emb.DEFAULT_STRENGTH
-
-
-def test_original_sends_the_contact_without_despeckling(start_emb, send_command, atd, modem, snippet):
-    service = start_emb()
+def test_original_sends_the_contact_without_despeckling_and_is_refined(start_service, encoded, answer, snippet):
+    service = start_service(**EMB)
     sent = snippet("c1", 64, 64)
-    atd.send(IN, "compressor", sent)
-    eventually(lambda: len(modem.received) == 1)
-    send_command("original", modem.received[0].image_id)
-    eventually(lambda: len(modem.received) == 2)
-    first, original = modem.received
+    [first] = encoded(sent)
+    original = answer("original", first.image_id)
     assert int(original.image_id, 36) == int(first.image_id, 36) + 1
     assert (original.contact, original.original_sha256) == (first.contact, first.original_sha256)
     assert (strength_of(first), strength_of(original)) == (1.0, 0.0)
     assert original.stream == expected_stream(sent, 0.0)
+    longer = answer("refine", original.image_id)
+    assert longer.image_id == original.image_id
+    assert longer.stream.startswith(original.stream)
+    assert len(longer.stream) >= 1.9 * len(original.stream)
+    assert strength_of(longer) == 0.0
     counters = service.health().counters
-    assert (counters["images_encoded"], counters["images_original"]) == (2, 1)
+    assert (counters["images_encoded"], counters["images_original"], counters["images_refined"]) == (2, 1, 1)
 
 
-def test_original_command_arrives_through_the_acoustic_link(start_emb, runner, atd, modem, snippet):
-    start_emb()
-    atd.send(IN, "compressor", snippet("c1", 64, 64))
-    eventually(lambda: len(modem.received) == 1)
-    first = modem.received[0]
-    downlink_bytes = dl.pack(message_of(command_record("original", first.image_id), 7))
-    commands = ReceivedCommands("uuv-1", UuvModemConfig(port="socket://x", address=3))
-    _, received = commands.accept(1, dl.unpack(downlink_bytes), first.image_id)
-    assert received.consumers == ("compressor",)
-    runner.peer("uuv-1", "vehicle_commands").send(received.key, "compressor", received.record)
-    eventually(lambda: len(modem.received) == 2)
-    assert strength_of(modem.received[1]) == 0.0
+def test_original_command_arrives_through_the_acoustic_link(start_service, encoded, command_over_the_link, snippet):
+    start_service(**EMB)
+    [first] = encoded(snippet("c1", 64, 64))
+    assert strength_of(command_over_the_link("original", first.image_id)) == 0.0
 
 
-def test_a_repeated_original_command_sends_the_same_image(start_emb, runner, send_command, atd, modem, snippet):
-    service = start_emb()
-    atd.send(IN, "compressor", snippet("c1", 64, 64), snippet("c2", 64, 64, seed=2))
-    eventually(lambda: len(modem.received) == 2)
-    send_command("original", modem.received[0].image_id)
-    eventually(lambda: len(modem.received) == 3)
+def test_a_repeated_original_command_sends_the_same_image(start_service, restart, encoded, answer, snippet):
+    service = start_service(**EMB)
+    first, _ = encoded(snippet("c1", 64, 64), snippet("c2", 64, 64, seed=2))
+    original = answer("original", first.image_id)
     # The answer is the same after a restart with another strength.
-    eventually(lambda: service.store.outbox_depth() == 0)
-    runner.stop(service)
-    service = start_emb(despeckle_strength=0.5)
-    send_command("original", modem.received[0].image_id)
-    eventually(lambda: len(modem.received) == 4)
-    assert modem.received[3] == modem.received[2]
+    service = restart(service, **EMB, despeckle_strength=0.5)
+    assert answer("original", first.image_id) == original
     assert "images_original" not in service.health().counters
 
 
-def test_an_original_image_that_left_the_cache_is_encoded_again(start_emb, send_command, atd, modem, snippet):
-    start_emb(cache_images=2)
-    atd.send(IN, "compressor", snippet("c1", 64, 64))
-    eventually(lambda: len(modem.received) == 1)
-    first = modem.received[0].image_id
-    send_command("original", first)
-    eventually(lambda: len(modem.received) == 2)
-    send_command("refine", first)  # now the original image is the oldest entry
-    eventually(lambda: len(modem.received) == 3)
-    atd.send(IN, "compressor", snippet("c2", 64, 64, seed=2))
-    eventually(lambda: len(modem.received) == 4)
-    send_command("original", first)
-    eventually(lambda: len(modem.received) == 5)
-    assert modem.received[4].stream == modem.received[1].stream
-    assert modem.received[4].image_id != modem.received[1].image_id
+def test_an_original_image_that_left_the_cache_is_encoded_again(start_service, encoded, answer, snippet):
+    start_service(**EMB, cache_images=2)
+    [first] = encoded(snippet("c1", 64, 64))
+    original = answer("original", first.image_id)
+    answer("refine", first.image_id)  # now the original image is the oldest entry
+    encoded(snippet("c2", 64, 64, seed=2))
+    again = answer("original", first.image_id)
+    assert again.stream == original.stream
+    assert again.image_id != original.image_id
 
 
 @pytest.mark.parametrize("options", [{"despeckle_strength": 0.0}, {"codec": "vq", "budget_bytes": 0}])
-def test_original_for_an_image_without_despeckling_is_counted(options, start_emb, send_command, atd, modem, snippet):
-    service = start_emb(**options)
-    atd.send(IN, "compressor", snippet("c1"))
-    eventually(lambda: len(modem.received) == 1)
-    send_command("original", modem.received[0].image_id)
+def test_original_for_an_image_without_despeckling_is_counted(
+    options, start_service, encoded, send_command, answer, snippet
+):
+    service = start_service(**(EMB | options))
+    [image] = encoded(snippet("c1"))
+    send_command("original", image.image_id)
     eventually(lambda: service.health().counters.get("commands_without_despeckling") == 1)
-    send_command("resend", modem.received[0].image_id)
-    eventually(lambda: len(modem.received) == 2)
-    assert modem.received[1] == modem.received[0]
+    assert answer("resend", image.image_id) == image
     assert service.health().counters["images_encoded"] == 1
 
 
 def test_original_of_an_original_image_and_of_an_unknown_image_are_counted(
-    start_emb, send_command, atd, modem, snippet
+    start_service, encoded, send_command, answer, modem, snippet
 ):
-    service = start_emb()
-    atd.send(IN, "compressor", snippet("c1", 64, 64))
-    eventually(lambda: len(modem.received) == 1)
-    send_command("original", modem.received[0].image_id)
-    eventually(lambda: len(modem.received) == 2)
-    send_command("original", modem.received[1].image_id)
+    service = start_service(**EMB)
+    [first] = encoded(snippet("c1", 64, 64))
+    send_command("original", answer("original", first.image_id).image_id)
     eventually(lambda: service.health().counters.get("commands_without_despeckling") == 1)
     send_command("original", "ZZZZ")
     eventually(lambda: service.health().counters.get("commands_unknown_image") == 1)
     assert len(modem.received) == 2
 
 
-def test_an_expanded_image_is_despeckled_and_its_original_can_be_requested(
-    start_emb, send_command, atd, modem, snippet
-):
-    start_emb()
+def test_an_expanded_image_is_despeckled_and_its_original_can_be_requested(start_service, encoded, answer, snippet):
+    start_service(**EMB)
     wide = snippet("wide", 64, 64, seed=9).picture
     contact = Contact(contact_id="c1", vehicle_id="uuv-1", pixel_along_m=0.05, pixel_across_m=0.1)
-    atd.send(IN, "compressor", Snippet(contact=contact, picture=snippet("c1", 64, 64).picture, wide=wide))
-    eventually(lambda: len(modem.received) == 1)
-    send_command("wider", modem.received[0].image_id)
-    eventually(lambda: len(modem.received) == 2)
-    send_command("original", modem.received[1].image_id)
-    eventually(lambda: len(modem.received) == 3)
-    expanded, original = modem.received[1:]
+    [first] = encoded(Snippet(contact=contact, picture=snippet("c1", 64, 64).picture, wide=wide))
+    expanded = answer("wider", first.image_id)
+    original = answer("original", expanded.image_id)
     assert original.original_sha256 == expanded.original_sha256 == wide.sha256
     assert original.contact == expanded.contact
     assert (strength_of(expanded), strength_of(original)) == (1.0, 0.0)
 
 
-@pytest.mark.parametrize("model", ["standard", "structure"])
-@pytest.mark.parametrize(("before", "after"), [(1.0, 0.0), (0.0, 1.0), (1.0, 0.25)])
+@pytest.mark.parametrize(
+    ("before", "after", "model"), [(1.0, 0.0, "standard"), (0.0, 1.0, "structure"), (1.0, 0.25, "structure")]
+)
 def test_images_of_another_strength_are_resent_and_refined(
-    before, after, model, start_emb, runner, send_command, atd, modem, snippet
+    before, after, model, start_service, restart, encoded, answer, snippet
 ):
-    service = start_emb(despeckle_strength=before, model=model)
-    sent = snippet("c1", 64, 64)
-    atd.send(IN, "compressor", sent)
-    eventually(lambda: len(modem.received) == 1)
-    eventually(lambda: service.store.outbox_depth() == 0)
-    runner.stop(service)
-    service = start_emb(despeckle_strength=after, model=model)
-    first = modem.received[0]
-    send_command("resend", first.image_id)
-    eventually(lambda: len(modem.received) == 2)
-    assert modem.received[1] == first
-    send_command("refine", first.image_id)
-    eventually(lambda: len(modem.received) == 3)
-    longer = modem.received[2]
+    service = start_service(**EMB, despeckle_strength=before, model=model)
+    [first] = encoded(snippet("c1", 64, 64))
+    service = restart(service, **EMB, despeckle_strength=after, model=model)
+    assert answer("resend", first.image_id) == first
+    longer = answer("refine", first.image_id)
     assert longer.stream.startswith(first.stream)
     assert len(longer.stream) >= 1.9 * len(first.stream)
     assert strength_of(longer) == before
@@ -194,32 +137,13 @@ def test_images_of_another_strength_are_resent_and_refined(
     assert service.health().counters["images_refined"] == 1
 
 
-def test_original_image_is_refined(start_emb, send_command, atd, modem, snippet):
-    service = start_emb()
-    atd.send(IN, "compressor", snippet("c1", 64, 64))
-    eventually(lambda: len(modem.received) == 1)
-    send_command("original", modem.received[0].image_id)
-    eventually(lambda: len(modem.received) == 2)
-    original = modem.received[1]
-    send_command("refine", original.image_id)
-    eventually(lambda: len(modem.received) == 3)
-    longer = modem.received[2]
-    assert longer.image_id == original.image_id
-    assert longer.stream.startswith(original.stream)
-    assert len(longer.stream) >= 1.9 * len(original.stream)
-    assert strength_of(longer) == 0.0
-    assert service.health().counters["images_refined"] == 1
+def test_a_cache_entry_without_an_original_id_is_read(start_service, encoded, change_cached, answer, snippet):
+    service = start_service(**EMB)
+    [image] = encoded(snippet("c1", 64, 64))
 
+    def without_the_last(entry):
+        assert len(entry) == 4
+        return entry[:3]
 
-def test_a_cache_entry_without_an_original_id_is_read(start_emb, send_command, atd, modem, snippet):
-    service = start_emb()
-    atd.send(IN, "compressor", snippet("c1", 64, 64))
-    eventually(lambda: len(modem.received) == 1)
-    name = f"kept/{modem.received[0].image_id}"
-    *others, _ = msgpack.unpackb(service.store.get_state(name))
-    assert len(others) == 3
-    with service.store.transaction() as tx:
-        tx.put_state(name, msgpack.packb(others))
-    send_command("original", modem.received[0].image_id)
-    eventually(lambda: len(modem.received) == 2)
-    assert strength_of(modem.received[1]) == 0.0
+    change_cached(service, without_the_last)
+    assert strength_of(answer("original", image.image_id)) == 0.0

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import msgpack
 import numpy as np
 import pytest
 from builders.common import eventually
-from builders.records import command_record
+from builders.joined_surveys import FEW_CANDIDATES
 
-from sonarpost import keys
 from sonarpost.detection.detector import detect
+from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.stream import FileOrigin
-from sonarpost.link.downlink import messages as dl
 from sonarpost.messages import Contact, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.survey_detection import snippet_of
 from sonarpost.services.compressor.encoding import expand
-from sonarpost.services.op_modem.vessel_endpoint import message_of
-from sonarpost.services.uuv_modem.config import UuvModemConfig
-from sonarpost.services.uuv_modem.received_commands import ReceivedCommands
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-
-IN, OUT = keys.contact_detected("uuv-1"), keys.image_encoded("uuv-1")
 
 
 @pytest.fixture
@@ -37,16 +30,11 @@ def expandable_snippet(snippet):
     return make
 
 
-def test_expand_sends_more_seabed_as_an_image_of_its_own(
-    start_service, send_command, atd, modem, expandable_snippet, vq
-):
+def test_expand_sends_more_seabed_as_an_image_of_its_own(start_service, encoded, answer, expandable_snippet, vq):
     service = start_service()
     sent = expandable_snippet("c1")
-    atd.send(IN, "compressor", sent)
-    eventually(lambda: len(modem.received) == 1)
-    send_command("wider", modem.received[0].image_id)
-    eventually(lambda: len(modem.received) == 2)
-    first, expanded = modem.received
+    [first] = encoded(sent)
+    expanded = answer("wider", first.image_id)
     assert int(expanded.image_id, 36) == int(first.image_id, 36) + 1
     assert expanded.contact == sent.contact.model_copy(update={"pixel_along_m": 0.1, "pixel_across_m": 0.2})
     assert expanded.stream == vq.encode(sent.wide.to_array())
@@ -55,28 +43,19 @@ def test_expand_sends_more_seabed_as_an_image_of_its_own(
     assert (counters["images_encoded"], counters["images_expanded"]) == (2, 1)
 
 
-def test_expand_of_a_detection_shows_twice_the_ground(start_service, runner, atd, modem, emb):
+def test_expand_of_a_detection_shows_twice_the_ground(start_service, encoded, command_over_the_link, emb):
     survey = simulate_survey(SurveySpec(seed=1, pings=400, samples=1024, clutter=0)).survey
-    config = AtdStubConfig()
-    origin = FileOrigin("ab" * 32, "line-7.xtf", "line-7")
     # Away from the ends of the recording, where the expanded image would be shifted.
-    detection = next(each for each in detect(survey) if 80 <= each.ping_index < 320 and 150 <= each.sample < 850)
-    sent = snippet_of(survey, detection, origin, "uuv-1", config)
-    start_service(codec="emb", budget_bytes=4000)
-    atd.send(IN, "compressor", sent)
-    eventually(lambda: len(modem.received) == 1)
-    first = modem.received[0]
-    # A command on the vessel, bytes on the acoustic link, a command again on the vehicle.
-    downlink_bytes = dl.pack(message_of(command_record("wider", first.image_id), 7))
-    outcome, received = ReceivedCommands("uuv-1", UuvModemConfig(port="unused")).accept(
-        1, dl.unpack(downlink_bytes), first.image_id
+    detection = next(
+        each
+        for each in detect(survey, DetectorSettings(**FEW_CANDIDATES.model_dump()))
+        if 80 <= each.ping_index < 320 and 150 <= each.sample < 850
     )
-    assert (outcome, received.consumers) == (dl.CommandOutcome.ACCEPTED, ("compressor",))
-    runner.peer("uuv-1", "vehicle_commands").send(received.key, "compressor", received.record)
-    eventually(lambda: len(modem.received) == 2)
-    expanded = modem.received[1]
-    decoded = {image.image_id: emb.decode(image.stream).image.astype(float) for image in (first, expanded)}
-    around, near = decoded[expanded.image_id], decoded[first.image_id]
+    origin = FileOrigin("ab" * 32, "line-7.xtf", "line-7")
+    start_service(codec="emb", budget_bytes=4000)
+    [first] = encoded(snippet_of(survey, detection, origin, "uuv-1", AtdStubConfig()))
+    expanded = command_over_the_link("wider", first.image_id)
+    near, around = (emb.decode(image.stream).image.astype(float) for image in (first, expanded))
     assert around.shape == near.shape == (80, 140)
     assert expanded.contact.pixel_along_m == 2 * first.contact.pixel_along_m
     assert expanded.contact.pixel_across_m == 2 * first.contact.pixel_across_m
@@ -91,62 +70,41 @@ def test_expand_of_a_detection_shows_twice_the_ground(start_service, runner, atd
     assert correlation[20, 35] > 0.8
 
 
-def test_a_repeated_expand_command_sends_the_same_image(
-    start_service, runner, send_command, atd, modem, expandable_snippet
-):
+def test_a_repeated_expand_command_sends_the_same_image(start_service, restart, encoded, answer, expandable_snippet):
     service = start_service()
-    atd.send(IN, "compressor", expandable_snippet("c1"), expandable_snippet("c2", seed=2))
-    eventually(lambda: len(modem.received) == 2)
-    send_command("wider", modem.received[0].image_id)
-    eventually(lambda: len(modem.received) == 3)
-    send_command("refine", modem.received[0].image_id)  # replaces the cache entry
-    eventually(lambda: len(modem.received) == 4)
-    runner.stop(service)
-    service = start_service()
-    send_command("wider", modem.received[0].image_id)
-    eventually(lambda: len(modem.received) == 5)
-    assert modem.received[4] == modem.received[2]
+    first, _ = encoded(expandable_snippet("c1"), expandable_snippet("c2", seed=2))
+    expanded = answer("wider", first.image_id)
+    answer("refine", first.image_id)  # replaces the cache entry
+    service = restart(service)
+    assert answer("wider", first.image_id) == expanded
     assert "images_encoded" not in service.health().counters
 
 
-def test_an_expanded_image_that_left_the_cache_is_encoded_again(
-    start_service, send_command, atd, modem, expandable_snippet
-):
+def test_an_expanded_image_that_left_the_cache_is_encoded_again(start_service, encoded, answer, expandable_snippet):
     start_service(codec="emb", budget_bytes=120, cache_images=2)
-    atd.send(IN, "compressor", expandable_snippet("c1"))
-    eventually(lambda: len(modem.received) == 1)
-    first = modem.received[0].image_id
-    send_command("wider", first)
-    eventually(lambda: len(modem.received) == 2)
-    send_command("refine", first)  # now the expanded image is the oldest entry
-    eventually(lambda: len(modem.received) == 3)
-    atd.send(IN, "compressor", expandable_snippet("c2", seed=2))
-    eventually(lambda: len(modem.received) == 4)
-    send_command("wider", first)
-    eventually(lambda: len(modem.received) == 5)
-    assert modem.received[4].stream == modem.received[1].stream
-    assert modem.received[4].image_id not in {image.image_id for image in modem.received[:4]}
+    [first] = encoded(expandable_snippet("c1"))
+    expanded = answer("wider", first.image_id)
+    answer("refine", first.image_id)  # now the expanded image is the oldest entry
+    [other] = encoded(expandable_snippet("c2", seed=2))
+    again = answer("wider", first.image_id)
+    assert again.stream == expanded.stream
+    assert again.image_id not in {first.image_id, expanded.image_id, other.image_id}
 
 
 def test_expand_without_an_expanded_image_is_counted(
-    start_service, send_command, atd, modem, snippet, expandable_snippet
+    start_service, encoded, send_command, answer, snippet, expandable_snippet
 ):
     service = start_service()
-    atd.send(IN, "compressor", snippet("plain"), expandable_snippet("c1"))
-    eventually(lambda: len(modem.received) == 2)
-    plain, first = (image.image_id for image in modem.received)
+    plain, first = encoded(snippet("plain"), expandable_snippet("c1"))
     counters = lambda: service.health().counters  # noqa: E731
-    send_command("wider", plain)
+    send_command("wider", plain.image_id)
     eventually(lambda: counters().get("commands_without_expanded_image") == 1)
     send_command("wider", "ZZZZ")
     eventually(lambda: counters().get("commands_unknown_image") == 1)
-    send_command("wider", first)
-    eventually(lambda: len(modem.received) == 3)
-    send_command("wider", modem.received[2].image_id)  # an expanded image cannot be expanded again
+    expanded = answer("wider", first.image_id)
+    send_command("wider", expanded.image_id)  # an expanded image cannot be expanded again
     eventually(lambda: counters().get("commands_without_expanded_image") == 2)
-    send_command("resend", modem.received[2].image_id)
-    eventually(lambda: len(modem.received) == 4)
-    assert modem.received[3] == modem.received[2]
+    assert answer("resend", expanded.image_id) == expanded
 
 
 def test_pixel_sizes_above_the_range_of_the_record_are_unknown(expandable_snippet):
@@ -155,14 +113,8 @@ def test_pixel_sizes_above_the_range_of_the_record_are_unknown(expandable_snippe
     assert expanded.wide is None
 
 
-def test_a_cache_entry_without_an_expanded_id_is_sent(start_service, send_command, atd, modem, snippet):
+def test_a_cache_entry_without_an_expanded_id_is_sent(start_service, encoded, change_cached, answer, snippet):
     service = start_service()
-    atd.send(IN, "compressor", snippet("c1"))
-    eventually(lambda: len(modem.received) == 1)
-    name = f"kept/{modem.received[0].image_id}"
-    image, packed, *_ = msgpack.unpackb(service.store.get_state(name))
-    with service.store.transaction() as tx:
-        tx.put_state(name, msgpack.packb([image, packed]))
-    send_command("resend", modem.received[0].image_id)
-    eventually(lambda: len(modem.received) == 2)
-    assert modem.received[1] == modem.received[0]
+    [image] = encoded(snippet("c1"))
+    change_cached(service, lambda entry: entry[:2])
+    assert answer("resend", image.image_id) == image

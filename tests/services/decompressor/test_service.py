@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
+import time
 from datetime import UTC, datetime
 
 import msgpack
@@ -15,6 +17,7 @@ from builders.vessel_frames import CONTACT
 from PIL import Image
 
 from sonarpost import keys
+from sonarpost.archive.decoder import Decoder
 from sonarpost.archive.image_files import image_file_name
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import StreamHeader
@@ -82,6 +85,19 @@ def modem(runner):
     return runner.peer(VESSEL, "op_modem")
 
 
+@pytest.fixture
+def decoded(modem, console):
+    """Send records to the service, and return the images that it makes of them."""
+
+    def decode(*records):
+        before = len(console.received)
+        modem.send(IN, "decompressor", *records)
+        eventually(lambda: len(console.received) == before + len(records))
+        return console.received[before:]
+
+    return decode
+
+
 def frames_of(image_id, stream, contact=CONTACT):
     """Return the frames of an image in the paper's format."""
     return [data for packet in plan_packets(image_id, stream, contact, 3, 64) for data in packet]
@@ -118,14 +134,12 @@ def embedded(stream, *, version=1, image_id="0001", complete=False):
     )
 
 
-def test_complete_image_is_decoded(begin, modem, console, stream, vq, check_monitoring, watch):
+def test_complete_image_is_decoded(begin, decoded, stream, vq, check_monitoring, watch):
     seen = watch(OUT)
     service = begin()
     data = stream()
     size = StreamHeader.unpack(data).size
-    modem.send(IN, "decompressor", *updates(*frames_of("0A1B", data)))
-    eventually(lambda: len(console.received) == 1)
-    image = console.received[0]
+    [image] = decoded(*updates(*frames_of("0A1B", data)))
     assert (image.vessel_id, image.vehicle_id, image.image_id, image.version) == (VESSEL, "uuv-1", "0A1B", 1)
     assert (image.complete, image.missing_fraction, image.missing_halves, image.missing_mask) == (True, 0.0, (), b"")
     assert (image.codec, image.model) == ("vq", vq.model_hash)
@@ -140,63 +154,61 @@ def test_complete_image_is_decoded(begin, modem, console, stream, vq, check_moni
     check_monitoring(service)
 
 
-def test_files_and_record_hold_the_same_image(begin, modem, console, stream, out):
-    begin()
-    modem.send(IN, "decompressor", *updates(*frames_of("0A1B", stream())))
-    eventually(lambda: len(console.received) == 1)
-    image = console.received[0]
+def test_files_and_record_hold_the_same_image(begin, runner, decoded, stream, out):
+    service = begin()
+    records = updates(*frames_of("0A1B", stream()))
+    [image] = decoded(*records)
     name = f"uuv-1_{datetime.fromtimestamp(START_UTC_S, UTC):%Y%m%dT%H%M%SZ}_0A1B_v1"
     assert image_file_name(image) == name
     assert {p.name for p in out.iterdir()} == {f"{name}.{kind}" for kind in ("tiff", "png", "json")}
     tiff, png = read_image(out / f"{name}.tiff"), np.asarray(Image.open(out / f"{name}.png"))
     np.testing.assert_array_equal(tiff, png)
     assert hashlib.sha256(tiff.tobytes()).hexdigest() == image.picture_sha256
-    side = json.loads((out / f"{name}.json").read_text())
+    whole = (out / f"{name}.json").read_bytes()
+    side = json.loads(whole)
     assert side["picture_sha256"] == image.picture_sha256
     assert (side["image_id"], side["contact"]["lat_deg"], side["missing_pixels"]) == ("0A1B", 56.4, 0)
     assert (side["height_px"], side["width_px"], side["bits"]) == (40, 60, 8)
-
-
-@pytest.mark.parametrize(("arrived", "missing"), [("top", "bottom"), ("bottom", "top")])
-def test_missing_half_is_black_and_marked(arrived, missing, begin, modem, console, stream, vq):
+    # A damaged side car is written again.
+    runner.stop(service)
+    (out / f"{name}.json").write_bytes(b"\xff\xfe half of it")
     begin()
-    first = stream(1)
-    modem.send(IN, "decompressor", *updates(half("AAAA", first, arrived)))
-    eventually(lambda: len(console.received) == 1)
-    image = console.received[0]
-    assert (image.image_id, image.complete, image.missing_halves) == ("AAAA", False, (missing,))
-    assert image.missing_fraction == pytest.approx(0.5, abs=0.1)
-    pixels, black = image.picture.to_array(), image.missing()
-    assert (pixels[black] == 0).all()
-    np.testing.assert_array_equal(pixels[~black], vq.decode(first).image[~black])
-    rows = np.flatnonzero(black.any(axis=1))
-    assert (rows.min() >= 20) if missing == "bottom" else (rows.max() < 20)
+    decoded(*records)
+    assert (out / f"{name}.json").read_bytes() == whole
 
 
-def test_versions_of_an_embedded_stream_become_finer(begin, modem, console, emb, texture, out):
+def test_missing_half_is_black_and_marked(begin, decoded, stream, vq):
+    begin()
+    for image_id, arrived, missing in (("AAAA", "top", "bottom"), ("BBBB", "bottom", "top")):
+        [image] = decoded(*updates(half(image_id, stream(1), arrived)))
+        assert (image.image_id, image.complete, image.missing_halves) == (image_id, False, (missing,))
+        assert image.missing_fraction == pytest.approx(0.5, abs=0.1)
+        pixels, black = image.picture.to_array(), image.missing()
+        assert (pixels[black] == 0).all()
+        np.testing.assert_array_equal(pixels[~black], vq.decode(stream(1)).image[~black])
+        rows = np.flatnonzero(black.any(axis=1))
+        assert (rows.min() >= 20) if missing == "bottom" else (rows.max() < 20)
+
+
+def test_versions_of_an_embedded_stream_become_finer(begin, decoded, emb, texture, out):
     begin()
     whole = emb.encode(texture(), 192)
     lengths = (40, 96, len(whole))
-    modem.send(
-        IN,
-        "decompressor",
-        *(embedded(whole[:n], version=v, complete=n == len(whole)) for v, n in enumerate(lengths, start=1)),
-    )
-    eventually(lambda: len(console.received) == 3)
-    for length, image in zip(lengths, console.received, strict=True):
+    records = (embedded(whole[:n], version=v, complete=n == len(whole)) for v, n in enumerate(lengths, start=1))
+    images = decoded(*records)
+    for length, image in zip(lengths, images, strict=True):
         np.testing.assert_array_equal(image.picture.to_array(), emb.decode(whole[:length]).image)
         assert (image.missing_fraction, image.missing_halves, image.frames_received) == (0.0, (), 0)
         assert (image.bytes_received, image.bytes_total) == (length, length if image.complete else 0)
-    assert [(image.version, image.complete) for image in console.received] == [(1, False), (2, False), (3, True)]
-    assert (console.received[0].codec, console.received[0].model) == ("emb", emb.model_hash)
+    assert [(image.version, image.complete) for image in images] == [(1, False), (2, False), (3, True)]
+    assert (images[0].codec, images[0].model) == ("emb", emb.model_hash)
     assert len(list(out.glob("*.tiff"))) == 3
 
 
-def test_missing_end_of_a_stream_that_is_not_embedded_is_marked(begin, modem, console, stream, vq):
+def test_missing_end_of_a_stream_that_is_not_embedded_is_marked(begin, decoded, stream, vq):
     begin()
-    modem.send(IN, "decompressor", embedded(stream()[:24]))
-    eventually(lambda: len(console.received) == 1)
-    image, whole = console.received[0], vq.decode(stream()).image
+    [image] = decoded(embedded(stream()[:24]))
+    whole = vq.decode(stream()).image
     assert 0.2 < image.missing_fraction < 0.8
     assert not image.complete
     black = image.missing()
@@ -204,38 +216,34 @@ def test_missing_end_of_a_stream_that_is_not_embedded_is_marked(begin, modem, co
     np.testing.assert_array_equal(image.picture.to_array()[~black], whole[~black])
 
 
-@pytest.mark.parametrize(("size", "shape"), [({}, (40, 60)), ({"height_px": None, "width_px": None}, (16, 16))])
-def test_contact_record_alone_gives_an_image_of_missing_pixels(size, shape, begin, modem, console, out):
+def test_contact_record_alone_gives_an_image_of_missing_pixels(begin, decoded, out):
     begin()
     [record] = updates(ContactFrame("AAAA", CONTACT).pack())
-    modem.send(IN, "decompressor", record.model_copy(update=size))
-    eventually(lambda: len(console.received) == 1)
-    image = console.received[0]
-    assert (image.contact.lat_deg, image.contact.time_utc_s) == (56.4, 1_475_568_000.0)
-    assert (image.codec, image.bytes_total, image.missing_fraction, image.complete) == ("", 0, 1.0, False)
-    assert image.missing_halves == ("top", "bottom")
-    assert image.picture.to_array().shape == shape
-    assert not image.picture.to_array().any()
-    assert "only the contact record arrived" in image.notes
-    assert len(list(out.glob("*.json"))) == 1
+    of_unknown_size = record.model_copy(update={"version": 2, "height_px": None, "width_px": None})
+    for image, shape in zip(decoded(record, of_unknown_size), ((40, 60), (16, 16)), strict=True):
+        assert (image.contact.lat_deg, image.contact.time_utc_s) == (56.4, 1_475_568_000.0)
+        assert (image.codec, image.bytes_total, image.missing_fraction, image.complete) == ("", 0, 1.0, False)
+        assert (image.missing_halves, image.despeckle_strength) == (("top", "bottom"), None)
+        assert image.picture.to_array().shape == shape
+        assert not image.picture.to_array().any()
+        assert "only the contact record arrived" in image.notes
+    assert len(list(out.glob("*.json"))) == 2
 
 
-def test_contradicting_frames_are_noted(begin, modem, console, stream):
+def test_contradicting_frames_are_noted(begin, decoded, stream):
     begin()
-    modem.send(IN, "decompressor", *updates(half("AAAA", stream(1), "top"), half("AAAA", stream(2), "top")))
-    eventually(lambda: len(console.received) == 1)
-    assert console.received[0].notes[-1] == "1 frames disagreed with others of this image"
+    [image] = decoded(*updates(half("AAAA", stream(1), "top"), half("AAAA", stream(2), "top")))
+    assert image.notes[-1] == "1 frames disagreed with others of this image"
 
 
-def test_index_beyond_the_codebook_is_a_black_tile(begin, modem, console, stream, vq):
+def test_index_beyond_the_codebook_is_a_black_tile(begin, decoded, stream, vq):
     begin()
     data = bytearray(stream())
     assert len(vq.tiles) < 1 << 14
     start = StreamHeader.unpack(data).size
     data[start : start + 2] = b"\xff\xff"
-    modem.send(IN, "decompressor", *updates(*frames_of("AAAA", bytes(data))))
-    eventually(lambda: len(console.received) == 1)
-    image, whole = console.received[0], vq.decode(stream()).image
+    [image] = decoded(*updates(*frames_of("AAAA", bytes(data))))
+    whole = vq.decode(stream()).image
     pixels, black = image.picture.to_array(), image.missing()
     assert black[:10, :10].all()
     assert (pixels[black] == 0).all()
@@ -245,35 +253,37 @@ def test_index_beyond_the_codebook_is_a_black_tile(begin, modem, console, stream
     assert image.notes
 
 
-def test_image_of_an_unknown_codebook_is_quarantined(begin, modem, console, texture, refused, vq, stream):
+def test_images_that_cannot_be_decoded_are_quarantined(
+    begin, modem, console, texture, refused, vq, emb, stream, monkeypatch
+):
     service = begin()
+    decode = Decoder.decode
+    monkeypatch.setattr(Decoder, "decode", lambda self, r: 1 // 0 if r.image_id == "CCCC" else decode(self, r))
     other = default_registry().create("vq", CodecResources(open_codebook("nominal-20").tiles))
     modem.send(IN, "decompressor", *updates(*frames_of("AAAA", other.encode(texture()))))
-    modem.send(IN, "decompressor", *updates(*frames_of("BBBB", stream())))
-    eventually(lambda: [i.image_id for i in console.received] == ["BBBB"])
-    [(key, reason)] = refused(service)
-    assert key == "image uuv-1/AAAA"
-    for codec in (other, vq):
-        assert f"{codebook_tag(codec.tiles):#06x}" in reason
-    assert service.health().counters["images_undecodable"] == 1
-    assert service.health().state == "ok"
-
-
-def test_undecodable_stream_is_quarantined(begin, modem, emb, texture, refused):
-    service = begin()
     modem.send(IN, "decompressor", embedded(b"\xee" + emb.encode(texture(), 192)[1:]))
-    eventually(lambda: service.health().counters.get("images_undecodable") == 1)
-    assert [key for key, _ in refused(service)] == ["image uuv-1/0001"]
+    for image_id in ("CCCC", "BBBB"):
+        modem.send(IN, "decompressor", *updates(*frames_of(image_id, stream())))
+    eventually(lambda: [i.image_id for i in console.received] == ["BBBB"])
+    assert [key for key, _ in refused(service)] == ["image uuv-1/AAAA", "image uuv-1/0001", "image uuv-1/CCCC"]
+    (_, unknown), _, (_, defect) = refused(service)
+    for codec in (other, vq):
+        assert f"{codebook_tag(codec.tiles):#06x}" in unknown
+    assert "ZeroDivisionError" in defect
+    assert service.health().counters["images_undecodable"] == 3
+    assert service.health().state == "ok"
+    assert not service.failed
 
 
-def test_every_configured_codebook_is_used(begin, modem, console, texture, stream):
+def test_every_configured_codebook_is_used(begin, decoded, texture, stream):
     begin(codebooks=("nominal-10", "nominal-20"))
     other = default_registry().create("vq", CodecResources(open_codebook("nominal-20").tiles))
-    modem.send(IN, "decompressor", *updates(*frames_of("AAAA", other.encode(texture()))))
-    modem.send(IN, "decompressor", *updates(*frames_of("BBBB", stream())))
-    eventually(lambda: len(console.received) == 2)
-    assert [i.complete for i in console.received] == [True, True]
-    assert console.received[0].model == other.model_hash != console.received[1].model
+    first, second = decoded(
+        *updates(*frames_of("AAAA", other.encode(texture()))), *updates(*frames_of("BBBB", stream()))
+    )
+    assert first.complete
+    assert second.complete
+    assert first.model == other.model_hash != second.model
 
 
 def test_malformed_and_foreign_records_are_refused(begin, modem, console, stream, refused):
@@ -306,29 +316,15 @@ def test_images_wait_while_the_folder_is_not_writable(begin, runner, modem, cons
     eventually(lambda: service.health().state == "ok")
 
 
-def test_full_disk_leaves_images_with_op_modem(begin, modem, console, stream):
+def test_full_disk_leaves_images_with_op_modem(begin, modem, console, stream, full_disk):
     service = begin()
-    service.store._db.execute("PRAGMA max_page_count=1")
-    modem.send(IN, "decompressor", *updates(*frames_of("AAAA", stream(1, 200, 200))))
-    eventually(lambda: service.health().state == "degraded")
-    assert console.received == []
-    service.store._db.execute("PRAGMA max_page_count=1000000")
+    with full_disk(service):
+        modem.send(IN, "decompressor", *updates(*frames_of("AAAA", stream(1, 200, 200))))
+        eventually(lambda: service.health().state == "degraded")
+        assert console.received == []
     eventually(lambda: len(console.received) == 1)
     assert (console.received[0].complete, console.received[0].version) == (True, 1)
     eventually(lambda: service.health().state == "ok")
-
-
-def test_unexpected_exception_costs_one_image(begin, modem, console, stream, monkeypatch, refused):
-    service = begin()
-    decode = service._decoder.decode
-    monkeypatch.setattr(service._decoder, "decode", lambda r: 1 // 0 if r.image_id == "AAAA" else decode(r))
-    for seed, image_id in enumerate(("AAAA", "BBBB"), start=1):
-        modem.send(IN, "decompressor", *updates(*frames_of(image_id, stream(seed))))
-    eventually(lambda: [i.image_id for i in console.received] == ["BBBB"])
-    [(key, reason)] = refused(service)
-    assert key == "image uuv-1/AAAA"
-    assert "ZeroDivisionError" in reason
-    assert not service.failed
 
 
 def test_unreadable_codebook_is_an_error_at_the_start(platform, tmp_path):
@@ -351,49 +347,30 @@ def test_two_codebooks_with_one_tag_are_rejected(platform, tmp_path, monkeypatch
     DecompressorService(platform(VESSEL), DecompressorConfig(codebooks=(names[0], names[0]))).store.close()
 
 
-def test_damaged_side_car_is_written_again(begin, runner, modem, console, stream, out):
-    service = begin()
-    records = updates(*frames_of("AAAA", stream()))
-    modem.send(IN, "decompressor", *records)
-    eventually(lambda: len(console.received) == 1)
-    [side] = out.glob("*.json")
-    whole = side.read_bytes()
-    runner.stop(service)
-    side.write_bytes(b"\xff\xfe half of it")
-    begin()
-    modem.send(IN, "decompressor", *records)
-    eventually(lambda: len(console.received) == 2)
-    assert side.read_bytes() == whole
-
-
-@pytest.mark.parametrize("authenticated", [True, False, None])
-def test_record_and_side_car_state_the_authentication(begin, modem, console, stream, out, authenticated):
-    begin()
-    [record] = updates(*frames_of("00A7", stream()))
-    modem.send(IN, "decompressor", record.model_copy(update={"authenticated": authenticated}))
-    eventually(lambda: len(console.received) == 1)
-    assert console.received[0].authenticated is authenticated
-    side_car = json.loads((out / f"{image_file_name(console.received[0])}.json").read_text())
-    assert side_car.get("authenticated") is authenticated
-    assert ("authenticated" in side_car) == (authenticated is not None)
-
-
-@pytest.mark.parametrize("strength", [0.0, 0.5, 1.0, None])
-def test_record_and_side_car_state_the_strength_of_despeckling(begin, modem, console, stream, texture, out, strength):
+@pytest.mark.parametrize(("authenticated", "strength"), [(True, 0.5), (False, 0.0), (None, None)])
+def test_record_and_side_car_state_authentication_and_despeckling(
+    authenticated, strength, begin, decoded, stream, texture, out
+):
     begin()
     # The streams of vq do not state a strength.
     coded = stream() if strength is None else EmbCodec(strength=strength).encode(texture(40, 60), 200)
-    modem.send(IN, "decompressor", *updates(*frames_of("00A7", coded)))
-    eventually(lambda: any(image.complete for image in console.received))
-    record = next(image for image in console.received if image.complete)
-    assert record.despeckle_strength == strength
-    side_car = json.loads((out / f"{image_file_name(record)}.json").read_text())
-    assert side_car.get("despeckle_strength") == strength
-    assert ("despeckle_strength" in side_car) == (strength is not None)
+    record = updates(*frames_of("00A7", coded))[-1]
+    [image] = decoded(record.model_copy(update={"authenticated": authenticated}))
+    assert (image.authenticated, image.despeckle_strength) == (authenticated, strength)
+    side_car = json.loads((out / f"{image_file_name(image)}.json").read_text())
+    for name, value in {"authenticated": authenticated, "despeckle_strength": strength}.items():
+        assert side_car.get(name) == value
+        assert (name in side_car) == (value is not None)
 
 
-def test_contact_record_without_an_image_states_no_strength(begin, modem, console):
-    begin()
-    modem.send(IN, "decompressor", *updates(ContactFrame("00A7", CONTACT).pack()))
-    eventually(lambda: len(console.received) == 1)
-    assert (console.received[0].codec, console.received[0].despeckle_strength) == ("", None)
+def test_old_image_files_are_removed_by_default(begin, decoded, runner, stream, out):
+    service = begin()
+    decoded(*(record for name in ("AAAA", "BBBB") for record in updates(*frames_of(name, stream()))))
+    runner.stop(service)
+    past_s = time.time() - 366 * 86400.0
+    for path in out.glob("*_AAAA_v1.*"):
+        os.utime(path, (past_s, past_s))
+    service = begin()
+    # The files of an image are removed one after another.
+    eventually(lambda: {path.stem.split("_")[-2] for path in out.iterdir()} == {"BBBB"})
+    eventually(lambda: service.health().counters.get("images_removed") == 1)

@@ -7,33 +7,31 @@ import time
 from dataclasses import replace
 
 import pytest
-from builders.common import eventually
+from builders.common import WAIT_S, eventually
 from builders.v1_world import next_frames
 from builders.vessel_frames import CONTACT, packet
 from pydantic import ValidationError
 
 from sonarpost import keys, wire
-from sonarpost.errors import ConfigError, DeliveryError, PayloadError
+from sonarpost.errors import ConfigError, PayloadError
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink import messages as dl
-from sonarpost.link.downlink.vessel_endpoint import DownlinkPacket
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.receiver import FeedbackReceived, MessageReceived
-from sonarpost.messages import Command, Decision, DownlinkState, ReceivedImage, ReceivedMessage
+from sonarpost.messages import Command, Decision, DownlinkState, ReceivedMessage
 from sonarpost.modem.interface import PacketReceived
 from sonarpost.modem.micromodem import CAPABILITIES, MicroModem, MicroModemConfig
 from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialPort
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.op_modem.config import OpModemConfig
-from sonarpost.services.op_modem.service import OpModemService
 from sonarpost.services.op_modem.transmit_gate import TransmitGate
 
 VESSEL = "vessel-1"
@@ -63,30 +61,6 @@ def command(kind="refine", command_id="c-1", vehicle_id="uuv-1", **fields):
         issued_utc_s=time.time(),
         **(usual | fields),
     )
-
-
-@pytest.fixture
-def key_file(tmp_path):
-    path = tmp_path / "acoustic.key"
-    path.write_text(bytes(range(32)).hex())
-    path.chmod(0o600)
-    return path
-
-
-@pytest.fixture
-def begin(runner, platform, modem_pair):
-    def start(*, key_file=None, **options):
-        usual = {
-            "port": modem_pair.port(modem_pair.VESSEL),
-            "vehicles": {"3": "uuv-1"},
-            "retry_s": 0.5,
-            "holdoff_s": 0.05,
-        }
-        auth = "none" if key_file is None else "key"
-        there = platform(VESSEL).model_copy(update={"acoustic_auth": auth, "acoustic_key_file": key_file})
-        return runner.start(OpModemService(there, OpModemConfig(**(usual | options))))
-
-    return start
 
 
 @pytest.fixture
@@ -180,11 +154,8 @@ def test_commands_are_sent_and_confirmed(authenticated, modem_pair, begin, conso
     fresh = VERDICT.model_copy(update={"decided_utc_s": time.time()})
     console.send(DECISION, "op_modem", fresh)
     for record_id in (*sent, "d-1"):
-        eventually(
-            lambda r=record_id: states(r) and states(r)[-1].state == "confirmed",
-            timeout_s=400,
-            what=f"{record_id} confirmed",
-        )
+        confirmed = lambda r=record_id: states(r) and states(r)[-1].state == "confirmed"  # noqa: E731
+        eventually(confirmed, what=f"{record_id} confirmed")
         steps = [state.state for state in states(record_id)]
         assert steps[0] == "asked"
         assert set(steps[1:-1]) == {"sent"}
@@ -208,7 +179,7 @@ def test_command_is_repeated_until_it_is_confirmed(modem_pair, begin, console, s
     far = vehicle(silent=2)
     begin()
     console.send(keys.command(VESSEL, "refine"), "op_modem", command())
-    eventually(lambda: states("c-1") and states("c-1")[-1].state == "confirmed", timeout_s=120)
+    eventually(lambda: states("c-1") and states("c-1")[-1].state == "confirmed")
     assert len(far.commands) >= 3
     assert len(set(far.commands)) == 1
     assert states("c-1")[-1].times_sent >= 3
@@ -225,7 +196,7 @@ def test_command_survives_a_restart_and_the_same_record_is_added_once(
     modem_pair.start()
     far = vehicle()
     service = begin()
-    eventually(lambda: states("c-1") and states("c-1")[-1].state == "confirmed", timeout_s=120)
+    eventually(lambda: states("c-1") and states("c-1")[-1].state == "confirmed")
     assert {found.token for found in far.commands} == {dl.token_of("c-1", "command")}
     console.send(keys.command(VESSEL, "refine"), "op_modem", record)  # from a second site
     eventually(lambda: service.health().counters.get("commands_repeated") == 1)
@@ -281,7 +252,7 @@ def test_feedback_names_the_missing_symbols(modem_pair, begin, vehicle, watch):
         far.sender.add_image(number, contact, bytes([0x20]) + bytes(range(150)), time.time())
     next_frames(far.sender, 2, time.time())  # lost
     far.send()
-    eventually(lambda: len(far.feedback) >= 1, timeout_s=120)
+    eventually(lambda: len(far.feedback) >= 1)
     assert sum(far.feedback[0].missing) > 0
     assert len(observed) == 3
     assert service.health().gauges["feedback_open"] == 1.0
@@ -311,7 +282,7 @@ def test_command_is_validated_while_the_link_is_locked(begin, console, states):
     with service._link_lock:
         # The inbox validates inside a transaction while another thread holds the lock and will open a transaction.
         console.send(keys.command(VESSEL, "refine"), "op_modem", command())
-        eventually(lambda: service.store.inbox_depth() == 1, timeout_s=120, what="command in the inbox")
+        eventually(lambda: service.store.inbox_depth() == 1, what="command in the inbox")
     eventually(lambda: [state.state for state in states("c-1")] == ["asked"])
 
 
@@ -336,11 +307,6 @@ def test_frames_without_authentication_change_nothing(begin, console, key_file):
     assert service.health().counters["frames_rejected"] == 1
 
 
-@pytest.fixture
-def decompressor(runner):
-    return runner.peer(VESSEL, "decompressor", {IMAGE: ReceivedImage})
-
-
 def vehicle_frames(numbers, authenticator=None):
     """Return all frames of some images, in the order of transmission."""
     config = SenderConfig(frame_bytes=64, channels=(LossChannel(0.3),), frames_per_image=6)
@@ -359,27 +325,23 @@ def vehicle_authenticator(key_file, first_counter=0):
     return authenticator
 
 
-def complete(peer):
-    return {int(image.image_id, 36) for image in peer.received if image.complete}
-
-
-def test_both_wire_formats_are_received_side_by_side(begin, decompressor):
+def test_both_wire_formats_are_received_side_by_side(begin, decompressor, complete):
     service = begin(pairing_timeout_s=0.2)
     contact_frame = ContactFrame("0A1B", CONTACT).pack()
     for data in vehicle_frames([1, 2]):
         service.on_modem_event(packet(data, contact_frame))
-    eventually(lambda: complete(decompressor) == {1, 2})
+    eventually(lambda: complete() == {1, 2})
     eventually(lambda: "0A1B" in {image.image_id for image in decompressor.received})
     assert service.health().counters["frames_rejected"] == 0
 
 
-def test_only_authenticated_frames_count_and_each_once(begin, runner, decompressor, key_file):
+def test_only_authenticated_frames_count_and_each_once(begin, runner, decompressor, complete, key_file):
     service = begin(key_file=key_file)
     genuine = vehicle_frames([1, 2], vehicle_authenticator(key_file))
     forged = vehicle_frames([3, 4])
     for data in (*forged, *genuine):
         service.on_modem_event(packet(data))
-    eventually(lambda: complete(decompressor) == {1, 2})
+    eventually(lambda: complete() == {1, 2})
     for data in genuine:
         service.on_modem_event(packet(data, src=4))  # with the address of another vehicle
     assert service.health().counters["frames_rejected"] == len(forged) + len(genuine)
@@ -390,25 +352,17 @@ def test_only_authenticated_frames_count_and_each_once(begin, runner, decompress
     assert service.health().counters["frames_rejected"] == len(genuine)
     for data in vehicle_frames([5], vehicle_authenticator(key_file, len(genuine))):
         service.on_modem_event(packet(data))
-    eventually(lambda: complete(decompressor) == {1, 2, 5})
+    eventually(lambda: complete() == {1, 2, 5})
     assert {int(image.image_id, 36) for image in decompressor.received} == {1, 2, 5}
 
 
-def test_authenticated_frame_of_a_failed_commit_is_no_replay(begin, decompressor, key_file, monkeypatch):
+def test_authenticated_frame_of_a_failed_commit_is_no_replay(begin, complete, key_file, unwritable):
     service = begin(key_file=key_file)
-    commit, failed = OpModemService.commit, []
-
-    def fail_first(self, effects, item=None):
-        if len(failed) < 2:
-            failed.append(effects)
-            raise DeliveryError("disk is full")
-        commit(self, effects, item)
-
-    monkeypatch.setattr(OpModemService, "commit", fail_first)
-    for data in vehicle_frames([1], vehicle_authenticator(key_file)):
-        service.on_modem_event(packet(data))
-    eventually(lambda: complete(decompressor) == {1})
-    assert len(failed) == 2
+    with unwritable(service):
+        for data in vehicle_frames([1], vehicle_authenticator(key_file)):
+            service.on_modem_event(packet(data))
+        assert service.health().gauges["unsaved"] > 1
+    eventually(lambda: complete() == {1})
     assert service.health().gauges["frames_replayed"] == 0.0
     assert service.health().counters["frames_rejected"] == 0
 
@@ -418,7 +372,7 @@ def test_key_requires_the_format_with_authentication(begin, key_file):
         begin(key_file=key_file, link="paper", wire_formats=("paper",))
 
 
-def test_feedback_is_open_until_everything_arrived(begin, decompressor):
+def test_feedback_is_open_until_everything_arrived(begin, complete):
     service = begin()
     frames = vehicle_frames([1, 2])
     assert service.health().gauges["feedback_open"] == 0.0
@@ -427,17 +381,11 @@ def test_feedback_is_open_until_everything_arrived(begin, decompressor):
     assert service.health().gauges["images_incomplete"] >= 1.0
     for data in frames[1:]:
         service.on_modem_event(packet(data))
-    eventually(lambda: complete(decompressor) == {1, 2})
+    eventually(lambda: complete() == {1, 2})
     assert service.health().gauges["images_incomplete"] == 0.0
-    service._in_flight = (1, DownlinkPacket(3, (), (), has_feedback=True))
-    service._link.endpoint.v1.feedback(3, time.time())
-    assert service._link.endpoint.feedback_open == 0
-    assert service.health().gauges["feedback_open"] == 1.0
-    service._in_flight = None
-    assert service.health().gauges["feedback_open"] == 0.0
 
 
-def test_vehicle_of_another_vessel_gets_no_feedback(begin, runner, decompressor):
+def test_vehicle_of_another_vessel_gets_no_feedback(begin, runner, complete):
     service = begin()
     first, *others = vehicle_frames([1, 2])
     service.on_modem_event(packet(first, dest=9))
@@ -450,7 +398,7 @@ def test_vehicle_of_another_vessel_gets_no_feedback(begin, runner, decompressor)
     for data in others[1:]:
         service.on_modem_event(packet(data, dest=9))
     assert service.health().gauges["feedback_open"] == 0.0
-    eventually(lambda: complete(decompressor) == {1, 2})
+    eventually(lambda: complete() == {1, 2})
 
 
 def test_unreadable_state_is_discarded_and_counted(begin, runner, caplog):
@@ -528,5 +476,5 @@ def test_polled_vehicle_sends_a_packet(modem_pair, begin, vehicle, watch):
     far.modem.set_poll_handler(uplink)
     eventually(lambda: far.modem.ready)
     begin(mac="polled", poll_interval_s=0.2)
-    assert polled_once.wait(30)
-    eventually(lambda: any(b"polled" in sample.payload.to_bytes() for sample in observed), timeout_s=120)
+    assert polled_once.wait(WAIT_S)
+    eventually(lambda: any(b"polled" in sample.payload.to_bytes() for sample in observed))

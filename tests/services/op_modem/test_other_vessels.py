@@ -11,10 +11,9 @@ from pydantic import ValidationError
 from sonarpost import keys, wire
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.errors import ConfigError
-from sonarpost.messages import AcousticFrame, Command, ReceivedImage
-from sonarpost.security.acoustic_key import create_key, link_key
+from sonarpost.messages import AcousticFrame, Command
+from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.op_modem.config import OpModemConfig
-from sonarpost.services.op_modem.service import OpModemService
 
 LEAD, OTHER = "vessel-1", "vessel-2"
 IMAGES = 4
@@ -22,34 +21,13 @@ INBOX = keys.vessel_frames(LEAD, OTHER)
 
 
 @pytest.fixture
-def key_file(tmp_path):
-    create_key(tmp_path / "acoustic.key")
-    return tmp_path / "acoustic.key"
+def begin(begin, key_file):
+    return lambda name, **options: begin(name, key_file=key_file, **options)
 
 
 @pytest.fixture
-def frames(secured):
-    return genuine_frames(secured(LEAD)[1], IMAGES)
-
-
-@pytest.fixture
-def secured(platform, key_file):
-    """Return the configuration of a platform with the key, and the key."""
-
-    def make(name):
-        found = platform(name).model_copy(update={"acoustic_auth": "key", "acoustic_key_file": key_file})
-        return found, link_key(found)
-
-    return make
-
-
-@pytest.fixture
-def begin(runner, secured, modem_pair):
-    def start(name, **options):
-        usual = {"port": modem_pair.port(modem_pair.VESSEL), "vehicles": {"3": "uuv-1"}}
-        return runner.start(OpModemService(secured(name)[0], OpModemConfig(**(usual | options))))
-
-    return start
+def frames(key_file):
+    return genuine_frames(read_key(key_file), IMAGES)
 
 
 @pytest.fixture
@@ -57,11 +35,6 @@ def vessels(begin):
     lead = begin(LEAD, other_vessels=[OTHER])
     other = begin(OTHER, address=2, lead_vessel=LEAD, image_consumers=[])
     return lead, other
-
-
-@pytest.fixture
-def decompressor(runner):
-    return runner.peer(LEAD, "decompressor", {keys.acoustic_image(LEAD): ReceivedImage})
 
 
 def gauge(service, name):
@@ -90,6 +63,8 @@ def record(data, **changes):
 
 def test_frames_of_two_vessels_make_complete_images_at_the_lead(vessels, decompressor, frames, watch):
     lead, other = vessels
+    assert Command in lead.consumed_keys().values()
+    assert other.consumed_keys() == {}
     published = watch(INBOX)
     for number, frame in enumerate(frames):
         lead.on_modem_event(packet(*([frame] if number % 2 else [])))
@@ -128,17 +103,6 @@ def test_frames_wait_at_the_other_vessel_until_the_lead_runs_and_a_restart_keeps
     eventually(lambda: sum(image.complete for image in decompressor.received) >= IMAGES)
 
 
-def test_other_vessel_receives_only(vessels, frames):
-    lead, other = vessels
-    assert Command in lead.consumed_keys().values()
-    assert other.consumed_keys() == {}
-    other.on_modem_event(packet(*frames[:4]))
-    eventually(lambda: merged(lead) == 4)
-    other.transmit()
-    assert gauge(other, "feedback_open") == 0
-    assert gauge(lead, "feedback_open") == 1
-
-
 def test_hostile_vessel_changes_nothing(vessels, runner, frames, refused):
     lead, _other = vessels
     hostile = runner.peer(OTHER, "hostile", {})
@@ -160,33 +124,23 @@ def test_hostile_vessel_changes_nothing(vessels, runner, frames, refused):
     assert gauge(lead, "images_incomplete") <= 1
 
 
-def test_frames_of_a_vessel_that_is_not_configured_are_not_accepted(vessels, runner, frames):
-    lead, _other = vessels
+def test_frames_of_other_senders_and_plain_publications_are_not_accepted(vessels, runner, frames):
+    lead, other = vessels
     stranger = runner.peer("vessel-3", "stranger", {})
     stranger.send(keys.vessel_frames(LEAD, "vessel-3"), "op_modem", record(frames[0], platform_id="vessel-3"))
-    hostile = runner.peer(OTHER, "hostile", {})
-    hostile.send(INBOX, "op_modem", record(frames[1]))
-    eventually(lambda: merged(lead) == 1)
-    assert gauge(stranger, "outbox") == 1
-
-
-def test_plain_publications_are_ignored(vessels, frames):
-    lead, other = vessels
     lead.session.put(INBOX, wire.encode(record(frames[0])))
-    other.on_modem_event(packet(frames[1]))
-    eventually(lambda: merged(lead) == 1)
+    other.on_modem_event(packet(*frames[1:5]))
+    eventually(lambda: merged(lead) == 4)
+    assert gauge(stranger, "outbox") == 1
     assert gauge(lead, "inbox") == 0
+    assert (gauge(lead, "feedback_open"), gauge(other, "feedback_open")) == (1, 0), "the other vessel receives only"
 
 
 def test_frame_of_a_failed_commit_is_new_again(vessels, frames):
-    lead, _other = vessels
-    effects = UnitOfWork()
-    lead.validate(INBOX, record(frames[0]))
-    lead.handle(INBOX, record(frames[0]), effects)
-    # Not committed: the same frame is new again.
-    again = UnitOfWork()
-    lead.handle(INBOX, record(frames[0]), again)
-    assert effects.counts == again.counts
+    lead, other = vessels
+    lead.handle(INBOX, record(frames[0]), UnitOfWork())  # not committed
+    other.on_modem_event(packet(frames[0]))
+    eventually(lambda: merged(lead) == 1)
     assert gauge(lead, "frames_duplicate") == 0
 
 
@@ -206,9 +160,9 @@ def test_invalid_combination_is_refused(options):
 
 
 @pytest.mark.parametrize("options", [{"other_vessels": [OTHER, LEAD]}, {"lead_vessel": LEAD}])
-def test_own_name_is_refused(options, secured):
+def test_own_name_is_refused(options, begin):
     with pytest.raises(ConfigError, match="other vessels than vessel-1"):
-        OpModemConfig(port="/dev/ttyS0", **options).check_with(secured(LEAD)[0])
+        begin(LEAD, **options)
 
 
 @pytest.mark.parametrize("options", [{"other_vessels": [OTHER]}, {"lead_vessel": OTHER}])

@@ -79,13 +79,10 @@ def test_invalid_configuration_is_rejected(platform):
         OpModemService(other, OpModemConfig(port=port, ranging_period_s=10.0))
 
 
-def test_distance_is_published(runner, platform, modem_pair, watch):
+def test_distance_is_published(begin, modem_pair, watch):
     samples = watch(RANGE)
     modem_pair.start()
-    config = OpModemConfig(
-        port=modem_pair.port(modem_pair.VESSEL), vehicles={"3": "uuv-1"}, ranging_period_s=0.5, holdoff_s=0.05
-    )
-    service = runner.start(OpModemService(platform(VESSEL), config))
+    service = begin(ranging_period_s=0.5)
     eventually(lambda: len(samples) >= 2, what="two distances")
     record = wire.decode(VehicleRange, samples[0].payload.to_bytes(), RANGE)
     assert (record.vessel_id, record.vehicle_id, record.sound_speed_mps) == (VESSEL, "uuv-1", 1500.0)
