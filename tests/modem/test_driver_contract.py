@@ -141,13 +141,6 @@ class Doubled(Condition):
         return [(0.0, message), *([(self._delay_s, message)] if doubled else [])]
 
 
-class Mute(Condition):
-    """The modem says nothing."""
-
-    def to_host(self, message: bytes, kind: str) -> Parts:
-        return []
-
-
 class Deaf(Condition):
     """The modem does not read."""
 
@@ -241,11 +234,6 @@ class DumpAfterEcho(Condition):
         return [(0.0, message)]
 
 
-def say(kind: str, *fields: str | int) -> Callable[[Condition], None]:
-    """Return an action that lets the modem say a sentence."""
-    return lambda condition: condition.bench.inject(nmea.format(kind, *fields))
-
-
 class StartInDump(Condition):
     """The process starts during a dump."""
 
@@ -282,8 +270,7 @@ def chaos(condition: Condition) -> None:
 
 def errors(condition: Condition) -> None:
     """An error report and a message."""
-    say("CAERR", "000000", "AGC", 9, "odd")(condition)
-    say("CAMSG", "CLOCK_DRIFT", 1)(condition)
+    condition.bench.inject(nmea.format("CAERR", "000000", "AGC", 9, "odd") + nmea.format("CAMSG", "CLOCK_DRIFT", 1))
 
 
 def reception_start(condition: Condition) -> None:
@@ -319,7 +306,7 @@ CONDITIONS: dict[str, Callable[[], Condition]] = {
     "port vanishes for 2 s": lambda: Every(15.0, lambda c: c.bench.close_port(2.0)),
     "port blinks": lambda: Every(10.0, lambda c: c.bench.close_port(0.05)),
     "port gone for 30 s": lambda: Every(60.0, lambda c: c.bench.close_port(30.0)),
-    "mute": Mute,
+    "mute": lambda: Drop(1.0),
     "modem does not read": Deaf,
     "false receptions": lambda: Every(3.0, reception_start),
     "false receptions every second": lambda: Every(1.0, reception_start),

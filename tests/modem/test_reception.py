@@ -112,12 +112,20 @@ def test_next_packet_ends_a_packet_without_statistics(skipped: int) -> None:
     assert second.complete
 
 
-def test_frame_of_another_source_starts_another_packet() -> None:
+def test_frame_of_another_source_and_an_announcement_start_another_packet() -> None:
     modem = ready()
     modem.send("CARXD", 3, 1, 0, 1, "AA")
-    modem.send("CARXD", 4, 1, 0, 2, "BB")
-    cst(modem, nframes=0)
-    assert [packet.src for packet in modem.events_of(PacketReceived)] == [3, 4]
+    modem.send("CARXD", 4, 9, 1, 2, "BB")
+    modem.send("CACYC", 0, 4, 9, 4, 1, 2)
+    modem.send("CARXD", 4, 9, 1, 2, "CC")
+    cst(modem)
+    packets = modem.events_of(PacketReceived)
+    assert [[(f.src, f.dest, f.ack, f.data) for f in packet.frames] for packet in packets] == [
+        [(3, 1, False, b"\xaa")],
+        [(4, 9, True, b"\xbb")],
+        [(4, 9, True, b"\xcc")],
+    ]
+    assert not any(packet.complete for packet in packets)
 
 
 @pytest.mark.parametrize(("bad_messages", "nbad"), [(1, 1), (1, 0), (0, 1)])
@@ -210,13 +218,6 @@ def test_acknowledgements_are_not_a_packet() -> None:
     cst(modem, nframes=0, packet_type=4)
     assert [type(event) for event in modem.events] == [FrameAcknowledged, StatisticsReceived]
     assert not modem.driver.receiving
-
-
-def test_frames_for_another_modem_are_reported() -> None:
-    modem = ready()
-    modem.send("CARXD", 3, 9, 1, 1, "AB")
-    cst(modem, nframes=1)
-    assert (modem.events[0].dest, modem.events[0].ack) == (9, True)
 
 
 def test_restart_or_lost_port_reports_the_received_frames() -> None:
@@ -318,14 +319,3 @@ def test_single_damaged_frame_is_reported_as_a_packet() -> None:
     modem.run(30.0)
     (packet,) = modem.events
     assert (packet.frames, packet.bad_frames, packet.nframes, packet.complete) == ((), 1, None, False)
-
-
-def test_announcement_of_the_next_packet_ends_the_previous_one() -> None:
-    modem = ready()
-    modem.send("CACYC", 0, 3, 1, 4, 0, 2)
-    modem.send("CARXD", 3, 1, 0, 1, "AA")
-    modem.send("CACYC", 0, 3, 1, 4, 0, 2)
-    modem.send("CARXD", 3, 1, 0, 2, "BB")
-    cst(modem)
-    assert [[f.data for f in packet.frames] for packet in modem.events_of(PacketReceived)] == [[b"\xaa"], [b"\xbb"]]
-    assert [packet.complete for packet in modem.events_of(PacketReceived)] == [False, False]

@@ -185,13 +185,7 @@ def test_travel_time_is_limited(text: str, travel_s: float | None) -> None:
     assert parse_travel_time_s(text) == travel_s
 
 
-ANSWERS = {
-    b"?AL": b"1",
-    b"@CTRL": b"ERROR WRONG FORMAT",
-    b"I0": b"1.9",
-    b"@ZX1": b"OK",
-    b"!AL1": b"OK",
-}
+ANSWERS = {b"?AL": b"1", b"@CTRL": b"ERROR WRONG FORMAT", b"I0": b"1.9", b"@ZX1": b"OK", b"!AL1": b"OK"}
 
 
 def answer(modem: S2cModem, text: bytes, now: float = 1.0) -> list[ModemEvent]:

@@ -68,21 +68,6 @@ def test_bytes_of_a_complete_cycle() -> None:
     assert sent.statistics.nbytes == 3
 
 
-@pytest.mark.parametrize("rate", RATES)
-def test_full_packet_of_every_rate(rate: int) -> None:
-    modem = ready()
-    frames = [bytes([n]) * RATES[rate].frame_bytes for n in range(RATES[rate].frames)]
-    send(modem, frames, rate)
-    modem.run(20.0)
-    assert modem.transmitted == [tuple(frames)]
-    (sent,) = modem.events
-    assert sent.frames == tuple(frames)
-    airtime_s = RATES[rate].airtime_s
-    # At rate 0 a header is transmitted before the packet.
-    assert modem.marks[-2:] == [TransmissionStarted(airtime_s), TransmissionEnded(airtime_s)]
-    assert modem.driver.queued == 0
-
-
 def test_empty_frame_is_sent_as_empty_hex() -> None:
     modem = ready()
     send(modem, [b"x", b""])
@@ -119,15 +104,20 @@ EXCHANGE = [("CCCYC", 1), ("CACYC", 1), ("CADRQ", 1), ("CCTXD", 1), ("CATXD", 1)
 HARMLESS = {"CCCYC", "CACYC", "CATXD", "CATXP", "CATXF", "CAXST"}
 
 
+@pytest.mark.parametrize("reports", [True, False], ids=["errors reported", "errors not reported"])
 @pytest.mark.parametrize(("kind", "nth"), EXCHANGE)
-def test_next_packet_is_sent_after_any_lost_sentence(kind: str, nth: int) -> None:
+def test_next_packet_is_sent_after_any_lost_sentence(kind: str, nth: int, reports: bool) -> None:
+    """Without CAERR from the modem, the time-outs of the driver end the cycle."""
     modem = ready(drop_nth(kind, nth))
+    modem.silent_kinds.update(() if reports else ("CAERR",))
     first, second = send(modem, FIRST), send(modem, SECOND)
-    modem.run(60.0)
+    modem.run(90.0)
     outcomes = modem.events_of(PacketSent, PacketFailed)
     assert [event.packet_id for event in outcomes] == [first, second]
     assert isinstance(outcomes[1], PacketSent)
     assert modem.transmitted[-1] == tuple(SECOND)
+    if not reports:
+        return
     assert isinstance(outcomes[0], PacketSent if kind in HARMLESS else PacketFailed)
     if isinstance(outcomes[0], PacketSent):
         assert modem.transmitted == [tuple(FIRST), tuple(SECOND)], "a packet reported as sent was transmitted"
@@ -136,20 +126,6 @@ def test_next_packet_is_sent_after_any_lost_sentence(kind: str, nth: int) -> Non
         assert modem.transmitted == [tuple(SECOND)]
     assert outcomes[1].finished_s < 30.0
     assert modem.driver.queued == 0
-
-
-@pytest.mark.parametrize(("kind", "nth"), EXCHANGE)
-def test_next_packet_is_sent_after_a_lost_sentence_without_error_report(kind: str, nth: int) -> None:
-    """Without CAERR from the modem, the time-outs of the driver end the cycle."""
-    modem = ready(drop_nth(kind, nth))
-    modem.silent_kinds.add("CAERR")
-    send(modem, FIRST)
-    send(modem, SECOND)
-    modem.run(90.0)
-    outcomes = modem.events_of(PacketSent, PacketFailed)
-    assert len(outcomes) == 2
-    assert isinstance(outcomes[1], PacketSent)
-    assert modem.transmitted[-1] == tuple(SECOND)
 
 
 @pytest.mark.parametrize(
@@ -219,7 +195,7 @@ def test_late_data_request_gets_an_empty_answer() -> None:
     assert modem.events == []
 
 
-@pytest.mark.parametrize("moment_s", [0.02, 0.07, 0.12, 0.3, 2.0, 3.4])
+@pytest.mark.parametrize("moment_s", [0.02, 0.12, 2.0])
 def test_restart_during_a_cycle(moment_s: float) -> None:
     modem = ready()
     first, second = send(modem, FIRST), send(modem, SECOND)

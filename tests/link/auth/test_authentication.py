@@ -227,9 +227,15 @@ def test_damage_is_distinguished_from_forgery() -> None:
     assert len(frame) == 64
     damaged = bytes([*frame[:20], frame[20] ^ 1, *frame[21:]])
     rewritten = checksum(damaged[2:]).to_bytes(2, "big") + damaged[2:]
-    for sent, field in ((damaged, "checksum"), (rewritten, "tag")):
+    bare = pack_symbol(Symbol(SymbolKind.OBJECT, 1, 2, 3, bytes(54)))
+    for sent, used, field in (
+        (damaged, vessel, "checksum"),
+        (rewritten, vessel, "tag"),
+        (bare, vessel, "tag"),
+        (frame, None, "tag"),
+    ):
         with pytest.raises(FrameError) as caught:
-            parse_frame(sent, VEHICLE, vessel)
+            parse_frame(sent, VEHICLE, used)
         assert caught.value.field == field
     assert vessel.counts == AuthenticationCounts(forged=1)
     padded = frame + bytes(192)

@@ -8,11 +8,7 @@ import math
 import pytest
 
 from sonarpost.modem.micromodem import RATES
-from sonarpost.simulation.channel.acoustics import (
-    absorption_db_per_km,
-    frame_error_rate,
-    noise_db_per_hz,
-)
+from sonarpost.simulation.channel.acoustics import absorption_db_per_km, frame_error_rate, noise_db_per_hz
 
 
 @pytest.mark.parametrize(("frequency_hz", "db_per_km"), [(1_000, 0.06), (10_000, 1.0), (25_000, 5.1), (100_000, 33.6)])

@@ -56,12 +56,7 @@ def test_burst_data_is_delivered_in_a_connection_that_stays_open() -> None:
     water.say(1, b"AT*SEND,6,2,ab\r\nc\n")
     water.say(1, b"AT*SEND,1,2,d")
     water.run(10.0)
-    assert water.messages(1) == [
-        (b"*SEND", b"OK"),
-        (b"*SEND", b"OK"),
-        (b"", b"DELIVERED,1,2"),
-        (b"", b"DELIVERED,2,2"),
-    ]
+    assert water.messages(1) == [(b"*SEND", b"OK"), (b"*SEND", b"OK"), (b"", b"DELIVERED,1,2"), (b"", b"DELIVERED,2,2")]
     assert water.messages(2) == [
         (b"", b"RECV,6,1,2,6500,-40,150,100000,0.0000,ab\r\nc\n"),
         (b"", b"RECV,1,1,2,6500,-40,150,100000,0.0000,d"),
@@ -165,10 +160,7 @@ CLIENTS = {
         rb"\+\+\+ATC:2:OK\r\n(OK\r\n){4}\d+\r\n(DELIVEREDIM,2\r\n|DELIVERED,1,2\r\n){2}",
     ),
     # DESERT Underwater, mdriverS2C_EvoLogics and minterpreterAT: set the address, send a burst.
-    "desert burst": (
-        b"+++ATC\nAT!AL1\nAT*SEND,5,2,hello\n",
-        rb"\+\+\+ATC:2:OK\r\n(OK\r\n){2}DELIVERED,1,2\r\n",
-    ),
+    "desert burst": (b"+++ATC\nAT!AL1\nAT*SEND,5,2,hello\n", rb"\+\+\+ATC:2:OK\r\n(OK\r\n){2}DELIVERED,1,2\r\n"),
 }
 
 

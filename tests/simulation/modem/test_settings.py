@@ -156,14 +156,7 @@ def test_number_of_settings_is_bounded():
     assert len(modem.settings.items()) == 512
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        {"generation": 3},
-        {"airtimes_s": {1: 0.0}},
-        {"airtimes_s": {9: 1.0}},
-    ],
-)
+@pytest.mark.parametrize("config", [{"generation": 3}, {"airtimes_s": {1: 0.0}}, {"airtimes_s": {9: 1.0}}])
 def test_invalid_configuration_names_the_field(config: dict[str, object]):
     with pytest.raises(ValueError, match=next(iter(config))):
         EmulatedModemConfig(1, **config)  # type: ignore[arg-type]

@@ -207,9 +207,7 @@ def hostile_frames(draw: st.DrawFn) -> bytes:
 
 
 @given(st.lists(st.tuples(st.integers(-1, 2), hostile_frames(), st.floats(-100, 1e6)), max_size=40))
-def test_hostile_frames_and_times_never_raise_and_memory_is_bounded(
-    arrivals: list[tuple[int, bytes, float]],
-) -> None:
+def test_hostile_frames_and_times_never_raise_and_memory_is_bounded(arrivals: list[tuple[int, bytes, float]]) -> None:
     receiver = PaperReceiver(TIMEOUT_S, max_images=3)
     versions: dict[Key, int] = {}
     announced: dict[Key, set[tuple[StreamHeader, int]]] = defaultdict(set)

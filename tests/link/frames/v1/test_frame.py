@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -126,40 +124,3 @@ def with_checksum(covered: bytes) -> bytes:
 def test_invalid_fields_are_rejected(covered: bytes) -> None:
     with pytest.raises(FrameError, match="acoustic frame"):
         parse_frame(with_checksum(covered))
-
-
-class Keyed:
-    """A protection for tests: four bytes of a keyed hash."""
-
-    overhead_bytes = 4
-
-    def __init__(self, key: bytes) -> None:
-        self.key = key
-
-    def protect(self, covered: bytes) -> bytes:
-        return covered + hashlib.blake2s(covered, key=self.key, digest_size=4).digest()
-
-    def verify(self, source: int, protected: bytes, where: str) -> bytes:
-        if source != 3 or self.protect(protected[:-4]) != protected:
-            raise FrameError(where, "tag", protected[-4:], "a tag made with the common key")
-        return protected[:-4]
-
-
-def test_protection_accepts_only_its_own_frames() -> None:
-    protection, other = Keyed(b"one"), Keyed(b"two")
-    symbol = Symbol(SymbolKind.OBJECT, 3, 4, 5, bytes(55))
-    frame = pack_symbol(symbol, protection)
-    assert len(frame) == 64
-    assert parse_frame(frame, 3, protection) == symbol
-    for found, source, used in (
-        (frame, 3, other),
-        (frame, 4, protection),
-        (pack_symbol(symbol), 3, protection),
-        (frame, 3, None),
-    ):
-        with pytest.raises(FrameError, match="tag"):
-            parse_frame(found, source, used)
-    listed = [Segment(SegmentKind.MESSAGE, b"\x00go")]
-    protected = pack_segments(listed, 64, protection)
-    assert len(protected) == 64 == segments_room(64, protection) + 6
-    assert parse_frame(protected, 3, protection) == tuple(listed)
