@@ -33,12 +33,8 @@ def contents(folder):
 def test_name_holds_vehicle_time_image_and_version():
     assert image_file_name(COMPLETE_IMAGE) == NAME
     assert image_file_name(DAMAGED_IMAGE) == "uuv-1_20161012T090001Z_00A7_v2"
-    assert (
-        image_file_name(with_pixels(np.zeros((1, 1), np.uint8), first_frame_utc_s=0.0)).split("_")[1]
-        == "19700101T000000Z"
-    )
-    last = with_pixels(np.zeros((1, 1), np.uint8), first_frame_utc_s=253402300799.0)
-    assert image_file_name(last).split("_")[1] == "99991231T235959Z"
+    for at_s, time in ((0.0, "19700101T000000Z"), (253402300799.0, "99991231T235959Z")):
+        assert image_file_name(with_pixels(np.zeros((1, 1), np.uint8), first_frame_utc_s=at_s)).split("_")[1] == time
 
 
 def test_image_is_three_consistent_files(tmp_path):
@@ -178,15 +174,11 @@ def test_other_image_of_the_same_name_is_kept(tmp_path):
     now = contents(tmp_path)
     assert len(now) == 9
     assert stored.items() <= now.items()
-
-
-def test_repeated_images_of_one_name_change_no_file(tmp_path):
-    images = [COMPLETE_IMAGE, shifted(0.4), shifted(0.1)]
-    written = [write_image(tmp_path, image) for image in images]
-    before = contents(tmp_path)
-    for image, found in zip(images, written, strict=True):
-        assert write_image(tmp_path, image) == (found.tiff, False, found.is_conflict)
-    assert contents(tmp_path) == before
+    # Repeated images change no file.
+    for found, image in zip(written, (second, third), strict=True):
+        assert write_image(tmp_path, image) == (found.tiff, False, True)
+    assert write_image(tmp_path, first) == (tmp_path / f"{NAME}.tiff", False, False)
+    assert contents(tmp_path) == now
 
 
 def test_conflicting_images_in_one_commit_are_kept(tmp_path):

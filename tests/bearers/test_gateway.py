@@ -2,6 +2,7 @@
 
 import socket
 import threading
+from contextlib import ExitStack, closing
 from urllib.error import HTTPError
 from urllib.parse import urlencode
 from urllib.request import Request, urlopen
@@ -11,6 +12,7 @@ from builders.common import eventually
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sonarpost.bearers import rockblock
 from sonarpost.bearers.iridium import (
     ExchangeResult,
     IridiumTerminal,
@@ -34,23 +36,20 @@ def messages():
 
 @pytest.fixture
 def webhook(messages):
-    webhook = Webhook("127.0.0.1", 0, TOKEN, messages.append)
-    yield webhook
-    webhook.close()
+    with closing(Webhook("127.0.0.1", 0, TOKEN, messages.append)) as webhook:
+        yield webhook
 
 
 @pytest.fixture
 def gateway(webhook):
-    gateway = MessageGatewayEmulator(f"http://127.0.0.1:{webhook.port}/{TOKEN}", [IMEI])
-    yield gateway
-    gateway.close()
+    with closing(MessageGatewayEmulator(f"http://127.0.0.1:{webhook.port}/{TOKEN}", [IMEI])) as gateway:
+        yield gateway
 
 
 @pytest.fixture
 def terminal(gateway):
-    terminal = IridiumTerminal(gateway.terminal_url(IMEI))
-    yield terminal
-    terminal.close()
+    with closing(IridiumTerminal(gateway.terminal_url(IMEI))) as terminal:
+        yield terminal
 
 
 @pytest.fixture
@@ -123,18 +122,17 @@ def test_webhook_reports_that_a_message_has_to_be_repeated(messages):
             raise errors.pop(0)
         messages.append(message)
 
-    webhook = Webhook("127.0.0.1", 0, TOKEN, receive)
-    try:
+    with closing(Webhook("127.0.0.1", 0, TOKEN, receive)) as webhook:
         assert [post(webhook, f"/{TOKEN}", form()) for _ in range(3)] == [503, 400, 200]
-    finally:
-        webhook.close()
 
 
-def test_idle_connections_do_not_block_the_webhook_for_ever(webhook, monkeypatch):
-    idle = [socket.create_connection(("127.0.0.1", webhook.port)) for _ in range(40)]
-    for connection in idle:
-        connection.close()
-    eventually(lambda: post_or_none(webhook) == 200)
+def test_idle_connections_do_not_block_the_webhook_for_ever(messages, monkeypatch):
+    monkeypatch.setattr(rockblock, "MAX_REQUESTS", 2)
+    monkeypatch.setattr(rockblock._WebhookHandler, "timeout", 0.1)
+    with closing(Webhook("127.0.0.1", 0, TOKEN, messages.append)) as webhook, ExitStack() as idle:
+        for _ in range(2):
+            idle.enter_context(socket.create_connection(("127.0.0.1", webhook.port)))
+        eventually(lambda: post_or_none(webhook) == 200)
 
 
 def post_or_none(webhook):

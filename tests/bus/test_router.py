@@ -75,6 +75,7 @@ def write_config(tmp_path, text, name="router.json5"):
     return path
 
 
+@pytest.mark.system
 def test_linked_routers_with_files_forward_a_record(start, tmp_path):
     shore, vessel = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
     processes = [

@@ -125,6 +125,7 @@ def test_running_service_is_scraped_and_its_series_end_with_it(exporter, platfor
     assert scrape(exporter)["sonarpost_up", *who] == 0
 
 
+@pytest.mark.system
 def test_port_in_use_is_reported_in_one_line(exporter, router):
     eventually(lambda: scrape(exporter) != {})
     port = exporter.rpartition(":")[2].removesuffix("/metrics")

@@ -18,7 +18,7 @@ def manager_socket(tmp_path):
     """Return systemd's end of the socket."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
         bound.bind(str(tmp_path / "notify"))
-        bound.settimeout(30)
+        bound.settimeout(120)
         yield bound
 
 
@@ -68,6 +68,7 @@ def test_an_absent_manager_is_logged_once(tmp_path, caplog):
     assert [record.message for record in caplog.records] == ["systemd not notified"]
 
 
+@pytest.mark.system
 def test_a_router_notifies_systemd(manager_socket, tmp_path):
     command = [sys.executable, "-m", "sonarpost.bus.router", "--listen", f"tcp/127.0.0.1:{free_port()}"]
     environment = {**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify")}
