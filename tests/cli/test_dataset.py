@@ -127,72 +127,55 @@ def test_export_writes_images_and_annotations(archive, capsys):
         assert np.array_equal(np.asarray(png), MINE.picture.to_array())
 
 
-def test_box_of_unknown_size_is_the_image(archive):
-    _, document = export(archive)
-    _, annotation = by_name(document)["0002"]
-    assert annotation["bbox"] == [0.0, 0.0, 24.0, 16.0]
-    assert not annotation["bbox_is_measured"]
-
-
-def test_disputed_contacts_are_included_on_request(archive):
+def test_disputed_contacts_are_included_on_request_and_the_next_export_replaces_them(archive, capsys):
     out, document = export(archive, "--include-disputed")
     check_coco(out, document)
     _, annotation = by_name(document)["0004"]
     assert (annotation["verdict"], annotation["disputed"], annotation["operators"]) == ("mine_like", True, 2)
-
-
-def test_json_prints_the_counts(archive, capsys):
-    out, _ = export(archive, "--json")
-    assert json.loads(capsys.readouterr().out) == {
-        "out": str(out),
-        "images": 3,
-        "disputed": 1,
-        "unsure": 1,
-        "unreviewed": 1,
-        "without_image": 1,
-        "rejected": 0,
-        "mine_like": 1,
-        "not_mine_like": 2,
-    }
+    capsys.readouterr()
+    out, document = export(archive, "--json")
+    check_coco(out, document)
+    assert len(document["images"]) == 3
+    _, annotation = by_name(document)["0002"]  # an object of unknown size
+    assert (annotation["bbox"], annotation["bbox_is_measured"]) == ([0.0, 0.0, 24.0, 16.0], False)
+    counts = {"disputed": 1, "unsure": 1, "unreviewed": 1, "without_image": 1, "rejected": 0}
+    counts |= {"out": str(out), "images": 3, "mine_like": 1, "not_mine_like": 2}
+    assert json.loads(capsys.readouterr().out) == counts
 
 
 @pytest.mark.parametrize(
     ("later", "expected"),
     [
-        ({**NO}, ("not_mine_like", False)),
+        (NO, ("not_mine_like", False)),
         ({"verdict": "unsure"}, None),
         ({**NO, "operator": "B", "decided_utc_s": FIRST_UTC_S + 500}, None),
     ],
 )
 def test_later_verdict_counts(later, expected, tmp_path):
     """Of one operator the later verdict replaces the earlier one; of two operators they are a dispute."""
-    changes = {"decided_utc_s": FIRST_UTC_S + 900, **later}
-    first, second = decision("0001", decision_id="z"), decision("0001", decision_id="a", **changes)
+    first = decision("0001", decision_id="z")
+    second = decision("0001", decision_id="a", **{"decided_utc_s": FIRST_UTC_S + 900, **later})
     kept = [image("0002"), decision("0002", decision_id="k")]
     _, document = export(store(tmp_path / "out", image("0001"), second, first, *kept))
     found = by_name(document).get("0001")
-    assert (None if found is None else (found[1]["verdict"], found[1]["disputed"])) == expected
+    assert (found and (found[1]["verdict"], found[1]["disputed"])) == expected
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (["--vehicle", "uuv-2"], ["0002"]),
-        (["--vessel", "vessel-2"], ["0003"]),
-        (["--since", "2016-10-13"], ["0004"]),
-        ([], ["0001", "0002", "0003", "0004"]),
-    ],
-)
-def test_filters(options, expected, tmp_path):
+def test_filters(tmp_path):
     others = {"0002": {"vehicle_id": "uuv-2"}, "0003": {"vessel_id": "vessel-2"}}
     records = [image("0004", first_frame_utc_s=FIRST_UTC_S + 86400, last_frame_utc_s=FIRST_UTC_S + 86401)]
-    records += [image(name, **others.get(name, {})) for name in ("0001", "0002", "0003")]
-    records += [
-        decision(name, decision_id=name, decided_utc_s=FIRST_UTC_S + 90000, **others.get(name, {}))
-        for name in ("0001", "0002", "0003", "0004")
-    ]
-    _, document = export(store(tmp_path / "out", *records), *options)
-    assert sorted(by_name(document)) == expected
+    names = ("0001", "0002", "0003", "0004")
+    records += [image(name, **others.get(name, {})) for name in names[:3]]
+    later_s = FIRST_UTC_S + 90000
+    records += [decision(name, decision_id=name, decided_utc_s=later_s, **others.get(name, {})) for name in names]
+    archive = store(tmp_path / "out", *records)
+    for options, expected in (
+        ("--vehicle uuv-2", ["0002"]),
+        ("--vessel vessel-2", ["0003"]),
+        ("--since 2016-10-13", ["0004"]),
+        ("", list(names)),
+    ):
+        assert sorted(by_name(export(archive, *options.split())[1])) == expected
 
 
 def test_groups_without_a_line_name_are_separated_by_time(tmp_path):
@@ -238,13 +221,13 @@ def test_hostile_identifier_in_a_side_car_is_rejected(tmp_path, capsys):
     assert "rejected: " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("damage", [lambda path: path.write_bytes(b"\x89PNG"), lambda path: path.write_bytes(b"")])
-def test_damaged_image_is_rejected_and_the_others_written(damage, archive, capsys):
-    damage(next((archive / "vessel-1").glob("*_0002_v1.png")))
-    out, document = export(archive, status=1)
-    check_coco(out, document)
-    assert sorted(by_name(document)) == ["0001", "0003"]
-    assert "0002_v1.png" in capsys.readouterr().err
+def test_damaged_image_is_rejected_and_the_others_written(archive, capsys):
+    for content in (b"\x89PNG", b""):
+        next((archive / "vessel-1").glob("*_0002_v1.png")).write_bytes(content)
+        out, document = export(archive, status=1)
+        check_coco(out, document)
+        assert sorted(by_name(document)) == ["0001", "0003"]
+        assert "0002_v1.png" in capsys.readouterr().err
 
 
 def test_exchanged_image_is_rejected(archive, capsys):
@@ -264,13 +247,6 @@ def test_image_of_16_bits_is_scaled_to_8_bits(tmp_path):
         written = np.asarray(png)
     assert (written.min(), written.max()) == (0, 255)
     assert abs(int(written[32, 0]) - 128) <= 1
-
-
-def test_export_into_an_existing_folder_replaces_the_annotations(archive):
-    export(archive, "--include-disputed")
-    out, document = export(archive)
-    check_coco(out, document)
-    assert len(document["images"]) == 3
 
 
 def test_missing_archive_and_unwritable_folder_are_named(archive, tmp_path, capsys):

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import termios
 import threading
-import time
 
 import pytest
 import zenoh
@@ -94,18 +93,11 @@ def test_plain_text_is_complete_and_has_no_control_characters():
     assert "\x1b" not in "".join(on_terminal(state)[3:])
 
 
-@pytest.mark.parametrize(
-    ("age_s", "text"), [(None, "-"), (0.0, "0 s"), (59.9, "59 s"), (60, "1 min"), (7199, "1 h"), (1e6, "11 d")]
-)
-def test_age_text(age_s, text):
-    assert age_text(age_s) == text
-
-
-@pytest.mark.parametrize(
-    ("size", "text"), [(None, "-"), (0, "0 B"), (999, "999 B"), (3400, "3.4 kB"), (1.2e10, "12 GB"), (9e15, "9000 TB")]
-)
-def test_bytes_text(size, text):
-    assert bytes_text(size) == text
+def test_age_and_bytes_as_text():
+    ages = {None: "-", 0.0: "0 s", 59.9: "59 s", 60: "1 min", 7199: "1 h", 1e6: "11 d"}
+    assert {age_s: age_text(age_s) for age_s in ages} == ages
+    sizes = {None: "-", 0: "0 B", 999: "999 B", 3400: "3.4 kB", 1.2e10: "12 GB", 9e15: "9000 TB"}
+    assert {size: bytes_text(size) for size in sizes} == sizes
 
 
 @pytest.fixture
@@ -133,9 +125,7 @@ def test_once_as_text_and_as_json(router, platforms, capsys):
 
 def test_once_ends_without_a_router(capsys):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    started = time.monotonic()
-    assert main(["status", "--once", "--wait", "0.3", "--router", endpoint]) == 1
-    assert time.monotonic() - started < 10
+    assert main(["status", "--once", "--wait", "0.1", "--router", endpoint]) == 1
     assert capsys.readouterr().out.splitlines()[0] == f"{endpoint}: router not reached yet"
 
 
@@ -194,8 +184,8 @@ class Terminal:
         return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.text.rpartition("\x1b[H")[2])
 
     def wait(self):
-        status = self.process.wait(10)
-        self._thread.join(5)
+        status = self.process.wait()
+        self._thread.join()
         os.close(self.master)
         return status
 
@@ -207,6 +197,7 @@ def ended_cleanly(terminal):
     assert terminal.text.rindex("\x1b[?25h") > terminal.text.rindex("\x1b[?25l")
 
 
+@pytest.mark.system
 def test_sigterm_restores_the_terminal():
     terminal = Terminal("--router", f"tcp/127.0.0.1:{free_port()}", "--interval", "0.1")
     try:
@@ -255,7 +246,7 @@ def test_json_lines_on_a_pipe(router, platforms, platform):
         while not any(s["well"] for s in json.loads(process.stdout.readline())["services"]):
             pass
         process.send_signal(signal.SIGINT)
-        assert process.wait(120) == 0
+        assert process.wait() == 0
 
 
 def test_position_and_age_of_a_vehicle():

@@ -5,10 +5,8 @@ from __future__ import annotations
 import os
 import re
 import sqlite3
-import subprocess
-import sys
 import time
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
@@ -72,14 +70,12 @@ def test_sound_store(relay, capsys):
     assert relay.read_bytes() == before
 
 
-def test_write_ahead_log_of_a_killed_service_is_read_and_stays(relay, capsys):
-    script = (
-        "import os; from pathlib import Path; from sonarpost.delivery.store import Store\n"
-        f"store = Store(Path({str(relay)!r}))\n"
-        "with store.transaction() as tx: tx.send('k', 'c2', b'in the log', encoding='e')\n"
-        "os._exit(0)"
-    )
-    subprocess.run([sys.executable, "-c", script], check=True)
+def test_write_ahead_log_of_a_killed_service_is_read_and_stays(relay, tmp_path, capsys):
+    with closing(Store(relay)) as store:
+        send(store, b"in the log", consumer="c2")
+        running = {path.name: path.read_bytes() for path in tmp_path.glob("relay.db*")}
+    for name, content in running.items():  # as if the service had been killed
+        (tmp_path / name).write_bytes(content)
     log = relay.with_name("relay.db-wal")
     before = (relay.read_bytes(), log.read_bytes())
     assert run("check", relay) == 0
@@ -138,20 +134,16 @@ def test_missing_store_and_existing_output(relay, tmp_path, capsys):
 @pytest.fixture
 def salvaged(relay, capsys):
     """Salvage a damaged store and open the new one; fails if the damaged one was changed."""
-    opened = []
+    with ExitStack() as stack:
 
-    def salvage(status=1):
-        before = relay.read_bytes()
-        out = relay.with_name("new.db")
-        assert run("salvage", relay, "--out", out) == status
-        assert relay.read_bytes() == before
-        assert out.stat().st_mode & 0o777 == 0o600
-        opened.append(Store(out))
-        return opened[-1], capsys.readouterr().out
+        def salvage(status=1):
+            before, out = relay.read_bytes(), relay.with_name("new.db")
+            assert run("salvage", relay, "--out", out) == status
+            assert relay.read_bytes() == before
+            assert out.stat().st_mode & 0o777 == 0o600
+            return stack.enter_context(closing(Store(out))), capsys.readouterr().out
 
-    yield salvage
-    for store in opened:
-        store.close()
+        yield salvage
 
 
 def numbers(store):

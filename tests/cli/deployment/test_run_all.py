@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
 import sys
-import threading
-from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from builders.common import eventually, free_port
@@ -24,12 +25,10 @@ class RunAll:
     """A running `sonarpost run all` for one service, and its output."""
 
     def __init__(self, folder, endpoint):
-        self.folder = folder
-        self.config = folder / "vessel.toml"
+        self.folder, self.config, self.process = folder, folder / "vessel.toml", None
         self.config.write_text(
             f'[platform]\nid = "vessel-1"\nrouter = ["{endpoint}"]\nstate_dir = "{folder}/state"\n[relay]\n'
         )
-        self.process: subprocess.Popen[bytes] | None = None
 
     def start(self):
         command = [sys.executable, "-m", "sonarpost.cli.main", "run", "all", "--config", str(self.config)]
@@ -43,28 +42,19 @@ class RunAll:
         return (self.folder / "log").read_text()
 
     def wait_for(self, text, count=1):
-        eventually(lambda: self.log.count(text) >= count, 120, f"{text!r} in {self.folder}/log")
+        eventually(lambda: self.log.count(text) >= count, what=f"{text!r} in {self.folder}/log")
 
     def child(self, module):
         """Return the process identifier of a module."""
-        assert self.process is not None
         children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
         [found] = [int(pid) for pid in children if module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes()]
         return found
 
 
-Start = Callable[[str], RunAll]
-
-
 @pytest.fixture
 def bench(tmp_path):
-    made: list[RunAll] = []
-
-    def make(endpoint):
-        made.append(RunAll(tmp_path, endpoint))
-        return made[-1]
-
-    yield make
+    made = []
+    yield lambda endpoint: made.append(RunAll(tmp_path, endpoint)) or made[-1]
     for each in made:
         if each.process is not None:
             each.process.kill()
@@ -79,7 +69,7 @@ def test_a_killed_service_is_restarted_and_ctrl_c_stops_all(bench):
     run.wait_for("Service started", 2)
     assert "relay  | ended with status -9; restarting in 1 s" in run.log
     process.send_signal(signal.SIGINT)
-    assert process.wait(60) == 0
+    assert process.wait() == 0
     lines = run.log.splitlines()
     assert all(line.startswith(("relay  | ", "router | ")) for line in lines)
     assert lines[-1].endswith("Router stopped")
@@ -89,21 +79,23 @@ def test_a_killed_service_is_restarted_and_ctrl_c_stops_all(bench):
     assert "Heartbeat not written" not in run.log
 
 
+@pytest.mark.system
 def test_a_router_that_runs_already_is_used(bench, router):
     run = bench(router)
     process = run.start()
     run.wait_for("Service started")
     process.send_signal(signal.SIGTERM)
-    assert process.wait(60) == 0
+    assert process.wait() == 0
     assert "Router" not in run.log
     assert run.log.startswith(f"router | not started: {router} has a router already, or is on another host\n")
 
 
+@pytest.mark.system
 def test_status_2_of_a_service_stops_all_with_status_2(bench):
     run = bench(f"tcp/127.0.0.1:{free_port()}")
     (run.folder / "state").mkdir()
     (run.folder / "state" / "relay.db").write_bytes(b"no database" * 1000)
-    assert run.start().wait(90) == 2
+    assert run.start().wait() == 2
     assert "ended with status 2: its configuration or its store is invalid; stopping all" in run.log
     assert run.log.count("Service cannot start") == 1
     assert run.log.rstrip().endswith("Router stopped")
@@ -160,43 +152,49 @@ def test_a_router_with_certificates_needs_a_file():
 # Restarts
 
 
-@pytest.fixture
-def ending_module(tmp_path, monkeypatch):
-    """Return a module that ends at once with status 1."""
-    (tmp_path / "ends_at_once.py").write_text("import sys\nprint('begun')\nsys.exit(1)\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    return "ends_at_once"
+class Bench:
+    """Processes that live as long as it is told, their clock, and the event that ends their supervision."""
+
+    names = ("ends",)
+
+    def __init__(self, monkeypatch, *lives_s, ended_with=1):
+        self.now_s, self.lives_s, self.started_s, self.ended_with = 0.0, lives_s, [], ended_with
+        monkeypatch.setattr(run_all, "Processes", lambda: self)
+        monkeypatch.setattr(run_all, "time", self)
+
+    def spawn(self, *_):
+        self.started_s.append(self.now_s)
+        return SimpleNamespace(stdout=io.BytesIO(b"begun\n"))
+
+    def status(self, _name):
+        is_over = self.now_s - self.started_s[-1] >= self.lives_s[len(self.started_s) - 1]
+        return self.ended_with if is_over else None
+
+    def wait(self, duration_s):
+        self.now_s += duration_s
+        return len(self.started_s) == len(self.lives_s) > 1
+
+    def monotonic(self):
+        return self.now_s
 
 
-def test_the_wait_before_a_restart_doubles(ending_module, monkeypatch, capsys):
-    monkeypatch.setattr(run_all, "FIRST_RESTART_S", 0.01)
-    monkeypatch.setattr(run_all, "LAST_RESTART_S", 0.04)
-    stop = threading.Event()
-    supervisor = Supervisor(stop, width=4)
-    waits: list[float] = []
-    schedule = supervisor._schedule_restart
-
-    def count_restart(name, status, now_s):
-        schedule(name, status, now_s)
-        waits.append(supervisor._restart_at_s[name] - now_s)
-        if len(waits) == 4:
-            stop.set()
-
-    monkeypatch.setattr(supervisor, "_schedule_restart", count_restart)
-    supervisor.start("ends", [ending_module])
+def test_the_wait_before_a_restart_doubles_until_a_process_was_stable(monkeypatch, capsys):
+    lives_s = (0.0,) * 7 + (run_all.STABLE_S, 0.0, 0.0)
+    bench = Bench(monkeypatch, *lives_s)
+    supervisor = Supervisor(bench, width=4)
+    supervisor.start("ends", ["module"])
     assert supervisor.supervise() == 0
-    supervisor.stop()
-    assert [round(wait_s, 3) for wait_s in waits] == [0.01, 0.02, 0.04, 0.04]
-    assert "ends | begun" in capsys.readouterr().out
+    waits_s = [1, 2, 4, 8, 16, 32, 60, 1, 2]
+    lines = [line for line in capsys.readouterr().out.splitlines() if "begun" not in line]
+    assert lines == [f"ends | ended with status 1; restarting in {wait_s} s" for wait_s in waits_s]
+    pauses_s = [later - earlier for earlier, later in pairwise(bench.started_s)]
+    expected = [life_s + wait_s for life_s, wait_s in zip(lives_s, waits_s, strict=False)]
+    assert pauses_s == pytest.approx(expected, abs=0.31)
 
 
-def test_a_process_that_was_stable_is_restarted_soon(ending_module, monkeypatch):
-    supervisor = Supervisor(threading.Event(), width=4)
-    supervisor.start("ends", [ending_module])
-    supervisor.stop()
-    started_s = supervisor._started_s["ends"]
-    for _ in range(5):
-        supervisor._schedule_restart("ends", 1, started_s + 1.0)
-    assert supervisor._restart_at_s["ends"] == started_s + 1.0 + 16.0
-    supervisor._schedule_restart("ends", 1, started_s + run_all.STABLE_S)
-    assert supervisor._restart_at_s["ends"] == started_s + run_all.STABLE_S + run_all.FIRST_RESTART_S
+def test_status_2_ends_the_supervision_with_status_2(monkeypatch, capsys):
+    supervisor = Supervisor(Bench(monkeypatch, 0.0, ended_with=2), width=4)
+    supervisor.start("ends", ["module"])
+    assert supervisor.supervise() == 2
+    text = "ends | ended with status 2: its configuration or its store is invalid; stopping all\n"
+    assert text in capsys.readouterr().out
