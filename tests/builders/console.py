@@ -313,6 +313,17 @@ class Console:
         return browser
 
 
+class Clock:
+    """Replaces the clock of a console's state."""
+
+    def __init__(self, console: Console, now_utc_s: float = FIRST_UTC_S) -> None:
+        self.now_utc_s = now_utc_s
+        console.state.clock = lambda: self.now_utc_s
+
+    def advance(self, seconds: float) -> None:
+        self.now_utc_s += seconds
+
+
 ConsoleMaker = Callable[..., Console]
 
 

@@ -66,10 +66,11 @@ def serve(console, clock):
 def connect():
     opened = []
 
-    def make(server, sent=b"", source="127.0.0.1", *, buffer_bytes=65536):
+    def make(server, sent=b"", source="127.0.0.1", *, buffer_bytes=None):
         client = socket.socket()
         opened.append(client)
-        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer_bytes)
+        if buffer_bytes is not None:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer_bytes)
         client.settimeout(120)
         client.bind((source, 0))
         client.connect(("127.0.0.1", server.port))

@@ -2,49 +2,21 @@
 
 from __future__ import annotations
 
-import sqlite3
-from contextlib import closing
-
 import pytest
-from builders.console import image_record
+from builders.console import Clock, contact_id, image_record
 from pydantic import ValidationError
 
 from sonarpost.messages import Decision
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.database import Database
 
-ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
-
-
-class Clock:
-    """Replaces the clock of the console's state."""
-
-    def __init__(self, console):
-        self.now_utc_s = 1_800_000_000.0
-        console.state.clock = lambda: self.now_utc_s
-
-    def advance(self, seconds):
-        self.now_utc_s += seconds
+ID = contact_id()
 
 
 @pytest.fixture
 def clock(console):
     console.state.store_image(image_record())
-    return Clock(console)
-
-
-def displayed(browser, contact_id=ID):
-    version = browser.contact(contact_id)["versions"][-1]
-    return {"version": version["version"], "sha256": version["sha256"], "layer": "raw"}
-
-
-def undo(browser, decision, contact_id=ID, **changes):
-    body = {"decision_id": decision["decision_id"], **displayed(browser, contact_id), **changes}
-    return browser.post(f"/api/contacts/{contact_id}/undo", body)
-
-
-def overrule(browser, verdict, reason, **changes):
-    return browser.decide(ID, verdict=verdict, remark=reason, overrules=True, **changes)
+    return Clock(console, 1_800_000_000.0)
 
 
 def sent(console):
@@ -72,7 +44,7 @@ def test_decision_taken_back_in_time_is_not_sent(console, clock):
     anna = console.browser("anna")
     decision = anna.decide(ID).json()["decision"]
     clock.advance(7.9)
-    answer = undo(anna, decision)
+    answer = anna.undo(ID, decision["decision_id"])
     assert answer.status_code == 201, answer.text
     assert answer.json()["contact"]["review"] == "unreviewed"
     clock.advance(3600)
@@ -98,7 +70,7 @@ def test_clock_that_is_set_back_does_not_keep_a_decision(console, clock):
     clock.advance(-3600)
     assert [item[0] for item in sent(console)] == [decision["decision_id"]]
     # Released for sending: from now on an undo is sent too, also if the clock is before the take-back time.
-    answer = undo(console.browser("anna"), decision).json()["decision"]
+    answer = console.browser("anna").undo(ID, decision["decision_id"]).json()["decision"]
     assert [item[0] for item in sent(console)] == [answer["decision_id"]]
 
 
@@ -109,10 +81,10 @@ def test_undo_after_the_take_back_time_is_sent_and_restores_the_previous_verdict
     clock.advance(10)
     assert [item[1] for item in sent(console)] == ["mine_like", "unsure"]
     # The first decision is replaced by the second one: it cannot be undone before it.
-    assert undo(anna, first).json()["error"]["field"] == "decision_id"
-    undone = undo(anna, second).json()
+    assert anna.undo(ID, first["decision_id"]).json()["error"]["field"] == "decision_id"
+    undone = anna.undo(ID, second["decision_id"]).json()
     assert (undone["contact"]["review"], undone["decision"]["undoes"]) == ("mine_like", second["decision_id"])
-    first_undone = undo(anna, first).json()
+    first_undone = anna.undo(ID, first["decision_id"]).json()
     assert (first_undone["contact"]["review"], first_undone["decision"]["verdict"]) == ("unreviewed", "unsure")
     assert [item[1] for item in sent(console)] == ["mine_like", "unsure"]
     assert len(anna.contact(ID)["decisions"]) == len(anna.contact(ID)["audit"]) == 4
@@ -125,8 +97,8 @@ def test_undo_is_audited_with_the_image_on_the_screen(console, clock):
     second = anna.contact(ID)["versions"][1]["sha256"]
     assert second != decision["sha256"]
     # The digest of another version is refused.
-    assert undo(anna, decision, sha256=decision["sha256"]).json()["error"]["field"] == "sha256"
-    assert undo(anna, decision, layer="enhanced").status_code == 201
+    assert anna.undo(ID, decision["decision_id"], sha256=decision["sha256"]).json()["error"]["field"] == "sha256"
+    assert anna.undo(ID, decision["decision_id"], layer="enhanced").status_code == 201
     entry = anna.contact(ID)["audit"][-1]
     assert [entry[name] for name in ("action", "version", "sha256", "layer")] == ["undo", 2, second, "enhanced"]
 
@@ -134,9 +106,9 @@ def test_undo_is_audited_with_the_image_on_the_screen(console, clock):
 def test_only_own_decisions_can_be_undone(console, clock):
     anna, bo = console.browser("anna"), console.browser("bo")
     decision = anna.decide(ID).json()["decision"]
-    answer = undo(bo, decision)
+    answer = bo.undo(ID, decision["decision_id"])
     assert (answer.status_code, answer.json()["error"]["field"]) == (400, "decision_id")
-    assert undo(bo, {"decision_id": "d-unknown"}).status_code == 400
+    assert bo.undo(ID, "d-unknown").status_code == 400
     assert anna.contact(ID)["contact"]["review"] == "mine_like"
 
 
@@ -148,7 +120,7 @@ def test_last_own_decision_of_any_contact(console, clock):
     decisions = [browser.decide(name).json()["decision"] for browser, name in ((anna, ID), (anna, other), (bo, ID))]
     last = anna.get("/api/decisions/last").json()
     assert (last["decision"]["decision_id"], last["contact"]["id"]) == (decisions[1]["decision_id"], other)
-    undo(anna, decisions[1], other)
+    anna.undo(other, decisions[1]["decision_id"])
     assert anna.get("/api/decisions/last").json()["contact"]["id"] == ID
     clock.advance(12 * 3600 + 1)
     assert anna.get("/api/decisions/last").json()["decision"] is None
@@ -170,21 +142,15 @@ def test_differing_verdicts_are_kept_as_disputed(console, clock):
     assert [row["id"] for row in anna.get("/api/contacts", review="disputed").json()["items"]] == [ID]
     assert anna.get("/api/contacts", review="not_mine_like").json()["items"] == []
     clock.advance(8)
-    assert sent(console) == [
-        (first["decision_id"], "mine_like", True),
-        (second["decision_id"], "not_mine_like", False),
-    ]
+    records = [(first["decision_id"], "mine_like", True), (second["decision_id"], "not_mine_like", False)]
+    assert sent(console) == records
     assert bo.contact(ID)["decisions"][0]["delivery"]["vehicle"] == "disputed"
     # The first operator receives a notice until the dispute is settled.
     [notice] = anna.get("/api/notices").json()["notices"]
-    assert [notice[name] for name in ("kind", "name", "operator", "verdict")] == [
-        "disputed",
-        "uuv-1/00A7",
-        "bo",
-        "not_mine_like",
-    ]
+    shown = [notice[name] for name in ("kind", "name", "operator", "verdict")]
+    assert shown == ["disputed", "uuv-1/00A7", "bo", "not_mine_like"]
     assert bo.get("/api/notices").json()["notices"] == []
-    assert undo(bo, second).json()["contact"]["review"] == "mine_like"
+    assert bo.undo(ID, second["decision_id"]).json()["contact"]["review"] == "mine_like"
     assert anna.get("/api/notices").json()["notices"] == []
 
 
@@ -192,7 +158,7 @@ def test_decision_with_a_later_one_of_another_operator_is_sent_before_its_undo(c
     anna, bo = console.browser("anna"), console.browser("bo")
     first = anna.decide(ID).json()["decision"]
     bo.decide(ID, verdict="not_mine_like")
-    assert undo(anna, first).json()["contact"]["review"] == "not_mine_like"
+    assert anna.undo(ID, first["decision_id"]).json()["contact"]["review"] == "not_mine_like"
     clock.advance(8)
     # The vehicle receives the verdict that counts, although the record of the dispute was not sent to it.
     assert [item[1] for item in sent(console) if item[2]] == ["mine_like", "not_mine_like"]
@@ -202,13 +168,16 @@ def test_overruling_needs_a_reason_and_is_announced_to_the_overruled_operator(co
     anna, bo = console.browser("anna"), console.browser("bo")
     first = anna.decide(ID).json()["decision"]
     for reason in ("", "  "):
-        assert overrule(bo, "not_mine_like", reason).status_code == 400
+        assert bo.decide(ID, verdict="not_mine_like", overrules=True, remark=reason).status_code == 400
     assert anna.contact(ID)["contact"]["review"] == "mine_like"
-    assert overrule(bo, "mine_like", "the same verdict").json()["error"]["field"] == "overrules"
-    stale = overrule(bo, "not_mine_like", "a boulder", revision=0)
+    assert (
+        bo.decide(ID, verdict="mine_like", overrules=True, remark="the same verdict").json()["error"]["field"]
+        == "overrules"
+    )
+    stale = bo.decide(ID, verdict="not_mine_like", overrules=True, remark="a boulder", revision=0)
     assert (stale.status_code, stale.json()["error"]["code"]) == (409, "conflict")
     assert stale.json()["decision"]["decision_id"] == first["decision_id"]
-    answer = overrule(bo, "not_mine_like", "a boulder").json()
+    answer = bo.decide(ID, verdict="not_mine_like", overrules=True, remark="a boulder").json()
     assert (answer["contact"]["review"], answer["decision"]["overrules"]) == ("not_mine_like", [first["decision_id"]])
     entry = anna.contact(ID)["audit"][-1]
     assert (entry["action"], entry["user"], entry["detail"]["remark"]) == ("overrule", "bo", "a boulder")
@@ -251,19 +220,3 @@ def test_classes_are_a_list_or_a_table_of_groups(make_console):
             ConsoleConfig(classes=classes)
     longest = ConsoleConfig(classes={"x" * 20: ("k" * 36,)}).class_groups()["x" * 20][1]
     assert len(longest) <= 60
-
-
-def test_database_of_an_earlier_version_gains_the_columns(tmp_path):
-    path = tmp_path / "console-review.db"
-    Database(path).close()
-    with closing(sqlite3.connect(path)) as old:
-        old.execute("DROP TABLE notice")
-        old.execute("DROP INDEX decision_operator")
-        for column in ("send_after_utc_s", "overrules"):
-            old.execute(f"ALTER TABLE decision DROP COLUMN {column}")
-        old.commit()
-    database = Database(path)
-    with database.read() as db:
-        assert {"send_after_utc_s", "overrules"} <= {row["name"] for row in db.execute("PRAGMA table_info(decision)")}
-        assert db.execute("SELECT COUNT(*) FROM notice").fetchone()[0] == 0
-    database.close()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 import math
-import sqlite3
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from builders.console import image_record
+from builders.console import contact_id, image_record
 from PIL import Image
 
 from sonarpost.detection.snippets import cut_snippet
@@ -17,12 +17,10 @@ from sonarpost.messages import Contact
 from sonarpost.review import rendering
 from sonarpost.review.image_geometry import contact_box, contact_mark, range_axis
 from sonarpost.review.measurement import NotMeasurableError, height_from_shadow, measure_length
-from sonarpost.services.console.store.database import Database
-from sonarpost.services.console.store.measurements import list_measurements
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.survey import Side
 
-ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
+ID = contact_id()
 VERSION = f"/api/contacts/{ID}/versions/1"
 
 
@@ -56,50 +54,38 @@ def test_enhanced_layer_is_marked_as_not_measurable(anna):
     assert anna.get(f"{VERSION}/picture.png", layer="grain").status_code == 404
 
 
-def test_masks_of_missing_and_guessed_pixels(anna):
+def test_masks_and_thumbnail_show_missing_and_guessed_pixels(anna):
     missing = pixels_of(anna.get(f"{VERSION}/mask.png"))
     assert (missing[:-10] == 0).all()
     assert (missing[-10:] == 255).all()
     assert (pixels_of(anna.get(f"{VERSION}/mask.png", kind="guessed")) == 0).all()
     guessed = pixels_of(anna.get(f"{VERSION}/mask.png", kind="guessed", layer="enhanced"))
     assert (guessed == 255 - missing).all()
-
-
-def test_thumbnail_hatches_missing_areas(anna):
+    # The thumbnail hatches missing areas.
     small = pixels_of(anna.get(f"{VERSION}/thumbnail.png"))
     assert max(small.shape) <= 96
     assert (small[-9:] > 60).all()
 
 
-@pytest.mark.parametrize("name", rendering.MAPS)
-def test_colour_maps_are_monotonic(name):
+def test_colour_maps_are_monotonic_and_apply_levels():
     ramp = np.arange(256, dtype=np.uint8)[None, :]
-    colours = rendering.render(ramp, name)
-    assert colours.shape == ((1, 256) if name == "grey" else (1, 256, 3))
-    levels = colours.reshape(256, -1).astype(int).sum(axis=1)
-    steps = np.diff(levels)
-    assert (steps <= 0).all() if name == "inverse" else (steps >= 0).all()
-
-
-def test_black_and_white_point_and_gamma():
-    ramp = np.arange(256, dtype=np.uint8)[None, :]
+    for name in rendering.MAPS:
+        colours = rendering.render(ramp, name)
+        assert colours.shape == ((1, 256) if name == "grey" else (1, 256, 3))
+        steps = np.diff(colours.reshape(256, -1).astype(int).sum(axis=1))
+        assert (steps <= 0).all() if name == "inverse" else (steps >= 0).all()
     narrow = rendering.render(ramp, low_percent=20, high_percent=60)[0]
     assert (narrow[:51] == 0).all()
     assert (narrow[154:] == 255).all()
     assert rendering.render(ramp, gamma=0.5)[0, 64] == 128
+    # Sixteen bits become the most significant eight.
+    assert rendering.eight_bits(np.array([[0, 255, 256, 65535]], np.uint16)).tolist() == [[0, 0, 1, 255]]
 
 
-def test_sixteen_bits_become_the_most_significant_eight():
-    pixels = np.array([[0, 255, 256, 65535]], np.uint16)
-    assert rendering.eight_bits(pixels).tolist() == [[0, 0, 1, 255]]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("low", "100"), ("gamma", "0"), ("map", "jet"), ("layer", "best"), ("high", "x")]
-)
-def test_error_names_the_invalid_parameter(anna, name, value):
-    answer = anna.get(f"{VERSION}/picture.png", **{name: value})
-    assert (answer.status_code, answer.json()["error"]["field"]) == (400, name)
+def test_error_names_the_invalid_parameter(anna):
+    for name, value in (("low", "100"), ("gamma", "0"), ("map", "jet"), ("layer", "best"), ("high", "x")):
+        answer = anna.get(f"{VERSION}/picture.png", **{name: value})
+        assert (answer.status_code, answer.json()["error"]["field"]) == (400, name)
 
 
 def measure(anna, **changes):
@@ -119,6 +105,9 @@ def test_height_from_shadow_with_uncertainty(anna):
     assert 0 < found["height_sigma_m"] < 0.1
     assert found["id"] is None
     assert anna.contact(ID)["measurements"] == []
+    # A shadow lies across the track.
+    found = measure(anna, to=[14.0, 50.0]).json()
+    assert (found["to"], found["along_m"]) == ([10.0, 50.0], 0.0)
 
 
 def test_stored_measurement_is_in_the_audit(anna):
@@ -130,25 +119,20 @@ def test_stored_measurement_is_in_the_audit(anna):
     assert (entry["action"], entry["user"], entry["detail"]["value_m"]) == ("measure", "anna", found["value_m"])
 
 
-@pytest.mark.parametrize(
-    ("changes", "field"),
-    [
+def test_missing_or_synthesised_pixels_and_unknown_sizes_are_not_measurable(anna, make_console):
+    for changes, field in (
         ({"layer": "enhanced"}, "layer"),
         ({"kind": "length", "to": [38.0, 50.0]}, "line"),
         ({"to": [10.0, 10.0]}, "to"),
         ({"to": [10.0, 60.5]}, "to"),
         ({"layer": "grain"}, "layer"),
-    ],
-)
-def test_missing_or_synthesised_pixels_are_not_measurable(anna, changes, field):
-    answer = measure(anna, **changes)
-    assert answer.status_code == 409
-    assert (answer.json()["measurable"], answer.json()["error"]["field"]) == (False, field)
-
-
-def test_unknown_pixel_size_is_not_measurable(console):
-    console.state.store_image(image_record(pixel_along_m=None))
-    answer = measure(console.browser("anna"))
+    ):
+        answer = measure(anna, **changes)
+        assert answer.status_code == 409
+        assert (answer.json()["measurable"], answer.json()["error"]["field"]) == (False, field)
+    other = make_console()
+    other.state.store_image(image_record(pixel_along_m=None))
+    answer = measure(other.browser("anna"))
     assert (answer.status_code, answer.json()["measurable"]) == (409, False)
 
 
@@ -227,42 +211,30 @@ def test_range_of_square_pixels_is_unknown():
     assert height.sigma_m > 1.0 * 5 / (12 + 1) - 1.0 * 5 / (13 + 1)
 
 
-def test_shadow_lies_across_the_track(anna):
-    found = measure(anna, to=[14.0, 50.0]).json()
-    assert (found["to"], found["along_m"]) == ([10.0, 50.0], 0.0)
-
-
-@pytest.mark.parametrize("range_m", [1.0, 2.0, 6.0, 20.0])
-@pytest.mark.parametrize("shadow_samples", [0, 30, 200])
-def test_mark_and_box_contain_the_contact_of_a_snippet(range_m, shadow_samples):
-    simulated = simulate_survey(SurveySpec(seed=1, pings=200, samples=512, targets=1, clutter=0))
+def test_mark_and_box_contain_the_contact_of_a_snippet():
+    survey = simulate_survey(SurveySpec(seed=1, pings=200, samples=512, targets=1, clutter=0)).survey
     across_m = 30.0 / 512
-    sample = round(range_m / across_m)
-    cut = cut_snippet(simulated.survey, detection_at(sample, shadow_samples), 80, 140)
-    contact = Contact(**{**FAR, "pixel_across_m": across_m}, slant_range_m=(sample + 0.5) * across_m)
-    mark, box = contact_mark(contact, *cut.image.shape), contact_box(contact, *cut.image.shape)
-    assert mark.row == 100 - cut.first_ping_index + 0.5
-    assert mark.columns[0] - 0.5 <= sample - cut.first_sample + 0.5 <= mark.columns[1] + 0.5
-    assert box.columns[0] <= sample - cut.first_sample <= box.columns[1]
-    assert box.rows == (pytest.approx(30.5), pytest.approx(50.5))
+    for range_m, shadow_samples in product((1.0, 2.0, 6.0, 20.0), (0, 30, 200)):
+        sample = round(range_m / across_m)
+        detection = SimpleNamespace(ping_index=100, sample=sample, shadow_samples=shadow_samples, side=Side.PORT)
+        cut = cut_snippet(survey, detection, 80, 140)
+        contact = Contact(**{**FAR, "pixel_across_m": across_m}, slant_range_m=(sample + 0.5) * across_m)
+        mark, box = contact_mark(contact, *cut.image.shape), contact_box(contact, *cut.image.shape)
+        assert mark.row == 100 - cut.first_ping_index + 0.5
+        assert mark.columns[0] - 0.5 <= sample - cut.first_sample + 0.5 <= mark.columns[1] + 0.5
+        assert box.columns[0] <= sample - cut.first_sample <= box.columns[1]
+        assert box.rows == (pytest.approx(30.5), pytest.approx(50.5))
 
 
-def test_mark_is_unknown_without_range_or_pixel_size():
+def test_version_states_mark_box_and_range_axis_where_they_are_known(anna):
     assert contact_mark(None, 40, 60) is None
     assert contact_mark(Contact(**FAR), 40, 60) is None
     assert contact_box(Contact(**{**FAR, "pixel_along_m": None}, slant_range_m=9.0), 40, 60) is None
-
-
-def test_version_states_mark_box_and_range_axis(anna):
     [version] = anna.contact(ID)["versions"]
     assert version["range_axis"] == "slant"
     assert version["mark"] == {"row": 20.5, "column": 23.0, "columns": [15.5, 30.5], "range_m": 13.0}
     assert version["box"] == {"rows": [10.5, 30.5], "columns": [0.0, 50.5]}
     assert version["edge_sigma_px"] == pytest.approx(0.58)
-
-
-def detection_at(sample, shadow_samples):
-    return SimpleNamespace(ping_index=100, sample=sample, shadow_samples=shadow_samples, side=Side.PORT)
 
 
 def test_withdrawn_measurement_is_stored_and_does_not_count(anna):
@@ -281,20 +253,6 @@ def test_withdrawn_measurement_is_stored_and_does_not_count(anna):
     assert (entry["action"], entry["user"], entry["detail"]["id"]) == ("withdraw", "anna", kept[1]["id"])
     assert anna.post(path, {}).status_code == 404
     assert anna.post(f"/api/contacts/{ID}/measure/{2**70}/withdraw", {}).status_code == 404
-
-
-def test_database_without_withdrawals_is_migrated(tmp_path):
-    path = tmp_path / "console-review.db"
-    Database(path).close()
-    with sqlite3.connect(path) as db:
-        db.execute("ALTER TABLE measurement DROP COLUMN withdrawn_by")
-        db.execute("ALTER TABLE measurement DROP COLUMN withdrawn_utc_s")
-        db.execute("INSERT INTO measurement (contact_id, utc_s, body) VALUES ('c', 0, '{}')")
-    database = Database(path)
-    with database.read() as db:
-        [found] = list_measurements(db, "c")
-    database.close()
-    assert (found["withdrawn_by"], found["withdrawn_utc_s"]) == (None, None)
 
 
 def test_line_over_one_missing_pixel_is_rejected():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 import pytest
-from builders.console import FIRST_UTC_S, image_record
+from builders.console import FIRST_UTC_S, Clock, contact_ids, image_record
 
 from sonarpost.services.console.known_objects import KnownObjects
 from sonarpost.services.console.store.contacts import ContactFilter
@@ -19,14 +19,7 @@ ROCK = Truth(is_mine_like=False, label="boulder", sealed=True)
 
 @pytest.fixture
 def clock(console):
-    class Clock:
-        now_utc_s = FIRST_UTC_S
-
-        def __call__(self):
-            return self.now_utc_s
-
-    console.state.clock = Clock()
-    return console.state.clock
+    return Clock(console)
 
 
 @pytest.fixture
@@ -37,13 +30,7 @@ def short_surveys(monkeypatch):
 
 def add(console, image_id, truth=None, **changes):
     console.state.store_image(image_record(image_id, **changes), truth)
-    return next(
-        row["id"] for row in console.state.list_contacts(ContactFilter())["items"] if row["image_id"] == image_id
-    )
-
-
-def listed(console):
-    return {row["image_id"] for row in console.state.list_contacts(ContactFilter())["items"]}
+    return contact_ids(console.state)[image_id]
 
 
 def test_sealed_contact_differs_in_nothing_before_the_decision(console):
@@ -55,14 +42,14 @@ def test_sealed_contact_differs_in_nothing_before_the_decision(console):
     assert other["truth"] is None
     assert one["contact"].keys() == other["contact"].keys()
     # Unknown values are those of the other contact too.
-    assert {name for name, value in one["contact"].items() if value is None} == {
-        name for name, value in other["contact"].items() if value is None
-    }
-    for contact in (one["contact"], other["contact"]):
+    contacts = (one["contact"], other["contact"])
+    unknown = [{name for name, value in contact.items() if value is None} for contact in contacts]
+    assert unknown[0] == unknown[1]
+    for contact in contacts:
         looks = anna.get(f"/api/objects/{contact['object']}").json()["looks"]
         assert [look["contact"]["id"] for look in looks] == [contact["id"]]
     assert "cylinder" not in str(one)
-    assert listed(console) == {"00A7", "00A8"}
+    assert set(contact_ids(console.state)) == {"00A7", "00A8"}
 
 
 def test_object_is_revealed_after_the_take_back_time(console, clock):
@@ -78,7 +65,7 @@ def test_object_is_revealed_after_the_take_back_time(console, clock):
     known.reveal()
     assert anna.contact(contact_id)["truth"] == {"is_mine_like": True, "label": "cylinder", "sealed": True}
     assert [event.name for event in console.state.events.events_after(last)] == ["truth", "contact"]
-    assert listed(console) == set()
+    assert set(contact_ids(console.state)) == set()
     assert console.state.counts().total == 0
     last = console.state.events.last
     known.reveal()
@@ -140,9 +127,9 @@ def test_watch_adds_a_sealed_contact_of_the_kind_of_the_vehicles(console, short_
     console.state.store_image(reference)
     watch.contact_arrived(reference, now_s=0.0)
     watch.step(DELAY_S[0] - 1.0)
-    assert listed(console) == {"00A7"}
+    assert set(contact_ids(console.state)) == {"00A7"}
     watch.step(DELAY_S[1])
-    (added,) = listed(console) - {"00A7"}
+    [added] = set(contact_ids(console.state)) - {"00A7"}
     rows = {row["image_id"]: row for row in console.state.list_contacts(ContactFilter())["items"]}
     record = console.state.image(str(rows[added]["id"]), 1)
     assert (record.picture.height_px, record.picture.width_px) == (40, 60)
@@ -183,4 +170,4 @@ def test_contact_without_position_or_pixel_size_is_not_imitated(console, changes
     watch = CalibratedWatch(console.state, share=1.0, draws=random.Random(1))
     watch.contact_arrived(image_record("00A7", **changes), now_s=0.0)
     watch.step(1e6)
-    assert listed(console) == set()
+    assert set(contact_ids(console.state)) == set()

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import math
-import sqlite3
 
 import pytest
-from builders.console import image_record
+from builders.console import encoded_health, image_record, queue_state, received_frame
 
-from sonarpost import keys, wire
-from sonarpost.messages import AcousticFrame, Health, LinkQuality, QueuedImage, QueueState
+from sonarpost.messages import LinkQuality
 from sonarpost.review.positions import LocalFrame, destination, distance_m, vehicle_position
-from sonarpost.services.console.store.database import Database
-
-ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 
 
 def test_map_has_positions_in_degrees(make_console):
@@ -47,28 +42,13 @@ def test_vehicle_on_the_map_is_at_its_newest_contact(console):
     assert (vehicle["lat_deg"], vehicle["utc_s"]) == (pytest.approx(56.02, abs=1e-4), 1_700_000_090.0)
 
 
-def test_map_without_contacts_or_vessel_is_empty(console):
+def test_map_without_vessel_and_heading(console):
     chart = console.browser("watch").get("/api/map").json()
     assert (chart["contacts"], chart["vehicles"], chart["vessel"]) == ([], [], None)
-
-
-def test_contact_without_heading_is_on_the_map(console):
     console.state.store_image(image_record("0001", heading_deg=None))
     chart = console.browser("watch").get("/api/map").json()
     [point] = chart["contacts"]
     assert (point["heading_deg"], point["vehicle_lat_deg"], chart["vehicles"]) == (None, None, [])
-
-
-@pytest.mark.parametrize("column", ["heading_deg", "pixel_along_m"])
-def test_database_of_an_earlier_version_gains_the_column(column, tmp_path):
-    path = tmp_path / "review.db"
-    Database(path).close()
-    with sqlite3.connect(path) as old:
-        old.execute(f"ALTER TABLE contact DROP COLUMN {column}")
-    database = Database(path)
-    with database.read() as db:
-        assert column in {row["name"] for row in db.execute("PRAGMA table_info(contact)")}
-    database.close()
 
 
 def test_local_frame():
@@ -83,44 +63,16 @@ def test_local_frame():
     assert vehicle_position(56.0, -5.0, None, "port", 10.0) is None
 
 
-def frame(packet: int, bad: int, vehicle_time: float = 1000.0) -> AcousticFrame:
-    return AcousticFrame(
-        direction="rx",
-        platform_id="vessel-1",
-        time_utc_s=vehicle_time,
-        source=3,
-        destination=1,
-        rate=1,
-        packet=packet,
-        frame_number=1,
-        frame_count=3,
-        data=b"x",
-        quality=LinkQuality(snr_in_db=12.0, frames=3, bad_frames=bad),
-    )
+def frame(packet, bad):
+    return received_frame(1000.0, packet, quality=LinkQuality(snr_in_db=12.0, frames=3, bad_frames=bad))
 
 
 def test_link_quality_and_stale_link(make_console):
-    console = make_console(vehicle_stale_s=60.0)
-    monitor = console.state.fleet
+    monitor = make_console(vehicle_stale_s=60.0).state.fleet
     for packet, bad in enumerate((0, 1, 2)):
         monitor.add_frame("uuv-1", frame(packet, bad), now_s=float(packet))
     monitor.add_frame("uuv-1", frame(2, 2), now_s=2.5)
-    monitor.set_queue(
-        QueueState(
-            platform_id="uuv-1",
-            time_utc_s=1000.0,
-            rate=1,
-            frame_loss=None,
-            packet_interval_s=6.0,
-            messages_waiting=0,
-            message_bytes=0,
-            images_waiting=1,
-            images=(
-                QueuedImage(image_id="0001", contact_id="c", bytes_left=64, preview_utc_s=None, expected_utc_s=1040.0),
-            ),
-        ),
-        now_s=2.0,
-    )
+    monitor.set_queue(queue_state([("0001", 64, 1040.0)], 1000.0), now_s=2.0)
     now = monitor.vehicles(now_s=10.0)["uuv-1"]
     assert (now["frames"], now["bad_frames"], now["loss"]) == (9, 3, 0.333)
     assert (now["snr_in_db"], now["stale"], now["age_s"]) == (12.0, False, 7.5)
@@ -130,25 +82,11 @@ def test_link_quality_and_stale_link(make_console):
     assert (later["stale"], later["queue"]["stale"], later["frames_per_minute"]) == (True, True, 0)
 
 
-def detector_health(vehicle="uuv-1", service="atd_stub", **gauges: float) -> tuple[str, bytes]:
-    health = Health(
-        platform_id=vehicle,
-        service=service,
-        time_utc_s=1000.0,
-        started_utc_s=900.0,
-        state="ok",
-        counters={},
-        gauges=gauges,
-    )
-    return keys.health(vehicle, service), wire.encode(health)
-
-
-def test_seabed_is_from_the_health_of_the_vehicles_detector(make_console):
-    console = make_console()
+def test_seabed_is_from_the_health_of_the_vehicles_detector(console):
     monitor = console.state.fleet
     gauges = {"expected_pd": 0.62, "worst_expected_pd": 0.35, "clutter_per_1000_m2": 41.0, "ripple_strength": 0.12}
-    monitor.services.add(*detector_health(**gauges), now_s=10.0)
-    monitor.services.add(*detector_health("uuv-2", "compressor", expected_pd=0.1), now_s=10.0)
+    monitor.services.add(*encoded_health("atd_stub", "uuv-1", **gauges), now_s=10.0)
+    monitor.services.add(*encoded_health("compressor", "uuv-2", expected_pd=0.1), now_s=10.0)
     monitor.add_frame("uuv-2", frame(1, 0), now_s=10.0)
     vehicles = monitor.vehicles(now_s=12.0)
     assert vehicles["uuv-2"]["seabed"] is None
@@ -164,20 +102,18 @@ def test_seabed_is_from_the_health_of_the_vehicles_detector(make_console):
     assert served["uuv-2"] is None
 
 
-@pytest.mark.parametrize(("expected_pd", "warns"), [(0.0, True), (0.799, True), (0.8, False), (1.0, False)])
-def test_warning_of_a_difficult_seabed(make_console, expected_pd, warns):
-    monitor = make_console().state.fleet
-    monitor.services.add(*detector_health(expected_pd=expected_pd), now_s=1.0)
-    seabed = monitor.vehicles(now_s=1.0)["uuv-1"]["seabed"]
-    assert ("a clean result does not mean no mines" in seabed["warning"]) == warns
-    assert seabed["worst_expected_pd"] is None
-
-
-@pytest.mark.parametrize("value", [-0.1, 1.1, 1e300])
-def test_values_of_a_seabed_beyond_their_range_are_unknown(make_console, value):
-    monitor = make_console().state.fleet
+def test_warning_of_a_difficult_seabed_and_values_beyond_their_range(console):
+    monitor = console.state.fleet
     monitor.add_frame("uuv-1", frame(1, 0), now_s=1.0)
-    monitor.services.add(*detector_health(expected_pd=value), now_s=1.0)
-    assert monitor.vehicles(now_s=1.0)["uuv-1"]["seabed"] is None
-    monitor.services.add(*detector_health(expected_pd=0.5, ripple_strength=value), now_s=1.0)
-    assert monitor.vehicles(now_s=1.0)["uuv-1"]["seabed"]["ripple_strength"] is None
+
+    def seabed(**gauges):
+        monitor.services.add(*encoded_health("atd_stub", "uuv-1", **gauges), now_s=1.0)
+        return monitor.vehicles(now_s=1.0)["uuv-1"]["seabed"]
+
+    for expected_pd, warns in ((0.0, True), (0.799, True), (0.8, False), (1.0, False)):
+        found = seabed(expected_pd=expected_pd)
+        assert ("a clean result does not mean no mines" in found["warning"]) == warns
+        assert found["worst_expected_pd"] is None
+    for value in (-0.1, 1.1, 1e300):
+        assert seabed(expected_pd=value) is None
+        assert seabed(expected_pd=0.5, ripple_strength=value)["ripple_strength"] is None

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from builders.common import REPOSITORY
-from builders.console import image_record
+from builders.console import Clock, contact_ids, downlink_state, image_record, queue_state, received_frame
 
-from sonarpost.messages import AcousticFrame, DownlinkState, QueuedImage, QueueState
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.review.positions import destination
 from sonarpost.services.console.mission import hourly_counts, hull_area_m2, queue_forecast
@@ -34,11 +32,9 @@ def test_contacts_of_the_last_24_hours():
 
 @pytest.fixture
 def mission(make_console):
-    """A console with contacts of two vehicles, whose clock a test sets."""
+    """A console with a clock for tests."""
     console = make_console(downlink_rate=0)
-    times = [NOW_S]
-    console.state.clock = lambda: times[0]
-    console.set_time = lambda utc_s: times.__setitem__(0, utc_s)
+    console.clock = Clock(console, NOW_S)
     return console
 
 
@@ -46,27 +42,22 @@ def progress(console):
     return console.browser("watch").get("/api/mission").json()
 
 
-def contact_id(console, image_id):
-    items = console.browser("watch").get("/api/contacts").json()["items"]
-    return next(row["id"] for row in items if row["image_id"] == image_id)
-
-
-def test_mission_without_contacts(mission):
+def test_contacts_area_and_bytes_by_vehicle(mission):
     empty = progress(mission)
     assert (empty["vehicles"], empty["operators"]) == ([], [])
-    total = empty["total"]
-    assert (total["contacts"], total["area"], total["image_bytes"], total["contacts_utc_s"]) == ({}, None, 0, None)
-
-
-def test_contacts_area_and_bytes_by_vehicle(mission):
+    assert [empty["total"][name] for name in ("contacts", "area", "image_bytes", "contacts_utc_s")] == [
+        {},
+        None,
+        0,
+        None,
+    ]
     # The heading is unknown, so that the positions of the vehicle are unknown: the corners are those of the contacts.
     corner = (56.0, -5.0)
     east = destination(*corner, 90.0, 200.0)
     for number, position in enumerate((corner, east, destination(*east, 0.0, 100.0), destination(*corner, 0.0, 100.0))):
-        mission.state.store_image(
-            image_record(f"000{number}", position=position, heading_deg=None, total=100, missing_rows=20)
-        )
-    mission.set_time(NOW_S + 2 * HOUR_S)
+        changes = {"position": position, "heading_deg": None, "total": 100, "missing_rows": 20}
+        mission.state.store_image(image_record(f"000{number}", **changes))
+    mission.clock.advance(2 * HOUR_S)
     mission.state.store_image(image_record("0009", vehicle="uuv-2", position=None))
     found = progress(mission)
     one, two = found["vehicles"]
@@ -81,26 +72,11 @@ def test_contacts_area_and_bytes_by_vehicle(mission):
     assert (two["uplink"], two["queue"], two["seabed"]) == (None, None, None)
 
 
-def frame(packet, number, rate=1):
-    return AcousticFrame(
-        direction="rx",
-        platform_id="vessel-1",
-        time_utc_s=NOW_S + packet,
-        source=3,
-        destination=1,
-        rate=rate,
-        packet=packet,
-        frame_number=number,
-        frame_count=3,
-        data=b"x",
-    )
-
-
 def test_air_time_counts_packets_not_frames(mission):
     for packet in (1, 2):
         for number in (1, 2, 3):
-            mission.state.fleet.add_frame("uuv-1", frame(packet, number))
-    mission.state.fleet.add_frame("uuv-1", frame(3, 1, rate=None))
+            mission.state.fleet.add_frame("uuv-1", received_frame(NOW_S + packet, packet, number))
+    mission.state.fleet.add_frame("uuv-1", received_frame(NOW_S + 3, 3, rate=None))
     [vehicle] = progress(mission)["vehicles"]
     assert vehicle["uplink"] == {
         "packets": 3,
@@ -113,22 +89,13 @@ def test_air_time_counts_packets_not_frames(mission):
 def test_downlink_counts_each_transmission(mission):
     mission.state.store_image(image_record("0001"))
     anna = mission.browser("anna")
-    decision = anna.decide(contact_id(mission, "0001")).json()["decision"]
-    state = DownlinkState(
-        vessel_id="vessel-1",
-        vehicle_id="uuv-1",
-        kind="decision",
-        record_id=decision["decision_id"],
-        state="sent",
-        times_sent=3,
-        expires_utc_s=NOW_S + 100,
-        changed_utc_s=NOW_S + 7,
-    )
+    decision = anna.decide(contact_ids(mission.state)["0001"]).json()["decision"]
+    state = downlink_state("decision", decision["decision_id"], "sent", NOW_S + 7, times_sent=3)
     mission.state.apply_downlink_state(state)
-    downlink = progress(mission)["total"]["downlink"]
-    assert downlink == {
+    airtime_s = round(3 * RATES[0].airtime_s, 1)
+    assert progress(mission)["total"]["downlink"] == {
         "transmissions": 3,
-        "airtime_s": round(3 * RATES[0].airtime_s, 1),
+        "airtime_s": airtime_s,
         "time_utc_s": NOW_S + 7,
     }
 
@@ -136,17 +103,13 @@ def test_downlink_counts_each_transmission(mission):
 def test_median_time_of_operators_is_to_the_first_verdict(mission):
     for number in range(3):
         mission.state.store_image(image_record(f"000{number}"))
-    anna, bo = mission.browser("anna"), mission.browser("bo")
-    for number, delay_s in enumerate((10.0, 20.0, 60.0)):
-        mission.set_time(NOW_S + delay_s)
-        assert anna.decide(contact_id(mission, f"000{number}")).status_code == 201
-    mission.set_time(NOW_S + 1000.0)
-    last = bo.decide(contact_id(mission, "0000"), verdict="unsure").json()["decision"]
-    detail = bo.contact(contact_id(mission, "0000"))
-    shown = {name: detail["versions"][-1][name] for name in ("version", "sha256")}
-    body = {"decision_id": last["decision_id"], **shown, "layer": "raw"}
-    undone = bo.post(f"/api/contacts/{contact_id(mission, '0000')}/undo", body)
-    assert undone.status_code == 201
+    anna, bo, ids = mission.browser("anna"), mission.browser("bo"), contact_ids(mission.state)
+    for number, delay_s in enumerate((10.0, 10.0, 40.0)):
+        mission.clock.advance(delay_s)
+        assert anna.decide(ids[f"000{number}"]).status_code == 201
+    mission.clock.advance(1000.0)
+    last = bo.decide(ids["0000"], verdict="unsure").json()["decision"]
+    assert bo.undo(ids["0000"], last["decision_id"]).status_code == 201
     by_name = {one["operator"]: one for one in progress(mission)["operators"]}
     assert by_name["anna"]["median_s"] == 20.0
     assert (by_name["anna"]["decisions"], by_name["anna"]["verdicts"]) == (3, {"mine_like": 3})
@@ -154,53 +117,21 @@ def test_median_time_of_operators_is_to_the_first_verdict(mission):
     assert (by_name["bo"]["decisions"], by_name["bo"]["median_s"], by_name["bo"]["first_verdicts"]) == (1, None, 0)
 
 
-def queue(images, waiting):
-    return QueueState(
-        platform_id="uuv-1",
-        time_utc_s=NOW_S - 5,
-        rate=1,
-        frame_loss=None,
-        packet_interval_s=6.0,
-        messages_waiting=0,
-        message_bytes=0,
-        images_waiting=waiting,
-        images=tuple(
-            QueuedImage(image_id=f"000{n}", contact_id="c", bytes_left=64, preview_utc_s=None, expected_utc_s=end)
-            for n, end in enumerate(images)
-        ),
-    )
-
-
-@pytest.mark.parametrize(
-    ("images", "waiting", "finished", "work_off_s"),
-    [
+def test_forecast_of_a_queue(mission):
+    for expected, waiting, finished, work_off_s in (
         ([NOW_S + 40, NOW_S + 90], 2, NOW_S + 90, 90.0),
         ([], 0, NOW_S, 0.0),
         ([NOW_S - 3], 1, NOW_S - 3, 0.0),
         ([NOW_S + 40], 2, None, None),  # the record lists only a part
-    ],
-)
-def test_forecast_of_a_queue(mission, images, waiting, finished, work_off_s):
-    mission.state.fleet.set_queue(queue(images, waiting))
-    [vehicle] = progress(mission)["vehicles"]
-    forecast = vehicle["queue"]
-    assert (forecast["images_waiting"], forecast["finished_utc_s"], forecast["work_off_s"]) == (
-        waiting,
-        finished,
-        work_off_s,
-    )
-    assert (forecast["time_utc_s"], forecast["stale"]) == (NOW_S - 5, False)
+    ):
+        images = [(f"000{n}", 64, expected_utc_s) for n, expected_utc_s in enumerate(expected)]
+        mission.state.fleet.set_queue(queue_state(images, NOW_S - 5, waiting))
+        [vehicle] = progress(mission)["vehicles"]
+        assert vehicle["queue"] == vehicle["queue"] | {
+            "images_waiting": waiting,
+            "finished_utc_s": finished,
+            "work_off_s": work_off_s,
+            "time_utc_s": NOW_S - 5,
+            "stale": False,
+        }
     assert queue_forecast(None, NOW_S) is None
-
-
-def test_all_fields_are_documented(mission):
-    text = (REPOSITORY / "docs" / "specifications" / "console-api.md").read_text(encoding="utf-8")
-    mission.state.store_image(image_record("0001"))
-    mission.state.fleet.add_frame("uuv-1", frame(1, 1))
-    mission.state.fleet.set_queue(queue([], 0))
-    mission.browser("anna").decide(contact_id(mission, "0001"))
-    found = progress(mission)
-    [vehicle] = found["vehicles"]
-    for part in (found, vehicle, vehicle["uplink"], vehicle["queue"], vehicle["downlink"], found["operators"][0]):
-        for name in part:
-            assert f'"{name}"' in text, name

@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-import sqlite3
-
 import pytest
-from builders.console import FIRST_UTC_S, image_record
+from builders.console import FIRST_UTC_S, Clock, contact_id, downlink_state, image_record, partial_record
 
-from sonarpost.messages import DownlinkState
-from sonarpost.services.console.store.database import Database
 from sonarpost.services.console.store.requests import REFUSAL_VALID_S
 
-ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
+ID = contact_id()
 
 
-def preview(image_id="00A7", version=1, received=30, *, complete=False, total=0, **fields):
-    record = image_record(image_id, version, **fields)
-    changes = {"complete": complete, "bytes_received": received, "bytes_total": received if complete else total}
-    return record.model_copy(update={**changes, "despeckle_strength": 1.0})
+def store(console, version=1, received=200, *, complete=True, total=0):
+    """Store a version of contact 00A7."""
+    console.state.store_image(partial_record("00A7", version, received, complete=complete, total=total))
 
 
 def related(kind, version=1, *, complete=True, received=300, **fields):
     """The image that answers a request about contact 00A7."""
     scale = 2.02 if kind == "wider" else 1.0  # the link transmits pixel sizes in steps of 2.5 %
     sizes = {"pixel_along_m": 0.1 * scale, "pixel_across_m": 0.05 * scale, **fields}
-    record = preview("00A9", version, received, complete=complete, first_utc_s=FIRST_UTC_S + 60, **sizes)
-    return record.model_copy(
-        update={
-            "contact": record.contact.model_copy(update={"time_utc_s": FIRST_UTC_S - 100}),
-            "despeckle_strength": 1.0 if kind == "wider" else 0.0,
-        }
-    )
+    times = {"first_utc_s": FIRST_UTC_S + 60, "time_utc_s": FIRST_UTC_S - 100}
+    record = partial_record("00A9", version, received, complete=complete, **times, **sizes)
+    return record.model_copy(update={"despeckle_strength": 1.0 if kind == "wider" else 0.0})
 
 
 def ask(console, kind="refine", contact_id=ID, status=201):
@@ -44,18 +35,9 @@ def requests_of(console, contact_id=ID):
 
 
 def downlink(console, request, state, reason=""):
+    now = console.state.clock()
     console.state.apply_downlink_state(
-        DownlinkState(
-            vessel_id="vessel-1",
-            vehicle_id="uuv-1",
-            kind=request["kind"],
-            record_id=request["command_id"],
-            state=state,
-            times_sent=1,
-            expires_utc_s=console.state.clock() + 3600.0,
-            changed_utc_s=console.state.clock(),
-            reason=reason,
-        )
+        downlink_state(request["kind"], request["command_id"], state, now, reason=reason)
     )
 
 
@@ -63,46 +45,35 @@ def costs(console, contact_id=ID):
     return {cost["kind"]: cost for cost in console.browser("anna").contact(contact_id)["costs"]}
 
 
-def test_costs_come_with_the_contact(console):
-    console.state.store_image(preview(received=200, complete=True))
-    anna = console.browser("anna")
-    assert anna.contact(ID)["costs"] == anna.get(f"/api/contacts/{ID}/costs").json()["costs"]
-
-
 def test_refine_request_is_answered_by_the_complete_longer_stream(console):
-    console.state.store_image(preview(received=200, complete=True))
+    store(console)
     request = ask(console)
     downlink(console, request, "confirmed")
-    console.state.store_image(preview(version=2, received=260))
+    store(console, 2, 260, complete=False)
     [arriving] = requests_of(console)
     assert (arriving["arrived_utc_s"], arriving["result"]) == (None, {"id": ID, "version": 2, "bytes": 60})
-    console.state.store_image(preview(version=3, received=400, complete=True))
+    store(console, 3, 400)
     [arrived] = requests_of(console)
     assert arrived["arrived_utc_s"] is not None
     assert arrived["result"] == {"id": ID, "version": 3, "bytes": 200}
     assert console.browser("watch").contact(ID)["contact"]["open_requests"] == 0
-    console.state.store_image(preview(version=4, received=800, complete=True))
+    store(console, 4, 800)
     assert requests_of(console)[0] == arrived
 
 
-def test_bytes_announced_before_the_refine_request_do_not_answer_it(console):
-    console.state.store_image(preview(received=60, total=131))
+def test_complete_image_answers_a_resend_request_and_no_refine_request_for_announced_bytes(console):
+    store(console, received=100, complete=False, total=200)
     ask(console)
-    console.state.store_image(preview(version=2, received=131, complete=True))
-    assert requests_of(console)[0]["arrived_utc_s"] is None
-
-
-def test_resend_request_is_answered_by_the_complete_image(console):
-    console.state.store_image(preview(received=100, total=200))
     ask(console, "resend")
-    console.state.store_image(preview(version=2, received=200, complete=True))
-    assert requests_of(console)[0]["result"] == {"id": ID, "version": 2, "bytes": 100}
+    store(console, 2, 200)
+    found = {request["kind"]: request for request in requests_of(console)}
+    assert found["refine"]["arrived_utc_s"] is None
+    assert found["resend"]["result"] == {"id": ID, "version": 2, "bytes": 100}
 
 
 def test_revisit_request_is_answered_by_a_later_look_of_the_vehicle(console):
-    now = FIRST_UTC_S + 1000.0
-    console.state.clock = lambda: now
-    console.state.store_image(preview(received=200, complete=True))
+    now = Clock(console, FIRST_UTC_S + 1000.0).now_utc_s
+    store(console)
     ask(console, "revisit")
     console.state.store_image(image_record("00B1", vehicle="uuv-2", first_utc_s=now + 500))
     assert requests_of(console)[0]["arrived_utc_s"] is None
@@ -112,7 +83,7 @@ def test_revisit_request_is_answered_by_a_later_look_of_the_vehicle(console):
 
 @pytest.mark.parametrize("kind", ["wider", "original"])
 def test_answer_to_a_request_is_a_layer_of_its_contact(kind, console):
-    console.state.store_image(preview(received=200, complete=True))
+    store(console)
     ask(console, kind)
     console.state.store_image(related(kind, complete=False, received=30))
     console.state.store_image(related(kind, 2))
@@ -135,113 +106,79 @@ def test_answer_to_a_request_is_a_layer_of_its_contact(kind, console):
 def test_layer_that_arrives_before_its_contact_is_linked(console):
     console.state.store_image(related("wider"))
     assert console.state.counts().total == 1
-    console.state.store_image(preview(received=200, complete=True))
+    store(console)
     listed = console.browser("watch").get("/api/contacts").json()
     assert [row["id"] for row in listed["items"]] == [ID]
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"position": (56.0001, -5.0)},
-        {"altitude_m": 5.5},
-        {"pixel_across_m": 0.05},
-        {"vehicle": "uuv-2"},
-    ],
-)
-def test_other_detections_stay_contacts(changes, console):
-    console.state.store_image(preview(received=200, complete=True))
-    console.state.store_image(related("wider", **changes))
-    assert console.state.counts().total == 2
-
-
-def test_same_image_with_another_identifier_stays_a_contact(console):
-    """A vehicle that has lost its state can send a contact twice: nothing shows that a request was answered."""
-    console.state.store_image(preview(received=200, complete=True))
-    again = related("original").model_copy(update={"despeckle_strength": 1.0})
-    console.state.store_image(again)
-    assert console.state.counts().total == 2
+def test_other_detections_and_equal_images_stay_contacts(make_console):
+    changes = ({"position": (56.0001, -5.0)}, {"altitude_m": 5.5}, {"pixel_across_m": 0.05}, {"vehicle": "uuv-2"})
+    others = [related("wider", **change) for change in changes]
+    # A vehicle that has lost its state can send a contact twice: nothing shows that a request was answered.
+    for other in (*others, related("original").model_copy(update={"despeckle_strength": 1.0})):
+        console = make_console()
+        store(console)
+        console.state.store_image(other)
+        assert console.state.counts().total == 2
 
 
 def test_image_with_a_decision_stays_a_contact(console):
     console.state.store_image(related("wider"))
     [row] = console.browser("watch").get("/api/contacts").json()["items"]
     assert console.browser("anna").decide(row["id"]).status_code == 201
-    console.state.store_image(preview(received=200, complete=True))
+    store(console)
     assert console.state.counts().total == 2
 
 
 def test_vehicle_without_a_consumer_is_remembered(console):
-    now = FIRST_UTC_S
-    console.state.clock = lambda: now
-    console.state.store_image(preview(received=200, complete=True))
+    clock = Clock(console)
+    store(console)
     console.state.store_image(image_record("00B2", position=(57.0, -5.0)))
     other = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00B2"
     downlink(console, ask(console, "revisit"), "refused", "unsupported")
-    found = costs(console, other)["revisit"]
-    assert (found["available"], found["reason_code"], found["reason"]) == (
-        False,
-        "unsupported",
-        "uuv-1 cannot do this",
-    )
-    assert costs(console, other)["refine"]["available"]
-    ask(console, "revisit", other, 400)
-    now += REFUSAL_VALID_S + 1.0
-    assert costs(console, other)["revisit"]["available"]
-
-
-def test_other_refusals_do_not_exclude_a_kind(console):
-    console.state.store_image(preview(received=200, complete=True))
+    # Another refusal does not exclude its kind.
     downlink(console, ask(console), "refused", "unknown image")
+    found = costs(console, other)
+    reason = [found["revisit"][name] for name in ("available", "reason_code", "reason")]
+    assert reason == [False, "unsupported", "uuv-1 cannot do this"]
     assert costs(console)["refine"]["available"]
+    assert found["refine"]["available"]
+    ask(console, "revisit", other, 400)
+    clock.advance(REFUSAL_VALID_S + 1.0)
+    assert costs(console, other)["revisit"]["available"]
 
 
 def test_vessel_without_downlink_offers_no_requests(make_console):
     console = make_console(command_consumers=())
-    console.state.store_image(preview(received=200, complete=True))
+    store(console)
+    anna = console.browser("anna")
+    assert anna.contact(ID)["costs"] == anna.get(f"/api/contacts/{ID}/costs").json()["costs"]
     assert {cost["reason_code"] for cost in costs(console).values()} == {"no_downlink"}
     ask(console, status=400)
 
 
 def test_pending_request_excludes_another_of_its_kind_until_it_is_late(console):
-    now = FIRST_UTC_S
-    console.state.clock = lambda: now
-    console.state.store_image(preview(received=200, complete=True))
+    clock = Clock(console)
+    store(console)
     request = ask(console)
     downlink(console, request, "confirmed")
     ask(console, status=400)
-    now = requests_of(console)[0]["late_utc_s"] + 1.0
+    clock.now_utc_s = requests_of(console)[0]["late_utc_s"] + 1.0
     ask(console)
 
 
 def test_expected_time_follows_the_durations_of_earlier_requests(make_console):
     console = make_console(assumed_rate=1)
-    now = FIRST_UTC_S
-    console.state.clock = lambda: now
-    console.state.store_image(preview(received=200, complete=True))
+    clock = Clock(console)
+    store(console)
     first = ask(console)
     airtime_s = costs(console)["refine"]["airtime_s"]
     assert first["expected_utc_s"] is None
-    assert first["earliest_utc_s"] == pytest.approx(now + airtime_s)
+    assert first["earliest_utc_s"] == pytest.approx(clock.now_utc_s + airtime_s)
     # The displayed air time of the request is 12 s; it was answered after ten times this.
-    now += 120.0
-    console.state.store_image(preview(version=2, received=400, complete=True))
+    clock.advance(120.0)
+    store(console, 2, 400)
     second = ask(console)
-    airtime_s = second["earliest_utc_s"] - now
-    assert second["expected_utc_s"] == pytest.approx(now + 10 * airtime_s)
+    airtime_s = second["earliest_utc_s"] - clock.now_utc_s
+    assert second["expected_utc_s"] == pytest.approx(clock.now_utc_s + 10 * airtime_s)
     assert second["late_utc_s"] > second["expected_utc_s"]
-
-
-def test_database_of_an_earlier_version_opens(tmp_path):
-    path = tmp_path / "console-review.db"
-    Database(path).close()
-    with sqlite3.connect(path) as db:
-        for index in ("contact_answers", "contact_listed"):
-            db.execute(f"DROP INDEX {index}")
-        for table, column in (("contact", "parent"), ("contact", "relation"), ("request", "result_bytes")):
-            db.execute(f"ALTER TABLE {table} DROP COLUMN {column}")
-    database = Database(path)
-    with database.read() as db:
-        assert {"parent", "relation"} <= {row["name"] for row in db.execute("PRAGMA table_info(contact)")}
-        assert "result_bytes" in {row["name"] for row in db.execute("PRAGMA table_info(request)")}
-    database.close()

@@ -7,18 +7,18 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 
 import pytest
-from builders.console import FIRST_UTC_S, image_record
-from hypothesis import HealthCheck, given, settings
+from builders.console import FIRST_UTC_S, advice_record, contact_id, downlink_state, image_record
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import DeliveryError
-from sonarpost.messages import Advice, Decision, DownlinkState
+from sonarpost.messages import Decision
 from sonarpost.services.console.store.contacts import ContactFilter
 from sonarpost.services.console.store.database import Actor, DisplayedImage
 from sonarpost.services.console.store.decisions import DecisionInput
 from sonarpost.services.console.store.requests import REQUEST_KINDS, is_later_state
 
-ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
+ID = contact_id()
 SECONDS = count()
 
 
@@ -35,27 +35,19 @@ def test_image_versions_belong_to_one_contact(console):
     assert detail["contact"]["percent_received"] == 100.0
     assert detail["record"]["altitude_m"] == 5.0
     assert detail["record"]["nadir_side"] == "left"
-
-
-def test_late_older_version_does_not_replace_the_newer(console):
-    console.state.store_image(image_record(version=3))
-    console.state.store_image(image_record(version=2, missing_rows=10))
-    detail = console.browser("watch").contact(ID)
-    assert detail["contact"]["version"] == 3
-    assert [v["version"] for v in detail["versions"]] == [2, 3]
+    # A late older version does not replace the newer one.
+    console.state.store_image(image_record(version=4))
+    console.state.store_image(image_record(version=3, missing_rows=10))
+    detail = watch.contact(ID)
+    assert detail["contact"]["version"] == 4
+    assert [v["version"] for v in detail["versions"]] == [1, 2, 3, 4]
 
 
 def test_list_filter_sort_and_pages(console):
     for number in range(25):
-        console.state.store_image(
-            image_record(
-                f"{number:04d}",
-                vehicle=f"uuv-{number % 2 + 1}",
-                atd_confidence=number / 20,
-                position=(56 + number / 100, -5.0),
-                missing_rows=10 * (number % 2),
-            )
-        )
+        changes = {"vehicle": f"uuv-{number % 2 + 1}", "missing_rows": 10 * (number % 2)}
+        place = {"position": (56 + number / 100, -5.0), "atd_confidence": number / 20}
+        console.state.store_image(image_record(f"{number:04d}", **changes, **place))
     watch = console.browser("watch")
     first = watch.get("/api/contacts", sort="confidence", order="asc", limit=10).json()
     second = watch.get("/api/contacts", sort="confidence", order="asc", limit=10, offset=10).json()
@@ -70,9 +62,9 @@ def test_list_filter_sort_and_pages(console):
     assert watch.get("/api/contacts", q="/0007").json()["items"][0]["image_id"] == "0007"
 
 
-@pytest.mark.parametrize(
-    ("parameter", "value"),
-    [
+def test_error_names_the_invalid_parameter(console):
+    watch = console.browser("watch")
+    for parameter, value in (
         ("sort", "id; DROP TABLE contact"),
         ("limit", "501"),
         ("limit", "1.5"),
@@ -81,12 +73,9 @@ def test_list_filter_sort_and_pages(console):
         ("review", "maybe"),
         ("order", "up"),
         ("q", "x" * 81),
-    ],
-)
-def test_error_names_the_invalid_parameter(console, parameter, value):
-    answer = console.browser("watch").get("/api/contacts", **{parameter: value})
-    assert answer.status_code == 400
-    assert answer.json()["error"]["field"] == parameter
+    ):
+        answer = watch.get("/api/contacts", **{parameter: value})
+        assert (answer.status_code, answer.json()["error"]["field"]) == (400, parameter)
 
 
 def test_looks_at_one_object_are_grouped(console):
@@ -119,6 +108,19 @@ def test_decision_is_stored_with_the_displayed_image(make_console):
     [item] = console.state.unsent_records()
     assert isinstance(item.record, Decision)
     assert (item.record.verdict, item.record.operator, item.record.image_version) == ("mine_like", "anna", 1)
+    console.state.mark_sent(item)
+    # A decision on another image is rejected; a new version of the image is no conflict.
+    assert anna.decide(ID, sha256="0" * 64).json()["error"]["field"] == "sha256"
+    assert anna.decide(ID, version=2).json()["error"]["field"] == "version"
+    assert console.state.unsent_records() == []
+    revision = anna.contact(ID)["contact"]["revision"]
+    console.state.store_image(image_record(version=2))
+    assert anna.decide(ID, revision=revision).status_code == 201
+    # A refused decision has a reason.
+    decision_id = anna.contact(ID)["decisions"][0]["decision_id"]
+    console.state.apply_acknowledgement("decision", decision_id, "op_modem", "no such vehicle")
+    delivery = anna.contact(ID)["contact"]["delivery"]
+    assert (delivery["vehicle"], delivery["reason"], delivery["shore"]) == ("refused", "no such vehicle", "waiting")
 
 
 def test_simultaneous_decisions_of_several_operators_are_all_stored(console):
@@ -143,7 +145,6 @@ def test_simultaneous_decisions_of_several_operators_are_all_stored(console):
 @given(
     st.lists(st.text(alphabet="ab%_\\'é", max_size=4), max_size=6), st.text(alphabet="ab%_\\'é", min_size=1, max_size=3)
 )
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_search_finds_exactly_the_contacts_with_the_text(console, remarks, text):
     with console.state.database.transaction() as db:
         db.execute("DELETE FROM contact")
@@ -155,20 +156,6 @@ def test_search_finds_exactly_the_contacts_with_the_text(console, remarks, text)
     # SQLite ignores the case of ASCII letters only.
     expected = {f"{number:04d}" for number, remark in enumerate(remarks) if text in remark or text in "uuv-1/"}
     assert {row["image_id"] for row in found} == expected
-
-
-def test_new_image_version_is_no_conflict(console):
-    console.state.store_image(image_record())
-    console.state.store_image(image_record(version=2))
-    assert console.browser("anna").decide(ID, revision=0).status_code == 201
-
-
-def test_decision_on_another_image_is_rejected(console):
-    console.state.store_image(image_record())
-    anna = console.browser("anna")
-    assert anna.decide(ID, sha256="0" * 64).json()["error"]["field"] == "sha256"
-    assert anna.decide(ID, version=2).json()["error"]["field"] == "version"
-    assert console.state.unsent_records() == []
 
 
 def test_audit_is_append_only(console):
@@ -195,18 +182,7 @@ def test_delivery_of_a_decision_to_shore_and_vehicle(console):
     now = console.state.clock()
     # The clock of the modem's host is slow.
     for number, state in enumerate(("asked", "sent", "confirmed", "sent"), start=-100):
-        console.state.apply_downlink_state(
-            DownlinkState(
-                vessel_id="vessel-1",
-                vehicle_id="uuv-1",
-                kind="decision",
-                record_id=decision_id,
-                state=state,
-                times_sent=1,
-                expires_utc_s=now + 100,
-                changed_utc_s=now + number,
-            )
-        )
+        console.state.apply_downlink_state(downlink_state("decision", decision_id, state, now + number))
     assert delivery()["vehicle"] == "confirmed"
     console.state.mark_delivered_to_shore(now - 60)
     assert delivery()["shore"] == "relay"
@@ -223,15 +199,6 @@ def test_order_of_delivery_states():
     assert not is_later_state("expired", 1, "confirmed", 1)
 
 
-def test_refused_decision_has_a_reason(console):
-    console.state.store_image(image_record())
-    anna = console.browser("anna")
-    decision_id = anna.decide(ID).json()["decision"]["decision_id"]
-    console.state.apply_acknowledgement("decision", decision_id, "op_modem", "no such vehicle")
-    delivery = anna.contact(ID)["contact"]["delivery"]
-    assert (delivery["vehicle"], delivery["reason"], delivery["shore"]) == ("refused", "no such vehicle", "waiting")
-
-
 def test_records_before_their_image_are_attached_to_it(make_console):
     console = make_console(role="shore")
     at = FIRST_UTC_S + 50
@@ -239,7 +206,7 @@ def test_records_before_their_image_are_attached_to_it(make_console):
     decision = Decision(decision_id="d-1", verdict="mine_like", operator="anna", decided_utc_s=at, **names)
     assert console.state.store_decision(decision)
     assert not console.state.store_decision(decision)
-    console.state.store_advice(Advice(advice_id="a-1", author="eva", advised_utc_s=at, remark="look again", **names))
+    console.state.store_advice(advice_record())
     console.state.store_image(image_record())
     detail = console.browser("watch").contact(ID)
     assert detail["contact"]["review"] == "mine_like"
@@ -278,19 +245,16 @@ def test_request_costs_and_no_repeated_request(make_console):
     assert anna.post(path, {"kind": "larger"}).status_code == 400
 
 
-def test_new_images_cost_as_much_as_the_first_version(make_console):
-    console = make_console(assumed_rate=1)
-    console.state.store_image(image_record())
-    longer = {"bytes_received": 400, "bytes_total": 400, "despeckle_strength": 1.0}
-    console.state.store_image(image_record(version=2).model_copy(update=longer))
-    costs = {cost["kind"]: cost for cost in console.browser("anna").get(f"/api/contacts/{ID}/costs").json()["costs"]}
-    assert [costs[kind]["bytes"] for kind in ("refine", "wider", "original")] == [400, 200, 200]
-
-
-def test_unknown_cost_is_none(console):
-    console.state.store_image(image_record(missing_rows=30))
-    costs = console.browser("anna").get(f"/api/contacts/{ID}/costs").json()["costs"]
-    assert [c["airtime_s"] for c in costs if c["kind"] == "refine"] == [None]
+def test_costs_of_new_images_are_those_of_the_first_version_and_unknown_without_a_rate(make_console):
+    for rate in (1, None):
+        console = make_console(assumed_rate=rate)
+        console.state.store_image(image_record())
+        longer = {"bytes_received": 400, "bytes_total": 400, "despeckle_strength": 1.0}
+        console.state.store_image(image_record(version=2).model_copy(update=longer))
+        costs = {cost["kind"]: cost for cost in console.browser("anna").contact(ID)["costs"]}
+        expected = [None] * 3 if rate is None else [400, 200, 200]
+        assert [costs[kind]["bytes"] for kind in ("refine", "wider", "original")] == expected
+        assert (costs["refine"]["airtime_s"] is None) == (rate is None)
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import sqlite3
-
 import pytest
-from builders.console import PASSWORD
 
-from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.web.settings_routes import MAX_VALUE, SETTINGS
 
 
@@ -51,17 +47,3 @@ def test_settings_need_a_session_and_the_token_of_the_page(console):
     assert console.browser().get("/api/settings").status_code == 401
     answer = console.browser("anna").post("/api/settings", {"settings": {}}, **{"X-CSRF-Token": "wrong"})
     assert answer.status_code == 403
-
-
-def test_users_file_of_an_earlier_version_opens(tmp_path):
-    users = Users(tmp_path / FILE_NAME)
-    users.add("anna", "operator", PASSWORD)
-    users.close()
-    with sqlite3.connect(tmp_path / FILE_NAME) as db:
-        db.execute("DROP TABLE link")
-        db.execute("DROP TABLE setting")
-    users = Users(tmp_path / FILE_NAME)
-    users.store_settings("anna", {"theme": "night"})
-    assert users.settings("anna") == {"theme": "night"}
-    assert users.use_login_link(users.make_login_link("anna")) == ("valid", "anna")
-    users.close()

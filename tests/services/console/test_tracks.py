@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 from itertools import pairwise
 
 import pytest
@@ -141,12 +140,8 @@ def test_many_wide_legs_are_counted_with_few_cells():
     assert covered_area_m2(legs) == pytest.approx(900.0 * 1816.0, rel=0.1)
 
 
-def test_track_survives_a_restart_and_a_database_without_tracks(tmp_path):
+def test_track_survives_a_restart(tmp_path):
     path = tmp_path / DATABASE_NAME
-    Database(path).close()
-    with sqlite3.connect(path) as old:
-        old.execute("DROP TABLE track")
-    old.close()
     database = Database(path)
     with database.transaction() as db:
         assert tracks.store_status(db, received())
