@@ -11,7 +11,7 @@ from itertools import islice
 from typing import Final
 
 from builders import v1_fuzz
-from builders.modem_fuzz import ENDS, LIKELY, Fuzz, real_lines
+from builders.modem_fuzz import ENDS, LIKELY, Fuzz, real_lines, send_request
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.receiver import ImageUpdate, MessageReceived
 from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, nmea
@@ -95,7 +95,8 @@ def check_driver(data: bytes) -> int:
         now += (0.0, 0.01, 0.5, 7.0)[kind >> 3 & 3]
         line = _line(kind & 7, body)
         if line is None:
-            asked.append(_ask(driver, body, now))
+            choice, ack = (body[0] % 5 if body else 4), len(body) % 2 == 0
+            asked.append(send_request(driver, choice, body[:64] or b".", 1, now, ack=ack))
         else:
             taken += sum(isinstance(item, nmea.Sentence) for item in parser.feed(line))
             ended += [e for e in driver.receive(line, now) if isinstance(e, ENDS)]
@@ -126,20 +127,6 @@ def _checked(start: bytes) -> bytes:
     for byte in start[1:]:
         total ^= byte
     return start + b"*%02X\r\n" % total
-
-
-def _ask(driver: MicroModem, body: bytes, now: float) -> int:
-    match body[0] % 5 if body else 0:
-        case 0:
-            return driver.send_packet(2, 1, [body[:64] or b"."], ack=len(body) % 2 == 0, now=now)
-        case 1:
-            return driver.ping(2, now)
-        case 2:
-            return driver.send_mini(2, 5, now)
-        case 3:
-            return driver.send_flexible(2, 1, b"flexible", now)
-        case _:
-            return driver.request_packet(2, 1, now=now)
 
 
 CHECKS: Final = {"receiver": check_receiver, "driver": check_driver}

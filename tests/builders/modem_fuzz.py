@@ -74,7 +74,8 @@ class Fuzz:
             line = self.line()
             self.sentences_parsed += sum(isinstance(item, nmea.Sentence) for item in parser.feed(line))
             if self.rng.random() < 0.02:
-                requested.append(self._send_request(driver, now))
+                data, ack, rate = b"ab", self.rng.random() < 0.5, self.rng.choice((0, 1, 4))
+                requested.append(send_request(driver, self.rng.randrange(5), data, rate, now, ack=ack))
             events = driver.receive(line, now)
             now += self.rng.choice((0.0, 0.0, 0.01, 0.5, 7.0))
             events += driver.poll(now)
@@ -122,18 +123,6 @@ class Fuzz:
                 driver.receive(nmea.format("CACFG", item.fields[0], value), 0.0)
         assert driver.ready
 
-    def _send_request(self, driver: MicroModem, now: float) -> int:
-        choice = self.rng.randrange(5)
-        if choice == 0:
-            return driver.ping(2, now)
-        if choice == 1:
-            return driver.send_mini(2, 5, now)
-        if choice == 2:
-            return driver.send_flexible(2, 1, b"flexible", now)
-        if choice == 3:
-            return driver.request_packet(2, self.rng.choice((0, 1, 4)), now=now)
-        return driver.send_packet(2, self.rng.choice((0, 4)), [b"ab"], ack=self.rng.random() < 0.5, now=now)
-
     def line(self) -> bytes:
         """Return the next line, possibly damaged."""
         draw = self.rng.random()
@@ -168,6 +157,21 @@ class Fuzz:
         if len(fields) > 1:
             fields[self.rng.randrange(1, len(fields))] = self.rng.choice(LIKELY)
         return fields
+
+
+def send_request(driver: MicroModem, kind: int, data: bytes, rate: int, now: float, *, ack: bool) -> int:
+    """Send a request of one of five kinds; return its number."""
+    match kind:
+        case 0:
+            return driver.ping(2, now)
+        case 1:
+            return driver.send_mini(2, 5, now)
+        case 2:
+            return driver.send_flexible(2, 1, b"flexible", now)
+        case 3:
+            return driver.request_packet(2, rate, now=now)
+        case _:
+            return driver.send_packet(2, rate, [data], ack=ack, now=now)
 
 
 def real_lines() -> list[bytes]:

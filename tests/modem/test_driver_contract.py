@@ -12,9 +12,10 @@ from collections.abc import Callable
 import pytest
 from builders.hostile_line import HOSTILE, PEER, Bench, Condition, Parts, Subject
 
+from sonarpost.errors import ConfigError
 from sonarpost.modem.interface import ModemReady, PacketFailed, PacketSent
 from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.registry import ModemRegistry
+from sonarpost.modem.registry import ModemRegistry, ModemSettings, modem_driver
 
 CONDITION_S = 90.0
 RECOVERY_S = 240.0
@@ -396,3 +397,11 @@ def test_driver_accepts_any_bytes_in_any_parts(subject: Subject) -> None:
             bench.inject(bench.rng.randbytes(length))
     bench.run(RECOVERY_S)
     assert len(bench.received(PEER)) >= 3
+
+
+@pytest.mark.parametrize("name", ModemRegistry().names())
+def test_address_of_the_modem_is_checked(name: str) -> None:
+    limits = modem_driver(name).create(ModemSettings(1), "test port").capabilities
+    for address in (limits.min_address - 1, limits.max_address + 1):
+        with pytest.raises(ConfigError, match="address"):
+            modem_driver(name).create(ModemSettings(address), "test port")

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.errors import ConfigError, FrameError, SentenceError
+from sonarpost.errors import FrameError, SentenceError
 from sonarpost.modem.interface import (
     FrameReceived,
     ModemError,
@@ -298,9 +298,3 @@ def test_modem_that_was_replaced_is_configured_again(driver: NanoModem) -> None:
     assert not driver.ready
     assert take(driver) == b"$A003"
     assert driver.receive(b"#A003\r\n", 60.2) == [ModemReady(3, None)]
-
-
-@pytest.mark.parametrize("address", [-1, 255])
-def test_address_is_checked(address: int) -> None:
-    with pytest.raises(ConfigError, match="address"):
-        NanoModem(ModemSettings(address))

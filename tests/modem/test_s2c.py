@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.errors import ConfigError, FrameError, SentenceError
+from sonarpost.errors import FrameError, SentenceError
 from sonarpost.modem.interface import (
     FrameReceived,
     ModemEvent,
@@ -428,9 +428,7 @@ def test_ping_without_an_answer_fails() -> None:
 
 
 @pytest.mark.parametrize("address", [0, 255])
-def test_address_is_checked(address: int) -> None:
-    with pytest.raises(ConfigError, match="address"):
-        S2cModem(ModemSettings(address))
+def test_destination_and_length_are_checked(address: int) -> None:
     with pytest.raises(FrameError):
         ready_modem().ping(address, 2.0)
     with pytest.raises(FrameError, match="length of frame 1"):

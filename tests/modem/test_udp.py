@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.errors import ConfigError, SentenceError
+from sonarpost.errors import SentenceError
 from sonarpost.modem.interface import FrameReceived, ModemEvent, ModemReady, PacketReceived, PacketSent
 from sonarpost.modem.registry import ModemSettings
 from sonarpost.modem.udp import RATES, UdpModem
@@ -120,9 +120,3 @@ def test_lost_frames_are_counted() -> None:
     [packet] = [e for e in events if isinstance(e, PacketReceived)]
     assert (packet.bad_frames, packet.nframes, packet.complete) == (1, 3, False)
     assert [frame.frame_number for frame in packet.frames] == [1, 3]
-
-
-@pytest.mark.parametrize("address", [-1, 255])
-def test_address_is_checked(address: int) -> None:
-    with pytest.raises(ConfigError, match="address"):
-        UdpModem(ModemSettings(address))

@@ -292,14 +292,6 @@ def test_a_malformed_part_is_reported_and_the_rest_restored(name, change):
     assert {part: data for part, data in again.parts().items() if part in kept} == kept
 
 
-def test_foreign_parts_are_reported_and_nothing_is_restored():
-    again = TransmitQueue(queue_config())
-    junk = {"queue": b"junk", "sender": b"", "image/1": b"\x80", "block/7": b"\xc1", "message/x": b"\x01"}
-    assert set(again.restore(junk)) == set(junk)
-    assert again.is_idle
-    assert again.next_packet(0.0) is None
-
-
 def test_rate_that_is_not_configured_any_more_is_replaced():
     queue = filled(TransmitQueue(queue_config(rates=(5,), first_rate=5)), 5)
     take_packet(queue, 0.0)

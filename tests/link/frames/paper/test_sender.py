@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.paper.frame import HALF_PREFIX_SIZE, ContactFrame, HalfFrame, half_bounds, parse_frame
+from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, half_bounds, parse_frame
 from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import Packet, plan_packets
 from sonarpost.link.receiver import ImageUpdate
@@ -126,25 +126,6 @@ def check_contact_leads(parsed: list[list[HalfFrame | ContactFrame]], frames_per
         halves = group.replace("C", "")
         free = -len(halves) % frames_per_packet
         assert group == ("C" + halves + "C" * (free - 1) if free else halves)
-
-
-@pytest.mark.parametrize("header_bytes", sorted(HEADERS))
-@pytest.mark.parametrize("with_contact", [True, False])
-@pytest.mark.parametrize("rate", sorted(RATES))
-def test_capacity_is_the_longest_body_with_one_packet_per_half(
-    rate: int, with_contact: bool, header_bytes: int
-) -> None:
-    frames_per_packet, frame_bytes = RATES[rate]
-    contact = CONTACT if with_contact else None
-    own_packet = 1 if with_contact and frames_per_packet == 1 else 0
-    frames = frames_per_packet - 1 if with_contact and not own_packet else frames_per_packet
-    capacity = 2 * frames * (frame_bytes - HALF_PREFIX_SIZE - header_bytes)
-    plan = plan_packets("0K3P", make_stream(capacity, header_bytes), contact, frames_per_packet, frame_bytes)
-    assert len(plan) == 2 + own_packet
-    if with_contact and not own_packet:
-        assert all(any(frame[:1] == b"C" for frame in packet) for packet in plan)
-    beyond = plan_packets("0K3P", make_stream(capacity + 1, header_bytes), contact, frames_per_packet, frame_bytes)
-    assert len(beyond) > len(plan) or sum(frame[:1] == b"C" for frame in beyond[0]) == 0
 
 
 @given(st.integers(0, 700), st.sampled_from(sorted(RATES)), st.sampled_from(sorted(HEADERS)))
