@@ -99,6 +99,12 @@ class FakeModem:
         self.restarts += 1
         self._schedule_reply(self.restart_s, lambda: self.send("CAREV", "000001", "INIT", "2.0.27087"))
 
+    def forget(self) -> None:
+        """End the cycle in progress without a word."""
+        self._cycle = None
+        self._cycle_number += 1
+        self._due = []
+
     def run(self, until_s: float) -> None:
         """Advance the time from deadline to deadline."""
         while True:
@@ -164,9 +170,9 @@ class FakeModem:
         self._frames = []
         self._cycle_number += 1
         self._schedule_reply(0.05, lambda: self.send("CACYC", *fields))
-        self._schedule_reply(0.10, self._request_data)
+        self._schedule_reply(0.10, self.request_data)
 
-    def _request_data(self) -> None:
+    def request_data(self) -> None:
         cycle, number, wanted = self._cycle, self._cycle_number, len(self._frames) + 1
         assert cycle is not None
         size = RATES[cycle.rate].frame_bytes
@@ -185,9 +191,9 @@ class FakeModem:
             return
         self._frames.append(bytes.fromhex(data))
         self._schedule_reply(0.05, lambda: self.send("CATXD", src, dest, ack, len(data) // 2))
-        self._schedule_reply(0.10, self._request_data if len(self._frames) < cycle.nframes else self._transmit)
+        self._schedule_reply(0.10, self.request_data if len(self._frames) < cycle.nframes else self.transmit)
 
-    def _transmit(self) -> None:
+    def transmit(self) -> None:
         cycle, frames = self._cycle, tuple(self._frames)
         assert cycle is not None
         size = sum(map(len, frames))

@@ -107,12 +107,12 @@ def test_retry_waits_double_up_to_the_limit() -> None:
     driver = MicroModem(MicroModemConfig(address=3, reply_timeout_s=1.0, retry_cap_s=10.0))
     driver.start(0.0)
     sent_s, now = [], 0.0
-    for _ in range(8):
-        assert driver.bytes_to_send() == b"$CCCFG,SRC,3*33\r\n"
-        sent_s.append(now)
-        while driver._out == b"":
-            now = driver.next_wakeup()
-            driver.poll(now)
+    while len(sent_s) < 8:
+        if data := driver.bytes_to_send():
+            assert data == b"$CCCFG,SRC,3*33\r\n"
+            sent_s.append(now)
+        now = driver.next_wakeup()
+        driver.poll(now)
     gaps = [b - a for a, b in itertools.pairwise(sent_s)]
     assert gaps == [1.0, 2.0, 4.0, 8.0, 10.0, 10.0, 10.0]
 

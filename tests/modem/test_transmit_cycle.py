@@ -160,7 +160,7 @@ def test_modem_is_queried_after_a_failed_packet() -> None:
 def test_repeated_data_request_is_answered_again() -> None:
     modem = ready(drop_nth("CCTXD", 1))
     send(modem, FIRST)
-    modem.schedule(1.0, modem._request_data)
+    modem.schedule(1.0, modem.request_data)
     modem.run(20.0)
     assert modem.transmitted == [tuple(FIRST)]
     assert len(modem.events_of(PacketSent)) == 1
@@ -201,9 +201,7 @@ def test_restart_during_a_cycle(moment_s: float) -> None:
     first, second = send(modem, FIRST), send(modem, SECOND)
 
     def restart() -> None:
-        modem._cycle = None
-        modem._cycle_number += 1
-        modem._due = []
+        modem.forget()
         modem.settings = {}
         modem.send("CAREV", "000001", "INIT", "2.0.27087")
 
@@ -228,7 +226,7 @@ def test_port_lost_during_a_cycle_and_reopened() -> None:
     assert modem.driver.next_wakeup() <= 6.0, "an event is pending"
     (failed,) = modem.driver.poll(6.0)
     assert (failed.packet_id, failed.reason) == (first, FailureReason.PORT_LOST)
-    modem._cycle, modem._due = None, []
+    modem.forget()
     modem.run(20.0)
     modem.driver.port_opened(20.0)
     modem.run(60.0)
@@ -241,7 +239,7 @@ def test_transmission_with_a_missing_frame_fails_the_packet() -> None:
         lambda sentence, _: sentence.kind == "CAERR" or (sentence.kind, sentence.fields[-1:]) == ("CADRQ", ("2",))
     )
     send(modem, FIRST)
-    modem.schedule(2.0, modem._transmit)
+    modem.schedule(2.0, modem.transmit)
     modem.run(20.0)
     (failed,) = modem.events_of(PacketFailed)
     assert (failed.reason, failed.maybe_sent) == (FailureReason.DATA_TIMEOUT, True)
@@ -374,7 +372,7 @@ def test_factory_address_during_a_cycle_is_treated_as_a_restart() -> None:
     modem = ready()
     first, second = send(modem, FIRST), send(modem, SECOND)
     modem.run(6.0)
-    modem._cycle, modem._due = None, []
+    modem.forget()
     modem.send("CACFG", "SRC", 0)
     assert [(e.packet_id, e.reason) for e in modem.events_of(PacketFailed)] == [(first, FailureReason.REBOOTED)]
     modem.run(30.0)
