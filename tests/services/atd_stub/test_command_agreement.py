@@ -7,7 +7,7 @@ import json
 from dataclasses import replace
 
 import pytest
-from builders.joined_surveys import Box, near, split, survey_of
+from builders.joined_surveys import FEW_CANDIDATES, Box, near, split, survey_of
 
 from sonarpost.cli.main import main
 from sonarpost.messages import Contact
@@ -58,26 +58,34 @@ def check_agreement(paths, capsys, *options, **changes):
     return list(vehicle.values())
 
 
-@pytest.mark.parametrize("boundary", [100, 118, 120, 122])
+@pytest.fixture
+def check_quickly(tmp_path, capsys):
+    """`check_agreement` with fewer candidates."""
+    path = tmp_path / "few.toml"
+    path.write_text(f"min_matched_response = {FEW_CANDIDATES.min_matched_response}\n")
+    return lambda paths: check_agreement(paths, capsys, "--settings", str(path), detector=FEW_CANDIDATES)
+
+
+@pytest.mark.parametrize("boundary", [118, 122])
 def test_object_at_the_boundary_of_two_files(boundary, tmp_path, capsys):
     survey = survey_of(300, Box(120), Box(40), Box(280))
     snippets = check_agreement(split(tmp_path, survey, (0, boundary), (boundary, 300)), capsys)
     assert [len(near(snippets, row)) for row in (40, 120, 280)] == [1, 1, 1]
 
 
-def test_objects_at_the_boundaries_of_strips_and_files(tmp_path, capsys):
-    rows = (799, 899, 950, 1000, 1620)
-    paths = split(tmp_path, survey_of(1900, *map(Box, rows)), (0, 1620), (1620, 1900))
-    snippets = check_agreement(paths, capsys)
+def test_objects_at_the_boundaries_of_strips_and_files(tmp_path, check_quickly):
+    rows = (899, 950, 1120)
+    paths = split(tmp_path, survey_of(1300, *map(Box, rows)), (0, 1120), (1120, 1300))
+    snippets = check_quickly(paths)
     assert [len(near(snippets, row)) for row in rows] == [1] * len(rows)
 
 
 def test_simulated_line_with_settings(tmp_path, capsys):
-    spec = SurveySpec(seed=4, pings=500, samples=400, targets=6, clutter=6, seabed=SeabedKind.MIXED)
-    paths = split(tmp_path, simulate_survey(spec).survey, (0, 180), (180, 260), (260, 500))
-    tuning = {"separation_along_m": 2.0, "shadow_lengths_m": [1.0, 4.0]}
+    spec = SurveySpec(seed=4, pings=360, samples=400, targets=6, clutter=6, seabed=SeabedKind.MIXED)
+    paths = split(tmp_path, simulate_survey(spec).survey, (0, 140), (140, 200), (200, 360))
+    tuning = {"separation_along_m": 2.0, "shadow_lengths_m": [1.0, 4.0], "min_matched_response": 2.0}
     (tmp_path / "settings.toml").write_text(
-        "separation_along_m = 2.0\nshadow_lengths_m = [1.0, 4.0]\n"
+        "separation_along_m = 2.0\nshadow_lengths_m = [1.0, 4.0]\nmin_matched_response = 2.0\n"
         "join_overlap_pings = 100\nconfidence_threshold = 0.2\n"
     )
     (tmp_path / "options.toml").write_text("[errors]\nposition_m = 1.5\n")
@@ -92,17 +100,18 @@ def test_simulated_line_with_settings(tmp_path, capsys):
     assert 3 <= len(limited) <= 6 < len(snippets), "at most two contacts of each file"
 
 
-def test_files_of_two_sonars_may_alternate(tmp_path, capsys):
+def test_files_of_two_sonars_may_alternate(tmp_path, check_quickly):
     survey = survey_of(300, Box(148), Box(60), Box(240))
     paths = []
     for number, (first, end) in enumerate([(0, 149), (149, 300)]):
         for sonar in ("left", "right"):
             paths.append(tmp_path / f"{sonar}-{number}.xtf")
             write_xtf(replace(survey, pings=survey.pings[first:end], sonar_id=sonar), paths[-1])
-    assert len(check_agreement(paths, capsys)) == 6
+    assert len(check_quickly(paths)) == 6
 
 
 @pytest.mark.realdata
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("name", "boundaries"), [("scotsman-iver2", (150, 300)), ("000_1236", (400, 900)), ("000_1236", (1445,))]
 )
@@ -114,6 +123,7 @@ def test_recordings_in_several_files(name, boundaries, data_dir, tmp_path, capsy
 
 
 @pytest.mark.realdata
+@pytest.mark.system
 @pytest.mark.parametrize("name", ["scotsman-iver2", "000_1236"])
 def test_object_of_a_recording_at_a_boundary(name, data_dir, tmp_path, capsys):
     path = data_dir / "surveys" / f"{name}.xtf"

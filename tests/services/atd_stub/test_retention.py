@@ -4,109 +4,113 @@ from __future__ import annotations
 
 import os
 import time
+from types import SimpleNamespace
 
 import msgpack
 import numpy as np
 import pytest
 from builders.common import eventually
 
-from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.service import AtdStubService
+from sonarpost.services.atd_stub import service as atd_stub
 from sonarpost.sonar.image_files import write_tiff
 
 DAY_S = 86400.0
 
 
 @pytest.fixture
-def folder(tmp_path):
-    (tmp_path / "incoming").mkdir()
-    return tmp_path / "incoming"
+def clock(monkeypatch):
+    """A wall clock that can be ahead of the real one; the service applies the retention with each poll."""
+    ahead = SimpleNamespace(days=0.0)
+    now = lambda: time.time() + ahead.days * DAY_S  # noqa: E731
+    simulated = SimpleNamespace(time=now, monotonic=time.monotonic, perf_counter=time.perf_counter)
+    monkeypatch.setattr(atd_stub, "time", simulated)
+    monkeypatch.setattr(atd_stub, "INTERVAL_S", 0.0)
+    return ahead
 
 
 @pytest.fixture
-def start(runner, platform, folder, tmp_path):
-    def begin(**options):
-        config = AtdStubConfig(
-            mode="snippets", input_dir=folder, poll_s=0.05, settle_s=0.0, snippet_dir=tmp_path / "snippets", **options
-        )
-        return runner.start(AtdStubService(platform("uuv-1"), config))
-
-    return begin
+def start(start_service, tmp_path):
+    return lambda **options: start_service(
+        mode="snippets", max_in_flight=8, snippet_dir=tmp_path / "snippets", **options
+    )
 
 
-def add_file(folder, name, seed, text=""):
-    write_tiff(folder / f"{name}.tiff", np.random.default_rng(seed).integers(0, 255, (40, 60), dtype=np.uint8))
-    if text:
-        (folder / f"{name}.txt").write_text(text)
+@pytest.fixture
+def add_file(incoming):
+    """Add an image whose age is counted from its processing."""
+
+    def add(name, seed):
+        pixels = np.random.default_rng(seed).integers(0, 255, (40, 60), dtype=np.uint8)
+        write_tiff(incoming / f".{name}.tiff", pixels)
+        os.utime(incoming / f".{name}.tiff", (1e9, 1e9))
+        (incoming / f".{name}.tiff").rename(incoming / f"{name}.tiff")
+
+    return add
 
 
 def processed(service):
     return service.health().counters.get("files_processed", 0)
 
 
-def run_retention(service, now_utc_s):
-    """Apply the retention as the poll thread does."""
-    service.stopping.set()
-    service._threads[0].join()
-    service._retention_due_s = 0.0
-    service._apply_retention(now_utc_s)
-
-
-def test_old_processed_files_are_removed_by_default_and_unprocessed_ones_stay(start, folder, tmp_path):
-    service = start()
-    add_file(folder, "a", 1, "lat_deg: 56.0\nlon_deg: -5.0\n")
-    (folder / "a.tiff.done").touch()
-    (folder / "bad.tiff").write_bytes(b"not an image")
-    eventually(lambda: processed(service) == 1 and (folder / "quarantine" / "bad.tiff").exists())
-    eventually(lambda: [file.path.name for file in service._processed] == ["a.tiff"])
-    now_utc_s = time.time()
-    run_retention(service, now_utc_s + 364 * DAY_S)
-    assert (folder / "a.tiff").exists()
-    add_file(folder, "unprocessed", 2)
-    service._retention_due_s = 0.0
-    service._apply_retention(now_utc_s + 366 * DAY_S)
-    assert sorted(path.name for path in folder.iterdir()) == ["quarantine", "unprocessed.tiff"]
-    assert (folder / "quarantine" / "bad.tiff").exists()
-    assert list((tmp_path / "snippets").iterdir()) == []
-    assert service.store.state_names("file:") == ()
-    assert service.gauges()["contacts_waiting"] == 1
+def test_old_processed_files_are_removed_by_default_and_unprocessed_ones_stay(
+    start, clock, add_file, incoming, tmp_path
+):
+    service = start(settle_s=3600.0)
+    (incoming / "a.txt").write_text("lat_deg: 56.0\nlon_deg: -5.0\n")
+    add_file("a", 1)
+    add_file("unprocessed", 3)
+    (incoming / "bad.tiff").write_bytes(b"not an image")
+    for name in "a", "b", "bad":
+        (incoming / f"{name}.tiff.done").touch()
+    eventually(lambda: processed(service) == 1 and (incoming / "quarantine" / "bad.tiff").exists())
+    clock.days = 364.0
+    add_file("b", 2)  # processed later, so that it is kept for longer
+    eventually(lambda: processed(service) == 2)
+    assert (incoming / "a.tiff").exists()
+    clock.days = 366.0
+    eventually(lambda: service.health().counters.get("files_removed") == 1)
+    eventually(lambda: len(service.store.state_names("file:")) == 1)
+    left = ["b.tiff", "b.tiff.done", "bad.tiff.done", "quarantine", "unprocessed.tiff"]
+    assert sorted(path.name for path in incoming.iterdir()) == left
+    assert (incoming / "quarantine" / "bad.tiff").exists()
+    assert service.gauges()["contacts_waiting"] == 2, "what is not sent stays"
+    clock.days = 1000.0
+    eventually(lambda: not service.store.state_names("file:"))
+    eventually(lambda: not list((tmp_path / "snippets").iterdir()))
     counters = service.health().counters
-    assert (counters["files_removed"], counters["snippets_removed"]) == (1, 1)
+    assert (counters["files_removed"], counters["snippets_removed"]) == (2, 2)
 
 
-def test_oldest_processed_files_are_removed_above_the_maximum_size(start, folder):
+def test_oldest_processed_files_are_removed_above_the_maximum_size(start, clock, add_file, incoming):
     service = start(max_bytes=6000)
     for seed, name in enumerate("abc"):
-        add_file(folder, name, seed)
-        os.utime(folder / f"{name}.tiff", (1e9, 1e9))
+        add_file(name, seed)
         eventually(lambda expected=seed + 1: processed(service) == expected)
-    eventually(lambda: len(service._processed) == 3)
-    assert 3 * (folder / "a.tiff").stat().st_size > 6000
-    run_retention(service, time.time())
-    assert sorted(path.name for path in folder.iterdir()) == ["b.tiff", "c.tiff"]
+    eventually(lambda: not (incoming / "a.tiff").exists())
+    assert 3 * (incoming / "b.tiff").stat().st_size > 6000
+    assert sorted(path.name for path in incoming.iterdir()) == ["b.tiff", "c.tiff"]
     assert len(service.store.state_names("file:")) == 3
 
 
-def test_entry_of_an_older_version_starts_its_age_at_the_upgrade(start, folder):
+def test_entry_of_an_older_version_starts_its_age_at_the_upgrade(start, runner, clock, add_file, incoming):
     service = start()
-    add_file(folder, "a", 1)
-    eventually(lambda: len(service._processed) == 1)
-    service.stopping.set()
-    service._threads[0].join()
+    add_file("a", 1)
+    eventually(lambda: service.store.state_names("file:"))
     [name] = service.store.state_names("file:")
     with service.store.transaction() as tx:
         tx.put_state(name, msgpack.packb({"file": "a.tiff", "contacts": 1}))
-    now_utc_s = time.time()
-    run_retention(service, now_utc_s + 1000 * DAY_S)
-    assert (folder / "a.tiff").exists()
-    service._retention_due_s = 0.0
-    service._apply_retention(now_utc_s + 1366 * DAY_S)
-    assert not (folder / "a.tiff").exists()
-
-
-def test_link_to_itself_is_skipped(start, folder):
-    (folder / "loop.tiff").symlink_to(folder / "loop.tiff")
+    runner.stop(service)
+    clock.days = 1000.0
     service = start()
-    add_file(folder, "a", 1)
+    eventually(lambda: "processed_utc_s" in msgpack.unpackb(service.store.get_state(name) or b"\x80"))
+    assert (incoming / "a.tiff").exists()
+    clock.days = 1366.0
+    eventually(lambda: not (incoming / "a.tiff").exists())
+
+
+def test_link_to_itself_is_skipped(start, add_file, incoming):
+    (incoming / "loop.tiff").symlink_to(incoming / "loop.tiff")
+    service = start()
+    add_file("a", 1)
     eventually(lambda: processed(service) == 1)
     assert service.health().state == "ok"

@@ -7,9 +7,7 @@ from builders.common import eventually
 from builders.joined_surveys import Box, split, survey_of
 
 from sonarpost.detection.difficulty import Difficulty
-from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.seabed_history import WORST_OF_S, SeabedHistory
-from sonarpost.services.atd_stub.service import AtdStubService
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey
 
 SAND = Difficulty(5000.0, 4.0, 0.1, 0.4, 0.95)
@@ -32,36 +30,22 @@ def test_last_file_and_worst_of_the_last_hour():
     assert later["expected_pd"] == 0.95
 
 
-def test_file_of_unknown_seabed():
+def test_a_difficult_seabed_is_a_warning_and_an_unknown_one_has_no_gauges():
     history = SeabedHistory()
     history.add(ROCK, 10.0)
+    assert history.warning() == "expected Pd 31 % on this seabed; a clean result does not mean no mines"
     history.add(None, 20.0)
     assert history.gauges(20.0) == {"worst_expected_pd": 0.31}
     assert history.warning() == ""
 
 
-def test_warning_on_a_difficult_seabed():
-    history = SeabedHistory()
-    history.add(ROCK, 10.0)
-    assert history.warning() == "expected Pd 31 % on this seabed; a clean result does not mean no mines"
-
-
-@pytest.fixture
-def survey_file(tmp_path):
+def test_health_has_the_difficulty_of_the_last_file(start_service, incoming, tmp_path, lines):
     (path,) = split(tmp_path, survey_of(200, Box(100)), (0, 200))
-    return path
-
-
-def test_health_has_the_difficulty_of_the_last_file(runner, platform, survey_file, tmp_path, caplog):
-    caplog.set_level("INFO")
-    folder = tmp_path / "incoming"
-    config = AtdStubConfig(input_dir=folder, poll_s=0.02, settle_s=0.0, max_in_flight=0, confidence_threshold=1.9)
-    expected = detect_in_survey(survey_file, "0" * 64, "uuv-1", config).difficulty
+    service = start_service(confidence_threshold=1.9)
+    expected = detect_in_survey(path, "0" * 64, "uuv-1", service.config).difficulty
     assert expected is not None
-    service = runner.start(AtdStubService(platform("uuv-1"), config))
     assert not set(GAUGES) & set(service.health().gauges), "unknown before the first file"
-    folder.mkdir(exist_ok=True)
-    survey_file.rename(folder / survey_file.name)
+    path.rename(incoming / path.name)
     eventually(lambda: "expected_pd" in service.health().gauges)
     health = service.health()
     assert health.gauges["expected_pd"] == health.gauges["worst_expected_pd"] == round(expected.expected_pd, 3)
@@ -69,5 +53,5 @@ def test_health_has_the_difficulty_of_the_last_file(runner, platform, survey_fil
     assert health.gauges["ripple_strength"] == pytest.approx(expected.ripple_strength, abs=0.001)
     assert health.state == "ok", "a difficult seabed is not a failure"
     assert ("a clean result does not mean no mines" in health.detail) == (not expected.is_reliable)
-    (line,) = [record for record in caplog.records if record.message == "File processed"]
-    assert line.fields["expected_pd"] == f"{expected.expected_pd:.2f}"
+    eventually(lambda: lines("File processed"))
+    assert lines("File processed")[0]["expected_pd"] == f"{expected.expected_pd:.2f}"

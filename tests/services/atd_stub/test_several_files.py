@@ -9,27 +9,10 @@ from builders.common import eventually
 from builders.survey_oracle import tiny_survey
 from builders.surveys import make_humminbird, make_waterfall
 
-from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.service import AtdStubService
+from sonarpost.services.atd_stub import service as atd_stub
 from sonarpost.sonar.readers import recording_parts
 
 MAKERS = {"humminbird": make_humminbird, "waterfall": make_waterfall}
-
-
-@pytest.fixture
-def incoming(tmp_path):
-    folder = tmp_path / "incoming"
-    folder.mkdir()
-    return folder
-
-
-@pytest.fixture
-def start_service(runner, platform, incoming):
-    def start(**changes):
-        config = AtdStubConfig(input_dir=incoming, poll_s=0.02, settle_s=0.0).model_copy(update=changes)
-        return runner.start(AtdStubService(platform("uuv-1"), config))
-
-    return start
 
 
 @pytest.fixture(params=sorted(MAKERS))
@@ -50,54 +33,29 @@ def deposit(part, recording, incoming):
     return target
 
 
-def counter(service, name):
-    return service.health().counters.get(name, 0)
-
-
-def polled(service):
-    """Wait for two more polls."""
-    seen = []
-    original = service._process_folder
-    service._process_folder = lambda: (original(), seen.append(1))
-    eventually(lambda: len(seen) >= 3)
-    service._process_folder = original
-
-
-def test_recording_is_processed_when_all_files_exist(start_service, recording, incoming):
+def test_recording_is_processed_when_all_files_exist_and_once_under_any_name(
+    start_service, recording, incoming, counter, gauge, lines
+):
+    """The other files may arrive first."""
     service = start_service()
-    for part in recording[:-1]:
+    parts = list(reversed(recording))
+    for part in parts[:-1]:
         deposit(part, recording, incoming)
-        polled(service)
-        assert service.health().gauges["files_waiting"] == 1
-        assert counter(service, "files_processed") == counter(service, "files_quarantined") == 0
-    deposit(recording[-1], recording, incoming)
+    deposit(parts[-1], recording, incoming)
     eventually(lambda: counter(service, "files_processed") == 1)
     assert counter(service, "files_quarantined") == 0
-    eventually(lambda: service.health().gauges["files_waiting"] == 0)  # counted after the commit
-
-
-def test_other_files_may_arrive_first(start_service, recording, incoming):
-    service = start_service()
-    for part in reversed(recording):
-        deposit(part, recording, incoming)
-    eventually(lambda: counter(service, "files_processed") == 1)
-    assert counter(service, "files_quarantined") == 0
-
-
-def test_recording_is_processed_once_under_any_name(start_service, recording, incoming, tmp_path):
-    for part in recording:
-        deposit(part, recording, incoming)
-    service = start_service()
-    eventually(lambda: counter(service, "files_processed") == 1)
+    eventually(lambda: gauge(service, "files_waiting") == 0)  # counted after the commit
     again = incoming / recording[0].name.replace("line", "again", 1)
-    if len(recording) == 3:  # the DAT file names its folder
-        shutil.copytree(incoming / "line", incoming / "again")
     shutil.copyfile(recording[0], again)
-    eventually(lambda: len(service._processed) == 2)
-    assert counter(service, "files_processed") == 1
+    if len(recording) == 3:  # the DAT file names its folder, which is not there yet
+        eventually(lambda: lines("Recording waits for missing files"))
+        assert gauge(service, "files_waiting") == 1
+        shutil.copytree(incoming / "line", incoming / "again")
+    eventually(lambda: lines("File already processed"))
+    assert (counter(service, "files_processed"), counter(service, "files_quarantined")) == (1, 0)
 
 
-def test_changed_part_makes_another_recording(start_service, recording, incoming):
+def test_changed_part_makes_another_recording(start_service, recording, incoming, counter):
     for part in recording:
         deposit(part, recording, incoming)
     service = start_service()
@@ -107,7 +65,7 @@ def test_changed_part_makes_another_recording(start_service, recording, incoming
     eventually(lambda: counter(service, "files_quarantined") == 1)
 
 
-def test_all_files_of_a_bad_recording_are_moved(start_service, recording, incoming):
+def test_all_files_of_a_bad_recording_are_moved(start_service, recording, incoming, counter):
     recording[-1].write_bytes(b"not a file of a recording")
     service = start_service()
     for number in range(2):  # the second one differs, and has the same name
@@ -124,17 +82,17 @@ def test_all_files_of_a_bad_recording_are_moved(start_service, recording, incomi
         assert (folder / f"{names[0]}.reason.txt").read_text()
 
 
-def test_done_marker_completes_a_recording_with_one_side(start_service, incoming, tmp_path):
+def test_done_marker_completes_a_recording_with_one_side(start_service, incoming, counter, lines):
     path = make_humminbird(tiny_survey(40, 400), incoming)
     (incoming / "line" / "B003.SON").unlink()
     service = start_service()
-    polled(service)
+    eventually(lambda: lines("Recording waits for missing files"))
     assert counter(service, "files_processed") == 0
     (incoming / f"{path.name}.done").touch()
     eventually(lambda: counter(service, "files_processed") == 1)
 
 
-def test_files_outside_the_folder_and_of_other_recordings_stay(start_service, incoming, tmp_path):
+def test_files_outside_the_folder_and_of_other_recordings_stay(start_service, incoming, tmp_path, counter):
     """A description may name any file; only files in the folder that no other recording uses are moved."""
     make_waterfall(tiny_survey(40, 400), incoming)
     outside = tmp_path / "outside.csv"
@@ -148,10 +106,9 @@ def test_files_outside_the_folder_and_of_other_recordings_stay(start_service, in
     assert all(part.is_file() for part in recording_parts(incoming / "line.waterfall.toml"))
 
 
-def test_retention_removes_all_files(start_service, recording, incoming):
+def test_retention_removes_all_files(start_service, recording, incoming, monkeypatch):
+    monkeypatch.setattr(atd_stub, "INTERVAL_S", 0.0)
     for part in recording:
         deposit(part, recording, incoming)
-    service = start_service(retain_days=1e-9)
-    eventually(lambda: counter(service, "files_processed") == 1)
-    service._retention_due_s = 0.0
+    start_service(retain_days=1e-9)
     eventually(lambda: not list(incoming.iterdir()), what="removal")

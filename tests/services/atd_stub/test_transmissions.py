@@ -15,16 +15,14 @@ from sonarpost import keys, wire
 from sonarpost.cli.detection.transmissions import read_transmissions
 from sonarpost.delivery.store import Store
 from sonarpost.errors import DeliveryError
-from sonarpost.messages import Snippet, Transmission, Transmissions
+from sonarpost.messages import Transmission, Transmissions
 from sonarpost.modem.interface import TransmissionEnded, TransmissionStarted
-from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.services.atd_stub.service import AtdStubService
 from sonarpost.services.atd_stub.transmissions import MAX_RETAINED, RETAINED_S, SAVE_INTERVAL_S, TransmissionLog
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService
 from sonarpost.sonar.xtf_writer import write_xtf
 
-KEY, CONTACT = keys.acoustic_transmissions("uuv-1"), keys.contact_detected("uuv-1")
+KEY = keys.acoustic_transmissions("uuv-1")
 
 
 def record_of(*pairs):
@@ -91,8 +89,8 @@ def test_only_changes_are_written_and_at_most_once_a_minute(store):
     assert bench.commits == 1
 
 
-def test_a_write_that_fails_is_repeated(store):
-    bench, now_s = Bench(store), time.time()
+def test_a_write_that_fails_is_repeated(store, tmp_path):
+    bench, now_s = Bench(store, tmp_path / "transmissions.json"), time.time()
     bench.log.add(record_of((now_s - 50.0, now_s - 45.0)), now_s)
     bench.fails = True
     with pytest.raises(DeliveryError):
@@ -101,6 +99,7 @@ def test_a_write_that_fails_is_repeated(store):
     bench.fails = False
     bench.log.save(1.0)
     assert Bench(store).times == [(now_s - 50.0, now_s - 45.0)]
+    assert read_transmissions(tmp_path / "transmissions.json") == ((now_s - 50.0, now_s - 45.0),), "for the command"
 
 
 def test_retention(store):
@@ -118,38 +117,16 @@ def test_retention(store):
     assert not store.states("transmissions:")
 
 
-@pytest.mark.parametrize("damaged", [b"\xc1", b"\x01", msgpack.packb([[1.0]]), msgpack.packb([[2.0, 1.0]])])
-def test_damaged_transmissions_are_discarded_and_logged(damaged, store, caplog):
+def test_damaged_transmissions_are_discarded_and_logged(store, caplog):
+    damaged = [b"\xc1", b"\x01", msgpack.packb([[1.0]]), msgpack.packb([[2.0, 1.0]])]
     with store.transaction() as tx:
-        tx.put_state("transmissions:5", damaged)
+        for number, packed in enumerate(damaged):
+            tx.put_state(f"transmissions:{number}", packed)
     assert Bench(store).times == []
-    assert "Discarding unreadable transmissions" in caplog.text
-
-
-def test_the_file_is_read_by_the_command(store, tmp_path):
-    bench, now_s = Bench(store, tmp_path / "transmissions.json"), time.time()
-    bench.log.add(record_of((now_s - 50.0, now_s - 45.0)), now_s)
-    bench.log.save()
-    assert read_transmissions(tmp_path / "transmissions.json") == ((now_s - 50.0, now_s - 45.0),)
+    assert caplog.text.count("Discarding unreadable transmissions") == len(damaged)
 
 
 # Service
-
-
-@pytest.fixture
-def start_service(runner, platform, tmp_path):
-    (tmp_path / "incoming").mkdir(exist_ok=True)
-
-    def start(**changes):
-        config = AtdStubConfig(input_dir=tmp_path / "incoming", poll_s=0.02, settle_s=0.0, max_in_flight=0, **changes)
-        return runner.start(AtdStubService(platform("uuv-1"), config))
-
-    return start
-
-
-@pytest.fixture
-def compressor(runner):
-    return runner.peer("uuv-1", "compressor", {CONTACT: Snippet})
 
 
 NOISE = (60, 72)
@@ -157,22 +134,17 @@ NOISE = (60, 72)
 
 
 @pytest.fixture
-def put_survey(tmp_path):
-    """Deliver a survey with an object at ping 160 and the modem's noise; return the times of the noise."""
+def put_survey(tmp_path, incoming):
+    """Deliver a survey with an object at ping 160 and the modem's noise."""
 
     def put(name, started_s):
         survey = survey_of(240, Box(160), Box(66))
         offset_s = started_s - survey.pings[0].time_utc_s
         pings = tuple(replace(ping, time_utc_s=ping.time_utc_s + offset_s) for ping in survey.pings)
         write_xtf(replace(survey, pings=pings), tmp_path / name)
-        (tmp_path / name).rename(tmp_path / "incoming" / name)
-        return pings[NOISE[0]].time_utc_s, pings[NOISE[1]].time_utc_s
+        (tmp_path / name).rename(incoming / name)
 
     return put
-
-
-def counter(service, name):
-    return service.health().counters.get(name, 0)
 
 
 def known(service):
@@ -185,7 +157,7 @@ def noise_times(started_s):
     return started_s + pings[NOISE[0]].time_utc_s - first_s, started_s + pings[NOISE[1]].time_utc_s - first_s
 
 
-def test_noise_of_the_modem_is_a_contact_without_masking(start_service, compressor, put_survey):
+def test_noise_of_the_modem_is_a_contact_without_masking(start_service, compressor, put_survey, counter):
     service = start_service(mask_transmissions=False)
     put_survey("line.xtf", time.time() - 300.0)
     eventually(lambda: counter(service, "files_processed") == 1)
@@ -194,7 +166,7 @@ def test_noise_of_the_modem_is_a_contact_without_masking(start_service, compress
 
 
 def test_published_transmissions_are_masked_also_after_a_restart(
-    start_service, runner, compressor, put_survey, publish
+    start_service, runner, compressor, put_survey, publish, counter
 ):
     started_s = float(round(time.time() - 300.0))
     service = start_service()
@@ -210,7 +182,7 @@ def test_published_transmissions_are_masked_also_after_a_restart(
     assert NOISE[1] - NOISE[0] <= counter(service, "pings_masked") <= 40
 
 
-def test_a_mostly_masked_file_is_one_warning(start_service, put_survey, publish, caplog):
+def test_a_mostly_masked_file_is_one_warning(start_service, put_survey, publish, caplog, counter):
     started_s = float(round(time.time() - 300.0))
     service = start_service()
     publish(KEY, wire.encode(record_of((started_s, started_s + 200.0))))
@@ -223,28 +195,18 @@ def test_a_mostly_masked_file_is_one_warning(start_service, put_survey, publish,
     assert counter(service, "pings_masked") == 240
 
 
-@pytest.mark.parametrize(
-    "payload", [b"\xc1", msgpack.packb({"type": "transmissions", "v": 1})], ids=["bytes", "fields"]
-)
-def test_a_malformed_record_is_logged_counted_and_ignored(payload, start_service, publish, caplog):
+def test_malformed_and_hostile_records_are_logged_counted_and_ignored(start_service, publish, caplog, counter):
     service = start_service()
-    publish(KEY, payload)
-    eventually(lambda: counter(service, "transmissions_ignored") == 1)
+    everything = {"transmissions": ({"start_utc_s": 0.0, "end_utc_s": 2.5e11},)}
+    hostile = msgpack.packb(wire.unpack_map(wire.encode(record_of()), KEY) | everything)
+    for payload in (b"\xc1", msgpack.packb({"type": "transmissions", "v": 1}), hostile):
+        publish(KEY, payload)
     now_s = time.time()
     publish(KEY, wire.encode(record_of((now_s - 20.0, now_s - 15.0))))
     eventually(lambda: known(service) == 1)
+    assert counter(service, "transmissions_ignored") == 3
     assert "Ignoring malformed transmissions" in caplog.text
     assert not service.failed
-
-
-def test_a_hostile_record_cannot_mask_everything(start_service, publish):
-    service = start_service()
-    payload = wire.unpack_map(wire.encode(record_of()), KEY) | {
-        "transmissions": ({"start_utc_s": 0.0, "end_utc_s": 2.5e11},)
-    }
-    publish(KEY, msgpack.packb(payload))
-    eventually(lambda: counter(service, "transmissions_ignored") == 1)
-    assert known(service) == 0
 
 
 def test_a_late_subscriber_receives_the_transmissions_of_uuv_modem(start_service, runner, platform, modem_pair):
