@@ -82,20 +82,6 @@ class Exchange:
         raise AssertionError(f"{self.sender.waiting} items, {self.sender.unacknowledged} messages left")
 
 
-def test_100_contacts_with_previews_arrive_although_every_fifth_message_is_lost():
-    exchange = Exchange(1)
-    images = [received(n) for n in range(1, 101)]
-    decisions = [decision(f"d{n}", remark="long " * 100 if n == 3 else "") for n in range(10)]
-    for record in (*images, *decisions):
-        exchange.add(record)
-    exchange.run()
-    arrived = exchange.records
-    assert sorted(r.image_id for r in arrived if not isinstance(r, Decision)) == [i.image_id for i in images]
-    assert {r.decision_id: r for r in arrived if isinstance(r, Decision)} == {d.decision_id: d for d in decisions}
-    assert len(arrived) == 110
-    assert [r for r in arrived if r in images]  # the whole stream of 200 bytes fits
-
-
 @given(st.integers(0, 2**32), st.floats(0, 0.6), st.floats(0, 0.2), st.integers(0, 260))
 def test_every_record_arrives_once_with_any_loss_and_restarts(seed, loss, restarts, preview_bytes):
     exchange = Exchange(seed, loss, restarts, preview_bytes=preview_bytes)
@@ -109,6 +95,8 @@ def test_every_record_arrives_once_with_any_loss_and_restarts(seed, loss, restar
     names = sorted(r.decision_id if isinstance(r, Decision) else r.image_id for r in exchange.records)
     assert names == sorted([*(i.image_id for i in images), *(d.decision_id for d in decisions)])
     assert all(r in decisions for r in exchange.records if isinstance(r, Decision))
+    # The whole stream of 200 bytes fits, except where other items share the message.
+    assert preview_bytes < 220 or any(r in images for r in exchange.records)
 
 
 def test_several_contacts_share_a_message_and_decisions_go_first():

@@ -10,7 +10,7 @@ import hashlib
 import shutil
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import cast
+from types import SimpleNamespace
 
 import msgpack
 import zenoh
@@ -18,7 +18,7 @@ import zenoh
 from sonarpost import keys
 from sonarpost.delivery.inbox import Inbox
 from sonarpost.delivery.outbox import QueuePolicy, QueueSender, _NoReplyError
-from sonarpost.delivery.protocol import AckReply, watcher_origin
+from sonarpost.delivery.protocol import AckReply
 from sonarpost.delivery.records import Topic
 from sonarpost.delivery.store import Store
 from sonarpost.errors import PayloadError
@@ -26,27 +26,6 @@ from sonarpost.errors import PayloadError
 CONSUMER = "relay"
 WAIT_LIMIT = 60
 """Rounds after which all records must be delivered when no fault occurs."""
-
-
-@dataclass(frozen=True)
-class Bytes:
-    """Stands for `zenoh.ZBytes`."""
-
-    content: bytes
-
-    def to_bytes(self):
-        return self.content
-
-
-@dataclass(frozen=True)
-class Received:
-    """Stands for `zenoh.Reply` and its sample."""
-
-    payload: Bytes
-
-    @property
-    def ok(self):
-        return self
 
 
 class Handler:
@@ -59,7 +38,9 @@ class Handler:
     def try_recv(self):
         if self.timed_out:
             raise zenoh.ZError("no reply")
-        return None if self.reply is None else Received(Bytes(self.reply))
+        if self.reply is None:
+            return None
+        return SimpleNamespace(ok=SimpleNamespace(payload=zenoh.ZBytes(self.reply)))
 
 
 @dataclass(eq=False)
@@ -78,11 +59,11 @@ class SentQuery:
 
     @property
     def payload(self):
-        return Bytes(self.content)
+        return zenoh.ZBytes(self.content)
 
     @property
     def attachment(self):
-        return Bytes(self.attached)
+        return zenoh.ZBytes(self.attached)
 
     def __enter__(self):
         return self
@@ -128,7 +109,7 @@ class SteppedInbox(Inbox):
     def receive(self, queries):
         """Commit queries in one transaction and reply."""
         for query in queries:
-            self._on_query(cast(zenoh.Query, query))
+            self._on_query(query)
         while not self._messages.empty():
             messages = self._next_messages()
             self._reply(messages, self._commit(messages))
@@ -168,8 +149,7 @@ class Sending:
         self.was_restored = False
 
     def _new_sender(self):
-        session = cast(zenoh.Session, self.network)
-        return SteppedSender(session, self.store, CONSUMER, QueuePolicy(), None)
+        return SteppedSender(self.network, self.store, CONSUMER, QueuePolicy(), None)
 
     def reopen(self, path):
         """Start with another copy of the store; what was in memory is lost."""
@@ -212,8 +192,7 @@ class Delivery:
         self.serial = 0
 
     def _new_inbox(self):
-        session = cast(zenoh.Session, None)  # no key expressions are declared
-        return SteppedInbox(session, self.store, CONSUMER, (), validate, self.refused.append)
+        return SteppedInbox(None, self.store, CONSUMER, (), validate, self.refused.append)
 
     def _copy(self, store):
         self._copies += 1
@@ -350,8 +329,3 @@ def query_of(key, origin, records, settled, *, whole_bytes=0):
     attached = msgpack.packb(fields | {"origin": origin, "consumer": CONSUMER, "settled": settled})
     content = b"".join(data for _, data, _ in records)
     return SentQuery(keys.delivery_query(key, CONSUMER), content, attached)
-
-
-def origin_for_watchers(query):
-    """Return the origin that watchers receive for the records of a query."""
-    return watcher_origin(msgpack.unpackb(query.attached)["origin"])

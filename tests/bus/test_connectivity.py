@@ -18,20 +18,9 @@ def test_presence_reply_round_trip():
     assert msgpack.unpackb(reply.pack()) == {"v": 1, "platform": "shore-1", "service": "c2"}
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {},
-        {"platform": "a", "service": "b"},
-        {"v": 2, "platform": "a", "service": "b"},
-        {"v": True, "platform": "a", "service": "b"},
-        {"v": 1, "platform": 3, "service": "b"},
-        {"v": 1, "platform": "a", "service": "b" * 41},
-        {"v": 1, "platform": "", "service": "b"},
-    ],
-)
-def test_invalid_presence_reply_is_rejected(fields):
+@pytest.mark.parametrize("change", [{"v": 2}, {"v": True}, {"platform": 3}, {"service": "b" * 41}, {"platform": ""}])
+def test_invalid_presence_reply_is_rejected(change):
     with pytest.raises(PayloadError):
-        parsed(msgpack.packb(fields))
+        parsed(msgpack.packb({"v": 1, "platform": "a", "service": "b"} | change))
     with pytest.raises(PayloadError):
         parsed(b"junk")

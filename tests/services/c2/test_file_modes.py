@@ -6,14 +6,12 @@ import subprocess
 import sys
 
 from builders.common import eventually
-from builders.records import decision_record, reconstructed_image
+from builders.records import decision_record
+from builders.shore import image, relayed
 
-from sonarpost import keys, wire
+from sonarpost import keys
 from sonarpost.cli.main import main
 from sonarpost.delivery.store import Store
-from sonarpost.messages import Pixels, Relayed
-
-VESSEL = "vessel-1"
 
 
 def modes(folder):
@@ -39,17 +37,8 @@ def test_files_of_c2_are_readable_by_its_user_only(runner, platform, tmp_path, c
     command = [sys.executable, "-m", "sonarpost.services.c2", "--config", str(config)]
     process = subprocess.Popen(command, umask=0o022)
     try:
-        relay = runner.peer(VESSEL, "relay")
-        picture = Pixels(height_px=2, width_px=3, bits=8, data=bytes(6))
-        image = reconstructed_image(picture, vessel_id=VESSEL)
-        for key, record in (
-            (keys.image_reconstructed(VESSEL), image),
-            (keys.contact_decision(VESSEL), decision_record()),
-        ):
-            payload = wire.encode(record)
-            relay.send(
-                keys.shore_inbox(VESSEL), "c2", Relayed(vessel_id=VESSEL, key=key, payload=payload, relayed_utc_s=5.0)
-            )
+        relay = runner.peer("vessel-1", "relay")
+        relay.send(keys.shore_inbox("vessel-1"), "c2", relayed(image()), relayed(decision_record()))
         eventually(lambda: len(list(out.glob("*/*.json"))) == 1 and len(list(out.glob("*/decisions/*.json"))) == 1)
         eventually(lambda: relay.store.outbox_depth() == 0)
         names = assert_private(tmp_path / "deep")

@@ -5,12 +5,13 @@ import hashlib
 import pytest
 from builders.common import eventually
 from builders.records import reconstructed_image
+from builders.shore import relayed
 from builders.small_disk import SmallDisk
 
-from sonarpost import keys, wire
+from sonarpost import keys
 from sonarpost.delivery.protocol import CHUNK_BYTES, AckReply, attachment
 from sonarpost.delivery.records import OutboxItem
-from sonarpost.messages import Pixels, Relayed
+from sonarpost.messages import Pixels
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 
@@ -53,11 +54,8 @@ def test_incomplete_records_are_deleted_when_the_disk_reserve_is_reached(
     begin_records(client, "vessel-2", 5)
     picture = Pixels.from_array(texture(seed=1))
     relay = runner.peer("vessel-1", "relay")
-    for number in range(20):
-        image = reconstructed_image(picture, vessel_id="vessel-1", image_id=f"{number:04X}")
-        key = keys.image_reconstructed("vessel-1")
-        envelope = Relayed(vessel_id="vessel-1", key=key, payload=wire.encode(image), relayed_utc_s=5.0)
-        relay.send(keys.shore_inbox("vessel-1"), "c2", envelope)
+    images = [reconstructed_image(picture, image_id=f"{number:04X}") for number in range(20)]
+    relay.send(keys.shore_inbox("vessel-1"), "c2", *map(relayed, images))
     eventually(lambda: service.health().counters.get("images_stored", 0) == 20)
     (stored,) = service.store._query("SELECT COALESCE(SUM(has), 0) FROM partial")[0]
     assert stored <= 2 * SIZE

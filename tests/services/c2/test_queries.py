@@ -67,10 +67,13 @@ class Shore:
     def handled(self):
         return int(self.service.health().counters.get("records_handled", 0))
 
+    def put(self, key, record):
+        self.client.put(key, wire.encode(record), congestion_control=zenoh.CongestionControl.BLOCK)
+
     def accept(self, *records):
         before = self.handled()
         for record in records:
-            self.client.put(keys.shore_inbox(record.vessel_id), wire.encode(relayed(record)))
+            self.put(keys.shore_inbox(record.vessel_id), relayed(record))
         eventually(lambda: self.handled() == before + len(records), what="acceptance")
 
     def replies(self, selector):
@@ -237,7 +240,7 @@ def test_invalid_query_gets_one_error(shore):
 def test_tasking_states_are_all_in_order_or_the_latest(shore, runner):
     fields = {"vehicle_id": "uuv-1", "image_id": "0001", "image_version": 1, "author": "expert", "advised_utc_s": 2.0}
     advice = Advice(advice_id="a-1", vessel_id="vessel-1", **fields, verdict="unsure")
-    shore.client.put(keys.tasking_advice("vessel-1"), wire.encode(advice))
+    shore.put(keys.tasking_advice("vessel-1"), advice)
     selector = keys.tasking_state_all()
     eventually(lambda: shore.names(selector) == ["tasking_state"])
     runner.peer("vessel-1", "relay", {keys.advice("vessel-1"): Advice})
@@ -486,6 +489,6 @@ def test_journal_that_cannot_be_written_degrades_c2_until_it_can(shore, monkeypa
 
     with monkeypatch.context() as patch:
         patch.setattr(Journal, "append_dated", full)
-        shore.client.put(keys.shore_inbox("vessel-1"), wire.encode(relayed(image("0001"))))
+        shore.put(keys.shore_inbox("vessel-1"), relayed(image("0001")))
         eventually(lambda: shore.service.health().state == "degraded")
     eventually(lambda: shore.names(CONTACTS) == ["0001.1"])
