@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from builders.console import console, fast_password_hashes, make_console, users_file
+from builders.console import Console, console, contact_ids, fast_password_hashes, make_console, users_file
 from playwright.sync_api import (
     Browser,
     BrowserContext,
@@ -20,7 +20,6 @@ from playwright.sync_api import (
     sync_playwright,
 )
 
-from sonarpost.services.console.store.users import Users
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 __all__ = ["console", "fast_password_hashes", "make_console", "users_file"]
@@ -39,57 +38,79 @@ BROWSER_MESSAGES = (
     "An unknown error occurred when fetching the script.",
 )
 """Parts of messages of browsers that are no errors of the page."""
-FIREFOX_FILES = ("test_decisions.py", "test_known_objects.py", "test_page.py", "test_requests.py", "test_start.py")
-"""Files that run in Firefox too; with SONARPOST_FIREFOX=all, every file does."""
+
+
+class Browsers:
+    """Playwright and its browsers: started at their first use, closed after the last test of this folder in a row."""
+
+    def __init__(self) -> None:
+        self._playwright: Playwright | None = None
+        self._browsers: dict[str, Browser] = {}
+
+    def get(self, name: str) -> Browser:
+        if name not in self._browsers:
+            self._playwright = self._playwright or sync_playwright().start()
+            self._browsers[name] = self._launch(self._playwright, name)
+        return self._browsers[name]
+
+    def _launch(self, playwright: Playwright, name: str) -> Browser:
+        found = (shutil.which(command) for command in COMMANDS[name])
+        chosen = os.environ.get(f"SONARPOST_{name.upper()}")
+        path = chosen if chosen not in (None, "", "all") else next(filter(None, found), None)
+        if path is None:
+            pytest.skip(f"no {name}: apt-get install {COMMANDS[name][-1]}, or set SONARPOST_{name.upper()}")
+        if name == "firefox":
+            return playwright.firefox.launch(channel="moz-firefox", executable_path=path)
+        # Chromium's sandbox does not run as root, for example in containers.
+        arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
+        # Only the local host can be resolved.
+        arguments += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
+        return playwright.chromium.launch(executable_path=path, args=arguments)
+
+    def close(self) -> None:
+        for browser in self._browsers.values():
+            browser.close()
+        self._browsers = {}
+        if self._playwright is not None:
+            # Until then, its event loop runs in this thread, and other tests cannot start one.
+            self._playwright.stop()
+        self._playwright = None
+
+
+BROWSERS = Browsers()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
+    """Close the browsers before a test of another folder."""
+    yield
+    if nextitem is None or nextitem.path.parent != item.path.parent:
+        BROWSERS.close()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "firefox: runs in Firefox too; with SONARPOST_FIREFOX=all, every test does")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip tests that Firefox cannot run, and leave out those of files that are not in `FIREFOX_FILES`."""
-
-    def in_firefox(item: pytest.Item) -> bool:
-        parameters = getattr(item, "callspec", None)
-        return parameters is not None and parameters.params.get("browser") == "firefox"
-
-    for item in items:
-        chromium_only = item.get_closest_marker("chromium_only")
-        if chromium_only is not None and in_firefox(item):
-            item.add_marker(pytest.mark.skip(reason=chromium_only.args[0]))
-    if os.environ.get("SONARPOST_FIREFOX") == "all":
-        return
+    """Leave out what does not run in Firefox: tests that cannot, and those without the mark `firefox`."""
 
     def is_left_out(item: pytest.Item) -> bool:
-        return in_firefox(item) and item.path.name not in FIREFOX_FILES
+        parameters = getattr(item, "callspec", None)
+        if parameters is None or parameters.params.get("browser") != "firefox":
+            return False
+        if item.get_closest_marker("chromium_only") is not None:
+            return True
+        return os.environ.get("SONARPOST_FIREFOX") != "all" and item.get_closest_marker("firefox") is None
 
     left_out = [item for item in items if is_left_out(item)]
     config.hook.pytest_deselected(items=left_out)
     items[:] = [item for item in items if not is_left_out(item)]
 
 
-@pytest.fixture(scope="module")
-def playwright() -> Iterator[Playwright]:
-    with sync_playwright() as playwright:
-        yield playwright
-
-
-@pytest.fixture(scope="module", params=["chromium", "firefox"])
-def browser(request: pytest.FixtureRequest, playwright: Playwright) -> Iterator[Browser]:
-    """Each browser, one for the tests of a file."""
-    name = request.param
-    found = (shutil.which(command) for command in COMMANDS[name])
-    chosen = os.environ.get(f"SONARPOST_{name.upper()}")
-    path = chosen if chosen not in (None, "", "all") else next(filter(None, found), None)
-    if path is None:
-        pytest.skip(f"no {name}: apt-get install {COMMANDS[name][-1]}, or set SONARPOST_{name.upper()}")
-    if name == "firefox":
-        browser = playwright.firefox.launch(channel="moz-firefox", executable_path=path)
-    else:
-        # Chromium's sandbox does not run as root, for example in containers.
-        arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
-        # Only the local host can be resolved.
-        arguments += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
-        browser = playwright.chromium.launch(executable_path=path, args=arguments)
-    yield browser
-    browser.close()
+@pytest.fixture(params=["chromium", "firefox"])
+def browser(request: pytest.FixtureRequest) -> Browser:
+    return BROWSERS.get(request.param)
 
 
 class Visit:
@@ -138,6 +159,19 @@ class Visit:
         """Wait until a contact and its image are displayed."""
         self.until("id => document.querySelector('.heading h2')?.textContent.endsWith(id)", image_id)
         self.until("id => document.querySelector('canvas').dataset.shows?.includes(`.${id} `)", image_id)
+
+    def resize(self, width: int, height: int) -> None:
+        self.page.set_viewport_size({"width": width, "height": height})
+        self.until("width => innerWidth === width", width)
+        self.settle()
+
+    def settle(self) -> None:
+        """Wait for two frames, in which the observers of sizes are called."""
+        self.page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+    def is_firefox(self) -> bool:
+        browser = self.page.context.browser
+        return browser is not None and browser.browser_type.name == "firefox"
 
     def pixels(self, selector: str = ".stage canvas") -> int:
         """Return how many pixels of a canvas differ from its first one."""
@@ -193,10 +227,10 @@ def visit(browser: Browser) -> Iterator[Callable[..., Visit]]:
 class Served:
     """A web server with a console, without Zenoh. Tests store records in its state."""
 
-    def __init__(self, console: Any, visit: Callable[..., Visit]) -> None:
+    def __init__(self, console: Console, visit: Callable[..., Visit]) -> None:
         self.console = console
         self.state = console.state
-        self.users: Users = console.users
+        self.users = console.users
         self._visit = visit
         self._app = console.app
         self._server = WebServer(self._app.asgi, "127.0.0.1", 0)
@@ -206,6 +240,17 @@ class Served:
     def visit(self, user: str = "anna", **options: Any) -> Visit:
         """Open the page with a session of a user; without a session for an empty name."""
         return self._visit(self.address, self.users.start_session(user).token if user else "", **options)
+
+    def contact(self, image_id: str = "00A7") -> Any:
+        """The contact of an image, with its decisions, measurements and requests."""
+        return self.state.contact_detail(contact_ids(self.state)[image_id])
+
+    def decisions(self, image_id: str) -> Any:
+        return self.contact(image_id)["decisions"]
+
+    def sent(self, kind: type) -> list[Any]:
+        """Records of a kind that wait to be sent."""
+        return [item.record for item in self.state.unsent_records() if isinstance(item.record, kind)]
 
     def stop(self) -> None:
         self._app.stop()

@@ -3,65 +3,46 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from builders.common import eventually
-from builders.console import FIRST_UTC_S, image_record
+from builders.console import FIRST_UTC_S, downlink_state, image_record, partial_record, with_pixels
 
 from sonarpost.codec.region import RegionBox
-from sonarpost.messages import Command, DownlinkState, Pixels
+from sonarpost.messages import Command
 
-ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
 LARGE = {"width": 1920, "height": 1080}
+SELECTED = '[data-tool="layer-{}"][aria-pressed="true"]'
 
 
-def v1_record(version: int, received: int, *, complete: bool = True, image_id: str = "00A7", **fields: Any) -> Any:
-    """A version as the v1 link delivers it."""
-    record = image_record(image_id, version, **fields)
-    changes = {
-        "complete": complete,
-        "bytes_received": received,
-        "bytes_total": received if complete else 0,
-        "frames_received": 0,
-        "despeckle_strength": 1.0,
-    }
-    return record.model_copy(update=changes)
+def sent_record(version, received):
+    return partial_record("00A7", version, received, complete=True)
 
 
-def wider_record(version: int = 1, *, complete: bool = True) -> Any:
+def wider_record():
     fields = {"first_utc_s": FIRST_UTC_S + 60, "time_utc_s": FIRST_UTC_S - 100}
-    sizes = {"pixel_along_m": 0.2, "pixel_across_m": 0.1}
-    return v1_record(version, 300, complete=complete, image_id="00A9", **fields, **sizes)
+    return partial_record("00A9", 1, 300, complete=True, pixel_along_m=0.2, pixel_across_m=0.1, **fields)
 
 
-def with_pixels(record: Any, pixels: npt.NDArray[np.uint8]) -> Any:
-    picture = Pixels.from_array(pixels)
-    return record.model_copy(update={"picture": picture, "picture_sha256": picture.sha256})
-
-
-def mean_grey(visit: Any, left: float, top: float, right: float, bottom: float) -> float:
+def mean_grey(visit, left, top, right, bottom):
     """Mean grey level of the canvas in a rectangle, in CSS pixels."""
-    return float(
-        visit.page.evaluate(
-            """([left, top, right, bottom]) => {
-              const ratio = devicePixelRatio || 1;
-              const copy = new OffscreenCanvas((right - left) * ratio, (bottom - top) * ratio);
-              const context = copy.getContext('2d', {willReadFrequently: true});
-              context.drawImage(document.querySelector('.stage canvas'), -left * ratio, -top * ratio);
-              const pixels = context.getImageData(0, 0, copy.width, copy.height).data;
-              let sum = 0;
-              for (let i = 0; i < pixels.length; i += 4) sum += pixels[i];
-              return (4 * sum) / pixels.length;
-            }""",
-            [left, top, right, bottom],
-        )
+    return visit.page.evaluate(
+        """([left, top, right, bottom]) => {
+          const ratio = devicePixelRatio || 1;
+          const copy = new OffscreenCanvas((right - left) * ratio, (bottom - top) * ratio);
+          const context = copy.getContext('2d', {willReadFrequently: true});
+          context.drawImage(document.querySelector('.stage canvas'), -left * ratio, -top * ratio);
+          const pixels = context.getImageData(0, 0, copy.width, copy.height).data;
+          let sum = 0;
+          for (let i = 0; i < pixels.length; i += 4) sum += pixels[i];
+          return (4 * sum) / pixels.length;
+        }""",
+        [left, top, right, bottom],
     )
 
 
-def outline(visit: Any) -> tuple[float, float, float, float]:
+def outline(visit):
     """Left, top, right and bottom of the only outline on the canvas, in CSS pixels."""
     corners = json.loads(visit.page.locator(".stage canvas").first.get_attribute("data-outlines"))
     assert len(corners) == 4
@@ -69,77 +50,45 @@ def outline(visit: Any) -> tuple[float, float, float, float]:
     return left, top, right, bottom
 
 
-def shows_layer(visit: Any, layer: str) -> None:
-    visit.wait(f'[data-tool="layer-{layer}"][aria-pressed="true"]')
+def shows_layer(visit, layer):
+    visit.wait(SELECTED.format(layer))
     visit.until("layer => document.querySelector('canvas').dataset.shows.endsWith(` ${layer}`)", layer)
 
 
-def downlink(served: Any, state: str, reason: str = "") -> None:
-    [request, *_] = served.state.contact_detail(ID)["requests"]
-    served.state.apply_downlink_state(
-        DownlinkState(
-            vessel_id="vessel-1",
-            vehicle_id="uuv-1",
-            kind=request["kind"],
-            record_id=request["command_id"],
-            state=state,
-            times_sent=2,
-            expires_utc_s=served.state.clock() + 3600,
-            changed_utc_s=served.state.clock(),
-            reason=reason,
-        )
-    )
-
-
 @pytest.fixture
-def v1_console(serve: Any) -> Any:
+def v1_page(serve):
+    """A console with two versions of a contact, as the v1 link delivers them, and its page."""
     served = serve(assumed_rate=1)
-    served.state.store_image(v1_record(1, 30, complete=False))
-    served.state.store_image(v1_record(2, 131))
-    return served
+    served.state.store_image(partial_record())
+    served.state.store_image(sent_record(2, 131))
 
+    def downlink(state, reason=""):
+        request, now = served.contact()["requests"][0], served.state.clock()
+        changes = {"times_sent": 2, "reason": reason}
+        served.state.apply_downlink_state(downlink_state(request["kind"], request["command_id"], state, now, **changes))
 
-def test_integrity_line_states_bytes_and_resolution(v1_console: Any) -> None:
-    visit = v1_console.visit(viewport=LARGE)
+    served.downlink = downlink
+    visit = served.visit(viewport=LARGE)
     visit.wait_for_contact("00A7")
+    return served, visit
+
+
+def test_integrity_line_and_newer_versions_that_do_not_move_the_image(v1_page):
+    served, visit = v1_page
     strip = visit.text(".strip").replace("\u202f", " ")
     assert "sent 131 B · sharp to ≈" in strip
     assert "Lossy: detail below ≈" in strip
     assert "shared" in strip
     for untrue in ("0.0", "frames", "100", "synthetic"):
         assert untrue not in strip
-    visit.page.locator(".versions button").first.click()
+    visit.press("[")
+    visit.wait('.versions [data-version="1"][aria-pressed="true"]')
     visit.wait(".strip >> text=Preview: more detail is on its way.")
     assert "preview 30 B" in visit.text(".strip").replace("\u202f", " ")
     assert "%" not in visit.text(".row .share") + visit.text(".versions")
-
-
-def test_row_of_the_queue_names_the_preview(serve: Any) -> None:
-    served = serve()
-    served.state.store_image(v1_record(1, 30, complete=False))
-    visit = served.visit(viewport=LARGE)
-    assert visit.text(".row .share").replace("\u202f", " ") == "preview 30 B"
-
-
-def test_codebook_texture_is_named(serve: Any) -> None:
-    served = serve()
-    served.state.store_image(image_record().model_copy(update={"codec": "vq"}))
-    visit = served.visit(viewport=LARGE)
-    visit.wait_for_contact("00A7")
-    strip = visit.text(".strip")
-    assert "tiles:" in strip
-    assert "Texture from a codebook; edges to ± 10 px." in strip
-    assert visit.text('[data-tool="layer-raw"]') == "tiles"
-
-
-def test_newer_version_is_a_badge_and_does_not_move_the_image(v1_console: Any) -> None:
-    visit = v1_console.visit()
-    visit.wait_for_contact("00A7")
-    visit.press("[")
-    visit.wait('.versions [data-version="1"][aria-pressed="true"]')
     before = visit.page.locator(".stage").bounding_box()
     for version, received in ((3, 314), (4, 629)):
-        v1_console.state.store_image(v1_record(version, received))
+        served.state.store_image(sent_record(version, received))
     visit.wait('.versions [data-version="4"] .newer')
     assert visit.page.locator(".stage").bounding_box() == before
     assert visit.page.locator(".versions > span").count() == 0
@@ -148,9 +97,22 @@ def test_newer_version_is_a_badge_and_does_not_move_the_image(v1_console: Any) -
     assert visit.page.locator(".stage").bounding_box() == before
 
 
-def test_request_with_the_mouse_runs_from_order_to_arrival(v1_console: Any) -> None:
-    visit = v1_console.visit(viewport=LARGE)
+def test_codebook_texture_is_named_and_a_vessel_without_downlink_shows_no_buttons(serve):
+    served = serve(command_consumers=())
+    served.state.store_image(image_record().model_copy(update={"codec": "vq"}))
+    visit = served.visit(viewport=LARGE)
     visit.wait_for_contact("00A7")
+    strip = visit.text(".strip")
+    assert "tiles:" in strip
+    assert "Texture from a codebook; edges to ± 10 px." in strip
+    assert visit.text('[data-tool="layer-raw"]') == "tiles"
+    visit.wait(".request-buttons >> text=This vessel sends no requests")
+    assert visit.page.locator("[data-request]").count() == 0
+
+
+@pytest.mark.firefox
+def test_request_runs_from_order_to_arrival_or_refusal(v1_page):
+    served, visit = v1_page
     button = visit.page.locator('[data-request="refine"]')
     assert button.inner_text().startswith("Sharper")
     assert button.inner_text().endswith("s")  # its cost
@@ -158,110 +120,80 @@ def test_request_with_the_mouse_runs_from_order_to_arrival(v1_console: Any) -> N
     visit.wait(".request-states >> text=ordered")
     assert visit.page.locator("dialog").count() == 0
     assert button.is_disabled()
-    downlink(v1_console, "confirmed")
+    served.downlink("confirmed")
     visit.wait(".request-states >> text=accepted by the vehicle; answer pending; not before")
-    v1_console.state.store_image(v1_record(3, 196, complete=False))
+    served.state.store_image(partial_record("00A7", 3, 196))
     visit.wait(".request-states >> text=arriving 50")
-    v1_console.state.store_image(v1_record(4, 262))
+    served.state.store_image(sent_record(4, 262))
     visit.wait(".request-states >> text=arrived: v4 (+131")
     visit.until("() => !document.querySelector('[data-request=refine]').disabled")
     assert "refined 262" in visit.text(".strip")
-
-
-def test_request_on_a_phone(v1_console: Any) -> None:
-    visit = v1_console.visit(viewport={"width": 390, "height": 844})
-    visit.wait_for_contact("00A7")
-    visit.page.locator(".request-menu").click()
-    visit.wait("dialog .costs")
-    visit.page.locator('dialog [data-action="send"]').click()
-    visit.until("() => !document.querySelector('dialog')")
-    # The dialog closes before the request is stored.
-    eventually(
-        lambda: [one["kind"] for one in v1_console.state.contact_detail(ID)["requests"]] == ["refine"],
-        what="the request",
-    )
-
-
-def test_request_with_keys(v1_console: Any) -> None:
-    visit = v1_console.visit(viewport=LARGE)
-    visit.wait_for_contact("00A7")
+    # Another kind with the keyboard; the vehicle does not support it, and it is not offered again.
     visit.page.locator('[data-request="revisit"]').focus()
     visit.press("Enter")
     visit.wait(".request-states >> text=after the vehicle has passed the position")
-
-
-def test_costly_request_is_confirmed(serve: Any) -> None:
-    served = serve()  # no rate is known
-    served.state.store_image(v1_record(1, 131))
-    visit = served.visit(viewport=LARGE)
-    visit.wait_for_contact("00A7")
-    visit.page.locator('[data-request="refine"]').click()
-    visit.wait("dialog >> text=The cost is not known")
-    visit.press("Escape")
-    assert served.state.contact_detail(ID)["requests"] == []
-
-
-def test_kind_that_the_vehicle_does_not_support_is_not_offered(v1_console: Any) -> None:
-    visit = v1_console.visit(viewport=LARGE)
-    visit.wait_for_contact("00A7")
-    visit.page.locator('[data-request="revisit"]').click()
-    visit.wait(".request-states >> text=ordered")
-    downlink(v1_console, "refused", "unsupported")
+    served.downlink("refused", "unsupported")
     visit.wait(".request-buttons >> text=Second pass: uuv-1 cannot do this")
     visit.wait(".request-states >> text=uuv-1 cannot do this (refused, 2 tries)")
     assert visit.page.locator('[data-request="revisit"]').count() == 0
 
 
-def test_vessel_without_downlink_shows_no_buttons(serve: Any) -> None:
-    served = serve(command_consumers=())
-    served.state.store_image(v1_record(1, 131))
+def test_request_of_unknown_cost_is_confirmed_and_a_phone_has_a_menu(served):
+    served.state.store_image(sent_record(1, 131))  # no rate is known
     visit = served.visit(viewport=LARGE)
-    visit.wait(".request-buttons >> text=This vessel sends no requests")
-    assert visit.page.locator("[data-request]").count() == 0
-
-
-def test_observer_has_no_request_buttons(v1_console: Any) -> None:
-    visit = v1_console.visit("watch", viewport=LARGE)
     visit.wait_for_contact("00A7")
+    visit.page.locator('[data-request="refine"]').click()
+    visit.wait("dialog >> text=The cost is not known")
+    visit.press("Escape")
+    visit.until("() => !document.querySelector('dialog')")
+    assert served.contact()["requests"] == []
+    visit.resize(390, 844)
+    visit.page.locator(".request-menu").click()
+    visit.wait("dialog .costs")
+    visit.page.locator('dialog [data-action="send"]').click()
+    visit.until("() => !document.querySelector('dialog')")
+    # The dialog closes before the request is stored.
+    eventually(lambda: [one["kind"] for one in served.contact()["requests"]] == ["refine"], what="the request")
+
+
+def test_observer_sees_the_preview_and_no_request_buttons(served):
+    served.state.store_image(partial_record())
+    visit = served.visit("watch", viewport=LARGE)
+    visit.wait_for_contact("00A7")
+    assert visit.text(".row .share").replace("\u202f", " ") == "preview 30 B"
     assert not visit.page.locator(".requests").is_visible()
 
 
-def test_wider_view_is_a_layer_of_its_contact(v1_console: Any) -> None:
-    visit = v1_console.visit(viewport=LARGE)
-    visit.wait_for_contact("00A7")
+@pytest.mark.firefox
+def test_wider_view_is_a_layer_of_its_contact(v1_page):
+    served, visit = v1_page
     visit.page.locator('[data-request="wider"]').click()
     visit.wait(".request-states >> text=ordered")
-    v1_console.state.store_image(wider_record())
+    served.state.store_image(wider_record())
     visit.wait(".request-states >> text=arrived: wider view (+300")
     assert visit.page.locator(".row").count() == 1
     assert visit.page.locator('[data-tool="layer-wider"]').count() == 1
     visit.press("-")  # zooming out of the whole image continues into the wider image
-    visit.wait('[data-tool="layer-wider"][aria-pressed="true"]')
-    visit.until("() => document.querySelector('canvas').dataset.shows.endsWith(' wider')")
+    shows_layer(visit, "wider")
     assert visit.pixels() > 1000
     visit.wait(".strip >> text=wider view:")
     assert visit.page.locator('[data-tool="measure"]').get_attribute("aria-disabled") == "true"
     visit.press("e")
-    visit.wait('[data-tool="layer-raw"][aria-pressed="true"]')
-
-
-def test_wheel_continues_into_the_wider_view(v1_console: Any) -> None:
-    v1_console.state.store_image(wider_record())
-    visit = v1_console.visit(viewport=LARGE)
-    visit.wait_for_contact("00A7")
+    shows_layer(visit, "raw")
     visit.page.locator(".stage canvas").first.hover()
     visit.page.mouse.wheel(0, 100)
-    visit.wait('[data-tool="layer-wider"][aria-pressed="true"]')
+    visit.wait(SELECTED.format("wider"))
 
 
-def test_wider_view_surrounds_the_image_at_its_place(serve: Any) -> None:
+@pytest.mark.firefox
+def test_wider_view_surrounds_the_image_at_its_place(serve):
     """The wider image is darker than the contact's image here, so that the latter can be told apart inside it."""
     blocks = np.random.default_rng(3).integers(100, 250, (20, 30))
     own = np.kron(blocks, np.ones((2, 2))).astype(np.uint8)
     surroundings = np.full((40, 60), 20, np.uint8)
     surroundings[6:26, 20:50] = blocks // 5
     served = serve(assumed_rate=1)
-    served.state.store_image(with_pixels(v1_record(1, 131), own))
+    served.state.store_image(with_pixels(sent_record(1, 131), own))
     served.state.store_image(with_pixels(wider_record(), surroundings))
     visit = served.visit(viewport=LARGE)
     visit.wait_for_contact("00A7")
@@ -281,11 +213,12 @@ def test_wider_view_surrounds_the_image_at_its_place(serve: Any) -> None:
         assert top < y < bottom
 
 
-def test_region_is_drawn_at_its_place(serve: Any) -> None:
+@pytest.mark.firefox
+def test_region_is_drawn_at_its_place(serve):
     served = serve(assumed_rate=1)
     whole = np.full((40, 60), 30, np.uint8)
     whole[:3] = 220
-    served.state.store_image(with_pixels(v1_record(1, 131), whole))
+    served.state.store_image(with_pixels(sent_record(1, 131), whole))
     visit = served.visit(viewport=LARGE)
     visit.wait_for_contact("00A7")
     visit.press("7")
@@ -302,14 +235,15 @@ def test_region_is_drawn_at_its_place(serve: Any) -> None:
     visit.page.get_by_role("dialog").get_by_text("smallest detail").wait_for()
     visit.page.get_by_role("button", name="Send request").click()
 
-    def commands() -> list[Command]:
-        return [item.record for item in served.state.unsent_records() if isinstance(item.record, Command)]
-
-    eventually(lambda: len(commands()) == 1, what="the request")
-    [command] = commands()
+    eventually(lambda: len(served.sent(Command)) == 1, what="the request")
+    [command] = served.sent(Command)
+    assert (command.kind, command.stream_bytes) == ("region", 192)
+    # The box begins right of and below the middle.
+    assert command.box[0] >= 16
+    assert command.box[1] >= 16
     top_px, left_px, bottom_px, right_px = RegionBox(*command.box).pixels(40, 60)
     part = with_pixels(
-        v1_record(1, 96, image_id="00A9", first_utc_s=FIRST_UTC_S + 60, time_utc_s=FIRST_UTC_S - 100),
+        partial_record("00A9", 1, 96, complete=True, first_utc_s=FIRST_UTC_S + 60, time_utc_s=FIRST_UTC_S - 100),
         np.full((bottom_px - top_px, right_px - left_px), 220, np.uint8),
     )
     served.state.store_image(part)
