@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -50,6 +50,8 @@ class Router:
             env=environment if zenoh_log is None else {**environment, "RUST_LOG": zenoh_log},
         )
         self.lines: list[str] = []
+        self.first_line = 0
+        """First line of the present test."""
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
@@ -59,24 +61,25 @@ class Router:
             self.lines.append(line)
 
     def logged(self, *words: str) -> bool:
-        return any(all(word in line for word in words) for line in list(self.lines))
+        """Return whether a line since the begin of the present test has these words."""
+        return any(all(word in line for word in words) for line in self.lines[self.first_line :])
 
     def wait_for(self, *words: str) -> None:
-        deadline = time.monotonic() + 20
-        while not self.logged(*words):
-            if time.monotonic() > deadline or (self.process.poll() is not None and not self._thread.is_alive()):
-                pytest.fail(f"the router did not log {words}:\n{''.join(self.lines)}")
-            time.sleep(0.01)
+        def logged_or_over() -> bool:
+            return self.logged(*words) or (self.process.poll() is not None and not self._thread.is_alive())
+
+        eventually(logged_or_over, what=f"{words} in the log of the router")
+        assert self.logged(*words), f"the router did not log {words}:\n{''.join(self.lines)}"
 
     def denied(self) -> list[tuple[str, str, str]]:
-        """Return (peer, message, key) of every denied incoming message; all empty for an oversized one.
+        """Return (peer, message, key) of every incoming message denied in this test; all empty for an oversized one.
 
         Zenoh logs a decision for each message, some ahead of time, and then that a message was intercepted.
         """
         names: dict[str, str] = {}
         last: dict[str, tuple[str, str, str]] = {}
         found = []
-        for line in list(self.lines):
+        for number, line in enumerate(list(self.lines)):
             if match := _DECISION.match(line):
                 if name := re.search(r"CertCommonName\(([^()]*)\)", line):
                     names[match["zid"]] = name[1]
@@ -84,24 +87,20 @@ class Router:
                 denial = (names.get(match["zid"], ""), match["message"], match["key"]) if match["no"] else ("", "", "")
                 last[match["thread"]] = ("", "outgoing", "") if outgoing else denial
             elif match := _INTERCEPTED.match(line):
-                found.append(last.pop(match["thread"], ("", "", "")))
+                denial = last.pop(match["thread"], ("", "", ""))
+                found += [denial] if number >= self.first_line else []
         return [denial for denial in found if denial[1] != "outgoing"]
 
     def wait_for_denial(self, peer: str, message: str, key: str) -> None:
         def denied() -> bool:
             return any(p == peer and message in m and key in k for p, m, k in self.denied())
 
-        eventually(denied, timeout_s=120, what=f"denial of {message} {key} from {peer}")
+        eventually(denied, what=f"denial of {message} {key} from {peer}")
 
     def stop(self) -> None:
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGTERM)
-            try:
-                self.process.wait(10)
-            except subprocess.TimeoutExpired:
-                self.process.kill()
-                self.process.wait()
-        self._thread.join(5)
+        self.process.terminate()
+        self.process.wait()
+        self._thread.join()
         assert self.process.stderr is not None
         self.process.stderr.close()
 
@@ -152,8 +151,8 @@ def shifted(now_days: float) -> Callable[[], float]:
     return lambda: time.time() + now_days * DAY_S
 
 
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+@contextmanager
+def _new_world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     folder = tmp_path_factory.mktemp("fleet")
     fleet = Fleet.init(folder / "pki", "test")
     folders = {
@@ -200,6 +199,28 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
             router.stop()
 
 
+@pytest.fixture(scope="session")
+def shared_world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    with _new_world(tmp_path_factory) as made:
+        made.shore.wait_for("Peer connected", "peer=vessel-1")
+        yield made
+
+
+@pytest.fixture
+def world(shared_world: World) -> World:
+    """The world of all tests; what its routers log is that of this test."""
+    for router in shared_world.routers.values():
+        router.first_line = len(router.lines)
+    return shared_world
+
+
+@pytest.fixture
+def own_world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """A world whose routers and certificates a test changes."""
+    with _new_world(tmp_path_factory) as made:
+        yield made
+
+
 @pytest.fixture
 def shore_session(world: World) -> Iterator[zenoh.Session]:
     """Session of a service at the shore's router."""
@@ -211,7 +232,6 @@ def shore_session(world: World) -> Iterator[zenoh.Session]:
 @pytest.fixture
 def vessel_session(world: World) -> Iterator[zenoh.Session]:
     """Session of a service at the vessel's router, which is linked to the shore's."""
-    world.shore.wait_for("Peer connected", "peer=vessel-1")
     session = zenoh.open(client_config([world.vessel_local]))
     yield session
     session.close()

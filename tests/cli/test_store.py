@@ -195,7 +195,8 @@ def test_record_with_a_wrong_digest_is_quarantined(relay, salvaged):
     assert queued_items(new, "c2@north", 9) == ()
     assert len(numbers(new)) == RECORDS
     assert re.search(rf"^outbox +{RECORDS} +1 +-$", text, re.MULTILINE)
-    reasons = new._query("SELECT direction, reason FROM refused ORDER BY id")
+    with closing(sqlite3.connect(relay.with_name("new.db"))) as db:
+        reasons = db.execute("SELECT direction, reason FROM refused ORDER BY id").fetchall()
     assert reasons == [("in", "refused by a test"), ("out", "salvage: the digest of the record is wrong")]
 
 

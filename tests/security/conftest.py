@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from builders.fleet_certificates import shore_session, vessel_session, world
+from builders.fleet_certificates import own_world, shared_world, shore_session, vessel_session, world
 
-__all__ = ["shore_session", "vessel_session", "world"]
+__all__ = ["own_world", "shared_world", "shore_session", "vessel_session", "world"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import stat
-from pathlib import Path
 
 import pytest
 
@@ -15,9 +14,7 @@ from sonarpost.link.auth.key import AcousticKey, Direction
 from sonarpost.security.acoustic_key import key_warning, link_key, read_key
 
 
-def test_command_creates_a_private_key_and_prints_its_fingerprint_only(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_creates_a_private_key_and_prints_its_fingerprint_only(tmp_path, capsys):
     folder = tmp_path / "fleet"
     assert main(["pki", "init", "--dir", str(folder)]) == 0
     assert main(["pki", "acoustic", "--dir", str(folder)]) == 0
@@ -29,7 +26,7 @@ def test_command_creates_a_private_key_and_prints_its_fingerprint_only(
     assert key.secret.hex() not in output
 
 
-def test_each_key_is_another_one_and_none_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_key_is_another_one_and_none_is_overwritten(tmp_path, capsys):
     one, two = tmp_path / "one.key", tmp_path / "two.key"
     assert main(["pki", "acoustic", "--out", str(one)]) == 0
     assert main(["pki", "acoustic", "--out", str(two)]) == 0
@@ -43,12 +40,12 @@ def test_each_key_is_another_one_and_none_is_overwritten(tmp_path: Path, capsys:
     assert stat.S_IMODE(one.stat().st_mode) == 0o600
 
 
-def test_missing_folder_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_folder_is_named(tmp_path, capsys):
     assert main(["pki", "acoustic", "--dir", str(tmp_path / "fleet")]) == 2
     assert "sonarpost pki init" in capsys.readouterr().err
 
 
-def test_authentication_is_on_unless_it_is_switched_off(tmp_path: Path) -> None:
+def test_authentication_is_on_unless_it_is_switched_off(tmp_path):
     path = tmp_path / "acoustic.key"
     assert main(["pki", "acoustic", "--out", str(path)]) == 0
     assert link_key(PlatformConfig(id="uuv-1", acoustic_key_file=path)) == read_key(path)
@@ -61,7 +58,7 @@ def test_authentication_is_on_unless_it_is_switched_off(tmp_path: Path) -> None:
         PlatformConfig.model_validate({"id": "uuv-1", "acoustic_auth": "off"})
 
 
-def test_warning_when_the_last_sixteenth_of_the_key_is_in_use() -> None:
+def test_warning_when_the_last_sixteenth_of_the_key_is_in_use():
     key = AcousticKey(bytes(range(32)))
     fresh = FrameAuthenticator(key, 3, Direction.FROM_VEHICLE, first_counter=1_000_000 - 20_000)
     assert key_warning(fresh) == key_warning(None) == ""

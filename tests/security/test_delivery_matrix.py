@@ -8,14 +8,10 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
-import zenoh
 from builders.common import eventually
-from builders.fleet_certificates import World
 
 from sonarpost import keys
 from sonarpost.delivery.inbox import Inbox
@@ -23,10 +19,10 @@ from sonarpost.delivery.outbox import Outbox
 from sonarpost.delivery.protocol import attachment, batch_attachment
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.store import Store
-from sonarpost.errors import BadInputError, PayloadError
+from sonarpost.errors import PayloadError
 
 VESSEL, VEHICLE = "vessel-1", "uuv-1"
-RECORDS = 200
+RECORDS = 60
 CERTIFICATES = ("uuv-1", "vessel-1", "vessel-2", "shore-1", "console-1", "observer-1")
 UPLINK = (keys.shore_inbox(VESSEL),)
 TASKING = (keys.tasking_advice(VESSEL), keys.tasking_command(VESSEL))
@@ -67,22 +63,22 @@ ALLOWED_PUBLICATIONS = ALLOWED | {
 class Consumer:
     """Inbox of a site that accepts every record with the prefix `valid`."""
 
-    def __init__(self, session: zenoh.Session, path: Path, name: str, expressions: tuple[str, ...]) -> None:
+    def __init__(self, session, path, name, expressions):
         self.store = Store(path)
         self.refused = 0
         self._inbox = Inbox(session, self.store, name, expressions, self._validate, self._count_refused)
 
-    def _validate(self, key: str, payload: bytes) -> None:
+    def _validate(self, key, payload):
         if not payload.startswith(b"valid"):
             raise PayloadError(key, "payload", payload[:10], "a valid record")
 
-    def _count_refused(self, _: BadInputError) -> None:
+    def _count_refused(self, _):
         self.refused += 1
 
-    def received(self) -> Counter[tuple[str, bytes]]:
+    def received(self):
         return Counter((item.key, item.payload) for item in self.store.inbox_items(100_000))
 
-    def close(self) -> None:
+    def close(self):
         self._inbox.close()
         self.store.close()
 
@@ -90,7 +86,7 @@ class Consumer:
 class Producer:
     """Outbox of a site."""
 
-    def __init__(self, session: zenoh.Session, path: Path, queue: str, expressions: tuple[str, ...]) -> None:
+    def __init__(self, session, path, queue, expressions):
         self._queue = queue
         self._keys = expressions
         self._count = 0
@@ -98,7 +94,7 @@ class Producer:
         self.sent: Counter[tuple[str, bytes]] = Counter()
         self._outbox = Outbox(session, self.store)
 
-    def send(self, count: int) -> None:
+    def send(self, count):
         with self.store.transaction() as tx:
             for _ in range(count):
                 self._count += 1
@@ -107,21 +103,19 @@ class Producer:
                 self.sent[key, payload] += 1
 
     @property
-    def origin(self) -> bytes:
+    def origin(self):
         return bytes(self.store._query("SELECT origin FROM outbox_next")[0][0])
 
-    def is_done(self) -> bool:
+    def is_done(self):
         return self.store.outbox_depth() == 0
 
-    def close(self) -> None:
+    def close(self):
         self._outbox.close()
         self.store.close()
 
 
 @pytest.fixture
-def sites(
-    world: World, shore_session: zenoh.Session, vessel_session: zenoh.Session, tmp_path: Path
-) -> Iterator[tuple[dict[str, Consumer], dict[str, Producer]]]:
+def sites(world, shore_session, vessel_session, tmp_path):
     with ExitStack() as stack:
         consumers = {
             "c2": Consumer(shore_session, tmp_path / "c2.db", "c2", AT_SHORE),
@@ -137,7 +131,7 @@ def sites(
         yield consumers, producers
 
 
-def attack(session: zenoh.Session, who: str, door: str, origins: list[bytes]) -> None:
+def attack(session, who, door, origins):
     """Send poisoned queries and publications on every key, and wait for the ends of the queries."""
     queries = []
     highest = 1 << 62
@@ -155,23 +149,21 @@ def attack(session: zenoh.Session, who: str, door: str, origins: list[bytes]) ->
         list(query)
 
 
-def test_only_granted_records_are_accepted_and_no_peer_blocks_another(
-    world: World, sites: tuple[dict[str, Consumer], dict[str, Producer]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_only_granted_records_are_accepted_and_no_peer_blocks_another(world, sites):
     consumers, producers = sites
     for producer in producers.values():
         producer.send(3)
-    eventually(lambda: all(p.is_done() for p in producers.values()), timeout_s=120, what="the first records")
+    eventually(lambda: all(p.is_done() for p in producers.values()), what="the first records")
     origins = [producer.origin for producer in producers.values()]
     doors = {"shore": world.shore_tls, "vessel": world.vessel_tls}
     for who in CERTIFICATES:
         for door, endpoint in doors.items():
             with world.open(who, endpoint=endpoint) as session:
-                attack(session, who, door, origins)
-                attack(session, who, door, origins)  # again: routes are known now
+                attack(session, who, door, origins[:1])
+                attack(session, who, door, origins)  # routes are known now
     for producer in producers.values():
         producer.send(RECORDS)
-    eventually(lambda: all(p.is_done() for p in producers.values()), timeout_s=120, what="all records acknowledged")
+    eventually(lambda: all(p.is_done() for p in producers.values()), what="all records acknowledged")
 
     received = consumers["c2"].received() + consumers["relay"].received()
     sent = sum((p.sent for p in producers.values()), Counter())
@@ -181,27 +173,9 @@ def test_only_granted_records_are_accepted_and_no_peer_blocks_another(
     for key, payload in foreign:
         _, who, door, kind = payload.decode().split()
         accepted.setdefault((who, door, kind), set()).add(key)
-    with capsys.disabled():
-        print_matrix(accepted)
     for who in CERTIFICATES:
         for door in doors:
             assert accepted.get((who, door, "query"), set()) == ALLOWED.get((who, door), set()), (who, door)
             granted = ALLOWED_PUBLICATIONS.get((who, door), set()) | ALLOWED.get((who, door), set())
             assert accepted.get((who, door, "publication"), set()) <= granted, (who, door)
     assert all(consumer.refused for consumer in consumers.values())
-
-
-def print_matrix(accepted: dict[tuple[str, str, str], set[str]]) -> None:
-    """Print accepted delivery queries (Q) and publications (P) for each key, certificate and door."""
-    columns = [(who, door) for who in CERTIFICATES for door in ("shore", "vessel")]
-    print("\n" + " " * 42 + " ".join(f"{who}@{door}" for who, door in columns))
-    for key in ALL_KEYS:
-        cells = []
-        for who, door in columns:
-            marks = "".join(
-                mark
-                for mark, kind in (("Q", "query"), ("P", "publication"))
-                if key in accepted.get((who, door, kind), ())
-            )
-            cells.append(f"{marks or '-':^{len(who) + len(door) + 1}}")
-        print(f"{key.removeprefix(keys.ROOT + '/'):42}" + " ".join(cells))

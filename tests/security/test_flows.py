@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from builders.common import eventually, free_port
@@ -27,10 +29,10 @@ class Producer(Service[ServiceConfig]):
 
     NAME = "producer"
 
-    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+    def handle(self, key, record, effects):
         raise AssertionError("consumes nothing")
 
-    def send(self, key: str, consumer: str, record: Record) -> None:
+    def send(self, key, consumer, record):
         effects = UnitOfWork()
         effects.send(key, consumer, record)
         self.commit(effects)
@@ -41,19 +43,19 @@ class Console(Service[ServiceConfig]):
 
     NAME = "console"
 
-    def __init__(self, platform: PlatformConfig, config: ServiceConfig) -> None:
+    def __init__(self, platform, config):
         super().__init__(platform, config)
         self.got: list[Record] = []
 
     def consumed_keys(self):
         return {keys.advice(self.platform.id): Advice, keys.command_all(self.platform.id): Command}
 
-    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+    def handle(self, key, record, effects):
         self.got.append(record)
 
 
 @pytest.fixture
-def start_service(world, tmp_path):
+def start_service(tmp_path):
     started = []
 
     def start(service_type, platform_id, router, config=None, **platform):
@@ -70,7 +72,8 @@ def start_service(world, tmp_path):
         service.stop()
 
 
-def test_records_advice_and_commands_pass_the_routers(world, start_service, tmp_path):
+def test_records_advice_and_commands_pass_the_routers(own_world, start_service, tmp_path):
+    world = own_world
     got: list[str] = []
     c2 = start_service(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
     relay = start_service(
@@ -89,16 +92,8 @@ def test_records_advice_and_commands_pass_the_routers(world, start_service, tmp_
     operator.send(keys.contact_decision("vessel-1"), "relay", decision_record("d-1"))
     eventually(lambda: c2.health().counters.get("decisions_stored") == 1, what="the decision at the shore")
 
-    advice = Advice(
-        advice_id="a-1",
-        vessel_id="vessel-1",
-        vehicle_id="uuv-1",
-        image_id="AAAA",
-        image_version=1,
-        author="expert",
-        verdict="unsure",
-        advised_utc_s=2.0,
-    )
+    fields = {"vehicle_id": "uuv-1", "image_id": "AAAA", "image_version": 1, "author": "expert", "advised_utc_s": 2.0}
+    advice = Advice(advice_id="a-1", vessel_id="vessel-1", verdict="unsure", **fields)
     expert.send(keys.tasking_advice("vessel-1"), "c2", advice)
     eventually(lambda: advice in console.got, what="the advice at the vessel")
 
@@ -135,7 +130,7 @@ def test_malformed_record_is_refused_by_c2_and_logged(world, start_service, tmp_
     key = keys.delivery_query(keys.shore_inbox("vessel-1"), "c2")
     replies: list[bytes] = []
 
-    def refused_repeatedly() -> bool:
+    def refused_repeatedly():
         found = [
             r.ok.payload.to_bytes() for r in vessel_session.get(key, payload=b"x" * 40000, attachment=b"junk") if r.ok
         ]
@@ -152,7 +147,7 @@ def test_connectivity_check_names_the_obstacle(world, start_service, vessel_sess
     endpoints = (world.shore_tls,)
     tls = world.tls("vessel-1")
 
-    def reached(vessel: str) -> ConnectivityState:
+    def reached(vessel):
         return diagnose_no_reply(query_presence(vessel_session, vessel), endpoints, tls).state
 
     # The router of the shore replies; c2 does not run.
@@ -163,56 +158,37 @@ def test_connectivity_check_names_the_obstacle(world, start_service, vessel_sess
     assert reached("vessel-2") is ConnectivityState.DENIED
 
 
-@pytest.mark.parametrize(
-    ("who", "words"),
-    [
-        ("stranger", "certificate verify failed"),
-        ("expired", "certificate expired"),
-        ("no tls", "[platform] has no tls"),
-    ],
-)
-def test_refused_certificate_is_reported_with_its_reason(world, who, words):
-    tls = None if who == "no tls" else world.tls(who)
-    if who == "stranger":
-        tls = tls.model_copy(update={"ca": world.fleet.folder / "ca.pem"})
-        words = "unknown ca"
-    outcome = probe_endpoint(world.shore_tls, tls)
-    assert outcome.state is ConnectivityState.TLS_REFUSED
-    assert words in outcome.detail
-    assert outcome.detail.startswith(world.shore_tls)
-
-
-def test_unreachable_endpoint_is_no_connection():
-    endpoint = f"tls/localhost:{free_port()}"
-    assert probe_endpoint(endpoint, None).state is ConnectivityState.NO_CONNECTION
-    assert probe_endpoint("tls/no-such-host.invalid:1", None).state is ConnectivityState.NO_CONNECTION
+def test_obstacles_of_a_connection_are_reported_with_their_reason(world):
+    for who, words in (("stranger", "unknown ca"), ("expired", "certificate expired"), ("", "[platform] has no tls")):
+        tls = world.tls(who) if who else None
+        if who == "stranger":
+            tls = tls.model_copy(update={"ca": world.fleet.folder / "ca.pem"})
+        outcome = probe_endpoint(world.shore_tls, tls)
+        assert outcome.state is ConnectivityState.TLS_REFUSED
+        assert words in outcome.detail
+        assert outcome.detail.startswith(world.shore_tls)
+    for absent in (f"tls/localhost:{free_port()}", "tls/no-such-host.invalid:1"):
+        assert probe_endpoint(absent, None).state is ConnectivityState.NO_CONNECTION
     assert probe_endpoint("somewhere", None).state is ConnectivityState.NO_REPLY
 
 
 def test_revoked_vessel_reports_that_it_is_denied(world, start_service, caplog):
     local = f"tcp/127.0.0.1:{free_port()}"
     # The stolen router runs with the configuration from before the revocation.
-    before = world.fleet.index()
-    entries = tuple(e.model_copy(update={"revoked_utc_s": None}) for e in before.certificates)
-    stolen = type(world)(
-        **{**vars(world), "fleet": _Unrevoked(before.model_copy(update={"certificates": entries[:-1]}))}
-    )
+    now = world.fleet.index()
+    names = [entry for entry in now.certificates if entry.common_name != "vessel-3.g2"]
+    entries = tuple(entry.model_copy(update={"revoked_utc_s": None}) for entry in names)
+    index = now.model_copy(update={"certificates": entries})
+    stolen = replace(world, fleet=SimpleNamespace(index=lambda: index))
     wanted = RouterOptions("vessel-3", local=[local], connect=[world.shore_tls], files=world.folders["vessel-3"])
-    stolen.start("vessel-3", wanted)
+    router = stolen.start("vessel-3", wanted)
     relay = start_service(
         RelayService, "vessel-3", local, RelayConfig(), upstream=(world.shore_tls,), tls=world.tls("vessel-3")
     )
     eventually(lambda: "denied by access control" in relay.health().detail, what="the connectivity check")
     assert relay.health().state == "degraded"
     assert "Shore not reached" in caplog.text
-
-
-class _Unrevoked:
-    def __init__(self, index) -> None:
-        self._index = index
-
-    def index(self):
-        return self._index
+    router.stop()
 
 
 OPEN = """
@@ -243,7 +219,7 @@ def test_no_part_of_a_key_appears_in_logs_health_or_process_list(world, start_se
     secrets = [line for text in keys_of_hosts for line in text.splitlines() if not line.startswith("-----")]
     assert len(secrets) > 20
     texts = [caplog.text, relay.health().model_dump_json()]
-    for router in world.routers.values():
+    for router in (router for router in world.routers.values() if router.process.poll() is None):
         texts += router.lines
         texts.append(Path(f"/proc/{router.process.pid}/cmdline").read_text(errors="replace"))
     written = "\n".join(texts)

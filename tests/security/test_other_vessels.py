@@ -29,14 +29,13 @@ DENIED = (
 )
 
 
-@pytest.fixture
-def lead(world):
+@pytest.fixture(scope="module")
+def lead(shared_world):
     """A second router with the certificate of the lead vessel, which admits the other vessel; its two endpoints."""
     tls, local = f"tls/localhost:{free_port()}", f"tcp/127.0.0.1:{free_port()}"
-    options = RouterOptions(
-        LEAD, listen=[tls], local=[local], files=PurePosixPath(world.folders[LEAD]), other_vessels=[OTHER]
-    )
-    router = world.start("lead", options)
+    files = PurePosixPath(shared_world.folders[LEAD])
+    options = RouterOptions(LEAD, listen=[tls], local=[local], files=files, other_vessels=[OTHER])
+    router = shared_world.start("lead", options)
     yield router, tls, local
     router.stop()
 
@@ -55,7 +54,7 @@ def test_frames_pass_the_routers_of_both_vessels(world, lead, tmp_path):
             for number in range(20):
                 tx.send(INBOX, "op_modem", b"frame %d" % number, encoding="")
         outbox = Outbox(at_other, sent)
-        eventually(lambda: sent.outbox_depth() == 0, timeout_s=120, what="the frames at the lead vessel")
+        eventually(lambda: sent.outbox_depth() == 0, what="the frames at the lead vessel")
         assert [item.payload for item in store.inbox_items(100)] == [b"frame %d" % n for n in range(20)]
         outbox.close()
         inbox.close()
@@ -68,12 +67,12 @@ def test_other_vessel_has_no_other_right(world, lead):
     router, tls, lead_local = lead
     asked: list[str] = []
 
-    def answer(query: zenoh.Query) -> None:
+    def answer(query):
         with query:
             asked.append(str(query.key_expr))
             query.reply(query.key_expr, b"stored")
 
-    def answered(session: zenoh.Session, key: str) -> bool:
+    def answered(session, key):
         selector = keys.delivery_query(key, "op_modem")
         return [r.ok.payload.to_bytes() for r in session.get(selector, timeout=3) if r.ok] == [b"stored"]
 
@@ -93,16 +92,13 @@ def test_other_vessel_has_no_other_right(world, lead):
     assert keys.acoustic_rx(LEAD) not in read
 
 
-@pytest.mark.parametrize(
-    ("platform", "options"),
-    [
+def test_invalid_names_are_refused(world):
+    for platform, options in (
         ("shore-1", {"other_vessels": [OTHER]}),
         (LEAD, {"other_vessels": ["vessel-9"]}),
         (LEAD, {"other_vessels": [LEAD]}),
         (LEAD, {"other_vessels": [OTHER], "lead_vessel": OTHER}),
         (LEAD, {"lead_vessel": "shore-1"}),
-    ],
-)
-def test_invalid_names_are_refused(world, platform, options):
-    with pytest.raises(BadInputError, match="router-config: vessel"):
-        router_json5(world.fleet.index(), RouterOptions(platform, **options), time.time())
+    ):
+        with pytest.raises(BadInputError, match="router-config: vessel"):
+            router_json5(world.fleet.index(), RouterOptions(platform, **options), time.time())

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
 import msgpack
 import pytest
 import zenoh
 from builders.common import eventually
-from builders.fleet_certificates import World
 from builders.records import decision_record
 
 from sonarpost import keys, wire
@@ -22,15 +17,11 @@ from sonarpost.services.c2.service import C2Service
 CONTACTS, STATES = keys.shore_contact_all(), keys.tasking_state_all()
 CERTIFICATES = ("uuv-1", "vessel-1", "vessel-2", "console-1", "observer-1", "shore-2")
 # What docs/explanation/security.md grants at the shore's router; at a vessel's router no certificate may query.
-ALLOWED = {
-    "console-1": {CONTACTS, STATES},
-    "observer-1": {CONTACTS, STATES},
-    "shore-2": {CONTACTS},
-}
+ALLOWED = {"console-1": {CONTACTS, STATES}, "observer-1": {CONTACTS, STATES}, "shore-2": {CONTACTS}}
 
 
 @pytest.fixture
-def c2(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[C2Service]:
+def c2(world, tmp_path, monkeypatch):
     # This test queries faster than clients may.
     monkeypatch.setattr("sonarpost.services.c2.queries.BURST", 1e9)
     platform = PlatformConfig(
@@ -42,13 +33,13 @@ def c2(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
     service.stop()
 
 
-def received(session: zenoh.Session, selector: str) -> list[dict[str, Any]]:
+def received(session, selector):
     """Return the payloads of all replies to a query."""
     replies = session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=10)
     return [msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
 
-def test_only_readers_of_the_shore_may_query(world: World, c2: C2Service, shore_session: zenoh.Session) -> None:
+def test_only_readers_of_the_shore_may_query(world, c2, shore_session):
     fields = {"vehicle_id": "uuv-1", "image_id": "AAAA", "image_version": 1, "author": "expert", "advised_utc_s": 2.0}
     advice = Advice(advice_id="a-1", vessel_id="vessel-1", verdict="unsure", **fields)
     decision = decision_record("d1")
@@ -80,7 +71,7 @@ def test_only_readers_of_the_shore_may_query(world: World, c2: C2Service, shore_
     assert any(CONTACTS in denied or own in denied for _, _, denied in world.shore.denied())
 
 
-def test_peers_cannot_answer_for_c2(world: World, c2: C2Service, shore_session: zenoh.Session) -> None:
+def test_peers_cannot_answer_for_c2(world, c2, shore_session):
     asked: list[str] = []
     for who in ("vessel-1", "console-1", "observer-1", "nameless"):
         with world.open(who) as session:

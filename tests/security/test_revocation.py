@@ -9,11 +9,11 @@ from sonarpost import keys
 from sonarpost.bus.session import client_config
 
 
-def wait_until_received(world, shore_session: zenoh.Session, session: zenoh.Session, key: str) -> None:
+def wait_until_received(shore_session, session, key):
     got: list[str] = []
     subscriber = shore_session.declare_subscriber("sonarpost/v1/**", lambda sample: got.append(str(sample.key_expr)))
 
-    def put_and_received() -> bool:
+    def put_and_received():
         session.put(key, b"")
         return key in got
 
@@ -21,11 +21,12 @@ def wait_until_received(world, shore_session: zenoh.Session, session: zenoh.Sess
     subscriber.undeclare()
 
 
-def test_revoked_vessel_is_denied_and_reconnects_under_a_new_name(world):
+def test_revoked_vessel_is_denied_and_reconnects_under_a_new_name(own_world):
+    world = own_world
     key = "sonarpost/v1/vessel-2/test/a"
     wanted = world.shore_wanted(world.shore_tls, world.shore_local)
     with world.open("vessel-2") as old, zenoh.open(client_config([world.shore_local])) as shore_session:
-        wait_until_received(world, shore_session, old, key)
+        wait_until_received(shore_session, old, key)
 
         world.fleet.revoke("vessel-2", "laptop stolen")
         world.shore.stop()
@@ -36,10 +37,10 @@ def test_revoked_vessel_is_denied_and_reconnects_under_a_new_name(world):
         got: list[str] = []
         shore_session.declare_subscriber("sonarpost/v1/**", lambda sample: got.append(str(sample.key_expr)))
         with world.open("vessel-1") as other:
-            wait_until_received(world, shore_session, other, "sonarpost/v1/vessel-1/test/before")
+            wait_until_received(shore_session, other, "sonarpost/v1/vessel-1/test/before")
             old.put(key, b"stolen")
             assert list(old.get(keys.presence_any("vessel-2"), timeout=3)) == []
-            wait_until_received(world, shore_session, other, "sonarpost/v1/vessel-1/test/after")
+            wait_until_received(shore_session, other, "sonarpost/v1/vessel-1/test/after")
         assert key not in got
 
     folder = world.fleet.issue("vessel-2", "vessel").folder
@@ -48,6 +49,6 @@ def test_revoked_vessel_is_denied_and_reconnects_under_a_new_name(world):
     restarted.stop()
     world.start("shore-1", wanted)
     with world.open("vessel-2.g2") as new, zenoh.open(client_config([world.shore_local])) as shore_session:
-        wait_until_received(world, shore_session, new, key)
+        wait_until_received(shore_session, new, key)
         [reply] = list(new.get(keys.presence_any("vessel-2"), timeout=3))
         assert reply.ok is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import subprocess
 import sys
 import time
@@ -16,23 +17,23 @@ from sonarpost import config
 from sonarpost.config import ServiceConfig
 from sonarpost.errors import ConfigError
 from sonarpost.security.fleet import Fleet
-from sonarpost.security.tls_files import HostCertificate, TlsMonitor, check_tls_files
+from sonarpost.security.tls_files import TlsMonitor, check_tls_files
 
 DAY_S = 86400.0
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+def fleet(tmp_path_factory):
     return Fleet.init(tmp_path_factory.mktemp("fleet") / "pki", "test")
 
 
 @pytest.fixture
-def folder(fleet: Fleet, tmp_path: Path) -> Path:
+def folder(fleet, tmp_path):
     platform = f"vessel-{len(fleet.index().certificates)}"
     return fleet.issue(platform, "vessel", out=tmp_path / "tls").folder
 
 
-def check(folder: Path, now_utc_s: float | None = None) -> HostCertificate:
+def check(folder, now_utc_s=None):
     return check_tls_files(tls_of(folder), time.time() if now_utc_s is None else now_utc_s)
 
 
@@ -43,34 +44,15 @@ def test_valid_files_return_the_certificate(folder):
     assert own.warnings == ()
 
 
-def missing(folder):
-    (folder / "key.pem").unlink()
+def copy_of_another(name, role):
+    """Return a defect: a file of another fleet."""
 
+    def spoil(folder):
+        other = Fleet.init(folder / "x", "other")
+        source = other.issue("vessel-1", "vessel").folder if role else other.folder
+        (folder / name).write_bytes((source / name).read_bytes())
 
-def open_key(folder):
-    (folder / "key.pem").chmod(0o604)
-
-
-def other_key(folder):
-    other = Fleet.init(folder / "x", "other").issue("vessel-1", "vessel").folder
-    (folder / "key.pem").write_bytes((other / "key.pem").read_bytes())
-
-
-def other_authority(folder):
-    other = Fleet.init(folder / "x", "other")
-    (folder / "ca.pem").write_bytes((other.folder / "ca.pem").read_bytes())
-
-
-def key_for_certificate(folder):
-    (folder / "certificate.pem").write_bytes((folder / "key.pem").read_bytes())
-
-
-def junk_certificate(folder):
-    (folder / "certificate.pem").write_bytes(b"junk")
-
-
-def junk_key(folder):
-    (folder / "key.pem").write_bytes(b"junk")
+    return spoil
 
 
 def locked_key(folder):
@@ -83,13 +65,13 @@ def locked_key(folder):
 @pytest.mark.parametrize(
     ("spoil", "where", "words"),
     [
-        (missing, "key", "No such file"),
-        (open_key, "key", "0604"),
-        (other_key, "key", "another certificate"),
-        (other_authority, "certificate", "issued by"),
-        (key_for_certificate, "certificate", "a private key"),
-        (junk_certificate, "certificate", "PEM certificates"),
-        (junk_key, "key", "PEM private key"),
+        (lambda folder: (folder / "key.pem").unlink(), "key", "No such file"),
+        (lambda folder: (folder / "key.pem").chmod(0o604), "key", "0604"),
+        (copy_of_another("key.pem", "vessel"), "key", "another certificate"),
+        (copy_of_another("ca.pem", ""), "certificate", "issued by"),
+        (lambda folder: shutil.copy(folder / "key.pem", folder / "certificate.pem"), "certificate", "a private key"),
+        (lambda folder: (folder / "certificate.pem").write_bytes(b"junk"), "certificate", "PEM certificates"),
+        (lambda folder: (folder / "key.pem").write_bytes(b"junk"), "key", "PEM private key"),
         (locked_key, "key", "passphrase"),
     ],
 )
@@ -142,7 +124,7 @@ def test_health_reports_soon_expiry_and_expiry(fleet, tmp_path, caplog):
 # Configuration
 
 
-def load(tmp_path: Path, text: str, **environment: str):
+def load(tmp_path, text, **environment):
     path = tmp_path / "vessel.toml"
     path.write_text(text)
     return config.load(path, "relay", ServiceConfig, environment)[0]
@@ -151,33 +133,20 @@ def load(tmp_path: Path, text: str, **environment: str):
 FILES = 'tls = { ca = "a.pem", certificate = "b.pem", key = "c.pem" }'
 
 
-def test_platform_table_names_the_files(tmp_path):
-    platform = load(tmp_path, f'[platform]\nid = "vessel-1"\nupstream = ["tls/shore:7448"]\n{FILES}\n')
-    assert platform.tls is not None
-    assert [str(p) for p in (platform.tls.ca, platform.tls.certificate, platform.tls.key)] == [
-        "a.pem",
-        "b.pem",
-        "c.pem",
-    ]
+def test_platform_table_names_the_files_and_the_environment_overrides_each_or_all(tmp_path):
+    table = '[platform]\nid = "vessel-1"\n'
+    platform = load(tmp_path, f'{table}upstream = ["tls/shore:7448"]\n{FILES}\n')
     assert platform.upstream == ("tls/shore:7448",)
-    assert load(tmp_path, '[platform]\nid = "vessel-1"\n').tls is None
-
-
-def test_environment_overrides_single_files_or_the_table(tmp_path):
-    one = load(tmp_path, f'[platform]\nid = "vessel-1"\n{FILES}\n', SONARPOST_PLATFORM__TLS__KEY="/run/key")
-    assert one.tls is not None
-    assert (str(one.tls.key), str(one.tls.ca)) == ("/run/key", "a.pem")
+    assert load(tmp_path, table).tls is None
     three = {f"SONARPOST_PLATFORM__TLS__{name}": f"/{name}" for name in ("CA", "CERTIFICATE", "KEY")}
-    separate = load(tmp_path, '[platform]\nid = "vessel-1"\n', **three)
-    assert separate.tls is not None
-    assert str(separate.tls.certificate) == "/CERTIFICATE"
-    whole = load(
-        tmp_path,
-        f'[platform]\nid = "vessel-1"\n{FILES}\n',
-        SONARPOST_PLATFORM__TLS='{ ca = "x", certificate = "y", key = "z" }',
-    )
-    assert whole.tls is not None
-    assert str(whole.tls.key) == "z"
+    whole = {"SONARPOST_PLATFORM__TLS": '{ ca = "x", certificate = "y", key = "z" }'}
+    for made, expected in (
+        (platform, "a.pem b.pem c.pem"),
+        (load(tmp_path, f"{table}{FILES}\n", SONARPOST_PLATFORM__TLS__KEY="/run/key"), "a.pem b.pem /run/key"),
+        (load(tmp_path, table, **three), "/CA /CERTIFICATE /KEY"),
+        (load(tmp_path, f"{table}{FILES}\n", **whole), "x y z"),
+    ):
+        assert [str(path) for path in (made.tls.ca, made.tls.certificate, made.tls.key)] == expected.split()
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 import pytest
-import zenoh
 from builders.common import eventually
 from builders.fleet_certificates import tls_of
 
@@ -25,7 +24,7 @@ def relay(vessel_session):
     """Keys of the delivery queries and publications that reach the vessel's relay."""
     asked: list[str] = []
 
-    def answer(query: zenoh.Query) -> None:
+    def answer(query):
         with query:
             asked.append(str(query.key_expr))
             query.reply(query.key_expr, b"stored")
@@ -41,7 +40,7 @@ def relay(vessel_session):
     return asked
 
 
-def answered(session: zenoh.Session, key: str) -> bool:
+def answered(session, key):
     return [reply.ok.payload.to_bytes() for reply in session.get(key, timeout=3) if reply.ok] == [b"stored"]
 
 
@@ -77,7 +76,7 @@ def test_vessel_console_sends_decisions_and_commands_and_receives_advice(world, 
 def test_shore_console_sends_advice_and_no_image(world, shore_session):
     advice = keys.delivery_query(keys.tasking_advice(VESSEL), "c2")
 
-    def answer(query: zenoh.Query) -> None:
+    def answer(query):
         with query:
             query.reply(query.key_expr, b"stored")
 
