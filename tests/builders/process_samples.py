@@ -102,11 +102,7 @@ class Samples:
                 f"| {name} | {memory} | {growth:+.1f} | {at[0].descriptors}, {at[3].descriptors} "
                 f"| {at[0].threads}, {at[3].threads} |"
             )
-        lines += [
-            "",
-            "| files | kB at 25, 50, 75, 100 % | kB per 1,000 contacts, from 60 % on |",
-            "|---|---|---|",
-        ]
+        lines += ["", "| files | kB at 25, 50, 75, 100 % | kB per 1,000 contacts, from 60 % on |", "|---|---|---|"]
         for name, points in self.sizes.items():
             at_bytes = [min(points, key=lambda p, x=quarter * part: abs(p[0] - x))[1] for part in (1, 2, 3, 4)]
             growth = self.growth([(x, y / 1000) for x, y in points], late)
