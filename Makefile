@@ -10,6 +10,8 @@ PYTEST := $(BIN)/python -m pytest
 
 # Set on some machines; without cached byte code every process of the tests would compile the whole package.
 unexport PYTHONDONTWRITEBYTECODE
+# Several tests run at once; a second thread of each would only wait for the others.
+export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: setup demo test test-busy test-system check docs docs-serve fmt lock sbom audit clean images test-compose screenshots
 
