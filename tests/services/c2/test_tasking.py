@@ -6,7 +6,7 @@ import zenoh
 from builders.common import eventually, free_port
 from builders.faulty_link import FaultyLink
 
-from sonarpost import keys
+from sonarpost import keys, wire
 from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.bus.session import router_config
 from sonarpost.errors import StoredFileError
@@ -197,8 +197,6 @@ def test_relay_refuses_advice_of_another_vessel_and_command_of_another_kind(rela
 
 def test_publication_on_the_vessel_is_ignored_by_the_relay(relay, console, publish):
     """The console receives it directly; the relay would deliver it twice."""
-    from sonarpost import wire
-
     service, screen = relay(), console()
     publish(keys.advice("vessel-1"), wire.encode(advice()))
     eventually(lambda: len(screen.received) == 1)

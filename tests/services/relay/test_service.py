@@ -8,27 +8,12 @@ from builders.record_samples import SAMPLES
 from builders.records import decision_record, reconstructed_image
 
 from sonarpost import keys, logs, wire
-from sonarpost.messages import Pixels, Relayed
+from sonarpost.messages import Pixels
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
 IMAGES, DECISIONS = keys.image_reconstructed("vessel-1"), keys.contact_decision("vessel-1")
 INBOX = keys.shore_inbox("vessel-1")
-
-
-@pytest.fixture
-def begin(runner, platform):
-    return lambda: runner.start(RelayService(platform("vessel-1"), RelayConfig()))
-
-
-@pytest.fixture
-def c2(runner):
-    return lambda: runner.peer("shore-1", "c2", {keys.shore_inbox_all(): Relayed})
-
-
-@pytest.fixture
-def source(runner):
-    return runner.peer("vessel-1", "decompressor")
 
 
 @pytest.fixture
@@ -149,6 +134,5 @@ def test_latest_status_of_each_vehicle_waits_for_the_shore_and_precedes_images(
     assert {m["vehicle_id"]: m["received_utc_s"] for m in inner[:2]} == {"uuv-0": 1476262848.5, "uuv-1": 1476262849.5}
 
 
-def test_statuses_are_not_relayed_if_configured(runner, platform):
-    service = runner.start(RelayService(platform("vessel-1"), RelayConfig(forward_status=False)))
-    assert keys.acoustic_status("vessel-1") not in service.consumed_keys()
+def test_statuses_are_not_relayed_if_configured(begin):
+    assert keys.acoustic_status("vessel-1") not in begin(forward_status=False).consumed_keys()

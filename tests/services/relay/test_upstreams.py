@@ -9,33 +9,13 @@ from builders.common import eventually, free_port
 from builders.records import decision_record, reconstructed_image
 from pydantic import ValidationError
 
-from sonarpost import keys
+from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
-from sonarpost.messages import Pixels, Relayed
+from sonarpost.messages import Pixels
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
-from sonarpost.services.relay.service import RelayService, topic_of
+from sonarpost.services.relay.service import topic_of
 
 IMAGES, DECISIONS = keys.image_reconstructed("vessel-1"), keys.contact_decision("vessel-1")
-
-
-@pytest.fixture
-def begin(runner, platform):
-    return lambda *upstreams, **options: runner.start(
-        RelayService(platform("vessel-1"), RelayConfig(upstreams=upstreams, **options))
-    )
-
-
-@pytest.fixture
-def c2(runner):
-    def make(site="shore", platform_id="shore-1"):
-        return runner.peer(platform_id, "c2", {keys.shore_inbox_all(site): Relayed})
-
-    return make
-
-
-@pytest.fixture
-def source(runner):
-    return runner.peer("vessel-1", "decompressor")
 
 
 def image(image_id="AAAA", version=1, height_px=40, **changes):
@@ -60,7 +40,7 @@ def test_every_site_receives_everything_and_an_unreachable_one_delays_none(begin
     assert (gauges["waiting_for_shore-2"], gauges["answering_shore-2"]) == (21, 0)
     assert (gauges["answering_shore"], gauges["delivered_to_shore"]) == (1, 21)
     assert gauges["waiting_bytes_for_shore-2"] > 20 * 4000
-    assert 0 < gauges["oldest_s_for_shore-2"] < 60
+    assert 0 < gauges["oldest_s_for_shore-2"] < 3600
     assert gauges["oldest_s_for_shore"] == 0
     runner.stop(service)
     service = begin(UpstreamOptions(), UpstreamOptions(site="shore-2"))
@@ -181,8 +161,6 @@ def test_senders_keep_images_below_the_reserve_and_decisions_are_accepted(begin,
 
 
 def test_plain_publication_of_an_image_below_the_reserve_is_refused_and_logged(begin, c2, publish, monkeypatch):
-    from sonarpost import wire
-
     monkeypatch.setattr("sonarpost.delivery.store.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, 20_000_000))
     service = begin(disk_reserve_bytes=50_000_000)
     publish(IMAGES, wire.encode(image()))
