@@ -70,9 +70,6 @@ class Condition:
     def begin(self) -> None:
         """Act when the condition begins."""
 
-    def end(self) -> None:
-        """Act when the condition ends."""
-
     def tick(self) -> None:
         """Act once a simulated second."""
 
@@ -108,7 +105,6 @@ class Bench:
         self.is_open = True
         self.open_packets: dict[int, set[int]] = {number: set() for number in modems}
         self.sent: dict[int, list[bytes]] = {number: [] for number in modems}
-        self.lost_packets = 0
         self._due: list[tuple[float, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self._number = itertools.count(1)
@@ -141,7 +137,6 @@ class Bench:
 
     def kill(self) -> None:
         """Replace the driver by a new one, as after a crash of its process."""
-        self.lost_packets += len(self.open_packets[HOSTILE])
         self.open_packets[HOSTILE].clear()
         self.drivers[HOSTILE] = self.new_driver(HOSTILE)
         if self.is_open:
@@ -189,9 +184,7 @@ class Bench:
                     self.offer(PEER)
             self._exchange()
             self.now = min(until_s, next_tick_s, max(self.now + 0.001, self._next_s()))
-        if condition is not None:
-            self.condition = None
-            condition.end()
+        self.condition = None
 
     def _next_s(self) -> float:
         times = [self.simulator.next_deadline_s()]

@@ -56,8 +56,6 @@ def check(events: list[Event], expected: list[dict[str, Any]]) -> None:
                     "missing_halves": list(event.missing_halves),
                     "first": event.first_frame_s,
                     "last": event.last_frame_s,
-                    "frames": event.frames,
-                    "complete": event.complete,
                 }
             case MessageReceived():
                 found = {"message": event.number, "data": event.data.hex()}

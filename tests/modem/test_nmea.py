@@ -47,13 +47,6 @@ def test_golden_sentences_parse_and_format(line: bytes) -> None:
     assert GOLDEN[line].encode() == line + b"\r\n"
 
 
-@pytest.mark.parametrize("step", [1, 2, 7, 64, len(STREAM)])
-def test_stream_split_at_any_position(step: int) -> None:
-    lines = LineAssembler()
-    assert [item for at in range(0, len(STREAM), step) for item in lines.feed(STREAM[at : at + step])] == SENTENCES
-    assert lines.pending_bytes == 0
-
-
 @pytest.mark.parametrize(
     ("before", "after", "errors"),
     [
@@ -120,19 +113,18 @@ def test_invalid_line_is_rejected(line: bytes) -> None:
         nmea.parse(line)
 
 
-@pytest.mark.parametrize(
-    ("kind", "field"),
-    [("", "1"), ("ccCYC", "1"), ("CC,YC", "1"), ("CCCFG", "a,b"), ("CCCFG", "a*b"), ("CCCFG", "a$b"), ("CCCFG", "é")],
-)
-def test_format_rejects_fields_that_cannot_be_parsed(kind: str, field: str) -> None:
+@pytest.mark.parametrize("kind", ["", "ccCYC", "CC,YC"])
+def test_format_rejects_kinds_that_cannot_be_parsed(kind: str) -> None:
     with pytest.raises(SentenceError):
-        nmea.format(kind, field)
+        nmea.format(kind, "1")
 
 
-def test_format_rejects_line_ends_and_too_long_sentences() -> None:
-    for field in ("1\r\n$CCMSC,1,1,0", "\x00", "A" * MAX_SENTENCE_BYTES):
-        with pytest.raises(SentenceError):
-            nmea.format("CCTXD", field)
+@pytest.mark.parametrize(
+    "field", ["a,b", "a*b", "a$b", "é", "1\r\n$CCMSC,1,1,0", "\x00", pytest.param("A" * MAX_SENTENCE_BYTES, id="long")]
+)
+def test_format_rejects_fields_that_cannot_be_parsed(field: str) -> None:
+    with pytest.raises(SentenceError):
+        nmea.format("CCCFG", field)
 
 
 def test_longest_sentence_has_exactly_the_maximum_length() -> None:

@@ -99,7 +99,3 @@ def test_packet_that_the_modem_cannot_send_is_refused(
     with pytest.raises(FrameError) as caught:
         modem.check_packet(destination, rate, frames)
     assert caught.value.field == field
-
-
-def test_mtu_is_that_of_the_longest_frame() -> None:
-    assert CAPABILITIES.mtu_bytes == 256

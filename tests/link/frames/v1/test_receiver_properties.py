@@ -151,11 +151,3 @@ def test_a_replaced_value_in_a_state_is_reported_or_accepted_and_raises_nothing(
     for _ in range(30):
         fresh.accept(VEHICLE, sender.next_frame(1.0) or b"", 1.0)
     fresh.feedback(VEHICLE, 1.0)
-
-
-@given(st.dictionaries(st.sampled_from(["counts", "peer/3", "image/3/1", "block/3/1", "x", "image/a/b"]), st.binary()))
-def test_any_bytes_as_parts_raise_nothing(parts: dict[str, bytes]) -> None:
-    receiver = V1Receiver()
-    errors = receiver.restore(parts)
-    assert set(errors) <= set(parts)
-    assert receiver.sources == ()
