@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 
 from sonarpost.detection.association import DetectionPlace
-from sonarpost.detection.detector import detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import Side
 
@@ -44,14 +43,14 @@ def test_rows_are_compared_at_the_spacing_of_the_first_place():
     assert PLACE.shifted(10).is_same_object(coarser, SETTINGS)
 
 
-@pytest.mark.parametrize("navigation", [True, False])
-def test_place_of_detection_in_stream(make_survey, navigation):
+@pytest.mark.parametrize("pixel_along_m", [0.1, None])
+def test_place_of_detection_in_stream(one_object, pixel_along_m):
     settings = DetectorSettings(assumed_row_along_m=0.5)
-    (found,) = detect(make_survey({}, navigation=navigation))
+    found = replace(one_object[1], pixel_along_m=pixel_along_m)
     place = DetectionPlace.of_detection(found, settings, 1000)
     assert (place.side, place.row, place.slant_range_m) == (found.side, 1000 + found.ping_index, found.slant_range_m)
     assert (place.first_row, place.end_row) == tuple(1000 + ping for ping in found.highlight_pings)
     assert place.near_m < place.slant_range_m < place.near_m + found.width_m + 1e-9
     assert place.far_m == pytest.approx(place.near_m + found.width_m + found.shadow_m)
-    assert place.along_m == (found.pixel_along_m if navigation else 0.5)
+    assert place.along_m == (pixel_along_m or 0.5)
     assert place.shifted(-1000) == DetectionPlace.of_detection(found, settings)

@@ -39,9 +39,9 @@ def square_on_the_seabed(altitude_m, cell_m, row_m, ground_m=12.0, along_m=10.0,
     return grid_of(np.where(inside, 2.0, 0.0), altitude_cells=round(altitude_m / cell_m), cell_m=cell_m, row_m=row_m)
 
 
-@pytest.mark.parametrize("altitude_m", [2.0, 9.0])
-@pytest.mark.parametrize("row_m", [0.05, 0.1, 0.3])
-@pytest.mark.parametrize("cell_m", [0.03, 0.06, 0.12])
+@pytest.mark.parametrize(
+    ("altitude_m", "row_m", "cell_m"), [(2.0, 0.05, 0.12), (2.0, 0.3, 0.03), (9.0, 0.1, 0.06), (9.0, 0.3, 0.12)]
+)
 def test_square_has_its_size_at_any_altitude_and_resolution(altitude_m, row_m, cell_m):
     plane = ground_plane(square_on_the_seabed(altitude_m, cell_m, row_m))
     area_m2 = plane.level.sum() / 2.0 * PIXEL_M**2

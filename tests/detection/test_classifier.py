@@ -73,12 +73,12 @@ def test_network_equals_its_definition():
 
 
 def test_result_depends_neither_on_the_batch_nor_on_the_direction_of_travel():
-    classifier, chips = default_classifier(), random_chips(100)
+    classifier, chips = default_classifier(), random_chips(50)
     together = classifier.probabilities(chips)
-    assert together.shape == (100, 3)
+    assert together.shape == (50, 3)
     np.testing.assert_allclose(together.sum(axis=1), 1.0, atol=1e-5)
-    alone = classifier.probabilities(chips.selected(np.array([70])))
-    np.testing.assert_allclose(alone[0], together[70], atol=1e-5)
+    alone = classifier.probabilities(chips.selected(np.array([49])))
+    np.testing.assert_allclose(alone[0], together[49], atol=1e-5)
     np.testing.assert_allclose(classifier.probabilities(chips.mirrored()), together, atol=1e-5)
     assert classifier.probabilities(chips.selected(np.arange(0))).shape == (0, 3)
 
@@ -100,19 +100,8 @@ def test_file_has_the_same_identity_after_writing_again(tmp_path):
     settings = DetectorSettings(classifier=str(path), classifier_identity=identity)
     assert classifier_of(settings).identity == identity
     assert classifier_of(DetectorSettings()) is default_classifier()
-
-
-def test_another_identity_is_refused(tmp_path):
-    path = tmp_path / "weights.npz"
-    with path.open("wb") as file:
-        write_classifier(Classifier(random_weights()), file)
     with pytest.raises(ConfigError, match=r"weights.npz: identity: got .[0-9a-f]{16}., expected 0{16}"):
         load_classifier_once(path, "0" * 16)
-
-
-def saved(path, **changes):
-    weights = {**random_weights(), **changes}
-    np.savez(path, **{name: value for name, value in weights.items() if value is not None})
 
 
 @pytest.mark.parametrize(
@@ -129,29 +118,23 @@ def saved(path, **changes):
 )
 def test_error_names_the_invalid_array(tmp_path, changes, message):
     path = tmp_path / "weights.npz"
-    saved(path, **changes)
+    weights = {**random_weights(), **changes}
+    np.savez(path, **{name: value for name, value in weights.items() if value is not None})
     with pytest.raises(ConfigError, match=message):
         load_classifier(path)
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"not an archive", b"\x93NUMPY\x01\x00"])
-def test_file_that_is_no_archive_is_refused(tmp_path, content):
+def test_file_that_is_no_archive_or_unpacks_to_a_large_size_is_refused(tmp_path):
     path = tmp_path / "weights.npz"
-    path.write_bytes(content)
-    with pytest.raises(ConfigError, match="weights"):
+    with pytest.raises(ConfigError, match="a readable file"):
         load_classifier(path)
-
-
-def test_archive_that_unpacks_to_a_large_size_is_refused(tmp_path):
-    path = tmp_path / "weights.npz"
+    for content in (b"", b"PK\x03\x04", b"not an archive", b"\x93NUMPY\x01\x00"):
+        path.write_bytes(content)
+        with pytest.raises(ConfigError, match="weights"):
+            load_classifier(path)
     buffer = io.BytesIO()
     np.save(buffer, np.zeros(1 << 23, np.float32))
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("hidden.npy", buffer.getvalue())
     with pytest.raises(ConfigError, match="bytes unpacked"):
         load_classifier(path)
-
-
-def test_missing_file_is_a_config_error(tmp_path):
-    with pytest.raises(ConfigError, match="a readable file"):
-        load_classifier(tmp_path / "absent.npz")

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from builders.common import REPOSITORY
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -31,6 +30,8 @@ from sonarpost.errors import ConfigError
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import Side
+
+pytestmark = pytest.mark.usefixtures("few_candidates")
 
 ROW_M, CELL_M = 0.1, 0.06
 ROWS, CELLS = 500, 450
@@ -69,8 +70,7 @@ def test_flat_seabed_has_no_clutter_ripples_or_contrast():
     assert rated(noise()).ripple_strength < 0.1
 
 
-@pytest.mark.parametrize("direction_deg", [0, 30, 90, 135])
-@pytest.mark.parametrize("wavelength_m", [0.6, 1.0, 1.7])
+@pytest.mark.parametrize(("wavelength_m", "direction_deg"), [(0.6, 0), (1.0, 30), (1.7, 90), (1.0, 135)])
 def test_ripples_of_any_wavelength_and_orientation(wavelength_m, direction_deg):
     along, across = places()
     direction = math.radians(direction_deg)
@@ -141,19 +141,14 @@ def test_expected_pd_never_increases_with_difficulty_or_threshold(clutter, rippl
     assert model.expected_pd(clutter, ripples, contrast, min(2.0, threshold + step)) <= at
 
 
-def test_shipped_model_separates_sand_from_rock():
+def test_model_separates_sand_from_rock_and_extreme_odds_do_not_overflow():
     model = default_pd_model()
     sand, rock = model.expected_pd(4.0, 0.1, 0.41, 1.0), model.expected_pd(50.0, 0.14, 1.2, 1.0)
     assert sand > 0.8
     assert rock < sand - 0.2
     assert model.expected_pd(50.0, 0.14, 1.2, 0.1) > model.expected_pd(50.0, 0.14, 1.2, 1.9)
-
-
-def test_extreme_odds_do_not_overflow():
-    text = json.dumps(MODEL | {"offsets": [1000.0, -1000.0], "clutter_weight": 1000.0})
-    model = load_pd_model(text, "x")
-    assert model.expected_pd(0.0, 0.0, 0.0, 0.0) == 1.0
-    assert model.expected_pd(1e9, 1.0, 9.0, 2.0) == 0.0
+    model = load_pd_model(json.dumps(MODEL | {"offsets": [1000.0, -1000.0], "clutter_weight": 1000.0}), "x")
+    assert (model.expected_pd(0.0, 0.0, 0.0, 0.0), model.expected_pd(1e9, 1.0, 9.0, 2.0)) == (1.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -177,23 +172,11 @@ def test_error_names_the_invalid_field(change, field, expected):
     assert expected in text
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        b"",
-        b"[]",
-        b"null",
-        b"{",
-        b"\xff\xfe",
-        b"{}",
-        b"[" * 5000,
-        json.dumps(MODEL).replace("8.0", "NaN").encode(),
-        json.dumps(MODEL).replace("8.0", "1e999").encode(),
-    ],
-)
-def test_invalid_tables_are_refused(text):
-    with pytest.raises(ConfigError, match=r"^table.json: .*got .*, expected "):
-        load_pd_model(text, "table.json")
+def test_invalid_tables_are_refused():
+    numbers = [json.dumps(MODEL).replace("8.0", number).encode() for number in ("NaN", "1e999")]
+    for text in (b"", b"[]", b"null", b"{", b"\xff\xfe", b"{}", b"[" * 5000, *numbers):
+        with pytest.raises(ConfigError, match=r"^table.json: .*got .*, expected "):
+            load_pd_model(text, "table.json")
 
 
 def test_combined_is_weighted_by_area():
@@ -205,35 +188,23 @@ def test_combined_is_weighted_by_area():
     assert not found.is_reliable
     assert one.is_reliable
     assert replace(one, expected_pd=RELIABLE_PD).is_reliable
-
-
-def test_warning_text():
     assert unreliable_text(0.618) == "expected Pd 62 % on this seabed; a clean result does not mean no mines"
 
 
-def test_search_rates_each_side_at_its_threshold(make_survey):
-    survey = make_survey({"ping": 100})
+def test_search_rates_each_side_at_its_threshold(one_object, make_survey, monkeypatch):
+    survey, _ = one_object
+    calls, original = [], detector.matched_response
+    monkeypatch.setattr(detector, "matched_response", lambda *a: calls.append(1) or original(*a))
     low, high = (search(survey, DetectorSettings(confidence_threshold=c)).difficulties for c in (0.1, 1.9))
+    assert len(calls) == 2 * 2, "the matched filter runs once a side"
     assert set(low) == set(Side)
+    assert search(make_survey(scale=0.0)).difficulties == {Side.PORT: None, Side.STARBOARD: None}, "no echoes"
     for side in Side:
         assert low[side].area_m2 == high[side].area_m2
         assert low[side].clutter_per_1000_m2 == high[side].clutter_per_1000_m2
         assert low[side].expected_pd > high[side].expected_pd
     assert low[Side.PORT].area_m2 == pytest.approx(200 * 0.1 * 16.7, rel=0.05)
     assert low[Side.PORT].clutter_per_1000_m2 > 0.0, "the object is an echo"
-
-
-def test_matched_filter_runs_once_a_side(make_survey, monkeypatch):
-    calls = []
-    original = detector.matched_response
-    monkeypatch.setattr(detector, "matched_response", lambda *a: calls.append(1) or original(*a))
-    search(make_survey({"ping": 100}))
-    assert len(calls) == 2
-
-
-def test_side_without_echoes_has_no_difficulty(make_survey):
-    survey = make_survey(scale=0.0)
-    assert search(survey).difficulties == {Side.PORT: None, Side.STARBOARD: None}
 
 
 def results_of(*surveys, settings=None):
@@ -269,18 +240,7 @@ def test_rows_of_a_joined_file_begin_at_its_first_ping(make_survey):
     assert second.joined
     assert {(s.first_row, s.end_row) for s in first.difficulties} == {(0, 110)}
     assert {(s.first_row, s.end_row) for s in second.difficulties} == {(0, 90)}
-
-
-def test_short_file_has_no_difficulty(make_survey):
-    survey = make_survey()
+    # A short file has no difficulty.
     (result,) = results_of(replace(survey, pings=survey.pings[:30]))
     assert [strip.difficulty for strip in result.difficulties] == [None, None]
     assert result.difficulty is None
-
-
-def test_shipped_table_is_valid():
-    path = REPOSITORY / "common" / "sonarpost" / "detection" / "difficulty.json"
-    table = json.loads(path.read_text("utf-8"))
-    assert load_pd_model(path.read_bytes(), str(path)) == default_pd_model()
-    assert table["fitted_by"] == "research/detection/difficulty.py"
-    assert table["seeds"][1] < 5000, "evaluation uses seeds from 5000 on"

@@ -8,6 +8,8 @@ import pytest
 from sonarpost.detection.images import ScaledImage, detect_in_image, normalise_window, seabed_window
 from sonarpost.sonar.survey import Side
 
+pytestmark = pytest.mark.usefixtures("few_candidates")
+
 
 def seabed(seed=0, shape=(256, 256)):
     return np.random.default_rng(seed).rayleigh(60, shape)
@@ -29,7 +31,7 @@ def test_object_in_image_has_higher_confidence_than_seabed():
     assert found.confidence > 1.5
     assert (found.row, found.column) == (pytest.approx(120, abs=8), pytest.approx(120, abs=8))
     assert found.side is Side.STARBOARD
-    for seed in range(3):
+    for seed in range(1):
         bare = detect_in_image(ScaledImage(to_uint8(seabed(seed + 10)), 0.05, 0.05))
         assert bare is None or bare.confidence < 0.5 * found.confidence
 
@@ -55,12 +57,18 @@ def pictures():
     return [with_object(seabed(seed, (150, 170)) ** power, 70, 60) for seed, power in ((1, 1.0), (2, 0.9), (3, 1.1))]
 
 
-@pytest.mark.parametrize("number", range(3))
-@pytest.mark.parametrize("value", [0, 90, 255])
-@pytest.mark.parametrize("widths", [((0, 40), (0, 0)), ((13, 0), (7, 0)), ((5, 5), (0, 64))])
-def test_padding_changes_place_but_not_score(number, value, widths):
-    image = pictures()[number]
-    one = detect_in_image(ScaledImage(image, 0.05, 0.05))
+@pytest.fixture(scope="module", params=range(3))
+def scored(request):
+    """A picture and its detection."""
+    image = pictures()[request.param]
+    return image, detect_in_image(ScaledImage(image, 0.05, 0.05))
+
+
+@pytest.mark.parametrize(
+    ("value", "widths"), [(0, ((0, 40), (0, 0))), (90, ((13, 0), (7, 0))), (255, ((5, 5), (0, 64)))]
+)
+def test_padding_changes_place_but_not_score(scored, value, widths):
+    image, one = scored
     other = detect_in_image(ScaledImage(np.pad(image, widths, constant_values=value), 0.05, 0.05))
     assert other.confidence == pytest.approx(one.confidence)
     assert (other.row, other.column) == (one.row + widths[0][0], one.column + widths[1][0])
@@ -74,36 +82,22 @@ def test_padding_with_traces_of_jpeg_is_cut_off():
     assert (window.values.shape, window.top, window.left) == ((256, 256), 20, 0)
 
 
-@pytest.mark.parametrize("number", range(3))
-@pytest.mark.parametrize("changed", [lambda i: (i * 0.5).astype(np.uint8), lambda i: i // 3])
-def test_score_does_not_depend_on_gain(number, changed):
-    image = pictures()[number]
-    assert confidence(changed(image)) == pytest.approx(confidence(image), abs=0.1)
-
-
-@pytest.mark.parametrize("number", range(3))
-def test_score_does_not_depend_on_direction(number):
-    image = pictures()[number]
-    assert confidence(image[:, ::-1]) == pytest.approx(confidence(image))
-
-
-@pytest.mark.parametrize("number", range(3))
-@pytest.mark.parametrize("factor", [1, 16, 257])
-def test_score_does_not_depend_on_bit_depth(number, factor):
-    image = pictures()[number]
-    deep = image.astype(np.uint16) * np.uint16(factor)
-    assert confidence(deep) == pytest.approx(confidence(image), rel=1e-4)
-
-
-def test_glint_does_not_change_the_score():
-    image = pictures()[0].astype(np.uint16) * np.uint16(16)
-    glint = image.copy()
+def test_score_depends_neither_on_gain_direction_nor_bit_depth(scored):
+    image, one = scored
+    assert confidence((image * 0.5).astype(np.uint8)) == pytest.approx(one.confidence, abs=0.1)
+    assert confidence(image // 3) == pytest.approx(one.confidence, abs=0.1)
+    assert confidence(image[:, ::-1]) == pytest.approx(one.confidence)
+    for factor in (16, 257):
+        deep = image.astype(np.uint16) * np.uint16(factor)
+        assert confidence(deep) == pytest.approx(one.confidence, rel=1e-4)
+    glint = image.astype(np.uint16) * np.uint16(16)
     glint[140, 160] = 65535
-    assert confidence(glint) == pytest.approx(confidence(image), abs=0.02)
+    assert confidence(glint) == pytest.approx(one.confidence, abs=0.02)
 
 
-@pytest.mark.parametrize("pixel_m", [0.005, 0.05, 0.5, 1.0])
-@pytest.mark.parametrize("shape", [(32, 32), (32, 300), (300, 32), (33, 47)])
+@pytest.mark.parametrize(
+    ("shape", "pixel_m"), [((32, 32), 0.005), ((32, 32), 1.0), ((32, 200), 0.05), ((200, 32), 0.1), ((33, 47), 0.5)]
+)
 def test_picture_of_any_size_has_a_level_grid(shape, pixel_m):
     image = ScaledImage(to_uint8(seabed(4, shape)), pixel_m, pixel_m)
     for side in Side:
@@ -119,15 +113,9 @@ def test_water_is_unknown():
     assert np.isfinite(grid.level[20:230, 10:150]).all()
 
 
-@pytest.mark.parametrize("value", [0, 7, 255])
-def test_flat_or_tiny_image_has_no_detection(value):
-    assert detect_in_image(ScaledImage(np.full((256, 256), value, np.uint8), 0.05, 0.05)) is None
-    assert detect_in_image(ScaledImage(np.full((8, 8), value, np.uint8), 0.05, 0.05)) is None
-
-
-@pytest.mark.parametrize(
-    "arguments", [(np.zeros((4, 4, 3), np.uint8), 1.0, 1.0), (np.zeros((4, 4), np.uint8), 0.0, 1.0)]
-)
-def test_invalid_image_is_rejected(arguments):
-    with pytest.raises(ValueError, match="expected"):
-        ScaledImage(*arguments)
+def test_flat_or_tiny_image_has_no_detection_and_an_invalid_one_is_rejected():
+    for value, side_px in ((0, 256), (7, 256), (255, 256), (0, 8), (255, 8)):
+        assert detect_in_image(ScaledImage(np.full((side_px, side_px), value, np.uint8), 0.05, 0.05)) is None
+    for arguments in ((np.zeros((4, 4, 3), np.uint8), 1.0, 1.0), (np.zeros((4, 4), np.uint8), 0.0, 1.0)):
+        with pytest.raises(ValueError, match="expected"):
+            ScaledImage(*arguments)

@@ -34,6 +34,8 @@ from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import Side
 from sonarpost.sonar.xtf_writer import write_xtf
 
+pytestmark = pytest.mark.usefixtures("few_candidates")
+
 ORIGIN = FileOrigin("0" * 64, "made.xtf", "made")
 
 
@@ -58,10 +60,12 @@ def measured(survey, *texts, settings=None):
     return measure_picks(source, ORIGIN, located, lambda _, picked, origin: (picked, origin.row), settings)
 
 
-@pytest.mark.parametrize("text", ["1120,port,300", "index:120,starboard,0"])
-def test_text_of_a_pick_is_what_was_parsed(text):
-    assert str(parse_pick(text, "--pick")) == text
-    assert parse_pick(f" {text.replace(',', ' , ')} ", "--pick") == parse_pick(text, "--pick")
+def test_text_of_a_pick_is_what_was_parsed():
+    for text in ("1120,port,300", "index:120,starboard,0"):
+        assert str(parse_pick(text, "--pick")) == text
+        assert parse_pick(f" {text.replace(',', ' , ')} ", "--pick") == parse_pick(text, "--pick")
+    picks = (Pick(1, Side.PORT, 2), Pick(3, Side.STARBOARD, 4, by_index=True))
+    assert parse_picks(picks_text(picks).encode(), "f") == (picks, ())
 
 
 @pytest.mark.parametrize(
@@ -86,19 +90,12 @@ def test_error_names_the_invalid_part(text, message):
     assert "\n" not in str(error.value)
 
 
-def test_file_of_picks_is_read_as_written():
-    picks = (Pick(1, Side.PORT, 2), Pick(3, Side.STARBOARD, 4, by_index=True))
-    assert parse_picks(picks_text(picks).encode(), "f") == (picks, ())
-
-
 def test_invalid_lines_of_a_file_are_reported_and_the_others_used():
     content = b"\xef\xbb\xbf# by anna\r\n\r\n1,port,2\nnonsense\n1,port,2\n\xff\x00,port,3\n5,port,6\n"
     picks, errors = parse_picks(content, "f.picks")
     assert picks == (Pick(1, Side.PORT, 2), Pick(5, Side.PORT, 6))
     assert [error.where for error in errors] == ["f.picks line 4", "f.picks line 6"]
-
-
-def test_number_and_size_of_picks_are_limited():
+    # Number and size are limited.
     picks, errors = parse_picks(b"".join(b"%d,port,1\n" % n for n in range(MAX_PICKS + 9)), "f")
     assert (len(picks), len(errors)) == (MAX_PICKS, 1)
     assert parse_picks(b"1,port,2\n" * MAX_PICKS_BYTES, "f")[0] == ()
@@ -116,16 +113,14 @@ def test_pick_outside_the_recording_is_an_error(survey):
     ]
 
 
-def test_repeated_ping_number_needs_the_index(survey):
+def test_repeated_ping_number_needs_the_index_and_a_side_its_channel(survey):
     pings = tuple(replace(ping, number=ping.number % 50) for ping in survey.pings)
     source = InMemorySource(replace(survey, pings=pings), SurveyOptions())
     _, (error,) = locate_picks(source, [Pick(7, Side.PORT, 3)], "--pick")
     assert "index:7" in error.expected
     assert locate_picks(source, [Pick(107, Side.PORT, 3, by_index=True)], "--pick")[0][0].row == 107
-
-
-def test_side_without_a_channel_is_an_error(make_survey):
-    source = InMemorySource(make_survey(sides=(Side.PORT,)), SurveyOptions())
+    port = tuple(replace(ping, channels=ping.channels[:1]) for ping in survey.pings)
+    source = InMemorySource(replace(survey, pings=port), SurveyOptions())
     _, (error,) = locate_picks(source, [Pick(1000, Side.STARBOARD, 3)], "--pick")
     assert error.field == "side"
 
@@ -140,7 +135,8 @@ def test_pick_on_a_detection_is_that_detection(survey):
 
 
 def test_missed_highlight_is_measured_at_the_pick(make_survey):
-    survey = make_survey({"side": Side.PORT, "ping": 60, "sample": 300, "shadow_samples": 0, "highlight": 4.0})
+    highlight = {"side": Side.PORT, "ping": 60, "sample": 300, "shadow_samples": 0, "highlight": 4.0}
+    survey = make_survey(highlight, sides=(Side.PORT,))
     ((picked, row),) = measured(survey, "1060,port,300", settings=DetectorSettings(min_matched_response=900.0))
     assert (picked.is_candidate, picked.is_measured) == (False, True)
     d = picked.detection
@@ -158,6 +154,9 @@ def test_missed_highlight_is_measured_at_the_pick(make_survey):
 def test_place_where_nothing_is_measurable_has_unknown_sizes(survey, text):
     ((picked, row),) = measured(survey, text, settings=DetectorSettings(min_matched_response=900.0))
     record = picked.record(ORIGIN, "uuv-1", "made")
+    if text == "1030,port,10":  # in the water column
+        assert not picked.is_measured
+        assert record.lat_deg is None
     assert Contact.model_validate(record.model_dump()) == record
     if picked.is_measured:  # speckle may exceed the seabed around
         return
@@ -167,17 +166,11 @@ def test_place_where_nothing_is_measurable_has_unknown_sizes(survey, text):
     assert (record.atd_class, record.ping_number, record.channel) == (PICKED, pick.ping, pick.side.value)
 
 
-def test_water_column_is_not_measurable(survey):
-    ((picked, _),) = measured(survey, "1030,port,10")
-    assert not picked.is_measured
-    assert picked.record(ORIGIN, "uuv-1", "made").lat_deg is None
-
-
 def test_picks_of_a_long_recording_are_those_of_a_short_one(survey, monkeypatch):
     """The strips in which picks are measured do not change place and order."""
     texts = ["index:190,port,300", "index:60,port,300", "index:120,starboard,250", "index:99,port,20"]
     whole = measured(survey, *texts)
-    monkeypatch.setattr(picks_module, "STRIP_PINGS", 60)
+    monkeypatch.setattr(picks_module, "STRIP_PINGS", 100)
     parts = measured(survey, *texts, settings=DetectorSettings(join_overlap_pings=20))
     for (one, row), (other, other_row) in zip(whole, parts, strict=True):
         assert abs(row - other_row) <= 3
@@ -185,9 +178,9 @@ def test_picks_of_a_long_recording_are_those_of_a_short_one(survey, monkeypatch)
         assert abs(one.detection.sample - other.detection.sample) <= 12
 
 
-def test_structure_takes_only_picks_near_its_centre(survey):
+def test_structure_takes_only_picks_near_its_centre(one_object):
     settings = DetectorSettings()
-    large = replace(detect(survey)[0], highlight_pings=(0, 200), atd_class="structure")
+    large = replace(one_object[1], highlight_pings=(0, 200), atd_class="structure")
     far = Pick(1010, large.side, large.sample)
     assert not is_at_detection(large, 10, far, settings)
     assert is_at_detection(large, large.ping_index, far, settings)
@@ -222,10 +215,8 @@ def test_table_marks_picks_and_unknown_values(file, capsys):
 def test_snippets_of_picks_can_be_sent_as_images(file, tmp_path, capsys):
     arguments = ["--pick", "1030,port,10", "--snippets", tmp_path / "s", "--plot", tmp_path / "p.png"]
     listed(capsys, file, *arguments)
-    assert {p.name for p in (tmp_path / "s").iterdir() if "pick" in p.name} == {
-        "line7-002-pick.png",
-        "line7-002-pick.txt",
-    }
+    names = {p.name for p in (tmp_path / "s").iterdir() if "pick" in p.name}
+    assert names == {"line7-002-pick.png", "line7-002-pick.txt"}
     side_car = read_side_car(tmp_path / "s" / "line7-002-pick.txt", "", "uuv-1")
     assert side_car.notes == ()
     assert (side_car.contact.ping_number, side_car.contact.atd_class) == (1030, PICKED)
@@ -240,10 +231,7 @@ def test_snippets_of_picks_can_be_sent_as_images(file, tmp_path, capsys):
     [
         (["--pick", "1"], "sonarpost: --pick: place: got '1', expected PING,SIDE,SAMPLE, for example 1120,port,300\n"),
         (["--pick", "1000,aft,1"], "sonarpost: --pick: side: got 'aft', expected port or starboard\n"),
-        (
-            ["--pick", "7,port,1"],
-            "sonarpost: --pick: ping: got 7, expected a ping number of the file, 1000 to 1199\n",
-        ),
+        (["--pick", "7,port,1"], "sonarpost: --pick: ping: got 7, expected a ping number of the file, 1000 to 1199\n"),
         (["--pick", "1000,port,512"], "sonarpost: --pick: sample: got 512, expected 0 to 511\n"),
         (["second.xtf", "--pick", "1000,port,5"], "sonarpost: --pick: survey files: got 2, expected one file\n"),
     ],

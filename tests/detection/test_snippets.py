@@ -13,10 +13,12 @@ from sonarpost.detection.detector import detect
 from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image, to_grey
 from sonarpost.sonar.survey import ChannelPing, Side
 
+pytestmark = pytest.mark.usefixtures("few_candidates")
+
 
 @pytest.fixture(scope="module")
 def found(make_survey):
-    survey = make_survey({"side": Side.STARBOARD})
+    survey = make_survey({"side": Side.STARBOARD}, sides=(Side.STARBOARD,))
     return survey, detect(survey)[0]
 
 
@@ -70,7 +72,7 @@ def test_missing_samples_are_black_and_do_not_change_contrast(found):
 
 def test_values_beyond_16_bits_are_divided_by_power_of_two(found, make_survey):
     _, detection = found
-    survey = make_survey({"side": Side.STARBOARD}, dtype=np.uint32, scale=10_000.0)
+    survey = make_survey({"side": Side.STARBOARD}, sides=(Side.STARBOARD,), dtype=np.uint32, scale=10_000.0)
     snippet = cut_snippet(survey, detection)
     assert snippet.divisor16 > 1
     assert snippet.divisor16 & (snippet.divisor16 - 1) == 0
@@ -102,18 +104,15 @@ def test_flat_window_is_mid_grey_and_unknown_is_black():
     assert not to_grey(flat, np.zeros(flat.shape, dtype=np.bool_)).any()
 
 
-@pytest.mark.parametrize("change", [{"ping_index": 200}, {"ping_index": -1}, {"sample": 512}])
-def test_detection_outside_survey_is_rejected(found, change):
+def test_detection_outside_survey_and_empty_window_are_rejected(found):
     survey, detection = found
-    for cut in (cut_snippet, cut_expanded):
-        with pytest.raises(ValueError, match="expected inside 200 pings of 512 samples"):
-            cut(survey, replace(detection, **change), 80, 100)
-
-
-@pytest.mark.parametrize("size", [(0, 10), (10, 0)])
-def test_empty_window_is_rejected(found, size):
-    with pytest.raises(ValueError, match="expected 1 or more"):
-        cut_snippet(*found, *size)
+    for change in ({"ping_index": 200}, {"ping_index": -1}, {"sample": 512}):
+        for cut in (cut_snippet, cut_expanded):
+            with pytest.raises(ValueError, match="expected inside 200 pings of 512 samples"):
+                cut(survey, replace(detection, **change), 80, 100)
+    for size in ((0, 10), (10, 0)):
+        with pytest.raises(ValueError, match="expected 1 or more"):
+            cut_snippet(*found, *size)
 
 
 def block_means(image):
@@ -159,7 +158,7 @@ def test_missing_samples_do_not_darken_expanded_snippet(found):
 
 
 def test_ground_image_is_centred_at_its_scale(make_survey):
-    survey = make_survey({"pings": 10, "samples": 25, "shadow_samples": 40})
+    survey = make_survey({"pings": 10, "samples": 25, "shadow_samples": 40}, sides=(Side.PORT,))
     (found,) = detect(survey)
     image = ground_projected_image(survey, found, 80, 80, 0.1)
     assert image.shape == (80, 80)
@@ -170,15 +169,11 @@ def test_ground_image_is_centred_at_its_scale(make_survey):
     assert np.count_nonzero(bright) == pytest.approx(10, abs=3)
 
 
-def test_ground_image_is_black_beyond_recording(make_survey):
-    survey = make_survey({"ping": 8})
-    (found,) = detect(survey)
-    image = ground_projected_image(survey, found, 50, 50, 0.2)
+def test_ground_image_is_black_beyond_recording_and_absent_without_navigation(one_object):
+    survey, found = one_object
+    image = ground_projected_image(survey, replace(found, ping_index=8), 50, 50, 0.2)
     assert not image[:15].any()
     assert image[30:].any(axis=1).all()
-
-
-def test_no_ground_image_without_navigation(make_survey):
-    survey = make_survey({}, navigation=False)
-    (found,) = detect(survey)
-    assert ground_projected_image(survey, found, 100, 100, 0.1) is None
+    bare = tuple(replace(ping, lat_deg=None, lon_deg=None, speed_mps=None) for ping in survey.pings)
+    unknown = replace(found, position=None, vehicle=None, heading_deg=None, pixel_along_m=None)
+    assert ground_projected_image(replace(survey, pings=bare), unknown, 100, 100, 0.1) is None

@@ -17,6 +17,8 @@ from sonarpost.simulation.seabed.survey import simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import ChannelPing, Side
 
+pytestmark = pytest.mark.usefixtures("few_candidates")
+
 SETTINGS = DetectorSettings()
 
 
@@ -36,6 +38,7 @@ def test_long_shadow_behind_bright_edge_is_one_structure(make_survey):
     assert find_structures(normalise_side(make_survey({}), Side.PORT, SETTINGS)) == []
 
 
+@pytest.mark.system
 def test_simulated_wreck_is_one_contact_of_class_structure():
     spec = SurveySpec(seed=3, pings=900, seabed=SeabedKind.SAND, targets=0, clutter=(ObjectKind.WRECK,))
     simulated = simulate_survey(spec)
@@ -81,14 +84,11 @@ def test_echo_in_the_water_column_is_a_structure(deep_survey):
     assert contact.slant_range_m < contact.altitude_m
 
 
-@pytest.mark.parametrize(
-    ("rows", "samples", "step"),
-    [((0, 400), (150, 170), 1), ((100, 108), (120, 240), 3)],
-    ids=["a line at one range, as of the surface", "eight pings of noise"],
-)
-def test_surface_line_and_short_noise_are_no_structure(deep_survey, rows, samples, step):
-    grid = normalise_side(with_water_echo(deep_survey.survey, rows, samples, 200, step), Side.PORT, SETTINGS)
-    assert [s for s in find_water_structures(grid) if s.confidence >= SETTINGS.confidence_threshold] == []
+def test_surface_line_and_short_noise_are_no_structure(deep_survey):
+    # A line at one range, as of the surface, and eight pings of noise.
+    for rows, samples, step in (((0, 400), (150, 170), 1), ((100, 108), (120, 240), 3)):
+        grid = normalise_side(with_water_echo(deep_survey.survey, rows, samples, 200, step), Side.PORT, SETTINGS)
+        assert [s for s in find_water_structures(grid) if s.confidence >= SETTINGS.confidence_threshold] == []
     assert find_water_structures(normalise_side(deep_survey.survey, Side.PORT, SETTINGS)) == []
     assert find_water_structures(replace(grid, water_echo=None)) == []
     assert np.isfinite(grid.water_echo).all()

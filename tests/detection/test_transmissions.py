@@ -24,6 +24,8 @@ from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 from sonarpost.sonar.xtf_writer import write_xtf
 
+pytestmark = pytest.mark.usefixtures("few_candidates")
+
 START_S = 1.0e9
 PINGS_PER_S = 10.0
 RANGE_M = 15.0
@@ -74,10 +76,13 @@ def test_margins_and_listening_time_belong_to_a_transmission(time_s, expected):
     assert TransmitIntervals.of([(100.0, 105.0)], 0.2, 0.5).contains(ping_at(time_s)) is expected
 
 
-def test_a_transmission_during_the_reception_of_the_echo_masks_the_ping():
+def test_a_transmission_during_the_reception_of_the_echo_and_each_clock_masks_the_ping():
     intervals = TransmitIntervals.of([(100.0, 101.0)], 0.0, 0.0)
     assert intervals.contains(ping_at(99.9, 75.0))
     assert not intervals.contains(ping_at(99.89, 75.0))
+    # A step of the clock masks what each clock has stamped.
+    intervals = TransmitIntervals.of([(1000.0, 1003.0), (400.0, 403.0)])
+    assert [intervals.contains(ping_at(time_s)) for time_s in (1001.0, 401.0, 700.0)] == [True, True, False]
 
 
 def test_unsorted_and_overlapping_intervals_are_joined():
@@ -97,23 +102,13 @@ def test_a_ping_is_in_the_union_of_all_intervals(pairs, time_s, before_s, after_
     assert TransmitIntervals.of(pairs, before_s, after_s).contains(ping_at(time_s)) is expected
 
 
-@pytest.mark.parametrize(
-    "pair", [(2.0, 1.0), (math.nan, 1.0), (1.0, math.nan), (-math.inf, 0.0), (0.0, math.inf)], ids=str
-)
-def test_invalid_intervals_are_one_error(pair):
-    with pytest.raises(ValueError, match="transmission: got"):
-        TransmitIntervals.of([(0.0, 1.0), pair])
-
-
-@pytest.mark.parametrize("margins", [(-0.1, 0.0), (0.0, math.nan), (math.inf, 0.0)], ids=str)
-def test_invalid_margins_are_one_error(margins):
-    with pytest.raises(ValueError, match="margins: got"):
-        TransmitIntervals.of([], *margins)
-
-
-def test_a_clock_step_masks_what_each_clock_has_stamped():
-    intervals = TransmitIntervals.of([(1000.0, 1003.0), (400.0, 403.0)])
-    assert [intervals.contains(ping_at(time_s)) for time_s in (1001.0, 401.0, 700.0)] == [True, True, False]
+def test_invalid_intervals_and_margins_are_one_error():
+    for pair in ((2.0, 1.0), (math.nan, 1.0), (1.0, math.nan), (-math.inf, 0.0), (0.0, math.inf)):
+        with pytest.raises(ValueError, match="transmission: got"):
+            TransmitIntervals.of([(0.0, 1.0), pair])
+    for margins in ((-0.1, 0.0), (0.0, math.nan), (math.inf, 0.0)):
+        with pytest.raises(ValueError, match="margins: got"):
+            TransmitIntervals.of([], *margins)
 
 
 def test_a_masked_ping_keeps_its_navigation():
@@ -146,25 +141,20 @@ def test_an_object_beside_the_bursts_is_found_at_the_same_place(make_survey):
     assert found.confidence == pytest.approx(expected.confidence, abs=0.15)
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("length", [1, 3, 12, 60])
-def test_masked_pings_have_no_edges(length, seed, make_survey):
-    survey = make_survey(seed=seed)
+@pytest.mark.parametrize("length", [1, 12, 60])
+def test_masked_pings_have_no_edges(length, make_survey):
+    survey = make_survey(seed=length % 4)
     bursts = [(first, first + length) for first in (20, 100)]
     assert detect(masked(survey, TransmitIntervals.of(transmissions(bursts)))) == ()
 
 
 @pytest.mark.parametrize("altitude", [True, False])
 def test_no_contact_has_its_centre_in_a_masked_ping(altitude, make_survey):
-    survey = make_survey({"ping": 100}, altitude=altitude)
+    survey = make_survey({"ping": 100}, sides=(Side.PORT,), altitude=altitude)
     intervals = TransmitIntervals.of([(START_S + 9.9, START_S + 10.1)])
     hidden = {row for row, ping in enumerate(survey.pings) if intervals.contains(ping)}
     assert {d.ping_index for d in detect(masked(survey, intervals))}.isdisjoint(hidden)
-
-
-def test_a_survey_of_masked_pings_has_no_contacts(make_survey):
-    survey = make_survey({"ping": 100})
-    assert detect(masked(survey, TransmitIntervals.of([(START_S, START_S + 60.0)]))) == ()
+    assert detect(masked(survey, TransmitIntervals.of([(START_S, START_S + 60.0)]))) == (), "all pings are masked"
 
 
 # Files
@@ -172,7 +162,7 @@ def test_a_survey_of_masked_pings_has_no_contacts(make_survey):
 
 def add(detector, survey, intervals):
     source = MaskedSource(InMemorySource(survey, SurveyOptions()), intervals)
-    return detector.add_file(source, FileOrigin.of(source, survey.path.stem)), source
+    return detector.add_file(source, FileOrigin.of(source, survey.path.stem))
 
 
 def halves(survey, boundary):
@@ -181,18 +171,18 @@ def halves(survey, boundary):
 
 
 def test_masked_pings_are_counted(make_survey):
-    detector = StreamDetector(lambda survey, detection, origin: None)
-    _, source = add(detector, make_survey(), TransmitIntervals.of(transmissions([(0, 150)]), 0.0, 0.0))
-    assert source.masked_count == 150
-    assert source.masked_share == 0.75
+    intervals = TransmitIntervals.of(transmissions([(0, 150)]), 0.0, 0.0)
+    source = MaskedSource(InMemorySource(make_survey(), SurveyOptions()), intervals)
+    assert len(list(source.pings())) == 200
+    assert (source.masked_count, source.masked_share) == (150, 0.75)
 
 
-@pytest.mark.parametrize("burst", [(85, 100), (100, 115), (90, 110)])
+@pytest.mark.parametrize("burst", [(85, 100), (90, 110)])
 def test_files_are_joined_at_a_boundary_in_masked_pings(burst, make_survey):
     survey = make_survey({"ping": 70}, {"ping": 140})
     detector = StreamDetector(lambda survey, detection, origin: survey.pings[detection.ping_index].number - 1000)
     intervals = TransmitIntervals.of(transmissions([burst]))
-    results = [add(detector, half, intervals)[0] for half in halves(survey, 100)]
+    results = [add(detector, half, intervals) for half in halves(survey, 100)]
     assert results[1].joined
     contacts = [c.content for r in results for c in (*r.released, *r.contacts)] + [c.content for c in detector.finish()]
     assert sorted(contacts) == [pytest.approx(70, abs=3), pytest.approx(140, abs=3)]
@@ -206,7 +196,7 @@ def test_masked_pings_do_not_join_recordings_with_other_channels(make_survey):
     detector = StreamDetector(lambda survey, detection, origin: None)
     intervals = TransmitIntervals.of(transmissions([(90, 110)]))
     add(detector, first, intervals)
-    assert not add(detector, replace(second, pings=tuple(shorter)), intervals)[0].joined
+    assert not add(detector, replace(second, pings=tuple(shorter)), intervals).joined
 
 
 # Command
@@ -215,7 +205,7 @@ def test_masked_pings_do_not_join_recordings_with_other_channels(make_survey):
 @pytest.fixture(scope="module")
 def noisy_file(make_survey, tmp_path_factory):
     path = tmp_path_factory.mktemp("noisy") / "line.xtf"
-    write_xtf(with_bursts(make_survey({"ping": 145})), path)
+    write_xtf(with_bursts(make_survey({"ping": 145}, sides=(Side.PORT,))), path)
     return path
 
 
@@ -237,10 +227,13 @@ def test_the_command_masks_the_transmissions_of_a_file(name, noisy_file, tmp_pat
     assert 16 < file["masked_pings"] <= 36
 
 
-def test_the_command_prints_the_masked_pings_and_takes_margins(noisy_file, tmp_path, capsys):
+def test_the_command_prints_the_masked_pings_and_refuses_invalid_margins(noisy_file, tmp_path, capsys):
     options = ["--transmissions", str(written(tmp_path, "times.json")), "--transmission-margins", "20", "20"]
     assert main(["detect", str(noisy_file), *options]) == 0
     assert "  note: 200 of 200 pings masked: the modem transmitted" in capsys.readouterr().out.splitlines()
+    assert main(["detect", str(noisy_file), "--transmissions", str(tmp_path / "none.json")]) == 2
+    assert main(["detect", str(noisy_file), "--transmission-margins", "-1", "0"]) == 2
+    assert "detect: --transmission-margins: got" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -268,9 +261,3 @@ def test_an_invalid_file_is_one_error(name, text, field, tmp_path):
     with pytest.raises(ConfigError) as caught:
         read_transmissions(tmp_path / name)
     assert caught.value.field == field
-
-
-def test_an_absent_file_and_invalid_margins_end_the_command(noisy_file, tmp_path, capsys):
-    assert main(["detect", str(noisy_file), "--transmissions", str(tmp_path / "none.json")]) == 2
-    assert main(["detect", str(noisy_file), "--transmission-margins", "-1", "0"]) == 2
-    assert "detect: --transmission-margins: got" in capsys.readouterr().err

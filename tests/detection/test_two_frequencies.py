@@ -22,6 +22,7 @@ from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import Side
 
+pytestmark = pytest.mark.usefixtures("few_candidates")
 SAMPLES, RANGE_M = 512, 30.0
 SECOND = pytest.mark.parametrize(
     ("samples", "range_m"),
@@ -34,15 +35,10 @@ SECOND = pytest.mark.parametrize(
 )
 
 
-@pytest.fixture(scope="module")
-def simulated():
-    return simulate_survey(
-        SurveySpec(seed=3, pings=400, samples=SAMPLES, range_m=RANGE_M, targets=4, clutter=0, seabed=SeabedKind.SAND)
-    )
-
-
-@SECOND
-def test_detections_equal_those_of_first_frequency(samples, range_m, simulated, tmp_path):
+@pytest.mark.parametrize(("samples", "range_m"), [(4 * SAMPLES, 10.0), (SAMPLES // 4, 90.0)])
+def test_detections_equal_those_of_first_frequency(samples, range_m, tmp_path):
+    sand = {"clutter": 0, "seabed": SeabedKind.SAND}
+    simulated = simulate_survey(SurveySpec(seed=3, pings=400, samples=SAMPLES, range_m=RANGE_M, targets=4, **sand))
     alone, both = read_both(simulated.survey, tmp_path, samples, range_m)
     found = detect(both)
     assert len(found) == len(simulated.truth) == 4
@@ -59,69 +55,52 @@ def test_detections_equal_those_of_first_frequency(samples, range_m, simulated, 
 
 
 @SECOND
-def test_detections_without_altitude_and_navigation(samples, range_m, make_survey, tmp_path):
-    survey = make_survey({}, navigation=False, altitude=False)
+def test_cells_snippets_waterfall_and_codec_effect_are_those_of_first_frequency(samples, range_m, one_object, tmp_path):
+    survey, found = one_object
     alone, both = read_both(survey, tmp_path, samples, range_m)
-    (found,) = detect(both)
-    assert found.slant_range_m == pytest.approx(250.5 * 20 / 512, abs=0.2)
-    assert found.width_m == pytest.approx(12 * 20 / 512, abs=0.2)
-    assert found.altitude_m == pytest.approx(3.0, abs=0.25)
-    assert (found,) == detect(alone)
+    one, other = (normalise_side(each, Side.PORT, DetectorSettings()) for each in (alone, both))
+    assert (other.cell_across_m, other.samples_per_cell) == (one.cell_across_m, one.samples_per_cell)
+    np.testing.assert_array_equal(other.level, one.level)
+    for sample in (250, 505):  # at the outer edge of the recording the window is shifted
+        at = replace(found, sample=sample)
+        for width in (140, 1000):
+            one, other = (cut_snippet(each, at, 80, width) for each in (alone, both))
+            assert other.first_sample == one.first_sample
+            np.testing.assert_array_equal(other.image16, one.image16)
+        np.testing.assert_array_equal(cut_expanded(both, at, 80, 140), cut_expanded(alone, at, 80, 140))
+        one, other = (ground_projected_image(each, at, 80, 140, 0.1) for each in (alone, both))
+        np.testing.assert_array_equal(other, one)
+    images = [annotated_waterfall(InMemorySource(each, SurveyOptions()), (found,)) for each in (alone, both)]
+    np.testing.assert_array_equal(*map(np.asarray, images))
+    image = cut_snippet(alone, found, 80, 140)
+    confidences = [confidence_with(each, found, image, image.image) for each in (alone, both)]
+    assert confidences[0] == confidences[1] > 1.0
 
 
 @SECOND
-def test_cells_are_those_of_first_frequency(samples, range_m, make_survey, tmp_path):
-    alone, both = (
-        normalise_side(survey, Side.PORT, DetectorSettings())
-        for survey in read_both(make_survey({}), tmp_path, samples, range_m)
-    )
-    assert (both.cell_across_m, both.samples_per_cell) == (alone.cell_across_m, alone.samples_per_cell)
-    np.testing.assert_array_equal(both.level, alone.level)
+def test_line_of_several_files_without_altitude_and_navigation(samples, range_m, make_survey, tmp_path):
+    found = []
+    survey = make_survey({}, sides=(Side.PORT,), navigation=False, altitude=False)
+    for each in read_both(survey, tmp_path, samples, range_m):
+        results, held = results_of(files_of(each, 98))
+        found.append([contact.content for result in results for contact in (*result.released, *result.contacts)])
+        found[-1] += [contact.content for contact in held]
+    assert found[0] == found[1]
+    ((_, detection),) = found[0]
+    assert detection.slant_range_m == pytest.approx(250.5 * 20 / 512, abs=0.2)
+    assert detection.width_m == pytest.approx(12 * 20 / 512, abs=0.2)
+    assert detection.altitude_m == pytest.approx(3.0, abs=0.25)
 
 
-@SECOND
-@pytest.mark.parametrize("sample", [250, 505])
-def test_snippets_are_those_of_first_frequency(sample, samples, range_m, make_survey, tmp_path):
-    alone, both = read_both(make_survey({}), tmp_path, samples, range_m)
-    # At the outer edge of the recording the window is shifted.
-    found = replace(detect(alone)[0], sample=sample)
-    for one, other in zip(
-        (cut_snippet(alone, found, 80, 140), cut_snippet(alone, found, 80, 1000)),
-        (cut_snippet(both, found, 80, 140), cut_snippet(both, found, 80, 1000)),
-        strict=True,
-    ):
-        assert other.first_sample == one.first_sample
-        np.testing.assert_array_equal(other.image16, one.image16)
-    np.testing.assert_array_equal(cut_expanded(both, found, 80, 140), cut_expanded(alone, found, 80, 140))
-    np.testing.assert_array_equal(
-        ground_projected_image(both, found, 80, 140, 0.1), ground_projected_image(alone, found, 80, 140, 0.1)
-    )
-
-
-def test_long_range_of_second_frequency_allows_small_pixels(make_survey, tmp_path):
-    alone, both = read_both(make_survey({}), tmp_path, 512, 8000.0)
-    (found,) = detect(alone)
+def test_long_range_of_second_frequency_allows_small_pixels(one_object, tmp_path):
+    survey, found = one_object
+    alone, both = read_both(survey, tmp_path, 512, 8000.0)
     pixel_m = 8000.0 / MAX_COLUMNS / 2
     image = ground_projected_image(alone, found, 8, 14, pixel_m)
     assert image is not None
     np.testing.assert_array_equal(ground_projected_image(both, found, 8, 14, pixel_m), image)
-
-
-def test_sample_beyond_first_frequency_is_rejected(make_survey):
-    survey = make_survey({})
-    found = replace(detect(survey)[0], sample=600)
     with pytest.raises(ValueError, match="512 samples"):
-        cut_snippet(with_second_frequency(survey, 1024, 20.0), found)
-
-
-@SECOND
-def test_annotated_waterfall_shows_first_frequency(samples, range_m, make_survey, tmp_path):
-    alone, both = read_both(make_survey({}), tmp_path, samples, range_m)
-    images = [
-        np.asarray(annotated_waterfall(InMemorySource(survey, SurveyOptions()), detect(survey)))
-        for survey in (alone, both)
-    ]
-    np.testing.assert_array_equal(*images)
+        cut_snippet(with_second_frequency(survey, 1024, 20.0), replace(found, sample=600))
 
 
 def files_of(survey, boundary):
@@ -135,29 +114,10 @@ def results_of(files):
     return [detector.add_file(source, FileOrigin.of(source, "0")) for source in sources], detector.finish()
 
 
-@SECOND
-def test_line_of_several_files(samples, range_m, make_survey, tmp_path):
-    found = []
-    for survey in read_both(make_survey({}), tmp_path, samples, range_m):
-        results, held = results_of(files_of(survey, 98))
-        found.append([contact.content for result in results for contact in result.contacts] + [c.content for c in held])
-    assert found[0] == found[1] != []
-
-
 def test_exchanged_frequencies_are_no_continuation(make_survey):
-    survey = with_second_frequency(make_survey({}), 512, 10.0)
+    survey = with_second_frequency(make_survey({}, sides=(Side.PORT,)), 512, 10.0)
     first, second = files_of(survey, 98)
     assert results_of([first, second])[0][1].joined
-    # The second channels of both sides come first: the image would continue at another scale.
-    exchanged = tuple(replace(p, channels=(*p.channels[2:], *p.channels[:2])) for p in second.pings)
+    # The second channel comes first: the image would continue at another scale.
+    exchanged = tuple(replace(p, channels=p.channels[::-1]) for p in second.pings)
     assert not results_of([first, replace(second, pings=exchanged)])[0][1].joined
-
-
-@SECOND
-def test_codec_effect_uses_first_frequency(samples, range_m, make_survey, tmp_path):
-    alone, both = read_both(make_survey({}), tmp_path, samples, range_m)
-    (found,) = detect(alone)
-    cut = cut_snippet(alone, found, 80, 140)
-    confidence = confidence_with(alone, found, cut, cut.image)
-    assert confidence > 1.0
-    assert confidence_with(both, found, cut, cut.image) == confidence
