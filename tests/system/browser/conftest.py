@@ -137,6 +137,14 @@ class Visit:
         ):
             self.foreign_requests.append(request.url)
 
+    def load(self, address: str) -> None:
+        """Load a page; again if an interface of the machine has changed, for example by containers of other tests."""
+        self.page.goto(address)
+        while any("ERR_NETWORK_CHANGED" in error for error in self.errors):
+            self.errors.clear()
+            self.page.goto("about:blank")
+            self.page.goto(address)
+
     def expect_errors(self, *parts: str) -> None:
         """Accept errors on the browser's console that contain one of these texts."""
         self.expected_errors += parts
@@ -211,7 +219,7 @@ def visit(browser: Browser) -> Iterator[Callable[..., Visit]]:
         if token:
             context.add_cookies([{"name": "sonarpost_session", "value": token, "url": address}])
         visits.append(Visit(context, address))
-        visits[-1].page.goto(address + path)
+        visits[-1].load(address + path)
         if token and not path:
             # The page accepts keys after it has loaded the list.
             visits[-1].until("() => /[0-9]/.test(document.querySelector('.filters .sum')?.textContent)")
