@@ -6,11 +6,10 @@ import os
 import select
 import threading
 import tty
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ import zenoh
 from builders.common import eventually, publish_once
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.messages import Contact, Health, Pixels, Record, Snippet
+from sonarpost.messages import Contact, Health, Pixels, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
 from sonarpost.simulation.channel.emulator import ChannelEmulator
@@ -35,31 +34,31 @@ class PeerService(Service[ServiceConfig]):
 
     NAME = "neighbour"
 
-    def __init__(self, platform: PlatformConfig, consumed: Mapping[str, type[Record]]) -> None:
+    def __init__(self, platform, consumed):
         super().__init__(platform, ServiceConfig())
         self._consumed = consumed
         self.received: list[Any] = []
 
-    def consumed_keys(self) -> Mapping[str, type[Record]]:
+    def consumed_keys(self):
         return self._consumed
 
-    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+    def handle(self, key, record, effects):
         self.received.append(record)
 
-    def send(self, key: str, consumer: str, *records: Record, priority: int = 4) -> None:
+    def send(self, key, consumer, *records, priority=4):
         effects = UnitOfWork()
         for record in records:
             effects.send(key, consumer, record, priority=priority)
         self.commit(effects)
 
-    def send_bytes(self, key: str, consumer: str, payload: bytes) -> None:
+    def send_bytes(self, key, consumer, payload):
         """Send a payload that is not a record."""
         with self.store.transaction() as tx:
             tx.send(key, consumer, payload, encoding="")
 
 
 @pytest.fixture(autouse=True)
-def short_retry_delays(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_retry_delays(monkeypatch):
     """Shorten the delays before retries; these tests count retries, not seconds."""
     monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.05)
     monkeypatch.setattr("sonarpost.services.atd_stub.release.RELEASE_INTERVAL_S", 0.05)
@@ -72,24 +71,24 @@ def short_retry_delays(monkeypatch: pytest.MonkeyPatch) -> None:
 class ServiceRunner:
     """Starts the services of one test and stops those that still run at its end."""
 
-    def __init__(self, platform: PlatformMaker) -> None:
+    def __init__(self, platform):
         self._platform = platform
         self._running: list[Service[Any]] = []
 
-    def start(self, service: Service[Any]) -> Any:
+    def start(self, service):
         assert service.start()
         self._running.append(service)
         return service
 
-    def stop(self, service: Service[Any]) -> None:
+    def stop(self, service):
         self._running.remove(service)
         service.stop()
 
-    def peer(self, platform_id: str, name: str, consumed: Mapping[str, type[Record]] | None = None) -> PeerService:
+    def peer(self, platform_id, name, consumed=None):
         named = type("Named", (PeerService,), {"NAME": name})
         return self.start(named(self._platform(platform_id), consumed or {}))
 
-    def stop_all(self) -> None:
+    def stop_all(self):
         """Stop all services at the same time, as a platform that is switched off does."""
         running, self._running = self._running, []
         with ThreadPoolExecutor() as pool:
@@ -98,20 +97,20 @@ class ServiceRunner:
 
 
 @pytest.fixture
-def runner(platform: PlatformMaker) -> Iterator[ServiceRunner]:
+def runner(platform):
     runner = ServiceRunner(platform)
     yield runner
     runner.stop_all()
 
 
 @pytest.fixture
-def check_monitoring(client: zenoh.Session, runner: ServiceRunner) -> Callable[[Service[Any]], None]:
+def check_monitoring(client, runner):
     """Check liveliness token and health records of a running service, then stop it and check the last ones."""
 
-    def tokens(key: str) -> list[str]:
+    def tokens(key):
         return [str(reply.ok.key_expr) for reply in client.liveliness().get(key, timeout=5.0) if reply.ok]
 
-    def check(service: Service[Any]) -> None:
+    def check(service):
         key = keys.alive(service.platform.id, service.NAME)
         eventually(lambda: tokens(key) == [key], what=f"token {key}")
         health_records: list[Health] = []
@@ -132,54 +131,47 @@ def check_monitoring(client: zenoh.Session, runner: ServiceRunner) -> Callable[[
 
 
 @pytest.fixture
-def refused() -> Callable[[Service[Any]], list[tuple[str, str]]]:
+def refused():
     """Return what a service has quarantined: (key, reason), oldest first."""
 
-    def read(service: Service[Any]) -> list[tuple[str, str]]:
+    def read(service):
         return [(str(k), str(r)) for k, r in service.store._query("SELECT key, reason FROM refused ORDER BY id")]
 
     return read
 
 
 @contextmanager
-def _full_disk(service: Service[Any]) -> Iterator[None]:
-    service.store._db.execute("PRAGMA max_page_count=1")
+def _pragma(service, during, after):
+    with service.store._lock:
+        service.store._db.execute(f"PRAGMA {during}")
     yield
-    service.store._db.execute("PRAGMA max_page_count=1000000")
+    with service.store._lock:
+        service.store._db.execute(f"PRAGMA {after}")
 
 
 @pytest.fixture
-def full_disk() -> Callable[[Service[Any]], AbstractContextManager[None]]:
+def full_disk():
     """Let the store of a service grow no further."""
-    return _full_disk
-
-
-@contextmanager
-def _unwritable(service: Service[Any]) -> Iterator[None]:
-    with service.store._lock:
-        service.store._db.execute("PRAGMA query_only=ON")
-    yield
-    with service.store._lock:
-        service.store._db.execute("PRAGMA query_only=OFF")
+    return lambda service: _pragma(service, "max_page_count=1", "max_page_count=1000000")
 
 
 @pytest.fixture
-def unwritable() -> Callable[[Service[Any]], AbstractContextManager[None]]:
+def unwritable():
     """Make every write to the store of a service fail."""
-    return _unwritable
+    return lambda service: _pragma(service, "query_only=ON", "query_only=OFF")
 
 
 @pytest.fixture
-def publish(client: zenoh.Session) -> Callable[[str, bytes], None]:
+def publish(client):
     """Publish without an outbox, as soon as a subscriber exists."""
     return partial(publish_once, client)
 
 
 @pytest.fixture
-def watch(client: zenoh.Session) -> Callable[[str], list[zenoh.Sample]]:
+def watch(client):
     """Collect what is published on a key."""
 
-    def collect(key: str) -> list[zenoh.Sample]:
+    def collect(key):
         samples: list[zenoh.Sample] = []
         client.declare_subscriber(key, samples.append)
         return samples
@@ -188,12 +180,12 @@ def watch(client: zenoh.Session) -> Callable[[str], list[zenoh.Sample]]:
 
 
 @pytest.fixture(scope="session")
-def survey_bytes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], bytes]:
+def survey_bytes(tmp_path_factory):
     """Make the bytes of a small XTF survey with contacts; the same seed gives the same bytes."""
     folder = tmp_path_factory.mktemp("xtf")
     made: dict[int, bytes] = {}
 
-    def make(seed: int) -> bytes:
+    def make(seed):
         if seed not in made:
             path = folder / f"{seed}.xtf"
             write_xtf(simulate_survey(SurveySpec(seed=seed, pings=200, samples=512)).survey, path)
@@ -204,10 +196,10 @@ def survey_bytes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], by
 
 
 @pytest.fixture(scope="session")
-def texture() -> Callable[..., np.ndarray]:
+def texture():
     """Make an image with structure."""
 
-    def make(height_px: int = 40, width_px: int = 60, seed: int = 1, dtype: type = np.uint8) -> np.ndarray:
+    def make(height_px=40, width_px=60, seed=1, dtype=np.uint8):
         rng = np.random.default_rng(seed)
         coarse = rng.integers(0, 200, (height_px // 8 + 1, width_px // 8 + 1))
         fine = np.kron(coarse, np.ones((8, 8)))[:height_px, :width_px] + rng.integers(0, 55, (height_px, width_px))
@@ -217,10 +209,10 @@ def texture() -> Callable[..., np.ndarray]:
 
 
 @pytest.fixture(scope="session")
-def snippet(texture: Callable[..., np.ndarray]) -> Callable[..., Snippet]:
+def snippet(texture):
     """Make a snippet by its contact identifier."""
 
-    def make(contact_id: str, height_px: int = 40, width_px: int = 60, **options: Any) -> Snippet:
+    def make(contact_id, height_px=40, width_px=60, **options):
         picture = Pixels.from_array(texture(height_px, width_px, **options))
         return Snippet(contact=Contact(contact_id=contact_id, vehicle_id="uuv-1"), picture=picture)
 
@@ -228,12 +220,12 @@ def snippet(texture: Callable[..., np.ndarray]) -> Callable[..., Snippet]:
 
 
 @pytest.fixture
-def put_file(tmp_path: Path) -> Callable[[str, bytes], Path]:
+def put_file(tmp_path):
     """Put a complete file into the polled folder: written under a hidden name, then renamed."""
     folder = tmp_path / "incoming"
     folder.mkdir(exist_ok=True)
 
-    def put(name: str, data: bytes) -> Path:
+    def put(name, data):
         hidden = folder / f".{name}.part"
         hidden.write_bytes(data)
         return hidden.rename(folder / name)
@@ -248,7 +240,7 @@ class SerialCable:
         device: Port of the emulated modem, or None for a cable that is connected to nothing.
     """
 
-    def __init__(self, device: str | None) -> None:
+    def __init__(self, device):
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         self.port = os.ttyname(self._slave)
@@ -260,12 +252,12 @@ class SerialCable:
         self._thread = threading.Thread(target=self._copy, daemon=True)
         self._thread.start()
 
-    def say(self, data: bytes) -> None:
+    def say(self, data):
         """Send bytes to the service."""
         while data:
             data = data[os.write(self._master, data) :]
 
-    def _copy(self) -> None:
+    def _copy(self):
         ends = {self._master: self._modem, self._modem: self._master}
         ends.pop(-1, None)
         while not self._stop.is_set():
@@ -274,7 +266,7 @@ class SerialCable:
                 if ends[end] >= 0:
                     os.write(ends[end], data)
 
-    def close(self) -> None:
+    def close(self):
         self._stop.set()
         self._thread.join()
         for descriptor in (self._master, self._slave, self._modem):
@@ -283,11 +275,11 @@ class SerialCable:
 
 
 @pytest.fixture
-def serial_cable() -> Iterator[Callable[[str | None], SerialCable]]:
+def serial_cable():
     """Make serial cables."""
     made: list[SerialCable] = []
 
-    def make(device: str | None) -> SerialCable:
+    def make(device):
         made.append(SerialCable(device))
         return made[-1]
 
@@ -301,28 +293,28 @@ class ModemPair:
 
     VESSEL, VEHICLE = 1, 2
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.folder = folder
         self._channel: ChannelEmulator | None = None
 
-    def port(self, modem: int) -> str:
+    def port(self, modem):
         return str(self.folder / f"modem-{modem}")
 
-    def start(self, *, time_scale: float = 150.0, **channel: Any) -> ChannelEmulator:
+    def start(self, *, time_scale=150.0, **channel):
         modems = (ModemSite(address=1), ModemSite(address=3, east_m=150.0))
         config = EmulatorConfig(modem=modems, **channel, pty_dir=self.folder, time_scale=time_scale)
         self._channel = ChannelEmulator(config)
         self._channel.start()
         return self._channel
 
-    def stop(self) -> None:
+    def stop(self):
         if self._channel is not None:
             self._channel.stop()
             self._channel = None
 
 
 @pytest.fixture
-def modem_pair(tmp_path: Path) -> Iterator[ModemPair]:
+def modem_pair(tmp_path):
     modem_pair = ModemPair(tmp_path / "modems")
     yield modem_pair
     modem_pair.stop()

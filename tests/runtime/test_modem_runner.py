@@ -4,10 +4,9 @@ import pty
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
+from builders.common import eventually
 
 from sonarpost.errors import FrameError, PortError
 from sonarpost.modem.interface import (
@@ -39,43 +38,41 @@ CONFIG = MicroModemConfig(address=3, settings=())
 class PtyModem:
     """A modem on a pseudo-terminal that replies at once and transmits in no time."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         self.path = path
         self.replies = True
         self.commands: list[nmea.Sentence] = []
         self.plug()
 
-    def plug(self) -> None:
+    def plug(self):
         self.master, slave = pty.openpty()
         tty.setraw(slave)
         self.path.symlink_to(os.ttyname(slave))
         os.close(slave)
         self._plugged = True
+        self._unplugged = threading.Event()
         self._thread = threading.Thread(target=self._serve, args=(self.master,), daemon=True)
         self._thread.start()
 
-    def unplug(self) -> None:
+    def unplug(self):
         if self._plugged:
             self._plugged = False
             self.path.unlink()
             os.close(self.master)
             self._thread.join(5.0)
 
-    def write(self, kind: str, *fields: str | int) -> None:
+    def write(self, kind, *fields):
         os.write(self.master, nmea.format(kind, *fields))
 
-    def _serve(self, master: int) -> None:
+    def _serve(self, master):
         lines = nmea.LineAssembler()
         os.set_blocking(master, False)
         while self._plugged:
             try:
                 items = lines.feed(os.read(master, 4096))
-            except BlockingIOError:
-                time.sleep(0.002)
-                continue
             except OSError:
-                # The other side is not open, or unplugged.
-                time.sleep(0.002)
+                # Nothing arrived, the other side is not open, or unplugged.
+                self._unplugged.wait(0.002)
                 continue
             for sentence in items:
                 assert isinstance(sentence, nmea.Sentence)
@@ -83,7 +80,7 @@ class PtyModem:
                 if self.replies:
                     self._reply(*([sentence.kind, *sentence.fields]))
 
-    def _reply(self, kind: str, *fields: str) -> None:
+    def _reply(self, kind, *fields):
         if kind == "CCCFG":
             self.write("CACFG", *fields)
         elif kind == "CCCFQ":
@@ -102,25 +99,18 @@ class PtyModem:
 
 
 class Rig:
-    def __init__(self, modem: PtyModem) -> None:
+    def __init__(self, modem):
         self.modem = modem
         self.events: list[ModemEvent] = []
         self.port = SerialPort(str(modem.path), first_retry_s=0.02, max_retry_s=0.1)
         self.runner = ModemRunner(MicroModem(CONFIG), self.port, self.events.append)
 
-    def of(self, *kinds: type) -> list[ModemEvent]:
+    def of(self, *kinds):
         return [event for event in self.events if isinstance(event, kinds)]
 
 
-def eventually(condition: Callable[[], object], timeout_s: float = 120.0) -> None:
-    end_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end_s, "condition not met in time"
-        time.sleep(0.005)
-
-
 @pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
+def rig(tmp_path):
     modem = PtyModem(tmp_path / "ttyMODEM")
     rig = Rig(modem)
     rig.runner.start()
@@ -129,7 +119,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     modem.unplug()
 
 
-def test_the_runner_configures_sends_and_receives(rig: Rig) -> None:
+def test_the_runner_configures_sends_and_receives(rig):
     eventually(lambda: rig.runner.ready)
     assert rig.events == [ModemReady(3, None)]
     packet_id = rig.runner.send_packet(1, 4, [b"snippet"])
@@ -143,21 +133,17 @@ def test_the_runner_configures_sends_and_receives(rig: Rig) -> None:
     rig.modem.write("CACST", 8, 0)
     eventually(lambda: rig.of(PacketReceived))
     assert [event.data for event in rig.of(FrameReceived)] == [b"\x00\xff"]
-
-
-def test_an_invalid_packet_raises_in_the_caller(rig: Rig) -> None:
     with pytest.raises(FrameError):
         rig.runner.send_packet(1, 9, [b"x"])
 
 
-def test_packets_of_several_threads_are_all_sent(rig: Rig) -> None:
+def test_packets_of_several_threads_are_all_sent(rig):
     eventually(lambda: rig.runner.ready)
     ids: list[int] = []
 
-    def sender(number: int) -> None:
+    def sender(number):
         for n in range(4):
-            while rig.runner.queued > 4:
-                time.sleep(0.002)
+            eventually(lambda: rig.runner.queued <= 4)
             ids.append(rig.runner.send_packet(1, 4, [bytes([number, n])]))
 
     threads = [threading.Thread(target=sender, args=(n,)) for n in range(4)]
@@ -170,7 +156,7 @@ def test_packets_of_several_threads_are_all_sent(rig: Rig) -> None:
     assert len(set(ids)) == 16
 
 
-def test_a_port_lost_during_a_cycle_is_opened_again(rig: Rig) -> None:
+def test_a_port_lost_during_a_cycle_is_opened_again(rig):
     eventually(lambda: rig.runner.ready)
     rig.modem.replies = False
     first, second = rig.runner.send_packet(1, 4, [b"first"]), rig.runner.send_packet(1, 4, [b"second"])
@@ -187,14 +173,14 @@ def test_a_port_lost_during_a_cycle_is_opened_again(rig: Rig) -> None:
     assert len(rig.of(ModemReady)) == 2
 
 
-def test_the_callback_may_send_and_may_raise(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_callback_may_send_and_may_raise(tmp_path, caplog):
     modem = PtyModem(tmp_path / "ttyMODEM")
     sent: list[int] = []
 
-    def fail() -> None:
+    def fail():
         raise RuntimeError("defect of a consumer")
 
-    def on_event(event: ModemEvent) -> None:
+    def on_event(event):
         if isinstance(event, ModemReady):
             runner.send_packet(1, 4, [b"from the callback"])
             fail()
@@ -211,7 +197,7 @@ def test_the_callback_may_send_and_may_raise(tmp_path: Path, caplog: pytest.LogC
     assert (record.getMessage(), record.fields["event"]) == ("Modem event not handled", "ModemReady")
 
 
-def test_stop_returns_at_once_and_reports_the_packet_that_failed(tmp_path: Path) -> None:
+def test_stop_reports_the_packet_that_failed(tmp_path):
     modem = PtyModem(tmp_path / "ttyMODEM")
     rig = Rig(modem)
     rig.runner.start()
@@ -221,16 +207,14 @@ def test_stop_returns_at_once_and_reports_the_packet_that_failed(tmp_path: Path)
     modem.replies = False
     packet_id = rig.runner.send_packet(1, 4, [b"x"])
     eventually(lambda: any(s.kind == "CCCYC" for s in modem.commands))
-    start_s = time.monotonic()
     rig.runner.stop()
-    assert time.monotonic() - start_s < 2.0
     assert [(event.packet_id, event.reason) for event in rig.of(PacketFailed)] == [(packet_id, FailureReason.PORT_LOST)]
     assert not any(thread.name.endswith("ttyMODEM") for thread in threading.enumerate())
     rig.runner.stop()
     modem.unplug()
 
 
-def test_timers_run_without_a_byte_from_the_port(tmp_path: Path) -> None:
+def test_timers_run_without_a_byte_from_the_port(tmp_path):
     """With a clock fifty times faster, a command without a reply is repeated."""
     modem = PtyModem(tmp_path / "ttyMODEM")
     modem.replies = False
@@ -250,9 +234,9 @@ def test_timers_run_without_a_byte_from_the_port(tmp_path: Path) -> None:
     assert events[0].attempts == 3
 
 
-def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path: Path) -> None:
+def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path):
     modems = (ModemSite(address=1), ModemSite(address=2, east_m=150.0))
-    channel = ChannelEmulator(EmulatorConfig(modem=modems, pty_dir=tmp_path / "modems", time_scale=50.0))
+    channel = ChannelEmulator(EmulatorConfig(modem=modems, pty_dir=tmp_path / "modems", time_scale=150.0))
     channel.start()
     events: dict[int, list[ModemEvent]] = {1: [], 2: []}
     runners = {
@@ -272,7 +256,7 @@ def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path: Path) -> Non
             runners[1].request(lambda driver, now: driver.send_flexible(2, 1, b"flexible", now)),
             runners[1].request_packet(2, 1),
         ]
-        eventually(lambda: len([e for e in events[1] if isinstance(e, RequestDone)]) == len(requests), 120)
+        eventually(lambda: len([e for e in events[1] if isinstance(e, RequestDone)]) == len(requests))
         assert [e.request_id for e in events[1] if isinstance(e, RequestDone)] == requests
         assert [e.travel_s for e in events[1] if isinstance(e, PingAnswered)] == [0.1]
         assert [e.data for e in events[1] if isinstance(e, FrameReceived)] == [b"polled"]

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
 from builders.fake_modem import FakeModem
 
-from sonarpost.messages import Record
-from sonarpost.modem.interface import ModemEvent, SentenceRejected
+from sonarpost.modem.interface import SentenceRejected
 from sonarpost.modem.micromodem import MicroModem, MicroModemConfig
 from sonarpost.runtime.modem_service import ModemService, ModemServiceConfig
-from sonarpost.runtime.service import UnitOfWork
 
 PORT = "/dev/ttyUSB0"
 
@@ -23,17 +20,17 @@ class Service(ModemService[ModemServiceConfig]):
 
     NAME = "uuv_modem"
 
-    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
+    def handle(self, key, record, effects):
         raise NotImplementedError
 
-    def on_modem_event(self, event: ModemEvent) -> None:
+    def on_modem_event(self, event):
         pass
 
 
 class Connected:
     """A service, not started, whose driver's events come from a modem on simulated time."""
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service):
         self.service = service
         self.modem = FakeModem(MicroModem(MicroModemConfig(address=3)))
         self._seen = 0
@@ -43,7 +40,7 @@ class Connected:
         self.modem.driver.start(0.0)
         self.run(5.0)
 
-    def run(self, seconds: float) -> None:
+    def run(self, seconds):
         until_s = self.modem.now + seconds
         while self.modem.now < until_s:
             self.modem.run(min(until_s, self.modem.now + 1.0))
@@ -51,28 +48,28 @@ class Connected:
                 self.service._on_event(event)
             self._seen = len(self.modem.events)
 
-    def send(self) -> None:
+    def send(self):
         if not self.modem.driver.queued:
             self.modem.driver.send_packet(1, 4, [b"x"], now=self.modem.now)
 
-    def keep_sending(self, seconds: float) -> None:
+    def keep_sending(self, seconds):
         for _ in range(round(seconds)):
             self.send()
             self.run(1.0)
 
 
 @pytest.fixture
-def connected(platform) -> Iterator[Connected]:
+def connected(platform):
     service = Service(platform("uuv-1"), ModemServiceConfig(port=PORT, address=3))
     yield Connected(service)
     service.stop()
 
 
-def lines(caplog: pytest.LogCaptureFixture, message: str) -> list[logging.LogRecord]:
+def lines(caplog, message):
     return [record for record in caplog.records if record.message == message]
 
 
-def test_modem_that_rejects_every_packet_is_in_health_until_it_transmits(connected: Connected, caplog) -> None:
+def test_modem_that_rejects_every_packet_is_in_health_until_it_transmits(connected, caplog):
     caplog.set_level(logging.INFO)
     connected.modem.refuses_cycles = True
     assert connected.service.health().state == "ok"
@@ -90,7 +87,7 @@ def test_modem_that_rejects_every_packet_is_in_health_until_it_transmits(connect
     assert vars(recovered)["fields"]["after_s"] > 10.0
 
 
-def test_channel_that_is_never_free_is_in_health(connected: Connected, caplog) -> None:
+def test_channel_that_is_never_free_is_in_health(connected, caplog):
     caplog.set_level(logging.INFO)
     for n in range(60):
         connected.modem.schedule(n * 5.0, lambda: connected.modem.send("CARXP", 1))
@@ -105,7 +102,7 @@ def test_channel_that_is_never_free_is_in_health(connected: Connected, caplog) -
     assert len(lines(caplog, "Modem reports a free channel again")) == 1
 
 
-def test_unreported_transmissions_are_in_health(connected: Connected) -> None:
+def test_unreported_transmissions_are_in_health(connected):
     connected.modem.settings |= {"TXP": "0", "TXF": "0", "XST": "0"}
     connected.keep_sending(60.0)
     health = connected.service.health()
@@ -116,12 +113,12 @@ def test_unreported_transmissions_are_in_health(connected: Connected) -> None:
     assert "does not report" not in connected.service.health().detail
 
 
-def test_log_lines_on_garbage_are_limited(connected: Connected, caplog) -> None:
-    for n in range(60_000):
+def test_log_lines_on_garbage_are_limited(connected, caplog):
+    for n in range(5000):
         for event in connected.modem.driver.receive(b"\xff\x00$garbage %d\r\n" % n, 5.0):
             connected.service._on_event(event)
     rejected = connected.service.health().counters["sentences_rejected"]
-    assert rejected >= 60_000
+    assert rejected >= 5000
     connected.service._flush_interval_logs(stopping=True)
     written = lines(caplog, "Line from the modem rejected")
     assert len(written) <= 10

@@ -9,17 +9,18 @@ import socket
 import subprocess
 import sys
 import textwrap
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import zenoh
-from builders.common import REPOSITORY, eventually
+from builders.common import REPOSITORY, WAIT_S, eventually
 
 from sonarpost import keys, wire
 from sonarpost.delivery.store import Store
 from sonarpost.messages import Health
+from sonarpost.runtime.process import main
+from sonarpost.services.relay.config import RelayConfig
+from sonarpost.services.relay.service import RelayService
 
 TINY = """
 import sys, threading
@@ -57,17 +58,17 @@ sys.exit(main(Tiny, TinyConfig))
 Start = Callable[..., subprocess.Popen[str]]
 
 
-def other_thread_of(process: subprocess.Popen[str]) -> int:
+def other_thread_of(process):
     """Return the identifier of a thread that is not the main thread."""
     return max(int(entry.name) for entry in Path(f"/proc/{process.pid}/task").iterdir())
 
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Start]:
+def start(tmp_path):
     """Starts the tiny service with the given configuration."""
     started: list[subprocess.Popen[str]] = []
 
-    def start_one(configuration: str, **environment: str) -> subprocess.Popen[str]:
+    def start_one(configuration, **environment):
         path = tmp_path / "vessel.toml"
         path.write_text(configuration)
         process = subprocess.Popen(
@@ -87,7 +88,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
         process.communicate()
 
 
-def configuration(tmp_path: Path, router: str, own: str = "") -> str:
+def configuration(tmp_path, router, own=""):
     return textwrap.dedent(f"""\
         [platform]
         id = "vessel-1"
@@ -99,7 +100,7 @@ def configuration(tmp_path: Path, router: str, own: str = "") -> str:
         """)
 
 
-def read_until(process: subprocess.Popen[str], text: str) -> str:
+def read_until(process, text):
     """Return the log up to the line with `text`."""
     assert process.stderr is not None
     lines = []
@@ -110,68 +111,86 @@ def read_until(process: subprocess.Popen[str], text: str) -> str:
     pytest.fail(f"ended without {text!r}:\n" + "".join(lines))
 
 
-def end(process: subprocess.Popen[str], number: signal.Signals) -> tuple[int, float, str]:
-    """Send a signal; return status, seconds until the end, and the rest of the log."""
-    began = time.monotonic()
+def end(process, number=signal.SIGTERM):
+    """Send a signal; return the exit status, and the rest of the log. A stop that takes 2.5 s has another status."""
     process.send_signal(number)
-    _, err = process.communicate(timeout=120)
-    return process.returncode, time.monotonic() - began, err
+    _, err = process.communicate(timeout=WAIT_S)
+    return process.returncode, err
 
 
-def test_signal_that_another_thread_receives_stops_a_service(start: Start, tmp_path: Path, router: str) -> None:
+def test_signal_that_another_thread_receives_stops_a_service(start, tmp_path, router):
     process = start(configuration(tmp_path, router))
     read_until(process, "Service started")
-    time.sleep(0.3)  # the main thread waits
+    # The main thread waits.
+    eventually(lambda: Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "S")
     os.kill(other_thread_of(process), signal.SIGTERM)
-    assert process.wait(timeout=120) == 0
+    assert process.wait(timeout=WAIT_S) == 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_signal_stops_a_running_service_quickly(
-    number: signal.Signals, start: Start, tmp_path: Path, router: str
-) -> None:
-    process = start(configuration(tmp_path, router))
-    read_until(process, "Service started")
-    status, seconds, log = end(process, number)
+def test_signal_stops_a_running_service_and_logs_are_json_if_configured(number, start, tmp_path, router):
+    as_json = number == signal.SIGINT
+    process = start(configuration(tmp_path, router), SONARPOST_PLATFORM__LOG_FORMAT="json" if as_json else "")
+    log = read_until(process, "Service started")
+    status, rest = end(process, number)
     assert status == 0
-    assert seconds < 3
-    assert f"Stopping signal={number.name}" in log
-    assert log.rstrip().endswith("Service stopped")
-    assert "Traceback" not in log
+    assert "Traceback" not in rest
+    last_lines = "\n".join(rest.splitlines()[-3:])
+    assert number.name in last_lines
+    assert "Service stopped" in last_lines
+    pattern = r'\{"time": "20[^"]+Z", "level": "info", "service": "relay", '
+    assert all(bool(re.match(pattern, line)) == as_json for line in (log + rest).splitlines())
+    if not as_json:
+        assert f"Stopping signal={number.name}" in rest
+        assert rest.rstrip().endswith("Service stopped")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_signal_stops_a_service_that_waits_for_its_router(number: signal.Signals, start: Start, tmp_path: Path) -> None:
+def test_signal_stops_a_service_that_waits_for_its_router(number, start, tmp_path):
     process = start(configuration(tmp_path, "tcp/127.0.0.1:1"))
     read_until(process, "Zenoh router not reached")
-    status, seconds, log = end(process, number)
+    status, log = end(process, number)
     assert (status, "Traceback" in log) == (0, False)
-    assert seconds < 3
 
 
-def test_overridden_keys_are_logged_at_the_start(start: Start, tmp_path: Path, router: str) -> None:
-    variables = {"SONARPOST_PLATFORM__HEALTH_INTERVAL_S": "9.0", "SONARPOST_PLATFORM__LOG_LEVEL": ""}
-    process = start(configuration(tmp_path, router), **variables)
-    read_until(process, "Configuration overridden by environment keys=platform.health_interval_s")
-    end(process, signal.SIGTERM)
+def test_running_service_notifies_systemd_and_publishes_health_and_liveliness(start, tmp_path, router, client):
+    seen: list[Health] = []
+    key = keys.health("vessel-1", "relay")
+    client.declare_subscriber(key, lambda sample: seen.append(wire.decode(Health, sample.payload.to_bytes(), key)))
 
+    def alive():
+        replies = client.liveliness().get(keys.alive("vessel-1", "relay"), timeout=2)
+        return any(reply.ok is not None for reply in replies)
 
-def test_a_service_notifies_systemd(start: Start, tmp_path: Path, router: str) -> None:
+    environment = {
+        "NOTIFY_SOCKET": str(tmp_path / "notify"),
+        "WATCHDOG_USEC": "200000",
+        "SONARPOST_PLATFORM__HEALTH_INTERVAL_S": "0.1",
+        "SONARPOST_PLATFORM__LOG_LEVEL": "",
+    }
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
         bound.bind(str(tmp_path / "notify"))
-        bound.settimeout(30)
-        process = start(configuration(tmp_path, router), NOTIFY_SOCKET=str(tmp_path / "notify"), WATCHDOG_USEC="200000")
+        bound.settimeout(WAIT_S)
+        process = start(configuration(tmp_path, router), **environment)
+        read_until(process, "Configuration overridden by environment keys=platform.health_interval_s")
         assert bound.recv(4096).decode() == f"STATUS=waiting for the router {router}"
         assert bound.recv(4096) == b"READY=1\nSTATUS=started\nWATCHDOG_USEC=300000"
         assert {bound.recv(4096) for _ in range(5)} == {b"WATCHDOG=1\nSTATUS=ok"}
+        eventually(lambda: len(seen) > 2 and seen[-1].state == "ok")
+        assert alive()
+        assert seen[-1].gauges.items() >= {"inbox": 0.0, "outbox": 0.0, "refused": 0.0}.items()
+        assert seen[-1].gauges["disk_free_bytes"] > 0
+        assert seen[-1].started_utc_s <= seen[0].time_utc_s < seen[-1].time_utc_s
         process.send_signal(signal.SIGTERM)
         messages: list[bytes] = []
         while b"STOPPING=1\nSTATUS=stopping" not in messages:
             messages.append(bound.recv(4096))
-    assert process.wait(timeout=120) == 0
+    assert process.wait(timeout=WAIT_S) == 0
+    eventually(lambda: seen[-1].state == "stopping")
+    eventually(lambda: not alive())
 
 
-def test_signal_stops_a_service_whose_consumer_does_not_reply(start: Start, tmp_path: Path, router: str) -> None:
+def test_signal_stops_a_service_whose_consumer_does_not_reply(start, tmp_path, router):
     (tmp_path / "state").mkdir()
     store = Store(tmp_path / "state" / "relay.db")
     with store.transaction() as tx:
@@ -180,29 +199,45 @@ def test_signal_stops_a_service_whose_consumer_does_not_reply(start: Start, tmp_
     store.close()
     process = start(configuration(tmp_path, router))
     read_until(process, "Consumer not responding; records queued")
-    status, seconds, log = end(process, signal.SIGTERM)
+    status, log = end(process)
     assert (status, "Traceback" in log) == (0, False)
-    assert seconds < 3
     store = Store(tmp_path / "state" / "relay.db")
     assert store.outbox_depth() == 20
     store.close()
 
 
-def test_hanging_shutdown_is_ended(start: Start, tmp_path: Path, router: str) -> None:
+def test_hanging_shutdown_is_ended(start, tmp_path, router):
     process = start(configuration(tmp_path, router, "hangs_on_stop = true"))
     read_until(process, "Service started")
-    status, seconds, log = end(process, signal.SIGTERM)
-    assert status == 3
-    assert seconds < 5
-    assert "Shutdown timed out" in log
+    status, log = end(process)
+    assert (status, "Shutdown timed out" in log) == (3, True)
 
 
-def test_exception_in_a_thread_stops_the_service_with_its_traceback(start: Start, tmp_path: Path, router: str) -> None:
+def test_exception_in_a_thread_stops_the_service_with_its_traceback(start, tmp_path, router):
     process = start(configuration(tmp_path, router, "raises = true"))
-    _, log = process.communicate(timeout=120)
+    _, log = process.communicate(timeout=WAIT_S)
     assert process.returncode == 1
     assert "ZeroDivisionError" in log
     assert "Service stopped" in log
+
+
+# Errors at the start, in this process
+
+
+@pytest.fixture
+def start_here(tmp_path, capfd):
+    """Run the main function of the relay with a configuration; return exit status and what it writes."""
+    umask = os.umask(0o022)
+
+    def run(text):
+        (tmp_path / "vessel.toml").write_text(text)
+        status = main(RelayService, RelayConfig, ["--config", str(tmp_path / "vessel.toml")])
+        out, err = capfd.readouterr()
+        assert out == ""
+        return status, err
+
+    yield run
+    os.umask(umask)
 
 
 @pytest.mark.parametrize(
@@ -213,71 +248,49 @@ def test_exception_in_a_thread_stops_the_service_with_its_traceback(start: Start
         ("[platform\n", "expected valid TOML"),
     ],
 )
-def test_invalid_configuration_is_status_2_and_one_line(start: Start, text: str, message: str) -> None:
-    process = start(text)
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 2
-    assert out == ""
+def test_invalid_configuration_is_status_2_and_one_line(start_here, text, message):
+    status, err = start_here(text)
+    assert status == 2
     assert err.startswith("relay: ")
     assert message in err
     assert err.count("\n") == 1
 
 
-def test_invalid_override_is_status_2_and_one_line(start: Start, tmp_path: Path, router: str) -> None:
-    process = start(configuration(tmp_path, router), SONARPOST_RELAY__RAISES="often")
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 2
-    assert err == "relay: environment: SONARPOST_RELAY__RAISES: got 'often', expected a valid boolean\n"
+def test_invalid_override_is_status_2_and_one_line(start_here, tmp_path, router, monkeypatch):
+    monkeypatch.setenv("SONARPOST_RELAY__SUPERSEDE", "often")
+    expected = "relay: environment: SONARPOST_RELAY__SUPERSEDE: got 'often', expected a valid boolean\n"
+    assert start_here(configuration(tmp_path, router)) == (2, expected)
 
 
-def test_unreadable_store_is_status_2_and_one_line(start: Start, tmp_path: Path, router: str) -> None:
+def test_unreadable_store_is_status_2_and_one_line(start_here, tmp_path, router):
     (tmp_path / "state").mkdir()
     (tmp_path / "state" / "relay.db").write_bytes(b"of another program" * 100)
-    process = start(configuration(tmp_path, router))
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 2
-    assert err.count("\n") == 1
+    status, err = start_here(configuration(tmp_path, router))
+    assert (status, err.count("\n")) == (2, 1)
     assert "ERROR relay: Service cannot start" in err
     assert "cannot be opened as a sonarpost store" in err
 
 
-def test_logs_are_json_if_configured(start: Start, tmp_path: Path, router: str) -> None:
-    process = start(configuration(tmp_path, router), SONARPOST_PLATFORM__LOG_FORMAT="json")
-    log = read_until(process, "Service started")
-    assert all(
-        re.match(r'\{"time": "20[^"]+Z", "level": "info", "service": "relay", ', line) for line in log.splitlines()
-    )
+def test_damaged_store_is_refused_with_the_command_that_recovers_it(start_here, tmp_path, router):
+    store = Store(tmp_path / "state" / "relay.db")
+    with store.transaction() as tx:
+        for number in range(100):
+            tx.send("k", "c2", b"%d" % number * 500, encoding="e")
+    store.close()
+    with store.path.open("r+b") as file:
+        file.seek((store.path.stat().st_size // 4096 - 5) * 4096)
+        file.write(b"\xa5" * 4096)
+    status, err = start_here(configuration(tmp_path, router))
+    assert (status, err.count("Service cannot start")) == (2, 1)
+    assert f"sonarpost store salvage {store.path} --out NEW" in err
 
 
-def test_running_service_publishes_health_and_liveliness(
-    start: Start, tmp_path: Path, router: str, client: zenoh.Session
-) -> None:
-    seen: list[Health] = []
-    key = keys.health("vessel-1", "relay")
-    client.declare_subscriber(key, lambda sample: seen.append(wire.decode(Health, sample.payload.to_bytes(), key)))
-    process = start(configuration(tmp_path, router))
-
-    def alive() -> bool:
-        replies = client.liveliness().get(keys.alive("vessel-1", "relay"), timeout=2)
-        return any(reply.ok is not None for reply in replies)
-
-    eventually(lambda: len(seen) > 2 and seen[-1].state == "ok")
-    assert alive()
-    assert seen[-1].gauges.items() >= {"inbox": 0.0, "outbox": 0.0, "refused": 0.0}.items()
-    assert seen[-1].gauges["disk_free_bytes"] > 0
-    assert seen[-1].started_utc_s <= seen[0].time_utc_s < seen[-1].time_utc_s
-    assert end(process, signal.SIGTERM)[0] == 0
-    eventually(lambda: seen[-1].state == "stopping")
-    eventually(lambda: not alive())
-
-
-def test_help_names_the_service(start: Start) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", TINY, "--help"], capture_output=True, text=True, check=False, timeout=400
-    )
-    assert done.returncode == 0
-    assert "usage: python -m sonarpost.services.relay" in done.stdout
-    assert "Consumes decisions." in done.stdout
+def test_help_names_the_service(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(RelayService, RelayConfig, ["--help"])
+    out = capsys.readouterr().out
+    assert "usage: python -m sonarpost.services.relay" in out
+    assert RelayService.__doc__.split(".")[0] in " ".join(out.split())
 
 
 # End with the parent process
@@ -292,7 +305,7 @@ child.wait()
 on_linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="requires prctl of Linux")
 
 
-def running(pid: int) -> bool:
+def running(pid):
     """Return whether a process runs; a zombie does not."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
@@ -302,15 +315,11 @@ def running(pid: int) -> bool:
 
 
 @on_linux
-def test_service_ends_when_its_parent_is_killed(tmp_path: Path, router: str) -> None:
+def test_service_ends_when_its_parent_is_killed(tmp_path, router):
     path = tmp_path / "vessel.toml"
     path.write_text(configuration(tmp_path, router))
-    parent = subprocess.Popen(
-        [sys.executable, "-c", PARENT, sys.executable, "-c", TINY, "--config", str(path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    command = [sys.executable, "-c", PARENT, sys.executable, "-c", TINY, "--config", str(path)]
+    parent = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     child = int(parent.stdout.readline())
     try:
@@ -319,35 +328,27 @@ def test_service_ends_when_its_parent_is_killed(tmp_path: Path, router: str) -> 
     finally:
         parent.kill()
         # The child holds the other end of this pipe, which ends with both processes.
-        _, log = parent.communicate(timeout=120)
-    eventually(lambda: not running(child), 120, "the end of the service")
+        _, log = parent.communicate(timeout=WAIT_S)
+    eventually(lambda: not running(child), what="the end of the service")
     assert "Stopping signal=SIGTERM" in log
     assert "Service stopped" in log
 
 
 @on_linux
-def test_service_without_its_parent_does_not_start(start: Start, tmp_path: Path, router: str) -> None:
+def test_service_without_its_parent_does_not_start(start, tmp_path, router):
     process = start(configuration(tmp_path, router), SONARPOST_EXIT_WITH_PARENT=str(os.getpid() + 1_000_000))
-    _, log = process.communicate(timeout=120)
+    _, log = process.communicate(timeout=WAIT_S)
     assert process.returncode == 1
     assert log == ""
 
 
-def test_service_outlives_its_parent_without_the_variable(tmp_path: Path, router: str) -> None:
-    path = tmp_path / "vessel.toml"
+def test_service_outlives_its_parent_without_the_variable(tmp_path, router):
+    path, log_path = tmp_path / "vessel.toml", tmp_path / "log"
     path.write_text(configuration(tmp_path, router))
-    log_path = tmp_path / "log"
     script = PARENT.replace(', "SONARPOST_EXIT_WITH_PARENT": str(os.getpid())', "").replace("child.wait()", "")
+    command = [sys.executable, "-c", script, sys.executable, "-c", TINY, "--config", str(path)]
     with log_path.open("w") as log:
-        done = subprocess.run(
-            [sys.executable, "-c", script, sys.executable, "-c", TINY, "--config", str(path)],
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
-            check=True,
-            timeout=400,
-        )
-    child = int(done.stdout)
+        child = int(subprocess.run(command, stdout=subprocess.PIPE, stderr=log, check=True, timeout=WAIT_S).stdout)
     try:
         eventually(lambda: "Service started" in log_path.read_text())
     finally:
@@ -358,27 +359,22 @@ def test_service_outlives_its_parent_without_the_variable(tmp_path: Path, router
 # Embedded router
 
 
-def router_process(*arguments: str) -> subprocess.Popen[str]:
+def router_process(*arguments):
     return subprocess.Popen(
-        [sys.executable, "-m", "sonarpost.bus.router", *arguments],
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=REPOSITORY,
+        [sys.executable, "-m", "sonarpost.bus.router", *arguments], stderr=subprocess.PIPE, text=True, cwd=REPOSITORY
     )
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_router_stops_on_a_signal(number: signal.Signals) -> None:
+def test_router_stops_on_a_signal(number):
     process = router_process("--listen", "tcp/127.0.0.1:0")
     read_until(process, "Router started")
-    status, seconds, _ = end(process, number)
-    assert status == 0
-    assert seconds < 3
+    assert end(process, number)[0] == 0
 
 
-def test_router_that_cannot_listen_is_status_2(router: str) -> None:
+def test_router_that_cannot_listen_is_status_2(router):
     process = router_process("--listen", router)
-    _, log = process.communicate(timeout=120)
+    _, log = process.communicate(timeout=WAIT_S)
     assert process.returncode == 2
     assert "Router cannot start" in log
     assert router in log

@@ -13,29 +13,29 @@ YEAR_S = 365 * 86400.0
 class Clocks:
     """Wall clock and monotonic clock of a test."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, monkeypatch):
         self.wall_s, self.steady_s = START_UTC_S, 100.0
         monkeypatch.setattr("sonarpost.runtime.retention.time.time", lambda: self.wall_s)
         monkeypatch.setattr("sonarpost.runtime.retention.time.monotonic", lambda: self.steady_s)
 
-    def run(self, seconds: float) -> None:
+    def run(self, seconds):
         self.wall_s += seconds
         self.steady_s += seconds
 
 
 @pytest.fixture
-def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
+def clocks(monkeypatch):
     return Clocks(monkeypatch)
 
 
-def test_time_follows_the_wall_clock_and_its_small_corrections(clocks: Clocks) -> None:
+def test_time_follows_the_wall_clock_and_its_small_corrections(clocks):
     steady = SteadyTime()
     clocks.run(1000.0)
     clocks.wall_s += 30.0
     assert steady.now_utc_s() == START_UTC_S + 1030.0
 
 
-def test_clock_that_is_set_forward_takes_effect_after_a_day(clocks: Clocks, caplog: pytest.LogCaptureFixture) -> None:
+def test_clock_that_is_set_forward_takes_effect_after_a_day(clocks, caplog):
     steady = SteadyTime()
     clocks.wall_s += YEAR_S
     assert steady.now_utc_s() == START_UTC_S
@@ -47,7 +47,7 @@ def test_clock_that_is_set_forward_takes_effect_after_a_day(clocks: Clocks, capl
     assert "Clock was set" in caplog.text
 
 
-def test_clock_that_is_set_back_soon_changes_nothing(clocks: Clocks) -> None:
+def test_clock_that_is_set_back_soon_changes_nothing(clocks):
     steady = SteadyTime()
     clocks.wall_s += YEAR_S
     assert steady.now_utc_s() == START_UTC_S
@@ -56,7 +56,7 @@ def test_clock_that_is_set_back_soon_changes_nothing(clocks: Clocks) -> None:
     assert steady.now_utc_s() == START_UTC_S + 10.0
 
 
-def test_earlier_time_is_used_at_once(clocks: Clocks) -> None:
+def test_earlier_time_is_used_at_once(clocks):
     steady = SteadyTime()
     clocks.wall_s -= YEAR_S
     assert steady.now_utc_s() == START_UTC_S - YEAR_S

@@ -16,7 +16,7 @@ from sonarpost.runtime.udp_port import UdpPort
 URL = "udp://239.255.77.1:15707?interface=127.0.0.1&ttl=0"
 
 
-def test_each_write_is_one_datagram_for_all() -> None:
+def test_each_write_is_one_datagram_for_all():
     events: list[queue.SimpleQueue[PortEvent]] = [queue.SimpleQueue(), queue.SimpleQueue()]
     ports = [UdpPort(URL), UdpPort(URL)]
     with pytest.raises(PortError, match="not open"):
@@ -35,7 +35,7 @@ def test_each_write_is_one_datagram_for_all() -> None:
         eventually(lambda port=port: not port.is_open)
 
 
-def test_two_stations_exchange_packets() -> None:
+def test_two_stations_exchange_packets():
     with SerialModem(URL, address=1, driver="udp") as vessel, SerialModem(URL, address=3, driver="udp") as vehicle:
         sent = vehicle.send([b"hello", b"again"], destination=1, rate=1, ack=True)
         assert sent.acknowledged == (1, 2)
@@ -44,24 +44,15 @@ def test_two_stations_exchange_packets() -> None:
         assert [frame.data for frame in packet.frames] == [b"hello", b"again"]
 
 
-@pytest.mark.parametrize(
-    "url",
-    [
-        "udp://192.0.2.1:5000",
-        "udp://239.255.7.1",
-        "udp://239.255.7.1:99999",
-        "udp://radio:5000",
-        "udp://239.255.7.1:5000/x",
-        "udp://239.255.7.1:5000?interface=eth0",
-        "udp://239.255.7.1:5000?ttl=256",
-        "udp://239.255.7.1:5000?speed=1",
-        "udp://239.255.7.1:5000?ttl",
-    ],
-)
-def test_invalid_url_is_refused(url: str) -> None:
+INVALID = """192.0.2.1:5000 239.255.7.1 239.255.7.1:99999 radio:5000 239.255.7.1:5000/x 239.255.7.1:5000?interface=eth0
+239.255.7.1:5000?ttl=256 239.255.7.1:5000?speed=1 239.255.7.1:5000?ttl"""
+
+
+@pytest.mark.parametrize("address", INVALID.split())
+def test_invalid_url_is_refused(address):
     with pytest.raises(ConfigError, match="modem port: url"):
-        open_modem_port(url, 19200)
+        open_modem_port(f"udp://{address}", 19200)
 
 
-def test_other_urls_are_serial_ports() -> None:
+def test_other_urls_are_serial_ports():
     assert isinstance(open_modem_port("/dev/ttyUSB0", 19200), SerialPort)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 import random
@@ -11,18 +12,16 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import serial
-import zenoh
-from builders.common import eventually, free_port
+from builders.common import WAIT_S, eventually, free_port
 from pydantic import ValidationError
 
 from sonarpost import keys, wire
 from sonarpost.cli import modem_emulator
-from sonarpost.config import PlatformConfig
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import Health
 from sonarpost.modem.micromodem import nmea
@@ -39,46 +38,46 @@ SCALE = 100.0
 class Host:
     """A client of one modem that fills cycles and collects the received sentences."""
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, device):
         self._port = serial.serial_for_url(device, timeout=0)
         self._lines = nmea.LineAssembler(device)
         self.sentences: list[nmea.Sentence] = []
         self._query_until_answered()
 
-    def _query_until_answered(self) -> None:
-        def answered() -> bool:
+    def _query_until_answered(self):
+        def answered():
             self.send_sentence("CCCFQ", "SRC")
             self.wait(0.02)
             return any(sentence.kind == "CACFG" for sentence in self.sentences)
 
         eventually(answered, what="answer to CCCFQ")
 
-    def send_sentence(self, kind: str, *fields: str | int) -> None:
+    def send_sentence(self, kind, *fields):
         self._port.write(nmea.format(kind, *fields))
 
-    def write(self, data: bytes) -> None:
+    def write(self, data):
         self._port.write(data)
 
-    def read(self) -> None:
+    def read(self):
         for item in self._lines.feed(self._port.read(65536)):
             assert isinstance(item, nmea.Sentence), item
             self.sentences.append(item)
 
-    def wait(self, wait_s: float) -> None:
+    def wait(self, wait_s):
         select.select([self._port], [], [], wait_s)
         self.read()
 
-    def count(self, kind: str) -> int:
+    def count(self, kind):
         return sum(sentence.kind == kind for sentence in self.sentences)
 
-    def expect(self, kind: str, number: int = 1) -> None:
-        def arrived() -> bool:
+    def expect(self, kind, number=1):
+        def arrived():
             self.wait(0.02)
             return self.count(kind) >= number
 
         eventually(arrived, what=f"{number} x {kind}")
 
-    def send(self, destination: int, rate: int, frames: list[bytes], source: int = 1) -> None:
+    def send(self, destination, rate, frames, source=1):
         """Run a cycle to the end of its transmission."""
         sent, requests = self.count("CAXST"), self.count("CADRQ")
         self.send_sentence("CCCYC", 0, source, destination, rate, 0, len(frames))
@@ -87,11 +86,11 @@ class Host:
             self.send_sentence("CCTXD", source, destination, 0, frame.hex())
         self.expect("CAXST", sent + 1)
 
-    def received(self) -> list[tuple[int, bytes]]:
+    def received(self):
         """Frame number and bytes of every `CARXD`."""
         return [(int(s.fields[3]), bytes.fromhex(s.fields[4])) for s in self.sentences if s.kind == "CARXD"]
 
-    def close(self) -> None:
+    def close(self):
         self._port.close()
 
 
@@ -99,11 +98,11 @@ Make = Callable[..., ChannelEmulator]
 
 
 @pytest.fixture
-def make(tmp_path: Path) -> Iterator[Make]:
+def make(tmp_path):
     """Start emulators, by default with pseudo-terminals and a log in a temporary folder, and stop them."""
     running: list[ChannelEmulator] = []
 
-    def start(**config: object) -> ChannelEmulator:
+    def start(**config):
         defaults: dict[str, object] = {"modem": MODEMS, "time_scale": SCALE, "log": tmp_path / "channel.jsonl"}
         if "tcp_ports" not in config:
             defaults["pty_dir"] = tmp_path / "ports"
@@ -118,25 +117,30 @@ def make(tmp_path: Path) -> Iterator[Make]:
         assert emulator.failure is None
 
 
-def log_of(path: Path, event: str | None = None) -> list[dict[str, object]]:
+def log_of(path, event=None):
     lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     return [line for line in lines if event is None or line["event"] == event]
 
 
-def hosts_of(emulator: ChannelEmulator) -> list[Host]:
+def hosts_of(emulator):
     return [Host(device.device) for device in emulator.devices()]
 
 
 @pytest.mark.parametrize("tcp", [False, True])
-def test_log_matches_the_received_sentences(make: Make, tmp_path: Path, tcp: bool):
-    emulator = make(seed=3, frame_loss=0.3, tail_damage=0.4, **({"tcp_ports": (0, 0)} if tcp else {}))
-    sender, receiver = hosts_of(emulator)
-    for n in range(12):
-        sender.send(2, 5, [bytes([n, k]) * 20 for k in range(3)] + [b""])
-        receiver.expect("CACST", n + 1)
-    sender.close()
-    receiver.close()
-    emulator.stop()
+def test_log_matches_the_received_sentences_and_one_seed_gives_equal_outcomes(make, tmp_path, tcp):
+    outcomes = []
+    for name in ("first.jsonl", "channel.jsonl"):
+        ports = {"tcp_ports": (0, 0)} if tcp else {}
+        emulator = make(seed=3, frame_loss=0.3, tail_damage=0.4, log=tmp_path / name, **ports)
+        sender, receiver = hosts_of(emulator)
+        for n in range(12):
+            sender.send(2, 5, [bytes([n, k]) * 20 for k in range(3)] + [b""])
+            receiver.expect("CACST", n + 1)
+        sender.close()
+        receiver.close()
+        emulator.stop()
+        outcomes.append([p["frames"] for p in log_of(tmp_path / name, "packet")])
+    assert outcomes[0] == outcomes[1]
 
     packets = log_of(tmp_path / "channel.jsonl", "packet")
     assert [p["packet"] for p in packets] == list(range(1, 13))
@@ -161,26 +165,7 @@ def test_log_matches_the_received_sentences(make: Make, tmp_path: Path, tcp: boo
     assert totals["frames"] == {fate: sum(f["fate"] == fate for f in frames) for fate in totals["frames"]}
 
 
-def test_runs_with_one_seed_have_equal_outcomes(make: Make, tmp_path: Path):
-    seen = []
-    for run in ("a", "b"):
-        emulator = make(
-            seed=8,
-            frame_loss=0.5,
-            tail_damage=0.5,
-            pty_dir=tmp_path / run,
-            log=tmp_path / f"{run}.jsonl",
-        )
-        sender, receiver = hosts_of(emulator)
-        for _ in range(5):
-            sender.send(2, 1, [b"abcdefgh", b"ijklmnop", b"qrstuvwx"])
-        receiver.expect("CACST", 5)
-        emulator.stop()
-        seen.append([p["frames"] for p in log_of(tmp_path / f"{run}.jsonl", "packet")])
-    assert seen[0] == seen[1]
-
-
-def test_packet_without_a_client_is_logged_as_not_heard(make: Make, tmp_path: Path):
+def test_packet_without_a_client_is_logged_as_not_heard(make, tmp_path):
     emulator = make()
     sender = Host(emulator.devices()[0].device)
     sender.send(2, 1, [b"abc"])
@@ -192,7 +177,7 @@ def test_packet_without_a_client_is_logged_as_not_heard(make: Make, tmp_path: Pa
 
 
 @pytest.mark.parametrize("tcp", [False, True])
-def test_reconnected_client_receives_no_stale_output(make: Make, tcp: bool):
+def test_reconnected_client_receives_no_stale_output(make, tcp):
     emulator = make(**({"tcp_ports": (0, 0)} if tcp else {}))
     sender, receiver = hosts_of(emulator)
     for n in range(3):
@@ -208,7 +193,7 @@ def test_reconnected_client_receives_no_stale_output(make: Make, tcp: bool):
     assert receiver.received() == [(1, b"fresh")]
 
 
-def test_restarted_emulator_has_the_same_paths(make: Make, tmp_path: Path):
+def test_restarted_emulator_has_the_same_paths(make, tmp_path):
     first = make()
     devices = [device.device for device in first.devices()]
     assert devices == [str(tmp_path / "ports" / f"modem-{n}") for n in (1, 2)]
@@ -224,7 +209,7 @@ def test_restarted_emulator_has_the_same_paths(make: Make, tmp_path: Path):
     Host(third.devices()[0].device).close()
 
 
-def test_command_of_a_short_lived_client_is_processed(make: Make):
+def test_command_of_a_short_lived_client_is_processed(make):
     emulator = make()
     device = Path(emulator.devices()[0].device)
     with device.open("wb", buffering=0) as port:
@@ -233,17 +218,17 @@ def test_command_of_a_short_lived_client_is_processed(make: Make):
     assert {sentence.fields for sentence in host.sentences if sentence.kind == "CACFG"} == {("SRC", "42")}
 
 
-def test_new_tcp_client_replaces_the_previous_one(make: Make):
+def test_new_tcp_client_replaces_the_previous_one(make):
     emulator = make(tcp_ports=(0, 0))
     first = Host(emulator.devices()[0].device)
     second = Host(emulator.devices()[0].device)
     second.send_sentence("CCCFQ", "CST")
     second.expect("CACFG", 2)
     with pytest.raises(serial.SerialException):
-        eventually(lambda: first.wait(0.05) is not None, timeout_s=120)
+        eventually(lambda: first.wait(0.05) is not None)
 
 
-def test_noise_is_answered_with_errors(make: Make):
+def test_noise_is_answered_with_errors(make):
     emulator = make(tcp_ports=(0, 0))
     host = Host(emulator.devices()[0].device)
     host.write(random.Random(5).randbytes(20_000) + b"\r\n$CCCYC,0,1,2,1,0,1*00\r\n")
@@ -254,56 +239,47 @@ def test_noise_is_answered_with_errors(make: Make):
     )
 
 
-def test_data_timeout_is_two_seconds_of_real_time(make: Make):
+def test_data_timeout_is_two_seconds_of_real_time(make):
     emulator = make(time_scale=1000.0)
     host = Host(emulator.devices()[0].device)
     started_s = time.monotonic()
     host.send_sentence("CCCYC", 0, 1, 2, 1, 0, 1)
     host.expect("CAERR")
-    assert 1.9 < time.monotonic() - started_s < 6.0
+    assert time.monotonic() - started_s > 1.9
     timeout = next(sentence for sentence in host.sentences if sentence.kind == "CAERR")
     assert timeout.fields[1:] == ("DATA_TIMEOUT", "1")
     assert emulator.totals().transmitted == 0
 
 
-def test_client_that_does_not_read_loses_whole_sentences(make: Make):
+def test_client_that_does_not_read_loses_whole_sentences(make):
     emulator = make(tcp_ports=(0, 0))
     device = emulator.devices()[0].device
     with socket.create_connection(("127.0.0.1", int(device.rsplit(":", 1)[1]))) as idle:
-        query = nmea.format("CCCFQ", "ALL") * 50
-        idle.settimeout(10.0)
-        for _ in range(200):  # some 10 MB of answers
-            idle.sendall(query)
-        eventually(lambda: emulator.connected() == 1, what="client seen")
+        idle.settimeout(WAIT_S)
+        for _ in range(100):  # some 5 MB of answers
+            idle.sendall(nmea.format("CCCFQ", "ALL") * 50)
         assembler = nmea.LineAssembler()
         seen = 0
-        try:
-            while data := idle.recv(1 << 20):
-                idle.settimeout(0.5)
-                for item in assembler.feed(data):
-                    assert isinstance(item, nmea.Sentence)
-                    seen += 1
-                if seen > 20_000:
-                    break
-        except TimeoutError:
-            pass
-        assert seen > 1000
-    other = Host(emulator.devices()[1].device)
-    other.close()
+        while seen <= 1000:
+            for item in assembler.feed(idle.recv(1 << 20)):
+                assert isinstance(item, nmea.Sentence)
+                seen += 1
+    Host(emulator.devices()[1].device).close()
 
 
-def test_air_time_is_scaled(make: Make):
-    emulator = make(time_scale=10.0, airtime_s={1: 5.0})
+def test_air_time_is_scaled(make):
+    """Unscaled, the end of the packet would be after the time-out of `expect`."""
+    emulator = make(time_scale=400.0, airtime_s={1: 200.0})
     host = Host(emulator.devices()[0].device)
     host.send_sentence("CCCYC", 0, 1, 2, 1, 0, 1)
     host.expect("CADRQ")
     started_s = time.monotonic()
     host.send_sentence("CCTXD", 1, 2, 0, "AA")
     host.expect("CATXF")
-    assert 0.5 <= time.monotonic() - started_s < 2.0
+    assert time.monotonic() - started_s >= 0.5
 
 
-def test_moved_modem(make: Make, tmp_path: Path):
+def test_moved_modem(make, tmp_path):
     emulator = make()
     sender, receiver = hosts_of(emulator)
     emulator.move(2, LocalPosition(300.0))
@@ -314,7 +290,7 @@ def test_moved_modem(make: Make, tmp_path: Path):
     assert log_of(tmp_path / "channel.jsonl", "move")[0]["modem"] == 2
 
 
-def test_port_error_names_the_port(make: Make, tmp_path: Path):
+def test_port_error_names_the_port(make, tmp_path):
     (tmp_path / "ports").mkdir()
     (tmp_path / "ports" / "modem-2").write_text("not a link")
     with pytest.raises(PortError, match="modem-2"):
@@ -328,7 +304,7 @@ def test_port_error_names_the_port(make: Make, tmp_path: Path):
         make(log=tmp_path, tcp_ports=(0, 0))
 
 
-def test_log_that_cannot_be_written_ends_the_emulator(tmp_path: Path):
+def test_log_that_cannot_be_written_ends_the_emulator(tmp_path):
     config = EmulatorConfig(modem=MODEMS, pty_dir=tmp_path / "ports", log=Path("/dev/full"))
     emulator = ChannelEmulator(config)
     emulator.start()
@@ -339,28 +315,19 @@ def test_log_that_cannot_be_written_ends_the_emulator(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "config",
-    [
-        {"modem": ()},
-        {"modem": ({"address": 1}, {"address": 1})},
-        {"modem": ({"address": 200},)},
-        {"tcp_ports": (1,)},
-        {"transponder": ({"letter": "E"},)},
-        {"time_scale": 0.0},
-        {"time_scale": float("nan")},
-        {"serial_baud": -1.0},
-    ],
+    "config", [{"modem": ({"address": 1}, {"address": 1})}, {"modem": ({"address": 200},)}, {"tcp_ports": (1,)}]
 )
-def test_invalid_configuration_is_rejected(config: dict[str, object], tmp_path: Path):
+def test_invalid_configuration_is_rejected(config, tmp_path):
     complete = {"modem": MODEMS, "pty_dir": tmp_path} | config
-    with pytest.raises(ValueError, match=next(iter(config))):
-        EmulatorConfig(**complete)  # type: ignore[arg-type]
+    for table in (EmulatorConfig, AcousticChannelConfig):
+        with pytest.raises(ValidationError, match=next(iter(config))):
+            table.model_validate(complete)
 
 
 # The command
 
 
-def run_command(*arguments: str) -> subprocess.Popen[str]:
+def run_command(*arguments):
     code = (
         "import argparse, sys; from sonarpost.cli import modem_emulator as m; p = argparse.ArgumentParser();"
         "m.add_parser(p.add_subparsers()); a = p.parse_args(sys.argv[1:]); sys.exit(a.run(a))"
@@ -374,12 +341,12 @@ def run_command(*arguments: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
-def test_command_lists_its_devices_first_and_ends_cleanly(tmp_path: Path, ending: signal.Signals):
+def test_command_lists_its_devices_first_and_ends_cleanly(tmp_path, ending):
     log, ports = tmp_path / "log.jsonl", tmp_path / "ports"
-    with run_command(
-        "--modems", "3", "--pty", str(ports), "--log", str(log), "--time-scale", "100", "--json"
-    ) as process:
+    options = ("--modems", "3", "--pty", str(ports), "--log", str(log), "--time-scale", "100", "--json")
+    with run_command(*options) as process:
         assert process.stdout is not None
+        assert process.stderr is not None
         listed = json.loads(process.stdout.readline())
         assert listed == {"modems": [{"address": n, "device": str(ports / f"modem-{n}")} for n in (1, 2, 3)]}
         host = Host(listed["modems"][0]["device"])
@@ -388,66 +355,52 @@ def test_command_lists_its_devices_first_and_ends_cleanly(tmp_path: Path, ending
         process.send_signal(ending)
         # communicate() would miss the output that readline has buffered.
         rest = process.stdout.read()
-        assert process.stderr is not None
-        assert (process.wait(timeout=120), process.stderr.read()) == (0, "")
+        assert (process.wait(timeout=WAIT_S), process.stderr.read()) == (0, "")
     assert rest == log.read_text(encoding="utf-8")
     assert log_of(log)[-1]["event"] == "totals"
     assert list(ports.iterdir()) == []
 
 
-def test_command_with_tcp_ports():
-    ports = [free_port(), free_port()]
-    with run_command("--tcp", *map(str, ports)) as process:
-        assert process.stdout is not None
-        listed = json.loads(process.stdout.readline())
-        assert [m["device"] for m in listed["modems"]] == [f"socket://127.0.0.1:{port}" for port in ports]
-        Host(listed["modems"][1]["device"]).close()
-        process.terminate()
-        assert process.wait(timeout=120) == 0
-
-
 @pytest.mark.parametrize("arguments", [(), ("--json",)])
-def test_command_continues_when_its_output_is_closed(arguments: tuple[str, ...]):
-    with run_command("--tcp", "--mm", "1", "--time-scale", "100", *arguments) as process:
+def test_command_with_tcp_ports_continues_when_its_output_is_closed(arguments):
+    ports = [] if arguments else [free_port(), free_port()]  # free ones by default
+    options = ("--tcp", *map(str, ports), "--mm", "1", "--time-scale", "100", *arguments)
+    with run_command(*options) as process:
         assert process.stdout is not None
+        assert process.stderr is not None
         listed = json.loads(process.stdout.readline())
+        if ports:
+            assert [m["device"] for m in listed["modems"]] == [f"socket://127.0.0.1:{port}" for port in ports]
         process.stdout.close()
         host = Host(listed["modems"][0]["device"])
         host.send(2, 1, [b"abc"])
-        eventually(
-            lambda: (host.wait(0.05), any(s.kind == "CATXF" for s in host.sentences))[1], what="end of the packet"
-        )
+        host.expect("CATXF")
         eventually(lambda: (host.wait(0.05), "0.93.0.09" in str(host.sentences))[1], what="a Micro-Modem 1")
         host.close()
         assert process.poll() is None
         process.terminate()
-        assert process.stderr is not None
-        assert (process.wait(timeout=120), process.stderr.read()) == (0, "")
+        assert (process.wait(timeout=WAIT_S), process.stderr.read()) == (0, "")
 
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (("--modems", "0"), "--modems"),
-        (("--set", "snr_spread_db=-1"), "snr_spread_db"),
-        (("--set", "colour=blue"), "colour"),
-        (("--water", "sea.toml"), "--water.*--channel"),
-        (("--transponder", "A=far"), "--transponder"),
-        (("--transponder", "E=1"), "transponder.0.letter"),
-        (("--loss", "1.5"), "frame_loss"),
-        (("--time-scale", "0"), "time_scale"),
-        (("--modems", "3", "--tcp", "1", "2"), "tcp_ports"),
-        (("--airtime", "fast"), "--airtime"),
-        (("--airtime", "9=1"), "airtime_s"),
-        (("--spacing", "nan"), "east_m"),
+        ("--modems 0", "--modems"),
+        ("--set colour=blue", "colour"),
+        ("--water sea.toml", "--water.*--channel"),
+        ("--transponder A=far", "--transponder"),
+        ("--transponder E=1", "transponder.0.letter"),
+        ("--loss 1.5", "frame_loss"),
+        ("--modems 3 --tcp 1 2", "tcp_ports"),
+        ("--airtime fast", "--airtime"),
+        ("--airtime 9=1", "airtime_s"),
+        ("--spacing nan", "east_m"),
     ],
 )
-def test_command_rejects_invalid_options(arguments: tuple[str, ...], named: str):
-    import argparse
-
+def test_command_rejects_invalid_options(arguments, named):
     parser = argparse.ArgumentParser()
     modem_emulator.add_parser(parser.add_subparsers())
-    parsed = parser.parse_args(["modem-emulator", *arguments])
+    parsed = parser.parse_args(["modem-emulator", *arguments.split()])
     with pytest.raises(ConfigError, match=named):
         parsed.run(parsed)
 
@@ -455,9 +408,7 @@ def test_command_rejects_invalid_options(arguments: tuple[str, ...], named: str)
 # The service
 
 
-def test_service_provides_modems_and_publishes_gauges(
-    platform: Callable[[str], PlatformConfig], client: zenoh.Session, tmp_path: Path
-):
+def test_service_provides_modems_and_publishes_gauges(platform, client, tmp_path):
     config = AcousticChannelConfig(
         pty_dir=tmp_path / "ports", log=tmp_path / "channel.jsonl", time_scale=SCALE, airtime_s={"1": 2.0}
     )
@@ -473,7 +424,7 @@ def test_service_provides_modems_and_publishes_gauges(
         sender.send(2, 1, [b"abc"])
         receiver.expect("CACST")
 
-        def reported() -> bool:
+        def reported():
             return any(r.gauges.get("frames_delivered") == 1 and r.gauges["modems_connected"] == 2 for r in reports)
 
         eventually(reported, what="health with one delivered frame")
@@ -484,15 +435,3 @@ def test_service_provides_modems_and_publishes_gauges(
         subscriber.undeclare()
     assert log_of(tmp_path / "channel.jsonl")[-1]["frames"]["delivered"] == 1
     assert log_of(tmp_path / "channel.jsonl", "packet")[0]["airtime_s"] == 2.0
-
-
-def test_invalid_service_table_is_rejected():
-    for wrong in (
-        {"modem": [{"address": 1}, {"address": 1}]},
-        {"tcp_ports": [1, 2, 3]},
-        {"frame_loss": 1.5},
-        {"airtime_s": {"9": 1.0}},
-        {"unknown": 1},
-    ):
-        with pytest.raises(ValidationError):
-            AcousticChannelConfig.model_validate(wrong)

@@ -12,7 +12,6 @@ from builders.common import eventually
 from builders.joined_surveys import FEW_CANDIDATES
 from builders.survey_oracle import tiny_survey
 from builders.surveys import MAKERS
-from PIL import Image
 
 from sonarpost.detection.detector import detect
 from sonarpost.detection.settings import DetectorSettings
@@ -214,34 +213,24 @@ def test_only_regular_files_with_a_known_suffix_are_listed(tmp_path):
     assert [file.path.name for file in list_input_files(tmp_path, (".xtf",))] == ["good.XTF"]
 
 
-def test_image_files_are_sent_unchanged(start_service, compressor, put_image, texture):
+def test_image_files_are_sent_unchanged_if_they_fit(start_service, compressor, put_image, texture, lines):
     images = {"eight.tiff": texture(16, 512), "sixteen.tiff": texture(512, 16, dtype=np.uint16)}
     for name, pixels in images.items():
         put_image(name, pixels)
+    put_image("large.tiff", texture(1024, 400))
     start_service(mode="snippets")
-    eventually(lambda: len(compressor.received) == 2)
-    for snippet in compressor.received:
-        expected = images[snippet.source]
-        assert snippet.picture.bits == 8 * expected.dtype.itemsize
-        np.testing.assert_array_equal(snippet.picture.to_array(), expected)
-        assert snippet.contact.contact_id.startswith(Path(snippet.source).stem + "-")
+    eventually(lambda: len(compressor.received) == 3)
+    found = {snippet.source: snippet for snippet in compressor.received}
+    assert found["large.tiff"].picture.to_array().shape == (512, 200)
+    eventually(lambda: lines("Image file warning"))
+    assert lines("Image file warning")[-1]["warning"] == "400 × 1024 px resized to 200 × 512 px"
+    for name, pixels in images.items():
+        snippet = found[name]
+        assert snippet.picture.bits == 8 * pixels.dtype.itemsize
+        np.testing.assert_array_equal(snippet.picture.to_array(), pixels)
+        assert snippet.contact.contact_id.startswith(Path(name).stem + "-")
         assert snippet.contact.atd_confidence is None, "no confidence is invented"
         assert snippet.wide is None, "nothing is known of the seabed around"
-
-
-def test_a_large_colour_jpeg_is_sent_with_its_position_and_a_warning(
-    start_service, compressor, put_file, texture, incoming, lines
-):
-    put_file("p.txt", b"lat_deg: 56.4\nlon_deg: -5.6\npixel_along_m: 0.1\n")
-    Image.fromarray(np.dstack([texture(1024, 400)] * 2 + [texture(1024, 400) // 2])).save(incoming / ".p.jpg")
-    (incoming / ".p.jpg").rename(incoming / "p.jpg")
-    start_service(mode="snippets")
-    eventually(lambda: len(compressor.received) == 1)
-    (snippet,) = compressor.received
-    assert (snippet.picture.width_px, snippet.picture.height_px) == (200, 512)
-    assert (snippet.contact.lat_deg, snippet.contact.pixel_along_m) == (56.4, 0.2)
-    eventually(lambda: len(lines("Image file warning")) == 2)
-    assert lines("Image file warning")[1]["warning"] == "400 × 1024 px resized to 200 × 512 px"
 
 
 def test_images_that_cannot_be_sent_are_quarantined(
@@ -314,47 +303,31 @@ def test_an_absent_input_folder_is_made_when_possible(start_service, tmp_path, c
     assert service.health().state == "ok"
 
 
-@pytest.mark.parametrize("when", ["before", "during"])
-def test_a_removed_file_is_processed_when_it_is_back(
-    when, start_service, compressor, put_file, survey_bytes, tmp_path, monkeypatch, counter
+@pytest.mark.parametrize("during", ["content_sha256", "detect_in_survey"])
+def test_a_file_that_is_removed_or_changed_while_it_is_read_is_processed_again(
+    during, start_service, compressor, put_file, survey_bytes, tmp_path, monkeypatch, counter
 ):
-    name = "content_sha256" if when == "before" else "detect_in_survey"
-    original, removed = getattr(atd_stub, name), []
+    original, calls = getattr(atd_stub, during), []
 
-    def remove_first(path, *rest):
-        if not removed:
-            removed.append(path)
+    def disturbed(path, *rest):
+        calls.append(path)
+        if len(calls) == 1:
             path.rename(tmp_path / "away")
-        return original(path, *rest)
-
-    monkeypatch.setattr(atd_stub, name, remove_first)
-    service = start_service()
-    path = put_file("line.xtf", survey_bytes(1))
-    eventually(lambda: bool(removed) and all_processed(service))
-    assert counter(service, "files_quarantined") == 0
-    (tmp_path / "away").rename(path)
-    eventually(lambda: len(compressor.received) == 3)
-    assert service.health().state == "ok"
-
-
-def test_a_file_that_changes_while_it_is_read_is_read_again(
-    start_service, compressor, put_file, survey_bytes, monkeypatch, counter
-):
-    read, changed = atd_stub.detect_in_survey, []
-
-    def change_then_read(path, *rest):
-        found = read(path, *rest)
-        if not changed:
-            changed.append(path)
+        found = original(path, *rest)
+        if len(calls) == 2 and during == "detect_in_survey":
             path.write_bytes(survey_bytes(2))
         return found
 
-    monkeypatch.setattr(atd_stub, "detect_in_survey", change_then_read)
+    monkeypatch.setattr(atd_stub, during, disturbed)
     service = start_service()
     path = put_file("line.xtf", survey_bytes(1))
-    eventually(lambda: len(compressor.received) == 3)
+    eventually(lambda: bool(calls) and all_processed(service))
+    assert counter(service, "files_quarantined") == 0
+    (tmp_path / "away").rename(path)
     eventually(lambda: counter(service, "files_processed") == 1)
+    eventually(lambda: len(compressor.received) == 3)
     assert [s.contact.atd_confidence for s in compressor.received] == [d.confidence for d in best_of(path)]
+    assert service.health().state == "ok"
 
 
 def test_a_file_name_that_is_not_utf_8_is_accepted(

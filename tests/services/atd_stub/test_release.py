@@ -21,21 +21,13 @@ from sonarpost.sonar.image_files import write_tiff
 
 
 def queue_state(waiting, accepted=None, bytes_left=()):
-    return QueueState(
-        platform_id="uuv-1",
-        time_utc_s=1.0,
-        rate=1,
-        frame_loss=None,
-        packet_interval_s=5.0,
-        messages_waiting=0,
-        message_bytes=0,
-        images_waiting=waiting,
-        images=tuple(
-            QueuedImage(image_id=f"{n:04d}", contact_id="c", bytes_left=left, preview_utc_s=None, expected_utc_s=1.0)
-            for n, left in enumerate(bytes_left)
-        ),
-        images_accepted=accepted,
+    images = tuple(
+        QueuedImage(image_id=f"{n:04d}", contact_id="c", bytes_left=left, preview_utc_s=None, expected_utc_s=1.0)
+        for n, left in enumerate(bytes_left)
     )
+    counts = {"messages_waiting": 0, "message_bytes": 0, "images_waiting": waiting, "images_accepted": accepted}
+    link = {"rate": 1, "frame_loss": None, "packet_interval_s": 5.0}
+    return QueueState(platform_id="uuv-1", time_utc_s=1.0, images=images, **counts, **link)
 
 
 # Credit
@@ -282,20 +274,6 @@ def test_a_full_transmit_queue_holds_contacts_over_a_restart_of_this_service(
     modem.transmit(1)
     eventually(lambda: len(compressor.received) == 3)
     assert [s.contact.atd_confidence for s in compressor.received] == [1.0, 1.5, 0.5]
-
-
-def test_contacts_that_are_accepted_while_this_service_is_down_give_their_credit_back(
-    start_service, runner, compressor, put_images, modem, gauge
-):
-    put_images([1.0, 1.0, 0.5, 0.4])
-    modem.accepted = 70
-    service = start_service()
-    publish_until(modem, lambda: len(compressor.received) == 2)
-    eventually(lambda: gauge(service, "contacts_in_flight") == 2)
-    runner.stop(service)
-    modem.accepted += 2
-    start_service()
-    publish_until(modem, lambda: len(compressor.received) == 4)
 
 
 def test_while_the_compressor_is_down_no_more_than_the_limit_is_released(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from builders.common import eventually
+from builders.joined_surveys import FEW_CANDIDATES
 from builders.record_samples import BARE_CONTACT, FULL_CONTACT
 from PIL import Image
 
@@ -36,6 +36,7 @@ from sonarpost.sonar.source import load_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
+FEW = DetectorSettings(**FEW_CANDIDATES.model_dump())
 ORIGIN = FileOrigin("ab" * 32, "line-7.xtf", "line-7")
 
 
@@ -50,7 +51,7 @@ def best_contact_of(path: Path, config: AtdStubConfig, change=lambda ping: ping)
     with open_survey(path, config) as source:
         survey = load_survey(source)
     survey = replace(survey, pings=tuple(change(ping) for ping in survey.pings))
-    found = detect(survey, None, config)[0]
+    found = detect(survey, FEW, config)[0]
     return survey, found, snippet_of(survey, found, ORIGIN, "uuv-1", config).contact
 
 
@@ -145,22 +146,6 @@ def test_another_classifier_than_configured_stops_the_start(start_service, tmp_p
     tuning = DetectorTuning(classifier=str(path), classifier_identity="0" * 16)
     with pytest.raises(ConfigError, match="identity: got"):
         start_service(detector=tuning)
-
-
-@pytest.mark.parametrize(
-    ("line", "field", "expected"),
-    [
-        ("ring_m = -1", "ring_m", "greater than 0"),
-        ("ring = 1", "ring", "a key that this table has"),
-        ("highlight_sizes_m = [[1.0, 51.0]]", "highlight_sizes_m.0.1", "less than or equal to 50"),
-        ("confidence_threshold = 1.0", "confidence_threshold", "a key that this table has"),
-    ],
-)
-def test_errors_name_invalid_settings_of_the_detector(line, field, expected, tmp_path):
-    path = tmp_path / "uuv.toml"
-    path.write_text(f'[platform]\nid = "uuv-1"\n[atd_stub]\n[atd_stub.detector]\n{line}\n')
-    with pytest.raises(ConfigError, match=rf"uuv\.toml:5: atd_stub\.detector\.{re.escape(field)}: got .*{expected}"):
-        load(path, "atd_stub", AtdStubConfig, {})
 
 
 # Images with square pixels on the ground
@@ -348,10 +333,7 @@ def test_a_large_colour_image_is_fitted_and_its_pixel_size_corrected(fit, shape,
     assert "'by'" in file.notes[2]
 
 
-def test_an_image_that_does_not_fit_is_an_error_that_names_the_key(tmp_path, texture):
-    write_tiff(tmp_path / "p.tiff", texture(20, 600))
-    with pytest.raises(SurveyFileError, match='fit = "crop" or fit = "resize"'):
-        read_snippet(tmp_path / "p.tiff", "ab" * 32, "uuv-1", "refuse")
+def test_a_pixel_size_that_becomes_too_large_is_an_error(tmp_path, texture):
     (tmp_path / "p.txt").write_text("pixel_along_m: 99\n")
     write_tiff(tmp_path / "p.tiff", texture(40, 600))
     with pytest.raises(SurveyFileError, match=r"p\.txt: pixel size: got '116\.471 m'"):

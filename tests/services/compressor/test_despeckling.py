@@ -27,6 +27,7 @@ def expected_stream(snippet, strength):
 @pytest.mark.parametrize("strength", [0.0, 0.25, None])
 def test_strength_is_passed_to_the_codec_and_logged(strength, start_service, encoded, snippet, caplog):
     caplog.set_level("INFO")
+    assert CompressorConfig().codec == "emb"
     assert CompressorConfig().despeckle_strength == emb.DEFAULT_STRENGTH == 1.0
     start_service(**EMB, **({} if strength is None else {"despeckle_strength": strength}))
     strength = emb.DEFAULT_STRENGTH if strength is None else strength

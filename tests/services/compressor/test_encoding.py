@@ -12,7 +12,7 @@ from sonarpost.codec.interface import StreamHeader, to_uint8
 from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.errors import CodebookError, ConfigError
 from sonarpost.link.frames.paper.frame import format_image_id, is_image_id
-from sonarpost.messages import Contact, EncodedImage
+from sonarpost.messages import Contact
 from sonarpost.services.compressor.config import CompressorConfig
 from sonarpost.services.compressor.service import IMAGE_IDS, CompressorService
 
@@ -41,13 +41,6 @@ def test_a_snippet_is_encoded_with_its_contact(start_service, atd, modem, snippe
     eventually(lambda: len(published) == 1, what="the copy for watchers")
     assert msgpack.unpackb(published[0].payload.to_bytes())["image_id"] == image.image_id
     check_monitoring(service)
-
-
-def test_the_default_codec_is_emb(runner, platform, atd, modem, snippet):
-    runner.start(CompressorService(platform("uuv-1"), CompressorConfig()))
-    atd.send(IN, "compressor", snippet("c1"))
-    eventually(lambda: len(modem.received) == 1)
-    assert modem.received[0].codec == "emb"
 
 
 def test_16_bit_images_are_mapped_over_their_own_range(start_service, encoded, snippet, vq):
@@ -105,12 +98,6 @@ def test_malformed_snippets_are_refused_and_the_next_one_is_encoded(start_servic
         assert "expected" in reason
 
 
-def test_a_plain_publication_is_encoded_too(start_service, modem, snippet, publish):
-    start_service()
-    publish(IN, wire.encode(snippet("from another detector")))
-    eventually(lambda: len(modem.received) == 1)
-
-
 def test_identifiers_continue_after_restarts(start_service, runner, atd, modem, snippet):
     for turn in range(3):
         service = start_service()
@@ -139,25 +126,6 @@ def test_a_new_store_begins_with_another_identifier(start_service, runner, encod
         runner.stop(service)
         service.store.path.unlink()
     assert len(starts) == 3
-
-
-def test_encoded_images_are_sent_after_a_restart(start_service, runner, atd, snippet):
-    service = start_service()
-    atd.send(IN, "compressor", snippet("a"), snippet("b"))
-    eventually(lambda: service.store.outbox_depth() == 2)
-    runner.stop(service)
-    start_service()
-    late = runner.peer("uuv-1", "uuv_modem", {OUT: EncodedImage})
-    eventually(lambda: [i.contact.contact_id for i in late.received] == ["a", "b"])
-
-
-def test_accepted_snippets_are_encoded_after_a_restart(start_service, platform, modem, snippet):
-    idle = CompressorService(platform("uuv-1"), CompressorConfig())
-    with idle.store.transaction() as tx:
-        tx.accept(IN, wire.encode(snippet("waiting")))
-    idle.store.close()
-    start_service()
-    eventually(lambda: [i.contact.contact_id for i in modem.received] == ["waiting"])
 
 
 def test_the_configured_packing_is_used(start_service, encoded, snippet):

@@ -18,16 +18,11 @@ from sonarpost.link.frames.v1.payload_objects import ENTRY_HEAD_BYTES, Preview
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.messages import AcousticFrame
-from sonarpost.security.acoustic_key import read_key
+from sonarpost.security.acoustic_key import create_key, read_key
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.service import DecompressorService
 
 VESSEL = "vessel-1"
-
-
-@pytest.fixture
-def unstarted(platform, tmp_path):
-    return lambda: DecompressorService(platform(VESSEL), DecompressorConfig(out_dir=tmp_path / "out"))
 
 
 def golden(name):
@@ -48,11 +43,12 @@ def fill(service, states, frames):
 
 
 @pytest.fixture
-def migrated(unstarted, runner, monkeypatch):
+def migrated(platform, tmp_path, runner, monkeypatch):
     """Fill a store as version 0.1 did, start the service, and return it and the images it found."""
 
-    def make(states, frames):
-        service = unstarted()
+    def make(states, frames, **settings):
+        there = platform(VESSEL).model_copy(update=settings)
+        service = DecompressorService(there, DecompressorConfig(out_dir=tmp_path / "out"))
         fill(service, states, frames)
         found = []
         monkeypatch.setattr(DecompressorService, "handle", lambda self, key, record, effects: found.append(record))
@@ -111,20 +107,14 @@ def test_unreadable_old_state_is_discarded_and_frames_are_converted(migrated, ca
     assert all(service.store.get_state(name) is None for name in skipped)
 
 
-def test_authenticated_frames_of_an_old_store_are_converted(platform, tmp_path, runner, monkeypatch):
+def test_authenticated_frames_of_an_old_store_are_converted(migrated, tmp_path):
     key_file = tmp_path / "acoustic.key"
-    key_file.write_text(bytes(range(32)).hex())
-    key_file.chmod(0o600)
+    create_key(key_file)
     authenticator = FrameAuthenticator(read_key(key_file), 3, Direction.FROM_VEHICLE)
     authenticator.grant(100)
     sender = V1Sender(SenderConfig(frame_bytes=64), protection=authenticator)
     sender.add_image(1, CONTACT, b"\x20" + bytes(60), 0.0)
     frames = [(3, sender.next_frame(0.0), 1e9), (3, preview_frame(2), 1e9)]
-    there = platform(VESSEL).model_copy(update={"acoustic_auth": "key", "acoustic_key_file": key_file})
-    service = DecompressorService(there, DecompressorConfig(out_dir=tmp_path / "out"))
-    fill(service, {}, frames)
-    found = []
-    monkeypatch.setattr(DecompressorService, "handle", lambda self, key, record, effects: found.append(record))
-    runner.start(service)
+    service, found = migrated({}, frames, acoustic_auth="key", acoustic_key_file=key_file)
     eventually(lambda: [image.image_id for image in found] == ["0001"])
     eventually(lambda: service.store.inbox_depth() == 0)  # the handler runs before its transaction is committed

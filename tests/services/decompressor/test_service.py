@@ -316,17 +316,6 @@ def test_images_wait_while_the_folder_is_not_writable(begin, runner, modem, cons
     eventually(lambda: service.health().state == "ok")
 
 
-def test_full_disk_leaves_images_with_op_modem(begin, modem, console, stream, full_disk):
-    service = begin()
-    with full_disk(service):
-        modem.send(IN, "decompressor", *updates(*frames_of("AAAA", stream(1, 200, 200))))
-        eventually(lambda: service.health().state == "degraded")
-        assert console.received == []
-    eventually(lambda: len(console.received) == 1)
-    assert (console.received[0].complete, console.received[0].version) == (True, 1)
-    eventually(lambda: service.health().state == "ok")
-
-
 def test_unreadable_codebook_is_an_error_at_the_start(platform, tmp_path):
     config = DecompressorConfig(codebooks=("nominal-10", str(tmp_path / "absent.tiles")))
     with pytest.raises(CodebookError, match=r"absent\.tiles"):

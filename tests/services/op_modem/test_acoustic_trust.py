@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from random import Random
 
 import pytest
-from builders.acoustic_attack import (
-    attack,
-    forged_contact,
-    forgeries,
-    genuine_frames,
-    run,
-    set_up,
-    shipped,
-)
+from builders.acoustic_attack import attack, forged_contact, forgeries, genuine_frames, run, set_up, shipped
 from builders.common import eventually
 from builders.vessel_frames import CONTACT, packet
 
 from sonarpost import keys
 from sonarpost.config import PlatformConfig
 from sonarpost.errors import ConfigError
-from sonarpost.link.auth.key import AcousticKey
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.v1.sender import V1Sender
@@ -38,13 +28,13 @@ MESSAGE = keys.message_received(VESSEL)
 
 
 @pytest.fixture(scope="module")
-def key_file(tmp_path_factory) -> Path:
+def key_file(tmp_path_factory):
     """The key of a fleet that the documented commands set up."""
     return set_up(tmp_path_factory.mktemp("fleet"))
 
 
 @pytest.fixture
-def key(key_file) -> AcousticKey:
+def key(key_file):
     found = link_key(shipped(key_file)[0])
     assert found is not None
     return found

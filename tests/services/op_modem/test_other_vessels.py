@@ -46,18 +46,8 @@ def merged(service):
 
 
 def record(data, **changes):
-    usual = {
-        "direction": "rx",
-        "platform_id": OTHER,
-        "time_utc_s": 1e9,
-        "source": 3,
-        "destination": 1,
-        "rate": 1,
-        "packet": 1,
-        "frame_number": 1,
-        "frame_count": 1,
-        "data": data,
-    }
+    usual = {"direction": "rx", "platform_id": OTHER, "time_utc_s": 1e9, "source": 3, "destination": 1}
+    usual |= {"rate": 1, "packet": 1, "frame_number": 1, "frame_count": 1, "data": data}
     return AcousticFrame(**(usual | changes))
 
 
@@ -146,17 +136,11 @@ def test_frame_of_a_failed_commit_is_new_again(vessels, frames):
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"other_vessels": [OTHER], "lead_vessel": "vessel-3"},
-        {"other_vessels": [OTHER], "link": "paper"},
-        {"other_vessels": [OTHER, OTHER]},
-        {"other_vessels": ["Vessel 2"]},
-        {"other_vessels": [f"vessel-{n}" for n in range(2, 19)]},
-    ],
+    [{"lead_vessel": "vessel-3"}, {"link": "paper"}, {"other_vessels": [OTHER] * 2}, {"other_vessels": ["Vessel 2"]}],
 )
 def test_invalid_combination_is_refused(options):
     with pytest.raises(ValidationError):
-        OpModemConfig(port="/dev/ttyS0", **options)
+        OpModemConfig(**({"port": "/dev/ttyS0", "other_vessels": [OTHER]} | options))
 
 
 @pytest.mark.parametrize("options", [{"other_vessels": [OTHER, LEAD]}, {"lead_vessel": LEAD}])

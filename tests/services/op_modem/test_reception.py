@@ -166,19 +166,6 @@ def test_every_measurement_of_a_modem_fits_the_record(**measured):
     assert quality.frames is None or quality.frames == measured["nframes"] >= 0
 
 
-def test_missing_port_is_named_and_used_when_it_appears(modem_pair, begin):
-    service = begin()
-    eventually(lambda: modem_pair.port(modem_pair.VESSEL) in service.health().detail)
-    assert service.health().state == "degraded"
-    modem_pair.start()
-    eventually(lambda: service.health().state == "ok")
-    modem_pair.stop()
-    eventually(lambda: service.health().state == "degraded")
-    assert modem_pair.port(modem_pair.VESSEL) in service.health().detail
-    modem_pair.start()
-    eventually(lambda: service.health().state == "ok")
-
-
 def test_full_disk_keeps_packets_in_memory_until_they_can_be_stored(begin, request, full_disk, observed, caplog):
     caplog.set_level("INFO")
     service = begin()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sonarpost.config import PlatformConfig
+from sonarpost.delivery.store import Store
+from sonarpost.services.op_modem.config import OpModemConfig
+from sonarpost.services.op_modem.service import OpModemService
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService
 
@@ -13,7 +15,7 @@ from sonarpost.services.uuv_modem.service import UuvModemService
 def start_service(runner, platform, modem_pair):
     """Start uuv_modem with short delays and the given options."""
 
-    def start(platform_config: PlatformConfig | None = None, **options):
+    def start(platform_config=None, **options):
         defaults = {
             "port": modem_pair.port(modem_pair.VEHICLE),
             "rate": 1,
@@ -33,3 +35,23 @@ def start_service(runner, platform, modem_pair):
 def compressor(runner):
     """A service of the vehicle that sends records to uuv_modem."""
     return runner.peer("uuv-1", "compressor")
+
+
+@pytest.fixture
+def start_vessel(runner, platform, modem_pair):
+    """Start op_modem of vessel-1 with the given options; it authenticates frames if there is a key file."""
+
+    def start(*, key_file=None, **options):
+        usual = {"port": modem_pair.port(modem_pair.VESSEL), "vehicles": {"3": "uuv-1"}, "status_interval_s": 1.0}
+        auth = "none" if key_file is None else "key"
+        there = platform("vessel-1").model_copy(update={"acoustic_auth": auth, "acoustic_key_file": key_file})
+        return runner.start(OpModemService(there, OpModemConfig(**(usual | options))))
+
+    return start
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = Store(tmp_path / "uuv_modem.db")
+    yield store
+    store.close()

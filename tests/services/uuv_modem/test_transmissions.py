@@ -11,15 +11,13 @@ from builders.records import outgoing_message
 from sonarpost import keys, wire
 from sonarpost.messages import Transmissions
 from sonarpost.modem.interface import PacketFailed, PacketSent, TransmissionEnded, TransmissionStarted
-from sonarpost.modem.micromodem import RATES, FailureReason
-from sonarpost.services.op_modem.config import OpModemConfig
-from sonarpost.services.op_modem.service import OpModemService
+from sonarpost.modem.micromodem import FailureReason
 from sonarpost.services.uuv_modem.transmissions import KEPT_S, MAX_KEPT, TransmissionLog
 
 KEY = keys.acoustic_transmissions("uuv-1")
 
 
-def sent(cycle_s: float) -> PacketSent:
+def sent(cycle_s):
     return PacketSent(1, 1, 1, (b"x",), (), 50.0, 50.0 + cycle_s, end_reported=False)
 
 
@@ -29,23 +27,21 @@ FAILED = PacketFailed(1, 1, 1, (b"x",), FailureReason.NO_TRANSMIT_START, maybe_s
 class Clock:
     """Two clocks and the log that is under test."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.log = TransmissionLog()
         self.utc_s, self.monotonic_s = 1000.0, 5.0
 
-    def event(self, event, after_s: float = 0.0) -> bool:
+    def event(self, event, after_s=0.0):
         self.utc_s += after_s
         self.monotonic_s += after_s
         return self.log.on_event(event, self.utc_s, self.monotonic_s)
 
     @property
-    def times(self) -> list[tuple[float, float]]:
+    def times(self):
         return [(each.start_utc_s, each.end_utc_s) for each in self.log.transmissions]
 
 
-@pytest.fixture
-def clock():
-    return Clock()
+clock = pytest.fixture(Clock)
 
 
 def test_the_nominal_air_time_is_replaced_by_the_measured_one(clock):
@@ -106,11 +102,11 @@ def test_a_clock_before_1970_and_a_report_after_hours_give_valid_records(clock):
 
 
 def test_the_service_publishes_each_transmission_and_replies_to_a_query(
-    start_service, runner, client, watch, platform, modem_pair
+    start_service, start_vessel, runner, client, watch, modem_pair
 ):
     modem_pair.start()
     published = watch(KEY)
-    runner.start(OpModemService(platform("vessel-1"), OpModemConfig(port=modem_pair.port(modem_pair.VESSEL))))
+    start_vessel()
     start_service()
     source = runner.peer("uuv-1", "autonomy")
     before_s = time.time()
@@ -123,7 +119,6 @@ def test_the_service_publishes_each_transmission_and_replies_to_a_query(
     eventually(lambda: bool(ended()), what="the record of an ended transmission")
     last = ended()[-1].transmissions[-1]
     assert before_s <= last.start_utc_s <= last.end_utc_s <= time.time()
-    assert last.end_utc_s - last.start_utc_s <= RATES[1].airtime_s + 1.0
     replies = [r.ok.payload.to_bytes() for r in client.get(KEY, timeout=5.0) if r.ok is not None]
     (record,) = [wire.decode(Transmissions, payload, KEY) for payload in replies]
     assert last in record.transmissions
