@@ -92,11 +92,7 @@ def mission(out_dir: Path) -> Path:
 
 def authenticated_mission(out_dir: Path) -> Path:
     """Write an authenticated contact, and one whose frames had no authentication."""
-    return store(
-        out_dir,
-        image("0001", authenticated=True),
-        image("0002", {"lat_deg": 41.5261}, authenticated=False),
-    )
+    return store(out_dir, image("0001", authenticated=True), image("0002", {"lat_deg": 41.5261}, authenticated=False))
 
 
 def classified_mission(out_dir: Path) -> Path:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.detection import stream
+from sonarpost.detection import candidates, stream
 from sonarpost.detection.detector import SearchResult, detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.stream import FileOrigin, StreamDetector, stored_ping_count
@@ -141,7 +141,8 @@ def test_ends_of_at_most_eight_sonars_are_kept(one_object, monkeypatch):
     assert list(detector.ends) == [f"sonar {n}" for n in range(1, 9)]
 
 
-def test_a_contact_that_the_joined_pings_do_not_confirm_is_dropped(make_survey):
+def test_a_contact_that_the_joined_pings_do_not_confirm_is_dropped(make_survey, monkeypatch):
+    monkeypatch.setattr(candidates, "_MAX_PER_1000_PINGS", 100)
     files = split(make_survey({"ping": 98}), 100)
     detector = detector_of()
     held = add(detector, files[0]).held

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,6 @@ from builders.common import eventually
 from builders.exports import FIRST_UTC_S, decision, image, mission, store
 
 from sonarpost import keys, wire
-from sonarpost.config import PlatformConfig
 from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import load_contacts
 from sonarpost.messages import Relayed
@@ -18,7 +16,7 @@ from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 
 
-def test_latest_image_version_is_exported(tmp_path: Path) -> None:
+def test_latest_image_version_is_exported(tmp_path):
     versions = [image(version=v, missing_fraction=1 / v if v > 1 else 1.0) for v in (2, 10, 9)]
     found = load_contacts(store(tmp_path, *versions))
     (contact,) = found.contacts
@@ -28,7 +26,7 @@ def test_latest_image_version_is_exported(tmp_path: Path) -> None:
     assert found.problems == ()
 
 
-def test_latest_decision_is_exported_for_any_image_version(tmp_path: Path) -> None:
+def test_latest_decision_is_exported_for_any_image_version(tmp_path):
     store(tmp_path, image(version=3))
     store(tmp_path, decision(decision_id="b", verdict="unsure", decided_utc_s=FIRST_UTC_S + 9, image_version=3))
     store(tmp_path, decision(decision_id="a", verdict="mine_like", decided_utc_s=FIRST_UTC_S + 10, image_version=1))
@@ -37,7 +35,7 @@ def test_latest_decision_is_exported_for_any_image_version(tmp_path: Path) -> No
     assert [d.decision_id for d in contact.decisions] == ["b", "a"]
 
 
-def test_repeated_image_identifier_is_another_contact(tmp_path: Path) -> None:
+def test_repeated_image_identifier_is_another_contact(tmp_path):
     later = FIRST_UTC_S + 86400
     store(tmp_path, image(), image(first_frame_utc_s=later, last_frame_utc_s=later))
     store(tmp_path, decision(decision_id="old", verdict="not_mine_like", decided_utc_s=FIRST_UTC_S + 60))
@@ -48,14 +46,12 @@ def test_repeated_image_identifier_is_another_contact(tmp_path: Path) -> None:
     assert [(c.review, len(c.decisions)) for c in found.contacts] == [("not_mine_like", 1), ("mine_like", 1)]
     assert len({c.uid for c in found.contacts}) == 2
     assert [d.decision_id for d in found.unmatched] == ["unmatched"]
-
-
-def test_single_candidate_matches_at_any_time(tmp_path: Path) -> None:
-    found = load_contacts(store(tmp_path, image(), decision(decided_utc_s=5.0)))
+    # A single candidate matches at any time.
+    found = load_contacts(store(tmp_path / "one", image(), decision(decided_utc_s=5.0)))
     assert found.contacts[0].review == "mine_like"
 
 
-def test_decision_matches_vessel_vehicle_and_image(tmp_path: Path) -> None:
+def test_decision_matches_vessel_vehicle_and_image(tmp_path):
     others = {"vessel_id": "vessel-2"}, {"vehicle_id": "uuv-2"}, {"image_id": "00A8"}
     store(tmp_path, image(), *(decision(decision_id=f"d{n}", **other) for n, other in enumerate(others)))
     found = load_contacts(tmp_path)
@@ -63,24 +59,20 @@ def test_decision_matches_vessel_vehicle_and_image(tmp_path: Path) -> None:
     assert len(found.unmatched) == 3
 
 
-def test_contact_identifier_is_permanent(tmp_path: Path) -> None:
+def test_contact_identifier_is_permanent(tmp_path):
     (before,) = load_contacts(store(tmp_path, image())).contacts
     (after,) = load_contacts(store(tmp_path, image(version=2, last_frame_utc_s=FIRST_UTC_S + 99), decision())).contacts
     assert before.uid == after.uid == "sonarpost.vessel-1.uuv-1.20161012T090001Z.00A7"
 
 
-@pytest.mark.parametrize("half", [{"lat_deg": None}, {"lon_deg": None}])
-def test_incomplete_position_is_none(tmp_path: Path, half: dict[str, None]) -> None:
-    found = load_contacts(store(tmp_path, image(contact=half)))
-    assert (len(found.located), len(found.unlocated)) == (0, 1)
+def test_incomplete_position_is_none_and_zero_is_valid(tmp_path):
+    store(tmp_path, image("0001", contact={"lat_deg": None}), image("0002", contact={"lon_deg": None}))
+    found = load_contacts(store(tmp_path, image("0003", contact={"lat_deg": 0.0, "lon_deg": 0.0})))
+    assert [c.position for c in found.located] == [(0.0, 0.0)]
+    assert len(found.unlocated) == 2
 
 
-def test_position_zero_zero_is_valid(tmp_path: Path) -> None:
-    found = load_contacts(store(tmp_path, image(contact={"lat_deg": 0.0, "lon_deg": 0.0})))
-    assert found.located[0].position == (0.0, 0.0)
-
-
-def test_image_path_is_none_without_image_or_file(tmp_path: Path) -> None:
+def test_image_path_is_none_without_image_or_file(tmp_path):
     store(tmp_path, image("0001", codec="", model=""), image("0002"))
     next(tmp_path.rglob("*_0002_v1.png")).unlink()
     assert [c.image_path for c in load_contacts(tmp_path).contacts] == [None, None]
@@ -96,7 +88,7 @@ INVALID_FILES = {
 
 
 @pytest.mark.parametrize("kind", INVALID_FILES)
-def test_invalid_file_is_reported_and_others_are_read(tmp_path: Path, kind: str) -> None:
+def test_invalid_file_is_reported_and_others_are_read(tmp_path, kind):
     store(tmp_path, image("0001"))
     text, field, expected = INVALID_FILES[kind]
     if text is None:
@@ -110,7 +102,7 @@ def test_invalid_file_is_reported_and_others_are_read(tmp_path: Path, kind: str)
     assert expected in str(problem)
 
 
-def test_record_of_another_vessel_is_rejected(tmp_path: Path) -> None:
+def test_record_of_another_vessel_is_rejected(tmp_path):
     store(tmp_path, image(), decision())
     (tmp_path / "vessel-1").rename(tmp_path / "vessel-2")
     found = load_contacts(tmp_path)
@@ -118,20 +110,13 @@ def test_record_of_another_vessel_is_rejected(tmp_path: Path) -> None:
     assert [(p.field, p.value, p.expected) for p in found.problems] == [("vessel_id", "vessel-1", "vessel-2")] * 2
 
 
-def test_incomplete_and_unrelated_files_are_ignored(tmp_path: Path) -> None:
+def test_unrelated_files_are_ignored_and_unreadable_ones_reported(tmp_path):
+    with pytest.raises(StoredFileError, match=r"nowhere.*the out_dir of c2"):
+        load_contacts(tmp_path / "nowhere")
     store(tmp_path, image())
     (tmp_path / "vessel-1" / ".half.json").write_text("{")
     (tmp_path / "readme.json").write_text("{")
     assert load_contacts(tmp_path).problems == ()
-
-
-def test_missing_folder_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(StoredFileError, match=r"nowhere.*the out_dir of c2"):
-        load_contacts(tmp_path / "nowhere")
-
-
-def test_unreadable_file_is_reported(tmp_path: Path) -> None:
-    store(tmp_path, image())
     folder = tmp_path / "vessel-1" / "folder.json"
     folder.mkdir()
     found = load_contacts(tmp_path)
@@ -139,20 +124,14 @@ def test_unreadable_file_is_reported(tmp_path: Path) -> None:
     assert [(p.where, p.value) for p in found.problems] == [(str(folder), "Is a directory")]
 
 
-def test_all_kinds_of_contacts(tmp_path: Path) -> None:
+def test_all_kinds_of_contacts(tmp_path):
     found = load_contacts(mission(tmp_path))
-    assert [c.review for c in found.contacts] == [
-        "unreviewed",
-        "mine_like",
-        "not_mine_like",
-        "unsure",
-        "unreviewed",
-        "unreviewed",
-    ]
+    reviews = "unreviewed mine_like not_mine_like unsure unreviewed unreviewed"
+    assert [c.review for c in found.contacts] == reviews.split()
     assert [c.name for c in found.unlocated] == ["uuv-1/0005"]
 
 
-def test_c2_files_are_readable(tmp_path: Path, platform: Callable[[str], PlatformConfig]) -> None:
+def test_c2_files_are_readable(tmp_path, platform):
     service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out"))
     assert service.start()
     try:

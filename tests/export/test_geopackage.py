@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
 import struct
 import subprocess
 import xml.etree.ElementTree as ET
 from contextlib import closing
-from pathlib import Path
 
 import pytest
+from builders import gdal
 from builders.exports import mission
 
 from sonarpost.export.contacts import load_contacts
@@ -18,7 +17,7 @@ from sonarpost.export.geopackage import write_geopackage
 from sonarpost.export.tables import COLUMNS, contact_properties
 
 
-def test_rows_hold_properties_points_and_pictures(tmp_path: Path) -> None:
+def test_rows_hold_properties_points_and_pictures(tmp_path):
     contacts = load_contacts(mission(tmp_path / "out"))
     path = tmp_path / "contacts.gpkg"
     assert write_geopackage(path, contacts) == []
@@ -37,18 +36,15 @@ def test_rows_hold_properties_points_and_pictures(tmp_path: Path) -> None:
         assert picture == (contact.image_path.read_bytes() if contact.image_path else None)
         point = None if geom is None else struct.unpack("<dd", geom[-16:])[::-1]
         assert point == contact.position
+    # An unreadable picture is reported.
+    lost = next(c.image_path for c in contacts.contacts if c.image_path)
+    lost.unlink()
+    problems = write_geopackage(tmp_path / "other.gpkg", contacts)
+    assert [str(lost) in str(problem) for problem in problems] == [True]
 
 
-def test_unreadable_picture_is_reported(tmp_path: Path) -> None:
-    contacts = load_contacts(mission(tmp_path / "out"))
-    path = next(c.image_path for c in contacts.contacts if c.image_path)
-    path.unlink()
-    problems = write_geopackage(tmp_path / "contacts.gpkg", contacts)
-    assert [str(path) in str(problem) for problem in problems] == [True]
-
-
-@pytest.mark.skipif(shutil.which("ogrinfo") is None, reason="ogrinfo (gdal-bin) is not installed")
-def test_ogr_reads_the_layer(tmp_path: Path) -> None:
+@gdal.needs_ogr
+def test_ogr_reads_the_layer(tmp_path):
     contacts = load_contacts(mission(tmp_path / "out"))
     path = tmp_path / "contacts.gpkg"
     write_geopackage(path, contacts)
@@ -57,7 +53,7 @@ def test_ogr_reads_the_layer(tmp_path: Path) -> None:
     assert "Geometry: Point" in result.stdout
 
 
-def test_full_disk_leaves_the_former_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_leaves_the_former_file(tmp_path, monkeypatch):
     contacts = load_contacts(mission(tmp_path / "out"))
     path = tmp_path / "contacts.gpkg"
     path.write_bytes(b"former")

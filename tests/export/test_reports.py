@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 from builders.exports import decision, image, mission, store
 from hypothesis import given
@@ -22,14 +21,14 @@ def one(**changes: object) -> ContactSet:
     return ContactSet((found,), (), ())
 
 
-def test_caris_line() -> None:
+def test_caris_line():
     assert caris_text(one(remark="a,b")) == (
         "0000,uuv-1   0367,0000,0367,10/12/2016,08:59:50.5,ATD,10/12/2016,09:10:01.2,A. ,0000,20.50,"
         "41.5251334,-70.6712456,uuv-1/00A7 mine_like a;b\n"
     )
 
 
-def test_caris_lines_have_one_form(tmp_path: Path) -> None:
+def test_caris_lines_have_one_form(tmp_path):
     contacts = load_contacts(mission(tmp_path / "out"))
     write_caris_text(tmp_path / "a.caris.txt", contacts)
     rows = [line.split(",") for line in (tmp_path / "a.caris.txt").read_text().splitlines()]
@@ -40,7 +39,7 @@ def test_caris_lines_have_one_form(tmp_path: Path) -> None:
     assert {row[11] for row in rows} == {"20.50", "-20.50"}
 
 
-def test_mine_report() -> None:
+def test_mine_report():
     assert mine_report(one(mlo_class="moored mine", remark="look / again")) == (
         "NOTE/NOT CONFORMANT WITH APP-11. IN THE MANNER OF A MINE REPORT. BY SONARPOST//\n"
         "CONTACTS/1/WITHOUT POSITION/0//\n"
@@ -54,7 +53,7 @@ def test_mine_report() -> None:
     )
 
 
-def test_contacts_without_position_are_listed(tmp_path: Path) -> None:
+def test_contacts_without_position_are_listed(tmp_path):
     contacts = load_contacts(store(tmp_path / "out", image(contact={"lat_deg": None, "depth_m": None})))
     write_mine_report(tmp_path / "a.app11-like.txt", contacts)
     text = (tmp_path / "a.app11-like.txt").read_text()
@@ -64,7 +63,7 @@ def test_contacts_without_position_are_listed(tmp_path: Path) -> None:
 
 
 @given(st.text(max_size=80), st.text(min_size=1, max_size=40), st.text(max_size=40))
-def test_free_text_cannot_add_fields_or_sets(remark: str, operator: str, mlo_class: str) -> None:
+def test_free_text_cannot_add_fields_or_sets(remark, operator, mlo_class):
     contacts = one(remark=remark, operator=operator, mlo_class=mlo_class)
     [line] = caris_text(contacts).splitlines()
     assert len(line.split(",")) == 15

@@ -47,9 +47,7 @@ def parameters(element: ET.Element) -> dict[str, str]:
     return {p.attrib["name"]: p.attrib["value"] for p in element.findall("Parameter")}
 
 
-def test_package_has_every_event_with_its_image(
-    contacts: ContactSet, tmp_path: Path, schema: xmlschema.XMLSchema
-) -> None:
+def test_package_has_every_event_with_its_image(contacts, tmp_path, schema):
     path = tmp_path / "contacts.tak.zip"
     assert write_data_package(path, contacts) == []
     with zipfile.ZipFile(path) as archive:
@@ -73,7 +71,7 @@ def test_package_has_every_event_with_its_image(
         assert (None if found is None else found.attrib["hashes"]) == (png and f'["{attachment_sha256(png)}"]')
 
 
-def test_unreadable_image_is_reported_and_its_event_is_kept(contacts: ContactSet, tmp_path: Path) -> None:
+def test_unreadable_image_is_reported_and_its_event_is_kept(contacts, tmp_path):
     lost = next(c for c in contacts.located if c.image_path)
     assert lost.image_path is not None
     lost.image_path.unlink()
@@ -83,7 +81,7 @@ def test_unreadable_image_is_reported_and_its_event_is_kept(contacts: ContactSet
         assert f"{lost.uid}/{lost.uid}.cot" in archive.namelist()
 
 
-def test_hostile_text_stays_text(tmp_path: Path) -> None:
+def test_hostile_text_stays_text(tmp_path):
     remark = '<x/>&"\x00</remarks>]]>'
     stored = load_contacts(store(tmp_path / "out", image(), decision(remark=remark, mlo_class="../../x")))
     [contact] = stored.contacts
@@ -93,7 +91,7 @@ def test_hostile_text_stays_text(tmp_path: Path) -> None:
     assert "<x/>" in (event.findtext("detail/remarks") or "")
 
 
-def test_file_transfer_names_the_package(contacts: ContactSet, schema: xmlschema.XMLSchema) -> None:
+def test_file_transfer_names_the_package(contacts, schema):
     contact = contacts.located[0]
     package = data_package(contact, b"png", NOW_S)
     uploaded = UploadedPackage("https://tak/x?hash=1&a=2", hashlib.sha256(package).hexdigest(), len(package))
@@ -140,7 +138,7 @@ def marti() -> Iterator[HTTPServer]:
     server.server_close()
 
 
-def test_upload(contacts: ContactSet, marti: HTTPServer) -> None:
+def test_upload(contacts, marti):
     package = data_package(contacts.located[0], b"png\r\n--x\r\n", NOW_S)
     url = f"http://127.0.0.1:{marti.server_port}"
     uploaded = TakFiles(url).upload("a.zip", package, "sonarpost")
@@ -151,7 +149,7 @@ def test_upload(contacts: ContactSet, marti: HTTPServer) -> None:
         TakFiles(url).upload("a.zip", package, "sonarpost")
 
 
-def test_unreached_server_and_invalid_address_are_errors() -> None:
+def test_unreached_server_and_invalid_address_are_errors():
     with pytest.raises(PortError, match="not uploaded"):
         TakFiles(f"http://127.0.0.1:{free_port()}").upload("a.zip", b"", "sonarpost")
     for url in ("ftp://a", "https://", "https://a:x", "https://u@a", "https://a/path"):
