@@ -4,23 +4,23 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from builders.records import decision_record, reconstructed_image
+from builders import shore
+from builders.records import decision_record
 
 from sonarpost.archive import shore_schema
 from sonarpost.archive.journal import Area, Criteria, Journal, JournalEntry, JournalRecord
 from sonarpost.archive.postgresql import Database, DatabaseAddress
 from sonarpost.archive.shore_database import ShoreDatabase, StoredImage
 from sonarpost.archive.shore_files import row_of_image
-from sonarpost.messages import Contact, Decision, Pixels
+from sonarpost.messages import Contact, Decision
 
 IMAGES, DECISIONS = "sonarpost/v1/shore/contact/vessel-1/image", "sonarpost/v1/shore/contact/vessel-1/decision"
 ALL = Criteria()
 
 
-def image(image_id, version=1, lat=56.0, lon=-5.0):
+def image(image_id, lat=56.0, lon=-5.0, **changes):
     contact = Contact(contact_id=image_id, vehicle_id="uuv-1", lat_deg=lat, lon_deg=lon)
-    picture = Pixels(height_px=2, width_px=3, bits=8, data=bytes(range(6)))
-    return reconstructed_image(picture, vessel_id="vessel-1", image_id=image_id, version=version, contact=contact)
+    return shore.image(image_id, contact=contact, **changes)
 
 
 def entry(record, name=""):

@@ -7,14 +7,15 @@ from hashlib import sha256
 
 import pytest
 from builders.common import eventually, free_port
-from builders.records import decision_record, reconstructed_image
+from builders.records import decision_record
+from builders.shore import image
 
 from sonarpost.archive.postgresql import Database, DatabaseAddress
 from sonarpost.archive.shore_database import AcceptedRecord, ShoreDatabase, StoredImage
 from sonarpost.archive.shore_files import decision_text, row_of_image
 from sonarpost.archive.shore_index import DecisionRow, TaskingRow
 from sonarpost.errors import ConfigError, DatabaseUnavailableError, StoredFileError
-from sonarpost.messages import Contact, Pixels
+from sonarpost.messages import Contact
 
 
 @pytest.fixture
@@ -29,10 +30,8 @@ def archive(open_):
 
 def stored(image_id="AAAA", text=b"{}", accepted_utc_s=5.0):
     contact = Contact(contact_id="c", vehicle_id="uuv-1", lat_deg=56.0, lon_deg=-5.0, atd_class="clutter")
-    picture = Pixels(height_px=2, width_px=3, bits=8, data=bytes(6))
-    image = reconstructed_image(picture, image_id=image_id, contact=contact)
     contents = (text, b"tiff", b"png")
-    row = row_of_image(f"name_{image_id}", image, 1.0, accepted_utc_s, contents)
+    row = row_of_image(f"name_{image_id}", image(image_id, contact=contact), 1.0, accepted_utc_s, contents)
     return StoredImage(replace(row, conflict=False), tuple(zip((".json", ".tiff", ".png"), contents, strict=True)))
 
 

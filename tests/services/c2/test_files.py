@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost import keys
+from sonarpost.archive.image_files import write_image
 from sonarpost.archive.shore_files import find_image, image_paths, select_images
 from sonarpost.archive.shore_index import FILE_NAME, DecisionRow, ImageRow, ShoreIndex
 from sonarpost.cli.main import main
@@ -70,6 +71,15 @@ def test_index_is_completed_from_the_files(open_files, out):
     again = open_files().index()
     assert [replace(row, accepted_utc_s=0.0) for row in again.images()] == before
     assert [d.decision_id for d in again.decisions()] == ["d1"]
+
+
+def test_image_whose_files_were_stored_before_a_crash_is_indexed(open_files, out):
+    archive = open_files()
+    assert archive.index().images() == []
+    write_image(out / "vessel-1", image())
+    assert not archive.store_image(image(), 5.0).is_new
+    archive.flush()
+    assert len(archive.index().images()) == 1
 
 
 # Comparison of files and index
