@@ -143,7 +143,7 @@ def attack(session, who, door, origins):
                 single = attachment(origin, item, 0, highest - 1)
                 batch = batch_attachment(origin, [item], highest - 1)
                 for attached in (single, batch):
-                    queries.append(session.get(selector, payload=payload, attachment=attached, timeout=3))
+                    queries.append(session.get(selector, payload=payload, attachment=attached, timeout=30))
         session.put(key, f"valid {who} {door} publication".encode())
     for query in queries:
         list(query)

@@ -74,7 +74,7 @@ def test_other_vessel_has_no_other_right(world, lead):
 
     def answered(session, key):
         selector = keys.delivery_query(key, "op_modem")
-        return [r.ok.payload.to_bytes() for r in session.get(selector, timeout=3) if r.ok] == [b"stored"]
+        return [r.ok.payload.to_bytes() for r in session.get(selector, timeout=30) if r.ok] == [b"stored"]
 
     with zenoh.open(client_config([lead_local])) as at_lead, world.open(OTHER, endpoint=tls) as hostile:
         for key in (INBOX, *DENIED):

@@ -44,7 +44,7 @@ def received(shore_session):
 
 
 def answers(session, key):
-    return [reply.ok.payload.to_bytes() for reply in session.get(key, timeout=3) if reply.ok is not None]
+    return [reply.ok.payload.to_bytes() for reply in session.get(key, timeout=30) if reply.ok is not None]
 
 
 def own_key_arrives(session, received, vessel, note):

@@ -41,7 +41,7 @@ def relay(vessel_session):
 
 
 def answered(session, key):
-    return [reply.ok.payload.to_bytes() for reply in session.get(key, timeout=3) if reply.ok] == [b"stored"]
+    return [reply.ok.payload.to_bytes() for reply in session.get(key, timeout=30) if reply.ok] == [b"stored"]
 
 
 def test_shore_sends_advice_and_commands_only(world, relay):
