@@ -1,9 +1,6 @@
 """The part that all fuzzers share; the modules under test must be imported before, with instrumentation."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import atheris
@@ -11,13 +8,7 @@ import atheris
 DEFAULTS = {"-timeout": 10, "-rss_limit_mb": 2048, "-print_final_stats": 1}
 
 
-def fuzz(
-    check: Callable[[bytes], object],
-    corpus: Path,
-    seeds: Callable[[], Iterable[bytes]],
-    max_bytes: int,
-    *arguments: str,
-) -> None:
+def fuzz(check, corpus, seeds, max_bytes, *arguments):
     """Run until libFuzzer ends the process, with the seeds unless an argument is a file to repeat."""
     corpus.mkdir(parents=True, exist_ok=True)
     options = [f"{name}={value}" for name, value in {**DEFAULTS, "-max_len": max_bytes}.items()]
@@ -27,7 +18,7 @@ def fuzz(
             (corpus / f"seed-{number:04}").write_bytes(seed[:max_bytes])
         arguments = (*arguments, str(corpus))
 
-    def test_one_input(data: bytes) -> None:
+    def test_one_input(data):
         check(data)
 
     atheris.Setup([sys.argv[0], *options, *arguments], test_one_input)

@@ -1,24 +1,19 @@
 """A chain of real processes for tests: snippets instead of surveys, a fast channel."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from builders.history import History
 from builders.progress import wait_while_progressing
 from sonarpost import keys
 from sonarpost.cli.demo.chain import Chain
-from sonarpost.cli.demo.outcome import ImageFile, Outcome, evaluate, last_versions, read_images
+from sonarpost.cli.demo.outcome import evaluate, last_versions, read_images
 from sonarpost.cli.demo.settings import VESSEL, ChainSettings, free_ports
 from sonarpost.cli.demo.watch import Watcher
 from sonarpost.link.frames.paper.frame import parse_frame
@@ -29,7 +24,7 @@ IMAGES = 6
 TIME_SCALE = 40.0
 
 
-def snippet(number: int) -> npt.NDArray[np.uint8]:
+def snippet(number):
     """Return a snippet of seabed with a highlight and a shadow, shape (80, 140)."""
     rng = np.random.default_rng(number)
     image = rng.gamma(4.0, 25.0, (80, 140))
@@ -38,7 +33,7 @@ def snippet(number: int) -> npt.NDArray[np.uint8]:
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def latest_versions(folder: Path) -> list[ImageFile]:
+def latest_versions(folder):
     """Return the last version of each image of a folder, an image that has two sets of files twice."""
     return last_versions(read_images(folder))
 
@@ -53,37 +48,35 @@ class VesselWatcher(Watcher):
             not delivered, again after a restart.
     """
 
-    def __init__(self, settings: ChainSettings) -> None:
+    def __init__(self, settings):
         super().__init__(settings)
-        self.images_with_frames: set[str] = set()
-        self.images_received: set[str] = set()
+        self.images_with_frames = set()
+        self.images_received = set()
 
-    def __enter__(self) -> VesselWatcher:
+    def __enter__(self):
         super().__enter__()
         vessel = self._open(self.settings.router_ports[1])
         self._subscribe(vessel, keys.acoustic_rx(VESSEL), AcousticFrame, self._on_frame)
         self._subscribe(vessel, keys.acoustic_image(VESSEL), ReceivedImage, self._on_received_image)
         return self
 
-    def _on_frame(self, frame: AcousticFrame) -> None:
+    def _on_frame(self, frame):
         if self.settings.link == "paper":
             self.images_with_frames.add(parse_frame(frame.data).image_id)
 
-    def _on_received_image(self, image: ReceivedImage) -> None:
+    def _on_received_image(self, image):
         self.images_received.add(image.image_id)
 
 
 class RunningChain:
-    """A started chain and its observer."""
-
-    def __init__(self, chain: Chain, watcher: VesselWatcher) -> None:
+    def __init__(self, chain, watcher):
         self.chain = chain
         self.watcher = watcher
         self.settings = chain.settings
         self.deposited = 0
         self.history = History(chain.settings.folder / "history.jsonl")
 
-    def deposit(self, count: int = IMAGES) -> None:
+    def deposit(self, count=IMAGES):
         """Put snippets into the folder that the vehicle polls."""
         for _ in range(count):
             hidden = self.settings.incoming / f".snippet-{self.deposited:03}.png"
@@ -91,12 +84,11 @@ class RunningChain:
             hidden.rename(hidden.with_name(hidden.name[1:]))
             self.deposited += 1
 
-    def kill(self, name: str) -> None:
-        """End a process at once (SIGKILL)."""
+    def kill(self, name):
         self.history.fault(name, "SIGKILL")
         self.chain.kill(name)
 
-    def assert_delivered_once(self) -> None:
+    def assert_delivered_once(self):
         """Check that each encoded image is at the vessel and at the shore site, once and unchanged.
 
         All versions of an image are one record; its digest is that of its last version's file.
@@ -110,34 +102,33 @@ class RunningChain:
         verdict = self.history.verdict()
         assert verdict.ok, f"{self.history.path}: {verdict}"
 
-    def outcome(self) -> Outcome:
-        """Return the outcome so far."""
+    def outcome(self):
         return evaluate(self.settings, self.watcher.snippets, self.watcher.contact_of_image, 0.0)
 
-    def until(self, condition: Callable[[], bool], what: str) -> None:
+    def until(self, condition, what):
         """Wait for `condition()`; fail with what keeps the chain busy when no record and no counter changes."""
         wait_while_progressing(condition, self._progress, what, lambda: f"busy: {self.busy()}")
 
-    def _progress(self) -> object:
+    def _progress(self):
         watcher = self.watcher
         counters = [sum(report.counters.values()) for report in list(watcher.health.values())]
         return watcher.changes, len(watcher.images_received), counters
 
-    def terminate(self, name: str) -> int | None:
+    def terminate(self, name):
         """End a process (SIGTERM); return its exit status."""
         os.kill(self.chain.pid(name), signal.SIGTERM)
         self.until(lambda: self.chain.status(name) is not None, f"end of {name}")
         return self.chain.status(name)
 
-    def busy(self) -> str:
+    def busy(self):
         """Return what keeps the chain busy, an empty text if nothing does."""
         return self.watcher.busy(0, time.time() - 30.0)
 
-    def until_idle(self) -> None:
+    def until_idle(self):
         """Wait until the chain has been idle for longer than a packet, by reports made after it became idle."""
         idle_since_utc_s = 0.0
 
-        def quiet() -> bool:
+        def quiet():
             nonlocal idle_since_utc_s
             if self.busy():
                 idle_since_utc_s = 0.0
@@ -149,11 +140,11 @@ class RunningChain:
 
 
 @pytest.fixture
-def start_chain(tmp_path: Path) -> Iterator[Callable[..., RunningChain]]:
+def start_chain(tmp_path):
     """Starts a chain of the paper's format; it is stopped at the end of the test."""
     with ExitStack() as stack:
 
-        def start(**changes: object) -> RunningChain:
+        def start(**changes):
             ports = free_ports(3)
             settings = ChainSettings(
                 folder=tmp_path / "run",
@@ -162,7 +153,7 @@ def start_chain(tmp_path: Path) -> Iterator[Callable[..., RunningChain]]:
                 time_scale=TIME_SCALE,
                 router_ports=(ports[0], ports[1], ports[2]),
             )
-            settings = dataclasses.replace(settings, **changes)  # type: ignore[arg-type]
+            settings = dataclasses.replace(settings, **changes)
             chain = stack.enter_context(Chain(settings))
             watcher = stack.enter_context(VesselWatcher(settings))
             watcher.wait_until_started(chain.check)

@@ -17,10 +17,8 @@ import sqlite3
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import pytest
 import tifffile
@@ -38,7 +36,6 @@ from sonarpost import keys
 from sonarpost.cli.demo.chain import ROUTERS, Chain
 from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings, free_ports
 from sonarpost.config import PlatformConfig
-from sonarpost.messages import ReconstructedImage
 from sonarpost.sonar.image_files import write_png
 
 PROCESSES = (*ROUTERS, *PLATFORM_OF)
@@ -61,15 +58,7 @@ STUCK_S = 120.0
 
 @dataclass(frozen=True)
 class Fault:
-    """One planned fault.
-
-    Attributes:
-        at_s: Time since the start.
-        target: A process, `link`, `clock PLATFORM` or `disk NAME`.
-        kind: SIGKILL, SIGTERM, SIGSTOP; cut, stall, reset; step; full.
-        duration_s: How long the process is down or stopped, the link unusable, or the disk full.
-        offset_s: New offset of a clock.
-    """
+    """A fault of a process, `link`, `clock PLATFORM` or `disk NAME`; `offset_s` is the new offset of a clock."""
 
     at_s: float
     target: str
@@ -78,14 +67,14 @@ class Fault:
     offset_s: float = 0.0
 
 
-def plan_faults(seed: int, seconds: float) -> list[Fault]:
+def plan_faults(seed, seconds):
     """Return faults for a duration, one every 3 s on average; the same arguments return the same plan.
 
     At most one fault has a target at a time.
     """
     rng = random.Random(seed)
-    free_at_s: dict[str, float] = {}
-    faults: list[Fault] = []
+    free_at_s = {}
+    faults = []
     at_s = rng.uniform(1.0, 3.0)
     while at_s < seconds:
         fault = _draw(rng, at_s)
@@ -96,7 +85,7 @@ def plan_faults(seed: int, seconds: float) -> list[Fault]:
     return faults
 
 
-def _draw(rng: random.Random, at_s: float) -> Fault:
+def _draw(rng, at_s):
     kind = rng.choices(("SIGKILL", "SIGTERM", "SIGSTOP", "link", "step", "full"), (35, 10, 20, 15, 10, 10))[0]
     if kind.startswith("SIG"):
         longest_s = 8.0 if kind == "SIGSTOP" else 3.0
@@ -115,16 +104,16 @@ def _draw(rng: random.Random, at_s: float) -> Fault:
 class _ClockedChain(Chain):
     """A chain whose services read a clock that is shifted by the number in a file of their platform."""
 
-    def clock(self, platform: str) -> Path:
+    def clock(self, platform):
         return self.settings.folder / f"clock-{platform}"
 
-    def command(self, name: str) -> list[str]:
+    def command(self, name):
         if name in ROUTERS:
             return super().command(name)
         script = REPOSITORY / "tests" / "builders" / "shifted_clock.py"
         return [sys.executable, str(script), str(self.clock(PLATFORM_OF[name])), *self.module(name)]
 
-    def step(self, platform: str, offset_s: float) -> None:
+    def step(self, platform, offset_s):
         new = self.clock(platform).with_suffix(".new")
         new.write_text(str(offset_s))
         new.replace(self.clock(platform))
@@ -132,13 +121,7 @@ class _ClockedChain(Chain):
 
 @dataclass
 class Counts:
-    """Counts of a run, for the table.
-
-    Attributes:
-        injected: Number of injected faults by (target, kind).
-        ended_alone: Number of processes that ended without a signal of the plan, by name and status.
-        skipped: Kinds of faults that this host does not allow, with the reason.
-    """
+    """Faults by (target, kind); processes that ended by themselves, by (name, status); faults that the host forbids."""
 
     injected: Counter[tuple[str, str]] = field(default_factory=Counter)
     ended_alone: Counter[tuple[str, int]] = field(default_factory=Counter)
@@ -146,9 +129,7 @@ class Counts:
 
 
 class ChaosChain:
-    """All processes of a chain under random faults; see `chaos_chain`."""
-
-    def __init__(self, chain: _ClockedChain, link: FaultyLink, disks: dict[str, SmallDisk], history: History) -> None:
+    def __init__(self, chain, link, disks, history):
         self.chain = chain
         self.settings = chain.settings
         self.history = history
@@ -157,9 +138,9 @@ class ChaosChain:
         self.images = 0
         self._link = link
         self._disks = disks
-        self._down_until_s: dict[str, float] = {}
-        self._expected_end: set[str] = set()
-        self._ends: list[tuple[float, Callable[[], None]]] = []
+        self._down_until_s = {}
+        self._expected_end = set()
+        self._ends = []
         self._archive = ArchiveLog(history, self.settings.shore_images.parent, VESSEL, IMAGE_KEY, SOURCE_VEHICLE)
         platform = PlatformConfig(
             id=VESSEL,
@@ -175,7 +156,7 @@ class ChaosChain:
 
     # Sources
 
-    def feed(self, elapsed_s: float) -> None:
+    def feed(self, elapsed_s):
         """Queue the snippets and images that are due."""
         while self.snippets * SNIPPET_INTERVAL_S < elapsed_s:
             hidden = self.settings.incoming / f".snippet-{self.snippets:04}.png"
@@ -190,13 +171,13 @@ class ChaosChain:
             self._log("queued", image)
             self.images += 1
 
-    def _log(self, operation: str, image: ReconstructedImage) -> None:
+    def _log(self, operation, image):
         assert operation in ("queued", "acknowledged")
         self.history.add(operation, "source", name_of(image), key=IMAGE_KEY, sha256=image.picture_sha256)
 
     # Faults
 
-    def run(self, faults: list[Fault], seconds: float) -> None:
+    def run(self, faults, seconds):
         """Inject the faults of a plan, then repair everything."""
         start_s = time.monotonic()
         pending = list(reversed(faults))
@@ -213,7 +194,7 @@ class ChaosChain:
             self.chain.step(platform, 0.0)
         self.history.fault("plan", "ended: everything repaired, clocks correct")
 
-    def _begin(self, fault: Fault) -> None:
+    def _begin(self, fault):
         begin, _, name = fault.target.partition(" ")
         if begin == "disk" and name not in self._disks:
             return
@@ -238,7 +219,7 @@ class ChaosChain:
                 self._expected_end.add(fault.target)
                 self._down_until_s[fault.target] = now_s + fault.duration_s
 
-    def supervise(self) -> None:
+    def supervise(self):
         """End the faults whose time is over, and start the processes that have ended."""
         now_s = time.monotonic()
         for due_s, end in list(self._ends):
@@ -262,10 +243,10 @@ class ChaosChain:
 
     # End
 
-    def wait_until_delivered(self) -> None:
+    def wait_until_delivered(self):
         """Wait until every snippet is complete at the shore site and nothing is queued; log what is there."""
 
-        def delivered() -> bool:
+        def delivered():
             self.supervise()
             return not self.busy()
 
@@ -274,11 +255,11 @@ class ChaosChain:
         finally:
             self._log_results()
 
-    def _describe(self) -> str:
+    def _describe(self):
         tails = "".join(f"\n--- {name}\n{self.chain.log_tail(name)}" for name in PROCESSES)
         return f"{self.busy()}; {self.history.verdict()}{tails}"
 
-    def busy(self) -> str:
+    def busy(self):
         """Return the undelivered records as text, an empty text if there are none."""
         if depth := self.source.store.outbox_depth():
             return f"source: {depth} images"
@@ -289,12 +270,12 @@ class ChaosChain:
         complete = self.complete_snippets()
         return f"{complete} of {self.snippets} snippets are complete" if complete < self.snippets else ""
 
-    def complete_snippets(self) -> int:
+    def complete_snippets(self):
         """Return the number of complete images of the vehicle's snippets at the shore site."""
         images = [i for i in latest_versions(self.settings.shore_images) if i.name.startswith(f"{UUV}_")]
         return len({i.image_id for i in images if i.complete})
 
-    def _log_results(self) -> None:
+    def _log_results(self):
         self._archive.update()
         for process, folder in (
             ("decompressor", self.settings.vessel_images),
@@ -310,14 +291,13 @@ class ChaosChain:
                 )
 
 
-def queued_records(path: Path) -> int:
-    """Return the number of records in the inbox and outbox of a store."""
+def queued_records(path):
     with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True, timeout=30)) as db:
         return sum(int(db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]) for table in ("inbox", "outbox"))
 
 
 @contextmanager
-def chaos_chain(folder: Path) -> Iterator[ChaosChain]:
+def chaos_chain(folder):
     """Start a chain with v1, 10 % of the frames lost, small disks, and a link between vessel and shore with faults."""
     with ExitStack() as stack:
         ports = free_ports(3)
@@ -337,7 +317,7 @@ def chaos_chain(folder: Path) -> Iterator[ChaosChain]:
         )
         places = {name: folder / "state" / name for name in (UUV, VESSEL, SHORE)}
         places["shore images"] = settings.shore_images.parent
-        disks: dict[str, SmallDisk] = {}
+        disks = {}
         skipped = ""
         for name, place in places.items():
             try:

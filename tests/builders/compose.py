@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import pytest
@@ -61,7 +60,7 @@ except urllib.error.HTTPError as error:
 """
 
 
-def compose_command() -> list[str]:
+def compose_command():
     """Return Compose v2 where it is installed, else v1."""
     if subprocess.run(["docker", "compose", "version"], capture_output=True, check=False).returncode == 0:
         return ["docker", "compose"]
@@ -78,7 +77,7 @@ class Project:
     environment: dict[str, str]
     files: list[str] = field(default_factory=lambda: ["docker-compose.yml", "tests/system/compose/small-volume.yml"])
 
-    def compose(self, *arguments: str, check: bool = True) -> str:
+    def compose(self, *arguments, check=True):
         """Run a compose command; its output."""
         command = [*compose_command(), "-p", self.name]
         command += [option for file in self.files for option in ("-f", file)]
@@ -95,41 +94,39 @@ class Project:
         assert not check or done.returncode == 0, f"{arguments}: {done.stdout}\n{done.stderr}"
         return done.stdout
 
-    def container(self, service: str) -> str:
-        """Return the identifier of a service's container."""
+    def container(self, service):
         labels = (f"project={self.name}", f"service={service}", "oneoff=False")
         filters = [option for label in labels for option in ("--filter", f"label=com.docker.compose.{label}")]
         found = docker("ps", "-aq", *filters).split()
         assert len(found) == 1, (service, found)
         return found[0]
 
-    def state(self, service: str) -> dict[str, object]:
-        """Return what the engine knows of a service's container."""
+    def state(self, service):
         [state] = json.loads(docker("inspect", self.container(service)))
         assert isinstance(state, dict)
         return state
 
-    def health(self, service: str) -> str:
+    def health(self, service):
         """Return starting, healthy or unhealthy, and what the check said last."""
-        health = self.state(service)["State"]["Health"]  # type: ignore[index]
+        health = self.state(service)["State"]["Health"]
         log = health["Log"]
         return f"{health['Status']}: {log[-1]['Output'].strip() if log else ''}"
 
-    def inside(self, service: str, script: str, *, check: bool = True) -> str:
+    def inside(self, service, script, *, check=True):
         """Run a Python script in a service's container; its output."""
         return docker("exec", self.container(service), "python", "-c", script, check=check)
 
-    def addresses(self, service: str) -> dict[str, str]:
+    def addresses(self, service):
         """Return a service's address in each network."""
-        networks = self.state(service)["NetworkSettings"]["Networks"]  # type: ignore[index]
+        networks = self.state(service)["NetworkSettings"]["Networks"]
         return {name.removeprefix(f"{self.name}_"): n["IPAddress"] for name, n in networks.items()}
 
-    def survey(self, number: int) -> None:
+    def survey(self, number):
         """Put simulated surveys into the vehicle's folder, up to this number."""
         self.environment["SIM_SURVEYS"] = str(number)
         self.compose("run", "--rm", "-e", "SURVEY_INTERVAL_S=0", "survey_source", "sonarpost-surveys", str(number))
 
-    def contacts(self) -> int:
+    def contacts(self):
         """Return how many contacts the vehicle has handed on, told by its store."""
         script = (
             "import sqlite3; db = sqlite3.connect('file:/var/lib/sonarpost/state/compressor.db?mode=ro', uri=True); "
@@ -137,7 +134,7 @@ class Project:
         )
         return int(self.inside("compressor", script))
 
-    def surveys_done(self) -> int:
+    def surveys_done(self):
         """Return how many survey files the vehicle has dealt with."""
         script = (
             "import sqlite3; db = sqlite3.connect('file:/var/lib/sonarpost/state/atd_stub.db?mode=ro', uri=True); "
@@ -147,24 +144,24 @@ class Project:
         files, owed = self.inside("atd_stub", script).split()
         return int(files) if owed == "0" else 0
 
-    def pictures(self, service: str) -> tuple[dict[str, str], int]:
+    def pictures(self, service):
         """Return a service's pictures (name to SHA-256) and how many of them are complete."""
         return read_pictures(self.inside(service, PICTURES))
 
-    def kept(self, volume: str) -> tuple[dict[str, str], int]:
+    def kept(self, volume):
         """Return the pictures in a volume, whether or not a service has it."""
         mount = f"{self.name}_{volume}:/var/lib/sonarpost/pictures:ro"
         return read_pictures(
             docker("run", "--rm", "-v", mount, self.environment["SONARPOST_IMAGE"], "python", "-c", PICTURES)
         )
 
-    def wait_until_healthy(self, services: Sequence[str] = SERVICES) -> None:
+    def wait_until_healthy(self, services=SERVICES):
         """Wait until every service says that it is well."""
         for service in services:
             until(lambda s=service: self.health(s).startswith("healthy"), f"{service} healthy")
 
 
-def until(condition: Callable[[], bool], what: str, within_s: float = 400.0) -> None:
+def until(condition, what, within_s=400.0):
     """Wait until `condition()` holds; a look costs a process in a container, so there is one a second."""
     deadline = time.monotonic() + within_s
     while not condition():
@@ -173,13 +170,13 @@ def until(condition: Callable[[], bool], what: str, within_s: float = 400.0) -> 
         time.sleep(1.0)  # noqa: TID251 polls
 
 
-def read_pictures(text: str) -> tuple[dict[str, str], int]:
+def read_pictures(text):
     """Return what the script PICTURES printed."""
     found = json.loads(text)
     return found["pictures"], found["complete"]
 
 
-def docker(*arguments: str, check: bool = True) -> str:
+def docker(*arguments, check=True):
     """Run a docker command; its output."""
     done = subprocess.run(["docker", *arguments], capture_output=True, text=True, timeout=400, check=False)
     assert not check or done.returncode == 0, f"{arguments}: {done.stdout}\n{done.stderr}"
@@ -188,7 +185,7 @@ def docker(*arguments: str, check: bool = True) -> str:
 
 
 @pytest.fixture(scope="session")
-def project() -> Iterator[Project]:
+def project():
     """The running chain, removed with its volumes after the last test, also after failures."""
     name = os.environ.get("SONARPOST_COMPOSE_PROJECT")
     if name is None:

@@ -1,13 +1,10 @@
 """TCP link between two routers that a test can cut, stall or limit in bandwidth."""
 
-from __future__ import annotations
-
 import contextlib
 import selectors
 import socket
 import struct
 import threading
-from collections.abc import Callable
 
 CHUNK_BYTES = 4096
 POLL_S = 0.02
@@ -31,9 +28,7 @@ class FaultyLink:
         on_fault: Called with the name of each fault, and of its end.
     """
 
-    def __init__(
-        self, target_port: int, bytes_per_s: float | None = None, on_fault: Callable[[str], None] = lambda _: None
-    ) -> None:
+    def __init__(self, target_port, bytes_per_s=None, on_fault=lambda _: None):
         self._on_fault = on_fault
         self._target_port = target_port
         self._bytes_per_s = bytes_per_s
@@ -42,43 +37,42 @@ class FaultyLink:
         self._closing = threading.Event()
         self._refusing = threading.Event()
         self._stalled = {"up": threading.Event(), "down": threading.Event()}
-        self._sockets: set[socket.socket] = set()
+        self._sockets = set()
         self._lock = threading.Lock()
         self.attempts = 0
         self.passed_bytes = {"up": 0, "down": 0}
         threading.Thread(target=self._accept, daemon=True).start()
 
-    def cut(self) -> None:
+    def cut(self):
         """Reset every connection, and every new one at once."""
         self._on_fault("cut")
         self._refusing.set()
         self._reset_all()
 
-    def stall(self, *directions: str) -> None:
+    def stall(self, *directions):
         """Stop the data in these directions, by default in both."""
         self._on_fault(f"stall {' '.join(directions)}".strip())
         for direction in directions or ("up", "down"):
             self._stalled[direction].set()
 
-    def mend(self) -> None:
+    def mend(self):
         """Restore the link."""
         self._on_fault("restored")
         for stalled in self._stalled.values():
             stalled.clear()
         self._refusing.clear()
 
-    def reset(self) -> None:
+    def reset(self):
         """Reset every connection, which loses the data in transit; new connections are accepted."""
         self._on_fault("reset")
         self._reset_all()
 
-    def close(self) -> None:
-        """Close the link."""
+    def close(self):
         self._closing.set()
         self._listener.close()
         self._reset_all()
 
-    def _reset_all(self) -> None:
+    def _reset_all(self):
         with self._lock:
             ends, self._sockets = self._sockets, set()
         for end in ends:
@@ -86,7 +80,7 @@ class FaultyLink:
                 end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_ON_CLOSE)
                 end.shutdown(socket.SHUT_RDWR)
 
-    def _accept(self) -> None:
+    def _accept(self):
         while not self._closing.is_set():
             try:
                 near, _ = self._listener.accept()
@@ -112,7 +106,7 @@ class FaultyLink:
                 thread.start()
             threading.Thread(target=self._close_after, args=(pair, near, far), daemon=True).start()
 
-    def _close_after(self, pair: list[threading.Thread], near: socket.socket, far: socket.socket) -> None:
+    def _close_after(self, pair, near, far):
         for thread in pair:
             thread.join()
         with self._lock:
@@ -120,7 +114,7 @@ class FaultyLink:
         near.close()
         far.close()
 
-    def _pump(self, source: socket.socket, target: socket.socket, direction: str) -> None:
+    def _pump(self, source, target, direction):
         with selectors.DefaultSelector() as selector:
             selector.register(source, selectors.EVENT_READ)
             try:

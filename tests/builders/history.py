@@ -24,11 +24,10 @@ import sys
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 Kind = Literal["consumer", "queued", "acknowledged", "accepted", "handled", "seen", "fault"]
 SHOWN = 5
@@ -66,12 +65,12 @@ class Operation:
     delivery: Literal["once", "any"] = "once"
     detail: str = ""
 
-    def __str__(self) -> str:
+    def __str__(self):
         text = [f"{self.time_s:10.3f} s", self.operation, self.process, self.key, self.record, self.sha256[:12]]
         text += [str(self.count)] * (self.operation == "accepted") + [self.detail]
         return " ".join(part for part in text if part)
 
-    def as_json(self) -> str:
+    def as_json(self):
         """Return the line of the log; fields with their default are omitted."""
         plain = {n: v for n, v in asdict(self).items() if v != getattr(Operation, n, None)}
         return json.dumps(plain)
@@ -84,15 +83,15 @@ class History:
         path: File of the log; its folder is made.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("a", encoding="utf-8", buffering=1)
-        self._operations: list[Operation] = []
+        self._operations = []
         self._lock = threading.Lock()
         self._start_s = time.monotonic()
 
-    def add(self, operation: Kind, process: str, record: str = "", **fields: Any) -> None:
+    def add(self, operation, process, record="", **fields):
         """Append an operation; the parameters are the attributes of `Operation`."""
         with self._lock:
             at_s = round(time.monotonic() - self._start_s, 3)
@@ -101,27 +100,24 @@ class History:
             if not self._file.closed:
                 self._file.write(done.as_json() + "\n")
 
-    def fault(self, process: str, detail: str) -> None:
+    def fault(self, process, detail):
         """Append the injection of a fault, or its end."""
         self.add("fault", process, detail=detail)
 
     @property
-    def operations(self) -> tuple[Operation, ...]:
-        """The operations so far."""
+    def operations(self):
         with self._lock:
             return tuple(self._operations)
 
-    def verdict(self) -> Verdict:
-        """Return the verdict about the operations so far."""
+    def verdict(self):
         return check(self.operations)
 
-    def close(self) -> None:
-        """Close the file."""
+    def close(self):
         with self._lock:
             self._file.close()
 
 
-def read_log(path: Path) -> list[Operation]:
+def read_log(path):
     """Read a log.
 
     Raises:
@@ -148,7 +144,7 @@ class Violation:
     message: str
     operations: tuple[Operation, ...]
 
-    def __str__(self) -> str:
+    def __str__(self):
         lines = [f"{self.rule.upper()} at {self.process}: {self.message}"]
         return "\n".join([*lines, *(f"    {done}" for done in self.operations[:SHOWN])])
 
@@ -170,11 +166,10 @@ class Verdict:
     faults: dict[str, int]
 
     @property
-    def ok(self) -> bool:
-        """Whether the run has no violation."""
+    def ok(self):
         return not self.violations
 
-    def __str__(self) -> str:
+    def __str__(self):
         handled = ", ".join(f"{process} {count}" for process, count in sorted(self.handled.items()))
         text = (
             f"{self.queued} records queued; handled: {handled or 'none'}; {sum(self.faults.values())} fault operations"
@@ -190,22 +185,22 @@ Name = tuple[str, str]
 
 
 class _Checker:
-    def __init__(self, operations: Sequence[Operation]) -> None:
+    def __init__(self, operations):
         self.operations = operations
-        self.queued: dict[Name, list[Operation]] = defaultdict(list)
+        self.queued = defaultdict(list)
         self.faults = [done for done in operations if done.operation == "fault"]
         for done in operations:
             if done.operation == "queued":
                 self.queued[done.key, done.record].append(done)
 
-    def of_process(self, process: str, *kinds: Kind) -> list[Operation]:
+    def of_process(self, process, *kinds):
         return [done for done in self.operations if done.process == process and done.operation in kinds]
 
-    def exactly_once(self, consumer: Operation) -> Iterable[Violation]:
+    def exactly_once(self, consumer):
         """Every record that is queued for the consumer is handled by it, once."""
         if consumer.delivery == "any":
             return
-        handled: dict[Name, list[Operation]] = defaultdict(list)
+        handled = defaultdict(list)
         for done in self.of_process(consumer.process, "handled"):
             handled[done.key, done.record].append(done)
         for name, queued in self.queued.items():
@@ -222,12 +217,12 @@ class _Checker:
                 message = f"{name[1]} is handled {len(times)} times"
                 yield Violation("doubled", consumer.process, message, (*queued, *times))
 
-    def order(self, consumer: Operation) -> Iterable[Violation]:
+    def order(self, consumer):
         """The consumer observes the records of each key in the order of queueing."""
         if not consumer.ordered or self.faults:
             return
         place = {name: number for number, name in enumerate(self.queued)}
-        observed: dict[str, dict[str, Operation]] = defaultdict(dict)
+        observed = defaultdict(dict)
         for done in self.of_process(consumer.process, "handled", "seen"):
             observed[done.key].setdefault(done.record, done)
         for key, by_record in observed.items():
@@ -237,7 +232,7 @@ class _Checker:
                     message = f"{first.record} before {second.record}, which was queued first"
                     yield Violation("reordered", consumer.process, message, (first, second))
 
-    def count(self, consumer: Operation) -> Iterable[Violation]:
+    def count(self, consumer):
         """The consumer has committed as many records as were queued for it."""
         accepted = self.of_process(consumer.process, "accepted")
         if not accepted:
@@ -248,15 +243,15 @@ class _Checker:
             message = f"{committed} records committed, {queued} queued"
             yield Violation("miscounted", consumer.process, message, tuple(accepted))
 
-    def unknown(self) -> Iterable[Violation]:
+    def unknown(self):
         """Every observed record was queued."""
         for done in self.operations:
             if done.operation in ("handled", "seen", "acknowledged") and (done.key, done.record) not in self.queued:
                 yield Violation("unknown", done.process, f"{done.record} was not queued", (done,))
 
-    def integrity(self) -> Iterable[Violation]:
+    def integrity(self):
         """All digests of a record are equal."""
-        first: dict[Name, Operation] = {}
+        first = {}
         for name, queued in self.queued.items():
             for done in queued:
                 if done.sha256:
@@ -270,7 +265,7 @@ class _Checker:
                 yield Violation("damaged", done.process, message, (original, done))
 
 
-def check(operations: Iterable[Operation]) -> Verdict:
+def check(operations):
     """Decide the rules of this module.
 
     Raises:
@@ -280,7 +275,7 @@ def check(operations: Iterable[Operation]) -> Verdict:
     consumers = {(d.process, d.key): d for d in checker.operations if d.operation == "consumer"}
     if not consumers:
         raise ValueError("operation log: got no consumer, expected at least one")
-    violations: list[Violation] = []
+    violations = []
     for consumer in consumers.values():
         violations += checker.exactly_once(consumer)
         violations += checker.order(consumer)
@@ -295,7 +290,7 @@ def check(operations: Iterable[Operation]) -> Verdict:
     )
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments):
     """Print the verdict of each log; return 0 if no run violates a rule, 1 if one does, 2 for unreadable logs."""
     if not arguments:
         print("usage: python -m tests.builders.history RUN.jsonl [RUN.jsonl …]", file=sys.stderr)

@@ -1,25 +1,17 @@
 """Outbox of a test that sends images to the relay, and images for it."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable
-
 import numpy as np
 
 from builders.records import reconstructed_image
 from sonarpost import keys, wire
-from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.delivery.records import OutboxItem
-from sonarpost.delivery.transaction import Transaction
+from sonarpost.config import ServiceConfig
 from sonarpost.messages import Pixels, ReconstructedImage
 from sonarpost.runtime.service import Service, UnitOfWork
 
 VESSEL = "vessel-1"
 
 
-def make_image(
-    number: int, shape: tuple[int, int] = (24, 32), mission: int = 0, version: int = 1
-) -> ReconstructedImage:
+def make_image(number, shape=(24, 32), mission=0, version=1):
     """Return an image of noise, unique for number, mission and version."""
     rng = np.random.default_rng([mission, number, version])
     pixels = Pixels.from_array(rng.integers(0, 256, shape, dtype=np.uint8))
@@ -42,18 +34,18 @@ class ImageSource(Service[ServiceConfig]):
 
     NAME = "source"
 
-    def __init__(self, platform: PlatformConfig, acknowledged: Callable[[ReconstructedImage], None]) -> None:
+    def __init__(self, platform, acknowledged):
         super().__init__(platform, ServiceConfig())
         self._acknowledged = acknowledged
 
-    def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
+    def on_acknowledged(self, tx, item, reason):
         if reason is None:
             self._acknowledged(wire.decode(ReconstructedImage, item.payload, item.key))
 
-    def handle(self, key: str, record: object, effects: UnitOfWork) -> None:
+    def handle(self, key, record, effects):
         raise AssertionError("the source consumes nothing")
 
-    def send(self, images: Iterable[ReconstructedImage]) -> None:
+    def send(self, images):
         """Queue images for the relay."""
         effects = UnitOfWork()
         for image in images:

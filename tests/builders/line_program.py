@@ -1,11 +1,9 @@
 """Example programs as processes whose lines a test reads."""
 
-from __future__ import annotations
-
 import queue
 import subprocess
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
@@ -15,26 +13,26 @@ from builders.common import WAIT_S
 class LineProgram:
     """A running program and the lines that it prints."""
 
-    def __init__(self, *command: str) -> None:
+    def __init__(self, *command):
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        self.lines: queue.Queue[str] = queue.Queue()
+        self.lines = queue.Queue()
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
 
-    def _read(self) -> None:
+    def _read(self):
         for line in self.process.stdout:
             self.lines.put(line.strip())
 
-    def read(self, count: int) -> list[str]:
+    def read(self, count):
         """Return the next lines."""
         return [self.lines.get(timeout=WAIT_S) for _ in range(count)]
 
-    def wait(self, status: int = 0) -> str:
+    def wait(self, status=0):
         """Wait for the end of the program; return its standard error."""
         assert self.process.wait(timeout=WAIT_S) == status, self.process.stderr.read()
         return self.process.stderr.read()
 
-    def stop(self) -> None:
+    def stop(self):
         """End the program."""
         self.process.kill()
         self.process.wait()
@@ -47,11 +45,11 @@ RunProgram = Callable[..., LineProgram]
 
 
 @pytest.fixture
-def run_program() -> Iterator[RunProgram]:
+def run_program():
     """Starts programs; they are ended at the end of the test."""
-    programs: list[LineProgram] = []
+    programs = []
 
-    def start(*command: str) -> LineProgram:
+    def start(*command):
         programs.append(LineProgram(*command))
         return programs[-1]
 

@@ -12,18 +12,16 @@ import base64
 import json
 import queue
 import threading
-from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import zenoh
 
 
-def shown(key: str, payload: zenoh.ZBytes, encoding: zenoh.Encoding) -> dict[str, Any]:
+def shown(key, payload, encoding):
     """Return a reply or publication in the form of the plugin."""
-    value: object = base64.b64encode(payload.to_bytes()).decode()
+    value = base64.b64encode(payload.to_bytes()).decode()
     if encoding == zenoh.Encoding.APPLICATION_JSON:
         value = json.loads(payload.to_bytes())
     elif encoding == zenoh.Encoding.TEXT_PLAIN:
@@ -32,7 +30,7 @@ def shown(key: str, payload: zenoh.ZBytes, encoding: zenoh.Encoding) -> dict[str
 
 
 class _Server(ThreadingHTTPServer):
-    def __init__(self, session: zenoh.Session) -> None:
+    def __init__(self, session):
         super().__init__(("127.0.0.1", 0), _Handler)
         self.session = session
         self.stopping = threading.Event()
@@ -41,7 +39,7 @@ class _Server(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server: _Server
 
-    def do_GET(self) -> None:
+    def do_GET(self):
         url = urlsplit(self.path)
         key = unquote(url.path).lstrip("/")
         if self.headers["accept"] == "text/event-stream":
@@ -49,7 +47,7 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._query(key, url.query)
 
-    def _query(self, key: str, parameters: str) -> None:
+    def _query(self, key, parameters):
         has_time = any(pair.startswith("_time=[") for pair in parameters.split(";"))
         mode = zenoh.ConsolidationMode.NONE if has_time else zenoh.ConsolidationMode.LATEST
         found = []
@@ -61,8 +59,8 @@ class _Handler(BaseHTTPRequestHandler):
         self._head("application/json")
         self.wfile.write(json.dumps(found).encode())
 
-    def _subscribe(self, key: str) -> None:
-        samples: queue.Queue[zenoh.Sample] = queue.Queue()
+    def _subscribe(self, key):
+        samples = queue.Queue()
         subscriber = self.server.session.declare_subscriber(key, samples.put)
         self._head("text/event-stream")
         try:
@@ -79,18 +77,18 @@ class _Handler(BaseHTTPRequestHandler):
         finally:
             subscriber.undeclare()
 
-    def _head(self, content_type: str) -> None:
+    def _head(self, content_type):
         self.send_response(200)
         self.send_header("Content-Type", content_type)
         self.end_headers()
         self.wfile.flush()
 
-    def log_message(self, *_: object) -> None:
+    def log_message(self, *_):
         """Log nothing."""
 
 
 @contextmanager
-def rest_interface(session: zenoh.Session) -> Iterator[str]:
+def rest_interface(session):
     """Run the server; yields its address."""
     server = _Server(session)
     thread = threading.Thread(target=server.serve_forever, args=(0.05,))

@@ -1,11 +1,8 @@
 """A small file system that a test can fill."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
 
@@ -18,7 +15,7 @@ class SmallDisk:
         size_kb: Initial size.
     """
 
-    def __init__(self, folder: Path, size_kb: int) -> None:
+    def __init__(self, folder, size_kb):
         self.folder = folder
         folder.mkdir(parents=True)
         if os.geteuid() != 0:
@@ -27,11 +24,10 @@ class SmallDisk:
         if done.returncode:
             pytest.skip(f"a small disk (tmpfs) cannot be mounted here: {done.stderr.strip()}")
 
-    def _mount(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+    def _mount(self, *arguments):
         return subprocess.run(["mount", *arguments], capture_output=True, text=True, check=False)
 
-    def fill(self) -> None:
-        """Use all free space."""
+    def fill(self):
         with (self.folder / "ballast").open("wb", buffering=0) as file:
             for size in (65536, 4096):
                 try:
@@ -40,21 +36,18 @@ class SmallDisk:
                 except OSError:
                     continue
 
-    def empty(self) -> None:
+    def empty(self):
         """Release the space that `fill` uses."""
         (self.folder / "ballast").unlink()
 
-    def grow(self, size_kb: int) -> None:
-        """Increase the size."""
+    def grow(self, size_kb):
         done = self._mount("-o", f"remount,size={size_kb}k", str(self.folder))
         assert done.returncode == 0, done.stderr
 
     @property
-    def free_bytes(self) -> int:
-        """Free space."""
+    def free_bytes(self):
         return shutil.disk_usage(self.folder).free
 
-    def close(self) -> None:
-        """Unmount."""
+    def close(self):
         if self.folder.is_mount():
             subprocess.run(["umount", "--lazy", str(self.folder)], check=True)

@@ -15,12 +15,9 @@ import sqlite3
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Literal
-
-import zenoh
 
 from builders.common import REPOSITORY, free_port
 from builders.faulty_link import FaultyLink
@@ -47,7 +44,6 @@ class Options:
         link_bytes_per_s: Bandwidth of the link in each direction.
         relay, c2: Additional lines for their tables.
         vessel_state, shore_state, shore_out: Folders, by default below the folder of the system.
-        launcher: Command that runs a module, by process; by default the interpreter.
         environment: Additional environment variables, by process.
         shore_prefix: Command that runs the processes of the shore, for example in another network namespace.
         shore_host: Address of the shore's router; for another host there is no FaultyLink.
@@ -59,7 +55,6 @@ class Options:
     vessel_state: Path | None = None
     shore_state: Path | None = None
     shore_out: Path | None = None
-    launcher: dict[str, Sequence[str]] = field(default_factory=dict)
     environment: dict[str, dict[str, str]] = field(default_factory=dict)
     shore_prefix: Sequence[str] = ()
     shore_host: str = "127.0.0.1"
@@ -73,25 +68,25 @@ class VesselAndShore:
         expected: Identities of the images that were sent.
     """
 
-    def __init__(self, folder: Path, options: Options | None = None) -> None:
+    def __init__(self, folder, options=None):
         self.folder = folder
         self.options = options or Options()
         self.vessel_state = self.options.vessel_state or folder / "state" / VESSEL
         self.shore_state = self.options.shore_state or folder / "state" / SHORE
         self.out = self.options.shore_out or folder / "out"
         self.ports = {"router-vessel": free_port(), "router-shore": free_port()}
-        self.link: FaultyLink | None = None
-        self.expected: set[str] = set()
+        self.link = None
+        self.expected = set()
         self.history = History(folder / "history.jsonl")
         self._accepted = 0
         self._archive_log = ArchiveLog(self.history, self.out, VESSEL, KEY)
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._logs: list[IO[bytes]] = []
-        self._source: ImageSource | None = None
-        self._watchers: list[zenoh.Session] = []
-        self.health: dict[str, Health] = {}
+        self._processes = {}
+        self._logs = []
+        self._source = None
+        self._watchers = []
+        self.health = {}
 
-    def __enter__(self) -> VesselAndShore:
+    def __enter__(self):
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.options.shore_host == "127.0.0.1":
             self.link = FaultyLink(
@@ -113,16 +108,16 @@ class VesselAndShore:
             raise
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self.close()
 
     # Processes
 
-    def _endpoint(self, router: str) -> str:
+    def _endpoint(self, router):
         host = self.options.shore_host if router == "router-shore" else "127.0.0.1"
         return f"tcp/{host}:{self.ports[router]}"
 
-    def _write_config(self) -> None:
+    def _write_config(self):
         common = "health_interval_s = 0.2\n"
         (self.folder / "relay.toml").write_text(
             f'[platform]\nid = "{VESSEL}"\nrouter = ["{self._endpoint("router-vessel")}"]\n'
@@ -133,17 +128,17 @@ class VesselAndShore:
             f'state_dir = "{self.shore_state}"\n{common}[c2]\nout_dir = "{self.out}"\n{self.options.c2}'
         )
 
-    def _command(self, name: str) -> list[str]:
+    def _command(self, name):
         prefix = list(self.options.shore_prefix) if name in ("router-shore", "c2") else []
-        launch = list(self.options.launcher.get(name, (sys.executable, "-m")))
+        launch = [*prefix, sys.executable, "-m"]
         if name == "router-vessel":
             shore = f"tcp/127.0.0.1:{self.link.port}" if self.link else self._endpoint("router-shore")
             return [*launch, "sonarpost.bus.router", "--listen", self._endpoint(name), "--connect", shore]
         if name == "router-shore":
-            return [*prefix, *launch, "sonarpost.bus.router", "--listen", self._endpoint(name)]
-        return [*prefix, *launch, f"sonarpost.services.{name}", "--config", str(self.folder / f"{name}.toml")]
+            return [*launch, "sonarpost.bus.router", "--listen", self._endpoint(name)]
+        return [*launch, f"sonarpost.services.{name}", "--config", str(self.folder / f"{name}.toml")]
 
-    def start(self, name: str) -> None:
+    def start(self, name):
         """Start a process; its output goes to NAME.log."""
         log = (self.folder / f"{name}.log").open("ab")
         self._logs.append(log)
@@ -163,22 +158,20 @@ class VesselAndShore:
             process_group=0,
         )
 
-    def pid(self, name: str) -> int:
-        """Identifier of a process."""
+    def pid(self, name):
         return self._processes[name].pid
 
-    def kill(self, name: str) -> None:
+    def kill(self, name):
         """End a process at once (SIGKILL)."""
         self.history.fault(name, "SIGKILL")
         self._processes[name].kill()
         self._processes[name].wait()
 
-    def send_signal(self, name: str, number: signal.Signals) -> None:
-        """Send a process a signal."""
+    def send_signal(self, name, number):
         self.history.fault(name, number.name)
         self._processes[name].send_signal(number)
 
-    def start_source(self, folder: str = "source") -> ImageSource:
+    def start_source(self, folder="source"):
         """Start the outbox of the test, with its own store."""
         state = self.folder / "state" / folder
         platform = PlatformConfig(
@@ -188,32 +181,27 @@ class VesselAndShore:
         assert self._source.start()
         return self._source
 
-    def stop_source(self) -> None:
-        """Stop the outbox of the test."""
+    def stop_source(self):
         if self._source is not None:
             source, self._source = self._source, None
             source.stop()
 
     @property
-    def source(self) -> ImageSource:
-        """The running outbox of the test."""
+    def source(self):
         assert self._source is not None
         return self._source
 
-    def send(self, images: Sequence[ReconstructedImage]) -> None:
+    def send(self, images):
         """Send images, which are then expected at the shore. An image may be sent again."""
         self.source.send(images)
         for image in images:
             self._log("queued", "source", image)
         self.expected.update(map(name_of, images))
 
-    def _log(
-        self, operation: Literal["queued", "acknowledged", "seen"], process: str, image: ReconstructedImage
-    ) -> None:
+    def _log(self, operation, process, image):
         self.history.add(operation, process, name_of(image), key=KEY, sha256=image.picture_sha256)
 
-    def close(self) -> None:
-        """Stop everything."""
+    def close(self):
         for watcher in self._watchers:
             watcher.close()
         self.stop_source()
@@ -236,26 +224,26 @@ class VesselAndShore:
 
     # Observation
 
-    def _watch_images(self) -> None:
+    def _watch_images(self):
         session = open_with_retry([self._endpoint("router-shore")], threading.Event())
         assert session is not None
         self._watchers.append(session)
         session.declare_subscriber(keys.shore_image(VESSEL), self._on_image)
 
-    def _on_image(self, sample: zenoh.Sample) -> None:
+    def _on_image(self, sample):
         image = wire.decode(ReconstructedImage, sample.payload.to_bytes(), str(sample.key_expr))
         self._log("seen", "subscriber", image)
 
-    def wait_for_state(self, service: str, state: str, detail: str = "") -> None:
+    def wait_for_state(self, service, state, detail=""):
         """Wait until relay or c2 reports a state, and a detail that contains a pattern; needs `watch_health`."""
 
-        def reports() -> bool:
+        def reports():
             health = self.health.get(service)
             return health is not None and health.state == state and re.search(detail, health.detail) is not None
 
         self.wait_until(reports, f"{service} reports {state} {detail}")
 
-    def watch_health(self) -> None:
+    def watch_health(self):
         """Subscribe to the health of relay and c2, each at its own router."""
         for router in ("router-vessel", "router-shore"):
             session = open_with_retry([self._endpoint(router)], threading.Event())
@@ -263,40 +251,36 @@ class VesselAndShore:
             self._watchers.append(session)
             session.declare_subscriber("sonarpost/v1/*/health/*", self._on_health)
 
-    def _on_health(self, sample: zenoh.Sample) -> None:
+    def _on_health(self, sample):
         health = wire.decode(Health, sample.payload.to_bytes(), str(sample.key_expr))
         self.health[health.service] = health
 
-    def wait_until(self, condition: Callable[[], bool], what: str) -> None:
+    def wait_until(self, condition, what):
         """Wait for a condition; fail with the state of all processes when no count changes."""
         wait_while_progressing(condition, self._progress, what, self.describe)
 
-    def _progress(self) -> object:
+    def _progress(self):
         stores = [self.depths(service) for service in ("relay", "c2")]
         outbox = self._source.store.outbox_depth() if self._source else 0
         return stores, self.accepted_count("c2"), outbox, self.shore_image_count()
 
-    def describe(self) -> str:
-        """Return the state of all processes as text."""
+    def describe(self):
         tails = "".join(f"\n--- {name}\n{self.log_tail(name)}" for name in PROCESSES)
         return (
             f"sent {len(self.expected)}, source {self.source.store.outbox_depth() if self._source else '-'}, relay "
             f"{self.depths('relay')}, c2 {self.depths('c2')}, at the shore {self.shore_image_count()}{tails}"
         )
 
-    def log_tail(self, name: str, lines: int = 6) -> str:
-        """Return the last lines of a process's log."""
+    def log_tail(self, name, lines=6):
         return "\n".join(self.log_text(name).splitlines()[-lines:]) if name in self._processes else ""
 
-    def log_text(self, name: str) -> str:
-        """Return the log of a process."""
+    def log_text(self, name):
         return (self.folder / f"{name}.log").read_text(errors="replace")
 
-    def database(self, service: str) -> Path:
-        """Path of a service's store."""
+    def database(self, service):
         return (self.vessel_state if service == "relay" else self.shore_state) / f"{service}.db"
 
-    def query(self, service: str, sql: str) -> int | None:
+    def query(self, service, sql):
         """Return one number of a store, None while it cannot be read."""
         try:
             with contextlib.closing(sqlite3.connect(f"file:{self.database(service)}?mode=ro", uri=True)) as db:
@@ -305,21 +289,20 @@ class VesselAndShore:
             return None
         return int(row[0]) if row and row[0] is not None else 0
 
-    def depths(self, service: str) -> dict[str, int | None]:
-        """Return the number of rows in a store's tables."""
+    def depths(self, service):
         return {t: self.query(service, f"SELECT COUNT(*) FROM {t}") for t in ("inbox", "outbox", "refused", "partial")}
 
-    def accepted_count(self, service: str) -> int | None:
+    def accepted_count(self, service):
         """Return the number of records ever committed to an inbox, from SQLite's autoincrement counter."""
         return self.query(service, "SELECT seq FROM sqlite_sequence WHERE name = 'inbox'")
 
-    def shore_image_count(self) -> int:
+    def shore_image_count(self):
         """Return the number of side-cars that c2 has written."""
         return len(side_cars(self.out / VESSEL))
 
     # Account
 
-    def is_complete(self) -> bool:
+    def is_complete(self):
         """Return whether all sent images are at the shore and all stores are empty."""
         return (
             self.shore_image_count() >= len(self.expected)
@@ -327,7 +310,7 @@ class VesselAndShore:
             and all(self.depths(s)[t] == 0 for s in ("relay", "c2") for t in ("inbox", "outbox"))
         )
 
-    def assert_all_delivered_once(self) -> None:
+    def assert_all_delivered_once(self):
         """Wait until all images are delivered, then let the checker of the operation log decide."""
         self.wait_until(self.is_complete, "all images at the shore")
         assert self.depths("c2")["refused"] == self.depths("relay")["refused"] == 0
@@ -341,7 +324,7 @@ class VesselAndShore:
         left = [p.name for p in self.out.rglob(".*.tmp")]
         assert left == [], "temporary files"
 
-    def delete_vessel_stores(self) -> None:
+    def delete_vessel_stores(self):
         """Delete the stores of relay and source, which must be stopped."""
         shutil.rmtree(self.vessel_state)
         shutil.rmtree(self.folder / "state" / "source")

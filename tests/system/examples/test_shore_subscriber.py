@@ -1,4 +1,4 @@
-"""The example program as a separate process, with a router and c2."""
+"""The example program as a separate process, with c2."""
 
 import re
 import signal
@@ -7,37 +7,16 @@ import sys
 
 import numpy as np
 import pytest
-import zenoh
-from builders.common import REPOSITORY, eventually, free_port
+from builders.common import REPOSITORY, eventually
 from builders.exports import decision, image
 from PIL import Image
 
 from sonarpost import keys, wire
-from sonarpost.bus.session import client_config
 from sonarpost.messages import Pixels, ReconstructedImage, Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 
 EXAMPLE = REPOSITORY / "examples" / "shore_subscriber.py"
-
-
-@pytest.fixture
-def router():
-    """A router in a separate process."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    command = [sys.executable, "-m", "sonarpost.bus.router", "--listen", endpoint]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
-
-        def answers():
-            try:
-                zenoh.open(client_config([endpoint])).close()
-            except zenoh.ZError:
-                return False
-            return True
-
-        eventually(answers, what="router")
-        yield endpoint
-        process.terminate()
 
 
 @pytest.fixture

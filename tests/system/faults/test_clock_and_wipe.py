@@ -1,31 +1,14 @@
 """Clock jumps, and a vessel whose disk is replaced."""
 
-import sys
 import time
 from pathlib import Path
 
 import pytest
-from builders.common import REPOSITORY
 from builders.image_source import make_image
 from builders.vessel_and_shore import PROCESSES
 
 COUNT = 200
 DAY_S = 86400.0
-
-
-class Clock:
-    """Clock of several processes; `jump` sets it while they run."""
-
-    def __init__(self, file, text):
-        self._file = file
-        self._text = text
-        self.jump(0.0)
-
-    def jump(self, offset_s):
-        """Set the offset from the true time."""
-        temporary = self._file.with_suffix(".new")
-        temporary.write_text(self._text(offset_s))
-        temporary.replace(self._file)
 
 
 def libfaketime():
@@ -37,42 +20,30 @@ def libfaketime():
     pytest.skip("libfaketime is not installed (Debian package faketime)")
 
 
-@pytest.fixture(params=["python", "libfaketime"])
-def system_with_clocks(request, tmp_path, start_system):
-    """A system with clocks of vessel and shore: of relay and c2 in Python, or of all four processes in libc."""
-    clocks = {side: tmp_path / f"clock-{side}" for side in ("vessel", "shore")}
-    if request.param == "python":
-        made = {side: Clock(file, str) for side, file in clocks.items()}
-        script = str(REPOSITORY / "tests" / "builders" / "shifted_clock.py")
-        launcher = {
-            "relay": (sys.executable, script, str(clocks["vessel"])),
-            "c2": (sys.executable, script, str(clocks["shore"])),
-        }
-        return start_system(launcher=launcher), made
+def test_clock_jumps_of_all_processes_lose_and_duplicate_nothing(tmp_path, start_system):
     library = libfaketime()
-    made = {side: Clock(file, lambda offset_s: f"{offset_s:+.0f}s") for side, file in clocks.items()}
-    environment = {
-        name: {
-            "LD_PRELOAD": library,
-            "FAKETIME_TIMESTAMP_FILE": str(clocks["vessel" if name in ("relay", "router-vessel") else "shore"]),
-            "FAKETIME_NO_CACHE": "1",
-            "FAKETIME_DONT_FAKE_MONOTONIC": "1",
-            "FAKETIME_DONT_RESET": "1",
-        }
-        for name in PROCESSES
-    }
-    return start_system(environment=environment), made
+    clocks = {side: tmp_path / f"clock-{side}" for side in ("vessel", "shore")}
+    settings = {"LD_PRELOAD": library, "FAKETIME_NO_CACHE": "1", "FAKETIME_DONT_RESET": "1"}
+    settings["FAKETIME_DONT_FAKE_MONOTONIC"] = "1"
 
+    def jump(side, offset_s):
+        """Set the offset from the true time while the processes run."""
+        new = clocks[side].with_suffix(".new")
+        new.write_text(f"{offset_s:+.0f}s")
+        new.replace(clocks[side])
 
-def test_clock_jumps_lose_and_duplicate_nothing(system_with_clocks):
-    system, clocks = system_with_clocks
+    for side in clocks:
+        jump(side, 0.0)
+    sides = {name: "vessel" if name in ("relay", "router-vessel") else "shore" for name in PROCESSES}
+    environment = {name: settings | {"FAKETIME_TIMESTAMP_FILE": str(clocks[side])} for name, side in sides.items()}
+    system = start_system(environment=environment)
     system.watch_health()
     jumps = [("vessel", 30 * DAY_S), ("shore", -365 * DAY_S), ("vessel", -2 * DAY_S), ("shore", 3600.0)]
     for part, (side, offset_s) in enumerate(jumps):
         first = 50 * part
         system.send([make_image(n) for n in range(first, first + 50)])
         system.wait_until(lambda first=first: system.shore_image_count() > first, "some images at the shore")
-        clocks[side].jump(offset_s)
+        jump(side, offset_s)
         system.history.fault(f"clock of {side}", f"{offset_s:+.0f} s")
         service = "relay" if side == "vessel" else "c2"
         expected_utc_s = time.time() + offset_s
