@@ -7,29 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from research.training.despeckle.scenes import (
-    HEIGHT_PX,
-    PATCH_PX,
-    SEEDS,
-    WIDTH_PX,
-    Examples,
-    averaged,
-    row_correlation,
-    simulated_scenes,
-    speckle,
-)
+from research.training.despeckle import scenes
+from research.training.despeckle.scenes import Examples, speckle
 
 
 @pytest.fixture(scope="module")
 def examples(tmp_path_factory: pytest.TempPathFactory) -> Examples:
     """Return examples of one simulated survey and one recording of independent pings."""
     path = tmp_path_factory.mktemp("scenes") / "scenes.npz"
-    crops, floors = simulated_scenes(SEEDS[0])
-    assert crops.shape[1:] == (HEIGHT_PX, WIDTH_PX)
-    assert floors.shape == (len(crops), WIDTH_PX)
+    crops, floors = scenes.simulated_scenes(scenes.SEEDS[0])
+    assert crops.shape[1:] == (scenes.HEIGHT_PX, scenes.WIDTH_PX)
+    assert floors.shape == (len(crops), scenes.WIDTH_PX)
     rng = np.random.default_rng(1)
     sheet = (100 * np.sqrt(speckle((700, 500), rng, product=True))).astype(np.float32)
-    assert abs(row_correlation(sheet)) < 0.15
+    assert abs(scenes.row_correlation(sheet)) < 0.15
     np.savez(path, scene=crops, floor=floors, sheet0=sheet)
     return Examples(path, seed=3)
 
@@ -39,7 +30,7 @@ def test_examples_are_grey_patches_with_a_cleaner_target(examples: Examples) -> 
     noisier = []
     for _ in range(60):
         noisy, clean, weight = examples.draw()
-        assert noisy.shape == clean.shape == (PATCH_PX, PATCH_PX)
+        assert noisy.shape == clean.shape == (scenes.PATCH_PX, scenes.PATCH_PX)
         assert noisy.dtype == clean.dtype == np.float32
         assert 0 <= min(noisy.min(), clean.min()) <= max(noisy.max(), clean.max()) <= 1
         weights.add(weight)
@@ -49,26 +40,21 @@ def test_examples_are_grey_patches_with_a_cleaner_target(examples: Examples) -> 
     assert np.mean(noisier) > 0.9
 
 
-@pytest.mark.parametrize("shape", [(80, 80), (140, 80), (112, 96)])
-def test_simulated_examples_have_the_shape(examples: Examples, shape: tuple[int, int]) -> None:
-    noisy, clean = examples.simulated(shape)
-    assert noisy.shape == clean.shape == shape
+def test_simulated_examples_have_the_shape(examples: Examples) -> None:
+    for shape in ((80, 80), (140, 80)):
+        noisy, clean = examples.simulated(shape)
+        assert noisy.shape == clean.shape == shape
 
 
-@pytest.mark.parametrize("product", [True, False])
-def test_speckle_has_mean_one(product: bool) -> None:
-    assert speckle((64, 64), np.random.default_rng(2), product=product).mean() == pytest.approx(1, abs=1e-3)
-
-
-def test_averaging_reduces_speckle() -> None:
+def test_speckle_has_mean_one_and_averaging_reduces_it() -> None:
+    for product in (True, False):
+        assert speckle((64, 64), np.random.default_rng(2), product=product).mean() == pytest.approx(1, abs=1e-3)
     sheet = np.sqrt(speckle((400, 400), np.random.default_rng(4), product=True))
-    mean = averaged(sheet, 4)
+    mean = scenes.averaged(sheet, 4)
     assert mean.shape == (100, 100)
     assert np.median(mean) == pytest.approx(1)
     assert mean.std() < 0.4 * (sheet**2).std()
 
 
 def test_data_folder_without_recordings_is_rejected(tmp_path: Path) -> None:
-    from research.training.despeckle.scenes import main
-
-    assert main(["--data", str(tmp_path), "--out", str(tmp_path / "scenes.npz")]) == 2
+    assert scenes.main(["--data", str(tmp_path), "--out", str(tmp_path / "scenes.npz")]) == 2

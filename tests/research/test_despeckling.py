@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +23,12 @@ def pairs() -> list[SpecklePair]:
     return speckle_pairs(4, seed=3, pings=180)
 
 
+@pytest.fixture
+def few_pairs(pairs: list[SpecklePair], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command uses the first of `pairs`."""
+    monkeypatch.setattr(command, "speckle_pairs", lambda count, seed: pairs[:count])
+
+
 def test_network_improves_the_decoded_images(pairs: list[SpecklePair]) -> None:
     by_name = {each.name: each for each in create_filters([])}
     none, network, oracle = (measure_pairs(by_name[name], pairs, [64, 256]) for name in ("none", "network 1", "oracle"))
@@ -39,18 +44,12 @@ def test_network_improves_the_decoded_images(pairs: list[SpecklePair]) -> None:
     assert psnr[0][0] < psnr[1][0]
 
 
-def small_pairs(pairs: list[SpecklePair]) -> Callable[..., list[SpecklePair]]:
-    return lambda count, seed: pairs[:count]
-
-
 def run(*arguments: object) -> int:
     return command.run(command.new_parser().parse_args([str(argument) for argument in arguments]))
 
 
-def test_json_object_of_the_command(
-    pairs: list[SpecklePair], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(command, "speckle_pairs", small_pairs(pairs))
+@pytest.mark.usefixtures("few_pairs")
+def test_json_object_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--count", 2, "--filters", "lee", "--budgets", "4,48", "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["pairs"], found["seed"], found["sdvd"]) == (2, 0, [])
@@ -66,10 +65,8 @@ def test_json_object_of_the_command(
             assert row["dots"] >= 0
 
 
-def test_tables_and_sheet_of_the_command(
-    pairs: list[SpecklePair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(command, "speckle_pairs", small_pairs(pairs))
+@pytest.mark.usefixtures("few_pairs")
+def test_tables_and_sheet_of_the_command(pairs, tmp_path, capsys):
     sheet = tmp_path / "new" / "sheet.png"
     assert run("--count", 2, "--filters", "none", "--budgets", "40", "--sheet", sheet) == 0
     output = capsys.readouterr().out
@@ -83,30 +80,21 @@ def test_tables_and_sheet_of_the_command(
     assert command.sheet_pairs(pairs) == sorted(pairs, key=lambda pair: pair.seabed)
 
 
-@pytest.mark.parametrize(
-    "options", [["--filters", "lee,other"], ["--filters", ""], ["--budgets", "0"], ["--count", "0"], ["--seed", "-1"]]
-)
-def test_invalid_option_is_an_error(options: list[str]) -> None:
-    with pytest.raises(ConfigError):
-        run(*options)
-
-
-def test_missing_recordings_are_an_error(tmp_path: Path) -> None:
+def test_invalid_option_is_an_error(tmp_path: Path) -> None:
+    filters = (["--filters", "lee,other"], ["--filters", ""])
+    for options in (*filters, ["--budgets", "0"], ["--count", "0"], ["--seed", "-1"]):
+        with pytest.raises(ConfigError):
+            run(*options)
     with pytest.raises(SurveyFileError, match=r"research/README\.md#data"):
         run("--sdvd", tmp_path)
 
 
 @pytest.mark.realdata
-def test_network_removes_dots_from_recordings(
-    data_dir: Path,
-    pairs: list[SpecklePair],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+@pytest.mark.usefixtures("few_pairs")
+def test_network_removes_dots_from_recordings(data_dir, monkeypatch, capsys):
     crops = image_sets.sdvd_crops(data_dir / "snippets" / "sdvd")
-    few = dataclasses.replace(crops, images=crops.images[::14])
+    few = dataclasses.replace(crops, images=crops.images[::28])
     monkeypatch.setattr(command, "sdvd_crops", lambda _: few)
-    monkeypatch.setattr(command, "speckle_pairs", small_pairs(pairs))
     folder = data_dir / "snippets" / "sdvd"
     assert run("--count", 1, "--filters", "none", "--budgets", "128", "--sdvd", folder, "--json") == 0
     rows = {(row["filter"], row["budget"]): row for row in json.loads(capsys.readouterr().out)["sdvd"]}

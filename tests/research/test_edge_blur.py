@@ -14,18 +14,16 @@ from sonarpost.review.edge_blur import EMB_TABLE, edge_sigma_px
 from sonarpost.review.measurement import CLICK_SIGMA_PX
 
 PIXELS = HEIGHT_PX * WIDTH_PX
-
-
 CODEC = EmbCodec(strength=emb.DEFAULT_STRENGTH)
 
 
 @pytest.fixture(scope="module")
 def streams():
     """Objects of another seed than those of the table, with their streams."""
-    return [(known, CODEC.encode(known.image, 629)) for known in known_objects(60, seed=7)]
+    return [(known, CODEC.encode(known.image, 192)) for known in known_objects(60, seed=7)]
 
 
-@pytest.mark.parametrize("size", [24, 64, 192, 629])
+@pytest.mark.parametrize("size", [24, 192])
 def test_stated_sigma_covers_the_error_of_a_length_in_68_percent(streams, size):
     rng = np.random.default_rng(size)
     errors = []
@@ -40,15 +38,12 @@ def test_stated_sigma_covers_the_error_of_a_length_in_68_percent(streams, size):
     assert 0.59 <= covered <= 0.78
 
 
-def test_more_bytes_never_increase_the_uncertainty():
+def test_more_bytes_never_increase_the_uncertainty_and_that_of_vq_is_a_tile() -> None:
     for codec in ("emb", "spiht", "vq"):
         sigmas = [edge_sigma_px(codec, size, PIXELS) for size in (0, 8, 24, 48, 64, 96, 131, 192, 314, 629, 5000)]
         assert sigmas == sorted(sigmas, reverse=True)
         assert sigmas[0] > sigmas[-1]
     assert edge_sigma_px("emb", 24, PIXELS) > 2 * edge_sigma_px("emb", 64, PIXELS)
-
-
-def test_tile_of_a_codebook_is_the_uncertainty_of_vq():
     assert edge_sigma_px("vq", 196, PIXELS) == pytest.approx(10 / math.sqrt(3))
     assert edge_sigma_px("vq", 49, PIXELS) == pytest.approx(20 / math.sqrt(3))
 

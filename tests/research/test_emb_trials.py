@@ -113,11 +113,8 @@ def test_best_corrections_remove_the_stated_error() -> None:
     assert tile_predictors.bytes_of(4, 64, 16384) == 11
 
 
-@pytest.mark.parametrize("use", ["before", "after", "nearest"])
-def test_tiles_leave_a_decodable_image(use: str) -> None:
+def test_tiles_leave_a_decodable_image() -> None:
     units = np.random.default_rng(5).normal(size=(40, 400)).astype(np.float32)
-    assert (
-        10
-        < tile_predictors.psnr_with_tiles(scene(), 64, units / np.linalg.norm(units, axis=1, keepdims=True), use, 2)
-        < 40
-    )
+    units /= np.linalg.norm(units, axis=1, keepdims=True)
+    for use in ("before", "after", "nearest"):
+        assert 10 < tile_predictors.psnr_with_tiles(scene(), 64, units, use, 2) < 40

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from builders.images import speckle_line
 
 from research.common.patches import PatchPlan, ToneMapping, cut_around, cut_line, reduce_line, shuffled, stretch
 
 
-def line(pings: int = 300, samples: int = 260, seed: int = 0) -> np.ndarray:
-    values = 50 * np.random.default_rng(seed).rayleigh(1.0, (pings, samples))
-    return np.clip(values, 1, 255).astype(np.uint8).astype(np.float32)
-
-
-def test_tone_table_is_its_curve() -> None:
+def test_tone_table_is_its_curve_and_reduction_averages_blocks() -> None:
     assert ToneMapping(1.0, 1.0).table().tolist() == list(range(256))
     dark = ToneMapping(2.0, 0.5).table()
     assert (dark[0], dark[255], dark[128]) == (0, 128, 32)
     assert ToneMapping(1.0, 3.0).table()[-1] == 255
+    values = np.arange(24, dtype=np.float32).reshape(4, 6)
+    assert reduce_line(values, 2, 3).tolist() == [[4.0, 7.0], [16.0, 19.0]]
+    assert reduce_line(values, 3, 4).shape == (1, 1)
 
 
 def test_stretch_maps_the_percentiles_to_the_ends() -> None:
@@ -32,14 +31,8 @@ def test_stretch_maps_the_percentiles_to_the_ends() -> None:
     assert not stretch(np.full((9, 9), 7.0)).any()
 
 
-def test_reduction_averages_blocks() -> None:
-    values = np.arange(24, dtype=np.float32).reshape(4, 6)
-    assert reduce_line(values, 2, 3).tolist() == [[4.0, 7.0], [16.0, 19.0]]
-    assert reduce_line(values, 3, 4).shape == (1, 1)
-
-
 def test_missing_and_flat_windows_are_skipped() -> None:
-    values = line()
+    values = speckle_line()
     values[:, 160:] = np.nan
     values[:80, :80] = 40.0
     plan = PatchPlan(reductions=((1, 1),), tones=(ToneMapping(1.0, 1.0),))
@@ -50,22 +43,19 @@ def test_missing_and_flat_windows_are_skipped() -> None:
 
 def test_windows_are_limited_and_repeated_in_other_tones_and_mirrored() -> None:
     plan = PatchPlan(reductions=((1, 1), (2, 2)), per_reduction=1, copies=3)
-    images = list(cut_line("x", line(), plan))
+    images = list(cut_line("x", speckle_line(), plan))
     assert len(images) == 6
     assert len({image.name for image in images}) == 6
     assert len({image.load().tobytes() for image in images}) == 6
-    plain = list(
-        cut_line(
-            "x", line(), PatchPlan(reductions=((1, 1),), per_reduction=1, tones=(ToneMapping(1.0, 1.0),), copies=4)
-        )
-    )
+    plan = PatchPlan(reductions=((1, 1),), per_reduction=1, tones=(ToneMapping(1.0, 1.0),), copies=4)
+    plain = list(cut_line("x", speckle_line(), plan))
     first = plain[0].load()
     for image, expected in zip(plain, (first, first[::-1], first[:, ::-1], first[::-1, ::-1]), strict=True):
         assert np.array_equal(image.load(), expected)
 
 
 def test_windows_around_an_object_contain_it() -> None:
-    values = line()
+    values = speckle_line()
     values[140:150, 120:135] = 2000.0
     plan = PatchPlan(reductions=((1, 1), (2, 1), (9, 9)), copies=3)
     images = list(cut_around("x", values, [(145, 127)], plan))
@@ -76,6 +66,6 @@ def test_windows_around_an_object_contain_it() -> None:
 
 
 def test_shuffled_order_depends_on_names_only() -> None:
-    images = list(cut_line("x", line(), PatchPlan()))
+    images = list(cut_line("x", speckle_line(), PatchPlan()))
     assert [i.name for i in shuffled(images)] == [i.name for i in shuffled(images[::-1])]
     assert [i.name for i in shuffled(images)] != [i.name for i in images]

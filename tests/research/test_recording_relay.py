@@ -52,24 +52,13 @@ def test_coded_and_decoded_images_are_recorded_with_their_size_and_time(relay, t
     assert not first["refused"]
 
 
-def test_a_record_that_is_acknowledged_twice_counts_once(relay, tmp_path) -> None:
+def test_a_record_that_is_acknowledged_twice_counts_once_and_decisions_do_not(relay, tmp_path) -> None:
     part = item_of(1, keys.shore_part("vessel-1"), ImagePart(u="uuv-1", i="0001", n=1, t=QUEUED_UTC_S, p=bytes(40)))
     acknowledge(relay, part)
     acknowledge(relay, part)
     assert len((tmp_path / FILE_NAME).read_text().splitlines()) == 2
     assert [entry["seq"] for entry in acknowledged(tmp_path)] == [1]
-
-
-def test_decisions_are_not_recorded(relay, tmp_path) -> None:
-    decision = Decision(
-        decision_id="d-1",
-        vessel_id="vessel-1",
-        vehicle_id="uuv-1",
-        image_id="0001",
-        image_version=1,
-        verdict="unsure",
-        operator="op",
-        decided_utc_s=1.0,
-    )
-    acknowledge(relay, item_of(1, keys.shore_inbox("vessel-1"), envelope_of(decision, "k")))
-    assert list(acknowledged(tmp_path)) == []
+    names = {"vessel_id": "vessel-1", "vehicle_id": "uuv-1", "image_id": "0001", "image_version": 1}
+    made = Decision(decision_id="d-1", verdict="unsure", operator="op", decided_utc_s=1.0, **names)
+    acknowledge(relay, item_of(2, keys.shore_inbox("vessel-1"), envelope_of(made, "k")))
+    assert [entry["seq"] for entry in acknowledged(tmp_path)] == [1]

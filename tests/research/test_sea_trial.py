@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -13,7 +12,7 @@ from research import channel_table
 from research.common.images import simulated_images
 from research.sea_trial import __main__ as sea_trial
 from research.sea_trial.__main__ import SIZES_PX, Cell, claims, measure, table
-from research.sea_trial.rig import CodedSnippet, DeliveryCounts, Rig, send_images
+from research.sea_trial.rig import CodedSnippet, DeliveryCounts, send_images
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.link.frames.contact_record import ContactSummary
@@ -32,21 +31,15 @@ def samples() -> list[CodedSnippet]:
     ]
 
 
-@pytest.mark.parametrize("rate", [1, 4])
-def test_everything_arrives_in_a_channel_without_fading(samples: list[CodedSnippet], rate: int) -> None:
-    found = send_images(ChannelParameters(), 300.0, rate, samples)
-    frames = 12 * (3 if rate == 1 else 2)
-    assert found == DeliveryCounts(12, 12, 0, frames, frames, 6, 6, 0, 0)
-
-
-def test_nothing_arrives_beyond_the_range_of_the_modem(samples: list[CodedSnippet]) -> None:
+def test_everything_arrives_in_a_channel_without_fading_and_nothing_beyond_the_range(samples):
+    for rate, frames in ((1, 36), (4, 24)):
+        found = send_images(ChannelParameters(), 300.0, rate, samples)
+        assert found == DeliveryCounts(12, 12, 0, frames, frames, 6, 6, 0, 0)
     found = send_images(build_parameters({"preset": "sea-trial"}, "test"), 300.0, 1, samples)
     assert found == DeliveryCounts(12, 0, 0, 36, 0, 6, 0, 0, 0)
 
 
-def test_counts_agree_with_the_events_of_the_channel(
-    samples: list[CodedSnippet], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_counts_agree_with_the_events_of_the_channel(samples, monkeypatch):
     """The events of the channel agree with the frames received by the driver of the vessel."""
     resolved: list[ArrivalEnded] = []
     inner = ChannelModel.poll
@@ -61,9 +54,8 @@ def test_counts_agree_with_the_events_of_the_channel(
     outcomes = [[frame.outcome for frame in event.frames] for event in resolved if event.frames]
     assert len(outcomes) == found.packets == 12
     assert sum(outcome is FrameOutcome.DELIVERED for packet in outcomes for outcome in packet) == found.good_frames
-    assert (
-        sum(all(outcome is FrameOutcome.DELIVERED for outcome in packet) for packet in outcomes) == found.whole_packets
-    )
+    whole = [all(outcome is FrameOutcome.DELIVERED for outcome in packet) for packet in outcomes]
+    assert sum(whole) == found.whole_packets
     assert 0 < found.good_frames < found.frames == 36
     pairs = zip(outcomes[::2], outcomes[1::2], strict=True)
     lost = [FrameOutcome.LOST in second for first, second in pairs if FrameOutcome.LOST not in first]
@@ -72,23 +64,15 @@ def test_counts_agree_with_the_events_of_the_channel(
     assert found.partial_pictures > 0
 
 
-def test_received_packet_equals_the_sent_one() -> None:
-    rig = Rig(ChannelParameters(), 100.0)
-    before = rig.now
-    received = rig.send((b"one", b"two" * 20), 1)
-    assert [frame.data for frame in received] == [b"one", b"two" * 20]
-    assert rig.now - before > 6.1
-
-
 def test_boundary_is_that_of_the_paper_and_results_are_reproducible() -> None:
     near, far = (60, 120), (160, 250)
     cells = measure(12, 1, (*near, *far), SIZES_PX[:1])
-    assert cells == measure(12, 1, (*near, *far), SIZES_PX[:1])
+    assert cells[:2] == measure(12, 1, near, SIZES_PX[:1])[:2]
     rate1 = {cell.range_m: cell for cell in cells if cell.rate == 1}
     assert min(rate1[range_m].packets for range_m in near) > 0.7
     assert max(rate1[range_m].packets for range_m in far) < 0.3
     assert {c.range_m: c.packets > 0.7 for c in cells if c.rate == 4} == {60: True, 120: False, 160: False, 250: False}
-    assert cells != measure(12, 2, (*near, *far), SIZES_PX[:1])
+    assert cells[1] != measure(12, 2, near, SIZES_PX[:1])[1]
 
 
 def cell(range_m: int, delivered: DeliveryCounts, width_px: int = 140) -> Cell:
@@ -111,19 +95,16 @@ def test_claims_of_the_paper_are_compared_with_the_measurement() -> None:
     assert "as in the paper" in text
 
 
-def test_command_prints_and_plots(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_command_prints_and_plots(tmp_path, capsys, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(sea_trial, "RANGES_M", (60, 130, 200))
-    monkeypatch.setattr(sea_trial, "SIZES_PX", SIZES_PX[1:])
+    monkeypatch.setattr(sea_trial, "SIZES_PX", SIZES_PX[1:2])
     path = tmp_path / "plot.png"
     assert sea_trial.main(["--pictures", "3", "--json", "--plot", str(path)]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert (printed["water"], printed["seed"]) == ("sea-trial", 0)
-    assert [(row["rate"], row["width_px"], row["range_m"]) for row in printed["results"]] == [
-        (rate, width, range_m) for width in (80, 40) for rate in (1, 4) for range_m in (60, 130, 200)
-    ]
+    found = [(row["rate"], row["width_px"], row["range_m"]) for row in printed["results"]]
+    assert found == [(rate, 80, range_m) for rate in (1, 4) for range_m in (60, 130, 200)]
     assert all(row["pictures"] == 3 and row["packets"] == 6 for row in printed["results"])
     with Image.open(path) as image:
         assert image.size[0] > 1000
@@ -131,10 +112,10 @@ def test_command_prints_and_plots(
     assert "| 130 | " in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("wrong", [["--pictures", "0"], ["--pictures", "1001"], ["--seed", "-1"]])
-def test_invalid_option_is_an_error(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert sea_trial.main([*wrong]) == 2
-    assert wrong[0] in capsys.readouterr().err
+def test_invalid_option_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    for wrong in (["--pictures", "0"], ["--pictures", "1001"], ["--seed", "-1"]):
+        assert sea_trial.main(wrong) == 2
+        assert wrong[0] in capsys.readouterr().err
 
 
 def test_delivery_table_has_every_rate_and_range() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from research.common import images as image_sets
+from research.common import speckle
 from research.common.images import grey_on_scale, simulated_images
 from research.common.nonlocal_means import nonlocal_means, reference_filtered
 from research.common.scene_measures import (
@@ -19,15 +20,7 @@ from research.common.scene_measures import (
     object_errors,
     place_in_window,
 )
-from research.common.speckle import (
-    FIRST_SEED,
-    HEIGHT_PX,
-    WIDTH_PX,
-    SpecklePair,
-    grey_gain,
-    scaled_grey,
-    speckle_pairs,
-)
+from research.common.speckle import SpecklePair, speckle_pairs
 from research.despeckling.filters import FILTERS
 from sonarpost.codec.quality import psnr_db
 from sonarpost.detection.snippets import to_grey
@@ -60,7 +53,7 @@ def with_speckle(image: np.ndarray, seed: int = 0) -> np.ndarray:
 def test_pairs_differ_by_the_speckle_only(pairs: list[SpecklePair]) -> None:
     assert {pair.seabed for pair in pairs} == set(SeabedKind)
     for pair in pairs:
-        assert pair.noisy.shape == pair.clean.shape == (HEIGHT_PX, WIDTH_PX)
+        assert pair.noisy.shape == pair.clean.shape == (speckle.HEIGHT_PX, speckle.WIDTH_PX)
         assert pair.noisy.dtype == pair.clean.dtype == np.uint8
         assert psnr_db(pair.clean, pair.noisy) < 30
         # The same scene: block means, which have little speckle, are proportional.
@@ -68,31 +61,33 @@ def test_pairs_differ_by_the_speckle_only(pairs: list[SpecklePair]) -> None:
         if clean.std() > 5:
             assert np.corrcoef(clean, noisy)[0, 1] > 0.9
         if pair.place is not None:
-            assert 0 <= pair.place.row < HEIGHT_PX
-            assert 0 <= pair.place.column < WIDTH_PX
+            assert 0 <= pair.place.row < speckle.HEIGHT_PX
+            assert 0 <= pair.place.column < speckle.WIDTH_PX
 
 
-def test_pairs_are_reproducible_and_differ_from_the_seeds_of_training(pairs: list[SpecklePair]) -> None:
+def test_pairs_are_reproducible_and_their_number_and_seed_limited(pairs: list[SpecklePair]) -> None:
     again = speckle_pairs(1, seed=3, pings=180)
-    assert np.array_equal(again[0].noisy.shape, pairs[0].noisy.shape)
-    assert again[0].source == pairs[0].source == f"simulated-{SeabedKind.SAND}-{FIRST_SEED + 3000}"
+    assert again[0].source == pairs[0].source == f"simulated-{SeabedKind.SAND}-{speckle.FIRST_SEED + 3000}"
     assert np.array_equal(again[0].noisy, pairs[0].noisy)
     assert np.array_equal(again[0].clean, pairs[0].clean)
-    assert FIRST_SEED > 100_260
+    assert speckle.FIRST_SEED > 100_260
+    for count, seed, option in ((0, 0, "count"), (10_001, 0, "count"), (1, -1, "seed"), (1, 1_000_001, "seed")):
+        with pytest.raises(ConfigError, match=f"--{option}"):
+            speckle_pairs(count, seed)
 
 
-@pytest.mark.parametrize(("count", "seed"), [(0, 0), (10_001, 0), (1, -1), (1, 1_000_001)])
-def test_invalid_number_of_pairs_or_seed_is_an_error(count: int, seed: int) -> None:
-    with pytest.raises(ConfigError, match="--count" if seed == 0 else "--seed"):
-        speckle_pairs(count, seed)
-
-
-def test_grey_scale_of_a_pair() -> None:
+def test_grey_scale_of_a_pair_and_of_a_scene() -> None:
     amplitude = np.linspace(0, 100, 1001, dtype=np.float32)[None]
-    assert grey_gain(amplitude) == pytest.approx(255 / 99.5)
-    assert grey_gain(np.full((4, 4), 2.0, np.float32)) == 8.0
-    assert grey_gain(np.zeros((4, 4), np.float32)) == 8.0
-    assert scaled_grey(amplitude, 3.0)[0, [0, 100, 1000]].tolist() == [0, 30, 255]
+    assert speckle.grey_gain(amplitude) == pytest.approx(255 / 99.5)
+    assert speckle.grey_gain(np.full((4, 4), 2.0, np.float32)) == 8.0
+    assert speckle.grey_gain(np.zeros((4, 4), np.float32)) == 8.0
+    assert speckle.scaled_grey(amplitude, 3.0)[0, [0, 100, 1000]].tolist() == [0, 30, 255]
+    raw = np.random.default_rng(0).integers(0, 200, (20, 30)).astype(np.float32)
+    known = np.ones(raw.shape, np.bool_)
+    assert np.array_equal(grey_on_scale(raw, raw), to_grey(raw.astype(np.uint32), known))
+    assert grey_on_scale(raw[:, :10], raw).shape == (20, 10)
+    assert np.array_equal(grey_on_scale(raw[:, :10], raw), grey_on_scale(raw, raw)[:, :10])
+    assert (grey_on_scale(raw, np.full((3, 3), 9, np.float32)) == 128).all()
 
 
 def test_dots_are_small_groups_that_differ_from_their_surroundings() -> None:
@@ -177,14 +172,10 @@ def test_filter_reduces_speckle_and_preserves_the_scene(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FILTERS)
-@pytest.mark.parametrize("level", [0, 77, 255])
-def test_filter_preserves_a_constant_image(name: str, level: int) -> None:
-    image = np.full((24, 30), level, np.uint8)
-    assert np.abs(FILTERS[name](image).astype(int) - level).max() <= 1
-
-
-@pytest.mark.parametrize("name", FILTERS)
-def test_filter_accepts_areas_without_echo(name: str) -> None:
+def test_filter_preserves_constant_images_and_areas_without_echo(name: str) -> None:
+    for level in (0, 77, 255):
+        image = np.full((24, 30), level, np.uint8)
+        assert np.abs(FILTERS[name](image).astype(int) - level).max() <= 1
     image = with_speckle(np.full((40, 60), 251, np.uint8))
     image[:, 20:45] = 0
     filtered = FILTERS[name](image)
@@ -207,24 +198,19 @@ def test_reference_filter_does_not_change() -> None:
     assert filtered.sum(dtype=np.int64) == 794_360
 
 
-def test_simulated_images_have_their_scenes_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simulated_images_are_reproducible_and_have_scenes_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(image_sets, "_PINGS", 260)
     plain = simulated_images(4, seed=5, side_px=64).images
     found = simulated_images(4, seed=5, side_px=64, with_scenes=True).images
+    other = simulated_images(4, seed=6, side_px=64).images
+    assert [image.is_target for image in plain] == [True, False] * 2
+    assert not np.array_equal(plain[0].pixels, other[0].pixels)
     assert all(image.clean is None and image.place is None for image in plain)
     for image, before in zip(found, plain, strict=True):
-        assert np.array_equal(image.pixels, before.pixels)
+        assert np.array_equal(image.pixels, before.pixels)  # reproducible
+        assert image.pixels.shape == (64, 64)
         assert image.clean is not None
         assert image.clean.shape == (64, 64)
         assert image.clean.std() > 0
         assert not np.array_equal(image.clean, image.pixels)
     assert sum(image.place is not None for image in found) >= 3
-
-
-def test_scene_has_the_grey_scale_of_the_snippet() -> None:
-    raw = np.random.default_rng(0).integers(0, 200, (20, 30)).astype(np.float32)
-    known = np.ones(raw.shape, np.bool_)
-    assert np.array_equal(grey_on_scale(raw, raw), to_grey(raw.astype(np.uint32), known))
-    assert grey_on_scale(raw[:, :10], raw).shape == (20, 10)
-    assert np.array_equal(grey_on_scale(raw[:, :10], raw), grey_on_scale(raw, raw)[:, :10])
-    assert (grey_on_scale(raw, np.full((3, 3), 9, np.float32)) == 128).all()

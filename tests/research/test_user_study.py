@@ -41,6 +41,15 @@ def panel(folders, tmp_path):
     answers.close()
 
 
+def start(client, name="Anna"):
+    """Start as a participant; return the header of the session."""
+    return {"X-Panel": client.post("/api/panel/start", json={"name": name}).json()["panel"]}
+
+
+def body_of(**changes):
+    return {"number": 1, "choice": 0, "sure": None, "seconds": 1.0, **changes}
+
+
 def grey_of(client, address) -> int:
     return int(np.asarray(Image.open(io.BytesIO(client.get(address).content)))[0, 0])
 
@@ -54,7 +63,7 @@ def right_choice(client, question) -> int:
 def test_study_from_the_first_trial_to_the_results(panel, tmp_path, capsys):
     assert panel.get("/api/panel").json() == {"title": "Which?", "trials": 12, "choices": 3}
     assert panel.get("/api/panel/next").status_code == 401
-    headers = {"X-Panel": panel.post("/api/panel/start", json={"name": "Anna"}).json()["panel"]}
+    headers = start(panel)
     for number in range(1, 13):
         question = panel.get("/api/panel/next", headers=headers).json()
         assert (question["number"], question["of"], len(question["choices"])) == (number, 12, 3)
@@ -80,41 +89,34 @@ def test_study_from_the_first_trial_to_the_results(panel, tmp_path, capsys):
 
 
 def test_responses_do_not_reveal_the_answer(panel):
-    headers = {"X-Panel": panel.post("/api/panel/start", json={"name": "Anna"}).json()["panel"]}
+    headers = start(panel)
     question = panel.get("/api/panel/next", headers=headers)
     assert not any(name in question.text for name in (*NAMES, "small", "large"))
     for address in (question.json()["shown"], *question.json()["choices"]):
         data = panel.get(address).content
         assert not any(name.encode() in data for name in NAMES)
     assert panel.get("/api/panel/pictures/contact-1.png").status_code == 404
-    body = {"number": 1, "choice": 0, "sure": None, "seconds": 1.0}
-    assert set(panel.post("/api/panel/answers", json=body, headers=headers).json()) == {"answered"}
+    assert set(panel.post("/api/panel/answers", json=body_of(), headers=headers).json()) == {"answered"}
 
 
 def test_participant_continues_and_another_has_another_order(panel):
-    start = panel.post("/api/panel/start", json={"name": "Anna"}).json()
-    headers = {"X-Panel": start["panel"]}
+    started = panel.post("/api/panel/start", json={"name": "Anna"}).json()
+    headers = {"X-Panel": started["panel"]}
     first = panel.get("/api/panel/next", headers=headers).json()
-    body = {"number": 1, "choice": 0, "sure": None, "seconds": 1.0}
-    panel.post("/api/panel/answers", json=body, headers=headers)
+    panel.post("/api/panel/answers", json=body_of(), headers=headers)
     again = panel.post("/api/panel/start", json={"name": "Anna"}).json()
-    assert again == {**start, "answered": 1}
-    other = {"X-Panel": panel.post("/api/panel/start", json={"name": "Bo"}).json()["panel"]}
-    assert panel.get("/api/panel/next", headers=other).json()["shown"] != first["shown"]
+    assert again == {**started, "answered": 1}
+    assert panel.get("/api/panel/next", headers=start(panel, "Bo")).json()["shown"] != first["shown"]
     orders = [[t.shown for t in trials_for(who, 1, NAMES, [Decoded("", n) for n in NAMES], 3)] for who in "ab"]
     assert orders[0] != orders[1]
     assert set(orders[0]) == set(orders[1])
 
 
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [({"choice": 3}, "choice"), ({"number": 2}, "number"), ({"seconds": -1.0}, "seconds"), ({"sure": 2}, "sure")],
-)
-def test_error_names_the_invalid_field(panel, change, field):
-    headers = {"X-Panel": panel.post("/api/panel/start", json={"name": "Anna"}).json()["panel"]}
-    body = {"number": 1, "choice": 0, "sure": None, "seconds": 1.0, **change}
-    answer = panel.post("/api/panel/answers", json=body, headers=headers)
-    assert (answer.status_code, answer.json()["error"]["field"]) == (400, field)
+def test_error_names_the_invalid_field(panel):
+    headers = start(panel)
+    for field, value in (("choice", 3), ("number", 2), ("seconds", -1.0), ("sure", 2)):
+        answer = panel.post("/api/panel/answers", json=body_of(**{field: value}), headers=headers)
+        assert (answer.status_code, answer.json()["error"]["field"]) == (400, field)
 
 
 def test_right_choice_is_unique_and_at_a_random_position():
@@ -152,8 +154,7 @@ def test_results_are_available_on_this_host_only(folders, tmp_path):
 
 
 def interval(method, right, number):
-    answers = [Answer("ann", "small", n < right, 1.0) for n in range(number)]
-    return share(answers)[method]
+    return share([Answer("ann", "small", n < right, 1.0) for n in range(number)])[method]
 
 
 def test_confidence_intervals():
