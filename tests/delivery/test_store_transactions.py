@@ -2,7 +2,6 @@
 
 import itertools
 import random
-import signal
 import subprocess
 import sys
 import threading
@@ -85,16 +84,13 @@ def check_complete(path, reported):
 def test_killed_process_leaves_complete_transactions_only(tmp_path):
     path, chance = tmp_path / "s.db", random.Random(7)
     for _ in range(3):
-        writer = subprocess.Popen(
-            [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        reported = int(writer.stdout.readline())
-        for _ in range(chance.randrange(40)):
-            reported = int(writer.stdout.readline())
-        writer.send_signal(signal.SIGKILL)
-        rest, complaints = writer.communicate()
-        assert complaints == ""
-        complete_lines = [line for line in rest.split("\n")[:-1] if line]
+        command = [sys.executable, "-c", KILLED, str(path)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as writer:
+            for _ in range(1 + chance.randrange(40)):
+                reported = int(writer.stdout.readline())
+            writer.kill()
+            *complete_lines, _ = writer.stdout.read().split("\n")
+            assert writer.stderr.read() == ""
         check_complete(path, int(complete_lines[-1]) if complete_lines else reported)
 
 
