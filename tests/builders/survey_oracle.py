@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from builders.surveys import MAKERS
+from builders.surveys import MAKERS, small_survey
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import georeference
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import open_survey
-from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
+from sonarpost.sonar.survey import Ping, Survey
 
 FILES = (
     ("xtf", "line.xtf"),
@@ -39,24 +39,7 @@ OPTIONS = SurveyOptions(projected_crs="EPSG:32619", humminbird_depth_as_altitude
 
 def tiny_survey(pings: int = 3, samples: int = 12) -> Survey:
     """Return a few pings of a few samples."""
-    rng = np.random.default_rng(0)
-    made = tuple(
-        Ping(
-            number=row,
-            time_utc_s=1_378_847_588.0 + row,
-            channels=tuple(ChannelPing(side, rng.integers(1, 255, samples, dtype=np.uint8), 25.0) for side in Side),
-            lat_deg=48.4 + row * 1e-5,
-            lon_deg=-68.8,
-            heading_deg=90.0,
-            altitude_m=6.0,
-            depth_m=14.0,
-            speed_mps=1.0,
-            pitch_deg=1.0,
-            roll_deg=-1.0,
-        )
-        for row in range(pings)
-    )
-    return Survey(Path("line"), "HDS", "line", made)
+    return small_survey(pings=pings, samples=samples)
 
 
 class Readers:

@@ -14,10 +14,24 @@ from pathlib import Path
 import numpy as np
 
 from sonarpost.sonar.image_files import write_png, write_tiff
-from sonarpost.sonar.survey import Side, Survey
+from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
 RADIUS_M = 6_378_388.0
+
+
+def small_survey(dtype: type = np.uint8, pings: int = 5, samples: int = 40) -> Survey:
+    """Return a survey of a few pings with different samples on both sides."""
+    rng = np.random.default_rng(3)
+    navigation = {"lon_deg": -68.827935, "heading_deg": 354.5, "altitude_m": 6.25, "depth_m": 14.5}
+    navigation |= {"speed_mps": 1.03125, "pitch_deg": -2.5, "roll_deg": 3.75}
+    made = []
+    for row in range(pings):
+        images = (rng.integers(0, np.iinfo(dtype).max, samples, dtype=dtype, endpoint=True) for _ in Side)
+        channels = tuple(ChannelPing(side, image, 25.0, 600_000.0) for side, image in zip(Side, images, strict=True))
+        time_utc_s = 1_378_847_588.13 + row * 0.37
+        made.append(Ping(row + 10, time_utc_s, channels, lat_deg=48.44545 + row * 1e-6, **navigation))
+    return Survey(Path("made.xtf"), "HDS", "made", tuple(made))
 
 
 def make_xtf(survey: Survey, folder: Path) -> Path:
@@ -33,20 +47,10 @@ def mercator(lat_deg: float, lon_deg: float) -> tuple[int, int]:
 
 
 def son_ping(number: int, time_ms: int, samples: bytes, extra: bytes = b"", **values: int) -> bytes:
-    """Return a ping of a SON file.
-
-    Args:
-        number: Number of the ping.
-        time_ms: Time since the start of the recording.
-        samples: Samples of 8 bits.
-        extra: Additional header fields.
-        values: Fields `east`, `north`, `heading`, `speed` and `depth` in the units of the format.
-    """
+    """Return a ping of a SON file; values are `east`, `north`, `heading`, `speed` and `depth` in the format's units."""
     fields = struct.pack(">BIBI", 0x80, number, 0x81, time_ms)
     fields += struct.pack(">BiBi", 0x82, values.get("east", 0), 0x83, values.get("north", 0))
-    fields += struct.pack(">BHH", 0x84, 1, values.get("heading", 0)) + struct.pack(
-        ">BHH", 0x85, 1, values.get("speed", 0)
-    )
+    fields += struct.pack(">BHHBHH", 0x84, 1, values.get("heading", 0), 0x85, 1, values.get("speed", 0))
     fields += struct.pack(">BI", 0x87, values.get("depth", 0)) + b"\x50\x02" + struct.pack(">BI", 0x92, 455_000) + extra
     return b"\xc0\xde\xab\x21" + fields + struct.pack(">BIB", 0xA0, len(samples), 0x21) + samples
 
@@ -100,16 +104,7 @@ def make_waterfall(survey: Survey, folder: Path, *, tiff: bool = False) -> Path:
 
 
 def lowrance_frame(version: int, offset: int, samples: bytes, channel: int = 5, **values: float) -> bytes:
-    """Return a frame of an SL2 or SL3 file.
-
-    Args:
-        version: 2 or 3.
-        offset: Place of the frame in the file.
-        samples: Samples of 8 bits.
-        channel: Channel number.
-        values: Fields `index`, `low`, `high`, `time_s`, `speed`, `east`, `north`, `heading` and `ms` in the units of
-            the format.
-    """
+    """Return the frame at an offset of an SL2 or SL3 file; values are fields in the units of the format."""
     head = bytearray(168 if version == 3 else 144)
     size = len(head) + len(samples)
     places = (8, 12, 44, 16, 20, 40, 84, 92, 112, 124) if version == 3 else (28, 32, 34, 36, 40, 60, 100, 108, 128, 140)
@@ -159,16 +154,14 @@ def make_sl2(survey: Survey, folder: Path) -> Path:
 
 
 def jsf_message(number: int, subsystem: int, channel: int, samples: np.ndarray, **values: float) -> bytes:
-    """Return a sonar message (80) of a JSF file.
+    """Return a sonar message (80) of a JSF file; values are fields in the units of the format.
 
     Args:
         number: Ping number.
         subsystem: 20, 21 or 22 for side-scan.
         channel: 0 port, 1 starboard.
         samples: Envelope, shape (n,); or analytic, complex.
-        values: Fields in the units of the format: `protocol`, `seconds`, `day_ms`, `lead`, `msb`, `lsb`, `valid`,
-            `kind`, `x`, `y`, `unit`, `count`, `interval_ns`, `depth`, `altitude`, `sound_speed`, `year`, `day`,
-            `weight`, `heading`, `pitch`, `roll` and `speed`.
+        values: `protocol` and the fields below.
     """
     head = bytearray(240)
     analytic = np.iscomplexobj(samples)
@@ -238,18 +231,7 @@ def make_jsf(survey: Survey, folder: Path) -> Path:
 def sdf_page(
     number: int, port: np.ndarray, starboard: np.ndarray, version: int = 3502, rest: bytes = b"", **values: float
 ) -> bytes:
-    """Return a side-scan page of an SDF file.
-
-    Args:
-        number: Ping number.
-        port: Samples of the port side, nearest first, shape (n,).
-        starboard: Samples of the starboard side.
-        version: Page version, 3501 or 3502.
-        rest: Bytes after the samples.
-        values: Fields in the units of the format: `count`, `range_m`, `speed`, `year`, `month`, `day`, `hour`,
-            `minute`, `second`, `heading`, `lat`, `lon`, `header`, `pitch`, `roll`, `depth`, `altitude`, `fraction` and
-            `khz`.
-    """
+    """Return a side-scan page of an SDF file with samples nearest first; values are fields in the format's units."""
     fields: tuple[tuple[int, str, str, float], ...] = (
         (20, "I", "count", max(len(port), len(starboard))),
         (32, "I", "range_m", 25),
@@ -334,14 +316,14 @@ def svlog_position(lat_deg: float, lon_deg: float, heading_deg: float, speed_mps
 
 
 def svlog_profile(number: int, clock_ms: int, channel: int, results: np.ndarray, **values: float) -> bytes:
-    """Return the profile (2198) of a transducer.
+    """Return the profile (2198) of a transducer; values are fields in the units of the format.
 
     Args:
         number: Ping number.
         clock_ms: Clock of the sonar.
         channel: 0 port, 1 starboard.
         results: Values of 16 bits between the least and the greatest decibel, shape (n,).
-        values: Fields in the units of the format: `start_mm`, `length_mm`, `max_db`, `min_db`, `heading`, `count`.
+        values: `start_mm`, `length_mm`, `max_db`, `min_db`, `heading`, `count`.
     """
     head = struct.pack(
         "<5I3HBx6f",

@@ -146,10 +146,9 @@ def test_closed_connection_is_detected_before_the_next_batch(serve, end):
 
 
 def test_batch_is_sent_when_the_server_starts_later():
-    port = free_port()
-    started: list[Server] = []
+    port, started = free_port(), []
 
-    def wait(_: float) -> bool:
+    def wait(_):
         if not started:
             started.append(Server(port=port))
         return False

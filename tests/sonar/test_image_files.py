@@ -117,8 +117,9 @@ GREY_OF_COLOUR = np.rint(COLOUR @ np.array([0.299, 0.587, 0.114])).astype(np.uin
 HALF_BLACK = np.where(ALPHA == 0, 0, ramp())
 
 
-def pillow_file(image: Image.Image, kind: str, **options: object) -> bytes:
+def pillow_file(image: Image.Image | np.ndarray, kind: str, **options: object) -> bytes:
     buffer = io.BytesIO()
+    image = image if isinstance(image, Image.Image) else Image.fromarray(image)
     image.save(buffer, format=kind, **options)
     return buffer.getvalue()
 
@@ -150,33 +151,31 @@ def palette_image() -> Image.Image:
 PALETTE_GREY = np.array([18, 29, 76, 255], np.uint8)[ramp() // 64]
 BITS = (ramp() > 100).astype(np.uint8) * np.uint8(255)
 FLOAT = np.where(ramp() == 0, np.nan, ramp() / 7.0 - 3).astype(np.float32)
-COLOUR_NOTE = "colour converted to grey"
+FLOAT_GREY = np.rint(np.nan_to_num((FLOAT + 3) * 7 - 1) / 254 * 65535).astype(np.uint16)
+COLOUR_NOTE, ALPHA_NOTE = "colour converted to grey", "alpha channel"
+CLEAR_COLOUR = np.where(ALPHA == 0, 0, GREY_OF_COLOUR)
 
 # Name: bytes, grey pixels, text of the notes (empty: no conversion). None for pixels: JPEG is compared with tolerance.
 READABLE: dict[str, tuple[bytes, np.ndarray, str]] = {
-    "JPEG grey": (pillow_file(Image.fromarray(ramp()), "JPEG", quality=95), ramp(), ""),
+    "JPEG grey": (pillow_file(ramp(), "JPEG", quality=95), ramp(), ""),
     "JPEG RGB": (
-        pillow_file(Image.fromarray(np.kron(COLOUR, np.ones((8, 8, 1), np.uint8))), "JPEG", quality=100, subsampling=0),
+        pillow_file(np.kron(COLOUR, np.ones((8, 8, 1), np.uint8)), "JPEG", quality=100, subsampling=0),
         np.kron(GREY_OF_COLOUR, np.ones((8, 8), np.uint8)),
         COLOUR_NOTE,
     ),
     "JPEG CMYK": (pillow_file(Image.fromarray(ramp()).convert("CMYK"), "JPEG", quality=100), ramp(), ""),
-    "PNG 8": (pillow_file(Image.fromarray(ramp()), "PNG"), ramp(), ""),
-    "PNG 16": (pillow_file(Image.fromarray(ramp(np.uint16)), "PNG"), ramp(np.uint16), ""),
+    "PNG 8": (pillow_file(ramp(), "PNG"), ramp(), ""),
+    "PNG 16": (pillow_file(ramp(np.uint16), "PNG"), ramp(np.uint16), ""),
     "PNG 1 bit": (pillow_file(Image.fromarray(BITS).convert("1"), "PNG"), BITS, "1-bit pixels"),
-    "PNG RGB": (pillow_file(Image.fromarray(COLOUR), "PNG"), GREY_OF_COLOUR, COLOUR_NOTE),
-    "PNG RGB equal": (pillow_file(Image.fromarray(np.stack([ramp()] * 3, -1)), "PNG"), ramp(), ""),
-    "PNG RGBA": (
-        pillow_file(Image.fromarray(np.dstack([COLOUR, ALPHA])), "PNG"),
-        np.where(ALPHA == 0, 0, GREY_OF_COLOUR),
-        "alpha channel",
-    ),
-    "PNG LA": (pillow_file(Image.fromarray(np.dstack([ramp(), ALPHA])), "PNG"), HALF_BLACK, "alpha channel"),
+    "PNG RGB": (pillow_file(COLOUR, "PNG"), GREY_OF_COLOUR, COLOUR_NOTE),
+    "PNG RGB equal": (pillow_file(np.stack([ramp()] * 3, -1), "PNG"), ramp(), ""),
+    "PNG RGBA": (pillow_file(np.dstack([COLOUR, ALPHA]), "PNG"), CLEAR_COLOUR, ALPHA_NOTE),
+    "PNG LA": (pillow_file(np.dstack([ramp(), ALPHA]), "PNG"), HALF_BLACK, ALPHA_NOTE),
     "PNG palette": (pillow_file(palette_image(), "PNG", bits=2), PALETTE_GREY, "palette"),
     "PNG palette with a transparent entry": (
         pillow_file(palette_image(), "PNG", transparency=3),
         np.where(PALETTE_GREY == 255, 0, PALETTE_GREY),
-        "alpha channel",
+        ALPHA_NOTE,
     ),
     "PNG RGB 16": (png16(2, wide(COLOUR)), GREY_OF_COLOUR, "reduced to 8 bits"),
     "PNG RGBA 16": (png16(6, wide(np.dstack([COLOUR, ALPHA * 0 + 255]))), GREY_OF_COLOUR, "reduced to 8 bits"),
@@ -185,13 +184,9 @@ READABLE: dict[str, tuple[bytes, np.ndarray, str]] = {
     "TIFF white is zero": (tiff_bytes(ramp(), photometric="miniswhite"), 255 - ramp(), ""),
     "TIFF RGB equal": (tiff_bytes(np.stack([ramp()] * 3, -1), photometric="rgb"), ramp(), ""),
     "TIFF 16": (tiff_bytes(ramp(np.uint16)), ramp(np.uint16), ""),
-    "TIFF 16 LZW": (pillow_file(Image.fromarray(ramp(np.uint16)), "TIFF", compression="tiff_lzw"), ramp(np.uint16), ""),
-    "TIFF RGB LZW": (pillow_file(Image.fromarray(COLOUR), "TIFF", compression="tiff_lzw"), GREY_OF_COLOUR, COLOUR_NOTE),
-    "TIFF float LZW": (
-        pillow_file(Image.fromarray(FLOAT), "TIFF", compression="tiff_lzw"),
-        np.rint(np.nan_to_num((FLOAT + 3) * 7 - 1) / 254 * 65535).astype(np.uint16),
-        "float32 samples scaled",
-    ),
+    "TIFF 16 LZW": (pillow_file(ramp(np.uint16), "TIFF", compression="tiff_lzw"), ramp(np.uint16), ""),
+    "TIFF RGB LZW": (pillow_file(COLOUR, "TIFF", compression="tiff_lzw"), GREY_OF_COLOUR, COLOUR_NOTE),
+    "TIFF float LZW": (pillow_file(FLOAT, "TIFF", compression="tiff_lzw"), FLOAT_GREY, "float32 samples scaled"),
     "TIFF 1 bit": (tiff_bytes(BITS > 0, photometric="minisblack"), BITS, "1-bit pixels"),
     "TIFF 1 bit fax": (
         pillow_file(Image.fromarray(BITS).convert("1"), "TIFF", compression="group4"),
@@ -214,17 +209,17 @@ READABLE: dict[str, tuple[bytes, np.ndarray, str]] = {
             np.dstack([ramp(), ALPHA]), photometric="minisblack", planarconfig="contig", extrasamples=["unassalpha"]
         ),
         HALF_BLACK,
-        "alpha channel",
+        ALPHA_NOTE,
     ),
     "TIFF RGBA": (
         tiff_bytes(np.dstack([COLOUR, ALPHA]), photometric="rgb", extrasamples=["unassalpha"]),
-        np.where(ALPHA == 0, 0, GREY_OF_COLOUR),
-        "alpha channel",
+        CLEAR_COLOUR,
+        ALPHA_NOTE,
     ),
     "TIFF RGB with associated alpha": (
         tiff_bytes(np.dstack([COLOUR, ALPHA]), photometric="rgb", extrasamples=["assocalpha"]),
         GREY_OF_COLOUR,
-        "alpha channel",
+        ALPHA_NOTE,
     ),
     "TIFF palette": (
         tiff_bytes(
@@ -235,11 +230,7 @@ READABLE: dict[str, tuple[bytes, np.ndarray, str]] = {
         PALETTE_GREY,
         "palette",
     ),
-    "TIFF float": (
-        tiff_bytes(FLOAT),
-        np.rint(np.nan_to_num((FLOAT + 3) * 7 - 1) / 254 * 65535).astype(np.uint16),
-        "float32 samples scaled from -2.85714..33.4286",
-    ),
+    "TIFF float": (tiff_bytes(FLOAT), FLOAT_GREY, "float32 samples scaled from -2.85714..33.4286"),
     "TIFF of 32 bits": (tiff_bytes(ramp().astype(np.uint32) << 20), wide(ramp()), "uint32 samples scaled"),
     "TIFF signed": (tiff_bytes(ramp().astype(np.int16) - 100), wide(ramp()), "int16 samples scaled from -100..155"),
     "TIFF of two pages": (
@@ -293,9 +284,9 @@ def test_orientation_is_applied_as_other_programs_apply_it(tmp_path, kind, orien
     if kind == "TIFF":
         raw = tiff_bytes(pixels, extratags=[(274, 3, 1, orientation, True)])
     elif kind == "TIFF LZW":
-        raw = pillow_file(Image.fromarray(pixels), "TIFF", compression="tiff_lzw", tiffinfo={274: orientation})
+        raw = pillow_file(pixels, "TIFF", compression="tiff_lzw", tiffinfo={274: orientation})
     else:
-        raw = pillow_file(Image.fromarray(pixels), kind, exif=exif)
+        raw = pillow_file(pixels, kind, exif=exif)
     (tmp_path / "a").write_bytes(raw)
     image = read_any_image(tmp_path / "a")
     source = Image.fromarray(pixels)
@@ -316,7 +307,7 @@ UNSUPPORTED = {
         tiff_bytes(np.zeros((12, 20, 4), np.uint8), photometric="separated"),
         "PhotometricInterpretation",
     ),
-    "GIF": (pillow_file(Image.fromarray(ramp()), "GIF"), "signature"),
+    "GIF": (pillow_file(ramp(), "GIF"), "signature"),
     "text": (b"not an image", "signature"),
     "nothing": (b"", "signature"),
 }

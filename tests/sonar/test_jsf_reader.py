@@ -89,16 +89,8 @@ def test_number_of_samples_beyond_16_bits(tmp_path):
 
 
 def test_navigation_needs_its_validity_bits(tmp_path):
-    values = {
-        "x": -41_000_000,
-        "y": 29_000_000,
-        "altitude": 6000,
-        "depth": 14_000,
-        "speed": 20,
-        "heading": 36_000,
-        "pitch": 182,
-        "roll": -182,
-    }
+    values = {"x": -41_000_000, "y": 29_000_000, "altitude": 6000, "depth": 14_000}
+    values |= {"speed": 20, "heading": 36_000, "pitch": 182, "roll": -182}
     none = read_one(tmp_path, **values, valid=0)
     names = ("lat_deg", "lon_deg", "altitude_m", "depth_m", "speed_mps", "heading_deg", "pitch_deg", "roll_deg")
     assert all(getattr(none, name) is None for name in names)
@@ -108,9 +100,7 @@ def test_navigation_needs_its_validity_bits(tmp_path):
     for bit, name in ((0, "lat_deg"), (6, "altitude_m"), (9, "depth_m"), (2, "speed_mps"), (3, "heading_deg")):
         assert getattr(read_one(tmp_path, **values, valid=ALL_VALID & ~(1 << bit)), name) is None
     assert read_one(tmp_path, **{**values, "altitude": 0}, valid=ALL_VALID).altitude_m is None
-
-
-def test_position_of_the_antenna_causes_a_warning(tmp_path):
+    # The position of the antenna causes a warning.
     values = {"x": -41_000_000, "y": 29_000_000}
     survey = read_survey(recording(tmp_path, jsf_message(1, 20, 0, ENVELOPE, **values)))
     assert any("without layback" in w for w in survey.warnings)
@@ -164,13 +154,9 @@ def test_file_without_side_scan_is_refused_with_its_messages(tmp_path):
     path = recording(tmp_path, jsf_message(1, 0, 0, ENVELOPE), jsf_other(2020, bytes(44)), jsf_other(2020, bytes(44)))
     with pytest.raises(SurveyFileError, match=r"type 2020 \(2 times\), type 80 \(1 times\)', expected .* side-scan"):
         read_survey(path)
-
-
-def test_sub_bottom_and_other_channels_are_skipped(tmp_path):
-    path = recording(
-        tmp_path, jsf_message(1, 0, 0, ENVELOPE), jsf_message(1, 20, 5, ENVELOPE), jsf_message(1, 20, 0, ENVELOPE)
-    )
-    survey = read_survey(path)
+    # Sub-bottom and other channels are skipped.
+    messages = (jsf_message(1, *place, ENVELOPE) for place in ((0, 0), (20, 5), (20, 0)))
+    survey = read_survey(recording(tmp_path, *messages))
     assert len(survey.pings) == 1
     assert sum("not side-scan" in w for w in survey.warnings) == 2
 

@@ -80,15 +80,6 @@ def test_overviews_are_means_of_pixels_with_data(tmp_path):
     assert reduced[0, :3].tolist() == [75, 25, 0]
 
 
-@gdal.needs_gdal
-def test_rotated_image_has_a_transformation(tmp_path):
-    angle = math.radians(30)
-    column, row = (math.cos(angle), math.sin(angle)), (math.sin(angle), -math.cos(angle))
-    write_image(tmp_path / "r.tif", np.ones((4, 5), np.uint8), GeoTransform(32619, (5e5, 5.3e6), column, row))
-    got = gdal.info(tmp_path / "r.tif")["geoTransform"]
-    assert got == pytest.approx([5e5, column[0], row[0], 5.3e6, column[1], row[1]])
-
-
 def test_swath_is_filled_and_nadir_is_not(tmp_path):
     """Across a straight line every pixel of the swath has data, except around the nadir."""
     survey = line(heading_deg=0.0, bright=None, spacing_m=1.0, pings=40)

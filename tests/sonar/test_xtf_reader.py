@@ -6,7 +6,6 @@ import csv
 import struct
 from dataclasses import replace
 from datetime import UTC, datetime
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,7 +40,7 @@ def raw(small_survey, tmp_path) -> bytearray:
     return bytearray((tmp_path / "complete.xtf").read_bytes())
 
 
-def read(tmp_path: Path, content: bytes, **options):
+def read(tmp_path, content: bytes, **options):
     path = tmp_path / "bad.xtf"
     path.write_bytes(content)
     return read_survey(path, SurveyOptions(**options))
@@ -232,36 +231,23 @@ def test_zero_altitude_is_unknown_and_negative_is_reported(tmp_path, raw):
     assert survey.warnings == ("altitude_m out of range in 1 of 5 pings, the first in row 1",)
 
 
-def test_100_hundredths_are_the_next_second(tmp_path, raw):
+def test_hundredths_of_100_are_the_next_second_and_a_sub_bottom_channel_is_skipped(tmp_path, raw):
     before = read(tmp_path, raw).pings[0].time_utc_s
-    assert read(tmp_path, put(raw, HEADER + 21, "B", 100)).pings[0].time_utc_s == pytest.approx(before - 0.13 + 1.0)
-
-
-def test_sub_bottom_channel_is_skipped(tmp_path, raw):
+    assert read(tmp_path, put(raw[:], HEADER + 21, "B", 100)).pings[0].time_utc_s == pytest.approx(before - 0.13 + 1.0)
     survey = read(tmp_path, put(raw, CHAN_INFO, "B", 0))
     assert survey.sides() == (Side.STARBOARD,)
     assert survey.warnings == ("skipped channel: sub-bottom, not side-scan (5 times)",)
 
 
-def test_sample_count_from_file_header(tmp_path, raw):
-    for row in range(5):
-        put(raw, HEADER + row * PACKET + 256 + 42, "I", 0)
-    survey = read(tmp_path, put(raw, CHAN_INFO + 8, "I", 40))
-    assert survey.pings[0].channels[0].samples.shape == (40,)
-
-
-def test_more_than_six_channels_extend_file_header(tmp_path, raw):
-    put(raw, 166, "H", 7)
-    survey = read(tmp_path, raw[:HEADER] + bytes(1024) + raw[HEADER:])
-    assert len(survey.pings) == 5
-
-
-def test_frequency_in_hertz_or_kilohertz(tmp_path, raw):
-    for row in range(5):
-        put(raw, HEADER + row * PACKET + 256 + 26, "H", 0)
-    assert read(tmp_path, raw).pings[0].channels[0].frequency_hz == 600_000
+def test_sample_count_and_frequency_are_from_the_file_header_if_a_ping_has_none(tmp_path, raw):
+    in_every_ping(in_every_ping(raw, 256 + 42, "I", 0), 256 + 26, "H", 0)
+    (channel, _) = read(tmp_path, put(raw, CHAN_INFO + 8, "I", 40)).pings[0].channels
+    assert (channel.samples.shape, channel.frequency_hz) == ((40,), 600_000)  # from kilohertz
     put(raw, CHAN_INFO + 32, "f", 455_000.0)
     assert read(tmp_path, raw).pings[0].channels[0].frequency_hz == 455_000
+    # More than six channels extend the file header.
+    put(raw, 166, "H", 7)
+    assert len(read(tmp_path, raw[:HEADER] + bytes(1024) + raw[HEADER:]).pings) == 5
 
 
 def test_index_file_of_pyxtf_is_not_loaded(tmp_path, raw):
@@ -364,18 +350,14 @@ def test_projected_coordinates_require_crs(raw, tmp_path):
     for wrong in ("EPSG:4326", "EPSG:999999", "nonsense", "EPSG:2225"):  # degrees, unknown, invalid, US feet
         with pytest.raises(ValidationError, match="projected_crs"):
             read(tmp_path, raw, projected_crs=wrong)
-    in_every_ping(raw, 160, "dd", 1e30, 1e30)
-    survey = read(tmp_path, raw, projected_crs="EPSG:32619")
-    assert survey.warnings == ("no position fix in 5 of 5 pings, the first in row 0",)
-
-
-def test_nav_units_decide_not_coordinate_values(raw, tmp_path):
-    """A local grid with small coordinates: only NavUnits determines the unit."""
-    struct.pack_into("<H", raw, 164, 0)
+    # A local grid with small coordinates: only NavUnits determines the unit.
     in_every_ping(raw, 160, "dd", 48.4, -68.8)
     assert all(p.lat_deg is None for p in read(tmp_path, raw))
     metres = read(tmp_path, raw, projected_crs="+proj=utm +zone=19 +datum=WGS84 +units=m")
     assert all(abs(p.lat_deg) < 1 for p in metres)
+    in_every_ping(raw, 160, "dd", 1e30, 1e30)
+    survey = read(tmp_path, raw, projected_crs="EPSG:32619")
+    assert survey.warnings == ("no position fix in 5 of 5 pings, the first in row 0",)
 
 
 @pytest.mark.parametrize(("source", "other", "offset"), [("sensor", "ship", 160), ("ship", "sensor", 128)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -53,22 +52,7 @@ def test_written_survey_is_read_back_and_by_pyxtf(small_survey, tmp_path, dtype)
         assert got.get_time() == np.datetime64(round(want.time_utc_s * 100) * 10, "ms")
         assert got.SensorYcoordinate == want.lat_deg
         assert got.NumBytesThisRecord % 64 == 0
-
-
-def test_golden_bytes_of_ping(tmp_path):
-    port = ChannelPing(Side.PORT, np.array([1, 2, 3], np.uint16), 30.0, 600_000.0)
-    ping = Ping(7, 1_378_847_588.13, (port,), lat_deg=48.5, lon_deg=-68.5, heading_deg=0.0)
-    write_xtf(Survey(Path("x"), "HDS", "x", (ping,)), tmp_path / "x.xtf")
-    raw = (tmp_path / "x.xtf").read_bytes()
-    assert raw[0] == 0x7B
-    assert raw[256:260] == b"\x01\x00\x01\x00"  # port, sub-channel 0, slant range
-    packet = raw[1024:]
-    assert len(packet) == 384  # 256 + 64 + 6, padded to 64
-    assert packet[:14] == bytes.fromhex("cefa 00 00 0100 00000000 80010000")
-    assert packet[14:22] == bytes.fromhex("dd07 09 0a 15 0d 08 0d")  # 2013-09-10 21:13:08.13
-    assert packet[22:24] == bytes.fromhex("fd00")  # day 253 of the year
-    assert packet[28:32] == bytes.fromhex("07000000")
-    assert packet[320:326] == bytes.fromhex("0300 0200 0100")  # farthest first
+        assert (got.MagicNumber, got.NumChansToFollow, got.PingNumber) == (0xFACE, 2, want.number)
 
 
 def test_missing_navigation_is_read_as_none(small_survey, tmp_path):
@@ -115,17 +99,10 @@ def test_any_ping_is_read_back(tmp_path_factory, lat, lon, heading, altitude, ti
     assert_same(read_survey(path), survey)
 
 
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"sonar_id": "a name longer than the field"}, "sonar_id"),
-        ({"sonar_id": "söder"}, "sonar_id"),
-        ({"pings": ()}, "channels"),
-    ],
-)
-def test_survey_outside_format_is_rejected(small_survey, tmp_path, change, field):
-    with pytest.raises(SurveyFileError, match=field):
-        write_xtf(dataclasses.replace(small_survey(), **change), tmp_path / "a.xtf")
+def test_survey_outside_format_is_rejected(small_survey, tmp_path):
+    for change in ({"sonar_id": "a name longer than the field"}, {"sonar_id": "söder"}, {"pings": ()}):
+        with pytest.raises(SurveyFileError, match="channels" if "pings" in change else "sonar_id"):
+            write_xtf(dataclasses.replace(small_survey(), **change), tmp_path / "a.xtf")
     assert not list(tmp_path.iterdir())
 
 
