@@ -41,7 +41,9 @@ class Clock:
         return [(each.start_utc_s, each.end_utc_s) for each in self.log.transmissions]
 
 
-clock = pytest.fixture(Clock)
+@pytest.fixture
+def clock():
+    return Clock()
 
 
 def test_the_nominal_air_time_is_replaced_by_the_measured_one(clock):
