@@ -107,10 +107,12 @@ def test_records_queued_before_the_consumer_exists_arrive_once_urgent_first_and_
     assert consumer.got == ["d99", *(f"d{n}" for n in range(50))]
     # Counted at the commit, which can follow the producer's removal of the last record.
     eventually(lambda: consumer.health().counters["records_handled"] == 51)
-    # Subscribers receive each record with its number, and another origin than the consumer.
-    eventually(lambda: len(seen) == 51)
+    # Subscribers receive each record once with its number, and another origin than the consumer.
+    producer.send(KEY, "consumer", decision_record("d-last"))
+    eventually(lambda: 52 in {attached["seq"] for _, attached in seen})
+    assert len(seen) == 52
     found = {attached["seq"]: msgpack.unpackb(payload)["decision_id"] for payload, attached in seen}
-    assert found == {**{n + 1: f"d{n}" for n in range(50)}, 51: "d99"}
+    assert found == {**{n + 1: f"d{n}" for n in range(50)}, 51: "d99", 52: "d-last"}
     (origin,) = producer.store._query("SELECT origin FROM outbox_next")[0]
     assert {attached["origin"] for _, attached in seen} == {hashlib.sha256(b"watcher" + origin).digest()[:16]}
 
