@@ -25,11 +25,6 @@ from sonarpost.sonar.survey import Side
 SETTINGS = DetectorSettings()
 
 
-def classified(survey):
-    grid = normalise_side(survey, Side.PORT, SETTINGS)
-    return grid, classified_candidates(matched_response(grid, SETTINGS), grid, SETTINGS, default_classifier())
-
-
 def candidate(row, cell, p_mine_like, score=5.0):
     return Candidate(Peak(row, cell, score, 4, 6), p_mine_like, 0.5 * (1 - p_mine_like))
 
@@ -48,11 +43,12 @@ def test_measured_extent_matches_object(make_survey):
 
 
 def test_object_has_the_greatest_probability_of_a_mine(make_survey):
-    _, found = classified(make_survey({}))
+    grid = normalise_side(make_survey({}), Side.PORT, SETTINGS)
+    found = classified_candidates(matched_response(grid, SETTINGS), grid, SETTINGS, default_classifier())
     best = max(found, key=lambda c: c.confidence)
     assert best.confidence > 1.0
     assert abs(best.peak.row - 100) <= 20
-    (placed,) = distinct_candidates(found, normalise_side(make_survey({}), Side.PORT, SETTINGS), SETTINGS, 0.5)
+    (placed,) = distinct_candidates(found, grid, SETTINGS, 0.5)
     assert abs(placed.measurement.row - 100) <= 4
     assert abs(2 * placed.measurement.cell - 250) <= 10
     assert all(0 <= c.p_mine_like <= 1 and 0 <= c.p_mine_like + c.p_other_object <= 1 + 1e-6 for c in found)
@@ -61,16 +57,12 @@ def test_object_has_the_greatest_probability_of_a_mine(make_survey):
     assert max(c.confidence for c in elsewhere) < 0.5 * best.confidence
 
 
-def test_seabed_without_response_has_no_candidates(make_survey):
-    grid = normalise_side(make_survey({}), Side.PORT, SETTINGS)
-    flat = replace(grid, level=np.zeros_like(grid.level))
-    assert classified_candidates(matched_response(flat, SETTINGS), flat, SETTINGS, default_classifier()) == []
-    assert distinct_candidates([], grid, SETTINGS, 0.1) == []
-
-
 def test_number_of_candidates_is_limited_by_length(make_survey, monkeypatch):
     monkeypatch.setattr("sonarpost.detection.candidates._MAX_PER_1000_PINGS", 100)
     grid = normalise_side(make_survey(), Side.PORT, SETTINGS)
+    flat = replace(grid, level=np.zeros_like(grid.level))
+    assert classified_candidates(matched_response(flat, SETTINGS), flat, SETTINGS, default_classifier()) == []
+    assert distinct_candidates([], grid, SETTINGS, 0.1) == []
     response = matched_response(grid, SETTINGS)
     many = candidate_peaks(response, grid, SETTINGS.model_copy(update={"min_matched_response": 1e-6}))
     assert len(many) == 100
@@ -83,9 +75,7 @@ def test_most_confident_candidate_suppresses_its_neighbours(make_survey):
     kept = distinct_candidates([one, near, far], grid, SETTINGS, 0.1)
     assert [placed.candidate for placed in kept] == [far, one]
     assert [placed.candidate for placed in distinct_candidates([one, near, far], grid, SETTINGS, 1.3)] == [far]
-
-
-def test_candidate_in_the_shadow_of_another_is_the_same_object(make_survey):
+    # A candidate in the shadow of another is the same object.
     grid = normalise_side(make_survey({"shadow_samples": 150}), Side.PORT, SETTINGS)
     kept = distinct_candidates([candidate(100, 125, 0.9), candidate(100, 190, 0.7)], grid, SETTINGS, 0.1)
     assert [placed.candidate.p_mine_like for placed in kept] == [0.9]

@@ -64,9 +64,7 @@ def test_unknown_cells_count_as_unknown_and_do_not_change_the_mean():
     assert plane.known[100, 60:200].min() > 0.99
     np.testing.assert_allclose(plane.level[100], whole.level[100], atol=1e-6)
     assert np.isfinite(plane.level).all()
-
-
-def test_image_is_resampled_without_projection():
+    # An image is resampled without projection.
     level = np.zeros((100, 200), np.float32)
     level[40:60, 100:120] = 1.0
     plane = ground_plane(grid_of(level, cell_m=0.05, row_m=0.05))

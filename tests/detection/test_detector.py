@@ -149,14 +149,8 @@ def test_scotsman_gives_wreck_and_small_objects_to_port(data_dir):
     assert [d for d in on_wreck if d.atd_class != STRUCTURE] == []
     # Small objects with a shadow to port.
     for ping, sample in ((313, 945), (356, 283)):
-        assert [
-            d
-            for d in found
-            if d.side is Side.PORT
-            and abs(d.ping_index - ping) <= 4
-            and abs(d.sample - sample) <= 15
-            and d.atd_class == MINE_LIKE
-        ], (ping, sample)
+        near = [d for d in found if abs(d.ping_index - ping) <= 4 and abs(d.sample - sample) <= 15]
+        assert [d for d in near if d.side is Side.PORT and d.atd_class == MINE_LIKE], (ping, sample)
     for d in found:
         snippet = cut_snippet(survey, d)
         assert snippet.image.shape == (100, 100)

@@ -35,13 +35,8 @@ pytestmark = pytest.mark.usefixtures("few_candidates")
 
 ROW_M, CELL_M = 0.1, 0.06
 ROWS, CELLS = 500, 450
-MODEL = {
-    "thresholds": [0.1, 1.9],
-    "offsets": [8.0, 4.0],
-    "clutter_weight": 1.0,
-    "contrast_weight": 2.0,
-    "ripple_weight": 1.0,
-}
+MODEL = {"thresholds": [0.1, 1.9], "offsets": [8.0, 4.0]}
+MODEL |= {"clutter_weight": 1.0, "contrast_weight": 2.0, "ripple_weight": 1.0}
 
 
 def grid_of(level, row_m=ROW_M, cell_m=CELL_M):
@@ -124,13 +119,7 @@ def test_too_little_known_seabed_has_no_difficulty():
     assert seabed_difficulty(grid_of(scattered), [], 1.0) is None, "no tile"
 
 
-@given(
-    clutter=st.floats(0, 500),
-    ripples=st.floats(0, 1),
-    contrast=st.floats(0, 4),
-    threshold=st.floats(0, 2),
-    step=st.floats(0, 1),
-)
+@given(st.floats(0, 500), st.floats(0, 1), st.floats(0, 4), st.floats(0, 2), st.floats(0, 1))
 def test_expected_pd_never_increases_with_difficulty_or_threshold(clutter, ripples, contrast, threshold, step):
     model = default_pd_model()
     at = model.expected_pd(clutter, ripples, contrast, threshold)

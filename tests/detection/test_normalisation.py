@@ -44,7 +44,7 @@ def test_cell_and_row_lengths(make_survey):
     assert unknown.row_along_m == SETTINGS.assumed_row_along_m
 
 
-def test_missing_channel_and_short_ping_are_unknown(make_survey):
+def test_missing_channel_and_short_ping_are_unknown_and_a_spike_is_removed(make_survey):
     survey = make_survey()
     pings = list(survey.pings)
     pings[50] = replace(pings[50], channels=())
@@ -55,30 +55,20 @@ def test_missing_channel_and_short_ping_are_unknown(make_survey):
     assert np.isnan(grid.level[60, 150:]).all()
     assert np.isfinite(grid.level[60, 100:148]).all()
     assert np.isfinite(grid.level[[49, 51, 59, 61], 100:]).all()
-
-
-def test_single_spike_is_removed(make_survey):
-    survey = make_survey()
+    # A single spike is removed.
     samples = survey.pings[80].channel(Side.PORT).samples
     samples[301] = 65535
     spiked = normalise_side(survey, Side.PORT, SETTINGS)
     assert spiked.level[80, 150] < 2.0
 
 
-@pytest.mark.parametrize(
-    "channels",
-    [
-        (),
-        (ChannelPing(Side.STARBOARD, np.full(200, 9, np.uint8), 20.0),),
-        (ChannelPing(Side.PORT, np.zeros(200, np.uint8), 20.0),),
-        (ChannelPing(Side.PORT, np.zeros(0, np.uint8), 20.0),),
-        (ChannelPing(Side.PORT, np.full(8, 9, np.uint8), 20.0),),
-        (ChannelPing(Side.PORT, np.full(200, 9, np.uint8), 0.0),),
-    ],
-)
-def test_unusable_side_is_none(channels):
-    survey = Survey(Path("x"), "x", "x", tuple(Ping(i, float(i), channels, altitude_m=2.0) for i in range(20)))
-    assert normalise_side(survey, Side.PORT, SETTINGS) is None
+def test_unusable_side_is_none():
+    nines = np.full(200, 9, np.uint8)
+    port = ((nines * 0, 20.0), (nines[:0], 20.0), (nines[:8], 20.0), (nines, 0.0))
+    unusable = (ChannelPing(Side.STARBOARD, nines, 20.0), *(ChannelPing(Side.PORT, *each) for each in port))
+    for channels in ((), *((channel,) for channel in unusable)):
+        survey = Survey(Path("x"), "x", "x", tuple(Ping(i, float(i), channels, altitude_m=2.0) for i in range(20)))
+        assert normalise_side(survey, Side.PORT, SETTINGS) is None
 
 
 def test_invalid_settings_are_rejected():

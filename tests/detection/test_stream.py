@@ -67,9 +67,8 @@ def test_target_at_file_boundary_is_detected_once(one_object, boundary):
     assert detection.sample == pytest.approx(expected.sample, abs=4)
     assert detection.length_m == pytest.approx(expected.length_m, abs=0.3)
     assert detection.confidence == pytest.approx(expected.confidence, abs=0.01), "the joined pings are the same"
-    assert found.origin.file.contact_id(detection) == (
-        f"{found.origin.file.source[0]}-{found.origin.file.source[0]}-{number}-{detection.side}-{detection.sample}"
-    )
+    line = found.origin.file.source[0]
+    assert found.origin.file.contact_id(detection) == f"{line}-{line}-{number}-{detection.side}-{detection.sample}"
 
 
 def test_every_contact_of_a_line_is_returned_once(make_survey):
@@ -161,14 +160,8 @@ def test_limit_applies_to_each_file_with_held_contacts(make_survey):
     assert sorted(d.ping_index for d in given) == sorted(d.ping_index for d in best)
 
 
-@pytest.mark.parametrize(
-    ("seen", "reported", "count"),
-    [
-        pytest.param(None, False, 1, id="the part in the first file is not detected"),
-        pytest.param((40, 60), False, 0, id="the first file shows it whole"),
-        pytest.param(None, True, 0, id="the part in the first file is reported"),
-    ],
-)
+# The part in the first file is not detected; the first file shows it whole; the part in the first file is reported.
+@pytest.mark.parametrize(("seen", "reported", "count"), [(None, False, 1), ((40, 60), False, 0), (None, True, 0)])
 def test_object_that_ends_beyond_a_file_is_taken_from_the_next(one_object, monkeypatch, seen, reported, count):
     survey, one = one_object
     rows = seen or (40, 130)
@@ -240,36 +233,27 @@ def visible_objects(template, objects):
             begin, end = max(row - HALF_ROWS, first), min(row + HALF_ROWS, last + 1)
             if begin < end:
                 centre = (begin + end) // 2 + (row + first + 3 * last) % 5 - 2
-                found.append(
-                    replace(
-                        template,
-                        side=side,
-                        ping_index=min(max(centre, first), last) - first,
-                        highlight_pings=(begin - first, end - first),
-                    )
-                )
+                index = min(max(centre, first), last) - first
+                rows = (begin - first, end - first)
+                found.append(replace(template, side=side, ping_index=index, highlight_pings=rows))
         return SearchResult(tuple(found), {})
 
     return search
 
 
 @given(
-    rows=st.integers(60, 700),
-    spacing=st.integers(38, 90),
-    first=st.integers(0, 80),
+    line=st.tuples(st.integers(60, 700), st.integers(38, 90), st.integers(0, 80)),
     boundaries=st.sets(st.integers(1, 699), max_size=8),
     overlap=st.integers(36, 120),
     strip=st.integers(50, 400),
     restored=st.booleans(),
 )
-def test_each_object_is_given_once_for_any_division(
-    template, rows, spacing, first, boundaries, overlap, strip, restored
-):
+def test_each_object_is_given_once_for_any_division(template, line, boundaries, overlap, strip, restored):
+    rows, spacing, first = line
     objects = [(row, list(Side)[row % 2]) for row in range(first, rows, spacing)]
     channels = (ChannelPing(Side.PORT, np.zeros(4, np.uint8), 20.0),)
     pings = tuple(Ping(row, 0.1 * row, channels) for row in range(rows))
-    line = Survey(Path("x.xtf"), "x", "x", pings)
-    files = split(line, *sorted(row for row in boundaries if row < rows))
+    files = split(Survey(Path("x.xtf"), "x", "x", pings), *sorted(row for row in boundaries if row < rows))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stream, "STRIP_PINGS", strip)
         patch.setattr(stream, "search", visible_objects(template, objects))

@@ -7,8 +7,6 @@ import socket
 import ssl
 import struct
 import threading
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 from builders.common import eventually, free_port
@@ -24,7 +22,7 @@ STREAM = b'<event uid="a"/>\n<event uid="b"/>\n'
 class Server:
     """Listener of a TAK server: stores the data of each connection, and optionally sends a greeting."""
 
-    def __init__(self, context: ssl.SSLContext | None = None, port: int = 0, greeting: bytes = b"") -> None:
+    def __init__(self, context=None, port=0, greeting=b""):
         self.received: list[bytearray] = []
         self.ended: list[bool] = []
         self.connections: list[socket.socket] = []
@@ -35,7 +33,7 @@ class Server:
         self._thread = threading.Thread(target=self._accept, daemon=True)
         self._thread.start()
 
-    def _accept(self) -> None:
+    def _accept(self):
         while True:
             try:
                 connection = self._listener.accept()[0]
@@ -52,7 +50,7 @@ class Server:
             self.connections.append(connection)
             threading.Thread(target=self._read, args=(connection, len(self.received) - 1), daemon=True).start()
 
-    def _read(self, connection: socket.socket, number: int) -> None:
+    def _read(self, connection, number):
         try:
             while data := connection.recv(65536):
                 self.received[number] += data
@@ -61,14 +59,14 @@ class Server:
         self.ended[number] = True
         connection.close()
 
-    def reset(self) -> None:
+    def reset(self):
         """Reset the newest connection, as a killed process does."""
         connection = self.connections[-1]
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         connection.shutdown(socket.SHUT_RDWR)
         connection.close()
 
-    def close(self) -> None:
+    def close(self):
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         for connection in self.connections:
@@ -77,7 +75,7 @@ class Server:
 
 
 @pytest.fixture
-def serve() -> Iterator[Callable[..., Server]]:
+def serve():
     servers: list[Server] = []
 
     def make(*args, **options):
@@ -89,7 +87,7 @@ def serve() -> Iterator[Callable[..., Server]]:
         server.close()
 
 
-def gives_up(_: float) -> bool:
+def gives_up(_):
     return True
 
 
@@ -163,7 +161,7 @@ def test_batch_is_sent_when_the_server_starts_later():
 def test_pauses_increase_until_the_time_limit():
     port, now, pauses = free_port(), [0.0], []
 
-    def wait(timeout: float) -> bool:
+    def wait(timeout):
         pauses.append(timeout)
         now[0] += timeout
         return False
@@ -187,24 +185,20 @@ def test_each_datagram_holds_one_event():
         sender.send([b"x" * 65_001])
 
 
-CertificateMaker = Callable[[str], TlsFiles]
-
-
 @pytest.fixture
-def issue(tmp_path: Path) -> CertificateMaker:
+def issue(tmp_path):
     """Issues certificates of a new authority."""
     fleet = Fleet.init(tmp_path / "pki", "test")
 
-    def make(name: str) -> TlsFiles:
+    def make(name):
         folder = fleet.issue(name, "vessel", hosts=("127.0.0.1",)).folder
         return TlsFiles(folder / CA_CERTIFICATE, folder / CERTIFICATE, folder / KEY)
 
     return make
 
 
-def server_context(files: TlsFiles) -> ssl.SSLContext:
+def server_context(files):
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    assert files.certificate is not None
     context.load_cert_chain(files.certificate, files.key)
     context.load_verify_locations(files.ca)
     context.verify_mode = ssl.CERT_REQUIRED

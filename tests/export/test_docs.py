@@ -21,7 +21,7 @@ def test_example_runs(tmp_path, monkeypatch, capsys):
     received = bytearray()
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
-        def receive() -> None:
+        def receive():
             connection = listener.accept()[0]
             with connection:
                 while data := connection.recv(65536):

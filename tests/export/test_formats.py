@@ -34,7 +34,7 @@ from sonarpost.export.tables import (
     write_geojson,
 )
 from sonarpost.export.text import csv_text, html_text, probabilities_text, xml_text
-from sonarpost.messages import Decision, Pixels
+from sonarpost.messages import Pixels
 from sonarpost.review.measured_size import MeasuredSize
 
 GOLDEN = GOLDEN_FOLDER / "export"
@@ -43,18 +43,18 @@ NOW_UTC_S = FIRST_UTC_S + 3600
 
 
 @pytest.fixture(scope="module")
-def schema() -> xmlschema.XMLSchema:
+def schema():
     return xmlschema.XMLSchema(Path(__file__).with_name("cot_event.xsd"))
 
 
 @pytest.fixture
-def contacts(tmp_path: Path) -> ContactSet:
+def contacts(tmp_path):
     return load_contacts(mission(tmp_path / "out"))
 
 
-def single(record: object, *decisions: Decision) -> ContactSet:
+def single(record, *decisions):
     """One contact without files."""
-    side = SideCar.model_validate_json(json.dumps(side_car(record)))  # type: ignore[arg-type]
+    side = SideCar.model_validate_json(json.dumps(side_car(record)))
     return ContactSet((ExportContact(side, decisions, None),), (), ())
 
 
@@ -127,7 +127,7 @@ def test_every_export_states_the_measurements_of_operators():
     measured = {"length_m": 1.2345, "length_sigma_m": 0.06, "height_m": 0.5, "height_sigma_m": 0.125}
     (contact,) = single(image(contact={"length_m": 2.5})).contacts
     contacts = ContactSet((dataclasses.replace(contact, size=MeasuredSize(**measured)),), (), ())
-    properties = geojson(contacts)["features"][0]["properties"]  # type: ignore[index]
+    properties = geojson(contacts)["features"][0]["properties"]
     assert (properties["length_m"], properties["measured_length_m"]) == (2.5, 1.234)
     assert (properties["measured_height_sigma_m"], properties["measured_width_m"]) == (0.125, None)
     assert csv_bytes(contacts).endswith(b",1.234,0.06,,,,,0.5,0.125\r\n")
@@ -233,7 +233,6 @@ def test_kmz_contains_all_referenced_files(contacts):
 
 def test_unreadable_image_is_omitted_from_kmz(contacts):
     path = contacts.contacts[0].image_path
-    assert path is not None
     path.write_bytes(b"no PNG")
     data, problems = kmz_bytes(contacts)
     assert [p.where for p in problems] == [str(path)]
@@ -253,7 +252,6 @@ def test_overlay_orientation(tmp_path, channel, heading_deg, corner, rotation):
     archive, picture = kmz_of(tmp_path, record)
     assert np.asarray(picture("overlays"))[corner] == 255
     box = ET.fromstring(archive.read("doc.kml")).find(f".//{KML}LatLonBox")
-    assert box is not None
     north, south, east, west, turn = (float(element.text or "") for element in box)
     assert turn == rotation
     # 16 rows of 0.25 m, 24 columns of 0.125 m.
@@ -318,10 +316,9 @@ def test_only_a_decision_gives_a_mine_type():
         assert cot_type(contact, CotOptions(mine_affiliation="h")) == expected.replace("a-s-", "a-h-")
 
 
-def attributes(event: bytes) -> tuple[dict[str, str], dict[str, str], str]:
+def attributes(event):
     root = ET.fromstring(event)
     point = root.find("point")
-    assert point is not None
     return dict(root.attrib), dict(point.attrib), root.findtext("detail/remarks") or ""
 
 

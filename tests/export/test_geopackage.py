@@ -58,7 +58,7 @@ def test_full_disk_leaves_the_former_file(tmp_path, monkeypatch):
     path = tmp_path / "contacts.gpkg"
     path.write_bytes(b"former")
 
-    def full(*_: object) -> bytes:
+    def full(*_):
         raise sqlite3.OperationalError("database or disk is full")
 
     monkeypatch.setattr("sonarpost.export.geopackage._point", full)

@@ -7,7 +7,6 @@ import contextlib
 import io
 import json
 import struct
-from pathlib import Path
 
 import jsonschema
 import pytest
@@ -40,7 +39,7 @@ ENCODING = wire.encoding_of(ReconstructedImage)
 TIME_NS = 1_700_000_000_123_456_789
 
 
-def samples() -> list[RecordedMessage]:
+def samples():
     records = [(IMAGE_KEY, image(f"{n:04}")) for n in range(5)]
     found = [RecordedMessage(key, ENCODING, wire.encode(r), TIME_NS + n) for n, (key, r) in enumerate(records)]
     verdict = RecordedMessage(
@@ -49,7 +48,7 @@ def samples() -> list[RecordedMessage]:
     return [*found, verdict, RecordedMessage("sonarpost/v1/uuv-1/own/key", "text/plain", b"x" * 40_000, TIME_NS + 10)]
 
 
-def written(path: Path) -> Path:
+def written(path):
     recording = McapRecording(path)
     for message in samples():
         assert recording.write(message.key, message.encoding, message.payload, message.time_ns)
@@ -64,12 +63,9 @@ def test_mcap_library_reads_channels_schemas_and_index(tmp_path):
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
         found = list(reader.iter_messages(topics=[IMAGE_KEY]))
-    assert summary is not None
-    assert summary.statistics is not None
     assert summary.statistics.message_count == 8
     assert len(summary.chunk_indexes) >= 1
     schema, channel, message = found[0]
-    assert schema is not None
     assert (schema.name, schema.encoding) == ("sonarpost.reconstructed_image.v1", "jsonschema")
     jsonschema.Draft202012Validator.check_schema(json.loads(schema.data))
     assert (channel.message_encoding, message.log_time) == ("msgpack", TIME_NS)
@@ -117,7 +113,7 @@ def test_channels_are_limited(tmp_path, monkeypatch):
         list(read_messages(path))
 
 
-def other_writer(path: Path, compression: CompressionType, channels: int = 1) -> Path:
+def other_writer(path, compression, channels=1):
     """A file of another program: no metadata, one large chunk."""
     with path.open("wb") as file:
         writer = Writer(file, compression=compression)
@@ -189,7 +185,6 @@ def test_damaged_file_gives_messages_or_the_documented_error(tmp_path, at, junk)
 def test_derived_messages_match_their_schemas(tmp_path):
     record = image()
     fix = location_fix(record, TIME_NS)
-    assert fix is not None
     picture = compressed_image(record, TIME_NS)
     contacts = load_contacts(mission(tmp_path / "out")).contacts
     document = contact_map(contacts)
@@ -217,7 +212,6 @@ def test_live_contacts_equal_those_of_the_archive(tmp_path):
     again = image("0002", {"lat_deg": 41.5261}, version=2, notes=("a note",))
     assert live.add(again) is None  # repeated
     newer = live.add(again.model_copy(update={"version": 3}))
-    assert newer is not None
     assert (newer.image.version, newer.review) == (3, "mine_like")
 
 
@@ -225,10 +219,8 @@ def test_live_contacts_are_limited_and_join_early_decisions():
     live = LiveContacts(max_names=2)
     assert live.add(decision("0001")) is None
     joined = live.add(image("0001"))
-    assert joined is not None
     assert joined.review == "mine_like"
     changed = live.add(decision("0001", decision_id="d-2", verdict="not_mine_like", operator="B"))
-    assert changed is not None
     assert changed.review == "disputed"
     live.add(image("0002"))
     live.add(image("0003"))

@@ -13,7 +13,7 @@ from sonarpost.export.live import LiveContacts
 from sonarpost.export.reports import caris_text, mine_report, write_caris_text, write_mine_report
 
 
-def one(**changes: object) -> ContactSet:
+def one(**changes):
     live = LiveContacts()
     live.add(image("00A7"))
     found = live.add(decision("00A7", **changes))
@@ -21,14 +21,11 @@ def one(**changes: object) -> ContactSet:
     return ContactSet((found,), (), ())
 
 
-def test_caris_line():
+def test_caris_lines_have_one_form(tmp_path):
     assert caris_text(one(remark="a,b")) == (
         "0000,uuv-1   0367,0000,0367,10/12/2016,08:59:50.5,ATD,10/12/2016,09:10:01.2,A. ,0000,20.50,"
         "41.5251334,-70.6712456,uuv-1/00A7 mine_like a;b\n"
     )
-
-
-def test_caris_lines_have_one_form(tmp_path):
     contacts = load_contacts(mission(tmp_path / "out"))
     write_caris_text(tmp_path / "a.caris.txt", contacts)
     rows = [line.split(",") for line in (tmp_path / "a.caris.txt").read_text().splitlines()]

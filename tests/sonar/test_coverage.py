@@ -70,6 +70,9 @@ def test_gap_ends_a_polygon_and_a_ping_without_position_does_not(tmp_path):
     coverage = survey_coverage([path])
     assert [(p.first_ping, p.last_ping) for p in coverage.polygons] == [(0, 39), (90, 119)]
     assert (coverage.pings, coverage.left_out) == (69, 1)
+    bare = tuple(replace(ping, heading_deg=None) for ping in pings)
+    with pytest.raises(SurveyFileError, match="position, heading and altitude"):
+        survey_coverage([make_xtf(replace(survey, pings=bare), tmp_path)])
 
 
 def polygons_of_turn(folder, radius_m):
@@ -161,13 +164,6 @@ def test_ogr_reads_the_same_polygons_from_both_files(tmp_path):
         assert len(got_ring) == len(want_ring)
         for point, other in zip(got_ring, want_ring, strict=True):
             assert point == pytest.approx(other, abs=2e-8)
-
-
-def test_recording_without_navigation_is_rejected(tmp_path):
-    survey = line()
-    bare = tuple(replace(ping, heading_deg=None) for ping in survey.pings)
-    with pytest.raises(SurveyFileError, match="position, heading and altitude"):
-        survey_coverage([make_xtf(replace(survey, pings=bare), tmp_path)])
 
 
 def test_commands_write_the_format_of_the_suffix(tmp_path, capsys):

@@ -52,19 +52,19 @@ def test_ground_range_assumes_flat_seabed():
     assert np.isnan(slant_to_ground_range_m(2.9, 3.0))
 
 
-@given(ground=st.floats(0, 500), altitude=st.floats(0.1, 100))
+@given(st.floats(0, 500), st.floats(0.1, 100))
 def test_slant_and_ground_range_conversions_are_inverse(ground, altitude):
     back = slant_to_ground_range_m(ground_to_slant_range_m(ground, altitude), altitude)
     # Near nadir the ground range is very sensitive to the slant range.
     assert np.nan_to_num(back) == pytest.approx(ground, abs=1e-5)
 
 
-def sample_position(ping: Ping, side: Side, sample_index: float, **changes: float) -> Position | None:
+def sample_position(ping, side, sample_index, **changes):
     found = georeference(ping, side, sample_index, SurveyOptions(), **changes)
     return None if found is None else found.position
 
 
-def ping_at(heading_deg: float | None, **changes: object) -> Ping:
+def ping_at(heading_deg, **changes):
     channels = tuple(ChannelPing(side, np.zeros(100, np.uint8), 50.0) for side in Side)
     ping = Ping(1, 0.0, channels, lat_deg=60.0, lon_deg=10.0, heading_deg=heading_deg, altitude_m=12.25)
     return dataclasses.replace(ping, **changes)
@@ -93,7 +93,7 @@ def test_no_position_without_navigation_or_the_channel_or_in_the_water_column():
     assert sample_position(ping_at(0, channels=()), Side.PORT, 60) is None
 
 
-def straight_line(step_m: float, count: int, digits: int = 12, **changes: object) -> Survey:
+def straight_line(step_m, count, digits=12, **changes):
     origin = Position(48.0, -68.0)
     places = (offset_position(origin, 30.0, row * step_m) for row in range(count))
     fixes = ((round(place.lat_deg, digits), round(place.lon_deg, digits)) for place in places)
@@ -148,13 +148,13 @@ FINE = 6000
 """Number of samples with which the sample spacing is negligible."""
 
 
-def accurate_ping(**changes) -> Ping:
+def accurate_ping(**changes):
     channels = tuple(ChannelPing(side, np.zeros(FINE, np.uint8), 60.0) for side in Side)
     complete = Ping(1, 0.0, channels, 60.0, 10.0, heading_deg=30.0, altitude_m=12.0, speed_mps=1.5)
     return dataclasses.replace(complete, **changes)
 
 
-def only_errors(**errors) -> SurveyOptions:
+def only_errors(**errors):
     return SurveyOptions(errors=ErrorBudget(**{**NO_ERRORS, **errors}))
 
 

@@ -11,7 +11,7 @@ from sonarpost.sonar.ground_range import beam_normalised, ground_range_image, in
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 
-def survey_of(rows: np.ndarray, range_m: float = 50.0, scale: float = 1.0) -> Survey:
+def survey_of(rows, range_m=50.0, scale=1.0):
     pings = tuple(Ping(i, i * 0.1, (ChannelPing(Side.PORT, row, range_m, scale=scale),)) for i, row in enumerate(rows))
     return Survey(Path("x"), "x", "x", pings)
 

@@ -27,7 +27,7 @@ def sides(survey):
     return ["".join(c.side.value[0] for c in ping.channels) for ping in survey]
 
 
-def profile(number=1, clock_ms=1_000_000, channel=0, **values):
+def profile(number=1, clock_ms=1000000, channel=0, **values):
     return svlog_profile(number, clock_ms, channel, RESULTS, **values)
 
 

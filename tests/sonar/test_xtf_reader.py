@@ -35,18 +35,18 @@ CUT = "the file ends inside its last packet, as after a power failure: {} bytes 
 
 
 @pytest.fixture
-def raw(small_survey, tmp_path) -> bytearray:
+def raw(small_survey, tmp_path):
     write_xtf(small_survey(), tmp_path / "complete.xtf")
     return bytearray((tmp_path / "complete.xtf").read_bytes())
 
 
-def read(tmp_path, content: bytes, **options):
+def read(tmp_path, content, **options):
     path = tmp_path / "bad.xtf"
     path.write_bytes(content)
     return read_survey(path, SurveyOptions(**options))
 
 
-def put(raw: bytearray, offset: int, fmt: str, *values: float) -> bytearray:
+def put(raw, offset, fmt, *values):
     struct.pack_into("<" + fmt, raw, offset, *values)
     return raw
 
@@ -115,7 +115,7 @@ def test_samples_of_32_bits_are_kept_and_impossible_ones_become_zero(tmp_path, s
         assert survey.warnings == ("samples that are negative, not finite or above 1e+12 are read as 0 (2 times)",)
 
 
-def as_ground_range(raw: bytearray) -> bytearray:
+def as_ground_range(raw):
     for number in range(2):
         put(raw, CHAN_INFO + 128 * number + 2, "H", 2)
     return raw
@@ -266,13 +266,13 @@ def test_port_stored_nearest_first_is_reported(small_survey, tmp_path):
     assert "port looks stored nearest" in read_survey(tmp_path / "a.xtf").warnings[0]
 
 
-def in_every_ping(raw: bytearray, offset: int, fmt: str, *values: float) -> bytearray:
+def in_every_ping(raw, offset, fmt, *values):
     for row in range(5):
         struct.pack_into("<" + fmt, raw, HEADER + row * PACKET + offset, *values)
     return raw
 
 
-def attitude(time: tuple[int, ...], pitch: float, roll: float, heading: float) -> bytes:
+def attitude(time, pitch, roll, heading):
     year, month, day, hour, minute, second, millisecond = time
     body = struct.pack("<HBBHHHI", 0xFACE, 3, 0, 0, 0, 0, 64) + bytes(16)
     body += struct.pack("<ffffIf", pitch, roll, 0, 0, 0, heading)

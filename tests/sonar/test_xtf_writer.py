@@ -16,7 +16,7 @@ from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
 
-def assert_same(read: Survey, written: Survey) -> None:
+def assert_same(read, written):
     assert len(read.pings) == len(written.pings)
     for got, want in zip(read, written, strict=True):
         assert got.number == want.number
