@@ -18,13 +18,12 @@ from pathlib import Path
 import httpx2
 import pytest
 from builders.common import eventually
-from builders.console import PASSWORD, Browser, image_record
+from builders.console import PASSWORD, Browser, image_record, server_certificate, web_server
 from builders.records import decision_record
 
 from sonarpost.cli.main import main
 from sonarpost.config import TlsConfig
 from sonarpost.errors import ConfigError
-from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.console.store.users import FILE_NAME, Users
@@ -196,28 +195,18 @@ def test_training_sends_a_new_image_once(kind, console):
 
 @pytest.fixture
 def certificate(tmp_path):
-    folder = Fleet.init(tmp_path / "pki", "test").issue("vessel-1", "vessel", hosts=("127.0.0.1",)).folder
-    return TlsConfig(ca=folder / CA_CERTIFICATE, certificate=folder / CERTIFICATE, key=folder / KEY)
+    return server_certificate(tmp_path)
 
 
 def test_https_with_the_certificate_of_the_fleet(make_console, certificate):
     console = make_console(tls=True)
-    server = WebServer(console.app.asgi, "127.0.0.1", 0, certificate)
-    server.start()
-    try:
+    body = json.dumps({"user": "anna", "password": PASSWORD}).encode()
+    trusted = ssl.create_default_context(cafile=str(certificate.ca))
+    with web_server(console, certificate) as server:
         assert server.address.startswith("https://")
-        trusted = ssl.create_default_context(cafile=str(certificate.ca))
-        body = json.dumps({"user": "anna", "password": PASSWORD}).encode()
-
-        def login() -> dict[str, object]:
-            with urllib.request.urlopen(server.address + "api/login", body, timeout=10, context=trusted) as answer:
-                assert "Secure" in answer.headers["set-cookie"]
-                found: dict[str, object] = json.load(answer)
-                return found
-
-        assert login()["user"] == "anna"
-    finally:
-        server.stop()
+        with urllib.request.urlopen(server.address + "api/login", body, timeout=120, context=trusted) as answer:
+            assert "Secure" in answer.headers["set-cookie"]
+            assert json.load(answer)["user"] == "anna"
     eventually(lambda: not server.running, what="end of the server")
 
 

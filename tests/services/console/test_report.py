@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 import pytest
-from builders.console import image_record
+from builders.console import contact_id, image_record
 from starlette.testclient import TestClient
 
 from sonarpost.services.console.web import report_routes
 from sonarpost.services.console.web.report import degrees_minutes
 from sonarpost.services.console.web.server import ConsoleApp
 
-ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
-
-
-def test_contact_without_a_decision_has_no_rows_about_one(console):
-    console.state.store_image(image_record())
-    text = console.browser("anna").get(f"/report/{ID}").text
-    assert "<dt>Verdict</dt><dd>unreviewed</dd>" in text
-    assert "Decided" not in text
-    assert "TRAINING" not in text
+ID = contact_id()
 
 
 def test_verdict_is_in_words_and_a_withdrawal_names_its_operator(console):
     console.state.store_image(image_record())
     anna = console.browser("anna")
+    text = anna.get(f"/report/{ID}").text
+    assert "<dt>Verdict</dt><dd>unreviewed</dd>" in text
+    assert "Decided" not in text
+    assert "TRAINING" not in text
     decision = anna.decide(ID).json()["decision"]
     text = anna.get(f"/report/{ID}").text
     assert "<dt>Verdict</dt><dd>mine-like</dd>" in text
     assert "<dt>Confidence of the operator</dt><dd>80 %</dd>" in text
-    shown = {"version": 1, "sha256": anna.contact(ID)["versions"][-1]["sha256"], "layer": "raw"}
-    body = {"decision_id": decision["decision_id"], **shown}
-    assert anna.post(f"/api/contacts/{ID}/undo", body).status_code == 201
+    assert anna.undo(ID, decision["decision_id"]).status_code == 201
     text = anna.get(f"/report/{ID}").text
     assert "<dd>unreviewed (decision withdrawn by anna)</dd>" in text
     assert "mine_like" not in text
@@ -74,14 +68,8 @@ def test_target_sheets_are_those_of_the_filter_and_limited(console, monkeypatch)
     assert "more than 2 contacts" in answer.json()["error"]["message"]
 
 
-@pytest.mark.parametrize(
-    ("value_deg", "text"),
-    [
-        (-5.5125, "5° 30.7500\N{PRIME} W"),
-        (0.0, "0° 00.0000\N{PRIME} E"),
-        # Rounding carries into the degrees.
-        (9.9999999999, "10° 00.0000\N{PRIME} E"),
-    ],
-)
-def test_degrees_and_minutes(value_deg, text):
-    assert degrees_minutes(value_deg, "EW") == text
+def test_degrees_and_minutes():
+    assert degrees_minutes(-5.5125, "EW") == "5° 30.7500\N{PRIME} W"
+    assert degrees_minutes(0.0, "EW") == "0° 00.0000\N{PRIME} E"
+    # Rounding carries into the degrees.
+    assert degrees_minutes(9.9999999999, "EW") == "10° 00.0000\N{PRIME} E"

@@ -7,17 +7,13 @@ import shutil
 import socket
 import ssl
 import subprocess
-from collections.abc import Iterator
-from pathlib import Path
 
 import httpx2
 import pytest
 from builders.common import REPOSITORY, eventually, free_port
-from builders.console import Browser, EventReader, image_record
+from builders.console import Browser, EventReader, image_record, server_certificate, web_server
 
-from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
 from sonarpost.services.console.web.connections import ConnectionLimits, TrustedProxies
-from sonarpost.services.console.web.server import WebServer
 
 CONFIGURATION = REPOSITORY / "packaging" / "nginx" / "sonarpost-console.conf"
 NGINX = os.environ.get("SONARPOST_NGINX") or shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
@@ -28,10 +24,10 @@ needs_nginx = pytest.mark.skipif(NGINX is None, reason="no nginx: apt-get instal
 class Proxied:
     """A console behind nginx."""
 
-    def __init__(self, port: int, certificates: Path) -> None:
+    def __init__(self, port, certificate):
         self.port = port
         self.address = f"https://{PROXY}:{port}/"
-        self.tls = ssl.create_default_context(cafile=str(certificates / CA_CERTIFICATE))
+        self.tls = ssl.create_default_context(cafile=str(certificate.ca))
 
     def client(self, source: str = PROXY) -> httpx2.Client:
         transport = httpx2.HTTPTransport(local_address=source, verify=self.tls)
@@ -39,40 +35,38 @@ class Proxied:
 
 
 @pytest.fixture
-def proxied(make_console, tmp_path) -> Iterator[tuple[Proxied, object]]:
+def proxied(make_console, tmp_path):
     console = make_console(trusted_proxies=(PROXY,))
     limits = ConnectionLimits(TrustedProxies(console.state.config.trusted_proxies))
-    server = WebServer(console.app.asgi, "127.0.0.1", 0, limits=limits)
-    server.start()
     port = free_port()
-    certificates = Fleet.init(tmp_path / "pki", "test").issue("vessel-1", "vessel", hosts=(PROXY,)).folder
-    text = CONFIGURATION.read_text(encoding="utf-8")
-    for old, new in (
-        ("listen 443 ssl", f"listen {PROXY}:{port} ssl"),
-        ("server_name bridge.example", f"server_name {PROXY}"),
-        ("server 127.0.0.1:8470", f"server 127.0.0.1:{server.port}"),
-        ("/etc/sonarpost/tls/console.pem", str(certificates / CERTIFICATE)),
-        ("/etc/sonarpost/tls/console.key", str(certificates / KEY)),
-    ):
-        assert old in text
-        text = text.replace(old, new)
-    (tmp_path / "console.conf").write_text(text)
-    folders = "".join(
-        f"{kind}_temp_path {tmp_path}/{kind};\n" for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
-    )
-    (tmp_path / "nginx.conf").write_text(
-        f"daemon off; pid {tmp_path}/pid; error_log stderr warn; events {{ worker_connections 512; }}\n"
-        f"{'user root;' if os.geteuid() == 0 else ''}\n"
-        f"http {{ access_log off; {folders} include {tmp_path}/console.conf; }}\n"
-    )
-    words = [str(NGINX), "-e", "stderr", "-p", str(tmp_path), "-c", str(tmp_path / "nginx.conf")]
-    subprocess.run([*words, "-t"], check=True, timeout=400)
-    with subprocess.Popen(words) as process:
-        eventually(lambda: is_open(port), what="nginx")
-        yield Proxied(port, certificates), console
-        console.app.stop()
-        process.terminate()
-    server.stop()
+    with web_server(console, limits=limits) as server:
+        certificate = server_certificate(tmp_path)
+        text = CONFIGURATION.read_text(encoding="utf-8")
+        for old, new in (
+            ("listen 443 ssl", f"listen {PROXY}:{port} ssl"),
+            ("server_name bridge.example", f"server_name {PROXY}"),
+            ("server 127.0.0.1:8470", f"server 127.0.0.1:{server.port}"),
+            ("/etc/sonarpost/tls/console.pem", str(certificate.certificate)),
+            ("/etc/sonarpost/tls/console.key", str(certificate.key)),
+        ):
+            assert old in text
+            text = text.replace(old, new)
+        (tmp_path / "console.conf").write_text(text)
+        folders = "".join(
+            f"{kind}_temp_path {tmp_path}/{kind};\n" for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+        )
+        (tmp_path / "nginx.conf").write_text(
+            f"daemon off; pid {tmp_path}/pid; error_log stderr warn; events {{ worker_connections 512; }}\n"
+            f"{'user root;' if os.geteuid() == 0 else ''}\n"
+            f"http {{ access_log off; {folders} include {tmp_path}/console.conf; }}\n"
+        )
+        words = [str(NGINX), "-e", "stderr", "-p", str(tmp_path), "-c", str(tmp_path / "nginx.conf")]
+        subprocess.run([*words, "-t"], check=True, timeout=400)
+        with subprocess.Popen(words) as process:
+            eventually(lambda: is_open(port), what="nginx")
+            yield Proxied(port, certificate), console
+            console.app.stop()
+            process.terminate()
 
 
 def is_open(port: int) -> bool:

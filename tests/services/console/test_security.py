@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 
 import pytest
-from builders.console import PASSWORD, ROLES_OF_USERS, Browser, image_record
+from builders.console import PASSWORD, ROLES_OF_USERS, Browser, contact_id, image_record
 from starlette.testclient import TestClient
 
 from sonarpost.errors import BadInputError
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.users import Users
 
-ID = "sonarpost.vessel-1.uuv-1.20231114T221320Z.00A7"
+ID = contact_id()
 ONE = f"/api/contacts/{ID}"
 READ_PATHS = [
     "/api/session",
@@ -46,39 +46,39 @@ def with_contact(console):
     return console
 
 
-@pytest.mark.parametrize("path", READ_PATHS)
-def test_reading_needs_a_session(with_contact, path):
-    browser = with_contact.browser()
-    answer = browser.get(path)
-    assert answer.status_code == 401
-    assert answer.json()["error"]["code"] == "no_session"
-    browser.client.cookies.set("sonarpost_session", "x" * 43)
-    assert browser.get(path).status_code == 401
+def test_reading_needs_a_session(with_contact):
+    browser, invented = with_contact.browser(), with_contact.browser()
+    invented.client.cookies.set("sonarpost_session", "x" * 43)
+    for path in READ_PATHS:
+        answer = browser.get(path)
+        assert (answer.status_code, answer.json()["error"]["code"]) == (401, "no_session"), path
+        assert invented.get(path).status_code == 401
+    for path in ("/", "/password"):
+        answer = browser.get(path)
+        assert (answer.status_code, answer.headers["location"]) == (303, "/login")
 
 
-@pytest.mark.parametrize("path", ["/", "/password"])
-def test_page_without_a_session_redirects_to_the_log_in(console, path):
-    answer = console.browser().get(path)
-    assert (answer.status_code, answer.headers["location"]) == (303, "/login")
+def test_actions_need_a_session_its_token_and_the_page_of_this_site(with_contact):
+    stranger, anna, other = with_contact.browser(), with_contact.browser("anna"), with_contact.browser("anna")
+    for path in (*PERMISSION_OF_PATH, "/api/logout", "/api/password", "/api/settings"):
+        assert stranger.post(path, {}).status_code == 401
+        for headers in ({}, {"X-CSRF-Token": ""}, {"X-CSRF-Token": other.csrf}):
+            answer = anna.client.post(path, json={}, headers=headers)
+            assert (answer.status_code, answer.json()["error"]["code"]) == (403, "csrf"), path
+    for origin in ("http://evil.example", "http://127.0.0.1:9999", "null"):
+        answer = anna.post(f"{ONE}/decisions", {}, Origin=origin)
+        assert (answer.status_code, answer.json()["error"]["code"]) == (403, "bad_origin")
+    assert anna.post(f"{ONE}/decisions", {}, Origin="http://127.0.0.1:8470").status_code == 400
 
 
-@pytest.mark.parametrize("path", [*PERMISSION_OF_PATH, "/api/logout", "/api/password"])
-def test_actions_need_a_session_and_its_token(with_contact, path):
-    assert with_contact.browser().post(path, {}).status_code == 401
-    anna = with_contact.browser("anna")
-    for headers in ({}, {"X-CSRF-Token": ""}, {"X-CSRF-Token": with_contact.browser("anna").csrf}):
-        answer = anna.client.post(path, json={}, headers=headers)
-        assert (answer.status_code, answer.json()["error"]["code"]) == (403, "csrf")
-
-
-@pytest.mark.parametrize(("path", "permission"), PERMISSION_OF_PATH.items())
-def test_role_permissions(with_contact, path, permission):
+def test_role_permissions(with_contact):
     for user, role in ROLES_OF_USERS.items():
         browser = with_contact.browser(user)
-        allowed = browser.get("/api/session").json()["may"][permission]
-        assert allowed == (role != "observer" and permission != "advise")
-        # The body is invalid, so that a permitted request changes nothing.
-        assert browser.post(path, {"x": 1}).status_code == (400 if allowed else 403)
+        may = browser.get("/api/session").json()["may"]
+        for path, permission in PERMISSION_OF_PATH.items():
+            assert may[permission] == (role != "observer" and permission != "advise")
+            # The body is invalid, so that a permitted request changes nothing.
+            assert browser.post(path, {"x": 1}).status_code == (400 if may[permission] else 403)
 
 
 def test_at_the_shore_site_only_experts_act(make_console):
@@ -148,24 +148,12 @@ def test_error_names_the_invalid_field_of_a_user(tmp_path, name, role, password,
     assert PASSWORD not in str(caught.value)
 
 
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:8470", "", "127.0.0.1.evil.example", "[::2]"])
-def test_unknown_host_name_is_rejected(console, host):
-    answer = console.browser().client.get("/login", headers={"Host": host})
-    assert (answer.status_code, answer.json()["error"]["code"]) == (400, "bad_host")
-
-
-def test_configured_host_name_is_accepted(make_console):
-    console = make_console(names=("bridge.example",))
-    browser = Browser(TestClient(console.app.asgi, base_url="http://bridge.example:8470"))
-    assert browser.login("anna").status_code == 200
-
-
-@pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:9999", "null"])
-def test_request_from_a_page_of_another_site_is_rejected(with_contact, origin):
-    anna = with_contact.browser("anna")
-    answer = anna.post(f"{ONE}/decisions", {}, Origin=origin)
-    assert (answer.status_code, answer.json()["error"]["code"]) == (403, "bad_origin")
-    assert anna.post(f"{ONE}/decisions", {}, Origin="http://127.0.0.1:8470").status_code == 400
+def test_only_known_host_names_are_accepted(console, make_console):
+    for host in ("evil.example", "evil.example:8470", "", "127.0.0.1.evil.example", "[::2]"):
+        answer = console.browser().client.get("/login", headers={"Host": host})
+        assert (answer.status_code, answer.json()["error"]["code"]) == (400, "bad_host")
+    named = make_console(names=("bridge.example",))
+    assert Browser(TestClient(named.app.asgi, base_url="http://bridge.example:8470")).login("anna").status_code == 200
 
 
 def test_all_responses_have_security_headers(console):
@@ -177,9 +165,9 @@ def test_all_responses_have_security_headers(console):
         assert headers["x-frame-options"] == "DENY"
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
+def test_path_traversal_is_rejected(with_contact):
+    anna = with_contact.browser("anna")
+    for path in (
         "/static/../service.py",
         "/static/%2e%2e/service.py",
         "/static/..%2fservice.py",
@@ -194,12 +182,9 @@ def test_all_responses_have_security_headers(console):
         "/tiles/1/1/..%2f..%2fx.png",
         "/api/export/..%2fx",
         "/report/..%2f..%2fetc%2fpasswd",
-    ],
-)
-def test_path_traversal_is_rejected(with_contact, path):
-    answer = with_contact.browser("anna").get(path)
-    assert answer.status_code == 404
-    assert answer.json()["error"]["code"] == "not_found"
+    ):
+        answer = anna.get(path)
+        assert (answer.status_code, answer.json()["error"]["code"]) == (404, "not_found"), path
 
 
 def test_tiles_are_served_from_their_folder(make_console, tmp_path):
@@ -213,35 +198,25 @@ def test_tiles_are_served_from_their_folder(make_console, tmp_path):
     assert watch.get("/api/info").json()["tiles"]["max_zoom"] == 3
 
 
-def test_too_large_body_is_rejected(with_contact):
+def test_too_large_and_invalid_bodies_are_rejected(with_contact):
     anna = with_contact.browser("anna")
     answer = anna.post(f"{ONE}/decisions", {"remark": "x" * 70_000})
     assert (answer.status_code, answer.json()["error"]["code"]) == (413, "too_large")
     assert with_contact.browser().login("x" * 70_000).status_code == 413
-
-
-@pytest.mark.parametrize("body", [b"", b"[]", b"{", b'"x"', b"\xff", b'{"revision": 1e999}', b"[" * 5000])
-def test_invalid_body_is_rejected(with_contact, body):
-    anna = with_contact.browser("anna")
-    answer = anna.client.post(f"{ONE}/decisions", content=body, headers={"X-CSRF-Token": anna.csrf})
-    assert (answer.status_code, answer.json()["error"]["code"]) == (400, "bad_request")
-
-
-@pytest.mark.parametrize(
-    ("changes", "field"),
-    [
-        ({"verdict": "maybe"}, "verdict"),
-        ({"confidence": 1.5}, "confidence"),
-        ({"confidence": "0.5"}, "confidence"),
-        ({"remark": "x" * 2001}, "remark"),
-        ({"mlo_class": ""}, "mlo_class"),
-        ({"revision": True}, "revision"),
-        ({"operator": "another"}, "operator"),
-    ],
-)
-def test_error_names_the_invalid_field(with_contact, changes, field):
-    answer = with_contact.browser("anna").decide(ID, **changes)
-    assert (answer.status_code, answer.json()["error"]["field"]) == (400, field)
+    for body in (b"", b"[]", b"{", b'"x"', b"\xff", b'{"revision": 1e999}', b"[" * 5000):
+        answer = anna.client.post(f"{ONE}/decisions", content=body, headers={"X-CSRF-Token": anna.csrf})
+        assert (answer.status_code, answer.json()["error"]["code"]) == (400, "bad_request")
+    for field, value in (
+        ("verdict", "maybe"),
+        ("confidence", 1.5),
+        ("confidence", "0.5"),
+        ("remark", "x" * 2001),
+        ("mlo_class", ""),
+        ("revision", True),
+        ("operator", "another"),
+    ):
+        answer = anna.decide(ID, **{field: value})
+        assert (answer.status_code, answer.json()["error"]["field"]) == (400, field)
     assert with_contact.state.unsent_records() == []
 
 
