@@ -10,6 +10,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -168,23 +169,29 @@ def test_running_service_notifies_systemd_and_publishes_health_and_liveliness(st
         "SONARPOST_PLATFORM__HEALTH_INTERVAL_S": "0.1",
         "SONARPOST_PLATFORM__LOG_LEVEL": "",
     }
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
+    stopping, received = b"STOPPING=1\nSTATUS=stopping", []
+
+    def collect():
+        while stopping not in received:
+            received.append(bound.recv(4096))
+
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound, ThreadPoolExecutor() as pool:
         bound.bind(str(tmp_path / "notify"))
         bound.settimeout(WAIT_S)
+        collected = pool.submit(collect)
         process = start(configuration(tmp_path, router), **environment)
         read_until(process, "Configuration overridden by environment keys=platform.health_interval_s")
-        assert bound.recv(4096).decode() == f"STATUS=waiting for the router {router}"
-        assert bound.recv(4096) == b"READY=1\nSTATUS=started\nWATCHDOG_USEC=300000"
-        assert {bound.recv(4096) for _ in range(5)} == {b"WATCHDOG=1\nSTATUS=ok"}
+        eventually(lambda: len(received) >= 7)
+        assert received[0].decode() == f"STATUS=waiting for the router {router}"
+        assert received[1] == b"READY=1\nSTATUS=started\nWATCHDOG_USEC=300000"
+        assert set(received[2:7]) == {b"WATCHDOG=1\nSTATUS=ok"}
         eventually(lambda: len(seen) > 2 and seen[-1].state == "ok")
         assert alive()
         assert seen[-1].gauges.items() >= {"inbox": 0.0, "outbox": 0.0, "refused": 0.0}.items()
         assert seen[-1].gauges["disk_free_bytes"] > 0
         assert seen[-1].started_utc_s <= seen[0].time_utc_s < seen[-1].time_utc_s
         process.send_signal(signal.SIGTERM)
-        messages: list[bytes] = []
-        while b"STOPPING=1\nSTATUS=stopping" not in messages:
-            messages.append(bound.recv(4096))
+        collected.result()
     assert process.wait(timeout=WAIT_S) == 0
     eventually(lambda: seen[-1].state == "stopping")
     eventually(lambda: not alive())

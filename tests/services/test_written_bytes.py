@@ -26,7 +26,7 @@ from sonarpost.services.uuv_modem.service import UuvModemService
 from sonarpost.services.uuv_modem.vehicle_endpoint import VehicleEndpoint
 
 VESSEL = "vessel-1"
-ITEMS, CONTACTS = 12, 300
+ITEMS, CONTACTS = 20, 725
 
 
 def written_bytes(store, action):
