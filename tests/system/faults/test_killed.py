@@ -1,6 +1,6 @@
 """Processes of vessel and shore are killed (SIGKILL) at critical moments; every image arrives exactly once.
 
-`SONARPOST_KILLS` sets the number of random kills (24).
+`SONARPOST_KILLS` sets the number of random kills (16).
 """
 
 import os
@@ -11,7 +11,7 @@ from builders.image_source import make_image
 from builders.vessel_and_shore import PROCESSES
 
 COUNT = 200
-KILLS = int(os.environ.get("SONARPOST_KILLS", "24"))
+KILLS = int(os.environ.get("SONARPOST_KILLS", "16"))
 
 
 def test_killed_routers_lose_nothing(system):
