@@ -178,7 +178,7 @@ def test_payload_must_be_a_map_with_text_keys(text):
 
 def test_oversized_payload_is_rejected_unread(monkeypatch):
     monkeypatch.setattr(wire, "MAX_PAYLOAD_BYTES", 100)
-    assert wire.unpack_map(msgpack.packb({"a": b"x" * 94}), KEY) == {"a": b"x" * 94}
+    assert wire.unpack_map(msgpack.packb({"a": b"x" * 95}), KEY) == {"a": b"x" * 95}
     with pytest.raises(PayloadError, match="got '101 bytes', expected at most 100 bytes"):
         wire.unpack_map(msgpack.packb({"a": b"x" * 96}), KEY)
 
