@@ -122,8 +122,7 @@ def test_humminbird_recording(data_dir):
 @pytest.mark.parametrize("size_bytes", [96, 100])
 def test_date_of_a_solix_recording_is_little_endian(recording, size_bytes):
     path, *_ = recording
-    whole = read_survey(path)
-    dat = bytearray(size_bytes)
+    whole, dat = read_survey(path), bytearray(size_bytes)
     struct.pack_into("<I", dat, 20, 1_600_000_000)
     path.write_bytes(dat)
     survey = read_survey(path)

@@ -35,6 +35,9 @@ def test_images_and_bottom_track_are_of_the_first_channel(samples, range_m, surv
     one, other = (ground_range_image(s, Side.PORT, np.full(120, 5.0), 0.25) for s in (alone, both))
     assert other.shape == (120, 120)
     np.testing.assert_array_equal(other, one)
+    port = replace(survey, pings=tuple(replace(p, channels=p.channels[:1]) for p in survey.pings))
+    assert (port.sample_count(Side.STARBOARD), port.max_slant_range_m(Side.STARBOARD)) == (0, 0.0)
+    assert port.waterfall(Side.STARBOARD).shape == (120, 0)
 
 
 @pytest.mark.parametrize(("samples", "range_m"), [(256, 10.0), (1024, 30.0)])
@@ -59,9 +62,3 @@ def test_commands_use_the_first_channel_and_info_names_it(samples, range_m, surv
     assert info["warnings"][-1] == NOTE
     assert f"  note: {NOTE}\n" in printed(both, "info")
     assert "several channels" not in printed(alone, "info")
-
-
-def test_absent_side_has_zero_range(survey):
-    port = replace(survey, pings=tuple(replace(p, channels=p.channels[:1]) for p in survey.pings))
-    assert (port.sample_count(Side.STARBOARD), port.max_slant_range_m(Side.STARBOARD)) == (0, 0.0)
-    assert port.waterfall(Side.STARBOARD).shape == (120, 0)

@@ -143,13 +143,11 @@ def test_ground_range_samples_are_at_their_ground_range(tmp_path, raw, stated):
                 assert channel.samples[sample] == want
 
 
-@pytest.mark.parametrize("altitude", [0.0, float("nan"), -3.0, 30.0])
-def test_ground_range_without_altitude_is_skipped(tmp_path, raw, altitude):
-    as_ground_range(raw)
-    put(raw, HEADER + ALTITUDE, "f", altitude)
-    survey = read(tmp_path, raw)
-    assert [len(p.channels) for p in survey] == [0, 2, 2, 2, 2]
-    assert "skipped port channel: ground-range samples without a plausible altitude (1 times)" in survey.warnings
+def test_ground_range_without_altitude_is_skipped(tmp_path, raw):
+    for altitude in (0.0, float("nan"), -3.0, 30.0):
+        survey = read(tmp_path, put(as_ground_range(raw), HEADER + ALTITUDE, "f", altitude))
+        assert [len(p.channels) for p in survey] == [0, 2, 2, 2, 2]
+        assert "skipped port channel: ground-range samples without a plausible altitude (1 times)" in survey.warnings
 
 
 @pytest.mark.realdata
@@ -255,17 +253,6 @@ def test_index_file_of_pyxtf_is_not_loaded(tmp_path, raw):
     assert len(read(tmp_path, raw).pings) == 5
 
 
-def test_port_stored_nearest_first_is_reported(small_survey, tmp_path):
-    survey = small_survey(pings=80, samples=128)
-    for ping in survey:
-        for channel in ping.channels:
-            channel.samples[:] = np.linspace(1, 200, 128)
-            if channel.side is Side.PORT:
-                channel.samples[:] = channel.samples[::-1].copy()
-    write_xtf(survey, tmp_path / "a.xtf")
-    assert "port looks stored nearest" in read_survey(tmp_path / "a.xtf").warnings[0]
-
-
 def in_every_ping(raw, offset, fmt, *values):
     for row in range(5):
         struct.pack_into("<" + fmt, raw, HEADER + row * PACKET + offset, *values)
@@ -305,9 +292,7 @@ def test_time_delay_keeps_every_echo_at_its_range(raw, tmp_path, range_includes_
     assert not channel.samples[:40].any()
     assert channel.slant_range_m == pytest.approx(25 if range_includes_delay else 50)
     assert any("zeros replace" in w for w in survey.warnings)
-
-
-def test_inconsistent_time_delay_skips_channel(raw, tmp_path):
+    # An inconsistent delay skips the channel.
     in_every_ping(raw, 256 + TIME_DELAY, "ff", 0.5, 0.001)
     survey = read(tmp_path, raw)
     assert survey.sides() == (Side.STARBOARD,)
@@ -375,10 +360,18 @@ def test_position_in_the_other_field_is_reported(raw, tmp_path, source, other, o
     assert not read(tmp_path, raw, position_source=other).warnings
 
 
-def test_port_order_nearest_first(raw, tmp_path):
+def test_port_order_nearest_first_is_an_option_and_reported(raw, small_survey, tmp_path):
     one = read(tmp_path, raw).pings[0].channels[0].samples
     other = read(tmp_path, raw, port_order="nearest_first").pings[0].channels[0].samples
     np.testing.assert_array_equal(one, other[::-1])
+    survey = small_survey(pings=80, samples=128)
+    for ping in survey:
+        for channel in ping.channels:
+            channel.samples[:] = np.linspace(1, 200, 128)
+            if channel.side is Side.PORT:
+                channel.samples[:] = channel.samples[::-1].copy()
+    write_xtf(survey, tmp_path / "a.xtf")
+    assert "port looks stored nearest" in read_survey(tmp_path / "a.xtf").warnings[0]
 
 
 def test_implausible_slant_range_skips_channel(raw, tmp_path):
