@@ -62,7 +62,6 @@ HOSTILE_LARGE = World(
 
 SCENARIOS = {
     "crashes": CRASHES,
-    "drops": DROPS,
     "hostile": HOSTILE,
     "hostile_with_origin": HOSTILE_WITH_ORIGIN,
     "shared_key": SHARED_KEY,
@@ -70,6 +69,7 @@ SCENARIOS = {
     "hostile_large": HOSTILE_LARGE,
 }
 LARGE_SCENARIOS = {
+    "drops": DROPS,
     "two_producers": TWO_PRODUCERS,
     "restore": RESTORE,
     # A restore, with records of two keys in one queue.

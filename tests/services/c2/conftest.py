@@ -30,7 +30,7 @@ def open_files(out):
         each.close()
 
 
-@pytest.fixture(params=["files", "postgresql"])
+@pytest.fixture(params=["files", pytest.param("postgresql", marks=pytest.mark.system)])
 def open_archive(request, open_files):
     """Opens archives of both kinds."""
     if request.param == "files":
