@@ -285,7 +285,7 @@ def test_a_held_contact_that_the_joined_pings_do_not_confirm_is_dropped(tmp_path
     assert (result.dropped, result.snippets) == ((held.contact.contact_id,), ())
 
 
-@pytest.mark.parametrize("pings", [300, 1700])
+@pytest.mark.parametrize("pings", [300, pytest.param(1700, marks=pytest.mark.system)])
 def test_counts_at_lower_thresholds_are_logged(pings, tmp_path, start_service, incoming, lines):
     spec = SurveySpec(seed=2, seabed=SeabedKind.ROCK, pings=pings, samples=400, targets=2, clutter=4)
     path = tmp_path / "rock.xtf"
