@@ -128,7 +128,7 @@ def test_one_connection_for_many_batches_and_server_data_is_discarded(serve):
 @pytest.mark.parametrize("end", ["close", "reset"])
 def test_closed_connection_is_detected_before_the_next_batch(serve, end):
     server = serve()
-    with CotSender(f"tcp://127.0.0.1:{server.port}") as sender:
+    with CotSender(f"tcp://127.0.0.1:{server.port}", timeout_s=600.0) as sender:
         sender.send(EVENTS)
         eventually(lambda: len(server.received) == 1 and bytes(server.received[0]) == STREAM)
         if end == "reset":
