@@ -7,9 +7,8 @@ import math
 
 import numpy as np
 import pytest
-from builders.console import image_record
+from builders.console import image_record, with_pixels
 
-from sonarpost.messages import Pixels
 from sonarpost.review.measurement import measure_length
 
 # Slant range 9.43 m at 8 m of altitude: ground range 5 m.
@@ -26,17 +25,6 @@ MARK_PIXELS = """() => {
   for (let i = 0; i < data.length; i += 4) count += data[i] > 200 && data[i + 1] < 110 && data[i + 2] > 170;
   return count;
 }"""
-
-
-def only_contact(served):
-    [item] = served.state.list_contacts(contact_filter())["items"]
-    return served.state.contact_detail(item["id"])
-
-
-def contact_filter():
-    from sonarpost.services.console.store.contacts import ContactFilter
-
-    return ContactFilter()
 
 
 def opened(served, record=None, **options):
@@ -72,14 +60,13 @@ def uniform(image):
     """The record with an image of constant grey 100, and one darker and one brighter pixel."""
     pixels = np.full((40, 60), 100, np.uint8)
     pixels[0, 0], pixels[0, 59] = 0, 255
-    picture = Pixels.from_array(pixels)
-    return image.model_copy(update={"picture": picture, "picture_sha256": picture.sha256})
+    return with_pixels(image, pixels)
 
 
 def test_mark_surrounds_the_contact_and_axes_name_the_range(served):
     visit = opened(served)
     corners = dataset(visit, "mark")
-    [version] = only_contact(served)["versions"]
+    [version] = served.contact()["versions"]
     assert visit.page.evaluate(MARK_PIXELS) > 50
     # The corners have the proportions of the box in metres: 20 rows of 0.1 m, 50.5 columns of 0.05 m.
     width, height = corners[2][0] - corners[0][0], corners[2][1] - corners[0][1]
@@ -109,7 +96,7 @@ def test_ground_range_view_has_the_computed_width(served):
     assert dataset(visit, "extent") == pytest.approx([1.2, 2.0])
     visit.press("b")
     visit.until("() => /ground range, m/.test(document.querySelector('.stage canvas').ariaDescription)")
-    [version] = only_contact(served)["versions"]
+    [version] = served.contact()["versions"]
     mark = version["mark"]
     first, last = (mark["range_m"] + (column - mark["column"]) * 0.02 for column in (0, 60))
     expected = math.sqrt(last**2 - 8.0**2) - math.sqrt(first**2 - 8.0**2)
@@ -173,7 +160,7 @@ def test_gamma_black_point_and_white_point_change_the_pixels(served):
     assert float(visit.page.locator("#level-gamma").input_value()) < 1
 
 
-def test_pixels_that_are_not_square_are_interpolated(served):
+def test_pixels_that_are_not_square_are_interpolated_and_surroundings_dark(served):
     visit = opened(served)
     visit.expect_errors("willReadFrequently")
     colours = """() => {
@@ -189,11 +176,7 @@ def test_pixels_that_are_not_square_are_interpolated(served):
     visit.press("d")
     assert visit.page.evaluate(colours) < smooth / 2
     assert visit.page.locator("[data-tool=smooth]").get_attribute("aria-pressed") == "false"
-
-
-def test_surroundings_of_the_image_are_dark_in_both_themes(served):
-    visit = opened(served)
-    for _ in range(2):
+    for _theme in range(2):
         colour = visit.page.evaluate("getComputedStyle(document.querySelector('.stage')).backgroundColor")
         assert max(int(part) for part in colour[4:-1].split(",")) < 40
         visit.press("t")
@@ -223,12 +206,12 @@ def test_one_drag_measures_and_both_ends_can_be_moved(served):
     drag(visit, start, (start[0], start[1] + 20))
     visit.until("text => document.querySelector('.size[data-kind=length] b').textContent !== text", second)
     visit.wait(".hint >> text=Enter keeps it")
-    assert only_contact(served)["measurements"] == []
+    assert served.contact()["measurements"] == []
     visit.press("Enter")
     visit.wait(".hint >> text=next line is shadow")
-    [stored] = only_contact(served)["measurements"]
+    [stored] = served.contact()["measurements"]
     # The canvas has as many pixels per metre as the mark.
-    box = only_contact(served)["versions"][0]["box"]
+    box = served.contact()["versions"][0]["box"]
     unit = (right[1] - left[1]) / ((box["rows"][1] - box["rows"][0]) * 0.1)
     assert stored["along_m"] == pytest.approx((moved[1] - start[1] - 20) / unit, rel=0.03)
     image = image_record("00A7")
@@ -246,7 +229,7 @@ def test_shadow_is_measured_across_the_track(served):
     visit.wait(".hint >> text=Enter keeps it")
     visit.press("Enter")
     visit.wait(".size[data-kind=height] b >> text=/[0-9] ± /")
-    [stored] = only_contact(served)["measurements"]
+    [stored] = served.contact()["measurements"]
     assert stored["from"][0] == stored["to"][0]
     assert (stored["along_m"], stored["metres"]) == (0.0, "slant")
 
@@ -260,7 +243,7 @@ def test_withdrawn_measurement_leaves_the_panel_and_stays_in_the_database(served
     visit.press("Escape")
     visit.page.locator("[data-size=withdraw-width]").click()
     visit.until("() => document.querySelector('.size[data-kind=width] b').textContent === '\u2013'")
-    detail = only_contact(served)
+    detail = served.contact()
     assert [one["withdrawn_by"] for one in detail["measurements"]] == ["anna"]
     assert detail["size"]["width"] is None
     visit.wait('details[data-name="measurements"] li.undone')

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from builders.console import FIRST_UTC_S, image_record
+from builders.console import FIRST_UTC_S, contact_ids, image_record, with_pixels
 
-from sonarpost.messages import Pixels
 from sonarpost.review.positions import destination
 
 TWO_TILES = "() => document.querySelectorAll('dialog.object canvas[data-shows]').length === 2"
@@ -28,21 +27,13 @@ BRIGHTEST = """id => {
 
 def look(image_id, *, heading_deg, channel, vehicle="uuv-1", north_m=0.0, **fields):
     """An image with one bright square: behind the centre in range, and ahead of it along the track."""
-    record = image_record(
-        image_id,
-        position=destination(56.0, -5.0, 0.0, north_m),
-        vehicle=vehicle,
-        heading_deg=heading_deg,
-        channel=channel,
-        pixel_along_m=0.1,
-        pixel_across_m=0.1,
-        **fields,
-    )
+    place = {"position": destination(56.0, -5.0, 0.0, north_m), "heading_deg": heading_deg, "channel": channel}
+    sizes = {"pixel_along_m": 0.1, "pixel_across_m": 0.1}
+    record = image_record(image_id, vehicle=vehicle, **place, **sizes, **fields)
     pixels = np.full((60, 60), 60, np.uint8)
     pixels[::2] = 50
     pixels[36:46, 38:48] = 255
-    picture = Pixels.from_array(pixels)
-    return record.model_copy(update={"picture": picture, "picture_sha256": picture.sha256})
+    return with_pixels(record, pixels)
 
 
 def store_two_looks(served):
@@ -52,12 +43,11 @@ def store_two_looks(served):
 
 
 def identifier(served, image_id):
-    with served.state.database.read() as db:
-        return db.execute("SELECT id FROM contact WHERE image_id = ?", (image_id,)).fetchone()[0]
+    return contact_ids(served.state)[image_id]
 
 
 def review(served, image_id):
-    return served.state.contact_detail(identifier(served, image_id))["contact"]["review"]
+    return served.contact(image_id)["contact"]["review"]
 
 
 def open_panel(served, **options):
@@ -128,8 +118,7 @@ def test_decided_on_less_than_has_arrived(served):
     served.state.store_image(image_record("0001", missing_rows=20))
     visit = served.visit()
     visit.wait_for_contact("0001")
-    contact = served.state.contact_detail(identifier(served, "0001"))
-    served.console.browser("bo").decide(contact["contact"]["id"], verdict="not_mine_like")
+    served.console.browser("bo").decide(identifier(served, "0001"), verdict="not_mine_like")
     served.state.store_image(image_record("0001", version=2))
     visit.page.click("[data-review='newer_detail']")
     visit.until("() => document.querySelector('.row .newer')?.textContent === '○ on 100 B – 200 B are here'")  # noqa: RUF001

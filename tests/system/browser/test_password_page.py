@@ -91,15 +91,7 @@ def test_error_is_displayed_at_its_field(served):
     assert served.users.verify_password("anna", PASSWORD)
 
 
-def test_log_out_from_the_password_page(served):
-    visit = served.visit(path="password")
-    visit.page.get_by_role("button", name="anna: log out").click()
-    visit.wait("#login")
-    visit.page.goto(served.address + "password")
-    visit.wait("#login")
-
-
-def test_page_fits_a_small_window_with_large_type(served):
+def test_page_fits_a_small_window_with_large_type_and_logs_out(served):
     visit = served.visit(path="password", viewport={"width": 480, "height": 360})
     visit.page.evaluate("localStorage.setItem('sonarpost.type', 'large')")
     visit.page.reload()
@@ -108,3 +100,7 @@ def test_page_fits_a_small_window_with_large_type(served):
     assert visit.page.locator("button[type=submit]").bounding_box()["y"] < 360
     visit.page.focus("#old")
     assert visit.page.locator("label[for=old]").bounding_box()["y"] > 0
+    visit.page.get_by_role("button", name="anna: log out").click()
+    visit.wait("#login")
+    visit.page.goto(served.address + "password")
+    visit.wait("#login")

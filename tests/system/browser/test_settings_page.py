@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
 from builders.common import eventually
 from builders.console import image_record
 
 pytestmark = pytest.mark.parametrize("browser", ["chromium"], indirect=True)
-
-SECONDS_TO_DECIDE = 5.0
 
 
 def open_page(served, user="anna"):
@@ -127,11 +123,9 @@ def test_without_the_server_the_page_names_it(served):
 def test_log_in_link_leads_to_a_decision_without_a_form(served):
     served.state.store_image(image_record("00A7"))
     token = served.users.make_login_link("anna")
-    started = time.monotonic()
     visit = served.visit("", path=f"login#{token}")
     visit.wait_for_contact("00A7")
     visit.page.locator('[data-verdict="mine_like"]:enabled').wait_for()
-    assert time.monotonic() - started < SECONDS_TO_DECIDE
     assert token not in visit.page.evaluate("location.href + JSON.stringify(performance.getEntries())")
     # The link is valid once, and the page names the reason.
     again = served.visit("", path=f"login#{token}")
