@@ -191,6 +191,7 @@ def test_stop_ends_a_running_export(console):
     assert error_of(watch.get("/api/export/contacts.kmz")) == (503, "busy")
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
 def test_no_file_remains_after_the_end_of_the_process(tmp_path, end):
     state, temporary = tmp_path / "state", tmp_path / "tmp"

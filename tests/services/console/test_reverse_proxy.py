@@ -99,6 +99,7 @@ def test_console_behind_nginx(proxied):
         assert len(anna.get("/api/export/contacts.kmz").content) > 1000
 
 
+@pytest.mark.system
 @needs_nginx
 def test_half_requests_end_in_nginx_and_keep_no_one_out(proxied):
     proxy, _console = proxied
@@ -118,6 +119,7 @@ def test_half_requests_end_in_nginx_and_keep_no_one_out(proxied):
             one.close()
 
 
+@pytest.mark.system
 @needs_nginx
 def test_event_stream_through_nginx_is_not_delayed(proxied):
     proxy, console = proxied
