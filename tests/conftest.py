@@ -77,6 +77,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: not item.nodeid.startswith(PROCESS_TESTS))
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not import the folders of system tests for the quick tests, whose packages are not sufficient for all."""
+    quick = config.option.markexpr == "not system"
+    folder = f"{collection_path.relative_to(REPOSITORY).as_posix()}/" if collection_path.is_dir() else ""
+    is_system = folder.startswith(SYSTEM_TESTS) and folder not in ("tests/system/", "tests/system/chain/")
+    return True if quick and is_system else None
+
+
 @pytest.fixture(autouse=True)
 def log_settings() -> Iterator[None]:
     """Restore the handlers and the level of the root logger, which commands run by a test replace."""
