@@ -108,7 +108,7 @@ def check_monitoring(client, runner):
     """Check liveliness token and health records of a running service, then stop it and check the last ones."""
 
     def tokens(key):
-        return [str(reply.ok.key_expr) for reply in client.liveliness().get(key, timeout=5.0) if reply.ok]
+        return [str(reply.ok.key_expr) for reply in client.liveliness().get(key, timeout=60.0) if reply.ok]
 
     def check(service):
         key = keys.alive(service.platform.id, service.NAME)

@@ -35,7 +35,7 @@ def c2(world, tmp_path, monkeypatch):
 
 def received(session, selector):
     """Return the payloads of all replies to a query."""
-    replies = session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=10)
+    replies = session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=60)
     return [msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
 

@@ -392,7 +392,7 @@ def test_service_that_does_not_reach_a_router_stops(platform, restartable_router
     address = console.address
     assert httpx2.get(f"{address}login", timeout=120).status_code == 200
     console.stop()
-    starting.join(timeout=10)
+    starting.join(timeout=120)
     assert not starting.is_alive()
     with pytest.raises(httpx2.ConnectError):
         httpx2.get(address)

@@ -233,7 +233,7 @@ def test_service_answers_the_example_query_with_the_example_reply(client, platfo
     selector = "sonarpost/v1/vessel-1/contact/decision/handoff/relay"
 
     def ask(payload, attached):
-        replies = client.get(selector, payload=payload, attachment=attached, timeout=5)
+        replies = client.get(selector, payload=payload, attachment=attached, timeout=60)
         received = replies.recv()
         assert str(received.ok.key_expr) == selector
         return received.ok.payload.to_bytes()
