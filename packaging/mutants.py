@@ -22,8 +22,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
+BIN = Path(sys.executable).parent
 COPY = ROOT / "build" / "mutants"
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(COPY / "common")}
 MAX_TESTS = 200
 OFF_BY_ONE = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
 
@@ -100,7 +104,7 @@ def tests_of(fault: Fault, coverage: Path) -> list[str]:
         ).fetchall()
     lines = range(fault.first, fault.last + 1)
     found = {
-        context.partition("|")[0]
+        context.partition("|")[0].partition("[")[0]
         for context, bits in rows
         if any(line // 8 < len(bits) and bits[line // 8] >> line % 8 & 1 for line in lines)
     }
@@ -110,25 +114,12 @@ def tests_of(fault: Fault, coverage: Path) -> list[str]:
 def is_caught(tests: list[str], seed: int) -> bool:
     """Run the tests in the copy; return whether one fails or hangs."""
     chosen = sorted(random.Random(seed).sample(tests, min(MAX_TESTS, len(tests))))  # noqa: S311
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-x",
-        "-q",
-        "-n2",
-        "-p",
-        "no:cacheprovider",
-        "--timeout",
-        "300",
-        "-m",
-        "",
-    ]
-    environment = os.environ | {"PYTHONPATH": str(COPY / "common")}
-    done = subprocess.run([*command, *chosen], cwd=COPY, env=environment, check=False, capture_output=True, text=True)  # noqa: S603
-    if done.returncode not in (0, 1):
-        print(done.stdout[-500:], done.stderr[-500:])
-    return done.returncode != 0
+    options = "-x -q -n2 -p no:cacheprovider --timeout 300"
+    command = [sys.executable, "-m", "pytest", *options.split()]
+    done = subprocess.run([*command, *chosen], cwd=COPY, env=ENVIRONMENT, check=False, capture_output=True, text=True)  # noqa: S603
+    if done.returncode not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED, pytest.ExitCode.INTERRUPTED):
+        sys.exit(f"{done.stdout[-2000:]}{done.stderr[-2000:]}")
+    return done.returncode != pytest.ExitCode.OK
 
 
 def main() -> None:
@@ -142,6 +133,7 @@ def main() -> None:
     shutil.rmtree(COPY, ignore_errors=True)
     subprocess.run(["git", "clone", "-q", str(ROOT), str(COPY)], check=True)  # noqa: S603, S607
     (COPY / ".venv").symlink_to(ROOT / ".venv")
+    subprocess.run([BIN / "sonarpost", "prepare"], cwd=COPY, env=ENVIRONMENT, check=True)  # noqa: S603
     caught = 0
     for number, fault in enumerate(faults(options.seed, options.count)):
         if options.keep not in (None, number):
