@@ -44,7 +44,7 @@ $(DEV): $(TEST) requirements-dev.lock
 demo: $(RUN_TIME)
 	$(BIN)/sonarpost demo $(ARGS)
 
-# The quick tests, at most five minutes on two cores. Order and assignment to workers: tests/conftest.py.
+# The quick tests, at most five minutes on two cores. Tiers and order: tests/conftest.py.
 test: setup
 	$(PYTEST) --numprocesses 3 --dist loadfile --no-loadscope-reorder $(ARGS)
 

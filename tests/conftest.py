@@ -13,8 +13,6 @@ import zenoh
 from builders.common import REPOSITORY, free_port
 from builders.postgresql import database, database_url, postgresql_server
 from hypothesis import HealthCheck, settings
-from xdist.remote import Producer
-from xdist.scheduler import LoadFileScheduling
 
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.config import PlatformConfig
@@ -47,26 +45,13 @@ if MEMORY.is_dir() and os.access(MEMORY, os.W_OK):
 
 SYSTEM_TESTS = ("tests/research/", "tests/security/", "tests/system/")
 """Folders of the tests of `make test-system`; other tests of it have the mark `system`, or use PostgreSQL."""
-PROCESS_TESTS = ("tests/system/chain/", "tests/system/faults/", "tests/system/compose/")
-"""Folders of tests with many real processes."""
-
-
-class ProcessTestsInOneWorker(LoadFileScheduling):
-    """Assigns the tests of a file to one worker, and those of a folder of `PROCESS_TESTS` to one worker."""
-
-    def _split_scope(self, nodeid: str) -> str:
-        folder = next((folder for folder in PROCESS_TESTS if nodeid.startswith(folder)), None)
-        return super()._split_scope(nodeid) if folder is None else folder
-
-
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> ProcessTestsInOneWorker:
-    """Return the scheduler of `make test`, which runs three tests at a time."""
-    return ProcessTestsInOneWorker(config, log)
+LONG_TESTS = ("tests/system/chain/", "tests/system/faults/", "tests/system/packaging/", "tests/system/docs/")
+"""Folders of tests that take longest and mostly wait; they start first."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of `make test-system`. Run those of many processes first: they take longest and mostly wait."""
+    """Mark the tests of `make test-system`, and sort those of `LONG_TESTS` to the front."""
     for item in items:
         quick = item.get_closest_marker("quick") is not None
         fixtures = getattr(item, "fixturenames", ())
@@ -74,7 +59,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("system")
         if item.nodeid.startswith("tests/system/compose/"):
             item.add_marker("containers")
-    items.sort(key=lambda item: not item.nodeid.startswith(PROCESS_TESTS))
+    items.sort(key=lambda item: not item.nodeid.startswith(LONG_TESTS))
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
