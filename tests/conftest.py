@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -39,7 +40,8 @@ settings.register_profile("random", settings.get_profile("thorough"), derandomiz
 settings.load_profile("quick")
 
 MEMORY = Path("/dev/shm")
-if MEMORY.is_dir() and os.access(MEMORY, os.W_OK):
+MEMORY_BYTES = 2_000_000_000
+if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MEMORY_BYTES:
     # The stores of services flush each commit.
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 

@@ -133,8 +133,8 @@ def test_killed_process_continues_without_loss(vessel, start_service, compressor
     compressor.send(IN, "uuv_modem", *images)
     compressor.send(OUT, "uuv_modem", *[outgoing_message(f"m{n}", priority=6) for n in range(5)])
     eventually(lambda: compressor.store.outbox_depth() == 0 and sent(service) >= 6)
-    # A copy of the store is what a process that is killed now leaves on the disk. It holds all records: what is accepted
-    # between the copy and the stop would be lost with the copy.
+    # A copy of the store is what a process that is killed now leaves on the disk. It holds all records: what is
+    # accepted between the copy and the stop would be lost with the copy.
     killed = tmp_path / "killed"
     killed.mkdir()
     path = service.store.path
