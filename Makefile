@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Several tests run at once; a second thread of each would only wait for the others.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: setup demo test test-busy test-system check docs docs-serve fmt lock sbom audit clean images test-compose screenshots
+.PHONY: setup demo test test-busy test-system test-processes check docs docs-serve fmt lock sbom audit clean images test-compose screenshots
 
 setup: $(TEST)
 
@@ -55,9 +55,11 @@ test-busy: setup
 # Chains with faults, browsers, TLS, research commands, examples, PostgreSQL, containers, and all property tests with more
 # examples. Longer runs of the tests of faults: docs/research/faults.md.
 test-system: $(DEV)
+	$(MAKE) --no-print-directory -j2 test-processes test-compose
+
+test-processes: $(DEV)
 	$(PYTEST) -m "(system or hypothesis) and not containers" --hypothesis-profile thorough \
 		--numprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
-	$(MAKE) --no-print-directory test-compose ARGS=
 
 check: $(DEV) docs
 	$(BIN)/ruff format --check .

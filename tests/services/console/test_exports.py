@@ -197,7 +197,7 @@ def test_no_file_remains_after_the_end_of_the_process(tmp_path, end):
     state, temporary = tmp_path / "state", tmp_path / "tmp"
     temporary.mkdir()
     database = Database(state / "console-review.db")
-    records = [image_record(f"{number:04X}", first_utc_s=1_700_000_000.0 + number) for number in range(400)]
+    records = [image_record(f"{number:04X}", first_utc_s=1_700_000_000.0 + number) for number in range(150)]
     ConsoleState(ConsoleConfig(), database).store_images(records)
     database.close()
     words = ["console", "--training", "1", "--port", "0", "--state", str(state), "--password", PASSWORD]

@@ -63,6 +63,7 @@ def link_distribution(name, site):
 
 
 def run(program, *arguments, status=0, cwd, **environment):
+    """Run a program; return its output and, after it, what it reports."""
     result = subprocess.run(
         [str(program), *arguments],
         cwd=cwd,
@@ -85,7 +86,9 @@ def use_the_codecs_and_the_detector(programs, folder):
         run(sonarpost, "decode", f"{codec}/contact.{codec}", "--out", codec, cwd=folder)
         assert (folder / codec / "contact.tiff").is_file()
     run(sonarpost, "simulate", "line.xtf", "--pings", "400", cwd=folder)
-    assert json.loads(run(sonarpost, "detect", "line.xtf", "--json", cwd=folder))["files"]
+    printed = run(sonarpost, "detect", "line.xtf", "--json", cwd=folder)
+    # On a slow machine progress follows.
+    assert json.JSONDecoder().raw_decode(printed)[0]["files"]
 
 
 def test_the_codecs_the_detector_and_the_services_of_the_chain_need_no_extra(minimal, tmp_path):
@@ -122,7 +125,7 @@ def interpreter(version):
     return found if works else str(installed[-1]) if installed else None
 
 
-@pytest.mark.parametrize("python", filter(None, map(interpreter, ("3.11", "3.12", "3.13"))))
+@pytest.mark.parametrize("python", filter(None, map(interpreter, ("3.12", "3.13"))))  # the others run in 3.11
 def test_the_wheel_runs_with_the_locked_packages(python, wheel, tmp_path):
     environment = tmp_path / "environment"
     subprocess.run([python, "-m", "venv", str(environment)], check=True)
