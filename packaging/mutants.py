@@ -114,7 +114,7 @@ def tests_of(fault: Fault, coverage: Path) -> list[str]:
 def is_caught(tests: list[str], seed: int) -> bool:
     """Run the tests in the copy; return whether one fails or hangs."""
     chosen = sorted(random.Random(seed).sample(tests, min(MAX_TESTS, len(tests))))  # noqa: S311
-    options = "-x -q -n2 -p no:cacheprovider --timeout 300"
+    options = "-x -q -n2 -p no:cacheprovider --timeout 60"
     command = [sys.executable, "-m", "pytest", *options.split()]
     done = subprocess.run([*command, *chosen], cwd=COPY, env=ENVIRONMENT, check=False, capture_output=True, text=True)  # noqa: S603
     if done.returncode not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED, pytest.ExitCode.INTERRUPTED):
@@ -128,6 +128,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=32)
     parser.add_argument("--count", type=int, default=30)
     parser.add_argument("--coverage", type=Path, default=ROOT / ".coverage")
+    parser.add_argument("--first", type=int, default=0, help="number of the first fault to make")
     parser.add_argument("--keep", type=int, help="make only this fault in the copy, and run nothing")
     options = parser.parse_args()
     shutil.rmtree(COPY, ignore_errors=True)
@@ -136,7 +137,7 @@ def main() -> None:
     subprocess.run([BIN / "sonarpost", "prepare"], cwd=COPY, env=ENVIRONMENT, check=True)  # noqa: S603
     caught = 0
     for number, fault in enumerate(faults(options.seed, options.count)):
-        if options.keep not in (None, number):
+        if number < options.first or options.keep not in (None, number):
             continue
         path = COPY / fault.file
         original = path.read_text(encoding="utf-8")
@@ -151,7 +152,7 @@ def main() -> None:
         verdict = "caught" if result else "NOT CAUGHT"
         place = f"{fault.file}:{fault.start[0]} {fault.function}"
         print(f"{number:2} {verdict:10} {place}: {fault.replacement!r}, {len(tests)} tests", flush=True)
-    print(f"{caught} of {options.count} caught by the quick tests")
+    print(f"{caught} of {options.count - options.first} caught by the quick tests")
 
 
 if __name__ == "__main__":
