@@ -92,7 +92,7 @@ def faults(seed: int, count: int) -> list[Fault]:
 
 
 def tests_of(fault: Fault, coverage: Path) -> list[str]:
-    """Return the tests that execute the function."""
+    """Return the tests that execute the function; where none is known, as in compiled code, those of its package."""
     name = str(fault.file)
     if name.startswith("services/"):
         name = f"common/sonarpost/{name}"
@@ -108,7 +108,8 @@ def tests_of(fault: Fault, coverage: Path) -> list[str]:
         for context, bits in rows
         if any(line // 8 < len(bits) and bits[line // 8] >> line % 8 & 1 for line in lines)
     }
-    return sorted(found - {""})
+    folder = Path("tests", *fault.file.parts[2 if fault.file.parts[0] == "common" else 0 : -1])
+    return sorted(found - {""}) or [str(folder)] * (ROOT / folder).is_dir()
 
 
 def is_caught(tests: list[str], seed: int) -> bool:
