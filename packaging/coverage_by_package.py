@@ -12,8 +12,8 @@ LOW_PERCENT = 70.0
 
 def package_of(file: str) -> str:
     """Return the package of a file: `link` of common/sonarpost/link/frames/x.py, `services/relay` of a service."""
-    parts = Path(file).parts[2:-1]
-    return "/".join(parts[:2] if parts[:1] == ("services",) else parts[:1]) or "sonarpost"
+    folder = Path(file).parts[:-1]
+    return "/".join(folder[:2] if folder[0] == "services" else folder[2:3]) or "sonarpost"
 
 
 def main() -> None:

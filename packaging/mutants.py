@@ -3,7 +3,7 @@
 Each fault is a negated condition, an integer or a comparison off by one, or a dropped call. It is made in a copy of the
 checkout. There, the quick tests that execute the function run; a run with coverage says which these are:
 
-    make test ARGS="--cov common/sonarpost --cov-context test --cov-report="
+    make test ARGS="--cov common/sonarpost --cov services --cov-context test --cov-report="
 
 A fault that they do not catch is printed; `--keep NUMBER` leaves it in the copy, for a run of other tests.
 """
@@ -93,14 +93,11 @@ def faults(seed: int, count: int) -> list[Fault]:
 
 def tests_of(fault: Fault, coverage: Path) -> list[str]:
     """Return the tests that execute the function; where none is known, as in compiled code, those of its package."""
-    name = str(fault.file)
-    if name.startswith("services/"):
-        name = f"common/sonarpost/{name}"
     with sqlite3.connect(coverage) as database:
         rows = database.execute(
             "SELECT context, numbits FROM line_bits JOIN context ON context.id = context_id"
             " JOIN file ON file.id = file_id WHERE path LIKE ?",
-            (f"%/{name}",),
+            (f"%/{fault.file}",),
         ).fetchall()
     lines = range(fault.first, fault.last + 1)
     found = {
