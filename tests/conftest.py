@@ -45,7 +45,7 @@ if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).
     # The stores of services flush each commit.
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 
-SYSTEM_TESTS = ("tests/research/", "tests/security/", "tests/system/")
+SYSTEM_TESTS = ("tests/research/", "tests/system/")
 """Folders of the tests of `make test-system`; other tests of it have the mark `system`, or use PostgreSQL."""
 LONG_TESTS = ("tests/system/chain/", "tests/system/faults/", "tests/system/packaging/", "tests/system/docs/")
 """Folders of tests that take longest and mostly wait; they start first."""

@@ -36,6 +36,11 @@ def test_services_are_clients_and_hubs_are_routers():
     assert setting(router, "connect/endpoints") == ["tcp/d:4"]
 
 
+def test_later_attempts_wait_longer():
+    waits_ms = [setting(client_config(["tcp/a:1"], attempt=n), "connect/timeout_ms") for n in range(5)]
+    assert waits_ms == [1000, 2000, 4000, 4000, 4000]
+
+
 def test_second_endpoint_is_used_if_the_first_is_unreachable(router):
     opened = open_with_retry(["tcp/127.0.0.1:1", router], threading.Event())
     assert len(opened.info.routers_zid()) == 1

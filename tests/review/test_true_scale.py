@@ -116,6 +116,7 @@ def test_scale_bar_has_its_length():
     assert int((row[:60] == 0).sum()) == pytest.approx(52, abs=3)  # the black half and the outline
     assert row[102] == 0
     assert row[106] == 255
+    assert (strip[2:17, 108:140] == 0).any(), "its length in metres"
 
 
 @pytest.mark.parametrize(

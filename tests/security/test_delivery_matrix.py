@@ -21,6 +21,8 @@ from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.store import Store
 from sonarpost.errors import PayloadError
 
+pytestmark = pytest.mark.system
+
 VESSEL, VEHICLE = "vessel-1", "uuv-1"
 RECORDS = 60
 CERTIFICATES = ("uuv-1", "vessel-1", "vessel-2", "shore-1", "console-1", "observer-1")

@@ -23,6 +23,8 @@ from sonarpost.services.c2.service import C2Service
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
 from sonarpost.services.relay.service import RelayService
 
+pytestmark = pytest.mark.system
+
 
 class Producer(Service[ServiceConfig]):
     """Sends records."""

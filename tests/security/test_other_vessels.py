@@ -17,6 +17,8 @@ from sonarpost.delivery.store import Store
 from sonarpost.errors import BadInputError
 from sonarpost.security.router_config import RouterOptions, router_json5
 
+pytestmark = pytest.mark.system
+
 LEAD, OTHER = "vessel-1", "vessel-2"
 INBOX = keys.vessel_frames(LEAD, OTHER)
 DENIED = (

@@ -14,6 +14,8 @@ from sonarpost.messages import Advice, Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 
+pytestmark = pytest.mark.system
+
 CONTACTS, STATES = keys.shore_contact_all(), keys.tasking_state_all()
 CERTIFICATES = ("uuv-1", "vessel-1", "vessel-2", "console-1", "observer-1", "shore-2")
 # What docs/explanation/security.md grants at the shore's router; at a vessel's router no certificate may query.

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
 import zenoh
 from builders.common import eventually
 
 from sonarpost import keys
 from sonarpost.bus.session import client_config
+
+pytestmark = pytest.mark.system
 
 
 def wait_until_received(shore_session, session, key):

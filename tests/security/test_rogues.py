@@ -15,6 +15,8 @@ from sonarpost.bus.session import client_config
 from sonarpost.messages import Health
 from sonarpost.security.router_config import RouterOptions
 
+pytestmark = pytest.mark.system
+
 INBOX_1 = keys.shore_inbox("vessel-1")
 INBOX_2 = keys.shore_inbox("vessel-2")
 

@@ -20,6 +20,8 @@ from sonarpost.delivery.outbox import Outbox
 from sonarpost.delivery.store import Store
 from sonarpost.security.router_config import THIN_HEALTH_S, RouterOptions
 
+pytestmark = pytest.mark.system
+
 VESSEL = "vessel-2"
 THINNED = tuple(keys.health(VESSEL, service) for service in ("relay", "op_modem"))
 OTHER = keys.health(VESSEL, "own_program")

@@ -10,6 +10,8 @@ from builders.fleet import Platforms, health
 
 from sonarpost.cli.main import main
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture
 def publishing(vessel_session, shore_session):
