@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import stat
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -193,7 +194,7 @@ def test_commands_end_to_end(tmp_path, capsys):
         ("vessel-1", "valid"),
     ]
     assert main(["pki", "revoke", "vessel-1", "--reason", "lost", "--dir", str(folder)]) == 0
-    assert "Not in force yet" in capsys.readouterr().out
+    assert re.match(r"revoked +vessel-1\nNot in force yet", capsys.readouterr().out)
     out = tmp_path / "router.json5"
     wanted = ["pki", "router-config", "--platform", "shore-1", "--listen", "tls/[::]:7448", "--dir", str(folder)]
     assert main([*wanted, "--out", str(out)]) == 0
