@@ -125,7 +125,7 @@ def interpreter(version):
     return found if works else str(installed[-1]) if installed else None
 
 
-@pytest.mark.parametrize("python", filter(None, map(interpreter, ("3.12", "3.13"))))  # the others run in 3.11
+@pytest.mark.parametrize("python", [*filter(None, map(interpreter, ("3.12", "3.13")))])  # the others run in 3.11
 def test_the_wheel_runs_with_the_locked_packages(python, wheel, tmp_path):
     environment = tmp_path / "environment"
     subprocess.run([python, "-m", "venv", str(environment)], check=True)
