@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.files import PUBLIC_FILE, AtomicFiles, make_private, write_atomically
+from sonarpost.files import PUBLIC_FILE, AtomicFiles, make_private, read_regular, write_atomically
 
 
 def leftovers(folder):
@@ -198,3 +198,26 @@ def test_an_error_names_the_file_and_not_the_temporary_one(tmp_path):
     with pytest.raises(FileNotFoundError) as caught:
         write_atomically(tmp_path / "absent" / "track.csv", b"")
     assert caught.value.filename == str(tmp_path / "absent" / "track.csv")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "loop", "absent", "zero byte", "large", "growing"])
+def test_only_a_regular_file_of_limited_size_is_read(kind, tmp_path):
+    path = tmp_path / "a"
+    (tmp_path / "good").write_bytes(b"12345678")
+    assert read_regular(tmp_path / "good", 8) == b"12345678"
+    match kind:
+        case "pipe":
+            os.mkfifo(path)
+        case "folder":
+            path.mkdir()
+        case "zero byte":
+            path = tmp_path / "a\0b"
+        case "large":
+            path.write_bytes(b"123456789")
+        case "absent":
+            pass
+        case _:
+            # Files in /proc have size 0 and content, as a file that grows.
+            path.symlink_to({"device": "/dev/zero", "loop": "a", "growing": "/proc/self/status"}[kind])
+    with pytest.raises(OSError, match=r".+"):
+        read_regular(path, 8)

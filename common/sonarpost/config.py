@@ -7,6 +7,7 @@ is parsed as a TOML value, or used as a string if it is not one. An empty variab
 
 from __future__ import annotations
 
+import stat
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -52,7 +53,7 @@ RENAMED_KEYS: Mapping[str, Mapping[str, str]] = {
         "seam_pings": "join_overlap_pings",
         "seam_wait_s": "join_timeout_s",
     },
-    "compressor": {"catalogue": "codebook", "keep_pictures": "cache_images", "keep_s": "cache_s"},
+    "compressor": {"catalogue": "codebook", "keep_pictures": "cache_images"},
     "uuv_modem": {
         "frame_s": "tdma_cycle_s",
         "frames_per_picture": "frames_per_image",
@@ -375,3 +376,21 @@ def _known_keys(model: type[ServiceConfig], names: Sequence[str]) -> str:
     if len(names) != 1:
         return "a key that this table has"
     return "one of: " + ", ".join(sorted(model.model_fields)) if model.model_fields else "no keys in this table"
+
+
+def read_passphrase(path: Path) -> bytes:
+    """Return the first line of a file that only its owner can read.
+
+    Raises:
+        ConfigError: It cannot be read, others can read it, or the line is empty.
+    """
+    try:
+        mode = stat.S_IMODE(path.stat().st_mode)
+        lines = path.read_bytes().splitlines()
+    except OSError as error:
+        raise ConfigError(str(path), "passphrase", error.strerror or str(error), "a readable file") from error
+    if mode & 0o077:
+        raise ConfigError(str(path), "mode", f"{mode:04o}", "0600: readable by its owner only")
+    if not lines or not lines[0]:
+        raise ConfigError(str(path), "passphrase", "an empty first line", "the passphrase")
+    return lines[0]

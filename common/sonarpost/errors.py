@@ -6,6 +6,8 @@ of these errors. The message has the form `where: field: got X, expected Y`: the
 
 from __future__ import annotations
 
+import errno
+
 
 class SonarpostError(Exception):
     """Base class of all exceptions of sonarpost."""
@@ -110,3 +112,17 @@ class RetryLaterError(DeliveryError):
 
 class DatabaseUnavailableError(DeliveryError):
     """The database server of a shore site is not reached, or rejects a statement; the caller retries."""
+
+
+class RejectedByDatabaseError(DatabaseUnavailableError):
+    """The database server rejects a value of a statement."""
+
+
+_ERRNO_OF_RECORD = frozenset({errno.ENAMETOOLONG, errno.EINVAL, errno.EILSEQ, errno.EISDIR, errno.ENOTDIR, errno.ELOOP})
+
+
+def can_concern_record(error: Exception) -> bool:
+    """Return whether an error can be caused by the record that is handled, not only by the machine or the network."""
+    if isinstance(error, OSError):
+        return error.errno in _ERRNO_OF_RECORD
+    return isinstance(error, RejectedByDatabaseError) or not isinstance(error, (DeliveryError, MemoryError))

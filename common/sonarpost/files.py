@@ -1,13 +1,15 @@
-"""Atomic and durable writes: after a crash or power cut each file is complete or absent.
+"""Atomic and durable writes: after a crash or power cut each file is complete or absent. Reading of regular files only.
 
 Files get the permissions that the umask of the process allows, unless a mode is given. Services run with umask 077.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -66,6 +68,38 @@ def _create_temporary(path: Path, mode: int) -> tuple[int, Path]:
     except OSError as error:
         error.filename = str(path)  # the file that the caller knows
         raise
+
+
+def open_regular(path: Path) -> int:
+    """Open a file for reading; return its descriptor. A pipe, a device and a socket are errors and do not block.
+
+    Raises:
+        OSError: It cannot be opened, or is not a regular file.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    except ValueError as error:  # a zero byte in the name
+        raise OSError(errno.EINVAL, str(error), str(path)) from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return descriptor
+
+
+def read_regular(path: Path, max_bytes: int) -> bytes:
+    """Return the content of a regular file.
+
+    Raises:
+        OSError: It cannot be read, is not a regular file, is larger than `max_bytes`, or grows.
+    """
+    with os.fdopen(open_regular(path), "rb") as file:
+        size_bytes = os.fstat(file.fileno()).st_size
+        if size_bytes > max_bytes:
+            raise OSError(errno.EFBIG, f"larger than {max_bytes} bytes", str(path))
+        content = file.read(size_bytes + 1)
+    if len(content) > size_bytes:
+        raise OSError(errno.EAGAIN, "grows while it is read", str(path))
+    return content
 
 
 def make_private(path: Path) -> None:

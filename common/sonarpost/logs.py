@@ -26,9 +26,16 @@ from sonarpost.wire import unpack_map
 LogFormat = Literal["text", "json"]
 
 
+class Fields(dict[str, object]):
+    """Fields of a line; as text, each with a space before it: ` image_id=0001 bytes=232`."""
+
+    def __str__(self) -> str:
+        return "".join(f" {name}={_shown(value)}" for name, value in self.items())
+
+
 def kv(**fields: object) -> dict[str, object]:
     """Return the `extra` argument of a log call: log.info("Image stored", extra=kv(image_id="0001"))."""
-    return {"fields": fields}
+    return {"fields": Fields(fields)}
 
 
 _NEEDS_QUOTES = re.compile(r"[ \"'=]").search
@@ -135,8 +142,8 @@ class IntervalLog:
         self._suppressed = 0
         self._last_fields: dict[str, object] = {}
 
-    def log(self, **fields: object) -> None:
-        """Log an occurrence with its fields, or count it as suppressed."""
+    def log(self, exception: BaseException | None = None, /, **fields: object) -> None:
+        """Log an occurrence with its fields and the traceback of an exception, or count it as suppressed."""
         with self._lock:
             now = self._clock()
             if now < self._next_line_s:
@@ -145,7 +152,7 @@ class IntervalLog:
                 return
             suppressed, self._suppressed = self._suppressed, 0
             self._next_line_s = now + self._interval_s
-        self._write(fields, suppressed)
+        self._write(fields, suppressed, exception)
 
     def flush(self, *, stopping: bool = False) -> None:
         """Log the last suppressed occurrence if its interval has ended, or at once with `stopping`.
@@ -161,10 +168,10 @@ class IntervalLog:
             self._next_line_s = now + self._interval_s
         self._write(fields, suppressed)
 
-    def _write(self, fields: dict[str, object], suppressed: int) -> None:
+    def _write(self, fields: dict[str, object], suppressed: int, exception: BaseException | None = None) -> None:
         if suppressed:
             fields = {**fields, "suppressed": suppressed}
-        self._logger.log(self._level, self._message, extra=kv(**fields))
+        self._logger.log(self._level, self._message, exc_info=exception, extra=kv(**fields))
 
 
 def _time_text(record: logging.LogRecord) -> str:
@@ -186,11 +193,10 @@ class TextFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
-        pairs = "".join(f" {name}={_shown(value)}" for name, value in fields_of(record).items())
         message = record.getMessage()
         if not message.isprintable():
             message = json.dumps(message)[1:-1]
-        line = f"{_time_text(record)} {record.levelname} {self._service}: {message}{pairs}"
+        line = f"{_time_text(record)} {record.levelname} {self._service}: {message}{Fields(fields_of(record))}"
         return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
 
 

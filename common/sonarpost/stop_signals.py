@@ -6,44 +6,83 @@ import ctypes
 import logging
 import os
 import signal
+import socket
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import NoReturn
+from typing import Final, NoReturn
+
+from sonarpost.limits import limit
 
 EXIT_WITH_PARENT = "SONARPOST_EXIT_WITH_PARENT"
 EXIT_ORPHANED = 1
 _PR_SET_PDEATHSIG = 1
-_WAKE_S = 0.5
+_NUMBERS: Final = (signal.SIGINT, signal.SIGTERM)
+END_S: Final = limit(
+    4.5,
+    "s",
+    "deadlines",
+    surface="SIGTERM and SIGINT",
+    source="anything that blocks",
+    resource="time from the signal to the end of a process",
+    at_limit="The system ends the process (SIGALRM); accepted records are on the disk",
+)
 
 
 @contextmanager
-def stop_on_signals() -> Iterator[threading.Event]:
-    """Return an event that SIGINT and SIGTERM set, so that a command can clean up before it ends.
+def signals_to(on_signal: Callable[[signal.Signals], None]) -> Iterator[None]:
+    """Call a function for each SIGINT and SIGTERM, in a thread of its own.
 
-    Outside the main thread, which alone can handle signals, no signal sets it.
+    Python runs the handler of a signal between two steps of the main thread. The main thread can wait in a library at
+    that time, or hold the lock of the event that the handler sets. A thread that reads the signals does not depend on
+    it. Outside the main thread, which alone can install handlers, no signal is read.
     """
-    stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield stop
+        yield
         return
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    reader, writer = socket.socketpair()
+    writer.settimeout(0)
+
+    def read_signals() -> None:
+        while number := reader.recv(1):
+            if number[0] in _NUMBERS:
+                on_signal(signal.Signals(number[0]))
+
+    thread = threading.Thread(target=read_signals, name="signals", daemon=True)
+    thread.start()
+    before = {number: signal.signal(number, lambda *_: None) for number in _NUMBERS}
+    fd_before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
     try:
-        yield stop
+        yield
     finally:
+        signal.set_wakeup_fd(fd_before)
         for number, handler in before.items():
             signal.signal(number, handler)
+        writer.close()
+        thread.join()
+        reader.close()
 
 
-def wait_until_set(stop: threading.Event) -> None:
-    """Wait in the main thread for an event that a signal handler sets.
+@contextmanager
+def stop_on_signals(exit_after_s: float = END_S) -> Iterator[threading.Event]:
+    """Return an event that SIGINT and SIGTERM set, so that a command can clean up before it ends.
 
-    Python runs the handler when the main thread wakes. The system can deliver the signal to another thread, which does
-    not wake the main thread, so the wait has a limit and is repeated.
+    Args:
+        exit_after_s: Time after the signal at which the process is ended if it runs inside this context.
     """
-    while not stop.wait(_WAKE_S):
-        pass
+    stop = threading.Event()
+
+    def on_signal(_number: signal.Signals) -> None:
+        signal.setitimer(signal.ITIMER_REAL, exit_after_s)
+        stop.set()
+
+    with signals_to(on_signal):
+        try:
+            yield stop
+        finally:
+            if stop.is_set():
+                signal.setitimer(signal.ITIMER_REAL, 0)
 
 
 def exit_with_parent() -> None:
