@@ -12,9 +12,11 @@ import pytest
 import zenoh
 from builders.common import REPOSITORY, eventually, free_port
 
+from sonarpost import keys, wire
 from sonarpost.bus import router
 from sonarpost.bus.session import client_config
 from sonarpost.errors import BadInputError, ConfigError
+from sonarpost.messages import Health
 
 Start = Callable[..., subprocess.Popen[str]]
 
@@ -195,6 +197,22 @@ def test_router_files_of_the_project_disable_discovery(path):
 )
 def test_configuration_names_the_platform_and_its_sites(metadata, expected):
     assert router.platform_and_sites(zenoh.Config.from_json5(f"{{metadata: {metadata}}}")) == expected
+
+
+def test_monitor_publishes_a_last_record_and_its_thread_ends():
+    text = "{mode: 'peer', scouting: {multicast: {enabled: false}}, metadata: {platform: 'a'}}"
+    config = zenoh.Config.from_json5(text)
+    monitor = router.RouterMonitor(config)
+    states = []
+    with zenoh.open(config) as session:
+        session.declare_subscriber(
+            keys.health("a", "router"),
+            lambda sample: states.append(wire.decode(Health, sample.payload.to_bytes(), "a").state),
+        )
+        monitor.start(session)
+        monitor.close()
+        assert "router-health" not in [thread.name for thread in threading.enumerate()]
+        eventually(lambda: states == ["stopping"])
 
 
 @pytest.mark.parametrize("metadata", ["{platform: 7}", "{platform: 'No Name'}", "{platform: 'a', sites: 'shore'}"])

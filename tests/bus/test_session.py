@@ -10,7 +10,7 @@ import zenoh
 from builders.common import eventually, free_port
 
 from sonarpost.bus import session
-from sonarpost.bus.session import client_config, open_with_retry, router_config
+from sonarpost.bus.session import client_config, lost_reason, open_with_retry, router_config
 
 
 def setting(config, path):
@@ -59,9 +59,45 @@ def test_router_that_starts_later_is_joined(caplog, monkeypatch):
         late = zenoh.open(router_config([endpoint]))
         joining.result().close()
     late.close()
-    # One warning for all attempts, with the endpoint.
-    [warning] = [r for r in caplog.records if r.message.startswith("Zenoh router not reached")]
-    assert vars(warning)["fields"]["router"] == endpoint
+    # One warning for all attempts with the same reason, with the endpoint.
+    fields = [vars(r)["fields"] for r in caplog.records if r.message.startswith("Zenoh router not reached")]
+    assert fields[0] == {"router": endpoint, "error": f"no connection: {endpoint}: Connection refused"}
+    assert len({line["error"] for line in fields}) == len(fields)
+
+
+def test_reasons_of_all_endpoints_are_logged_and_passed_on(caplog, monkeypatch):
+    monkeypatch.setattr(session, "RETRY_S", (0.0,))
+    monkeypatch.setattr(session, "OPEN_TIMEOUT_MS", (50,))
+    endpoints = [f"tcp/127.0.0.1:{free_port()}", "nonsense"]
+    stop, reasons = threading.Event(), []
+
+    def on_failure(reason):
+        reasons.append(reason)
+        if len(reasons) == 4:
+            stop.set()
+
+    assert open_with_retry(endpoints, stop, None, on_failure) is None
+    expected = [
+        f"no connection: {endpoints[0]}: Connection refused",
+        "no reply: nonsense is not tcp/HOST:PORT or tls/HOST:PORT",
+    ]
+    assert reasons == expected * 2
+    assert [vars(record)["fields"]["error"] for record in caplog.records] == expected
+
+
+def test_reason_of_a_lost_router_is_found_until_it_is_back():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    hub = zenoh.open(router_config([endpoint]))
+    opened = open_with_retry([endpoint], threading.Event())
+    try:
+        assert lost_reason(opened) == ""
+        hub.close()
+        eventually(lambda: lost_reason(opened) == f"no connection: {endpoint}: Connection refused")
+        hub = zenoh.open(router_config([endpoint]))
+        eventually(lambda: lost_reason(opened) == "")
+    finally:
+        opened.close()
+        hub.close()
 
 
 def test_stop_ends_the_wait_between_attempts(monkeypatch, caplog):

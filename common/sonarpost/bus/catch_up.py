@@ -28,8 +28,8 @@ QUERY_TIMEOUT_S: Final = 30.0
 RETRY_S: Final = 1.0
 MAX_RECORDS: Final = 256
 """Maximum number of records of one query."""
-MAX_BUFFERED: Final = 10_000
-"""Publications that wait for the consumer; after an overflow c2 is queried again."""
+MAX_BUFFERED: Final = 256
+"""Publications that wait for the consumer, as many as the records of a query; after an overflow c2 is queried again."""
 
 
 @dataclass(frozen=True, slots=True)

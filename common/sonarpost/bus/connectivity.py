@@ -135,12 +135,14 @@ def query_presence(session: zenoh.Session, vessel: str, site: str = keys.SHORE) 
 # Endpoints
 
 
-def probe_endpoint(endpoint: str, tls: TlsConfig | None) -> ConnectivityResult:
+def probe_endpoint(endpoint: str, tls: TlsConfig | None, *, is_silent: bool = False) -> ConnectivityResult:
     """Connect to an endpoint by TCP and, for `tls/...`, with the host's own certificate.
+
+    With `is_silent`, of an endpoint that does not reply to Zenoh, the port of `tcp/...` is checked for TLS.
 
     Returns:
         REACHED (a listener has accepted the connection), TLS_REFUSED (by either side, with the reason), NO_CONNECTION,
-        or NO_REPLY for an unsupported endpoint. Takes at most about 3 s.
+        or NO_REPLY for an unsupported endpoint. Takes at most about 3 s for each address of the host.
     """
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None:
@@ -149,8 +151,14 @@ def probe_endpoint(endpoint: str, tls: TlsConfig | None) -> ConnectivityResult:
     try:
         with socket.create_connection((host, port), TIMEOUT_S) as connection:
             refused = _probe_tls(connection, host, tls) if match["protocol"] == "tls" else ""
+            if is_silent and match["protocol"] == "tcp" and _expects_tls(connection):
+                refused = "the port expects TLS: tls/..."
     except (OSError, OverflowError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        if "handshake operation timed out" in reason:
+            reason = "no reply to the TLS handshake; a port without TLS is tcp/..."
+        if isinstance(error, FileNotFoundError):
+            reason = f"a certificate file of this host is missing ({reason})"
         return ConnectivityResult(ConnectivityState.NO_CONNECTION, f"{endpoint}: {reason}")
     if refused:
         return ConnectivityResult(ConnectivityState.TLS_REFUSED, f"{endpoint}: {refused}")
@@ -180,13 +188,23 @@ def _probe_tls(connection: socket.socket, host: str, tls: TlsConfig | None) -> s
         return reason
 
 
+def _expects_tls(connection: socket.socket) -> bool:
+    """Return whether a TLS server replies, with any certificate."""
+    connection.settimeout(TLS_REFUSAL_S)
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).wrap_socket(connection, server_hostname="localhost").close()
+    except OSError as error:
+        return isinstance(error, ssl.SSLCertVerificationError)
+    return True
+
+
 def diagnose_no_reply(
     result: ConnectivityResult, endpoints: Sequence[str], tls: TlsConfig | None
 ) -> ConnectivityResult:
     """Return the cause of a missing reply by probing the routers on the way; other results are returned unchanged."""
     if result.state is not ConnectivityState.NO_REPLY or not endpoints:
         return result
-    probes = [probe_endpoint(endpoint, tls) for endpoint in endpoints]
+    probes = [probe_endpoint(endpoint, tls, is_silent=True) for endpoint in endpoints]
     for probe in probes:
         if probe.state is ConnectivityState.REACHED:
             # The embedded router replies to every vessel that it admits; zenohd does not, so c2 can be down as well.
@@ -257,12 +275,15 @@ class SiteMonitor:
         return diagnose_no_reply(result, site.endpoints, self._tls)
 
     def update(self, name: str, result: ConnectivityResult) -> None:
-        """Store a site's result; log it if the state has changed."""
+        """Store a site's result; log it if the state has changed. A state is in the log before it is in the health."""
         with self._lock:
             before = self._results.get(name)
+            if before is None or before.state is not result.state:
+                self._log_change(name, result)
             self._results[name] = result
-        if before is not None and before.state is result.state:
-            return
+
+    @staticmethod
+    def _log_change(name: str, result: ConnectivityResult) -> None:
         if result.state is ConnectivityState.REACHED:
             log.info("Shore reached", extra=kv(site=name, by=result.detail))
         else:

@@ -29,7 +29,7 @@ from sonarpost.errors import BadInputError, ConfigError, DeliveryError, Sonarpos
 from sonarpost.messages import Health, ServiceState
 from sonarpost.monitoring.service_manager import ServiceManager
 from sonarpost.security.tls_files import TlsMonitor
-from sonarpost.stop_signals import exit_process, exit_with_parent, stop_on_signals, wait_until_set
+from sonarpost.stop_signals import exit_process, exit_with_parent, stop_on_signals
 
 log = logging.getLogger(__name__)
 
@@ -133,6 +133,8 @@ class RouterMonitor:
                 session.put(keys.health(platform, NAME), wire.encode(record), encoding=wire.encoding_of(Health))
             except (DeliveryError, zenoh.ZError) as error:
                 log.warning("Health not published", extra=logs.kv(error=str(error)))
+            except Exception:  # for example about the name of one peer
+                log.exception("Health not published after an unexpected exception")
 
 
 def platform_and_sites(config: zenoh.Config) -> tuple[str | None, tuple[str, ...]]:
@@ -184,7 +186,7 @@ def run(config: zenoh.Config) -> int:
         with stop_on_signals() as stop, zenoh.open(config) as session:
             monitor.start(session)
             log.info("Router started", extra=logs.kv(listen=listen, connect=connect))
-            wait_until_set(stop)
+            stop.wait()
             monitor.close()
     except (zenoh.ZError, SonarpostError) as error:
         log.error("Router cannot start", extra=logs.kv(listen=listen, error=str(error)))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import zenoh
 
-from sonarpost.bus.connectivity import probe_endpoint
+from sonarpost.bus.connectivity import ConnectivityState, probe_endpoint
 from sonarpost.config import TlsConfig
 from sonarpost.logs import kv
 from sonarpost.security.router_config import dropped_replies
@@ -20,6 +20,8 @@ OPEN_TIMEOUT_MS = (1000, 2000, 4000)
 """Time-outs of the first, second and all later attempts: TLS on a busy computer may take longer than a second."""
 WAIT_BEFORE_DROP_US = 50_000
 RETRY_S = (0.1, 0.2, 0.5, 1.0)
+_opened: dict[str, tuple[str, TlsConfig | None]] = {}
+"""Endpoint and certificate of each session, which Zenoh's sessions do not return."""
 
 
 def client_config(endpoints: Sequence[str], tls: TlsConfig | None = None, attempt: int = 2) -> zenoh.Config:
@@ -84,26 +86,47 @@ def tls_settings(tls: TlsConfig) -> dict[str, object]:
 
 
 def open_with_retry(
-    endpoints: Sequence[str], stop: threading.Event, tls: TlsConfig | None = None
+    endpoints: Sequence[str],
+    stop: threading.Event,
+    tls: TlsConfig | None = None,
+    on_failure: Callable[[str], None] = lambda _reason: None,
 ) -> zenoh.Session | None:
     """Open a client session, trying each endpoint in turn until one opens.
 
     Zenoh's own endless retry cannot be interrupted by a signal and only tries the first endpoint. An open session
-    reconnects to its endpoint by itself.
+    reconnects to its endpoint by itself. Each new reason of a failure is logged; `on_failure` receives all of them.
 
     Returns:
         The session, or None if `stop` was set first.
     """
-    attempt = 0
+    attempt, logged = 0, set[str]()
     while not stop.is_set():
         endpoint = endpoints[attempt % len(endpoints)]
         try:
-            return zenoh.open(client_config([endpoint], tls, attempt // len(endpoints)))
-        except zenoh.ZError as error:
-            if attempt == 0:
-                # Zenoh reports a refused certificate as a time-out.
-                reason = probe_endpoint(endpoint, tls).text if endpoint.startswith("tls/") else str(error)[:200]
+            session = zenoh.open(client_config([endpoint], tls, attempt // len(endpoints)))
+        except zenoh.ZError:
+            reason = _failure(endpoint, tls)
+            if reason not in logged:
                 log.warning("Zenoh router not reached; retrying", extra=kv(router=endpoint, error=reason))
+            logged.add(reason)
+            on_failure(reason)
             attempt += 1
             stop.wait(RETRY_S[min(attempt // len(endpoints), len(RETRY_S) - 1)])
+        else:
+            _opened[str(session.zid())] = (endpoint, tls)
+            return session
     return None
+
+
+def lost_reason(session: zenoh.Session) -> str:
+    """Return why a session has lost its router, empty if it has not or is not of `open_with_retry`; probes."""
+    opened = _opened.get(str(session.zid()))
+    return "" if opened is None or session.info.routers_zid() else _failure(*opened)
+
+
+def _failure(endpoint: str, tls: TlsConfig | None) -> str:
+    """Return why Zenoh, which reports every cause as a time-out, does not reach a router."""
+    result = probe_endpoint(endpoint, tls, is_silent=True)
+    if result.state is ConnectivityState.REACHED:
+        return f"no reply: {endpoint} accepts connections, but does not reply as a Zenoh router"
+    return result.text
