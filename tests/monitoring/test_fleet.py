@@ -53,6 +53,20 @@ def test_invalid_record_is_counted_and_dropped(key, payload, caplog):
     assert "expected" in vars(caplog.records[0])["fields"]["reason"]
 
 
+@pytest.mark.parametrize("name", ["range", "status"])
+def test_invalid_record_of_a_vehicle_is_counted_logged_and_dropped(name, caplog):
+    fleet = FleetTracker()
+    key, add_record = {
+        "range": (keys.acoustic_range("vessel-1"), fleet.add_range),
+        "status": (keys.acoustic_status("vessel-1"), fleet.add_status),
+    }[name]
+    add_record(key, b"\xc1", 0.0)
+    assert fleet.state(0.0).rejected == 1
+    [record] = caplog.records
+    assert record.message.endswith("of a vehicle rejected")
+    assert key in vars(record)["fields"]["reason"]
+
+
 def test_invalid_tokens_are_ignored():
     fleet = FleetTracker()
     fleet.set_alive(["sonarpost/v1/uuv-1/alive/c2", "sonarpost/v1/uuv-1/alive/a/b", "x"], 0.0)
@@ -67,6 +81,22 @@ def test_service_without_a_token_expires():
     assert len(fleet.state(60.0).services) == 2
     fleet.set_alive([keys.alive("uuv-1", "c2")], 61.0)
     assert [s.service for s in fleet.state(61.0).services] == ["c2"]
+
+
+def test_invented_services_of_a_platform_hide_no_other_platform(monkeypatch):
+    monkeypatch.setattr(fleet_module, "MAX_SERVICES_OF_PLATFORM", 3)
+    monkeypatch.setattr(fleet_module, "MAX_SERVICES", 10)
+    fleet = FleetTracker()
+    fleet.set_alive([keys.alive("uuv-1", f"t{number}") for number in range(20)] + [keys.alive("uuv-2", "c2")], 0.0)
+    for number in range(20):
+        add(fleet, health(service=f"s{number}"), 0.0)
+    add(fleet, health("uuv-2", "relay"), 0.0)
+    large = health(service="t1", gauges={f"gauge-{number}": 0.0 for number in range(10_000)})
+    add(fleet, large, 0.0)
+    state = fleet.state(0.0)
+    assert [one.service for one in state.services if one.platform == "uuv-2"] == ["c2", "relay"]
+    assert len([one for one in state.services if one.platform == "uuv-1"]) == 3
+    assert state.rejected == 21
 
 
 def test_number_of_services_is_limited(monkeypatch):

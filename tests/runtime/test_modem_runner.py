@@ -1,6 +1,7 @@
 import logging
 import os
 import pty
+import queue
 import threading
 import time
 import tty
@@ -17,6 +18,7 @@ from sonarpost.modem.interface import (
     PacketReceived,
     PacketSent,
     RequestDone,
+    SentenceRejected,
 )
 from sonarpost.modem.micromodem import (
     FailureReason,
@@ -27,8 +29,11 @@ from sonarpost.modem.micromodem import (
     PingAnswered,
     nmea,
 )
-from sonarpost.runtime.modem_runner import ModemRunner
-from sonarpost.runtime.serial_port import SerialPort
+from sonarpost.modem.registry import ModemSettings
+from sonarpost.modem.udp import UdpModem
+from sonarpost.modem.udp.datagram import Datagram, DatagramKind
+from sonarpost.runtime.modem_runner import MAX_INPUTS, ModemRunner
+from sonarpost.runtime.serial_port import ModemPort, PortOpened, SerialPort
 from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
 from sonarpost.simulation.channel.emulator import ChannelEmulator
 
@@ -268,3 +273,46 @@ def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path):
         for runner in runners.values():
             runner.stop()
         channel.stop()
+
+
+class FragileModem(UdpModem):
+    def receive(self, data, now):
+        if data == b"defect":
+            raise RuntimeError("a defect")
+        return super().receive(data, now)
+
+
+class FragilePort(ModemPort):
+    """A port that fails once, then delivers what is put into `parts`."""
+
+    STREAM = False
+
+    def __init__(self):
+        super().__init__("test port")
+        self.parts = queue.SimpleQueue()
+        self.opened = 0
+
+    def write(self, data):
+        pass
+
+    def _run(self, on_event, closing):
+        self.opened += 1
+        if self.opened == 1:
+            raise TypeError("of a library")
+        on_event(PortOpened())
+        while (part := self.parts.get()) is not None:
+            on_event(part)
+        closing.wait()
+
+
+def test_defects_of_driver_and_port_cost_one_input(caplog):
+    port, events = FragilePort(), []
+    runner = ModemRunner(FragileModem(ModemSettings(1)), port, events.append)
+    runner.start()
+    datagram = Datagram(DatagramKind.DATA, 2, 255, 1, 7, (b"x",)).pack()
+    for part in (*[b"junk"] * (2 * MAX_INPUTS), b"defect", datagram, None):
+        port.parts.put(part)
+    eventually(lambda: any(isinstance(event, PacketReceived) for event in events))
+    runner.stop()
+    assert (runner.failures, port.opened) == (1, 2)
+    assert sum(isinstance(event, SentenceRejected) for event in events) == 2 * MAX_INPUTS

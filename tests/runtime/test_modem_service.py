@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import logging
+import os
+import pty
 from types import SimpleNamespace
 
 import pytest
+from builders.common import eventually
 from builders.fake_modem import FakeModem
 
 from sonarpost.modem.interface import SentenceRejected
@@ -37,6 +41,7 @@ class Connected:
         # The port is not opened: the service has an open one and the driver of the simulated modem instead.
         service._port = SimpleNamespace(is_open=True, error="")  # type: ignore[assignment]
         service.modem = self.modem.driver  # type: ignore[assignment]
+        service.modem.failure, service.modem.failures = "", 0
         self.modem.driver.start(0.0)
         self.run(5.0)
 
@@ -63,6 +68,25 @@ def connected(platform):
     service = Service(platform("uuv-1"), ModemServiceConfig(port=PORT, address=3))
     yield Connected(service)
     service.stop()
+
+
+def test_service_whose_port_is_in_use_is_degraded_until_the_port_is_free(platform):
+    master, slave = pty.openpty()
+    path = os.ttyname(slave)
+    fcntl.flock(slave, fcntl.LOCK_EX)
+    service = Service(platform("uuv-1"), ModemServiceConfig(port=path, address=3))
+    try:
+        assert service.start()
+        eventually(lambda: "in use by" in service.health().detail)
+        health = service.health()
+        assert health.state == "degraded"
+        assert health.detail.startswith(f"{path}: in use by ")
+        assert f"(process {os.getpid()})" in health.detail
+        os.close(slave)
+        eventually(lambda: service.health().detail.startswith(f"{path}: no reply from the modem yet"))
+    finally:
+        service.stop()
+        os.close(master)
 
 
 def lines(caplog, message):

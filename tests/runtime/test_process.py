@@ -32,6 +32,7 @@ from sonarpost.runtime.process import main
 from sonarpost.runtime.service import UnitOfWork, Service
 
 class TinyConfig(ServiceConfig):
+    hangs_on_start: bool = False
     hangs_on_stop: bool = False
     raises: bool = False
 
@@ -46,6 +47,9 @@ class Tiny(Service[TinyConfig]):
         effects.count("decisions")
 
     def on_start(self) -> None:
+        if self.config.hangs_on_start:
+            print("start hangs", file=sys.stderr, flush=True)
+            threading.Event().wait()
         if self.config.raises:
             self.start_thread(lambda: 1 // 0, "raises")
 
@@ -182,7 +186,7 @@ def test_running_service_notifies_systemd_and_publishes_health_and_liveliness(st
         process = start(configuration(tmp_path, router), **environment)
         read_until(process, "Configuration overridden by environment keys=platform.health_interval_s")
         eventually(lambda: len(received) >= 7)
-        assert received[0].decode() == f"STATUS=waiting for the router {router}"
+        assert received[0].decode() == f"WATCHDOG=1\nSTATUS=waiting for the router {router}"
         assert received[1] == b"READY=1\nSTATUS=started\nWATCHDOG_USEC=300000"
         assert set(received[2:7]) == {b"WATCHDOG=1\nSTATUS=ok"}
         eventually(lambda: len(seen) > 2 and seen[-1].state == "ok")
@@ -218,6 +222,47 @@ def test_hanging_shutdown_is_ended(start, tmp_path, router):
     read_until(process, "Service started")
     status, log = end(process)
     assert (status, "Shutdown timed out" in log) == (3, True)
+
+
+def test_start_that_hangs_is_ended(start, tmp_path, router):
+    process = start(configuration(tmp_path, router, "hangs_on_start = true"))
+    read_until(process, "start hangs")
+    status, log = end(process)
+    assert (status, "Stopping signal=SIGTERM" in log, "Shutdown timed out" in log) == (3, True, True)
+
+
+def test_service_whose_log_is_not_read_is_ended(start, tmp_path, router):
+    """A write to a full pipe blocks, and holds the lock of the log."""
+    process = start(configuration(tmp_path, router))
+    read_until(process, "Service started")
+    with open(f"/proc/{process.pid}/fd/2", "wb", buffering=0, opener=nonblocking) as pipe:
+        while pipe.write(bytes(4096)):
+            pass
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(WAIT_S) == -signal.SIGALRM
+
+
+def nonblocking(path, flags):
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
+COMMAND = """
+import sys, threading
+from sonarpost.stop_signals import stop_on_signals
+with stop_on_signals() as stop:
+    print("started", file=sys.stderr, flush=True)
+    (stop if sys.argv[1] == "waits" else threading.Event()).wait()
+print("ended", file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize(("waits_for", "expected"), [("waits", 0), ("hangs", -signal.SIGALRM)])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signal_ends_a_command_that_hangs(waits_for, expected, number):
+    with subprocess.Popen([sys.executable, "-c", COMMAND, waits_for], stderr=subprocess.PIPE, text=True) as process:
+        read_until(process, "started")
+        status, log = end(process, number)
+    assert (status, "ended" in log) == (expected, expected == 0)
 
 
 def test_exception_in_a_thread_stops_the_service_with_its_traceback(start, tmp_path, router):

@@ -1,9 +1,10 @@
-"""Time that retention uses: a step of the wall clock takes effect after a day."""
+"""Time that retention uses: the start and a step of the wall clock take effect after a day."""
 
 from __future__ import annotations
 
 import pytest
 
+from sonarpost.archive.retention import EARLIEST_UTC_S
 from sonarpost.runtime.retention import FOLLOW_AFTER_S, SteadyTime
 
 START_UTC_S = 1_800_000_000.0
@@ -28,15 +29,33 @@ def clocks(monkeypatch):
     return Clocks(monkeypatch)
 
 
-def test_time_follows_the_wall_clock_and_its_small_corrections(clocks):
+@pytest.fixture
+def steady(clocks):
+    """The time of a service that has run for a day, until `START_UTC_S`."""
+    clocks.wall_s -= FOLLOW_AFTER_S
     steady = SteadyTime()
+    clocks.run(FOLLOW_AFTER_S)
+    assert steady.now_utc_s() == START_UTC_S
+    return steady
+
+
+def test_start_takes_effect_after_a_day(clocks, caplog):
+    clocks.wall_s += YEAR_S
+    steady = SteadyTime()
+    for _ in range(24):
+        assert steady.now_utc_s() < EARLIEST_UTC_S
+        clocks.run(FOLLOW_AFTER_S / 24)
+    assert steady.now_utc_s() == START_UTC_S + YEAR_S + FOLLOW_AFTER_S
+    assert not caplog.records
+
+
+def test_time_follows_the_wall_clock_and_its_small_corrections(clocks, steady):
     clocks.run(1000.0)
     clocks.wall_s += 30.0
     assert steady.now_utc_s() == START_UTC_S + 1030.0
 
 
-def test_clock_that_is_set_forward_takes_effect_after_a_day(clocks, caplog):
-    steady = SteadyTime()
+def test_clock_that_is_set_forward_takes_effect_after_a_day(clocks, steady, caplog):
     clocks.wall_s += YEAR_S
     assert steady.now_utc_s() == START_UTC_S
     clocks.run(FOLLOW_AFTER_S - 60.0)
@@ -47,8 +66,7 @@ def test_clock_that_is_set_forward_takes_effect_after_a_day(clocks, caplog):
     assert "Clock was set" in caplog.text
 
 
-def test_clock_that_is_set_back_soon_changes_nothing(clocks):
-    steady = SteadyTime()
+def test_clock_that_is_set_back_soon_changes_nothing(clocks, steady):
     clocks.wall_s += YEAR_S
     assert steady.now_utc_s() == START_UTC_S
     clocks.wall_s -= YEAR_S
@@ -56,7 +74,6 @@ def test_clock_that_is_set_back_soon_changes_nothing(clocks):
     assert steady.now_utc_s() == START_UTC_S + 10.0
 
 
-def test_earlier_time_is_used_at_once(clocks):
-    steady = SteadyTime()
+def test_earlier_time_is_used_at_once(clocks, steady):
     clocks.wall_s -= YEAR_S
     assert steady.now_utc_s() == START_UTC_S - YEAR_S

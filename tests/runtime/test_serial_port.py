@@ -1,15 +1,25 @@
+import errno
+import fcntl
 import logging
 import os
 import pty
 import queue
 import socket
+import subprocess
+import sys
+import termios
 import threading
+from contextlib import closing
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import serial
 from builders.common import WAIT_S, eventually, free_port
 
+from sonarpost.bearers import serial_device
+from sonarpost.bearers.iridium import IridiumTerminal
+from sonarpost.bearers.serial_device import close_port, open_port
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.runtime import serial_port
 from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialPort
@@ -241,3 +251,117 @@ def test_a_closed_port_can_be_started_again(pty_port):
 def test_an_invalid_url_or_baud_rate_is_a_configuration_error(url, baud):
     with pytest.raises(ConfigError, match="modem port: url or baud"):
         SerialPort(url, baud)
+
+
+# A port that another program has
+
+TIOCGEXCL = 0x80045440
+"""Linux: whether `TIOCEXCL` is set."""
+ME = f"(process {os.getpid()})"
+
+
+@pytest.fixture
+def first(pty_port):
+    """The first program on the port: it does not read by itself."""
+    port = serial.serial_for_url(str(pty_port.path), timeout=WAIT_S, do_not_open=True)
+    open_port(port)
+    yield port
+    close_port(port)
+
+
+def test_second_program_is_refused_and_the_first_keeps_its_bytes(pty_port, first):
+    os.set_blocking(pty_port.master, False)
+    settings = termios.tcgetattr(first.fileno())
+    os.write(pty_port.master, b"received before, not read yet")
+    command = ["modem", "ping", "--port", str(pty_port.path), "--baud", "4800", "--address", "1", "--destination", "2"]
+    arguments = [sys.executable, "-m", "sonarpost.cli.main", *command]
+    second = subprocess.run(arguments, check=False, capture_output=True, text=True, timeout=WAIT_S)
+    assert second.returncode == 2
+    last_line = second.stderr.splitlines()[-1]
+    assert last_line.startswith(f"sonarpost: {pty_port.path}: in use by ")
+    assert last_line.endswith(ME)
+    os.write(pty_port.master, b", and after")
+    assert first.read(40) == b"received before, not read yet, and after"
+    assert termios.tcgetattr(first.fileno()) == settings
+    with pytest.raises(BlockingIOError):
+        os.read(pty_port.master, 1)
+
+
+def test_port_in_use_is_retried_and_opened_when_it_is_free(pty_port, first, caplog):
+    port = make_port(str(pty_port.path))
+    events = PortEvents(port)
+    with closing(port):
+        eventually(lambda: port.error is not None)
+        assert port.error.startswith("in use by ")
+        assert port.error.endswith(ME)
+        assert not port.is_open
+        close_port(first)
+        assert events.next() == PortOpened()
+        assert port.error is None
+    [line] = [record for record in caplog.records if "cannot be opened" in record.message]
+    assert line.fields["reason"].endswith(ME)
+
+
+def test_each_reason_of_a_port_that_is_not_open_is_logged_once(pty_port, first, caplog):
+    link = pty_port.path.with_name("adapter")
+    port = make_port(str(link))
+    events = PortEvents(port)
+    with closing(port):
+        eventually(lambda: port.error is not None)
+        link.symlink_to(pty_port.path)
+        eventually(lambda: "in use by" in port.error)
+        close_port(first)
+        assert events.next() == PortOpened()
+    absent, in_use = [record.fields["reason"] for record in caplog.records if "cannot be opened" in record.message]
+    assert "No such file" in absent
+    assert in_use.startswith("in use by ")
+
+
+def test_satellite_terminal_does_not_take_a_port_in_use(pty_port, first):
+    with closing(IridiumTerminal(str(pty_port.path))) as terminal, pytest.raises(PortError, match="in use by "):
+        terminal.exchange(b"x")
+
+
+def test_port_that_the_system_refuses_names_the_program_that_has_it_open(pty_port, monkeypatch):
+    def refuse(_):
+        raise serial.SerialException(errno.EBUSY, "Device or resource busy")
+
+    monkeypatch.setattr(serial.Serial, "open", refuse)
+    port = serial.serial_for_url(str(pty_port.path), do_not_open=True)
+    with pytest.raises(OSError, match=r"^in use by another program$"):
+        open_port(port)
+    other = os.open(pty_port.path, os.O_RDWR | os.O_NOCTTY)  # without a lock
+    try:
+        with pytest.raises(OSError, match=rf"^in use by .+ \(process {os.getpid()}\)$"):
+            open_port(port)
+        monkeypatch.setattr(Path, "read_text", lambda *_, **__: refuse(None))  # another system, or no permission
+        with pytest.raises(OSError, match=r"^in use by another program$"):
+            open_port(port)
+    finally:
+        os.close(other)
+
+
+def test_device_is_closed_to_programs_without_a_lock_but_not_a_pseudo_terminal(pty_port, monkeypatch):
+    port = serial.serial_for_url(str(pty_port.path), do_not_open=True)
+    for majors, is_exclusive in ((serial_device._PTY_MAJORS, False), ((), True)):
+        monkeypatch.setattr(serial_device, "_PTY_MAJORS", majors)
+        open_port(port)
+        answer = fcntl.ioctl(port.fileno(), TIOCGEXCL, bytes(4))
+        close_port(port)
+        assert bool(int.from_bytes(answer, sys.byteorder)) == is_exclusive
+
+
+def test_unexpected_exception_counts_as_a_lost_port(pty_port, monkeypatch):
+    read = serial_port._read_descriptor
+    errors = [AttributeError("a defect")]
+
+    def failing(descriptor):
+        if errors:
+            raise errors.pop()
+        return read(descriptor)
+
+    monkeypatch.setattr(serial_port, "_read_descriptor", failing)
+    monkeypatch.setattr(serial_port, "_CLOSE_S", 0.0)
+    with closing(SerialPort(str(pty_port.path))) as port:
+        events = PortEvents(port)
+        assert [events.next() for _ in range(3)] == [PortOpened(), PortLost("a defect"), PortOpened()]

@@ -1,4 +1,4 @@
-"""A service whose store has lost commits is degraded until it is cleared."""
+"""A service whose store has lost commits, or states that cannot be read, is degraded."""
 
 from __future__ import annotations
 
@@ -27,3 +27,18 @@ def test_lost_commits_degrade_the_service_until_they_are_cleared(platform):
         assert health() == ("degraded", expected)
     assert sonarpost(["store", "check", str(path), "--clear"]) == 0
     assert health() == ("ok", "")
+
+
+def test_unreadable_state_degrades_the_service_until_the_next_start(platform):
+    service = RelayService(platform("vessel-1"), RelayConfig())
+    with service.store.transaction() as tx:
+        tx.put_state("name", b"not a number")
+    assert service.store.read_state("name", int, 0) == 0
+    found = service.health()
+    service.stop()
+    reason = "stored states discarded since the start: 1; they are in the quarantine"
+    assert (found.state, found.detail, found.counters["states_discarded"]) == ("degraded", reason, 1)
+    service = RelayService(platform("vessel-1"), RelayConfig())
+    found = service.health()
+    service.stop()
+    assert (found.state, found.gauges["refused"]) == ("ok", 1.0)

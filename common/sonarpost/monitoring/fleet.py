@@ -11,23 +11,48 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import groupby, islice
+from operator import itemgetter
 from typing import Final
 
 import zenoh
 
 from sonarpost import keys, wire
-from sonarpost.bus.session import open_with_retry
+from sonarpost.bus.session import lost_reason, open_with_retry
 from sonarpost.config import TlsConfig
 from sonarpost.errors import BadInputError, PayloadError
-from sonarpost.logs import kv
+from sonarpost.limits import limit
+from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import Health, ReceivedStatus, VehicleRange
 
 log = logging.getLogger(__name__)
 
-MAX_SERVICES: Final = 1000
-"""Limit of the memory that publishers can use with invented names."""
-
-MAX_VEHICLES: Final = 200
+_SURFACE: Final = "state of the fleet"
+MAX_SERVICES: Final = limit(
+    1000,
+    "services",
+    "shares",
+    surface=_SURFACE,
+    source="all platforms",
+    resource="services",
+    at_limit="others are ignored",
+)
+MAX_SERVICES_OF_PLATFORM: Final = limit(
+    40,
+    "services",
+    "shares",
+    surface=_SURFACE,
+    source="platform",
+    resource="its services",
+    at_limit="others are ignored",
+)
+MAX_HEALTH_BYTES: Final = limit(
+    65536, "bytes", "claims", surface=_SURFACE, source="platform", resource="a health record", at_limit="it is ignored"
+)
+MAX_VEHICLES: Final = limit(
+    200, "vehicles", "shares", surface=_SURFACE, source="vessel", resource="its vehicles", at_limit="others are ignored"
+)
 
 Name = tuple[str, str]
 
@@ -74,6 +99,7 @@ class FleetState:
         rejected: Number of invalid records since the start.
         vehicles: Vehicles with a status since the start, ordered by vessel and name.
         ranges: Last measured distances with the time since their arrival, in the same order.
+        failure: Why no router is reached, as far as it is known.
     """
 
     services: tuple[ServiceStatus, ...]
@@ -81,6 +107,7 @@ class FleetState:
     rejected: int
     vehicles: tuple[VehicleState, ...] = ()
     ranges: tuple[tuple[VehicleRange, float], ...] = ()
+    failure: str = ""
 
 
 class FleetTracker:
@@ -98,8 +125,9 @@ class FleetTracker:
         self._alive: frozenset[Name] = frozenset()
         self._vehicles: dict[Name, tuple[ReceivedStatus, float]] = {}
         self._ranges: dict[Name, tuple[VehicleRange, float]] = {}
-        self._connected = False
+        self._connected, self._failure = False, ""
         self._rejected = 0
+        self._rejected_log = IntervalLog(log, logging.WARNING, "Record of a service or of a vehicle rejected")
 
     def add(self, key: str, payload: bytes, now_s: float) -> None:
         """Add a health record; an invalid one is logged, counted and dropped.
@@ -111,18 +139,24 @@ class FleetTracker:
         """
         try:
             name = keys.service_of(key)
+            if len(payload) > MAX_HEALTH_BYTES:
+                raise PayloadError(key, "payload", f"{len(payload)} bytes", f"at most {MAX_HEALTH_BYTES} bytes")
             health = wire.decode(Health, payload, key)
             if (health.platform_id, health.service) != name:
                 raise PayloadError(key, "platform_id, service", f"{health.platform_id}, {health.service}", str(name))
             with self._lock:
                 if name not in self._last_s and len(self._last_s) >= MAX_SERVICES:
                     raise PayloadError(key, "service", name[1], f"no more than {MAX_SERVICES} services")
+                if name not in self._last_s and _number_of(name[0], self._last_s) >= MAX_SERVICES_OF_PLATFORM:
+                    raise PayloadError(
+                        key, "service", name[1], f"no more than {MAX_SERVICES_OF_PLATFORM} of a platform"
+                    )
                 self._health[name] = health
                 self._last_s[name] = now_s
         except BadInputError as error:
             with self._lock:
                 self._rejected += 1
-            log.warning("Health record rejected", extra=kv(reason=str(error)))
+            self._rejected_log.log(reason=str(error)[:300])
 
     def add_status(self, key: str, payload: bytes, now_s: float) -> None:
         """Add the status of a vehicle; an invalid one is logged, counted and dropped.
@@ -139,7 +173,7 @@ class FleetTracker:
                 raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
             name = (record.vessel_id, record.vehicle_id)
             with self._lock:
-                if name not in self._vehicles and len(self._vehicles) >= MAX_VEHICLES:
+                if name not in self._vehicles and _number_of(name[0], self._vehicles) >= MAX_VEHICLES:
                     raise PayloadError(key, "vehicle_id", record.vehicle_id, f"no more than {MAX_VEHICLES} vehicles")
                 known = self._vehicles.get(name)
                 # At a shore site a record can arrive twice, directly and later through the relay.
@@ -148,7 +182,7 @@ class FleetTracker:
         except BadInputError as error:
             with self._lock:
                 self._rejected += 1
-            log.warning("Status of a vehicle rejected", extra=kv(reason=str(error)))
+            self._rejected_log.log(reason=str(error)[:300])
 
     def add_range(self, key: str, payload: bytes, now_s: float) -> None:
         """Add the measured distance of a vehicle; an invalid one is logged, counted and dropped. As `add_status`."""
@@ -158,16 +192,16 @@ class FleetTracker:
                 raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
             name = (record.vessel_id, record.vehicle_id)
             with self._lock:
-                if name not in self._ranges and len(self._ranges) >= MAX_VEHICLES:
+                if name not in self._ranges and _number_of(name[0], self._ranges) >= MAX_VEHICLES:
                     raise PayloadError(key, "vehicle_id", record.vehicle_id, f"no more than {MAX_VEHICLES} vehicles")
                 self._ranges[name] = (record, now_s)
         except BadInputError as error:
             with self._lock:
                 self._rejected += 1
-            log.warning("Distance of a vehicle rejected", extra=kv(reason=str(error)))
+            self._rejected_log.log(reason=str(error)[:300])
 
-    def set_alive(self, tokens: Iterable[str] | None, now_s: float) -> None:
-        """Set the keys of all present liveliness tokens; None if the router is not reached."""
+    def set_alive(self, tokens: Iterable[str] | None, now_s: float, failure: str = "") -> None:
+        """Set the keys of all present liveliness tokens; None if the router is not reached, with the reason."""
         names: set[Name] = set()
         for token in tokens or ():
             try:
@@ -175,8 +209,10 @@ class FleetTracker:
             except BadInputError as error:
                 log.debug("Token ignored", extra=kv(reason=str(error)))
         with self._lock:
-            self._connected = tokens is not None
-            self._alive = frozenset(sorted(names)[:MAX_SERVICES])
+            self._connected, self._failure = tokens is not None, failure
+            of_platforms = groupby(sorted(names), key=itemgetter(0))
+            shown = [name for _, group in of_platforms for name in islice(group, MAX_SERVICES_OF_PLATFORM)]
+            self._alive = frozenset(shown[:MAX_SERVICES])
             for name in self._alive:
                 # The age of a service without a record counts from its token.
                 self._last_s.setdefault(name, now_s)
@@ -192,12 +228,17 @@ class FleetTracker:
             statuses = [record_and_time for _, record_and_time in sorted(self._vehicles.items())]
             vehicles = tuple(VehicleState(record, max(0.0, now_s - at_s)) for record, at_s in statuses)
             ranges = tuple((record, max(0.0, now_s - at_s)) for _, (record, at_s) in sorted(self._ranges.items()))
-            return FleetState(services, self._connected, self._rejected, vehicles, ranges)
+            return FleetState(services, self._connected, self._rejected, vehicles, ranges, self._failure)
 
     def _status(self, name: Name, now_s: float) -> ServiceStatus:
         health = self._health.get(name)
         age_s = None if health is None else max(0.0, now_s - self._last_s[name])
         return ServiceStatus(*name, health, age_s, name in self._alive if self._connected else None)
+
+
+def _number_of(source: str, names: Iterable[Name]) -> int:
+    """Return how many of the names are of a platform or vessel."""
+    return sum(name[0] == source for name in names)
 
 
 class FleetWatcher:
@@ -237,7 +278,8 @@ class FleetWatcher:
         return self.fleet.state(time.monotonic())
 
     def _run(self) -> None:
-        session = open_with_retry(self._endpoints, self._stop, self._tls)
+        on_failure = partial(self.fleet.set_alive, None, time.monotonic())  # no service is known yet: none expires
+        session = open_with_retry(self._endpoints, self._stop, self._tls, on_failure)
         if session is None:
             return
         # A session that is not closed would keep the process from exiting.
@@ -273,4 +315,4 @@ class FleetWatcher:
         except zenoh.ZError as error:
             log.warning("Liveliness tokens not received", extra=kv(error=str(error)))
             tokens = None
-        self.fleet.set_alive(tokens, time.monotonic())
+        self.fleet.set_alive(tokens, time.monotonic(), lost_reason(session))

@@ -2,9 +2,9 @@
 
 Exit status 0 if it is healthy, else 1 with the reason on standard output:
 
-- no heartbeat: the service has not started, for example because its router is not reached;
+- no heartbeat: the service has not started;
 - an old heartbeat: the process hangs;
-- degraded: the service reports that it cannot work (it cannot store records, its modem does not reply);
+- degraded: the service reports that it cannot work (it waits for its router, its modem does not reply);
 - stalled: records wait and none was finished for a long time;
 - the disk of its store is full.
 
@@ -46,7 +46,7 @@ def health_problem(path: Path, now_s: float, stalled_after_s: float = STALLED_AF
         state, detail, folder = str(beat["state"]), str(beat["detail"]), Path(str(beat["state_dir"]))
         waiting, stalled_s = int(beat["waiting"]), float(beat["stalled_s"])
     except FileNotFoundError:
-        return f"no heartbeat at {path}: the service has not started (is its router reached?)"
+        return f"no heartbeat at {path}: the service has not started"
     except (OSError, ValueError, KeyError, TypeError) as error:
         return f"{path}: got {type(error).__name__}: {error}, expected a heartbeat file"
     if age_s > allowed_s:

@@ -44,10 +44,6 @@ class ServiceManager:
         watchdog_s = int(watchdog_us) / 1e6 if watchdog_us.isdecimal() else 0.0
         return cls(environment.get(SOCKET_VARIABLE, ""), watchdog_s, interval_s)
 
-    def starting(self, status: str) -> None:
-        """Report what the start waits for."""
-        self._send(f"STATUS={_one_line(status)}")
-
     def ready(self, status: str) -> None:
         """Report that the process has started. A watchdog time that is too short for the interval is extended."""
         shortest_s = MISSED_INTERVALS * self._interval_s

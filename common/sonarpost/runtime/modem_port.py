@@ -2,38 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Final
 
-from sonarpost.runtime.serial_port import PortEvent, SerialPort
+from sonarpost.runtime.serial_port import ModemPort, SerialPort
 from sonarpost.runtime.udp_port import UdpPort
 
 UDP_SCHEME: Final = "udp://"
-
-
-class ModemPort(Protocol):
-    """What a `ModemRunner` needs of a port; see `SerialPort`."""
-
-    @property
-    def url(self) -> str:
-        """Name of the port."""
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the port is open."""
-
-    @property
-    def error(self) -> str | None:
-        """Why the port is not open; None while it is open, and before the first attempt."""
-
-    def start(self, on_event: Callable[[PortEvent], None]) -> None:
-        """Start to open and read the port; returns at once."""
-
-    def write(self, data: bytes) -> None:
-        """Write all of `data`, on a datagram port as one datagram."""
-
-    def close(self) -> None:
-        """Close the port and end its thread."""
 
 
 def open_modem_port(url: str, baud: int) -> ModemPort:

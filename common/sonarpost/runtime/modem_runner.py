@@ -7,16 +7,29 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Final
 
 from sonarpost.errors import PortError
+from sonarpost.limits import limit
 from sonarpost.logs import kv
 from sonarpost.modem.interface import Modem, ModemCapabilities, ModemEvent, PollHandler
-from sonarpost.runtime.modem_port import ModemPort
-from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened
+from sonarpost.runtime.serial_port import ModemPort, PortEvent, PortLost, PortOpened
 
 log = logging.getLogger(__name__)
 
 _STOP_S = 1.0
+_RETRY_S = 1.0
+_POLL_S = 0.2
+MAX_INPUTS: Final = limit(
+    256,
+    "inputs",
+    "claims",
+    surface="modem port",
+    source="modem or network",
+    resource="received parts that wait for the driver",
+    at_limit="the port is not read further: the system drops what does not fit its own buffer",
+)
 
 
 class ModemRunner:
@@ -29,6 +42,10 @@ class ModemRunner:
             `send_packet`. An exception from it is logged and loses that event only.
         clock: Monotonic time in seconds.
         max_wait_s: Maximum time between two polls of the timers, for clocks that run fast.
+
+    Attributes:
+        failures: Number of inputs after which the driver raised an unexpected exception. They are skipped.
+        failure: The exception of the last input; empty if it was processed.
     """
 
     def __init__(
@@ -46,7 +63,9 @@ class ModemRunner:
         self._clock = clock
         self._max_wait_s = max_wait_s
         self._lock = threading.Lock()
-        self._inputs: queue.SimpleQueue[PortEvent | None] = queue.SimpleQueue()
+        self._inputs: queue.Queue[PortEvent | None] = queue.Queue(MAX_INPUTS)
+        self.failures = 0
+        self.failure = ""
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -84,7 +103,7 @@ class ModemRunner:
         self._stopping.clear()
         self._thread = threading.Thread(target=self._run, name=f"modem {self._port.url}", daemon=True)
         self._thread.start()
-        self._port.start(self._inputs.put)
+        self._port.start(self._put)
 
     def stop(self) -> None:
         """Close the port and end the thread.
@@ -94,7 +113,7 @@ class ModemRunner:
         """
         self._port.close()
         self._stopping.set()
-        self._inputs.put(None)
+        self._wake()
         thread, self._thread = self._thread, None
         if thread is not None and thread is not threading.current_thread():
             thread.join(_STOP_S)
@@ -131,12 +150,29 @@ class ModemRunner:
         """
         with self._lock:
             number = request(self._driver, self._clock())
-        self._inputs.put(None)
+        self._wake()
         return number
+
+    def _put(self, event: PortEvent) -> None:
+        while not self._stopping.is_set():
+            with suppress(queue.Full):
+                self._inputs.put(event, timeout=_POLL_S)
+                return
+
+    def _wake(self) -> None:
+        with suppress(queue.Full):  # the thread is awake
+            self._inputs.put_nowait(None)
 
     def _run(self) -> None:
         while not self._stopping.is_set():
-            self._step(self._wait())
+            try:
+                self._step(self._wait())
+                self.failure = ""
+            except Exception as error:
+                self.failures += 1
+                self.failure = f"the driver failed: {type(error).__name__}: {error}"
+                log.exception("Modem driver failed; skipping its input", extra=kv(port=self._port.url))
+                self._stopping.wait(_RETRY_S)
         with self._lock:
             self._driver.port_lost(self._clock())
             events = self._driver.poll(self._clock())

@@ -131,7 +131,7 @@ class ModemService(Service[M]):
         self._port = open_modem_port(config.port, config.baud)
         self.key = link_key(platform)
         super().__init__(platform, config)
-        settings = ModemSettings(config.address, config.reply_timeout_s, config.max_carrier_sense_s)
+        settings = ModemSettings(config.address, config.reply_timeout_s, config.max_carrier_sense_s, self._port.STREAM)
         self.modem = ModemRunner(driver.create(settings, config.port), self._port, self._on_event)
         self._modem_error = f"{config.port}: no reply from the modem yet"
         self._transmit_failure = ""
@@ -164,18 +164,23 @@ class ModemService(Service[M]):
 
     def gauges(self) -> Mapping[str, float]:
         """Return whether the modem is ready, and whether the link is unauthenticated."""
-        return {"modem_ready": float(self.modem.ready), "unauthenticated": float(self.key is None)}
+        return {
+            "modem_ready": float(self.modem.ready),
+            "modem_driver_failures": float(self.modem.failures),
+            "unauthenticated": float(self.key is None),
+        }
 
     def degraded_reason(self) -> str:
         """Return why the port or the modem does not work."""
         if not self._port.is_open:
             return f"{self.config.port}: {self._port.error or 'not open yet'}"
+        if self.modem.failure:
+            return f"{self.config.port}: {self.modem.failure}"
         return self._transmit_failure or ("" if self.modem.ready else self._modem_error)
 
     def warning(self) -> str:
-        """Return that the link is unauthenticated, and what the modem reports wrongly."""
-        unauthenticated = UNAUTHENTICATED if self.key is None else ""
-        return "; ".join(text for text in (unauthenticated, self._carrier_warning, self._report_warning) if text)
+        """Return what the modem reports wrongly. The gauge `unauthenticated` states that the link has no key."""
+        return "; ".join(text for text in (self._carrier_warning, self._report_warning) if text)
 
     def _on_event(self, event: ModemEvent) -> None:
         match event:

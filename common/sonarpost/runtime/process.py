@@ -10,13 +10,12 @@ import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 
 from sonarpost import config, logs
 from sonarpost.errors import ConfigError, SonarpostError
 from sonarpost.files import PRIVATE_UMASK
 from sonarpost.runtime.service import C, Service
-from sonarpost.stop_signals import exit_with_parent, wait_until_set
+from sonarpost.stop_signals import END_S, exit_with_parent, signals_to
 
 log = logging.getLogger(__name__)
 
@@ -59,24 +58,32 @@ def main(service_type: type[Service[C]], config_type: type[C], arguments: Sequen
 
 
 def _run(service: Service[C]) -> int:
-    def on_signal(number: int, _frame: FrameType | None) -> None:
-        log.info("Stopping", extra=logs.kv(signal=signal.Signals(number).name))
-        service.stopping.set()
+    guard = threading.Timer(SHUTDOWN_S, _exit_at_once)
+    guard.daemon = True
+    is_first = threading.Lock()
 
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, on_signal)
-    try:
-        if service.start():
-            wait_until_set(service.stopping)
-    except (OSError, SonarpostError) as error:
-        log.error("Service cannot start", extra=logs.kv(reason=str(error)))
-        service.failed = True
-    finally:
-        guard = threading.Timer(SHUTDOWN_S, _exit_at_once)
-        guard.daemon = True
-        guard.start()
-        service.stop()
-        guard.cancel()
+    def on_signal(number: signal.Signals) -> None:
+        service.stopping.set()
+        end_later()
+        log.info("Stopping", extra=logs.kv(signal=number.name))
+
+    def end_later() -> None:
+        # The alarm of the system ends a process that cannot run Python code, or cannot write its log.
+        signal.setitimer(signal.ITIMER_REAL, END_S)
+        if is_first.acquire(blocking=False):
+            guard.start()
+
+    with signals_to(on_signal):
+        try:
+            if service.start():
+                service.stopping.wait()
+        except (OSError, SonarpostError) as error:
+            log.error("Service cannot start", extra=logs.kv(reason=str(error)))
+            service.failed = True
+        finally:
+            end_later()
+            service.stop()
+            guard.cancel()
     return EXIT_FAILURE if service.failed else 0
 
 

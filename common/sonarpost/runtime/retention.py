@@ -6,19 +6,37 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import Field
 
 from sonarpost.config import ServiceConfig
 from sonarpost.errors import DeliveryError
+from sonarpost.limits import limit
 from sonarpost.logs import kv
 
 log = logging.getLogger(__name__)
 
 INTERVAL_S = 60.0
 STEP_S = 3600.0
-FOLLOW_AFTER_S = 86400.0
+MAX_BYTES: Final = limit(
+    20_000_000_000,
+    "bytes",
+    "shares",
+    surface="stored images and files",
+    source="vessel, vehicle",
+    resource="default of max_bytes",
+    at_limit="The source with the most bytes loses items first; vehicles without a configured name are one source",
+)
+FOLLOW_AFTER_S: Final = limit(
+    86400.0,
+    "s",
+    "shares",
+    surface="clock of the host",
+    source="operator, time server",
+    resource="time until ages follow the start of a service or a step of the clock",
+    at_limit="Nothing is removed because of its age before",
+)
 
 RetainDays = Annotated[float, Field(gt=0, le=36500)]
 MaxBytes = Annotated[int, Field(ge=0)]
@@ -29,19 +47,22 @@ class RetentionConfig(ServiceConfig):
 
     Attributes:
         retain_days: Age in days above which files or images are removed.
-        max_bytes: Maximum size of the files or images in bytes; above it the oldest are removed.
+        max_bytes: Maximum size of the files or images in bytes; above it the oldest of the largest source are removed.
     """
 
     retain_days: RetainDays = 365.0
-    max_bytes: MaxBytes = 20_000_000_000
+    max_bytes: MaxBytes = MAX_BYTES
 
 
 class SteadyTime:
-    """Wall clock that follows a step only after a day, so that a wrong clock does not make all files old at once."""
+    """Wall clock that follows a step only after a day, so that a wrong clock does not make all files old at once.
+
+    The start counts as a step from 1970.
+    """
 
     def __init__(self) -> None:
-        self._offset_s = time.time() - time.monotonic()
-        self._stepped_s: float | None = None
+        self._offset_s = 0.0
+        self._stepped_s: float | None = time.monotonic()
 
     def now_utc_s(self) -> float:
         """Return the wall clock; for a day after a step of more than an hour, the earlier of new and previous time."""
@@ -62,7 +83,8 @@ class Retention:
     """Removes what is too old or too much, every minute and after `wake`.
 
     Args:
-        remove: Removes what the limits exceed, and counts it. Receives the current UTC in seconds.
+        remove: Removes what the limits exceed, and counts it. Receives the time that ages refer to, UTC in seconds; see
+            `SteadyTime`.
         stopping: Ends `run`.
     """
 
@@ -85,7 +107,9 @@ class Retention:
             try:
                 self._remove(self._time.now_utc_s())
                 self.error = ""
-            except (OSError, DeliveryError) as error:
+            except Exception as error:
+                if not isinstance(error, (OSError, DeliveryError)):
+                    log.exception("Retention failed after an unexpected exception; trying again")
                 self.error = f"stored files cannot be removed: {error}"
                 log.error("Retention failed", extra=kv(reason=str(error)))
             self._due.wait(INTERVAL_S)

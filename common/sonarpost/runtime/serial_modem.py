@@ -43,7 +43,8 @@ class SerialModem:
         self._url = url
         self._ready_timeout_s = ready_timeout_s
         self._port = open_modem_port(url, baud)
-        self._runner = ModemRunner(modem_driver(driver).create(ModemSettings(address), url), self._port, self._on_event)
+        settings = ModemSettings(address, stream=self._port.STREAM)
+        self._runner = ModemRunner(modem_driver(driver).create(settings, url), self._port, self._on_event)
         self._changed = threading.Condition()
         self._results: dict[int, PacketSent | PacketFailed] = {}
         self._received: deque[PacketReceived] = deque(maxlen=MAX_RECEIVED_PACKETS)

@@ -14,11 +14,14 @@ import socket
 import termios
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import serial
 
+from sonarpost.bearers.serial_device import close_port, open_port
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.logs import kv
 
@@ -45,41 +48,21 @@ PortEvent = PortOpened | PortLost | bytes
 """Argument of the callback: a change of state, or received bytes."""
 
 
-class SerialPort:
-    """A serial port, or another pyserial URL, that reconnects.
+class ModemPort(ABC):
+    """A port that a thread opens, reads and, after a loss, opens again.
 
-    Args:
-        url: `/dev/ttyUSB0`, `/dev/pts/3`, `socket://host:port`, `rfc2217://host:port`, `loop://`.
-        baud: Bits a second; 8N1 without flow control, as the Micro-Modem is set.
-        first_retry_s: Delay after the first failed attempt to open. It doubles with each attempt.
-        max_retry_s: Maximum delay between attempts.
-        write_timeout_s: A write that takes longer counts as a lost port.
-
-    Raises:
-        ConfigError: pyserial does not support this kind of URL.
+    Class attributes:
+        STREAM: Whether received bytes come in any parts; False: each event is one datagram.
     """
 
-    def __init__(
-        self,
-        url: str,
-        baud: int = 19200,
-        *,
-        first_retry_s: float = 0.2,
-        max_retry_s: float = 5.0,
-        write_timeout_s: float = 5.0,
-    ) -> None:
+    STREAM: ClassVar[bool] = True
+    _port: object | None = None
+
+    def __init__(self, url: str) -> None:
         self.url = url
-        self.baud = baud
-        self._first_retry_s = first_retry_s
-        self._max_retry_s = max_retry_s
-        self._write_timeout_s = write_timeout_s
-        # Held while writing and while closing: a closed descriptor may be reused by another file at once.
-        self._in_use = threading.Lock()
-        self._port: serial.Serial | None = None
         self._thread: threading.Thread | None = None
         self._closing = threading.Event()
         self._error: str | None = None
-        self._make_port()
 
     @property
     def is_open(self) -> bool:
@@ -105,25 +88,8 @@ class SerialPort:
         # One event a run: a thread that ends slowly must not react to the event of the next run.
         self._closing = threading.Event()
         arguments = (on_event, self._closing)
-        self._thread = threading.Thread(target=self._run, args=arguments, name=f"port {self.url}", daemon=True)
+        self._thread = threading.Thread(target=self._guarded, args=arguments, name=f"port {self.url}", daemon=True)
         self._thread.start()
-
-    def write(self, data: bytes) -> None:
-        """Write all of `data`; blocks until it is written.
-
-        Raises:
-            PortError: The port is not open, or is lost during the write.
-        """
-        with self._in_use:
-            port = self._port
-            if port is None:
-                raise PortError(f"{self.url}: not open ({self._error or 'not opened yet'})")
-            try:
-                port.write(data)
-            except (serial.SerialException, OSError) as error:
-                # The reading thread detects the change and closes the port.
-                self._port, self._error = None, _reason(error)
-                raise PortError(f"{self.url}: cannot be written: {_reason(error)}") from error
 
     def close(self) -> None:
         """Close the port and end the thread; returns within a second.
@@ -136,6 +102,76 @@ class SerialPort:
             thread.join(_CLOSE_S)
             if thread.is_alive():
                 log.warning("Port still busy; it closes later", extra=kv(port=self.url))
+
+    def _guarded(self, on_event: Callable[[PortEvent], None], closing: threading.Event) -> None:
+        while not closing.is_set():
+            try:
+                self._run(on_event, closing)
+            except Exception as error:  # a library's own error, for example of an adapter's driver
+                was_open, self._port, self._error = self._port is not None, None, _reason(error)
+                log.exception("Port failed; opening it again", extra=kv(port=self.url))
+                if was_open:
+                    on_event(PortLost(self._error))
+                closing.wait(_CLOSE_S)
+
+    @abstractmethod
+    def write(self, data: bytes) -> None:
+        """Write all of `data`, on a datagram port as one datagram; blocks until it is written.
+
+        Raises:
+            PortError: The port is not open, or is lost during the write.
+        """
+
+    @abstractmethod
+    def _run(self, on_event: Callable[[PortEvent], None], closing: threading.Event) -> None:
+        """Open and read the port until `closing` is set."""
+
+
+class SerialPort(ModemPort):
+    """A serial port, or another pyserial URL, that reconnects. A serial port is opened exclusively.
+
+    Args:
+        url: `/dev/ttyUSB0`, `/dev/pts/3`, `socket://host:port`, `rfc2217://host:port`, `loop://`.
+        baud: Bits a second; 8N1 without flow control, as the Micro-Modem is set.
+        first_retry_s: Delay after the first failed attempt to open. It doubles with each attempt.
+        max_retry_s: Maximum delay between attempts.
+        write_timeout_s: A write that takes longer counts as a lost port.
+
+    Raises:
+        ConfigError: pyserial does not support this kind of URL.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        baud: int = 19200,
+        *,
+        first_retry_s: float = 0.2,
+        max_retry_s: float = 5.0,
+        write_timeout_s: float = 5.0,
+    ) -> None:
+        super().__init__(url)
+        self.baud = baud
+        self._first_retry_s = first_retry_s
+        self._max_retry_s = max_retry_s
+        self._write_timeout_s = write_timeout_s
+        # Held while writing and while closing: a closed descriptor may be reused by another file at once.
+        self._in_use = threading.Lock()
+        self._port: serial.Serial | None = None
+        self._make_port()
+
+    def write(self, data: bytes) -> None:
+        """See `ModemPort`."""
+        with self._in_use:
+            port = self._port
+            if port is None:
+                raise PortError(f"{self.url}: not open ({self._error or 'not opened yet'})")
+            try:
+                port.write(data)
+            except (serial.SerialException, OSError) as error:
+                # The reading thread detects the change and closes the port.
+                self._port, self._error = None, _reason(error)
+                raise PortError(f"{self.url}: cannot be written: {_reason(error)}") from error
 
     def _run(self, on_event: Callable[[PortEvent], None], closing: threading.Event) -> None:
         wait_s = self._first_retry_s
@@ -157,19 +193,19 @@ class SerialPort:
 
     def _open(self, closing: threading.Event) -> serial.Serial | None:
         """Retry until the port is open; return None if it is closed before."""
-        wait_s, is_logged = self._first_retry_s, False
+        wait_s, logged = self._first_retry_s, ""
         while not closing.is_set():
             port = self._make_port()
             try:
-                port.open()
+                open_port(port)
                 if self.url.startswith("socket://"):
                     _enable_keepalive(port.fileno())
             except (serial.SerialException, OSError, ValueError, termios.error) as error:
-                _close_port(port)
+                close_port(port)
                 self._error = _reason(error)
-                if not is_logged:
+                if self._error != logged:
                     log.warning("Port cannot be opened; retrying", extra=kv(port=self.url, reason=self._error))
-                    is_logged = True
+                    logged = self._error
                 closing.wait(wait_s)
                 wait_s = min(2.0 * wait_s, self._max_retry_s)
                 continue
@@ -187,7 +223,9 @@ class SerialPort:
         while not closing.is_set() and self._port is port:
             try:
                 data = _read_object(port) if descriptor is None else _read_descriptor(descriptor)
-            except (serial.SerialException, OSError, TypeError, ValueError) as error:
+            except Exception as error:
+                # The caller closes the port: while it is open, it cannot be opened again.
+                log.debug("Port cannot be read", exc_info=True, extra=kv(port=self.url))
                 return _reason(error)
             if data:
                 on_event(data)
@@ -201,7 +239,7 @@ class SerialPort:
         if cancel_write is not None:
             cancel_write()
         with self._in_use:
-            _close_port(port)
+            close_port(port)
 
     def _make_port(self) -> serial.Serial:
         try:
@@ -211,17 +249,6 @@ class SerialPort:
         except ValueError as error:
             expected = "a device path or socket://, rfc2217://, loop://"
             raise ConfigError("modem port", "url or baud", f"{self.url} {self.baud}", expected) from error
-
-
-def _close_port(port: serial.Serial) -> None:
-    # pyserial 3.5 does not close a socket whose shutdown fails because the peer has reset it.
-    connection = getattr(port, "_socket", None)
-    try:
-        port.close()
-    except (serial.SerialException, OSError) as error:
-        log.debug("Error while closing", extra=kv(port=port.port, error=str(error)))
-    if isinstance(connection, socket.socket):
-        connection.close()
 
 
 def _enable_keepalive(descriptor: int) -> None:

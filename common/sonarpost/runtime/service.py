@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import sqlite3
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -18,19 +19,20 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar, Generic, TypeVar
+from typing import ClassVar, Final, Generic, TypeVar
 
 import zenoh
 
 from sonarpost import keys, wire
-from sonarpost.bus.session import open_with_retry
+from sonarpost.bus.session import lost_reason, open_with_retry
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.inbox import Inbox
 from sonarpost.delivery.outbox import Outbox, QueuePolicy
 from sonarpost.delivery.records import InboxItem, OutboxItem
 from sonarpost.delivery.store import HANDLING_RESERVE_BYTES, DiskReserve, Store
 from sonarpost.delivery.transaction import Transaction, UnitOfWork
-from sonarpost.errors import BadInputError, DeliveryError
+from sonarpost.errors import BadInputError, DeliveryError, can_concern_record
+from sonarpost.limits import limit
 from sonarpost.logs import IntervalLog, kv, log_context
 from sonarpost.messages import Health, Record, ServiceState
 from sonarpost.monitoring.heartbeat import Heartbeat
@@ -44,6 +46,25 @@ log = logging.getLogger(__name__)
 C = TypeVar("C", bound=ServiceConfig)
 
 RETRY_AFTER_S = 1.0
+MAX_RETRY_FACTOR = 4
+ALONE_AFTER: Final = limit(
+    2,
+    "failures",
+    "isolation",
+    surface="records of every service",
+    source="sender of a record",
+    resource="attempts of a batch that fails",
+    at_limit="its records are handled one by one, those that fail after the others",
+)
+FAILURES_ALONE: Final = limit(
+    3,
+    "failures",
+    "blame",
+    surface="records of every service",
+    source="sender of a record",
+    resource="failures of a record that is handled alone, while others are handled",
+    at_limit="the record is quarantined; `sonarpost store quarantine` queues it again",
+)
 MAX_DETAIL = 2000
 TYPES_KEPT = 1000
 """Maximum number of keys in the cache of record types."""
@@ -95,7 +116,7 @@ class Service(ABC, Generic[C]):
         self._counters: Counter[str] = Counter()
         self._counter_lock = threading.Lock()
         self._record_type = lru_cache(TYPES_KEPT)(self._find_record_type)
-        self._degraded = ""
+        self._degraded = self._router_failure = ""
         self._session: zenoh.Session | None = None
         self._inbox: Inbox | None = None
         self._outbox: Outbox | None = None
@@ -103,6 +124,7 @@ class Service(ABC, Generic[C]):
         self._threads: list[threading.Thread] = []
         self._interval_logs: list[IntervalLog] = []
         self._refusal_logs: dict[str, IntervalLog] = {}
+        self._failed_alone: dict[int, int] = {}
         self._heartbeat = Heartbeat.from_environment(os.environ, platform.state_dir, platform.health_interval_s)
         self._manager = ServiceManager.from_environment(os.environ, platform.health_interval_s)
 
@@ -115,6 +137,8 @@ class Service(ABC, Generic[C]):
     @abstractmethod
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Handle one record. Records are handled one at a time, in the order of arrival.
+
+        A record that has failed twice is handled again after later ones.
 
         Args:
             key: Key on which the record arrived.
@@ -231,13 +255,14 @@ class Service(ABC, Generic[C]):
         """
         endpoints = self.platform.router
         self.before_session()
-        self._manager.starting(f"waiting for the router {', '.join(endpoints)}")
-        self._session = open_with_retry(endpoints, self.stopping, self.platform.tls)
+        self._manager.alive(f"waiting for the router {', '.join(endpoints)}")
+        self._session = open_with_retry(endpoints, self.stopping, self.platform.tls, self._report_waiting)
         if self._session is None:
             return False
+        self._router_failure = ""
         self._token = self._session.liveliness().declare_token(keys.alive(self.platform.id, self.NAME))
         self._outbox = Outbox(
-            self._session, self.store, queue_policy=self.queue_policy, on_acknowledged=self.on_acknowledged
+            self._session, self.store, queue_policy=self.queue_policy, on_acknowledged=self._acknowledged
         )
         wanted = self.consumed_keys()
         if wanted:
@@ -256,6 +281,8 @@ class Service(ABC, Generic[C]):
             self.start_thread(self._work, "work")
         self.on_start()
         self.start_thread(self._report, "health")
+        # Not joined: a probe of the router can take longer than a stop.
+        threading.Thread(target=self._watch_router, name="router", daemon=True).start()
         self._manager.ready("started")
         log.info("Service started", extra=kv(platform=self.platform.id, router=", ".join(endpoints)))
         return True
@@ -322,23 +349,70 @@ class Service(ABC, Generic[C]):
         return self._refusal_logs[writer]
 
     def _work(self) -> None:
+        failures = 0
         while not self.stopping.is_set():
             self.store.inbox_changed.clear()
             try:
-                items = self.store.inbox_items(max(16, self.BATCH), max_bytes=self.BATCH_BYTES)
-                for first in range(0, len(items), self.BATCH):
-                    if self.stopping.is_set():
-                        return
-                    self._handle_batch(items[first : first + self.BATCH])
-            except (OSError, DeliveryError) as error:
-                self.set_degraded(f"{type(error).__name__}: {error}")
-                self.stopping.wait(RETRY_AFTER_S)
-                continue
+                found = self._handle_in_batches() if failures < ALONE_AFTER else self._handle_each_alone(failures)
             except ServiceStoppingError:
                 return
+            except Exception as error:
+                if not isinstance(error, (OSError, DeliveryError)):
+                    log.exception("Records not handled after an unexpected exception; trying again")
+                failures += 1
+                self.set_degraded(f"{type(error).__name__}: {error}")
+                self.stopping.wait(RETRY_AFTER_S * min(2 ** max(0, failures - ALONE_AFTER), MAX_RETRY_FACTOR))
+                continue
+            failures = 0
             self.set_degraded("")
-            if not items:
+            if not found:
                 self.store.inbox_changed.wait(1.0)
+
+    def _handle_in_batches(self) -> bool:
+        items = self.store.inbox_items(max(16, self.BATCH), max_bytes=self.BATCH_BYTES)
+        for first in range(0, len(items), self.BATCH):
+            if self.stopping.is_set():
+                raise ServiceStoppingError
+            self._handle_batch(items[first : first + self.BATCH])
+        return bool(items)
+
+    def _handle_each_alone(self, failures: int) -> bool:
+        """Handle records one by one, so that one that fails does not delay the others.
+
+        A record is quarantined if it fails `FAILURES_ALONE` times while others are handled, with an error that is not
+        one of the machine or the network.
+
+        Args:
+            failures: Number of rounds that failed. It increases the number of records, for the case that all of the
+                first ones fail.
+
+        Raises:
+            Exception: A record has failed.
+        """
+        factor = 2 ** min(failures // 4, 4)
+        items = self.store.inbox_items(factor * max(16, self.BATCH), max_bytes=factor * self.BATCH_BYTES)
+        failed: list[tuple[InboxItem, Exception]] = []
+        for item in items:
+            if self.stopping.is_set():
+                raise ServiceStoppingError
+            try:
+                self._handle_batch([item])
+            except ServiceStoppingError:
+                raise
+            except Exception as error:  # noqa: BLE001  raised below
+                failed.append((item, error))
+        counted = self._failed_alone
+        if len(failed) < len(items):
+            counted = {each.id: counted.get(each.id, 0) + 1 for each, why in failed if can_concern_record(why)}
+        for item, why in failed:
+            if counted.get(item.id, 0) >= FAILURES_ALONE:
+                log.error("Record quarantined: it fails while others are handled", extra=kv(key=item.key))
+                self.count("records_failed")
+                self._quarantine_record(item, f"{type(why).__name__}: {why}")
+        self._failed_alone = {name: count for name, count in counted.items() if count < FAILURES_ALONE}
+        if failed:
+            raise failed[0][1]
+        return bool(items)
 
     def _handle_batch(self, items: Sequence[InboxItem]) -> None:
         if self.BATCH == 1:
@@ -368,7 +442,7 @@ class Service(ABC, Generic[C]):
             try:
                 record = wire.decode(self._record_type(item.key), item.payload, item.key)
                 self.handle(item.key, record, effects)
-            except (OSError, DeliveryError, ServiceStoppingError):
+            except (OSError, DeliveryError, MemoryError, ServiceStoppingError):
                 raise
             except BadInputError as error:
                 self._refused(error)
@@ -385,7 +459,7 @@ class Service(ABC, Generic[C]):
 
     def _quarantine_record(self, item: InboxItem, reason: str) -> None:
         with self.store.transaction() as tx:
-            tx.quarantine("in", item.key, item.payload, reason)
+            tx.quarantine("in", item.key, item.payload, reason, is_accepted=True)
             tx.remove_handled(item)
 
     def commit(self, effects: UnitOfWork, item: InboxItem | None = None) -> None:
@@ -474,12 +548,16 @@ class Service(ABC, Generic[C]):
             or self._disk_reserve.degraded_reason()
             or self.degraded_reason()
             or self._lost_records()
+            or self._discarded_states()
             or self._tls.degraded_reason(now_utc_s)
         )
         restored = "" if self._outbox is None else self._outbox.warning()
-        warnings = (self.warning(), restored, self._tls.warning(now_utc_s))
+        router = f"router not reached: {self._router_failure}" if self._router_failure else ""
+        warnings = (self.warning(), router, restored, self._tls.warning(now_utc_s))
         with self._counter_lock:
             counters = dict(self._counters)
+        if discarded := self._discarded_count():
+            counters["states_discarded"] = discarded
         gauges = {
             "inbox": float(self.store.inbox_depth()),
             "outbox": float(self.store.outbox_depth()),
@@ -507,6 +585,35 @@ class Service(ABC, Generic[C]):
             f"commits of {self.store.path.name} are lost; records possibly lost: {records}; see `sonarpost store check`"
         )
 
+    def _discarded_count(self) -> int:
+        return self._counters["states_discarded"] + self.store.states_discarded
+
+    def _discarded_states(self) -> str:
+        count = self._discarded_count()
+        return f"stored states discarded since the start: {count}; they are in the quarantine" if count else ""
+
+    def _acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> bool | None:
+        """Call `on_acknowledged`; an unexpected exception about one record does not stop its queue."""
+        try:
+            return self.on_acknowledged(tx, item, reason)
+        except (OSError, DeliveryError, sqlite3.Error):
+            raise
+        except Exception:
+            log.exception("Acknowledgement not processed", extra=kv(key=item.key, consumer=item.queue))
+            self.count("acknowledgements_failed")
+            return None
+
+    def _report_waiting(self, reason: str) -> None:
+        self._router_failure = reason
+        self._publish_health("degraded")
+
+    def _watch_router(self) -> None:
+        while not self.stopping.wait(self.platform.health_interval_s):
+            try:
+                self._router_failure = lost_reason(self.session)
+            except Exception:
+                log.exception("Router not probed")
+
     def _report(self) -> None:
         while not self.stopping.wait(self.platform.health_interval_s):
             self._publish_health(None)
@@ -518,7 +625,8 @@ class Service(ABC, Generic[C]):
             # Before the publication, which can block: a router that hangs must not make this service unhealthy.
             self._heartbeat.beat(record, time.monotonic())
             self._manager.alive(f"{record.state}: {record.detail}" if record.detail else record.state)
-            self.publish(keys.health(self.platform.id, self.NAME), record)
+            if self._session is not None:
+                self.publish(keys.health(self.platform.id, self.NAME), record)
         except DeliveryError as error:
             self._manager.alive(f"health unknown: {error}")  # the process does not hang
             log.warning("Health not published", extra=kv(error=str(error)))

@@ -13,22 +13,22 @@ import select
 import socket
 import threading
 from collections.abc import Callable
-from typing import Final
+from typing import ClassVar, Final
 from urllib.parse import parse_qsl, urlsplit
 
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.logs import kv
-from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened
+from sonarpost.runtime.serial_port import ModemPort, PortEvent, PortLost, PortOpened
 
 log = logging.getLogger(__name__)
 
-_READ_BYTES: Final = 65535
+_READ_BYTES: Final = 8192
+"""Longer datagrams are cut, and refused by the driver: its format has at most 4096 bytes."""
 _POLL_S: Final = 0.2
-_CLOSE_S: Final = 1.0
 _ANY: Final = "0.0.0.0"  # noqa: S104 - datagrams of a multicast group arrive on any interface
 
 
-class UdpPort:
+class UdpPort(ModemPort):
     """A multicast group and port.
 
     Args:
@@ -39,48 +39,17 @@ class UdpPort:
         ConfigError: Not a multicast address of IPv4, or an unknown option.
     """
 
+    STREAM: ClassVar[bool] = False
+
     def __init__(self, url: str, *, retry_s: float = 1.0) -> None:
-        self.url = url
+        super().__init__(url)
         self._retry_s = retry_s
         self._group, self._interface, self._ttl = _parse(url)
-        self._socket: socket.socket | None = None
-        self._error: str | None = None
-        self._thread: threading.Thread | None = None
-        self._closing = threading.Event()
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the socket is open."""
-        return self._socket is not None
-
-    @property
-    def error(self) -> str | None:
-        """Why the socket is not open; None while it is open, and before the first attempt."""
-        return self._error
-
-    def start(self, on_event: Callable[[PortEvent], None]) -> None:
-        """Start to open and read the socket; returns at once.
-
-        Args:
-            on_event: Called from the reading thread, in order.
-
-        Raises:
-            PortError: Already started.
-        """
-        if self._thread is not None:
-            raise PortError(f"{self.url}: already started")
-        self._closing = threading.Event()
-        arguments = (on_event, self._closing)
-        self._thread = threading.Thread(target=self._run, args=arguments, name=f"port {self.url}", daemon=True)
-        self._thread.start()
+        self._port: socket.socket | None = None
 
     def write(self, data: bytes) -> None:
-        """Send one datagram to the group.
-
-        Raises:
-            PortError: The socket is not open, or the datagram cannot be sent.
-        """
-        opened = self._socket
+        """Send one datagram to the group. See `ModemPort`."""
+        opened = self._port
         if opened is None:
             raise PortError(f"{self.url}: not open ({self._error or 'not opened yet'})")
         try:
@@ -88,28 +57,21 @@ class UdpPort:
         except OSError as error:
             raise PortError(f"{self.url}: cannot be written: {error}") from error
 
-    def close(self) -> None:
-        """Close the socket and end the thread."""
-        self._closing.set()
-        thread, self._thread = self._thread, None
-        if thread is not None and thread is not threading.current_thread():
-            thread.join(_CLOSE_S)
-
     def _run(self, on_event: Callable[[PortEvent], None], closing: threading.Event) -> None:
         while not closing.is_set():
             try:
                 with self._open() as opened:
-                    self._socket, self._error = opened, None
+                    self._port, self._error = opened, None
                     log.info("Port open", extra=kv(port=self.url))
                     on_event(PortOpened())
                     self._read(opened, on_event, closing)
             except OSError as error:
-                was_open, self._socket, self._error = self._socket is not None, None, str(error)
+                was_open, self._port, self._error = self._port is not None, None, str(error)
                 log.warning("Port lost", extra=kv(port=self.url, reason=self._error))
                 if was_open:
                     on_event(PortLost(self._error))
                 closing.wait(self._retry_s)
-        self._socket, self._error = None, "closed"
+        self._port, self._error = None, "closed"
 
     def _open(self) -> socket.socket:
         opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM, socket.IPPROTO_UDP)

@@ -10,7 +10,7 @@ from typing import Final
 
 from sonarpost.config import PlatformConfig
 from sonarpost.errors import ConfigError
-from sonarpost.files import PRIVATE_FILE, write_atomically, write_new
+from sonarpost.files import PRIVATE_FILE, open_regular, write_atomically, write_new
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import KEY_BYTES, AcousticKey, parse_key
 
@@ -70,8 +70,8 @@ def read_key(path: Path) -> AcousticKey:
     """
     where = str(path)
     try:
-        # Check and read the same descriptor: the file cannot be replaced in between. A pipe must not block.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        # Check and read the same descriptor: the file cannot be replaced in between.
+        descriptor = open_regular(path)
     except OSError as error:
         raise ConfigError(
             where, "acoustic_key_file", error.strerror or str(error), f"a key file ({_CREATE})"
@@ -89,8 +89,6 @@ def read_key(path: Path) -> AcousticKey:
 
 
 def _check_owner_only(status: os.stat_result, where: str) -> None:
-    if not stat.S_ISREG(status.st_mode):
-        raise ConfigError(where, "acoustic key", stat.filemode(status.st_mode), "a regular file")
     if status.st_mode & 0o077:
         raise ConfigError(where, "mode", f"{stat.S_IMODE(status.st_mode):04o}", "0600, readable by its owner only")
     if status.st_uid not in {os.geteuid(), 0}:
