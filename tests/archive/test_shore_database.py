@@ -173,13 +173,13 @@ def test_accepted_record_of_another_c2_is_taken_over_once(open_):
     record = AcceptedRecord("some/key", b"\x00payload")
     first.accept([record, record])
     taken = []
-    assert first.take_over(0.0, 10, taken.extend) == 0
-    assert second.take_over(60.0, 10, taken.extend) == 0
-    assert second.take_over(0.0, 10, taken.extend) == 1
+    assert first.take_over(0.0, 10, 1000, taken.extend) == 0
+    assert second.take_over(60.0, 10, 1000, taken.extend) == 0
+    assert second.take_over(0.0, 10, 1000, taken.extend) == 1
     assert taken == [record]
-    assert third.take_over(60.0, 10, taken.extend) == 0
+    assert third.take_over(60.0, 10, 1000, taken.extend) == 0
     second.write([stored()], handled=[record])
-    assert third.take_over(0.0, 10, taken.extend) == 0
+    assert third.take_over(0.0, 10, 1000, taken.extend) == 0
     assert first.accepted_count() == 0
 
 
@@ -190,9 +190,9 @@ def test_record_stays_with_its_owner_if_it_cannot_be_taken_over(open_):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(OSError, match="No space left"):
-        open_("c2-b").take_over(0.0, 10, fails)
+        open_("c2-b").take_over(0.0, 10, 1000, fails)
     taken = []
-    assert open_("c2-b").take_over(0.0, 10, taken.extend) == 1
+    assert open_("c2-b").take_over(0.0, 10, 1000, taken.extend) == 1
 
 
 def test_decision_with_another_content_is_not_written(archive):

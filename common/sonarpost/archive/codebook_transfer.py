@@ -1,14 +1,18 @@
 """Codebooks by their identity: the vessel's decompressor replies to queries, c2 fetches what it lacks in pieces.
 
-A vessel replies below its own key only. c2 accepts a codebook if its identity is the one that the image names, and
-keeps the codebooks of each vessel apart, at most `MAX_CODEBOOKS`. docs/specifications/zenoh.md specifies the query.
+A vessel replies below its own key only. c2 queries the vessels in turn, for one piece each. It accepts a codebook if
+its identity is the one that the image names, and keeps the codebooks of each vessel apart, at most `MAX_CODEBOOKS`.
+docs/specifications/zenoh.md specifies the query.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Final
@@ -23,16 +27,53 @@ from sonarpost.codec.vq import codebook
 from sonarpost.delivery.protocol import CHUNK_BYTES
 from sonarpost.errors import BadInputError, CodebookError, PayloadError
 from sonarpost.files import write_atomically
+from sonarpost.limits import Turns, limit
 from sonarpost.logs import kv
 
 log = logging.getLogger(__name__)
 
-MAX_CODEBOOK_BYTES: Final = 16 * 1024 * 1024
-MAX_CODEBOOKS: Final = 8
-"""Codebooks that c2 keeps of one vessel."""
-REPLY_TIMEOUT_S: Final = 10.0
+SURFACE: Final = "codebooks of vessels"
+MAX_CODEBOOK_BYTES: Final = limit(
+    16 * 1024 * 1024,
+    "bytes",
+    "claims",
+    surface=SURFACE,
+    source="vessel",
+    resource="incomplete codebook, on the disk: one of each vessel",
+    at_limit="the codebook is refused",
+)
+MAX_CODEBOOKS: Final = limit(
+    8,
+    "codebooks",
+    "shares",
+    surface=SURFACE,
+    source="vessel",
+    resource="stored codebooks",
+    at_limit="no further codebook is fetched",
+)
+REPLY_TIMEOUT_S: Final = limit(
+    10.0,
+    "s",
+    "deadlines",
+    surface=SURFACE,
+    source="vessel",
+    resource="time for one piece: the longest delay that a vessel causes for the others, in one round",
+    at_limit="the vessel pauses, after each failure twice as long",
+)
 RETRY_S: Final = 60.0
-"""Interval of the attempts to fetch what is missing."""
+"""First pause of a vessel from which a codebook cannot be fetched, and interval of the attempts."""
+MAX_RETRY_S: Final = 3600.0
+SLOW_S: Final = 1.0
+PAUSE_FACTOR: Final = limit(
+    4,
+    "times the time of the reply",
+    "shares",
+    surface=SURFACE,
+    source="vessel",
+    resource="pause of a vessel after a reply that took more than 1 s, while other vessels wait",
+    at_limit="the other vessels are queried",
+)
+PARTIAL: Final = ".partial"
 
 
 class _Piece(BaseModel):
@@ -70,13 +111,32 @@ def declare_codebooks(session: zenoh.Session, vessel: str, decoder: Decoder) -> 
     return session.declare_queryable(keys.codebook_all(vessel), on_query)
 
 
+class _NoReplyError(PayloadError):
+    """The vessel is silent: what has arrived is kept for the next attempt."""
+
+
+@dataclass(slots=True)
+class _Vessel:
+    """Queries to one vessel.
+
+    Attributes:
+        failures: Consecutive failures.
+        next_at_s: When it is queried next, by the monotonic clock.
+        tried: Models that were refused or not available, in the order of their last failure.
+    """
+
+    failures: int = 0
+    next_at_s: float = 0.0
+    tried: list[str] = field(default_factory=list)
+
+
 class CodebookFetcher:
-    """Fetches the codebooks that images wait for.
+    """Fetches the codebooks that images wait for: the vessels in turn, of each one codebook at a time.
 
     Args:
-        folder: Folder of the codebooks, with a folder for each vessel.
-        missing: Returns (model, vessel) of all that images wait for.
-        added: Called after a codebook was stored.
+        folder: Folder of the codebooks, with a folder for each vessel. An incomplete one is in a file `*.partial`.
+        missing: Returns the models that images wait for, by vessel.
+        added: Called with the vessel after a codebook was stored.
         stopping: Set when the service stops.
 
     Attributes:
@@ -86,16 +146,17 @@ class CodebookFetcher:
     def __init__(
         self,
         folder: Path,
-        missing: Callable[[], Sequence[tuple[str, str]]],
-        added: Callable[[], None],
+        missing: Callable[[], Mapping[str, Sequence[str]]],
+        added: Callable[[str], None],
         stopping: threading.Event,
     ) -> None:
         self._folder = folder
         self._missing = missing
         self._added = added
         self._stopping = stopping
-        self._received: dict[tuple[str, str], bytearray] = {}
         self._wake = threading.Event()
+        self._turns = Turns()
+        self._vessels: dict[str, _Vessel] = {}
         self.faults: dict[tuple[str, str], str] = {}
 
     def wake(self) -> None:
@@ -106,64 +167,83 @@ class CodebookFetcher:
         """Fetch until the service stops."""
         while not self._stopping.is_set():
             self._wake.clear()
-            wanted = self._missing()
-            self.faults = {pair: fault for pair, fault in self.faults.items() if pair in wanted}
-            self._received = {pair: data for pair, data in self._received.items() if pair in wanted}
-            stored = [self._fetched(session, model, vessel) for model, vessel in wanted if not self._stopping.is_set()]
-            if any(stored):
-                self._added()
-            self._wake.wait(RETRY_S)
+            wanted = {vessel: models for vessel, models in self._missing().items() if models}
+            self.faults = {pair: fault for pair, fault in self.faults.items() if pair[0] in wanted.get(pair[1], ())}
+            self._vessels = {vessel: self._vessels.get(vessel, _Vessel()) for vessel in wanted}
+            now_s = time.monotonic()
+            due = {vessel: [vessel] for vessel, known in self._vessels.items() if known.next_at_s <= now_s}
+            if due:
+                [vessel] = self._turns.pick(due, 1)
+                self._step(session, vessel, wanted[vessel])
+            else:
+                ends_s = [known.next_at_s for known in self._vessels.values()]
+                self._wake.wait(min(ends_s) - now_s if ends_s else RETRY_S)
 
-    def _fetched(self, session: zenoh.Session, model: str, vessel: str) -> bool:
-        """Fetch and store a codebook; return whether it is there."""
+    def _step(self, session: zenoh.Session, vessel: str, models: Sequence[str]) -> None:
+        """Fetch one piece of a codebook of a vessel; store the codebook if it is complete."""
+        known = self._vessels[vessel]
+        known.tried = [model for model in known.tried if model in models]
+        model = next((model for model in models if model not in known.tried), (known.tried or models)[0])
+        started_s = time.monotonic()
         try:
-            data = self._fetch(session, model, vessel)
-            self._store(model, vessel, data)
-        except (BadInputError, OSError, zenoh.ZError) as error:
+            is_complete = self._fetch(session, model, vessel)
+        except Exception as error:
+            if not isinstance(error, (BadInputError, OSError, zenoh.ZError)):
+                log.exception("Codebook not fetched after an unexpected exception")
             if self.faults.get((model, vessel)) != str(error):
                 log.warning("Codebook not fetched", extra=kv(vessel=vessel, model=model, reason=str(error)))
             self.faults[model, vessel] = str(error)
-            return False
-        self.faults.pop((model, vessel), None)
-        log.info("Codebook fetched", extra=kv(vessel=vessel, model=model, bytes=len(data)))
-        return True
+            if not isinstance(error, _NoReplyError):
+                with suppress(OSError):  # the next attempt reports it
+                    (self._folder / vessel / f"{model}{PARTIAL}").unlink()
+                known.tried = [*(each for each in known.tried if each != model), model]
+            known.next_at_s = time.monotonic() + min(RETRY_S * 2**known.failures, MAX_RETRY_S)
+            known.failures = min(known.failures + 1, 10)
+            return
+        taken_s = time.monotonic() - started_s
+        if taken_s > SLOW_S and len(self._vessels) > 1:
+            known.next_at_s = time.monotonic() + PAUSE_FACTOR * taken_s
+        if is_complete:
+            known.failures = 0
+            self.faults.pop((model, vessel), None)
+            log.info("Codebook fetched", extra=kv(vessel=vessel, model=model))
+            self._added(vessel)
 
-    def _fetch(self, session: zenoh.Session, model: str, vessel: str) -> bytes:
-        """Return the file; what has arrived is kept for the next attempt.
+    def _fetch(self, session: zenoh.Session, model: str, vessel: str) -> bool:
+        """Fetch a piece; return whether the codebook is complete and stored.
 
         Raises:
             PayloadError: The vessel does not reply, or with something else.
-            CodebookError: The vessel has too many codebooks here.
-        """
-        if len(list((self._folder / vessel).glob(f"*{codebook.SUFFIX}"))) >= MAX_CODEBOOKS:
-            raise CodebookError(f"codebooks of {vessel}", "", f"{MAX_CODEBOOKS} files", "fewer, before a further one")
-        key = keys.codebook(vessel, model)
-        received = self._received.setdefault((model, vessel), bytearray())
-        while True:
-            piece = _query(session, key, len(received))
-            received += piece.data
-            if len(received) > piece.size:
-                del self._received[model, vessel]
-                raise PayloadError(key, "data", f"{len(received)} bytes", f"at most the {piece.size} bytes of the file")
-            if len(received) == piece.size:
-                return bytes(self._received.pop((model, vessel)))
-            if self._stopping.is_set():
-                raise PayloadError(key, "data", f"{len(received)} bytes", f"{piece.size} bytes")
-
-    def _store(self, model: str, vessel: str, data: bytes) -> None:
-        """Store a codebook.
-
-        Raises:
-            CodebookError: It is not a codebook, or not the one that was requested.
+            CodebookError: It is not the codebook that was requested, or the vessel has too many here.
             OSError: It cannot be written.
         """
+        folder = self._folder / vessel
+        path = folder / f"{model}{codebook.SUFFIX}"
+        if len({*folder.glob(f"*{codebook.SUFFIX}")} - {path}) >= MAX_CODEBOOKS:
+            raise CodebookError(f"codebooks of {vessel}", "", f"{MAX_CODEBOOKS} files", "fewer, before a further one")
+        partial = folder / f"{model}{PARTIAL}"
+        for other in folder.glob(f"*{PARTIAL}"):
+            if other != partial:
+                other.unlink()  # of each vessel, one incomplete codebook
+        offset = partial.stat().st_size if partial.exists() else 0
+        key = keys.codebook(vessel, model)
+        piece = _query(session, key, offset)
+        expected = min(CHUNK_BYTES, piece.size - offset)
+        if len(piece.data) != expected:
+            raise PayloadError(key, "data", f"{len(piece.data)} bytes", f"{expected} bytes from offset {offset}")
+        folder.mkdir(parents=True, exist_ok=True)
+        with partial.open("ab") as file:
+            file.write(piece.data)
+        if offset + expected < piece.size:
+            return False
+        data = partial.read_bytes()
         where = f"codebook of {vessel}"
         identity = codebook.from_bytes(data, where).tiles.identity
         if identity[:MODEL_DIGITS] != model:
             raise CodebookError(where, "identity", identity, f"{model}…, which was requested")
-        path = self._folder / vessel / f"{model}{codebook.SUFFIX}"
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, data)
+        partial.unlink()
+        return True
 
 
 def _query(session: zenoh.Session, key: str, offset: int) -> _Piece:
@@ -171,4 +251,4 @@ def _query(session: zenoh.Session, key: str, offset: int) -> _Piece:
         if reply.ok is not None:
             return wire.validated(_Piece, wire.unpack_map(reply.ok.payload.to_bytes(), key), key)
         raise PayloadError(key, "reply", "an error", "a piece of the codebook: the vessel does not have it")
-    raise PayloadError(key, "reply", "none", "a piece of the codebook")
+    raise _NoReplyError(key, "reply", "none", "a piece of the codebook")

@@ -1,14 +1,15 @@
 """Decoding of images in a process of its own: a stream that crashes the decoder, or never ends, costs that image only.
 
 `DecodeWorker` starts `python -m sonarpost.archive.decode_worker`, writes a coded image to its standard input and reads
-the decoded one from its standard output. Messages have a length of four bytes before them. The process ends when its
-standard input is closed, also if its parent is killed.
+the decoded one from its standard output. Messages have a length of four bytes before them. The first one is empty: the
+process is ready. It ends when its standard input is closed, also if its parent is killed.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import signal
 import struct
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Final, Literal
 
 import msgpack
 
@@ -26,14 +27,28 @@ from sonarpost.archive.decoder import Decoder
 from sonarpost.codec.jit import use_code_folder
 from sonarpost.codec.vq import codebook
 from sonarpost.errors import BadInputError, MissingCodebookError
+from sonarpost.limits import limit
+from sonarpost.logs import kv
 from sonarpost.messages import CodedImage, ReconstructedImage
 
 log = logging.getLogger(__name__)
 
-DECODE_TIMEOUT_S: Final = 120.0
-"""Maximum duration of one image, which includes the compilation of the codec at the first one."""
+DECODE_TIMEOUT_S: Final = limit(
+    120.0,
+    "s",
+    "deadlines",
+    surface="decoding of images",
+    source="vessel",
+    resource="time for one image",
+    at_limit="the decoding process is killed; the image is tried again later",
+)
+"""It includes the start of the process, and the compilation of the codec at the first image."""
 NICE: Final = 5
 """Lower priority of the decoder, so that records are accepted first."""
+END_S: Final = 2.0
+EXIT_MACHINE: Final = 75
+"""Exit status after an error of the machine, for example a lack of memory."""
+_MACHINE: Final = frozenset({EXIT_MACHINE, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.SIGHUP})
 _LENGTH = struct.Struct(">I")
 
 
@@ -45,13 +60,14 @@ class Decoded:
         image: The decoded image; None if it could not be decoded.
         reason: Why not.
         missing_model: The codebook that is not known, as in `coded_image`; empty if that is not the reason.
-        is_crash: Whether the process ended or exceeded the time.
+        failure: `machine` if the process did not start or was killed from outside; `crash` if it ended otherwise or
+            exceeded the time, which another program can cause as well; else empty.
     """
 
     image: ReconstructedImage | None = None
     reason: str = ""
     missing_model: str = ""
-    is_crash: bool = False
+    failure: Literal["", "machine", "crash"] = ""
 
 
 class DecodeWorker:
@@ -88,37 +104,58 @@ class DecodeWorker:
         return None if process is None else process.pid
 
     def decode(self, image: CodedImage) -> Decoded:
-        """Decode an image.
-
-        Raises:
-            OSError: The process cannot be started.
-        """
+        """Decode an image."""
+        is_new = False
         with self._lock:
             if self._closed:
-                return Decoded(reason="the service stops", is_crash=True)
+                return Decoded(reason="the service stops", failure="machine")
             if self._process is None:
-                self._process = subprocess.Popen(  # noqa: S603  the arguments are those of this module
-                    self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE
-                )
+                try:
+                    self._process = subprocess.Popen(  # noqa: S603  the arguments are those of this module
+                        self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+                    )
+                except OSError as error:
+                    return Decoded(reason=f"the decoder does not start: {error}", failure="machine")
+                is_new = True
             process = self._process
         assert process.stdin is not None
         assert process.stdout is not None
-        timer = threading.Timer(self._timeout_s, process.kill)
+        timed_out = threading.Event()
+
+        def end() -> None:
+            timed_out.set()
+            process.kill()
+
+        timer = threading.Timer(self._timeout_s, end)
         timer.start()
+        answer: bytes | None = None
+        is_ready = not is_new
         try:
-            _write(process.stdin, wire.encode(image))
-            answer = _read(process.stdout)
+            is_ready = is_ready or _read(process.stdout) is not None
+            if is_ready:
+                _write(process.stdin, wire.encode(image))
+                answer = _read(process.stdout)
         except OSError:
             answer = None  # the process has ended
         finally:
             timer.cancel()
         if answer is None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(END_S)  # its own status, not that of the kill
             self._end(process)
-            return Decoded(reason=f"the decoder ended with status {process.returncode}", is_crash=True)
+            return self._ended(process.returncode, is_ready=is_ready, timed_out=timed_out.is_set())
         fields = msgpack.unpackb(answer)
         if "payload" not in fields:
             return Decoded(reason=fields["reason"], missing_model=fields["model"])
         return Decoded(wire.decode(ReconstructedImage, fields["payload"], f"image {image.image_id}"))
+
+    def _ended(self, status: int, *, is_ready: bool, timed_out: bool) -> Decoded:
+        if not is_ready:
+            return Decoded(reason=f"the decoder does not start: it ended with status {status}", failure="machine")
+        if timed_out:
+            return Decoded(reason=f"the decoder did not finish within {self._timeout_s:g} s", failure="crash")
+        reason = f"the decoder ended with status {status}"
+        return Decoded(reason=reason, failure="machine" if status in _MACHINE else "crash")
 
     def close(self) -> None:
         """End the process, also while it decodes."""
@@ -161,12 +198,19 @@ def _decode(decoder: Decoder, folder: Path, payload: bytes) -> dict[str, object]
     try:
         further = None
         if image.model and decoder.codebook(image.model) is None and path.is_file():
-            further = codebook.load(path)
+            try:
+                further = codebook.load(path)
+            except BadInputError as error:
+                # The fault of the file, not of the image: it is fetched again.
+                log.warning("Stored codebook cannot be read", extra=kv(file=path, reason=str(error)))
         return {"payload": wire.encode(decoder.decode(image, further))}
     except MissingCodebookError as error:
         return {"reason": str(error), "model": error.model}
     except BadInputError as error:
         return {"reason": str(error), "model": ""}
+    except (OSError, MemoryError) as error:
+        log.exception("Decoder ends after an error of the machine")
+        raise SystemExit(EXIT_MACHINE) from error
     except Exception as error:
         # An unexpected exception costs this image only.
         log.exception("Image not decoded after an unexpected exception")
@@ -181,6 +225,7 @@ def main() -> None:
     os.dup2(2, 1)  # output of libraries must not get between the answers
     use_code_folder(Path(state_dir))
     decoder = Decoder(codebooks)
+    _write(answers, b"")
     while (payload := _read(sys.stdin.buffer)) is not None:
         packed: bytes = msgpack.packb(_decode(decoder, Path(folder), payload))
         _write(answers, packed)

@@ -1,4 +1,4 @@
-"""Files of a reconstructed image: TIFF, JSON side-car and PNG, with the same bytes on every platform.
+"""Files of a reconstructed image: TIFF, JSON side-car and PNG, with the same pixels on every platform.
 
 Different images can have the same file name: the time in it has whole seconds, and a producer can repeat identifiers.
 The first one keeps the plain name. Each further one has a digest of its side-car appended, so that none replaces
@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sonarpost.archive.retention import remove_files
+from sonarpost.archive.retention import remove_files, vehicle_source
 from sonarpost.export.contacts import SideCar
 from sonarpost.files import AtomicFiles
 from sonarpost.messages import ReconstructedImage
@@ -63,13 +63,21 @@ def is_superseded(name: str, names: Set[str]) -> bool:
 
 
 def remove_old_images(folder: Path, now_utc_s: float, retain_days: float, max_bytes: int) -> list[str]:
-    """Remove the files of images by age and total size, superseded versions first; return their names without suffix.
+    """Remove the files of images by age and total size; return their names without suffix.
+
+    Because of the total size, the vehicle with the most bytes loses images first, superseded versions before others.
 
     Raises:
         OSError: The folder cannot be read, or a file cannot be deleted.
     """
     return remove_files(
-        folder, SUFFIXES, now_utc_s, retain_days, max_bytes, lambda name, names: 0 if is_superseded(name, names) else 1
+        folder,
+        SUFFIXES,
+        now_utc_s,
+        retain_days,
+        max_bytes,
+        order=lambda name, names: 0 if is_superseded(name, names) else 1,
+        source=lambda name: vehicle_source(name.partition("_")[0]),
     )
 
 

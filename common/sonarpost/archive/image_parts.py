@@ -8,6 +8,7 @@ records and these rules for other languages.
 
 from __future__ import annotations
 
+import logging
 import zlib
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -23,7 +24,10 @@ from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError, FrameError, MissingBaseError, PayloadError
 from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary
 from sonarpost.link.received_image import contact_of, contact_record
+from sonarpost.logs import kv
 from sonarpost.messages import CodedImage, Contact, ImagePart
+
+log = logging.getLogger(__name__)
 
 MAX_VERSIONS: Final = 2048
 """Images of one vessel (c2) or for one site (relay) whose last version is kept for differences; at most 128 MiB."""
@@ -245,6 +249,15 @@ def is_whole(payload: bytes) -> bool:
 def version_of(payload: bytes) -> int:
     """Return the version in a valid encoded record `part`."""
     return int(msgpack.unpackb(payload)["n"])
+
+
+def stored_version(value: bytes | None, name: str) -> ImagePart | None:
+    """Return the version that a store keeps under a name of `version_name`; None for none, or if it cannot be read."""
+    try:
+        return None if value is None else wire.decode(ImagePart, value, name)
+    except PayloadError as error:
+        log.warning("Image version cannot be read; the whole image replaces it", extra=kv(reason=str(error)))
+        return None
 
 
 def surplus_names(names: Sequence[str]) -> Sequence[str]:

@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import Protocol
 from urllib.parse import parse_qs, unquote, urlsplit
 
-from sonarpost.errors import ConfigError, DatabaseUnavailableError
+from sonarpost.errors import ConfigError, DatabaseUnavailableError, RejectedByDatabaseError
 
 SCHEME = "postgresql://"
 DEFAULT_PORT = 5432
@@ -260,7 +260,10 @@ class Database:
             self.close()
         with self._lock:
             self.fault = f"database {self.address}: {reason}"
-            return DatabaseUnavailableError(self.fault)
+            # Data exception, violated constraint, limit of the server.
+            return (RejectedByDatabaseError if code.startswith(("22", "23", "54")) else DatabaseUnavailableError)(
+                self.fault
+            )
 
 
 def _tls_context(address: DatabaseAddress) -> ssl.SSLContext:

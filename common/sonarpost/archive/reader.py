@@ -14,6 +14,8 @@ from sonarpost.archive.shore_database import ShoreDatabase
 from sonarpost.archive.shore_files import decision_path, image_paths
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, Mark, ShoreIndex, TaskingRow
 from sonarpost.errors import StoredFileError
+from sonarpost.files import read_regular
+from sonarpost.sonar.image_decoding import MAX_FILE_BYTES
 
 ArchivePlace = Path | DatabaseAddress
 """Folder of c2, or address of its database."""
@@ -93,7 +95,7 @@ def read_image_files(place: ArchivePlace, row: ImageRow) -> dict[str, bytes]:
         files = {}
         for path in image_paths(place, row):
             try:
-                files[path.name] = path.read_bytes()
+                files[path.name] = read_regular(path, MAX_FILE_BYTES)
             except OSError as error:
                 raise StoredFileError(str(path), "", error.strerror or str(error), "a readable file of c2") from error
         return files

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic, TypeVar
 
 DAY_S = 86400.0
+UNLISTED = "modem-"
+"""Start of the name of a vehicle that is not in the configuration."""
 EARLIEST_UTC_S = 1_577_836_800.0
 """2020-01-01: an earlier time of storage shows that the clock was not set; the age of the item is unknown."""
-
 T = TypeVar("T")
 
 
@@ -22,13 +24,20 @@ class Stored(Generic[T]):
         item: The item.
         stored_utc_s: When it was stored.
         size_bytes: Its size.
-        order: Items of a lower order are removed first because of the total size.
+        order: Items of a lower order are removed first because of the total size, among those of the same source.
+        source: Vessel or vehicle that it came from.
     """
 
     item: T
     stored_utc_s: float
     size_bytes: int
     order: int = 0
+    source: str = ""
+
+
+def vehicle_source(vehicle_id: str) -> str:
+    """Return `Stored.source` of a vehicle: one for all without a configured name, whose addresses can be forged."""
+    return UNLISTED if vehicle_id.startswith(UNLISTED) else vehicle_id
 
 
 def select_for_removal(
@@ -36,23 +45,30 @@ def select_for_removal(
 ) -> list[T]:
     """Select the items that retention removes.
 
-    Items stored longer than `retain_days` ago are removed, except those of unknown age. Of the others, those of the
-    lowest order are removed first, oldest first, until at most `max_bytes` remain. None stands for no limit.
+    Items stored longer than `retain_days` before the newest one are removed, except those of unknown age: a clock that
+    is ahead makes no item old. Of the others, those of the source with the most bytes are removed, those of the lowest
+    order first, oldest first, until at most `max_bytes` remain. None stands for no limit.
     """
+    ordered = sorted(stored, key=lambda e: (e.order, e.stored_utc_s))  # stable: items of one time stay in order
+    now_utc_s = min(now_utc_s, max((each.stored_utc_s for each in ordered), default=0.0))
     old: list[T] = []
-    kept: list[Stored[T]] = []
-    for each in stored:
+    sizes: Counter[str] = Counter()
+    kept: dict[str, list[Stored[T]]] = {}
+    for each in reversed(ordered):
         age_s = now_utc_s - each.stored_utc_s if each.stored_utc_s >= EARLIEST_UTC_S else 0.0
         if retain_days is not None and age_s > retain_days * DAY_S:
             old.append(each.item)
         else:
-            kept.append(each)
-    total = sum(each.size_bytes for each in kept)
-    for each in sorted(kept, key=lambda e: (e.order, e.stored_utc_s)):  # stable: items of one time stay in order
-        if max_bytes is None or total <= max_bytes:
-            break
-        total -= each.size_bytes
-        old.append(each.item)
+            sizes[each.source] += each.size_bytes
+            kept.setdefault(each.source, []).append(each)
+    old.reverse()
+    total = sizes.total()
+    while max_bytes is not None and total > max_bytes:
+        largest = max(sizes, key=lambda source: (sizes[source], source))
+        removed = kept[largest].pop()
+        sizes[largest] -= removed.size_bytes
+        total -= removed.size_bytes
+        old.append(removed.item)
     return old
 
 
@@ -86,6 +102,7 @@ def remove_files(
     retain_days: float | None,
     max_bytes: int | None,
     order: Callable[[str, frozenset[str]], int] = lambda _name, _names: 0,
+    source: Callable[[str], str] = lambda _name: "",
 ) -> list[str]:
     """Remove files of a folder by age and total size; return their names without suffix.
 
@@ -96,14 +113,15 @@ def remove_files(
         retain_days: See `select_for_removal`.
         max_bytes: See `select_for_removal`.
         order: Returns `Stored.order` of a name among all names.
+        source: Returns `Stored.source` of a name.
 
     Raises:
         OSError: The folder cannot be read, or a file cannot be deleted.
     """
     stored = stored_files(folder, suffixes)
     names = frozenset(each.item for each in stored)
-    ordered = [replace(each, order=order(each.item, names)) for each in stored]
-    selected = select_for_removal(ordered, now_utc_s, retain_days, max_bytes)
+    described = [replace(each, order=order(each.item, names), source=source(each.item)) for each in stored]
+    selected = select_for_removal(described, now_utc_s, retain_days, max_bytes)
     for name in selected:
         for suffix in suffixes:
             (folder / f"{name}{suffix}").unlink(missing_ok=True)

@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
+from itertools import accumulate
 from typing import TypeVar
 
 from pydantic import TypeAdapter
@@ -464,12 +465,15 @@ class ShoreDatabase:
             digests=[record.sha256 for record in records],
         )
 
-    def take_over(self, age_s: float, limit: int, store: Callable[[list[AcceptedRecord]], None]) -> int:
+    def take_over(
+        self, age_s: float, limit: int, limit_bytes: int, store: Callable[[list[AcceptedRecord]], None]
+    ) -> int:
         """Take over records of other c2 that do not call this method any more; return their number.
 
         Args:
             age_s: Least age of the records, and time since the last call of their c2, by the clock of the server.
             limit: Maximum number of records.
+            limit_bytes: Maximum size of their payloads, at least one record.
             store: Stores the records durably at this c2; called before they are assigned to it.
         """
         with self._transaction() as sql:
@@ -480,13 +484,22 @@ class ShoreDatabase:
             )
         with self._transaction() as sql:
             found = sql.rows(
-                "SELECT key, payload FROM accepted WHERE owner <> :owner AND NOT EXISTS (SELECT 1 FROM member"
-                " WHERE member.owner = accepted.owner AND seen_at >= clock_timestamp() - :age * interval '1 second')"
+                "SELECT key, sha256, octet_length(payload) FROM accepted WHERE owner <> :owner"
+                " AND NOT EXISTS (SELECT 1 FROM member WHERE member.owner = accepted.owner"
+                " AND seen_at >= clock_timestamp() - :age * interval '1 second')"
                 " AND accepted_at < clock_timestamp() - :age * interval '1 second'"
                 " ORDER BY accepted_at LIMIT :limit FOR UPDATE SKIP LOCKED",
                 owner=self._owner,
                 age=age_s,
                 limit=limit,
+            )
+            totals = accumulate(int(str(size)) for _, _, size in found)
+            chosen = found[: max(1, sum(total <= limit_bytes for total in totals))]
+            found = sql.rows(
+                "SELECT key, payload FROM unnest(:keys::text[], :digests::bytea[]) AS k (key, sha256)"
+                " JOIN accepted USING (key, sha256) ORDER BY accepted_at",
+                keys=[key for key, _, _ in chosen],
+                digests=[digest for _, digest, _ in chosen],
             )
             records = [AcceptedRecord(str(key), _bytes(payload)) for key, payload in found]
             if records:

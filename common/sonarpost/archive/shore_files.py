@@ -7,18 +7,30 @@ import json
 import logging
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-
-from pydantic import ValidationError
+from typing import Final
 
 from sonarpost.archive.image_files import SUFFIXES, image_file_name
 from sonarpost.archive.retention import Stored, select_for_removal
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, Verified
 from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import DECISIONS, SideCar
+from sonarpost.files import read_regular
+from sonarpost.limits import limit
 from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage
+from sonarpost.sonar.image_decoding import MAX_FILE_BYTES
 
 log = logging.getLogger(__name__)
+
+MIN_FILE_BYTES: Final = limit(
+    16384,
+    "bytes a file",
+    "claims",
+    surface="archive of c2",
+    source="vessel",
+    resource="least size that max_bytes counts",
+    at_limit="Many small files exhaust neither blocks nor inodes of the disk before max_bytes is reached",
+)
 
 
 def image_paths(out_dir: Path, row: ImageRow) -> tuple[Path, ...]:
@@ -37,7 +49,7 @@ def files_digest(paths: Iterable[Path]) -> str:
     Raises:
         OSError: A file is missing or cannot be read.
     """
-    return " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths)
+    return " ".join(hashlib.sha256(read_regular(path, MAX_FILE_BYTES)).hexdigest() for path in paths)
 
 
 def decision_text(decision: Decision) -> bytes:
@@ -46,23 +58,22 @@ def decision_text(decision: Decision) -> bytes:
 
 
 def verify_files(out_dir: Path, row: ImageRow | DecisionRow) -> Verified:
-    """Compare the files of a row with the index: existence, size, digests.
+    """Compare the files of a row with the index: existence and digests.
 
-    A row without digests (of an earlier version) gets those of the present files, if their size is right.
+    A row without digests (of an earlier version) gets those of the present files.
     """
     if isinstance(row, ImageRow):
-        paths, size_bytes = image_paths(out_dir, row), row.size_bytes
+        paths = image_paths(out_dir, row)
     else:
-        paths, size_bytes = (decision_path(out_dir, row.vessel_id, row.decision_id),), None
+        paths = (decision_path(out_dir, row.vessel_id, row.decision_id),)
     try:
-        same_size = size_bytes in (None, sum(path.stat().st_size for path in paths))
         found = files_digest(paths)
     except FileNotFoundError:
         return Verified(row, row.files_sha256, "missing")
     except OSError as error:
         log.debug("Stored file cannot be read", extra=kv(file=paths[0], error=str(error)))
         return Verified(row, row.files_sha256, "unreadable")
-    if same_size and found == (row.files_sha256 or found):
+    if found == (row.files_sha256 or found):
         return Verified(row, found, "")
     return Verified(row, row.files_sha256, "changed")
 
@@ -85,7 +96,7 @@ def image_row(
         OSError: A file is missing.
     """
     folder = out_dir / image.vessel_id
-    contents = [(folder / f"{name}{suffix}").read_bytes() for suffix in SUFFIXES]
+    contents = [read_regular(folder / f"{name}{suffix}", MAX_FILE_BYTES) for suffix in SUFFIXES]
     return row_of_image(name, image, relayed_utc_s, accepted_utc_s, contents)
 
 
@@ -130,7 +141,7 @@ def row_of_image(
         lon_deg=contact.lon_deg if contact else None,
         atd_class=contact.atd_class if contact else None,
         atd_confidence=contact.atd_confidence if contact else None,
-        size_bytes=sum(len(content) for content in contents),
+        size_bytes=sum(max(len(content), MIN_FILE_BYTES) for content in contents),
         conflict=name != image_file_name(image),
         files_sha256=" ".join(hashlib.sha256(content).hexdigest() for content in contents),
         despeckle_strength=image.despeckle_strength,
@@ -169,22 +180,22 @@ def remove_temporary_files(out_dir: Path) -> int:
 
 def _missing_images(out_dir: Path, index: ShoreIndex) -> Iterator[ImageRow]:
     for path in sorted(out_dir.glob("*/[!.]*.json")):
-        if index.has_image(path.parent.name, path.stem):
-            continue
         try:
-            side_car = SideCar.model_validate_json(path.read_bytes())
+            if index.has_image(path.parent.name, path.stem):
+                continue
+            side_car = SideCar.model_validate_json(read_regular(path, MAX_FILE_BYTES))
             yield image_row(out_dir, path.stem, side_car, None, path.stat().st_mtime)
-        except (ValidationError, OSError) as error:
+        except (ValueError, OSError) as error:  # a name that is not UTF-8 is a ValueError too
             log.error("Stored image cannot be read", extra=kv(file=path, reason=str(error)[:200]))
 
 
 def _missing_decisions(out_dir: Path, index: ShoreIndex) -> Iterator[DecisionRow]:
     for path in sorted(out_dir.glob(f"*/{DECISIONS}/[!.]*.json")):
         try:
-            decision = Decision.model_validate_json(path.read_bytes())
+            decision = Decision.model_validate_json(read_regular(path, MAX_FILE_BYTES))
             if not index.has_decision(decision.vessel_id, decision.decision_id):
                 yield DecisionRow.of(decision, path.stat().st_mtime, files_digest([path]))
-        except (ValidationError, OSError) as error:
+        except (ValueError, OSError) as error:  # a name that is not UTF-8 is a ValueError too
             log.error("Stored decision cannot be read", extra=kv(file=path, reason=str(error)[:200]))
 
 
@@ -197,18 +208,16 @@ def select_images(
 ) -> list[ImageRow]:
     """Select the images that retention removes; see `select_for_removal`.
 
-    Because of the total size, exported images are removed first, then those with a decision, then those without, in
-    each group the one that was accepted first.
+    Because of the total size, the vessel with the most bytes loses images first: exported ones, of which a copy exists,
+    before others, then those without a decision before those with one, then the one that was accepted first.
     """
     decided = {(d.vessel_id, d.vehicle_id, d.image_id) for d in decisions}
 
     def order(row: ImageRow) -> int:
-        if row.exported_utc_s is not None:
-            return 0
-        return 1 if (row.vessel_id, row.vehicle_id, row.image_id) in decided else 2
+        return 2 * (row.exported_utc_s is None) + ((row.vessel_id, row.vehicle_id, row.image_id) in decided)
 
     rows = sorted(images, key=lambda row: (row.vessel_id, row.name))
-    stored = [Stored(row, row.accepted_utc_s, row.size_bytes, order(row)) for row in rows]
+    stored = [Stored(row, row.accepted_utc_s, row.size_bytes, order(row), row.vessel_id) for row in rows]
     return select_for_removal(stored, now_utc_s, retain_days, max_bytes)
 
 

@@ -81,7 +81,7 @@ class ImageRow:
         name: File name without suffix, in the vessel's folder.
         relayed_utc_s: When the vessel's relay accepted it, by the vessel's clock; None if restored from the files.
         accepted_utc_s: When c2 stored it, by the shore's clock.
-        size_bytes: Size of its three files.
+        size_bytes: Size of its three files, each counted as at least `shore_files.MIN_FILE_BYTES`.
         exported_utc_s: When it was last exported; None for never.
         removed_utc_s: When retention deleted its files; None while they exist.
         conflict: Whether another image has the plain file name, see `image_files`.
