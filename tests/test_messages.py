@@ -36,7 +36,7 @@ SHA = ["0" * 64, "f" * 64], ["0" * 63, "0" * 65, "G" * 64, "A" * 64]
 HASH = ["", "0a" * 32], ["0" * 63, "G" * 64]
 TIME = [0.0, 253402300799.0], [-0.001, 253402300800.0, NAN, INF]
 COUNT, FROM_1 = between(0, 2**63 - 1, 1), between(1, 2**63 - 1, 1)
-METRES, FRACTION, SIDE = between(0, 20000), between(0, 1), between(1, 4096, 1)
+METRES, FRACTION, SIDE = between(0, 20000), between(0, 1), between(1, 512, 1)
 PIXEL = [1e-9, 100], [0.0, 100.1, NAN]
 RANGES = [(), ((0, 14),)], [((0, 17),), ((4, 4),), ((5, 4),), ((8, 9), (1, 2)), ((1, 3), (3, 5))]
 ANY = [], []
@@ -45,7 +45,8 @@ RASTER = SAMPLES["raster-16-bits"]
 # Valid and invalid values of the correct type by field; then those of names with another meaning.
 LIMITS = {
     "contact_id": text(1, 120), "vehicle_id": NAMES, "vessel_id": NAMES, "platform_id": NAMES, "image_id": IMAGE_ID,
-    "sonar_id": text(0, 2000), "line_name": text(0, 2000), "source": text(0, 2000), "detail": text(0, 2000),
+    "sonar_id": text(0, 2000), "line_name": text(0, 2000), "position_note": text(0, 2000),
+    "source": text(0, 2000), "detail": text(0, 2000),
     "reason": text(0, 2000), "remark": text(0, 2000), "mlo_class": text(0, 60), "atd_class": text(0, 60),
     "message_id": ID, "decision_id": ID, "record_id": ID, "command_id": ID, "advice_id": ID, "withdraws": ID,
     "service": text(1, 40), "key": text(1, 300), "operator": text(1, 120), "author": text(1, 120),
@@ -79,7 +80,7 @@ LIMITS = {
     "images": ([(SAMPLES["queued-image"],) * 500], [(SAMPLES["queued-image"],) * 501]),
 }  # fmt: skip
 OWN_LIMITS = {
-    "raster": {"data": ([], [b"", b"12345", b"1234567"]), "height_px": ([], SIDE[1]), "width_px": ([], SIDE[1])},
+    "raster": {"data": ([], [b"", b"12345", b"1234567"]), "height_px": ([], [0, 4097]), "width_px": ([], [0, 4097])},
     "acoustic_frame": {"data": ([b"", bytes(2048)], [bytes(2049)]), "source": between(0, 255, 1)},
     "outgoing_message": {"data": ([b"x", bytes(1024)], [b"", bytes(1025)]), "source": text(1, 40)},
     "received_message": {"data": ([b"x", bytes(4096)], [b"", bytes(4097)])},

@@ -50,6 +50,7 @@ class Bounds(NamedTuple):
 
 Count = Annotated[int, Bounds(0, 2**62)]
 Byte = Annotated[int, Bounds(0, 255)]
+Word = Annotated[int, Bounds(0, 2**32 - 1)]
 
 
 def check_bounds(value: object, where: str, error: type[BadInputError]) -> None:
@@ -96,6 +97,15 @@ def unpack_plain(kind: type[_T], data: bytes, where: str) -> _T:
     if not isinstance(plain, kind):
         raise FrameError(where, "", plain, f"a {kind.__name__}")
     return plain
+
+
+def unpack_value(kind: type[_T], data: bytes, where: str) -> _T:
+    """Return the list, tuple or dataclass of type `kind` that msgpack bytes hold.
+
+    Raises:
+        FrameError: They hold something else.
+    """
+    return from_plain(kind, unpack_plain(list, data, where), where)
 
 
 def prefixed(prefix: str, parts: Mapping[str, _T]) -> dict[str, _T]:

@@ -103,6 +103,7 @@ class Contact(Record):
         lat_deg: Position of the object, north positive.
         lon_deg: Position of the object, east positive.
         position_sigma_m: One standard deviation of the position along the worse axis of its error ellipse.
+        position_note: Why the position may be wrong by more than that. The acoustic link does not carry it.
         depth_m: Depth of the vehicle below the surface.
         altitude_m: Altitude of the vehicle above the seabed.
         heading_deg: Heading of the vehicle, clockwise from true north.
@@ -139,6 +140,7 @@ class Contact(Record):
     lat_deg: Latitude | None = None
     lon_deg: Longitude | None = None
     position_sigma_m: Metres | None = None
+    position_note: Text | None = None
     depth_m: Annotated[float, Field(ge=-100, le=12000)] | None = None
     altitude_m: Metres | None = None
     heading_deg: Annotated[float, Field(ge=0, lt=360)] | None = None

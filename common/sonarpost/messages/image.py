@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, ValidationInfo, field_validator
 
+from sonarpost.limits import limit
 from sonarpost.messages.contact import Contact, Pixels
 from sonarpost.messages.record import (
     Count,
@@ -26,6 +27,17 @@ from sonarpost.messages.record import (
 
 MAX_STREAM_BYTES: Final = 65542
 """Longest stream of an image, header included."""
+MAX_SIDE_PX: Final = limit(
+    512,
+    "px",
+    "claims",
+    surface="records of coded images",
+    source="vessel, vehicle",
+    resource="claimed side of an image",
+    at_limit="The record is refused; pixels of which nothing arrived are decoded black and stored compressed",
+)
+"""Largest side of a coded image, as in `sonarpost.codec.interface`."""
+SidePx = Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]
 
 
 class EncodedImage(Record):
@@ -50,8 +62,8 @@ class EncodedImage(Record):
     contact: Contact
     codec: Annotated[str, Field(min_length=1, max_length=40)]
     model: ModelHash
-    height_px: Annotated[int, Field(ge=1, le=4096)]
-    width_px: Annotated[int, Field(ge=1, le=4096)]
+    height_px: SidePx
+    width_px: SidePx
     stream: Annotated[bytes, Field(min_length=2, max_length=MAX_STREAM_BYTES)]
     original_sha256: Sha256
 
@@ -114,8 +126,8 @@ class ReceivedImage(Record):
     image_id: ImageId
     version: Ordinal
     contact: Contact | None
-    height_px: Annotated[int, Field(ge=1, le=4096)] | None
-    width_px: Annotated[int, Field(ge=1, le=4096)] | None
+    height_px: SidePx | None
+    width_px: SidePx | None
     stream: Annotated[bytes, Field(max_length=MAX_STREAM_BYTES)]
     missing: tuple[tuple[Count, Count], ...]
     missing_halves: tuple[Literal["top", "bottom"], ...]
@@ -225,8 +237,8 @@ class ImagePart(Record):
     d: Count = 0
     l: Time | None = None  # noqa: E741  short on the wire
     c: Annotated[bytes, Field(max_length=20_000)] = b""
-    h: Annotated[int, Field(ge=1, le=4096)] | None = None
-    w: Annotated[int, Field(ge=1, le=4096)] | None = None
+    h: SidePx | None = None
+    w: SidePx | None = None
     z: Annotated[int, Field(ge=0, le=MAX_STREAM_BYTES)] | None = None
     p: Annotated[bytes, Field(max_length=MAX_STREAM_BYTES)] = b""
     s: tuple[tuple[Count, bytes], ...] = ()

@@ -154,3 +154,15 @@ def test_relatives_of_bands(size: tuple[int, int]) -> None:
             assert cousins | {int(band[t.PARENT])} == above
         assert band[t.HEIGHT] >= 0
         assert band[t.WIDTH] >= 0
+
+
+@pytest.mark.parametrize("shape", [(3, 8), (9, 4)])
+def test_synthesis_of_a_plane_is_that_of_each_row(shape):
+    plane = np.random.default_rng(3).integers(-1000, 1000, shape)
+    rows = [row[None].copy() for row in plane]
+    for row in rows:
+        t.synthesise_rows(row)
+    whole = plane.copy()
+    t.synthesise_rows(whole)
+    np.testing.assert_array_equal(whole, np.concatenate(rows))
+    assert (whole != plane).any()

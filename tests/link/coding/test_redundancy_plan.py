@@ -121,3 +121,5 @@ def test_symbols_to_send() -> None:
     assert symbols_to_send(50, LossChannel(0.0), 2.0) == 50
     assert symbols_to_send(50, LossChannel(0.5), 0.0) == 100
     assert 50 <= symbols_to_send(50, LossChannel(0.5), 2.0) < 100 < symbols_to_send(50, LossChannel(0.5), -2.0)
+    # Few symbols: the average need. Many: below it.
+    assert [symbols_to_send(n, LossChannel(0.3)) for n in (1, 4, 24, 48)] == [2, 6, 29, 61]

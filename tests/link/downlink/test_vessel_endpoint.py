@@ -98,7 +98,7 @@ def test_unanswered_command_is_retried_less_often_and_expires():
         if packet is not None:
             link.sent(packet, float(now))
             sent_at.append(float(now))
-    assert np.diff(sent_at).tolist()[:5] == [60.0, 120.0, 240.0, 480.0, 480.0]
+    assert np.diff(sent_at).tolist()[:7] == [60.0, 60.0, 60.0, 120.0, 240.0, 480.0, 480.0]
     [expired] = link.commands.expire(LASTING_S)
     assert (expired.state, expired.times_sent) == (CommandState.EXPIRED, len(sent_at))
     assert link.commands.open_commands == ()
@@ -150,6 +150,19 @@ def test_tracker_memory_is_bounded(monkeypatch):
         tracker.expire(1e9 + n + LASTING_S)
         tracker.add(command(tracker, f"d-{n}", now=1e9 + n), 1e9 + n)
     assert len(tracker.parts()) == 20 + 1, "the last closed ones and the open one"
+
+
+def test_vehicles_have_shares_of_open_commands_and_take_turns():
+    tracker = CommandTracker(60.0)
+    for n in range(MAX_PENDING):
+        tracker.add(command(tracker, f"c-{n}"), 0.0)
+    other = replace(command(tracker, "other"), address=9)
+    assert not tracker.is_full(9)
+    tracker.add(other, 1.0)
+    endpoint = VesselEndpoint(tracker)
+    packets = [endpoint.next_packet(1, 64, 2.0) for _ in range(4)]
+    assert [packet.address for packet in packets] == [3, 9, 3, 9]
+    assert packets[1].tokens == (other.token,)
 
 
 @pytest.mark.parametrize("field", ["format version", "state", "address", "message", "due_s"])
@@ -212,7 +225,7 @@ def test_unanswered_feedback_becomes_rare_and_ends():
         if packet is not None:
             at.append(now)
             link.sent(packet, float(now))
-    assert np.diff(at).tolist() == [10, 20, 40, 80] + 20 * [100]
+    assert np.diff(at).tolist() == [10, 10, 10, 20, 40, 80] + 18 * [100]
     link.accept(UUV, vehicle.sender.next_frame(3000.0), 3000.0)
     assert link.due_address(3000.0 + 400) == UUV
 

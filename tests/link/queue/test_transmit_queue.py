@@ -77,6 +77,41 @@ def test_all_contacts_precede_detail():
     assert first is None, f"detail of {first} before all contacts were seen"
 
 
+def test_free_frames_of_a_packet_carry_copies_and_symbols():
+    queue = TransmitQueue(queue_config(expected_loss=0.3))
+    queue.add_message("m1", "uuv_modem", b"confirmed", 0.0, once=True)
+    receivers = [V1Receiver(), V1Receiver()]
+    frames = take_packet(queue, 0.0)
+    events = [receiver.accept(3, frame, 0.0) for receiver, frame in zip(receivers, frames, strict=True)]
+    assert [messages(each) for each in events] == [[b"confirmed"]] * 2
+    assert take_packet(queue, 10.0) == ()
+    queue = TransmitQueue(queue_config(expected_loss=0.0))
+    queue.add_image(image(1, stream(1, 200)), 0.0)
+    queue.sender.expect_feedback(expected=True)
+    packets = list(iter(lambda: take_packet(queue, 0.0), ()))
+    assert {len(frames) for frames in packets} == {3}
+    assert sum(block.sent for block in queue.sender.blocks) > sum(b.source_symbols for b in queue.sender.blocks)
+
+
+@pytest.mark.parametrize("kind", ["image of its own", "longer stream", "refine"])
+def test_answer_to_a_request_goes_before_the_detail_of_others(kind):
+    queue = filled(TransmitQueue(queue_config(expected_loss=0.0, stream_bytes=100, group_delay_s=60.0)), 1, -60.0)
+    queue.sender.expect_feedback(expected=True)
+    receiver = V1Receiver()
+    _, now = run(queue, 60.0, now=0.0, receiver=receiver, feedback=True)
+    for number in range(2, 26):
+        queue.add_image(image(number), now - 60.0)
+    _, now = run(queue, 60.0, now=now, receiver=receiver, feedback=True)
+    if kind == "refine":
+        assert queue.refine(1, 200, now)
+    else:
+        own = ImageToSend("00ZZ", "c1", CONTACT, stream(99, 90))
+        assert queue.add_image(own if kind == "image of its own" else image(1, stream(1, 400)), now)
+    wanted, least = ("00ZZ", 90) if kind == "image of its own" else (image_of_number(1), 200)
+    events, _ = run(queue, 40.0, now=now, receiver=receiver, feedback=True)
+    assert any(e.image_id == wanted and e.received_bytes >= least for e in events if isinstance(e, ImageUpdate))
+
+
 def test_urgent_message_waits_for_one_packet_at_most():
     queue = filled(TransmitQueue(queue_config(expected_loss=0.0)), 20)
     for n in range(200):

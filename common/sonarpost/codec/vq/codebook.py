@@ -22,7 +22,7 @@ import numpy as np
 from sonarpost.codec.vq.codec import codebook_tag
 from sonarpost.codec.vq.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase
 from sonarpost.errors import CodebookError
-from sonarpost.files import write_atomically
+from sonarpost.files import read_regular, write_atomically
 
 MAGIC = b"SPTILES\n"
 VERSION = 1
@@ -34,6 +34,7 @@ SUFFIX: Final = ".tiles"
 _HEADER = struct.Struct(">8sHHIHI")  # magic, version, tile_px, tiles, dims, bytes of notes
 _HASH_BYTES = 32
 MAX_NOTES_BYTES = 1 << 20
+MAX_FILE_BYTES = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ def load(path: Path) -> Codebook:
         CodebookError: The file cannot be read or is damaged.
     """
     try:
-        data = path.read_bytes()
+        data = read_regular(path, MAX_FILE_BYTES)
     except OSError as error:
         raise CodebookError(str(path), "", str(error), "a tile codebook file") from error
     return from_bytes(data, str(path))

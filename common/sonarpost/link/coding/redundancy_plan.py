@@ -238,18 +238,21 @@ def copies(channel: LossChannel, missed: float = 0.01, limit: int = 8) -> int:
     return min(limit, math.ceil(math.log(missed) / math.log(channel.loss)))
 
 
-def symbols_to_send(missing_symbols: int, channel: LossChannel, caution: float = 1.5) -> int:
+def symbols_to_send(missing_symbols: int, channel: LossChannel, caution: float | None = None) -> int:
     """Return how many symbols to send before the next feedback.
 
-    The number is below the average need: feedback requests the rest, and symbols beyond the need are wasted.
+    For many symbols the number is below the average need: feedback requests the rest, and symbols beyond the need are
+    wasted. Few symbols are sent as often as they are needed on average: a round of feedback takes longer.
 
     Args:
         missing_symbols: Symbols that are missing at the receiver.
         channel: The channel.
-        caution: Standard deviations below the average.
+        caution: Standard deviations below the average; None for 1.5 from 24 symbols on, and less for fewer.
     """
     if missing_symbols <= 0:
         return 0
+    if caution is None:
+        caution = 1.5 * min(1.0, missing_symbols / 24)
     passed = 1.0 - channel.loss
     memory = channel.memory
     widening = (1 + memory) / (1 - memory)

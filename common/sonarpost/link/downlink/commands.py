@@ -12,13 +12,22 @@ from itertools import count
 from typing import Annotated, Final
 
 from sonarpost.errors import FrameError
+from sonarpost.limits import limit
 from sonarpost.link.downlink.messages import CommandOutcome, token_of
 from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
 
-MAX_PENDING: Final = 500
-"""Maximum number of open commands."""
+MAX_PENDING: Final = limit(
+    500,
+    "commands",
+    "shares",
+    surface="acoustic link, vessel",
+    source="vehicle",
+    resource="open commands",
+    at_limit="further ones for this vehicle are refused",
+)
 _MAX_CLOSED: Final = 1000
-_MAX_RETRY_FACTOR: Final = 8
+_MAX_RETRY_DOUBLINGS: Final = 3
+_QUICK_RETRIES: Final = 2
 _WHERE: Final = "commands"
 
 
@@ -72,12 +81,24 @@ class PendingCommand:
     order: Count = 0
 
 
+def retry_factor(repetitions: int, max_doublings: float) -> float:
+    """Return the factor of the wait before the next repetition: 1 for the first three, then doubled each time.
+
+    Lost packets are repeated soon; a vehicle out of range costs little air time.
+
+    Args:
+        repetitions: Repetitions that were sent.
+        max_doublings: Base-2 logarithm of the greatest factor.
+    """
+    return float(2.0 ** min(max(0, repetitions - _QUICK_RETRIES), max_doublings))
+
+
 @dataclass
 class CommandTracker:
     """All open commands, and the last 1000 closed ones.
 
     Attributes:
-        retry_s: Wait before a command is sent again; doubled each time, up to eight times as long.
+        retry_s: Wait before a command is sent again; see `retry_factor`.
     """
 
     retry_s: float
@@ -88,6 +109,10 @@ class CommandTracker:
         """The commands that are not confirmed, refused or expired, the oldest first."""
         # `list` copies in one step: other threads call this while a command is added.
         return tuple(command for command in list(self._commands.values()) if command.state.is_open)
+
+    def is_full(self, address: int) -> bool:
+        """Return whether a vehicle has the maximum number of open commands."""
+        return sum(command.address == address for command in self.open_commands) >= MAX_PENDING
 
     def find(self, kind: str, record_id: str) -> PendingCommand | None:
         """Return the command of a record, None for a new record."""
@@ -105,7 +130,7 @@ class CommandTracker:
         Raises:
             FrameError: Too many commands are open, or the token is in use.
         """
-        if len(self.open_commands) >= MAX_PENDING:
+        if self.is_full(command.address):
             raise FrameError(_WHERE, "open", MAX_PENDING, f"at most {MAX_PENDING}")
         if command.token in self._commands:
             raise FrameError(_WHERE, "token", command.token, "one that is free")
@@ -129,7 +154,7 @@ class CommandTracker:
         def after(command: PendingCommand) -> PendingCommand:
             if not command.state.is_open:
                 return command
-            wait_s = self.retry_s * min(2**command.times_sent, _MAX_RETRY_FACTOR)
+            wait_s = self.retry_s * retry_factor(command.times_sent, _MAX_RETRY_DOUBLINGS)
             return replace(
                 command, state=CommandState.SENT, times_sent=command.times_sent + 1, due_s=float(now + wait_s)
             )

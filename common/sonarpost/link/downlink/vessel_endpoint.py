@@ -6,6 +6,7 @@ UTC in seconds, because another process can restore the state.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -14,7 +15,7 @@ from sonarpost.errors import FrameError
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.merging import FrameMerger
 from sonarpost.link.config import ReceiverConfig
-from sonarpost.link.downlink.commands import CommandState, CommandTracker, PendingCommand
+from sonarpost.link.downlink.commands import CommandState, CommandTracker, PendingCommand, retry_factor
 from sonarpost.link.downlink.messages import ConfirmationMessage, DataMessage, DecisionMessage, unpack
 from sonarpost.link.downlink.status_message import StatusMessage
 from sonarpost.link.frames.paper.receiver import PaperReceiver
@@ -35,7 +36,7 @@ from sonarpost.link.state import Byte, Errors, PartReader, Parts, below, pack_pa
 _MAX_UNANSWERED: Final = 24
 """Maximum number of repetitions of feedback that no frame of the vehicle follows."""
 _MAX_WAIT_INTERVALS: Final = 10
-"""The wait between repetitions doubles from one feedback interval up to this many (10 min by default)."""
+"""The wait between repetitions grows from one feedback interval up to this many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +124,8 @@ class VesselEndpoint:
         self._feedback = feedback
         self._message_number = 0
         self._unanswered: dict[int, int] = {}
+        self._served: dict[int, int] = {}  # rises with each packet, by address
+        self._sent_commands = False
         self._feedback_s: dict[int, float] = {}
         self._feedback_failed: set[int] = set()
         self._overheard: set[int] = set()
@@ -221,12 +224,15 @@ class VesselEndpoint:
                     self.v1.stop_image(command.address, decision.number)
 
     def due_address(self, now: float) -> int | None:
-        """Return the modem address of the vehicle that something is due for, None for none."""
-        commands = self.commands.due(now)
-        if commands:
-            return commands[0].address
-        sources = [source for source in self.v1.sources if self._feedback_is_due(source, now)]
-        return min(sources, key=lambda source: self._feedback_s.get(source, 0.0), default=None)
+        """Return the modem address of the vehicle that something is due for, None for none.
+
+        Vehicles take turns, and commands and feedback too: commands do not wait for the feedback of many addresses.
+        """
+        with_commands = [command.address for command in self.commands.due(now)]
+        with_feedback = [source for source in self.v1.sources if self._feedback_is_due(source, now)]
+        with_feedback.sort(key=lambda source: self._feedback_s.get(source, 0.0))
+        addresses = with_feedback if self._sent_commands and with_feedback else with_commands or with_feedback
+        return min(addresses, key=lambda address: self._served.get(address, 0), default=None)
 
     def next_packet(self, max_frames: int, frame_bytes: int, now: float) -> DownlinkPacket | None:
         """Return the packet to send now, None if nothing is due; call `sent` or `failed` next.
@@ -263,6 +269,8 @@ class VesselEndpoint:
             self._feedback_failed |= {address} if has_feedback else set()
             raise
         self._message_number = number
+        self._sent_commands = bool(tokens)
+        self._served[address] = max(self._served.values(), default=0) + 1
         if has_feedback:
             self._unanswered[address] = self._unanswered.get(address, -1) + 1
             self._feedback_s[address] = now
@@ -286,7 +294,7 @@ class VesselEndpoint:
             return True
         unanswered = self._unanswered.get(source, -1)
         if unanswered >= 0:
-            wait_s = self.v1.config.feedback_interval_s * min(2**unanswered, _MAX_WAIT_INTERVALS)
+            wait_s = self.v1.config.feedback_interval_s * retry_factor(unanswered, math.log2(_MAX_WAIT_INTERVALS))
             if unanswered >= _MAX_UNANSWERED or now - self._feedback_s.get(source, 0.0) < wait_s:
                 return False
         return self.v1.feedback_is_due(source, now)

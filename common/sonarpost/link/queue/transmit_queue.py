@@ -137,10 +137,20 @@ class TransmitQueue(ImageSender):
         A known image is sent again from its beginning, unless it still waits. If its stream has become longer and
         begins with what was sent, only the new part is sent; if it does not begin so, nothing.
 
+        An image of a contact of which one is kept answers a request: it goes before the detail of the other images, and
+        does not wait for a group.
+
         Raises:
             FrameError: The identifier is invalid, or another image that waits has its number.
             StreamError: See `V1Sender.add_image`.
         """
+        answers = any(kept.contact_id == image.contact_id for kept in self.sender.kept.values())
+        is_sent = self._add_image(image, now)
+        if answers and is_sent:
+            self.sender.prioritise(number_of_image(image.image_id), now, first=True)
+        return is_sent
+
+    def _add_image(self, image: ImageToSend, now: float) -> bool:
         number = number_of_image(image.image_id)
         known = self.sender.kept.get(number)
         if known is not None and known.contact == image.contact.rounded():
@@ -182,7 +192,7 @@ class TransmitQueue(ImageSender):
         goal = stream_bytes or min(len(known.stream), MAX_STREAM_BYTES)
         if not known.sent < goal <= len(known.stream):
             return False
-        return self.sender.refine(RefineRequest(number, goal), now)
+        return self.sender.refine(RefineRequest(number, goal), now) and self.prioritise(number, now, first=True)
 
     def stop(self, number: int) -> bool:
         """Send nothing more of an image; see `ImageSender.stop`."""
@@ -244,6 +254,7 @@ class TransmitQueue(ImageSender):
     def _select_packet(self, now: float) -> OutgoingPacket | None:
         self._open_before_packet = self.open_numbers()
         self._update(now)
+        self.sender.begin_packet()
         frames: list[bytes] = []
         while len(frames) < self.config.rate(self.rate).frames:
             self._load_messages(now)
@@ -252,6 +263,8 @@ class TransmitQueue(ImageSender):
                 # There is nothing to send between two copies of a message.
                 self.sender.state.messages.release(self.sender.state.frames_sent)
                 frame = self._next_frame(now)
+            if frame is None and frames:
+                frame = self.sender.spare_frame(now)
             if frame is None:
                 break
             frames.append(frame)

@@ -287,6 +287,16 @@ def test_memory_is_bounded_and_deleted_images_are_reported() -> None:
     assert sorted(e.source for e in images(receiver.poll(100))) == [46, 47, 48, 49]
 
 
+def test_images_of_the_source_with_the_most_are_deleted_first() -> None:
+    receiver = PaperReceiver(60, max_images=4)
+    receiver.accept(1, half("top"), 0)
+    for number in range(50):
+        frame = HalfFrame("top", format_image_id(number), 0, 65535, HEADER, b"x").pack()
+        receiver.accept(9, frame, 1 + number / 100)
+    (event,) = images(receiver.accept(1, half("bottom"), 2))
+    assert (event.source, event.complete) == (1, True)
+
+
 def test_reported_images_are_deleted_before_open_ones() -> None:
     receiver = PaperReceiver(60, max_images=2)
     receiver.accept(1, half("top"), 0)

@@ -5,6 +5,7 @@ docs/specifications/acoustic-paper.md gives the rules and their reasons.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -321,8 +322,9 @@ class PaperReceiver:
     def _make_room(self) -> list[Event]:
         events: list[Event] = []
         while len(self._images) >= self._max_images:
-            # `min` is stable: the least recently seen image that is not open, or else the least recently seen one.
-            key = min(self._images, key=lambda k: self._images[k].open)
+            # Of the source with the most images: the least recently seen one that is not open, or else that of all.
+            counts = Counter(source for source, _ in self._images)
+            key = min(self._images, key=lambda k: (-counts[k[0]], self._images[k].open))
             image = self._images[key]
             if image.open:
                 events += self._report([image])

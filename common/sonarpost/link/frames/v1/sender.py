@@ -121,6 +121,7 @@ class V1Sender:
         self.may_repair = True
         self.kept: dict[int, OutgoingImage] = {}
         self.state = SenderState(first_block % BLOCKS)
+        self._packet_messages: list[Segment] = []
 
     @property
     def symbol_bytes(self) -> int:
@@ -266,6 +267,24 @@ class V1Sender:
             self.state.frames_sent += 1
         return frame
 
+    def begin_packet(self) -> None:
+        """Record that the next frame is the first of a packet."""
+        self._packet_messages = []
+
+    def spare_frame(self, now: float) -> bytes | None:
+        """Return a frame that fills a packet, whose air time does not depend on the number of its frames.
+
+        It has a further copy of the packet's messages, or with feedback another symbol of the least redundant
+        unconfirmed block; None if there is neither.
+        """
+        if self._packet_messages:
+            frame: bytes | None = pack_segments(self._packet_messages, self.config.frame_bytes, self._protection)
+            self._packet_messages = []
+        else:
+            frame = self._symbol_frame(now) if self.config.feedback and self._extend_least_redundant_block() else None
+        self.state.frames_sent += frame is not None
+        return frame
+
     def _images_frame(self, now: float) -> bytes | None:
         if self.config.announce and not any(b.is_fresh_preview and b.left > 0 for b in self.blocks):
             # Contacts whose group waits precede the detail of others.
@@ -353,6 +372,7 @@ class V1Sender:
         chosen = messages.segments(room, frame, spacing=round(4 * self.config.worst.burst))
         if not chosen:
             return None
+        self._packet_messages = chosen
         room -= sum(segment.size for segment in chosen)
         return pack_segments([*chosen, *self._fillers(room)], self.config.frame_bytes, self._protection)
 
@@ -429,9 +449,14 @@ class V1Sender:
         """
         if not self.waiting or any(b.left > 0 for b in self.blocks) or not self.config.feedback:
             return
+        if self._free_numbers() < WINDOW:
+            self._extend_least_redundant_block()
+
+    def _extend_least_redundant_block(self) -> bool:
         candidates = [b for b in self.blocks if b.sent < _MAX_SYMBOL_FACTOR * b.source_symbols]
-        if self._free_numbers() < WINDOW and candidates:
+        if candidates:
             min(candidates, key=lambda b: b.sent / b.source_symbols).planned += 1
+        return bool(candidates)
 
     def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int = 0) -> None:
         """Process feedback or a request.
