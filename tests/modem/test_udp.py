@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.interface import FrameReceived, ModemEvent, ModemReady, PacketReceived, PacketSent
+from sonarpost.modem.interface import (
+    FrameReceived,
+    ModemEvent,
+    ModemReady,
+    PacketReceived,
+    PacketSent,
+    SentenceRejected,
+)
 from sonarpost.modem.registry import ModemSettings
 from sonarpost.modem.udp import RATES, UdpModem
 from sonarpost.modem.udp.datagram import MAX_DATAGRAM_BYTES, Datagram, DatagramAssembler, DatagramKind, parse
@@ -120,3 +129,44 @@ def test_lost_frames_are_counted() -> None:
     [packet] = [e for e in events if isinstance(e, PacketReceived)]
     assert (packet.bad_frames, packet.nframes, packet.complete) == (1, 3, False)
     assert [frame.frame_number for frame in packet.frames] == [1, 3]
+
+
+@given(st.lists(st.binary(max_size=300) | st.integers(1, 60), max_size=5), datagrams, st.floats(0.0, 10.0))
+def test_datagram_neither_completes_nor_damages_another(
+    junk: list[bytes | int], datagram: Datagram, pause_s: float
+) -> None:
+    """Junk, and beginnings of a valid datagram, before and after each datagram."""
+    modem = UdpModem(ModemSettings(1))
+    modem.port_opened(0.0)
+    modem.poll(0.0)
+    datagram = dataclasses.replace(datagram, kind=DatagramKind.DATA, source=2)
+    packed, now = datagram.pack(), 0.0
+    wrong = [part if isinstance(part, bytes) else packed[: min(part, len(packed) - 1)] for part in junk]
+    events: list[ModemEvent] = []
+    for data in (*wrong, b"SPM1\x10\x00", packed, *wrong):
+        events += modem.receive(data, now)
+        now += pause_s
+    assert sum(isinstance(event, PacketReceived) for event in events) == 1
+    assert sum(isinstance(event, SentenceRejected) for event in events) == 2 * len(wrong) + 1
+
+
+def test_two_halves_are_no_datagram() -> None:
+    modem = UdpModem(ModemSettings(1))
+    modem.port_opened(0.0)
+    modem.poll(0.0)
+    packed = GOLDEN.pack()
+    events = [event for half in (packed[:10], packed[10:]) for event in modem.receive(half, 0.0)]
+    assert [type(event) for event in events] == [SentenceRejected, SentenceRejected]
+
+
+def test_repeated_datagram_is_received_once_and_other_content_of_its_number_too() -> None:
+    modem = UdpModem(ModemSettings(1))
+    modem.port_opened(0.0)
+    modem.poll(0.0)
+    frames: list[tuple[bytes, ...]] = [(b"ab", b"c"), (b"a", b"bc"), (b"ab", b"c")]
+    received = []
+    for content in frames:
+        for event in modem.receive(Datagram(DatagramKind.DATA, 2, 255, 1, 7, content).pack(), 0.0):
+            if isinstance(event, PacketReceived):
+                received.append(tuple(frame.data for frame in event.frames))
+    assert received == frames[:2]

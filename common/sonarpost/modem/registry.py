@@ -29,11 +29,14 @@ class ModemSettings:
         address: Address that the modem gets.
         reply_timeout_s: Time to wait for the modem's reply before a command is sent again.
         max_carrier_sense_s: Longest time for which a busy channel delays a packet.
+        stream: Whether the port is a stream, whose parts a driver of datagrams joins. Otherwise one call of `receive`
+            is one datagram.
     """
 
     address: int
     reply_timeout_s: float = 5.0
     max_carrier_sense_s: float = 30.0
+    stream: bool = False
 
 
 @dataclass(frozen=True, slots=True)

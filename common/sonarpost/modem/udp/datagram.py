@@ -16,7 +16,7 @@ All numbers are big-endian. A datagram is at most 4096 bytes.
 | 4 | CRC-32 of all bytes before (`zlib.crc32`) |
 
 An acknowledgement has an empty frame for each received one, and the length 65535 for each lost one.
-The length in the datagram makes the format self-delimiting, so a byte stream can carry it.
+The length in the datagram makes the format self-delimiting, so a byte stream can carry it, as in the simulated channel.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def parse(data: bytes) -> Datagram:
 
 
 class DatagramAssembler:
-    """Divides received bytes into datagrams: those of a network port come whole, those of a stream in any parts."""
+    """Divides the bytes of a stream into datagrams."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()

@@ -6,7 +6,6 @@ A packet is one datagram. After it the driver waits for the packet's air time, s
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -26,13 +25,13 @@ from sonarpost.modem.interface import (
 )
 from sonarpost.modem.packet_queue import PacketQueue, WaitingPacket
 from sonarpost.modem.registry import ModemSettings
-from sonarpost.modem.udp.datagram import Datagram, DatagramAssembler, DatagramKind
+from sonarpost.modem.udp.datagram import Datagram, DatagramAssembler, DatagramKind, parse
 from sonarpost.modem.udp.rates import CAPABILITIES, RATES
 
 REMEMBERED_PACKETS: Final = 256
-"""Numbers of received packets that are kept to recognise a repeated datagram."""
+"""Received datagrams that are kept to recognise a repeated one."""
 PAUSE_S: Final = 2.0
-"""After such a pause an unfinished datagram is dropped."""
+"""After such a pause an unfinished datagram of a stream is dropped."""
 
 
 @dataclass(slots=True)
@@ -66,7 +65,7 @@ class UdpModem(Modem):
         self._queue = PacketQueue()
         self._received_s = 0.0
         self._sending: _Sending | None = None
-        self._seen: dict[tuple[int, int, int], None] = {}
+        self._seen: dict[Datagram, None] = {}
         self._is_open = False
         self._next_id = 1
         self._out: list[bytes] = []
@@ -124,17 +123,26 @@ class UdpModem(Modem):
         return number
 
     def receive(self, data: bytes, now: float) -> list[ModemEvent]:
-        """Process received bytes; invalid ones are reported as events."""
-        if now - self._received_s > PAUSE_S:
-            self._assembler.reset()
-        self._received_s = now
-        for item in self._assembler.feed(data) if self._is_open else ():
+        """Process a datagram, or bytes of a stream; invalid ones are reported as events."""
+        for item in self._divided(data, now) if self._is_open else ():
             if isinstance(item, SentenceError):
                 self._events.append(SentenceRejected(item))
             elif item.source != self._settings.address:  # a multicast socket also receives its own datagrams
                 self._on_datagram(item, now)
         self._advance(now)
         return self._take_events()
+
+    def _divided(self, data: bytes, now: float) -> list[Datagram | SentenceError]:
+        if self._settings.stream:
+            if now - self._received_s > PAUSE_S:
+                self._assembler.reset()
+            self._received_s = now
+            return self._assembler.feed(data)
+        # Every station of the network can send: a datagram neither completes nor damages another one.
+        try:
+            return [parse(data)]
+        except SentenceError as error:
+            return [error]
 
     def poll(self, now: float) -> list[ModemEvent]:
         """Do what is due."""
@@ -223,11 +231,9 @@ class UdpModem(Modem):
     def _is_repeated(self, datagram: Datagram) -> bool:
         """Return whether the network has repeated a datagram."""
         # A station that has restarted counts from 1 again, so the number alone does not identify a packet.
-        content = zlib.crc32(b"".join(frame or b"" for frame in datagram.frames))
-        key = (datagram.source, datagram.number, content)
-        if key in self._seen:
+        if datagram in self._seen:
             return True
-        self._seen[key] = None
+        self._seen[datagram] = None
         if len(self._seen) > REMEMBERED_PACKETS:
             del self._seen[next(iter(self._seen))]
         return False
