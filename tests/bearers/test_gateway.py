@@ -1,8 +1,12 @@
 """Terminal, webhook and gateway against the emulated message service; hostile requests and replies."""
 
+import contextlib
+import itertools
 import socket
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
+from types import SimpleNamespace
 from urllib.error import HTTPError
 from urllib.parse import urlencode
 from urllib.request import Request, urlopen
@@ -12,7 +16,7 @@ from builders.common import eventually
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.bearers import rockblock
+from sonarpost.bearers import iridium
 from sonarpost.bearers.iridium import (
     ExchangeResult,
     IridiumTerminal,
@@ -126,20 +130,63 @@ def test_webhook_reports_that_a_message_has_to_be_repeated(messages):
         assert [post(webhook, f"/{TOKEN}", form()) for _ in range(3)] == [503, 400, 200]
 
 
-def test_idle_connections_do_not_block_the_webhook_for_ever(messages, monkeypatch):
-    monkeypatch.setattr(rockblock, "MAX_REQUESTS", 2)
-    monkeypatch.setattr(rockblock._WebhookHandler, "timeout", 0.1)
-    with closing(Webhook("127.0.0.1", 0, TOKEN, messages.append)) as webhook, ExitStack() as idle:
-        for _ in range(2):
-            idle.enter_context(socket.create_connection(("127.0.0.1", webhook.port)))
-        eventually(lambda: post_or_none(webhook) == 200)
+SLOW = b"POST /wrong HTTP/1.1\r\nX: "
 
 
-def post_or_none(webhook):
-    try:
-        return post(webhook, f"/{TOKEN}", form())
-    except OSError:
-        return None
+@pytest.mark.system
+def test_slow_clients_without_the_token_do_not_keep_the_gateway_out(webhook, messages):
+    with ExitStack() as slow:
+        clients = [slow.enter_context(socket.create_connection(("127.0.0.1", webhook.port))) for _ in range(200)]
+        for n, client in enumerate(clients):
+            with contextlib.suppress(OSError):  # the first ones are closed for later ones
+                client.sendall(SLOW)
+            if n % 10 == 0:
+                assert post(webhook, f"/{TOKEN}", form()) == 200
+    assert len(messages) == 20
+
+
+def test_webhook_refuses_with_a_status_while_all_connections_of_an_address_are_handled(messages):
+    entered, release = threading.Semaphore(0), threading.Event()
+
+    def receive(message):
+        entered.release()
+        assert release.wait(300)
+        messages.append(message)
+
+    with closing(Webhook("127.0.0.1", 0, TOKEN, receive)) as webhook, ThreadPoolExecutor(16) as pool:
+        statuses = [pool.submit(post, webhook, f"/{TOKEN}", form()) for _ in range(16)]
+        for _ in range(16):
+            assert entered.acquire(timeout=300)
+        assert [post(webhook, f"/{TOKEN}", form()) for _ in range(20)] == [503] * 20
+        release.set()
+        assert [status.result() for status in statuses] == [200] * 16
+        assert post(webhook, f"/{TOKEN}", form()) == 200
+    assert len(messages) == 17
+
+
+def test_webhook_refuses_an_incomplete_body_and_an_endless_head(webhook, messages):
+    with socket.create_connection(("127.0.0.1", webhook.port)) as client:
+        client.sendall(f"POST /{TOKEN} HTTP/1.1\r\nContent-Length: 100\r\n\r\n".encode() + form())
+        client.shutdown(socket.SHUT_WR)
+        assert b" 400 " in client.recv(4096)
+    with socket.create_connection(("127.0.0.1", webhook.port)) as client:
+        sent = 0
+        with contextlib.suppress(OSError):
+            client.sendall(f"POST /{TOKEN} HTTP/1.1\r\n".encode())
+            while sent < 50_000_000:
+                sent += client.send(b"X: " + bytes(1000).replace(b"\0", b"x") + b"\r\n")
+        assert sent < 50_000_000
+    assert post(webhook, f"/{TOKEN}", form()) == 200
+    assert len(messages) == 1
+
+
+def test_unexpected_exception_is_reported_and_the_gateway_repeats(messages, caplog):
+    def receive(message):
+        raise RuntimeError("a defect")
+
+    with closing(Webhook("127.0.0.1", 0, TOKEN, receive)) as webhook:
+        assert [post(webhook, f"/{TOKEN}", form()) for _ in range(20)] == [500] * 20
+    assert "unexpected exception" in caplog.text
 
 
 @given(st.binary(max_size=300) | st.text(max_size=100).map(lambda t: form(data=t)))
@@ -202,3 +249,33 @@ def test_terminal_that_refuses_or_is_absent():
         with pytest.raises(TerminalError, match="ERROR"):
             IridiumTerminal(f"socket://127.0.0.1:{server.getsockname()[1]}").exchange(b"x")
         thread.join()
+
+
+class EndlessPort:
+    """A port from which lines without a meaning come for ever, one byte a second of a simulated clock."""
+
+    def __init__(self, clock):
+        self._bytes = itertools.cycle(b"\r\n" * 15 + b"SBDRING\r\n")
+        self._clock = clock
+        self.is_open = True
+
+    def write(self, data):
+        pass
+
+    def read(self, size):
+        self._clock[0] += 1.0
+        return bytes([next(self._bytes)])
+
+    def close(self):
+        self.is_open = False
+
+
+def test_exchange_with_a_terminal_has_a_time_limit_in_total(monkeypatch):
+    clock = [0.0]
+    port = EndlessPort(clock)
+    terminal = IridiumTerminal("/dev/ttyTEST")
+    monkeypatch.setattr(iridium, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(terminal, "_open", lambda: port)
+    with pytest.raises(TerminalError):
+        terminal.exchange(b"x")
+    assert clock[0] <= iridium.EXCHANGE_S + 2

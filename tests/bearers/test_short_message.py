@@ -1,12 +1,11 @@
 """Format of short messages: golden bytes, round trip, hostile input."""
 
-import binascii
 import json
 import math
 
 import pytest
 from builders.common import REPOSITORY
-from builders.short_messages import decision, golden, received
+from builders.short_messages import decision, golden, received, with_crc
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -32,10 +31,6 @@ from sonarpost.bearers.short_message import (
 from sonarpost.errors import BadInputError
 
 GOLDEN = json.loads((REPOSITORY / "tests/golden/short-message/v1.json").read_text())
-
-
-def with_crc(body):
-    return body + binascii.crc_hqx(body, 0xFFFF).to_bytes(2, "big")
 
 
 def test_golden_messages_are_written_and_read_for_ever():

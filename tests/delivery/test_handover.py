@@ -6,7 +6,7 @@ from collections import Counter
 
 import msgpack
 import pytest
-from builders.common import eventually
+from builders.common import eventually, publish_once
 from builders.records import decision_record, encoded_image, reconstructed_image
 
 from sonarpost import keys, wire
@@ -22,7 +22,7 @@ from sonarpost.delivery.protocol import (
     unpack_replies,
 )
 from sonarpost.delivery.records import OutboxItem, ReceivedChunk
-from sonarpost.errors import BadInputError, RetryLaterError
+from sonarpost.errors import BadInputError, RejectedByDatabaseError, RetryLaterError
 from sonarpost.messages import Decision, Pixels, ReconstructedImage
 from sonarpost.runtime.service import Service
 
@@ -162,6 +162,54 @@ def test_temporary_errors_are_retried_and_permanent_ones_quarantined(send, consu
     assert consumer.store.refused_count() == 2
     assert consumer.health().counters["records_failed"] == 1
     eventually(lambda: consumer.health().state == "ok")
+
+
+def test_record_that_fails_while_others_are_handled_delays_and_harms_none(send, consumer, monkeypatch):
+    monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.0)
+    failing = {"d1": RejectedByDatabaseError("rejected"), "d2": OSError(28, "No space left on device")}
+    commit = consumer.commit
+
+    def refuse(effects, item=None):
+        name = str(wire.decode(Decision, item.payload, "").decision_id)
+        if name in failing:
+            raise failing[name]
+        commit(effects, item)
+
+    monkeypatch.setattr(consumer, "commit", refuse)
+    send(1, 2)
+    eventually(lambda: consumer.health().state == "degraded")
+    for number in range(3, 9):
+        send(number)
+        eventually(lambda: consumer.store.inbox_depth() <= 2 and f"d{number}" in consumer.got)  # noqa: B023
+    eventually(lambda: consumer.store.refused_count() == 1)
+    assert [record.reason for record in consumer.store.quarantined()] == ["RejectedByDatabaseError: rejected"]
+    # A full disk is no fault of the record: it is kept, and handled later.
+    assert consumer.store.inbox_depth() == 1
+    failing.clear()
+    eventually(lambda: consumer.store.inbox_depth() == 0 and consumer.health().state == "ok")
+
+
+def test_lack_of_memory_quarantines_no_record(send, consumer, monkeypatch):
+    monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.0)
+    consumer.fail_on = {"d1": MemoryError()}
+    send(1, 2)
+    eventually(lambda: consumer.got == ["d2"])
+    consumer.fail_on.clear()
+    eventually(lambda: consumer.got == ["d2", "d1"])
+    assert consumer.store.refused_count() == 0
+
+
+def test_publication_that_cannot_be_stored_does_not_stay_in_front_of_other_messages(begin, runner, send, monkeypatch):
+    def before_accepting(_self, records):
+        if any(wire.decode(Decision, payload, "").decision_id == "bad" for _, payload in records):
+            raise RejectedByDatabaseError("rejected")
+
+    monkeypatch.setattr(Consumer, "before_accepting", before_accepting)
+    consumer = begin()
+    publish_once(runner.peer("vessel-1", "other").session, KEY, wire.encode(decision_record("bad")))
+    eventually(lambda: consumer.health().counters.get("records_refused") == 1)
+    send(1)
+    eventually(lambda: consumer.got == ["d1"])
 
 
 # Producer with a scripted consumer
@@ -363,3 +411,26 @@ def test_restored_store_loses_and_doubles_nothing(runner, begin, platform, caplo
     assert origins(producer) != before
     producer.send(KEY, "consumer", decision_record("after"))
     eventually(lambda: consumer.got[-1] == "after")
+
+
+def test_unexpected_exceptions_do_not_stop_delivery(producer, send, consumer, monkeypatch):
+    """Of the producer's reaction to an acknowledgement, of its queue, and of the consumer's check of the capacity."""
+    failed = Counter()
+
+    def once(name, error):
+        def fail(*arguments):
+            failed[name] += 1
+            if failed[name] == 1:
+                raise error
+
+        return fail
+
+    monkeypatch.setattr(producer, "on_acknowledged", once("acknowledgement", RuntimeError("a defect")))
+    monkeypatch.setattr(consumer, "check_capacity", once("capacity", ValueError("a defect")))
+    fail_queue = once("queue", KeyError("a defect"))
+    monkeypatch.setattr(producer.store, "done_up_to", lambda queue: fail_queue() or 0)
+    send(1, 2, 3)
+    eventually(lambda: sorted(consumer.got) == ["d1", "d2", "d3"])
+    eventually(lambda: producer.store.outbox_depth() == 0)
+    assert producer.health().counters["acknowledgements_failed"] == 1
+    assert min(failed.values()) >= 1

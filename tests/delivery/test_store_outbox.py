@@ -8,6 +8,7 @@ from builders.store_steps import fail_within, queued_items, send
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sonarpost import keys
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.store import Store
 
@@ -44,7 +45,8 @@ def test_queue_order_is_priority_then_age(tmp_path_factory, priorities):
     store.close()
 
 
-def test_refused_record_is_quarantined_with_its_reason(store):
+def test_refused_record_is_quarantined_whole_with_its_reason(store, monkeypatch):
+    monkeypatch.setattr("sonarpost.delivery.transaction.MAX_QUARANTINED_BYTES", 2)
     send(store, b"bad")
     with store.transaction() as tx:
         tx.quarantine_refused(queued_items(store, "c", 1)[0], "no such record")
@@ -63,6 +65,26 @@ def test_quarantine_keeps_the_latest_records_truncated(store, monkeypatch):
     assert store.refused_count() == 5
     kept = [payload for (payload,) in store._query("SELECT payload FROM refused ORDER BY id")]
     assert kept == [b"%02d " % number for number in range(7, 12)]
+
+
+def test_records_of_one_sender_displace_none_of_another_from_the_quarantine(store, monkeypatch):
+    monkeypatch.setattr("sonarpost.delivery.transaction.MAX_QUARANTINED", 5)
+    monkeypatch.setattr("sonarpost.delivery.transaction.MAX_QUARANTINE_BYTES", 1000)
+    with store.transaction() as tx:
+        tx.quarantine("in", keys.shore_part("vessel-1"), b"of vessel-1", "no", is_accepted=True)
+        for number in range(20):
+            tx.quarantine("in", keys.shore_part("vessel-2"), bytes(number), "no")
+        tx.quarantine("in", keys.shore_part("vessel-2"), bytes(990), "no")
+    kept = store._query("SELECT key, LENGTH(payload) FROM refused ORDER BY id")
+    assert [(keys.part_vessel(key), size) for key, size in kept] == [("vessel-1", 11)]
+    with store.transaction() as tx:
+        for number in range(20):
+            tx.quarantine("in", keys.shore_part("vessel-2"), bytes(number), "no")
+    kept = store._query("SELECT key, LENGTH(payload) FROM refused ORDER BY id")
+    assert [(keys.part_vessel(key), size) for key, size in kept] == [
+        ("vessel-1", 11),
+        *(("vessel-2", size) for size in range(16, 20)),
+    ]
 
 
 def test_listeners_are_notified_of_commits_only(store):

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 
+import msgpack
 import pytest
 from builders.store_steps import fail_within, queued_items, record, send
 from hypothesis import given
@@ -176,3 +177,31 @@ def test_rollback_discards_collected_rows(store):
     with store.transaction() as tx:
         assert tx.send("k", "c", b"x", encoding="") == 1
         assert not tx.was_received("k", record(1, b"x"))
+
+
+def test_state_that_cannot_be_read_is_quarantined_alone(store, open_store, caplog):
+    values = {"good": msgpack.packb([7]), "junk": b"\xc1", "cut": b"\x92\x01", "text": msgpack.packb("x"), "gone": b""}
+    with store.transaction() as tx:
+        for name, value in values.items():
+            tx.put_state(f"part/{name}", value)
+    assert store.read_states("part/", lambda name, value: (name, msgpack.unpackb(value)[0] + 1)) == {
+        "good": ("good", 8)
+    }
+    assert (store.states_discarded, store.refused_count()) == (4, 4)
+    assert "Stored state discarded" in caplog.text
+    store = open_store()
+    assert store.state_names("part/") == ("part/good",)
+    assert store.read_state("part/good", int, 5) == 5
+    assert store.read_state("part/good", int, 6) == 6
+    assert (store.states_discarded, store.refused_count()) == (1, 5)
+
+
+def test_fault_of_the_machine_does_not_discard_a_state(store):
+    def parse(value):
+        raise MemoryError
+
+    with store.transaction() as tx:
+        tx.put_state("name", b"value")
+    with pytest.raises(MemoryError):
+        store.read_state("name", parse, None)
+    assert (store.get_state("name"), store.refused_count()) == (b"value", 0)

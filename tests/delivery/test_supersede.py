@@ -85,6 +85,16 @@ def test_quota_drops_least_urgent_then_oldest_and_never_urgent_records(store):
     assert queued(store) == ["d1"]
 
 
+def test_quota_drops_records_of_the_vehicle_with_the_most(store):
+    for number in range(3):
+        send(store, f"uuv-1/{number}", 1, size=100)
+    for number in range(20):
+        send(store, f"modem-{number}/0", 1, size=100)
+    with store.transaction() as tx:
+        assert tx.drop_oldest("c2", 700, 2) == 16
+    assert queued(store)[:3] == ["uuv-1/01", "uuv-1/11", "uuv-1/21"]
+
+
 def test_quota_keeps_records_in_flight(store):
     send(store, "a", 1, size=100)
     send(store, "b", 1, size=100)

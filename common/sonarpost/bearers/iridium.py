@@ -6,6 +6,7 @@ a serial port or another URL of pyserial.
 
 from __future__ import annotations
 
+import termios
 import threading
 import time
 from collections.abc import Generator
@@ -14,7 +15,9 @@ from typing import Final, Protocol
 
 import serial
 
+from sonarpost.bearers.serial_device import close_port, open_port
 from sonarpost.errors import BadInputError, PortError
+from sonarpost.limits import limit
 
 MAX_OUTGOING_BYTES: Final = 340
 MAX_INCOMING_BYTES: Final = 270
@@ -24,6 +27,15 @@ ANSWER_S: Final = 10.0
 POLL_S: Final = 0.3
 SESSION_S: Final = 90.0
 """The terminal itself gives up after about a minute."""
+EXCHANGE_S: Final = limit(
+    150.0,
+    "s",
+    "deadlines",
+    surface="satellite terminal",
+    source="terminal",
+    resource="exchange of a message",
+    at_limit="the port is closed, and the message counts as not sent",
+)
 _MO_SENT: Final = 4
 """Highest status of +SBDIX that means that the message was sent."""
 
@@ -191,8 +203,9 @@ class IridiumTerminal:
     def __init__(self, url: str, baud: int = 19200) -> None:
         self._url = url
         self._baud = baud
-        self._port: serial.SerialBase | None = None
+        self._port: serial.Serial | None = None
         self._stopping = threading.Event()
+        self._ends_s = 0.0
 
     def exchange(self, outgoing: bytes | None) -> ExchangeResult:
         """Send a message, or None to fetch only; return what was received in the same exchange.
@@ -203,6 +216,7 @@ class IridiumTerminal:
         """
         try:
             port = self._open()
+            self._ends_s = time.monotonic() + EXCHANGE_S
             steps = exchange_steps(outgoing)
             action = next(steps)
             while True:
@@ -210,20 +224,22 @@ class IridiumTerminal:
         except StopIteration as finished:
             result: ExchangeResult = finished.value
             return result
-        except (OSError, ValueError) as error:  # SerialException is an OSError
+        except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
             self.close()
             raise PortError(f"{self._url}: {error}") from error
         except (PortError, TerminalError):
             self.close()  # the rest of the reply belongs to no later command
             raise
 
-    def _perform(self, port: serial.SerialBase, action: Action) -> bytes:
+    def _perform(self, port: serial.Serial, action: Action) -> bytes:
+        if time.monotonic() > self._ends_s:
+            raise TerminalError("Iridium terminal", "exchange", "no end", f"an end within {EXCHANGE_S:g} s")
         if isinstance(action, Write):
             port.write(action.data)
             return b""
         timeout_s = action.timeout_s if isinstance(action, ReadLine) else ANSWER_S
         size = MAX_LINE_BYTES if isinstance(action, ReadLine) else action.size
-        ends_s = time.monotonic() + timeout_s
+        ends_s = min(time.monotonic() + timeout_s, self._ends_s)
         data = b""
         while len(data) < size and time.monotonic() < ends_s:
             if self._stopping.is_set():
@@ -233,9 +249,12 @@ class IridiumTerminal:
                 break
         return data
 
-    def _open(self) -> serial.SerialBase:
+    def _open(self) -> serial.Serial:
         if self._port is None:
-            self._port = serial.serial_for_url(self._url, baudrate=self._baud, timeout=POLL_S, write_timeout=ANSWER_S)
+            self._port = serial.serial_for_url(
+                self._url, baudrate=self._baud, timeout=POLL_S, write_timeout=ANSWER_S, do_not_open=True
+            )
+            open_port(self._port)
         return self._port
 
     def stop(self) -> None:
@@ -245,10 +264,5 @@ class IridiumTerminal:
     def close(self) -> None:
         """Close the port; the next exchange opens it again."""
         port, self._port = self._port, None
-        if port is None:
-            return
-        # pyserial 3.5 does not close a socket whose shutdown fails because the peer has reset it.
-        connection = getattr(port, "_socket", None)
-        port.close()
-        if connection is not None:
-            connection.close()
+        if port is not None:
+            close_port(port)

@@ -7,6 +7,8 @@ from datetime import UTC, datetime
 
 import msgpack
 
+from sonarpost.link.state import Count, unpack_value
+
 DAY_S = 86400.0
 
 
@@ -102,5 +104,10 @@ class ByteBudget:
         return packed
 
     def restore(self, data: bytes) -> None:
-        """Continue with stored counts."""
-        self.day, self.used_bytes, self.total_bytes, self.total_messages = msgpack.unpackb(data)
+        """Continue with stored counts.
+
+        Raises:
+            BadInputError: They are not valid.
+        """
+        counts = unpack_value(tuple[Count, Count, Count, Count], data, "state of the byte budget")
+        self.day, self.used_bytes, self.total_bytes, self.total_messages = counts

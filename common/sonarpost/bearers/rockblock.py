@@ -8,26 +8,50 @@ from __future__ import annotations
 
 import hmac
 import logging
+import math
 import re
 import threading
-import urllib.request
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Final
-from urllib.error import HTTPError
 from urllib.parse import parse_qs, urlencode, urlsplit
 
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError
+from sonarpost.limits import limit
+from sonarpost.network import http_client
+from sonarpost.network.connections import ConnectionLimits, LimitedHandler, LimitedServer
 
 log = logging.getLogger(__name__)
 
-MAX_BODY_BYTES: Final = 4096
+MAX_BODY_BYTES: Final = limit(
+    4096,
+    "bytes",
+    "claims",
+    surface="webhook",
+    source="client",
+    resource="body of a request",
+    at_limit="the request is refused",
+)
 MAX_FIELDS: Final = 20
 MAX_MT_BYTES: Final = 270
-REQUEST_S: Final = 10.0
-MAX_REQUESTS: Final = 16
-"""Requests that are handled at the same time; further ones are refused with 503."""
+MAX_CONNECTIONS: Final = limit(
+    64,
+    "connections",
+    "shares",
+    surface="webhook",
+    source="all clients",
+    resource="connections",
+    at_limit="the connection that waits longest for its request is closed; without one, 503",
+)
+MAX_CONNECTIONS_OF_ADDRESS: Final = limit(
+    16,
+    "connections",
+    "shares",
+    surface="webhook",
+    source="address",
+    resource="connections of an address",
+    at_limit="the connection that waits longest for its request is closed; without one, 503",
+)
 _IMEI = re.compile(r"[0-9]{15}")
 _HEX = re.compile(r"(?:[0-9a-fA-F]{2}){0,340}")
 
@@ -81,7 +105,7 @@ class Webhook:
     """HTTP server to which the gateway delivers messages: `POST /{token}`.
 
     It replies 200 after `receive` has returned, 400 to what is invalid, 404 without the token, 503 if the message
-    cannot be stored at present: the gateway then repeats it.
+    cannot be stored at present, and 500 after an unexpected exception: the gateway then repeats it.
 
     Args:
         host: Address to listen on. The server has no TLS: a reverse proxy adds it.
@@ -92,7 +116,8 @@ class Webhook:
 
     def __init__(self, host: str, port: int, token: str, receive: Receive) -> None:
         handler = type("Handler", (_WebhookHandler,), {"token": token, "receive": staticmethod(receive)})
-        self._server = _Server((host, port), handler)
+        limits = ConnectionLimits(max_connections=MAX_CONNECTIONS, max_of_address=MAX_CONNECTIONS_OF_ADDRESS)
+        self._server = LimitedServer((host, port), handler, limits)
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), name="webhook", daemon=True)
         self._thread.start()
 
@@ -108,69 +133,36 @@ class Webhook:
         self._thread.join()
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
-        super().__init__(address, handler)
-        self.slots = threading.BoundedSemaphore(MAX_REQUESTS)
-
-    def process_request(self, request: object, client_address: object) -> None:
-        if not self.slots.acquire(blocking=False):
-            self.shutdown_request(request)  # type: ignore[arg-type]
-            return
-        super().process_request(request, client_address)  # type: ignore[arg-type]
-
-    def process_request_thread(self, request: object, client_address: object) -> None:
-        try:
-            super().process_request_thread(request, client_address)  # type: ignore[arg-type]
-        finally:
-            self.slots.release()
-
-    def handle_error(self, request: object, client_address: object) -> None:
-        log.debug("Connection to the webhook lost")
-
-
-class _WebhookHandler(BaseHTTPRequestHandler):
-    timeout = REQUEST_S
-    server_version = "sonarpost"
-    sys_version = ""
+class _WebhookHandler(LimitedHandler):
     token: str
     receive: Receive
 
-    def do_POST(self) -> None:
+    def do_POST(self) -> None:  # noqa: N802 of the base class
         """Handle one message."""
         path = urlsplit(self.path).path.removeprefix("/")
         if not hmac.compare_digest(path.encode(), self.token.encode()):
-            self._reply(404, "not found")
+            self.reply(404, "not found")
             return
         length = self.headers.get("Content-Length", "")
         if not (length.isascii() and length.isdigit() and len(length) < 8 and int(length) <= MAX_BODY_BYTES):
-            self._reply(413, f"at most {MAX_BODY_BYTES} bytes with a Content-Length")
+            self.reply(413, f"at most {MAX_BODY_BYTES} bytes with a Content-Length")
             return
         body = self.rfile.read(int(length))
+        if len(body) < int(length):
+            self.reply(400, "incomplete body")
+            return
+        self.set_deadline(math.inf)
         try:
             type(self).receive(parse_webhook(body))
         except BadInputError as error:
-            self._reply(400, str(error))
+            self.reply(400, str(error))
         except DeliveryError as error:
-            self._reply(503, str(error))
+            self.reply(503, str(error))
+        except Exception:
+            log.exception("Message not stored after an unexpected exception")
+            self.reply(500, "internal error")
         else:
-            self._reply(200, "OK")
-
-    def _reply(self, status: int, text: str) -> None:
-        data = text.encode()
-        self.send_response(status)
-        self.send_header("Content-Type", "text/plain; charset=utf-8")
-        self.send_header("Content-Length", str(len(data)))
-        self.send_header("Connection", "close")
-        self.end_headers()
-        self.wfile.write(data)
-        self.close_connection = True
-
-    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 of the base class
-        """Log nothing: the address contains the token."""
+            self.reply(200, "OK")
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,14 +197,13 @@ class RockBlockAccount:
             "password": self.password,
             "data": data.hex(),
         }
-        request = urllib.request.Request(self.url, urlencode(form).encode(), method="POST")  # noqa: S310 checked above
+        host = urlsplit(self.url).hostname
+        content_type = {"Content-Type": "application/x-www-form-urlencoded"}
         try:
-            with urllib.request.urlopen(request, timeout=REQUEST_S) as response:  # noqa: S310
-                reply = response.read(MAX_BODY_BYTES).decode("utf-8", "replace").strip()
-        except (OSError, ValueError) as error:
-            if isinstance(error, HTTPError):
-                error.close()
-            raise DeliveryError(f"gateway {urlsplit(self.url).hostname}: {error}") from error
+            reply = http_client.post(self.url, urlencode(form).encode(), content_type, reads_body=True)
+        except OSError as error:
+            raise DeliveryError(f"gateway {host}: {error}") from error
+        text = reply.body.decode("utf-8", "replace").strip()
         # "OK,12345678" or "FAILED,10,Invalid login credentials"
-        if not reply.startswith("OK"):
-            raise DeliveryError(f"gateway {urlsplit(self.url).hostname}: {reply[:100]}")
+        if reply.status != 200 or not text.startswith("OK"):
+            raise DeliveryError(f"gateway {host}: status {reply.status} {text[:100]}")

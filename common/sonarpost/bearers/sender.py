@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated, Final
 
 import msgpack
 
 from sonarpost.bearers.short_message import (
     ITEM_HEAD_BYTES,
     MAX_MESSAGE_BYTES,
+    MAX_SEQ,
     WINDOW,
     Acknowledgement,
     Item,
@@ -22,13 +24,17 @@ from sonarpost.bearers.short_message import (
     pack_contact,
     pack_decision,
     split,
+    unpack_contact,
 )
+from sonarpost.limits import Turns
+from sonarpost.link.state import Bounds, Byte, Word, unpack_value
 from sonarpost.messages import Decision, ReceivedImage
 
 FIRST_TIMEOUT_S = 300.0
 MAX_TIMEOUT_S = 3600.0
 DECISION_PRIORITY = 2
 CONTACT_PRIORITY = 5
+_WHERE: Final = "state of short messages"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +56,11 @@ class QueuedItem:
     item: Item
 
     @property
+    def vehicle_id(self) -> str:
+        """Vehicle of a contact."""
+        return self.name.partition("/")[0]
+
+    @property
     def is_first_version(self) -> bool:
         """Whether a contact is the first version of its image."""
         return contact_version(self.item.content) == 1
@@ -68,21 +79,57 @@ class QueuedItem:
 
     @classmethod
     def unpack(cls, data: bytes) -> QueuedItem:
-        """Parse the bytes of `pack`."""
-        number, priority, name, created_s, item_type, content = msgpack.unpackb(data)
-        return cls(number, priority, name, created_s, Item(ItemType(item_type), content))
+        """Parse the bytes of `pack`.
+
+        Raises:
+            BadInputError: They are not valid.
+        """
+        number, priority, name, created_s, item_type, content = unpack_value(
+            tuple[Word, Byte, str, float, ItemType, bytes], data, _WHERE
+        )
+        if item_type == ItemType.CONTACT:
+            unpack_contact(content, "vessel", _WHERE)
+        return cls(number, priority, name, created_s, Item(item_type, content))
 
 
 @dataclass(slots=True)
-class _Pending:
+class PendingMessage:
+    """A message that was made and not acknowledged.
+
+    Attributes:
+        data: The bytes.
+        due_s: When it is sent again.
+        timeout_s: Time between its last transmission and `due_s`.
+        turn: Number of its last transmission.
+    """
+
     data: bytes
     due_s: float
     timeout_s: float = FIRST_TIMEOUT_S
     turn: int = 0
 
     def pack(self) -> bytes:
+        """Return the bytes for the store."""
         packed: bytes = msgpack.packb((self.due_s, self.timeout_s, self.data))
         return packed
+
+    @classmethod
+    def unpack(cls, data: bytes) -> PendingMessage:
+        """Parse the bytes of `pack`.
+
+        Raises:
+            BadInputError: They are not valid.
+        """
+        due_s, timeout_s, message = unpack_value(
+            tuple[float, Annotated[float, Bounds(0, MAX_TIMEOUT_S)], bytes], data, _WHERE
+        )
+        ShortMessage.unpack(message, _WHERE)
+        return cls(message, due_s, timeout_s)
+
+    @property
+    def message(self) -> ShortMessage:
+        """The message."""
+        return ShortMessage.unpack(self.data)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,24 +168,21 @@ class MessageSender:
     next_number: int = 0
     after_s: float = 0.0
     _queue: dict[int, QueuedItem] = field(default_factory=dict)
-    _pending: dict[int, _Pending] = field(default_factory=dict)
+    _pending: dict[int, PendingMessage] = field(default_factory=dict)
     _turn: int = 0
+    _turns: Turns = field(default_factory=Turns)
 
-    def restore(self, items: Iterable[QueuedItem], messages: Iterable[bytes], now_s: float) -> None:
-        """Continue with the stored items and unacknowledged messages; these keep their time-outs.
-
-        Raises:
-            ShortMessageError: A message is damaged.
-        """
+    def restore(self, items: Iterable[QueuedItem], messages: Iterable[PendingMessage], now_s: float) -> None:
+        """Continue with the stored items and unacknowledged messages; these keep their time-outs."""
         for item in items:
             self._queue[item.number] = item
             self.next_number = max(self.next_number, item.number + 1)
-        for stored in messages:
-            due_s, timeout_s, data = msgpack.unpackb(stored)
-            message = ShortMessage.unpack(data)
+        for pending in messages:
+            seq = pending.message.seq
             # The clock can have been set back.
-            self._pending[message.seq] = _Pending(data, min(due_s, now_s + MAX_TIMEOUT_S), timeout_s)
-            self.next_seq = max(self.next_seq, message.seq + 1)
+            pending.due_s = min(pending.due_s, now_s + MAX_TIMEOUT_S)
+            self._pending[seq] = pending
+            self.next_seq = max(self.next_seq, seq + 1)
 
     @property
     def waiting(self) -> int:
@@ -181,9 +225,16 @@ class MessageSender:
         return numbers
 
     def _ready(self, now_s: float) -> list[QueuedItem]:
-        """Return the items that have waited long enough, the most urgent first."""
-        ready = (item for item in self._queue.values() if item.created_s + self.after_s <= now_s)
-        return sorted(ready, key=lambda item: (item.priority, item.number))
+        """Return the items that have waited long enough: decisions, then contacts, first one of the vehicle in turn."""
+        ready = [item for item in self._queue.values() if item.created_s + self.after_s <= now_s]
+        ready.sort(key=lambda item: (item.priority, item.number))
+        if not ready or ready[0].priority < CONTACT_PRIORITY:
+            return ready
+        waiting: dict[str, list[QueuedItem]] = {}
+        for item in ready:
+            waiting.setdefault(item.vehicle_id, []).append(item)
+        [first] = self._turns.pick(waiting, 1)
+        return [first, *(item for item in ready if item is not first)]
 
     def next_due_s(self) -> float | None:
         """Return when `next_message` returns a message, None while there is none."""
@@ -194,7 +245,7 @@ class MessageSender:
 
     @property
     def _window_open(self) -> bool:
-        return not self._pending or self.next_seq - min(self._pending) < WINDOW
+        return self.next_seq - min(self._pending, default=self.next_seq) < WINDOW and self.next_seq <= MAX_SEQ
 
     def next_message(self, now_s: float) -> NextMessage | None:
         """Return the message to send now: the oldest that is due for repetition, else a new one.
@@ -207,8 +258,8 @@ class MessageSender:
             pending = self._pending[seq]
             self._sent(pending, now_s, min(2 * pending.timeout_s, MAX_TIMEOUT_S))
             return NextMessage(seq, pending.data, pending.pack())
-        ready = self._ready(now_s)
-        if not ready or not self._window_open:
+        ready = self._ready(now_s) if self._window_open else []
+        if not ready:
             return None
         packed, items = _choose(ready)
         seq, oldest = self.next_seq, min(self._pending, default=self.next_seq)
@@ -216,7 +267,7 @@ class MessageSender:
         for number in packed:
             del self._queue[number]
         self.next_seq += 1
-        pending = self._pending[seq] = _Pending(data, 0.0)
+        pending = self._pending[seq] = PendingMessage(data, 0.0)
         self._sent(pending, now_s, FIRST_TIMEOUT_S)
         return NextMessage(seq, data, pending.pack(), packed)
 
@@ -225,7 +276,7 @@ class MessageSender:
         if seq in self._pending:
             self._pending[seq].due_s = now_s + retry_s
 
-    def _sent(self, pending: _Pending, now_s: float, timeout_s: float) -> None:
+    def _sent(self, pending: PendingMessage, now_s: float, timeout_s: float) -> None:
         self._turn += 1
         pending.turn, pending.timeout_s, pending.due_s = self._turn, timeout_s, now_s + timeout_s
 
@@ -233,14 +284,15 @@ class MessageSender:
         """Process an acknowledgement; return the sequence numbers to remove from the store.
 
         A message that was sent before a received one, and is not among the received ones, is due for repetition.
+        Single numbers of messages that were never made are ignored: the shore site can have received a forged message.
 
         Raises:
-            ShortMessageError: It is not a valid acknowledgement of messages that were made.
+            ShortMessageError: It is not a valid acknowledgement, or its base is above all messages that were made.
         """
         ack = Acknowledgement.unpack(data)
         if ack.epoch != self.epoch:
             return ()  # of an earlier store
-        if ack.base > self.next_seq or any(seq >= self.next_seq for seq in ack.received):
+        if ack.base > self.next_seq:
             raise ShortMessageError("acknowledgement", "base", ack.base, f"at most {self.next_seq}")
         done = tuple(seq for seq in self._pending if seq < ack.base or seq in ack.received)
         last_turn = max((self._pending.pop(seq).turn for seq in done), default=0)

@@ -29,6 +29,8 @@ MAX_MESSAGE_BYTES: Final = 340
 MAX_ACKNOWLEDGEMENT_BYTES: Final = 43
 WINDOW: Final = 256
 """Messages that can be unacknowledged at once."""
+MAX_SEQ: Final = 2**32 - 2
+"""Highest sequence number: the base of an acknowledgement, which is above it, has 32 bits."""
 MAX_FRAGMENTS: Final = 255
 
 _MESSAGE_TYPE: Final = 0xB1
@@ -91,7 +93,7 @@ class ShortMessage:
 
     Attributes:
         epoch: Random number of the sender's store (0..2^32 - 1); sequence numbers count within it.
-        seq: Sequence number (0..2^32 - 1).
+        seq: Sequence number (0..2^32 - 2).
         oldest: Oldest sequence number that was not acknowledged when the message was made, at most 255 below `seq`.
         items: Its items.
     """
@@ -107,9 +109,11 @@ class ShortMessage:
         Raises:
             ShortMessageError: They would be more, or a number is out of range.
         """
-        if not (0 <= self.epoch < 2**32 and 0 <= self.oldest <= self.seq < 2**32 and self.seq - self.oldest < WINDOW):
+        in_range = 0 <= self.epoch < 2**32 and 0 <= self.oldest <= self.seq <= MAX_SEQ
+        if not in_range or self.seq - self.oldest >= WINDOW:
             numbers = (self.epoch, self.seq, self.oldest)
-            raise ShortMessageError(_WHERE, "epoch, seq and oldest", numbers, "32 bits, oldest at most 255 below seq")
+            expected = f"32 bits, seq at most {MAX_SEQ}, oldest at most 255 below seq"
+            raise ShortMessageError(_WHERE, "epoch, seq and oldest", numbers, expected)
         items = b"".join(_ITEM.pack(item.type, len(item.content)) + item.content for item in self.items)
         packed = _with_crc(_HEAD.pack(_MESSAGE_TYPE, self.epoch, self.seq, self.seq - self.oldest) + items)
         if len(packed) > MAX_MESSAGE_BYTES:
@@ -127,6 +131,8 @@ class ShortMessage:
         message_type, epoch, seq, behind = _HEAD.unpack_from(body)
         if message_type != _MESSAGE_TYPE:
             raise ShortMessageError(where, "type", message_type, f"{_MESSAGE_TYPE:#x}")
+        if seq > MAX_SEQ:
+            raise ShortMessageError(where, "seq", seq, f"at most {MAX_SEQ}")
         if behind > seq:
             raise ShortMessageError(where, "oldest", seq - behind, "0 or more")
         items, offset = [], _HEAD.size
@@ -159,7 +165,13 @@ class Acknowledgement:
     received: frozenset[int] = frozenset()
 
     def pack(self) -> bytes:
-        """Return the bytes, at most 43."""
+        """Return the bytes, at most 43.
+
+        Raises:
+            ShortMessageError: A number is out of range.
+        """
+        if not (0 <= self.epoch < 2**32 and 0 <= self.base < 2**32):
+            raise ShortMessageError(_WHERE, "epoch and base", (self.epoch, self.base), "32 bits")
         bitmap = bytearray(WINDOW // 8)
         for seq in self.received:
             if not 0 <= seq - self.base < WINDOW:

@@ -17,7 +17,14 @@ from sonarpost.delivery.protocol import MAX_BATCH_RECORDS, MAX_RECORD_BYTES, Ack
 from sonarpost.delivery.records import ReceivedChunk
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
-from sonarpost.errors import BadInputError, DeliveryError, MissingBaseError, PayloadError, RetryLaterError
+from sonarpost.errors import (
+    BadInputError,
+    DeliveryError,
+    MissingBaseError,
+    PayloadError,
+    RetryLaterError,
+    can_concern_record,
+)
 from sonarpost.logs import kv, log_context
 
 log = logging.getLogger(__name__)
@@ -160,9 +167,12 @@ class Inbox:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            messages = self._next_messages()
-            if messages:
-                self._reply(messages, self._commit(messages))
+            try:
+                if messages := self._next_messages():
+                    self._reply(messages, self._commit(messages))
+            except Exception:
+                log.exception("Messages not answered after an unexpected exception; their senders repeat them")
+                self._stop.wait(RETRY_S)
 
     def _next_messages(self) -> list[_Message]:
         if self._retained:
@@ -180,7 +190,7 @@ class Inbox:
         return messages
 
     def _commit(self, messages: list[_Message]) -> list[Replies]:
-        """Store several messages in one transaction, so that they share one write to the disk."""
+        """Store several messages in one transaction, which share one write to the disk; after a failure in halves."""
         self._no_capacity.clear()
         self._accepted.clear()
         try:
@@ -188,11 +198,19 @@ class Inbox:
                 replies = [self._store_message(tx, message) for message in messages]
                 if self._accepted:
                     self._before_commit(self._accepted)
-        except DeliveryError as error:
+        except Exception as error:
             if not self.storage_failing:
                 log.exception("Records cannot be stored; senders keep them", extra=kv(error=str(error)))
             self.storage_failing = True
-            self._retained = [message for message in messages if message.query is None]
+            if can_concern_record(error):
+                if len(messages) > 1:
+                    half = len(messages) // 2
+                    return self._commit(messages[:half]) + self._commit(messages[half:])
+                if messages[0].query is None:
+                    # Nothing repeats it, and it must not stay in front of other messages.
+                    self._on_refused(PayloadError(messages[0].key, "payload", str(error), "a record that is stored"))
+            else:
+                self._retained += [message for message in messages if message.query is None]
             later: Replies = AckReply("later", reason=str(error)[:MAX_REASON])
             return [later] * len(messages)
         if self.storage_failing:

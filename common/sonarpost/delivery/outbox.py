@@ -104,15 +104,13 @@ class Outbox:
             self._wake.wait()
             self._wake.clear()
             try:
-                queues = self._store.queues()
-            except DeliveryError:
+                for queue in self._store.queues():
+                    if queue not in self._senders and queue not in self._held and not self._stop.is_set():
+                        self._open(queue)
+            except Exception:
                 log.exception("Outbox cannot be read; retrying")
                 self._stop.wait(1.0)
                 self._wake.set()
-                continue
-            for queue in queues:
-                if queue not in self._senders and queue not in self._held and not self._stop.is_set():
-                    self._open(queue)
 
     def _open(self, queue: str) -> None:
         policy = self._queue_policy(queue)
@@ -210,7 +208,9 @@ class QueueSender:
         while not self._stop.is_set():
             try:
                 self._step()
-            except (_NoReplyError, DeliveryError, zenoh.ZError) as error:
+            except Exception as error:
+                if not isinstance(error, (_NoReplyError, DeliveryError, zenoh.ZError)):
+                    log.exception("Records not sent after an unexpected exception; sending them again")
                 self._back_off(str(error))
         try:
             self._remove_acknowledged()

@@ -91,3 +91,26 @@ class InboxItem:
     id: int
     key: str
     payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class QuarantinedRecord:
+    """A record that could not be handled.
+
+    Attributes:
+        id: Number in the quarantine.
+        at_utc_s: When it was quarantined.
+        direction: `in` for a received record, `out` for one that its consumer has refused.
+        key: Its key; a text with a space for data that is no record.
+        size_bytes: Size of the stored payload.
+        reason: Why it was quarantined.
+        can_be_queued: Whether it is a complete received record.
+    """
+
+    id: int
+    at_utc_s: float
+    direction: str
+    key: str
+    size_bytes: int
+    reason: str
+    can_be_queued: bool

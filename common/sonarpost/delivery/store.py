@@ -11,23 +11,42 @@ import fcntl
 import logging
 import shutil
 import sqlite3
+import struct
 import threading
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
+
+import msgpack
 
 from sonarpost.delivery import schema
-from sonarpost.delivery.records import InboxItem, OutboxItem
-from sonarpost.delivery.transaction import Transaction, runs
+from sonarpost.delivery.records import InboxItem, OutboxItem, QuarantinedRecord
+from sonarpost.delivery.transaction import MAX_QUARANTINED_BYTES, Transaction, runs
 from sonarpost.delivery.watermark import SUFFIX as SIDE_CAR_SUFFIX
 from sonarpost.delivery.watermark import LostRecords, Watermark, clear_lost_records, lost_records
-from sonarpost.errors import DeliveryError, RetryLaterError
+from sonarpost.errors import BadInputError, DeliveryError, RetryLaterError
 from sonarpost.files import make_private
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+D = TypeVar("D")
+
+UNREADABLE = (
+    BadInputError,
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    RecursionError,
+    TypeError,
+    ValueError,
+    msgpack.UnpackException,
+    struct.error,
+)
+"""Errors of a parser that mean that a stored value is invalid. A lack of memory, for example, does not."""
 
 CACHE_KB = 8000
 """Page cache: records in flight are deleted without reading them from the disk."""
@@ -64,6 +83,7 @@ class Store:
         origin: Random number of the store, 16 bytes; each queue has its own.
         inbox_changed: Set when a record was added to the inbox.
         lost: Report of lost commits that no operator has cleared; None if there is none.
+        states_discarded: Number of states that could not be read since the start; see `readable`.
 
     Args:
         path: The SQLite file.
@@ -83,6 +103,7 @@ class Store:
         self._in_flight: set[tuple[str, int]] = set()
         self._watermark = Watermark(path)
         self.lost: LostRecords | None = None
+        self.states_discarded = 0
         self._has_legacy_windows = False
         self.inbox_changed = threading.Event()
         try:
@@ -156,6 +177,7 @@ class Store:
                     self._watermark.committed(self._db, tx.assigned.items(), inbox=tx.wrote_inbox)
             except sqlite3.Error as error:
                 raise DeliveryError(f"{self.path}: {_reason(error, self.path)}") from error
+            self.states_discarded += tx.states_discarded
         if tx.wrote_outbox:
             for event in tuple(self._outbox_listeners):
                 event.set()
@@ -273,6 +295,15 @@ class Store:
         """Return the number of quarantined records."""
         return self._read_int("SELECT COUNT(*) FROM refused")
 
+    def quarantined(self) -> list[QuarantinedRecord]:
+        """Return the quarantined records, oldest first."""
+        rows = self._read(
+            "SELECT id, at_utc_s, direction, key, LENGTH(payload), reason,"
+            " direction = 'in' AND instr(key, ' ') = 0 AND LENGTH(payload) <> ? FROM refused ORDER BY id",
+            (MAX_QUARANTINED_BYTES,),
+        )
+        return [QuarantinedRecord(*row) for row in rows]
+
     def reusable_bytes(self) -> int:
         """Return the free space inside the file in bytes; the file itself never shrinks."""
         return self._read_int("PRAGMA freelist_count") * self._read_int("PRAGMA page_size")
@@ -320,6 +351,44 @@ class Store:
         """Return the number of values whose names start with `prefix`."""
         args = (prefix, prefix + "\U0010ffff")
         return self._read_int("SELECT COUNT(*) FROM state WHERE name >= ? AND name < ?", args)
+
+    def read_state(self, name: str, parse: Callable[[bytes], T], otherwise: D) -> T | D:
+        """Parse the value under `name`; return `otherwise` if there is none or it is discarded. See `readable`."""
+        value = self.get_state(name)
+        if value is None:
+            return otherwise
+        return self.readable({name: value}, lambda _, data: parse(data)).get(name, otherwise)
+
+    def read_states(self, prefix: str, parse: Callable[[str, bytes], T]) -> dict[str, T]:
+        """Parse all values whose names start with `prefix`, by the rest of their names. See `readable`."""
+        values = {prefix + name: value for name, value in self.states(prefix).items()}
+        found = self.readable(values, lambda name, value: parse(name.removeprefix(prefix), value))
+        return {name.removeprefix(prefix): parsed for name, parsed in found.items()}
+
+    def readable(self, values: Mapping[str, bytes], parse: Callable[[str, bytes], T]) -> dict[str, T]:
+        """Parse values of states, each on its own. Those that cannot be parsed are moved to the quarantine.
+
+        Each of these is logged and counted in `states_discarded`, which degrades the health of the service.
+
+        Args:
+            values: Values by their complete names.
+            parse: Receives the name and the value. An error of `UNREADABLE` means that the value is invalid.
+
+        Raises:
+            DeliveryError: The store cannot be written, or a transaction is open in this thread.
+        """
+        parsed: dict[str, T] = {}
+        errors: dict[str, str] = {}
+        for name, value in values.items():
+            try:
+                parsed[name] = parse(name, value)
+            except UNREADABLE as error:
+                errors[name] = str(error) if isinstance(error, BadInputError) else f"{type(error).__name__}: {error}"
+        if errors:
+            with self.transaction() as tx:
+                for name, reason in errors.items():
+                    tx.discard_state(name, values[name], reason)
+        return parsed
 
     def clear_lost(self) -> LostRecords | None:
         """Delete the report of lost commits; return it."""

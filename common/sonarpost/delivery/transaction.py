@@ -3,22 +3,55 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import sqlite3
 import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from functools import cache
+from typing import Final
 
 from sonarpost import wire
+from sonarpost.archive.retention import Stored, select_for_removal, vehicle_source
 from sonarpost.delivery.duplicate_window import DuplicateWindow
 from sonarpost.delivery.partial_records import PartialRecords
 from sonarpost.delivery.records import InboxItem, OutboxItem, ReceivedChunk, Topic
+from sonarpost.keys import writer_of
+from sonarpost.limits import limit
+from sonarpost.logs import kv
 from sonarpost.messages import Record
 
-# Limits on what a remote station can make a store keep; beyond them the oldest entries are deleted.
-MAX_QUARANTINED = 1000
-MAX_QUARANTINED_BYTES = 256 * 1024
+log = logging.getLogger(__name__)
+
+_PLACES: Final = {"surface": "quarantine of every service", "source": "sender of a record"}
+MAX_QUARANTINED: Final = limit(
+    1000,
+    "records",
+    "shares",
+    resource="quarantined records",
+    at_limit="the oldest records of the sender with the most bytes are deleted",
+    **_PLACES,
+)
+MAX_QUARANTINE_BYTES: Final = limit(
+    256 * 1024 * 1024,
+    "bytes",
+    "shares",
+    resource="size of the quarantine",
+    at_limit="the oldest records of the sender with the most bytes are deleted",
+    **_PLACES,
+)
+MAX_QUARANTINED_BYTES: Final = limit(
+    256 * 1024,
+    "bytes",
+    "claims",
+    resource="a quarantined record that was not accepted before",
+    at_limit="the record is cut",
+    **_PLACES,
+)
+
+ROW_BYTES: Final = 1024
+"""Size of a quarantined record in addition to its payload, for the shares."""
 
 # Each statement releases the interpreter lock and waits to get it back: multi-row statements are much faster.
 ROWS_PER_STATEMENT = 32
@@ -98,6 +131,7 @@ class Transaction:
         wrote_outbox: Whether a record was added to the outbox.
         wrote_inbox: Whether a record was added to the inbox.
         superseded: Number of queued records that newer editions replaced.
+        states_discarded: Number of states that could not be read.
     """
 
     def __init__(
@@ -112,7 +146,7 @@ class Transaction:
         self._has_legacy_windows = has_legacy_windows
         self.wrote_outbox = False
         self.wrote_inbox = False
-        self.superseded = 0
+        self.superseded = self.states_discarded = 0
         self._windows: dict[tuple[str, bytes], DuplicateWindow] = {}
         self._numbers: dict[str, tuple[int, bytes]] = {}
         self._new_outbox: list[tuple[object, ...]] = []
@@ -233,32 +267,27 @@ class Transaction:
         return position, priority
 
     def drop_oldest(self, queue: str, max_bytes: int, protected_priority: int) -> int:
-        """Drop records until the queue holds at most `max_bytes`: the least urgent first, then the oldest.
+        """Drop records until the queue holds at most `max_bytes`: of the vehicle with the most, the least urgent first.
 
-        Records in flight stay, and so do records of `protected_priority` or more urgent.
+        Records of equal priority are dropped oldest first. Records in flight stay, and so do records of
+        `protected_priority` or more urgent.
 
         Returns:
             Number of dropped records.
         """
         self._flush_outbox()
-        total = int(
-            self._db.execute(
-                "SELECT COALESCE(SUM(LENGTH(payload)), 0) FROM outbox WHERE consumer = ?", (queue,)
-            ).fetchone()[0]
-        )
-        dropped = 0
-        candidates = self._db.execute(
-            "SELECT seq, LENGTH(payload) FROM outbox WHERE consumer = ? AND priority > ? ORDER BY priority DESC, place",
-            (queue, protected_priority),
-        ).fetchall()
-        for seq, size in candidates:
-            if total <= max_bytes:
-                break
-            if (queue, seq) not in self._in_flight:
-                self.remove_acknowledged(queue, (seq,))
-                total -= size
-                dropped += 1
-        return dropped
+        stored: list[Stored[int]] = []
+        for seq, size_bytes, priority, place, topic in self._db.execute(
+            "SELECT seq, LENGTH(payload), priority, place, topic FROM outbox WHERE consumer = ?", (queue,)
+        ):
+            if priority <= protected_priority or (queue, seq) in self._in_flight:
+                max_bytes -= size_bytes
+            else:
+                vehicle = topic[: topic.find("/") + 1]
+                stored.append(Stored(seq, place, size_bytes, -priority, vehicle_source(vehicle)))
+        dropped = select_for_removal(stored, 0.0, None, max(0, max_bytes))
+        self.remove_acknowledged(queue, sorted(dropped))
+        return len(dropped)
 
     def drop_queue(self, queue: str) -> int:
         """Drop all records of a queue; return their number."""
@@ -273,7 +302,7 @@ class Transaction:
 
     def quarantine_refused(self, item: OutboxItem, reason: str) -> None:
         """Move a record that the consumer refused from the outbox to the quarantine."""
-        self.quarantine("out", item.key, item.payload, reason)
+        self.quarantine("out", item.key, item.payload, reason, is_accepted=True)
         self.remove_acknowledged(item.queue, (item.seq,))
 
     # Inbox
@@ -296,13 +325,36 @@ class Transaction:
         """Remove a handled record from the inbox."""
         self._handled.append(item.id)
 
-    def quarantine(self, direction: str, key: str, payload: bytes, reason: str) -> None:
-        """Store a record that cannot be handled, with the reason: the latest 1000, at most 256 KiB each."""
-        row = self._db.execute(
-            "INSERT INTO refused (direction, key, payload, reason, at_utc_s) VALUES (?, ?, ?, ?, ?) RETURNING id",
-            (direction, key, payload[:MAX_QUARANTINED_BYTES], reason, time.time()),
-        ).fetchone()
-        self._db.execute("DELETE FROM refused WHERE id <= ?", (int(row[0]) - MAX_QUARANTINED,))
+    def quarantine(self, direction: str, key: str, payload: bytes, reason: str, *, is_accepted: bool = False) -> None:
+        """Store a record that cannot be handled, with the reason, within the limits of this module.
+
+        Args:
+            direction: `in` for a received record, `out` for one that its consumer has refused.
+            key: Its key.
+            payload: Its bytes.
+            reason: Why it cannot be handled.
+            is_accepted: Whether no sender has it any more: it is not cut.
+        """
+        self._db.execute(
+            "INSERT INTO refused (direction, key, payload, reason, at_utc_s) VALUES (?, ?, ?, ?, ?)",
+            (direction, key, payload if is_accepted else payload[:MAX_QUARANTINED_BYTES], reason, time.time()),
+        )
+        count, size_bytes = self._db.execute("SELECT COUNT(*), SUM(LENGTH(payload)) FROM refused").fetchone()
+        if count <= MAX_QUARANTINED and size_bytes <= MAX_QUARANTINE_BYTES:
+            return
+        rows: dict[str, list[tuple[int, int]]] = {}
+        for number, its_key, its_bytes in self._db.execute("SELECT id, key, LENGTH(payload) FROM refused ORDER BY id"):
+            rows.setdefault(writer_of(its_key), []).append((number, its_bytes))
+        while count > MAX_QUARANTINED or size_bytes > MAX_QUARANTINE_BYTES:
+            largest = max(rows.values(), key=lambda found: sum(its_bytes + ROW_BYTES for _, its_bytes in found))
+            number, its_bytes = largest.pop(0)
+            self._db.execute("DELETE FROM refused WHERE id = ?", (number,))
+            count, size_bytes = count - 1, size_bytes - its_bytes
+
+    def requeue(self, number: int) -> None:
+        """Move a quarantined record to the inbox."""
+        row = self._db.execute("DELETE FROM refused WHERE id = ? RETURNING key, payload", (number,)).fetchone()
+        self.accept(str(row[0]), bytes(row[1]))
 
     def was_received(self, key: str, chunk: ReceivedChunk) -> bool:
         """Return whether the record of a chunk was accepted before: same key, origin, number and digest."""
@@ -359,6 +411,13 @@ class Transaction:
     def delete_state(self, name: str) -> None:
         """Delete the value under `name`."""
         self._db.execute("DELETE FROM state WHERE name = ?", (name,))
+
+    def discard_state(self, name: str, value: bytes, reason: str) -> None:
+        """Move a value that cannot be read from `name` to the quarantine."""
+        log.error("Stored state discarded: it cannot be read", extra=kv(state=name, reason=reason))
+        self.quarantine("in", f"state {name}", value, reason)
+        self._db.execute("DELETE FROM state WHERE name = ? AND value = ?", (name, value))
+        self.states_discarded += 1
 
 
 @cache
