@@ -18,6 +18,7 @@ from sonarpost.detection.chips import (
 )
 from sonarpost.detection.matched_filter import Peak
 from sonarpost.detection.normalisation import LevelGrid
+from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.survey import Side
 
 
@@ -52,6 +53,12 @@ def test_square_has_its_size_at_any_altitude_and_resolution(altitude_m, row_m, c
     slant_cell = int(np.hypot(12.0, altitude_m) / cell_m)
     row, column = plane.pixel_of(int(10.0 / row_m), slant_cell)
     assert (row, column) == (pytest.approx(80, abs=2), pytest.approx(96, abs=2))
+
+
+@pytest.mark.parametrize(("row_m", "cell_m"), [(855.0, 0.1), (0.1, 200.0)])
+def test_pings_that_claim_more_seabed_than_they_have_samples_for_are_refused(row_m, cell_m):
+    with pytest.raises(SurveyFileError, match="seabed of a strip: pixels"):
+        ground_plane(grid_of(np.zeros((1000, 500)), row_m=row_m, cell_m=cell_m))
 
 
 def test_unknown_cells_count_as_unknown_and_do_not_change_the_mean():

@@ -44,6 +44,14 @@ def test_cell_and_row_lengths(make_survey):
     assert unknown.row_along_m == SETTINGS.assumed_row_along_m
 
 
+def test_vehicle_that_hardly_moves_has_the_assumed_distance_between_pings(make_survey):
+    survey = make_survey()
+    still = [replace(ping, speed_mps=None, lat_deg=40 + 1e-12 * row) for row, ping in enumerate(survey.pings)]
+    grid = normalise_side(replace(survey, pings=tuple(replace(p, lon_deg=-70.0) for p in still)), Side.PORT, SETTINGS)
+    assert not grid.row_is_measured
+    assert grid.row_along_m == SETTINGS.assumed_row_along_m
+
+
 def test_missing_channel_and_short_ping_are_unknown_and_a_spike_is_removed(make_survey):
     survey = make_survey()
     pings = list(survey.pings)

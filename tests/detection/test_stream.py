@@ -190,7 +190,7 @@ def with_channels(ping, change):
         (lambda ping: with_channels(ping, lambda c: replace(c, samples=c.samples[:300])), False),
         (lambda ping: with_channels(ping, lambda c: replace(c, samples=c.samples.astype(np.uint32))), False),
         (lambda ping: with_channels(ping, lambda c: replace(c, slant_range_m=c.slant_range_m * 1.02)), False),
-        (lambda ping: replace(ping, channels=(*ping.channels, ping.channels[0])), False),
+        (lambda ping: replace(ping, channels=ping.channels[:1]), False),
     ],
 )
 def test_continuation_requires_same_sampling_time_and_place(make_survey, monkeypatch, change, continues):

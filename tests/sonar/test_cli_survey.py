@@ -54,7 +54,7 @@ def test_export_csv(small_survey, tmp_path, capsys):
     assert lines[0]["time_utc"] == "2013-09-10T21:13:08.130Z"
 
 
-def test_export_geojson_splits_track_at_gaps_and_antimeridian(small_survey, tmp_path):
+def test_export_geojson_divides_the_track_at_gaps_and_the_180th_meridian(small_survey, tmp_path):
     start = small_survey().pings[0]
     fixes = [(0, 179.9995), (1, 179.9999), (2, -179.9998), (3, -179.9994), (200, -179.9990)]
     pings = tuple(
@@ -65,9 +65,10 @@ def test_export_geojson_splits_track_at_gaps_and_antimeridian(small_survey, tmp_
     out = tmp_path / "track.geojson"
     assert main(["survey", "export", "--format", "geojson", "--out", str(out), str(path)]) == 0
     features = json.loads(out.read_text())["features"]
-    assert [f["geometry"]["type"] for f in features] == ["LineString", "LineString", "Point"]
-    assert features[0]["geometry"]["coordinates"] == [[179.9995, 48.44545], [179.9999, 48.44545]]
-    assert features[1]["properties"]["first_ping"] == 2
+    assert [f["geometry"]["type"] for f in features] == ["MultiLineString", "Point"]
+    lons = [[179.9995, 179.9999, 180.0], [-180.0, -179.9998, -179.9994]]
+    assert features[0]["geometry"]["coordinates"] == [[[lon, 48.44545] for lon in part] for part in lons]
+    assert [f["properties"]["first_ping"] for f in features] == [0, 4]
 
 
 @pytest.mark.parametrize("kind", ["csv", "geojson"])
@@ -77,7 +78,7 @@ def test_export_without_positions_is_an_error_and_writes_no_file(kind, small_sur
     out = tmp_path / "absent" / "track"
     for path, crs, message in (
         (without, [], "positions: got 'none in 5 pings', expected a recording with positions"),
-        (tmp_path / "metres.xtf", [], "positions: got 'metres', expected their projection, --crs EPSG:N"),
+        (tmp_path / "metres.xtf", [], "got 'projected coordinates', expected their projection, --crs EPSG:N"),
     ):
         assert main(["survey", "export", "--format", kind, "--out", str(out), str(path), *crs]) == 2
         printed = capsys.readouterr()
@@ -168,9 +169,9 @@ def test_file_cut_by_a_power_failure_is_read_and_a_damaged_one_leaves_no_export(
         elif "info" in command:
             assert json.loads(printed.out)["pings"] == 29
         assert "the file ends inside its last packet" in printed.out + printed.err
-    path.write_bytes(complete + bytes(512))
+    path.write_bytes(complete[:1024] + bytes(512))
     assert main(["survey", "export", "--out", str(tmp_path / "t.csv"), str(path)]) == 2
-    assert "MagicNumber" in capsys.readouterr().err
+    assert "marker: got '0000', expected cefa" in capsys.readouterr().err
     assert not (tmp_path / "t.csv").exists()
 
 

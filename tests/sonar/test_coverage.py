@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
+import struct
 import subprocess
 import tracemalloc
 from contextlib import closing
@@ -13,16 +14,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders import gdal
-from builders.survey_lines import ALTITUDE_M, RANGE_M, line, with_turn
+from builders.survey_lines import ALTITUDE_M, RANGE_M, course, line, with_turn
 from builders.surveys import make_xtf
 from pyproj import Geod
 
 from sonarpost.cli.main import main
 from sonarpost.errors import SurveyFileError
-from sonarpost.export.coverage import write_coverage_geojson
-from sonarpost.export.geopackage import write_coverage_geopackage
+from sonarpost.export.geo.coverage import write_coverage_geojson
+from sonarpost.export.geo.geopackage import write_coverage_geopackage
+from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.maps import track
 from sonarpost.sonar.maps.coverage import survey_coverage
+from sonarpost.sonar.xtf_writer import write_xtf
 
 REACH_M = math.sqrt(RANGE_M**2 - ALTITUDE_M**2)
 GEOD = Geod(ellps="WGS84")
@@ -70,7 +73,7 @@ def test_gap_ends_a_polygon_and_a_ping_without_position_does_not(tmp_path):
     coverage = survey_coverage([path])
     assert [(p.first_ping, p.last_ping) for p in coverage.polygons] == [(0, 39), (90, 119)]
     assert (coverage.pings, coverage.left_out) == (69, 1)
-    bare = tuple(replace(ping, heading_deg=None) for ping in pings)
+    bare = tuple(replace(ping, lat_deg=None, lon_deg=None) for ping in pings)
     with pytest.raises(SurveyFileError, match="position, heading and altitude"):
         survey_coverage([make_xtf(replace(survey, pings=bare), tmp_path)])
 
@@ -89,10 +92,20 @@ def polygons_with_errors_of_the_heading(folder):
     return survey_coverage([make_xtf(replace(survey, pings=pings), folder)]).polygons
 
 
+def polygons_across_the_180th_meridian(folder, lat_deg, heading_deg):
+    """A line across the meridian, a turn, a line back across it, and a recording on one side."""
+    start = offset_position(Position(lat_deg, 180.0), heading_deg + 175, 30.0)
+    headings = [heading_deg] * 120, np.linspace(heading_deg, heading_deg + 180, 240), [heading_deg + 180] * 120
+    survey = course(np.concatenate(headings).tolist(), start=start)
+    write_xtf(line(start=offset_position(start, heading_deg + 180, 500.0), bright=None), folder / "beside.xtf")
+    return survey_coverage([make_xtf(survey, folder), folder / "beside.xtf"]).polygons
+
+
 @gdal.needs_bindings
 def test_polygons_of_turns_overlaps_and_errors_are_valid(tmp_path):
     turns = [polygons_of_turn(tmp_path, radius_m) for radius_m in (5.0, 25.0, 60.0)]
-    for polygons in (*turns, polygons_with_errors_of_the_heading(tmp_path)):
+    across = polygons_across_the_180th_meridian(tmp_path, -16.9, 80.0)
+    for polygons in (*turns, polygons_with_errors_of_the_heading(tmp_path), across):
         write_coverage_geopackage(tmp_path / "c.gpkg", polygons)
         assert invalid_polygons(tmp_path / "c.gpkg") == (len(polygons), 0)
 
@@ -147,6 +160,48 @@ def test_both_files_hold_the_polygons(tmp_path):
         points = np.frombuffer(row["geom"][-16 * len(ring) :], "<f8").reshape(-1, 2)
         np.testing.assert_allclose(ring, points, atol=2e-8)
         np.testing.assert_allclose(points, [(p.lon_deg, p.lat_deg) for p in polygon.ring], atol=1e-9)
+
+
+def rings_of(geometry):
+    """Return the rings of a GeoPackage geometry of polygons, and its envelope: west, east, south, north."""
+    envelope = struct.unpack_from("<4d", geometry, 8)
+    kind, count = struct.unpack_from("<xII", geometry, 40)
+    assert kind == 6, "MULTIPOLYGON"
+    offset, rings = 49, []
+    for _ in range(count):
+        header = struct.unpack_from("<BIII", geometry, offset)
+        assert header[:3] == (1, 3, 1)
+        rings.append(np.frombuffer(geometry, "<f8", 2 * header[3], offset + 13).reshape(-1, 2).tolist())
+        offset += 13 + 16 * header[3]
+    assert offset == len(geometry)
+    return rings, envelope
+
+
+@pytest.mark.parametrize("lat_deg", [-16.9, 0.001, 65.0])
+@pytest.mark.parametrize("heading_deg", [90.0, 255.0])
+def test_polygons_across_the_180th_meridian_are_divided(tmp_path, lat_deg, heading_deg):
+    polygons = polygons_across_the_180th_meridian(tmp_path, lat_deg, heading_deg)
+    write_both(tmp_path, polygons)
+    with closing(sqlite3.connect(tmp_path / "c.gpkg")) as db:
+        stored = [rings_of(row[0]) for row in db.execute("SELECT geom FROM coverage ORDER BY fid")]
+        assert db.execute("SELECT geometry_type_name FROM gpkg_geometry_columns").fetchall() == [("MULTIPOLYGON",)]
+        box = db.execute("SELECT min_x, max_x FROM gpkg_contents").fetchone()
+    assert box == (-180.0, 180.0), "the extent of a layer is that of the plane"
+    features = json.loads((tmp_path / "c.geojson").read_text())["features"]
+    kinds = {"Polygon": lambda part: [part], "MultiPolygon": lambda parts: parts}
+    written = [kinds[f["geometry"]["type"]](f["geometry"]["coordinates"]) for f in features]
+    assert [len(parts) > 1 for parts in written] == [polygon.line != "beside" for polygon in polygons]
+    for polygon, parts, (rings, envelope) in zip(polygons, written, stored, strict=True):
+        assert [len(ring) for ring in rings] == [len(ring) for (ring,) in parts]
+        for (ring,), same in zip(parts, rings, strict=True):
+            np.testing.assert_allclose(ring, same, atol=2e-8)
+            assert ring[0] == ring[-1]
+            assert len({lon > 0 for lon, _ in ring}) == 1
+        lons, lats = zip(*(corner for ring in rings for corner in ring), strict=True)
+        assert envelope == (min(lons), max(lons), min(lats), max(lats))
+        areas_m2 = [GEOD.polygon_area_perimeter(*zip(*ring, strict=True))[0] for ring in rings]
+        assert min(areas_m2) > 0  # counter-clockwise
+        assert sum(areas_m2) == pytest.approx(polygon.area_m2, rel=2e-3)
 
 
 @gdal.needs_ogr

@@ -213,7 +213,14 @@ def test_tracked_altitude_and_layback_increase_error():
     assert tracked.position == own.position
     assert tracked.across_sigma_m == pytest.approx(10 * own.across_sigma_m, rel=0.01)
     towed = options.model_copy(update={"mounting": Mounting(layback_m=50)})
-    assert georeference(accurate_ping(), Side.PORT, index, towed).along_sigma_m == pytest.approx(7)
+    behind = georeference(accurate_ping(), Side.PORT, index, towed)
+    assert behind.along_sigma_m == pytest.approx(math.hypot(7, 50 * 0.05))
+    swing_m = 50 * math.sin(math.radians(3))
+    assert behind.across_sigma_m == pytest.approx(math.hypot(own.across_sigma_m, swing_m))
+    recorded = georeference(accurate_ping(layback_m=50), Side.PORT, index, options)
+    assert (recorded.along_sigma_m, recorded.across_sigma_m) == (behind.along_sigma_m, behind.across_sigma_m)
+    by_course = georeference(accurate_ping(heading_sigma_deg=10), Side.PORT, index, options)
+    assert by_course.along_sigma_m == pytest.approx(by_course.ground_range_m * math.radians(10))
 
 
 def test_no_position_outside_swath_in_water_column_or_at_poles():

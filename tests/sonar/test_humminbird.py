@@ -59,22 +59,85 @@ def test_depth_and_sample_spacing_options(recording):
 
 
 @pytest.mark.parametrize(
-    ("damage", "field"),
+    "damage",
     [
-        (lambda raw: b"\x00" + raw[1:], "start"),
-        (lambda raw: raw[:4] + b"\x10" + raw[5:], "tag"),
-        (lambda raw: raw.replace(b"\xa0\x00\x00\x00\x28\x21", b"\xa0\x00\x00\x00\x00\x21", 1), "number of samples"),
-        (lambda raw: raw.replace(b"\xa0\x00\x00\x00\x28\x21", b"\xa0\xff\xff\xff\xff\x21", 1), "number of samples"),
-        (lambda raw: raw.replace(b"\xa0\x00\x00\x00\x28\x21", b"\xa0\x00\x00\x00\x28\x22", 1), "end of the header"),
-        (lambda raw: raw[:4] + b"\xa0\x00\x00\x00\x28\x21" + raw[10:], "fields"),
-        (lambda raw: raw[:4] + b"\x41\x00" * 500 + raw[4:], "header"),
+        lambda raw: b"\x00" + raw[1:],
+        lambda raw: raw[:4] + b"\x10" + raw[5:],
+        lambda raw: raw.replace(b"\xa0\x00\x00\x00\x28\x21", b"\xa0\x00\x00\x00\x00\x21", 1),
+        lambda raw: raw.replace(b"\xa0\x00\x00\x00\x28\x21", b"\xa0\xff\xff\xff\xff\x21", 1),
+        lambda raw: raw.replace(b"\xa0\x00\x00\x00\x28\x21", b"\xa0\x00\x00\x00\x28\x22", 1),
+        lambda raw: raw[:4] + b"\xa0\x00\x00\x00\x28\x21" + raw[10:],
+        lambda raw: raw[:4] + b"\x41\x00" * 500 + raw[4:],
+        lambda raw: raw[:60] + raw[61:],
     ],
+    ids=["start", "tag", "no samples", "too many samples", "end of the header", "no fields", "too long", "lost byte"],
 )
-def test_error_names_invalid_header_field(recording, damage, field):
-    path, port, _ = recording
+def test_ping_with_a_damaged_header_is_left_out(recording, damage):
+    path, port, starboard = recording
+    complete = read_survey(path)
     port.write_bytes(damage(port.read_bytes()))
-    with pytest.raises(SurveyFileError, match=rf"B002.SON: ping 0.*{field}"):
+    survey = read_survey(path)
+    assert [len(ping.channels) for ping in survey] == [1, 2, 2, 2, 2]
+    for damaged, whole in zip(survey, complete, strict=True):
+        for channel in damaged.channels:
+            np.testing.assert_array_equal(channel.samples, whole.channel(channel.side).samples)
+    assert any(text.startswith("no ping of B002.SON at bytes 0 to ") for text in survey.warnings)
+    starboard.unlink()
+    port.write_bytes(damage(son_ping(1, 0, bytes(40))))
+    with pytest.raises(SurveyFileError, match="line"):
         read_survey(path)
+
+
+@pytest.mark.parametrize("row", [0, 1, 5, 10, 11])
+@pytest.mark.parametrize("field", [b"\x80", b"\x81"], ids=["number", "time"])
+@pytest.mark.parametrize("value", [0xFFFFFFFF, 2000, 0], ids=["great", "of another ping", "zero"])
+def test_wrong_time_or_number_of_one_ping_leaves_the_others_joined(small_survey, tmp_path, row, field, value):
+    path = make_humminbird(small_survey(pings=12), tmp_path)
+    complete = [{channel.side for channel in ping.channels} for ping in read_survey(path)]
+    assert complete == [set(Side)] * 12
+    for name in ("B002.SON", "B003.SON"):
+        file = path.with_suffix("") / name
+        raw = file.read_bytes()
+        starts = [at for at in range(len(raw)) if raw[at : at + 5] == b"\xc0\xde\xab\x21\x80"]
+        at = starts[row] + {b"\x80": 5, b"\x81": 10}[field]
+        file.write_bytes(raw[:at] + value.to_bytes(4, "big") + raw[at + 4 :])
+        survey = read_survey(path)
+        joined = [ping for ping in survey if len(ping.channels) == 2]
+        assert len(joined) == (12 if field == b"\x80" else 11)
+        file.write_bytes(raw)
+
+
+def test_lost_pings_of_one_side_and_a_pause_leave_the_others_joined(recording):
+    path, port, starboard = recording
+    times = [*range(0, 4000, 40), *range(600_000, 604_000, 40)]
+    pings = [(number, son_ping(number, time_ms, b"abcd")) for number, time_ms in enumerate(times)]
+    starboard.write_bytes(b"".join(ping for _, ping in pings))
+    port.write_bytes(b"".join(ping for number, ping in pings if not 20 <= number < 150))
+    survey = read_survey(path)
+    assert [ping.number for ping in survey] == list(range(200))
+    assert [len(ping.channels) for ping in survey] == [2] * 20 + [1] * 130 + [2] * 50
+
+
+def test_pings_after_the_clock_was_set_back_are_read(recording):
+    path, port, starboard = recording
+    times = [*range(9000, 9400, 40), *range(0, 400, 40)]
+    for side in (port, starboard):
+        side.write_bytes(b"".join(son_ping(number, time_ms, b"abcd") for number, time_ms in enumerate(times)))
+    survey = read_survey(path)
+    assert [(ping.number, len(ping.channels)) for ping in survey] == [(number, 2) for number in range(20)]
+    assert any("time goes back in 1 of 20 pings, the first in row 10" in text for text in survey.warnings)
+
+
+def test_end_inside_the_last_ping_of_both_files(recording):
+    path, port, starboard = recording
+    for side, lost in ((port, 1), (starboard, 60)):
+        side.write_bytes(side.read_bytes()[:-lost])
+    survey = read_survey(path)
+    assert [len(ping.channels) for ping in survey] == [2, 2, 2, 2]
+    ends = [text for text in survey.warnings if text.startswith("the file ends inside its last ping of")]
+    assert [text[:46] for text in ends] == [
+        f"the file ends inside its last ping of {name}" for name in (port.name, starboard.name)
+    ]
 
 
 def test_invalid_dat_file_is_rejected(recording):

@@ -6,6 +6,7 @@ import io
 import logging
 import os
 import struct
+import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -43,7 +44,7 @@ def test_both_formats_keep_every_pixel(tmp_path, image):
 def test_other_libraries_read_written_images(tmp_path):
     write_tiff(tmp_path / "a.tiff", np.array([[1, 2, 3]], np.uint8))
     raw = (tmp_path / "a.tiff").read_bytes()
-    assert (raw[:8], raw[-3:]) == (bytes.fromhex("49492a00 08000000"), b"\x01\x02\x03")
+    assert (raw[:8], zlib.decompress(raw[-11:])) == (bytes.fromhex("49492a00 08000000"), b"\x01\x02\x03")
     for dtype in (np.uint8, np.uint16):
         write_tiff(tmp_path / "a.tiff", ramp(dtype), description="contact 7")
         with tifffile.TiffFile(tmp_path / "a.tiff") as file:
@@ -343,6 +344,42 @@ def test_a_truncated_file_is_refused_or_lacks_no_pixel(tmp_path, name):
     assert refused > 25
 
 
+def png_header(columns, rows, depth, colour):
+    header = b"IHDR" + struct.pack(">IIBBBBB", columns, rows, depth, colour, 0, 0, 0)
+    chunks = [header, b"IDAT" + bytes(1 << 17), b"IEND"]
+    framed = (struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(framed)
+
+
+def tiff_header(columns, rows, bits, *others):
+    """Return a TIFF of tags only; `others` are tags with a single value."""
+    tags = sorted([(256, columns), (257, rows), (258, bits), (259, 1), (262, 1), (277, 1), *others])
+    packed = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
+    return struct.pack("<2sHIH", b"II", 42, 8, len(tags)) + packed + bytes(4)
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        png_header(8192, 8192, 16, 6),
+        png_header(8192, 8192, 1, 3),
+        png_header(8192, 8192, 8, 0)[: 1 << 12] + b"IEND\xaeB`\x82",
+        tiff_header(8192, 8192, 16, (322, 8192), (323, 8192), (324, 0), (325, 0)),
+        tiff_header(16, 16, 16, (322, 8192), (323, 8192), (324, 0), (325, 0)),
+        tiff_header(8192, 4096, 64, (339, 3), (273, 8), (278, 4096), (279, 64)),
+    ],
+    ids=["RGBA of 16 bits", "palette of 1 bit", "little data", "absent tile", "tile larger than image", "float64"],
+)
+def test_pixels_without_data_are_refused_before_decoding(raw, tmp_path):
+    (tmp_path / "a").write_bytes(raw)
+    tracemalloc.start()
+    with pytest.raises(SurveyFileError, match=r"size: got '.* bits', expected at most"):
+        read_any_image(tmp_path / "a")
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 4 * len(raw) + (1 << 21)
+
+
 @given(
     name=st.sampled_from(sorted(READABLE)),
     damage=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), min_size=1, max_size=8),
@@ -392,8 +429,8 @@ def test_folder_without_an_image_is_an_error_that_names_its_files(tmp_path):
         with pytest.raises(SurveyFileError, match=message):
             list_images(folder)
 
-    for path in (tmp_path / "absent.png", tmp_path):
-        with pytest.raises(SurveyFileError, match="absent"):
+    for path, message in ((tmp_path / "absent.png", "No such file"), (tmp_path, "not a regular file")):
+        with pytest.raises(SurveyFileError, match=message):
             read_image(path)
 
 

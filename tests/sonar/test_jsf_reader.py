@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 
 import numpy as np
@@ -28,30 +29,54 @@ def read_one(tmp_path, samples=ENVELOPE, **values):
     return ping
 
 
-def test_both_frequencies_are_in_one_ping(tmp_path):
-    """The subsystem with the most messages is first in each ping, in any order of the messages."""
-    low, high = ENVELOPE, np.arange(8, dtype=np.uint16)
-    messages = [jsf_message(1, 20, side, low) for side in (0, 1)]
-    for number in (2, 3):
-        messages += [jsf_message(number, 21, 0, high), jsf_message(number, 20, 0, low)]
-        messages += [jsf_message(number, 20, 1, low), jsf_message(number, 21, 1, high)]
-    messages.append(jsf_message(9, 21, 0, high))
-    survey = read_survey(recording(tmp_path, *messages))
-    sizes = [[(c.side, c.samples.size) for c in ping.channels] for ping in survey]
-    one = [(Side.PORT, 4), (Side.STARBOARD, 4)]
-    assert [ping.number for ping in survey] == [1, 2, 3]
-    assert sizes[0] == one
-    assert sizes[1] == sizes[2] == [*one, (Side.PORT, 8), (Side.STARBOARD, 8)]
-    assert "left out ping of subsystem 21: none of this number in subsystem 20 (1 times)" in survey.warnings
+LOW, HIGH = {"start": 22_000, "end": 24_000}, {"start": 52_000, "end": 56_000}
 
-    # Without common numbers the other frequency is left out.
-    numbers = [(20, number) for number in range(40)] + [(21, number + 5000) for number in range(40)]
-    messages = [jsf_message(number, system, side, ENVELOPE) for system, number in numbers for side in (0, 1)]
+
+def both_frequencies(numbers, samples=ENVELOPE, high=ENVELOPE):
+    """Return messages of two subsystems, in changing order."""
+    messages = []
+    for number in numbers:
+        messages += [jsf_message(number, 21, 0, high, **HIGH), jsf_message(number, 20, 0, samples, **LOW)]
+        messages += [jsf_message(number, 20, 1, samples, **LOW), jsf_message(number, 21, 1, high, **HIGH)]
+    return messages
+
+
+def test_both_frequencies_are_channel_sets_of_one_ping(tmp_path):
+    low, high = ENVELOPE, np.arange(8, dtype=np.uint16)
+    path = recording(tmp_path, *both_frequencies((2, 3), low, high), jsf_message(9, 20, 0, low, **LOW))
+    survey = read_survey(path)
+    assert [(p.number, [(c.side, c.samples.size, c.frequency_hz, c.index) for c in p.channels]) for p in survey] == [
+        (number, [(side, 8, 540e3, 21) for side in Side]) for number in (2, 3)
+    ]
+    assert any("2 channel sets: 540 kHz in 2 pings; 230 kHz in 3 pings" in w for w in survey.warnings)
+    assert "left out pings without a channel of 540 kHz: 1" in survey.warnings
+    survey = read_survey(path, SurveyOptions(frequency_hz=200e3))
+    assert [p.number for p in survey] == [2, 3, 9]
+    assert {c.index for p in survey for c in p.channels} == {20}
+
+
+def test_sides_are_joined_by_number_and_time(tmp_path):
+    messages = (
+        jsf_message(4, 22, side, ENVELOPE, seconds=seconds) for side, seconds in ((1, 8), (0, 8), (0, 8), (1, 9))
+    )
     survey = read_survey(recording(tmp_path, *messages))
-    assert [len(ping.channels) for ping in survey] == [2] * 40
-    assert any("left out ping of subsystem 21" in w and "(40 times)" in w for w in survey.warnings)
-    survey = read_survey(recording(tmp_path, *(jsf_message(4, 22, side, ENVELOPE) for side in (1, 0, 0))))
-    assert [[c.side for c in ping.channels] for ping in survey] == [[Side.PORT, Side.STARBOARD], [Side.PORT]]
+    assert [[c.side for c in p.channels] for p in survey] == [list(Side), [Side.PORT], [Side.STARBOARD]]
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "protocol", "frequency_hz"),
+    [
+        (84_000, 86_000, 0x12, 850e3),
+        (155_000, 165_000, 0xA, 1600e3),
+        (60_000, 70_000, 0xB, 650e3),
+        (1_000_000, 1_040_000, 0xB, 10_200e3),
+        (84_000, 86_000, 9, 194_640.0),  # older files do not have these bits
+    ],
+)
+def test_upper_bits_of_frequencies(tmp_path, start, end, protocol, frequency_hz):
+    (channel,) = read_one(tmp_path, start=start, end=end, protocol=protocol).channels
+    assert channel.frequency_hz == frequency_hz
+    assert channel.samples.tolist() == ENVELOPE.tolist()
 
 
 def test_envelope_is_unsigned_and_weighted(tmp_path):
@@ -106,6 +131,45 @@ def test_navigation_needs_its_validity_bits(tmp_path):
     assert any("without layback" in w for w in survey.warnings)
     survey = read_survey(recording(tmp_path, jsf_message(1, 20, 0, ENVELOPE, **values, valid=ALL_VALID)))
     assert survey.warnings == ()
+
+
+def test_course_and_fraction_of_speed(tmp_path):
+    values = {"course": 271, "speed": 35, "lsb": 25 << 8, "lsb2": 7, "valid": ALL_VALID | 2}
+    ping = read_one(tmp_path, **values, protocol=0xC)
+    assert (ping.course_deg, ping.speed_mps) == pytest.approx((271.25, 3.57 * 1852 / 3600))
+    ping = read_one(tmp_path, **values)  # older files do not have these bits
+    assert (ping.course_deg, ping.speed_mps) == pytest.approx((271.0, 3.5 * 1852 / 3600))
+    for invalid in ({"valid": ALL_VALID}, {"course": 2712}, {"course": -1}):
+        assert read_one(tmp_path, **values | invalid).course_deg is None
+
+
+def test_recorded_layback_is_applied_to_the_position_of_the_antenna(tmp_path):
+    def read(interpolated, choice="auto", layback=45.0):
+        """Return the last of three positions 100 m north of each other, and the notes."""
+        messages = (
+            jsf_message(
+                number, 20, 0, ENVELOPE, x=-41_000_000, y=29_000_000 + 540 * number, layback=layback,
+                seconds=1_378_847_588 + 4 * number, valid=1 | interpolated << 13,
+            )
+            for number in range(3)
+        )  # fmt: skip
+        survey = read_survey(recording(tmp_path, *messages), SurveyOptions(recorded_layback=choice))
+        return survey.pings[-1].lat_deg, "\n".join(survey.warnings)
+
+    recorded = (29_000_000 + 1080) / 600_000
+    towed = pytest.approx(recorded - 45 / 111_200, abs=2e-6)
+    for interpolated, choice, expected, note in (
+        (False, "auto", towed, "recorded layback of up to 45 m is applied"),
+        (False, "ignore", recorded, "position of the antenna at the last fix, without layback"),
+        (True, "auto", recorded, ""),
+        (True, "apply", towed, "recorded layback of up to 45 m is applied"),
+    ):
+        lat_deg, notes = read(interpolated, choice)
+        assert lat_deg == expected
+        assert note in notes
+        assert ("antenna" in notes) is ("antenna" in note)
+    for layback in (0.0, -5.0, 20_000.0, math.nan, math.inf):
+        assert read(False, layback=layback)[0] == recorded
 
 
 @pytest.mark.parametrize(("unit", "factor"), [(1, 1000), (3, 10), (4, 100)])
@@ -171,19 +235,50 @@ def test_cut_last_message_is_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("offset", "raw", "field"),
+    ("offset", "raw", "note"),
     [
-        (0, b"\x02", "marker"),
-        (12, struct.pack("<i", -1), "size"),
-        (12, struct.pack("<i", 1 << 25), "size"),
-        (12, struct.pack("<i", 5000), "truncated"),
-        (16 + 114, struct.pack("<H", 5), "number of samples"),
-        (16 + 16, struct.pack("<H", 0xF00), "number of samples"),
+        (0, b"\x02", "no message at bytes 0 to 263"),
+        (2, b"\0", "no message at bytes 0 to 263"),
+        (4, b"\xff\xff", "no message at bytes 0 to 263"),
+        (12, struct.pack("<i", -1), "no message at bytes 0 to 263"),
+        (12, struct.pack("<i", 100), "no message at bytes 0 to 263"),
+        (12, struct.pack("<i", 1 << 25), "no message at bytes 0 to 263"),
+        (12, struct.pack("<i", 5000), "no message at bytes 0 to 263"),
+        (12, struct.pack("<i", 260), "no message at bytes 0 to 263"),
+        (16 + 114, struct.pack("<H", 5), "message at byte 0 is left out: number of samples: got 5, expected up to 4"),
+        (16 + 16, struct.pack("<H", 0xF00), "message at byte 0 is left out: number of samples: got 983044"),
+        (16, struct.pack("<i", 0), "message at byte 0 is left out: date and time"),
     ],
 )
-def test_damage_is_rejected(tmp_path, offset, raw, field):
+def test_damaged_message_is_left_out(tmp_path, offset, raw, note):
     content = bytearray(jsf_message(1, 20, 0, ENVELOPE))
     content[offset : offset + len(raw)] = raw
-    for damaged, message in ((content, field), (jsf_other(80, bytes(30)), "at least 240")):
-        with pytest.raises(SurveyFileError, match=message):
-            read_survey(recording(tmp_path, damaged))
+    others = [jsf_message(number, 20, 0, ENVELOPE) for number in (2, 3)]
+    survey = read_survey(recording(tmp_path, content, *others))
+    assert [ping.number for ping in survey] == [2, 3]
+    assert survey.warnings[0].startswith(note)
+    with pytest.raises(SurveyFileError):
+        read_survey(recording(tmp_path, content))
+
+
+def test_lost_bytes_of_a_message_do_not_affect_the_next_one(tmp_path):
+    """Wherever its size points to: also into zeros."""
+    samples = np.arange(150, dtype=np.uint16)
+    first, *others = (jsf_message(number, 20, 0, samples) for number in range(4))
+    for lost in range(1, 300, 3):
+        survey = read_survey(recording(tmp_path, first[:256] + first[256 + lost :], *others))
+        assert [ping.number for ping in survey] == [1, 2, 3], lost
+        assert survey.warnings[0].startswith("no message at bytes 0 to")
+
+
+def test_message_between_two_damaged_places_is_read(tmp_path):
+    """Its content proves it: no message follows."""
+    messages = [jsf_message(number, 20, 0, ENVELOPE) for number in range(5)]
+    path = recording(tmp_path, messages[0], bytes(7), messages[1], b"damage", messages[2], jsf_other(99, b"x")[:-3])
+    survey = read_survey(path)
+    assert [ping.number for ping in survey] == [0, 1, 2]
+
+
+def test_file_of_another_kind_is_refused_by_its_first_bytes(tmp_path):
+    with pytest.raises(SurveyFileError, match="message at byte 0, marker: got '7468', expected 0116"):
+        read_survey(recording(tmp_path, b"this is a text"))

@@ -60,38 +60,125 @@ def test_missing_values_are_none_and_reported(tmp_path, version):
         ({"high": 1e30}, "maximum range"),
         ({"low": 3.0}, "minimum range"),
         ({"low": math.nan}, "minimum range"),
-        ({"time_s": 5}, "time: got 5"),
         ({"samples": b""}, "number of samples"),
         ({"samples": b"abc"}, "number of samples"),
-        ({"channel": 0}, "pings"),
     ],
 )
-def test_impossible_value_is_rejected(tmp_path, values, field):
-    with pytest.raises(SurveyFileError, match=field):
+def test_frame_with_an_impossible_value_is_left_out(tmp_path, values, field):
+    with pytest.raises(SurveyFileError, match=rf"frame at byte 8, {field}"):
         read_survey(recording(tmp_path, 3, values))
+    survey = read_survey(recording(tmp_path, 3, {"index": 1}, {"index": 2, **values}, {"index": 3}))
+    assert [ping.number for ping in survey] == [1, 3]
+    assert survey.warnings[0].startswith(f"frame at byte 184 is left out: {field}: got")
+
+
+@pytest.mark.parametrize("time_s", [5, 2**32 - 1])
+def test_recording_without_a_date_is_rejected(tmp_path, time_s):
+    with pytest.raises(SurveyFileError, match=f"frame at byte 8, time: got {time_s}"):
+        read_survey(recording(tmp_path, 3, {"time_s": time_s}))
+
+
+def test_recording_without_a_composite_ping_is_rejected(tmp_path):
+    with pytest.raises(SurveyFileError, match="pings: got '0; skipped channel: left side-scan, not composite"):
+        read_survey(recording(tmp_path, 3, {"channel": 0}, {"channel": 3}))
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_damaged_sizes_are_rejected(tmp_path, version):
+def test_date_is_that_of_the_first_frames(tmp_path, version):
+    counters = [{"time_s": 1000 * number, "ms": 1000 * number} for number in range(1, 4)]
+    survey = read_survey(recording(tmp_path, version, {"ms": 500}, *counters))
+    assert [ping.time_utc_s - 1_378_847_588 for ping in survey] == [0.5, 1, 2, 3]
+    wrong = read_survey(recording(tmp_path, version, {"time_s": 2_000_000_000}, {}, {}, *counters))
+    assert wrong.pings[-1].time_utc_s == 1_378_847_588 + 3
+    path = recording(tmp_path, version, {}, *counters)
+    path.write_bytes(path.read_bytes()[:-1].replace(SAMPLES, SAMPLES[:-1], 1))  # the first frame has lost a byte
+    assert [ping.time_utc_s - 1_378_847_588 for ping in read_survey(path)] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("version", "sizes"), [(2, (144,)), (2, (160,)), (3, (168,)), (3, (180,)), (3, (128,)), (3, (180, 128, 168, 172))]
+)
+def test_header_is_what_the_samples_leave_of_a_frame(tmp_path, version, sizes):
+    survey = read_survey(recording(tmp_path, version, *({"header_bytes": size} for size in sizes)))
+    assert len(survey.pings) == len(sizes)
+    for ping in survey:
+        assert ping.channel(Side.PORT).samples.tolist() == [4, 3, 2, 1]
+        assert ping.channel(Side.STARBOARD).samples.tolist() == [5, 6, 7, 8]
+
+
+@pytest.mark.parametrize(("version", "header_bytes"), [(2, 140), (2, 264), (3, 124), (3, 170), (3, 264)])
+def test_frame_with_an_implausible_header_is_left_out(tmp_path, version, header_bytes):
+    path = recording(tmp_path, version, *([{"samples": SAMPLES * 32}] * 3))
+    samples_at, samples_type = {2: (34, "<H"), 3: (44, "<I")}[version]
+    size = HEADER_BYTES[version] + 8 * 32
+    second = 8 + size
+    raw = bytearray(path.read_bytes())
+    struct.pack_into(samples_type, raw, second + samples_at, size - header_bytes)
+    path.write_bytes(raw)
+    survey = read_survey(path)
+    assert len(survey.pings) == 2
+    assert survey.warnings[0] == f"no frame at bytes {second} to {second + size - 1}: {size} bytes are left out"
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_recorded_course_is_the_heading_of_a_recording_without_a_compass(tmp_path, version):
+    east, north = 16_346_551, -5_276_871
+    frames = [{"east": east, "north": north, "course": rad, "ms": 100, "speed": 2.0} for rad in (4.0, -1.0, 0.0)]
+    survey = read_survey(recording(tmp_path, version, *frames))
+    assert [ping.course_deg for ping in survey] == [pytest.approx(229.183), pytest.approx(302.704), None]
+    assert [ping.heading_deg for ping in survey][:2] == [ping.course_deg for ping in survey][:2]
+    assert [ping.heading_sigma_deg for ping in survey][:2] == [10, 10]
+    assert any("heading is that of the course over ground" in text for text in survey.warnings)
+    drifting = read_survey(recording(tmp_path, version, *({**frame, "speed": 0.2} for frame in frames)))
+    assert {ping.heading_deg for ping in drifting} == {None}, "the course of a boat that does not move is noise"
+    (compass,) = read_survey(recording(tmp_path, version, {"heading": 1.0, "course": 4.0})).pings
+    assert (compass.heading_deg, compass.heading_sigma_deg) == (pytest.approx(57.296, abs=0.001), None)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_damage_is_local(tmp_path, version):
+    path = recording(tmp_path, version, *({"index": number} for number in range(1, 7)))
+    complete = path.read_bytes()
+    size = HEADER_BYTES[version] + len(SAMPLES)
+    size_at = {2: 28, 3: 8}[version]
+    third = 8 + 2 * size
+    for data, left in (
+        # A lost byte before the sizes, in the samples, and an inserted one: the stored offsets are wrong from there.
+        (complete[: third + 3] + complete[third + 4 :], [1, 2, 4, 5, 6]),
+        (complete[: third + size - 1] + complete[third + size :], [1, 2, 4, 5, 6]),
+        (complete[: third + 5] + b"\0" + complete[third + 5 :], [1, 2, 4, 5, 6]),
+        (complete[: third + size_at] + b"\0\0" + complete[third + size_at + 2 :], [1, 2, 4, 5, 6]),
+        (complete[:third] + b"\xff" * size + complete[third + size :], [1, 2, 4, 5, 6]),
+        (complete[:third] + complete[third + 3 * size + 5 :], [1, 2]),  # what is left of the last frame has lost bytes
+        (complete[: third + 5] + complete[-size:], [1, 2, 6]),
+    ):
+        path.write_bytes(data)
+        survey = read_survey(path)
+        assert [ping.number for ping in survey if ping.channel(Side.STARBOARD).samples.tolist() == [5, 6, 7, 8]] == left
+        assert "no frame at bytes" in survey.warnings[0] or "inside its last frame" in survey.warnings[0]
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_end_inside_a_frame_and_bytes_behind_the_last_one(tmp_path, version):
     path = recording(tmp_path, version, {}, {})
     complete = path.read_bytes()
-    size_at, samples_at = {2: (28, 34), 3: (8, 44)}[version]
-    for place, value, field in (
-        (0, 9, "frame at byte 8, offset"),
-        (size_at, 0, "frame size"),
-        (size_at, HEADER_BYTES[version] - 1, "frame size"),
-        (size_at, 65535, "truncated"),
-        (samples_at, 65534, "number of samples"),
+    for data, pings, note in (
+        (complete[:-1], 1, f"ends inside its last frame, as after a power failure: {HEADER_BYTES[version] + 7} bytes"),
+        (complete[: -HEADER_BYTES[version]], 1, "ends inside its last frame, as after a power failure: 8 bytes"),
+        (complete + b"\x05\x01", 2, "ends inside its last frame, as after a power failure: 2 bytes"),
+        (complete + bytes(4096), 2, "the file ends with 4096 zero bytes"),
     ):
-        raw = bytearray(complete)
-        struct.pack_into("<H", raw, 8 + place, value)
-        path.write_bytes(raw)
-        with pytest.raises(SurveyFileError, match=field):
+        path.write_bytes(data)
+        survey = read_survey(path)
+        assert len(survey.pings) == pings
+        assert note in survey.warnings[0]
+    for number in (0, 1, 4):
+        path.write_bytes(struct.pack("<4H", number, 2, 3200, 1))
+        with pytest.raises(SurveyFileError, match="format"):
             read_survey(path)
-    formats = [(struct.pack("<4H", number, 2, 3200, 1), "format") for number in (0, 1, 4)]
-    for content, field in ((complete[:-1], "truncated"), *formats):
-        path.write_bytes(content)
-        with pytest.raises(SurveyFileError, match=field):
+    for data in (complete[:5], complete[:8], complete[:100], complete[:8] + bytes(range(1, 256)) * 40):
+        path.write_bytes(data)
+        with pytest.raises(SurveyFileError):
             read_survey(path)
 
 

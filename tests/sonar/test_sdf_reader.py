@@ -10,6 +10,7 @@ import pytest
 from builders.surveys import sdf_other, sdf_page
 
 from sonarpost.errors import SurveyFileError
+from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Side
 
@@ -40,33 +41,29 @@ def test_samples_of_32_bits_are_nearest_first_on_both_sides(tmp_path):
     assert [(p.number, [c.samples.size for c in p.channels]) for p in survey] == [(n, [4, 4]) for n in range(3)]
 
 
-def test_both_frequencies_are_in_one_ping(tmp_path):
-    """The version with the most pages is first in each ping, in any order of the pages."""
+def test_both_frequencies_are_channel_sets_of_one_ping(tmp_path):
+    """In any order of the pages."""
     high, low = np.arange(6), np.arange(3)
-    pages = [sdf_page(1, high, high, 3502), sdf_page(2, low, low, 3501), sdf_page(2, high, high, 3502)]
-    pages += [sdf_page(3, high, high, 3502), sdf_page(3, low, low, 3501), sdf_page(9, low, low, 3501)]
-    pages.append(sdf_page(4, high, high, 3502))
-    survey = read_survey(recording(tmp_path, *pages))
-    assert [p.number for p in survey] == [1, 2, 3, 4]
-    assert [[c.samples.size for c in p.channels] for p in survey] == [[6, 6], [6, 6, 3, 3], [6, 6, 3, 3], [6, 6]]
-    assert "left out page of version 3501: none left of its number in version 3502 (1 times)" in survey.warnings
+    pages = [sdf_page(1, high, high, 3502), sdf_page(2, low, low, 3501, khz=400), sdf_page(2, high, high, 3502)]
+    pages += [sdf_page(3, high, high, 3502), sdf_page(3, low, low, 3501, khz=400), sdf_page(9, low, low, 3501, khz=400)]
+    path = recording(tmp_path, *pages)
+    survey = read_survey(path)
+    assert [(p.number, [(c.samples.size, c.index) for c in p.channels]) for p in survey] == [
+        (number, [(6, 1)] * 2) for number in (1, 2, 3)
+    ]
+    assert any("2 channel sets: 900 kHz in 3 pings; 400 kHz in 3 pings" in w for w in survey.warnings)
+    assert "left out pings without a channel of 900 kHz: 1" in survey.warnings
+    survey = read_survey(path, SurveyOptions(frequency_hz=400e3))
+    assert [(p.number, [(c.samples.size, c.index) for c in p.channels]) for p in survey] == [
+        (number, [(3, 0)] * 2) for number in (2, 3, 9)
+    ]
 
 
-def test_low_frequency_is_first_and_what_has_no_partner_left_out(tmp_path):
-    pages = [sdf_page(1, np.arange(6), NONE, 3502), sdf_page(1, np.arange(3), NONE, 3501)]
-    (ping,) = read_survey(recording(tmp_path, *pages)).pings
-    assert [c.samples.size for c in ping.channels] == [3, 6], "both have as many pages"
-    pages = [sdf_page(1, PORT, NONE, 3501), sdf_page(1, PORT, NONE, 3502), sdf_page(1, PORT, NONE, 3502)]
-    pages += [sdf_page(number, PORT, NONE, 3501) for number in (2, 3)]
+def test_pages_without_a_frequency_are_told_apart_by_their_version(tmp_path):
+    pages = [sdf_page(1, np.arange(n), NONE, version, khz=0) for n, version in ((6, 3502), (3, 3501), (4, 3501))]
     survey = read_survey(recording(tmp_path, *pages))
-    assert [len(p.channels) for p in survey] == [2, 1, 1]
-    assert "left out page of version 3502: none left of its number in version 3501 (1 times)" in survey.warnings
-    pages = []
-    for number in range(40):
-        pages += [sdf_page(number, PORT, STARBOARD, 3501), sdf_page(number + 5000, PORT, STARBOARD, 3502)]
-    survey = read_survey(recording(tmp_path, *pages))
-    assert [(p.number, len(p.channels)) for p in survey] == [(number, 2) for number in range(40)]
-    assert any("left out page of version 3502" in w and "(40 times)" in w for w in survey.warnings)
+    assert [[c.samples.size for c in p.channels] for p in survey] == [[3], [4]]
+    assert any("2 channel sets" in w for w in survey.warnings)
 
 
 @pytest.mark.parametrize("version", [3000, 3500, 3503])
@@ -136,29 +133,52 @@ def test_cut_last_page_is_left_out(tmp_path):
         survey = read_survey(path)
         assert [p.number for p in survey] == [0, 1]
         assert survey.warnings[0].startswith(f"the file ends inside its last page, as after a power failure: {left} ")
-    page = complete[:page_bytes]
     for length in (0, 3, 9, 12, 516, page_bytes - 1):
-        with pytest.raises(SurveyFileError, match=r"truncated|page version: got 'none'"):
-            read_survey(recording(tmp_path, page[:length]))
-    with pytest.raises(SurveyFileError, match="number of bytes: got 511, expected at least 512 for page version 3502"):
-        read_survey(recording(tmp_path, sdf_other(3502, bytes(511 - 8))))
+        with pytest.raises(SurveyFileError, match="pings: got '0"):
+            read_survey(recording(tmp_path, complete[:length]))
 
 
 @pytest.mark.parametrize(
-    ("offset", "value", "field"),
+    ("offset", "value", "note"),
     [
-        (0, 0xFFFFFFFE, "marker"),
-        (4, 7, "number of bytes"),
-        (4, (1 << 24) + 9, "number of bytes"),
-        (4, 5000, "truncated"),
-        (184, 256, "size of the header: got 256, expected 512"),
-        (516, 10, "number of port samples"),
-        (516, 2**32 - 1, "number of port samples"),
-        (536, 5, "number of starboard samples"),
+        (0, 0xFFFFFFFE, "no page at bytes 0 to 555"),
+        (4, 7, "no page at bytes 0 to 555"),
+        (4, 511, "no page at bytes 0 to 555"),
+        (4, (1 << 24) + 9, "no page at bytes 0 to 555"),
+        (4, 5000, "no page at bytes 0 to 555"),
+        (4, 560, "no page at bytes 0 to 555"),
+        (4, 0xFFFFFFFF, "no page at bytes 0 to 555"),
+        (8, 256, "no page at bytes 0 to 555"),
+        (76, 13, "page at byte 0 is left out: date and time: got (2013, 13, 10, 21, 13, 8)"),
+        (184, 256, "page at byte 0 is left out: size of the header: got 256, expected 512"),
+        (516, 10, "page at byte 0 is left out: number of port samples: got 10, expected up to 9"),
+        (516, 2**32 - 1, "page at byte 0 is left out: number of port samples: got 4294967295"),
+        (536, 5, "page at byte 0 is left out: number of starboard samples: got 5, expected up to 4"),
     ],
 )
-def test_damage_is_rejected(tmp_path, offset, value, field):
+def test_damaged_page_is_left_out(tmp_path, offset, value, note):
     content = bytearray(sdf_page(1, PORT, STARBOARD))
     struct.pack_into("<I", content, offset, value)
-    with pytest.raises(SurveyFileError, match=field):
+    survey = read_survey(recording(tmp_path, content, *(sdf_page(number, PORT, STARBOARD) for number in (2, 3))))
+    assert [ping.number for ping in survey] == [2, 3]
+    assert survey.warnings[0].startswith(note)
+    with pytest.raises(SurveyFileError):
         read_survey(recording(tmp_path, content))
+
+
+@pytest.mark.parametrize("lost", [1, 4, 12, 200, 600])
+def test_saturated_samples_are_not_taken_for_pages(tmp_path, lost):
+    """They have the value of the marker. A page between two damaged places is read: its content proves it."""
+    samples = np.full(3000, 0xFFFFFFFF, np.uint32)
+    samples[100::200], samples[101::200] = 600, 3501  # like the start of a page
+    pages = [sdf_page(number, samples, samples, rest=b"\xff" * 40 + b"end") for number in range(5)]
+    path = recording(tmp_path, pages[0], pages[1][lost:], pages[2], pages[3][lost:], pages[4])
+    survey = read_survey(path)
+    assert [ping.number for ping in survey] == [0, 2, 4]
+    assert all(np.array_equal(channel.samples, samples) for ping in survey for channel in ping.channels)
+    assert sum(f"{len(pages[0]) - lost} bytes are left out" in w for w in survey.warnings) == 2
+
+
+def test_file_of_another_kind_is_refused_by_its_first_bytes(tmp_path):
+    with pytest.raises(SurveyFileError, match="page at byte 0, marker: got '74686973', expected ffffffff"):
+        read_survey(recording(tmp_path, b"this is a text"))

@@ -48,6 +48,16 @@ def test_byte_limit_shortens_strips():
             list(strips(pings(3), length, overlap))
 
 
+def test_one_long_ping_counts_for_each_ping_of_its_strip():
+    mixed = [*pings(30), *pings(1, samples=1000), *pings(30)]
+    found = list(strips(mixed, 50, 2, max_bytes=10_000))
+    sizes = [len(strip.pings) * max(ping.channels[0].samples.size for ping in strip.pings) for strip in found]
+    assert max(sizes) <= 10_000
+    assert found[-1].first_row + len(found[-1].pings) == 61
+    with pytest.raises(SurveyFileError, match=r"survey, row 30: samples: got 'over 10000 bytes in 21 pings'"):
+        list(strips(mixed, 50, 10, max_bytes=5000))
+
+
 def test_strips_read_stream_lazily():
     read = []
 

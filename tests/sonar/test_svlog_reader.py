@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 import pytest
-from builders.surveys import svlog_packet, svlog_position, svlog_profile, svlog_session
+from builders.surveys import svlog_mavlink, svlog_packet, svlog_position, svlog_profile, svlog_session
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.readers import open_survey, read_survey
 from sonarpost.sonar.survey import Side
 
 RESULTS = np.array([0, 65_535])
@@ -31,11 +31,15 @@ def profile(number=1, clock_ms=1000000, channel=0, **values):
     return svlog_profile(number, clock_ms, channel, RESULTS, **values)
 
 
-def nmea(text):
+def sentence(text):
     total = 0
     for byte in text.encode():
         total ^= byte
-    return svlog_packet(109, f"${text}*{total:02X}\r\n".encode())
+    return f"${text}*{total:02X}\r\n"
+
+
+def nmea(*texts):
+    return svlog_packet(109, "".join(map(sentence, texts)).encode())
 
 
 def test_sides_are_paired_and_lost_profiles_leave_one_side(tmp_path):
@@ -89,8 +93,8 @@ def test_navigation_ages(tmp_path):
     survey = read_survey(recording(tmp_path, *packets))
     first, second, third = survey.pings
     assert (first.lat_deg, first.lon_deg) == pytest.approx((48.4, -68.8))
-    assert first.heading_deg == pytest.approx(359.5)
-    assert first.speed_mps == pytest.approx(1.5)
+    assert (first.heading_deg, first.course_deg) == pytest.approx((359.5, 359.5), abs=0.3)
+    assert first.speed_mps == pytest.approx(1.5, abs=0.005)
     assert second.lat_deg == pytest.approx(48.4)
     assert (third.lat_deg, third.speed_mps, third.heading_deg) == (None, None, 12.5)
     assert any(w.startswith("no position fix in 1 of 3") for w in survey.warnings)
@@ -111,10 +115,70 @@ def test_nmea_navigation(tmp_path):
     survey = read_survey(recording(tmp_path, *packets))
     first, second, third = survey.pings
     assert (first.lat_deg, first.lon_deg, first.heading_deg) == pytest.approx((48.4, -68.8, 33.5))
-    assert first.speed_mps == pytest.approx(1.0289, abs=1e-3)
+    assert (first.speed_mps, first.course_deg) == pytest.approx((1.0289, 90.0), abs=1e-3)
     assert second.lat_deg is None  # farther than a vehicle can have moved
     assert (third.lat_deg, third.heading_deg) == (None, None)
     assert "ignored NMEA sentence: checksum (1 times)" in survey.warnings
+
+
+@pytest.mark.parametrize("talker", ["GP", "GN", "HE", "II"])
+@pytest.mark.parametrize("ending", [True, False])
+def test_nmea_sentences_of_any_talker_with_or_without_checksum(tmp_path, talker, ending):
+    """Several sentences are in one packet, with spaces before them, and with different line ends."""
+    texts = [
+        "GGA,010203.00,3351.0000,S,15112.0000,E,4,12,0.7,3.0,M,20.0,M,,",
+        "VTG,271.5,T,,M,4.0,N,7.4,K,A",
+        "THS,33.5,A",
+    ]
+    lines = [sentence(talker + text).strip() for text in texts]
+    lines = lines if ending else [line.partition("*")[0] for line in lines]
+    for packet in ("\r\n".join(lines) + "\r\n", "  " + " \n ".join(lines) + "\0", "".join(lines)):
+        survey = read_survey(recording(tmp_path, svlog_packet(109, packet.encode()), profile()))
+        (ping,) = survey.pings
+        assert (ping.lat_deg, ping.lon_deg, ping.heading_deg) == pytest.approx((-33.85, 151.2, 33.5))
+        assert (ping.speed_mps, ping.course_deg) == pytest.approx((2.0578, 271.5), abs=1e-3)
+        assert ("accepted NMEA sentence without checksum (3 times)" in survey.warnings) is not ending
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "GPHDT,33.5",
+        "GPHDT,400,T",
+        "GPTHS,33.5,V",
+        "GPRMC,211300,V,4824.0,N,06848.0,W,2.0,90.0,100913",
+        "GPGGA,1,4824.0,N,068",
+        "GPGGA,1,4824.0,,06848.0,W,1",
+        "GPGLL,4824.0,N,06848.0,W,211300,V",
+        "GPVTG,,T,,M,0.1,N",
+        "",
+        "$",
+        "\xff",
+    ],
+)
+def test_incomplete_or_invalid_nmea_sentence_has_no_values(tmp_path, text):
+    (ping,) = read_survey(recording(tmp_path, svlog_packet(109, f"${text}\r\n".encode("latin-1")), profile())).pings
+    assert (ping.lat_deg, ping.heading_deg, ping.course_deg) == (None, None, None)
+
+
+def test_course_needs_speed_and_attitude_is_that_of_the_vehicle(tmp_path):
+    attitude = svlog_mavlink("ATTITUDE", yaw=-math.pi / 2, pitch=0.1, roll=-0.2)
+    slow = nmea("GPRMC,211300,A,4824.000,N,06848.000,W,0.1,90.0,100913,,")
+    (ping,) = read_survey(recording(tmp_path, attitude, slow, profile(heading=12.5))).pings
+    assert (ping.heading_deg, ping.course_deg) == (pytest.approx(270), None)
+    assert (ping.pitch_deg, ping.roll_deg) == pytest.approx((5.7296, -11.459), abs=1e-3)
+
+
+@pytest.mark.parametrize("recorded", ["MAVLink", "NMEA"])
+def test_without_a_heading_the_recorded_course_is_used(tmp_path, recorded):
+    message = nmea("GPRMC,211300,A,4824.000,N,06848.000,W,2.0,315.0,100913,,")
+    if recorded == "MAVLink":
+        values = {"lat": 484000000, "lon": -688000000, "vx": 100, "vy": -100, "hdg": 65_535}
+        message = svlog_mavlink("GLOBAL_POSITION_INT", **values)
+    survey = read_survey(recording(tmp_path, *(p for n in range(9) for p in (message, profile(n, 1_000_000 + 50 * n)))))
+    assert [ping.heading_deg for ping in survey] == pytest.approx([315.0] * 9)
+    assert survey.pings[0].heading_sigma_deg == 10
+    assert any("heading is that of the course over ground" in w for w in survey.warnings)
 
 
 @pytest.mark.parametrize(
@@ -123,6 +187,11 @@ def test_nmea_navigation(tmp_path):
     + [
         json.dumps({"message": {"type": "GLOBAL_POSITION_INT", "lat": lat, "lon": 5, "hdg": hdg}}).encode()
         for lat, hdg in (("x", 65_535), (None, []), (1e300, 1e300), (True, -5), (HUGE, HUGE), (math.inf, math.nan))
+    ]
+    + [
+        json.dumps({"message": {"type": kind, "yaw": value, "time_unix_usec": value}}).encode()
+        for kind in ("ATTITUDE", "SYSTEM_TIME", [], None)
+        for value in ("x", 1e300, -1e300, HUGE, None, math.nan)
     ],
 )
 def test_hostile_mavlink_is_ignored(tmp_path, payload):
@@ -151,24 +220,72 @@ def test_impossible_profile_is_left_out(tmp_path, values, text):
         read_survey(recording(tmp_path, profile(**values)))
 
 
-def test_damage_is_rejected(tmp_path):
-    path = recording(tmp_path, profile(), profile(2))
+@pytest.mark.parametrize("channel", [0, 1, 7, 255])
+@pytest.mark.parametrize("angle", [1.0, 90.0, 179.0, 181.0, 270.0, 359.0, -1.0, -90.0, -179.0, 450.0, -270.0])
+def test_side_is_that_of_the_look_angle(tmp_path, channel, angle):
+    side = Side.STARBOARD if angle in (1, 90, 179, 450, -270) else Side.PORT
+    survey = read_survey(recording(tmp_path, profile(channel=channel, look_angle=angle), profile(2, look_angle=0.0)))
+    assert survey.sides() == (side,)
+    assert len(survey.pings) == 1
+    assert f"only 1 transducer, to {side}" in survey.warnings
+    assert "skipped profile: channel 0 has a look angle of 0 degrees, thus no side (1 times)" in survey.warnings
+
+
+@pytest.mark.parametrize("angle", [0.0, 180.0, -180.0, 360.0, math.nan, math.inf])
+def test_side_is_guessed_from_the_channel_number_if_no_profile_has_a_look_angle(tmp_path, angle):
+    packets = [profile(n, 1_000_000 + 50 * n, channel, look_angle=angle) for n in range(3) for channel in (0, 1, 2)]
+    survey = read_survey(recording(tmp_path, *packets))
+    assert sides(survey) == ["ps"] * 3
+    assert "side guessed from the channel number, without a look angle (6 times)" in survey.warnings
+    assert "skipped profile: channel 2 has no look angle, thus no side (3 times)" in survey.warnings
+    with_angle = profile(9, 1_009_000, 0, look_angle=90.0)
+    survey = read_survey(recording(tmp_path, *packets, with_angle))
+    assert [p.number for p in survey] == [9]
+
+
+def test_transducers_of_one_side_are_kept_apart(tmp_path):
+    packets = [profile(n, 1_000_000 + 50 * n, channel, look_angle=80.0) for n in range(3) for channel in (3, 5)]
+    with open_survey(recording(tmp_path, *packets)) as source:
+        assert [len(each.channels) for each in source.pings()] == [1] * 3
+        assert [each.ping_count for each in source.info.channel_sets] == [3, 3]
+        assert "only 2 transducers, to starboard" in source.info.warnings
+
+
+def test_damaged_packets_are_left_out_with_their_place(tmp_path):
+    packets = [profile(n, 1_000_000 + 50 * n) for n in range(4)]
+    path = recording(tmp_path, *packets)
     complete = path.read_bytes()
-    session_bytes = len(svlog_session())
-    for place, raw, field in (
-        (0, b"X", "start"),
-        (session_bytes + 20, b"\xff\xff", "checksum"),
-        (session_bytes + 2, b"\xff\xff", "truncated"),
+    second = len(svlog_session()) + len(packets[0])
+    for place, raw, note in (
+        (second + 20, b"\xff\xff", f"packet at byte {second} is left out: checksum: got "),
+        (second + 2, b"\xff\xff", f"no packet at bytes {second} to {second + len(packets[1]) - 1}"),
+        (second, b"X", f"no packet at bytes {second} to {second + len(packets[1]) - 1}"),
     ):
         damaged = bytearray(complete)
         damaged[place : place + len(raw)] = raw
         path.write_bytes(damaged)
-        with pytest.raises(SurveyFileError, match=field):
-            read_survey(path)
+        survey = read_survey(path)
+        assert [p.number for p in survey] == [0, 2, 3]
+        assert survey.warnings[0].startswith(note)
     for packet, field in ((profile(count=3), "number of results"), (svlog_packet(2198, bytes(20)), "at least 52")):
+        survey = read_survey(recording(tmp_path, packet, *packets))
+        assert len(survey.pings) == 4
+        assert field in survey.warnings[0]
         with pytest.raises(SurveyFileError, match=field):
             read_survey(recording(tmp_path, packet))
     path.write_bytes(complete[:-1])
     survey = read_survey(path)
-    assert (survey.sides(), len(survey.pings)) == ((Side.PORT,), 1)
+    assert (survey.sides(), len(survey.pings)) == ((Side.PORT,), 3)
     assert survey.warnings[0].startswith("the file ends inside its last packet")
+
+
+def test_samples_that_look_like_packets_hide_no_packet_after_damage(tmp_path):
+    """The value 21058 is the bytes of the magic; a length and zeros follow it."""
+    results = np.array([0x5242, 3000, 2198, 0] * 20 + [0] * 400)
+    packets = [svlog_profile(n, 1_000_000 + 50 * n, 0, results) for n in range(8)]
+    raw = bytearray(svlog_session() + b"".join(packets))
+    raw[len(svlog_session()) + len(packets[0]) :][:3] = b"xxx"
+    del raw[len(svlog_session()) + len(packets[0]) + 3]
+    path = tmp_path / "line.svlog"
+    path.write_bytes(raw)
+    assert [p.number for p in read_survey(path)] == [0, 2, 3, 4, 5, 6, 7]

@@ -1,4 +1,4 @@
-"""Dual-frequency surveys: images use the first channel of each side."""
+"""Dual-frequency surveys: images are of the highest frequency, or of the one that is chosen."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders.two_frequencies import files_of, read_both
+from builders.two_frequencies import FIRST_HZ, SECOND_HZ, files_of, read_both
 
 from sonarpost.cli.main import main
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
@@ -16,7 +16,10 @@ from sonarpost.sonar.ground_range import ground_range_image
 from sonarpost.sonar.survey import Side
 
 SECOND = pytest.mark.parametrize(("samples", "range_m"), [(256, 10.0), (256, 90.0), (1024, 30.0), (64, 30.0)])
-NOTE = "several channels a side in 120 of 120 pings: images and contacts are of the first, 400 kHz, slant range 30 m"
+NOTE = (
+    "2 channel sets: 900 kHz in 120 pings; 400 kHz in 120 pings; "
+    "images and contacts are of 900 kHz (option frequency_hz)"
+)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +28,7 @@ def survey():
 
 
 @SECOND
-def test_images_and_bottom_track_are_of_the_first_channel(samples, range_m, survey, tmp_path):
+def test_images_and_bottom_track_are_of_the_highest_frequency(samples, range_m, survey, tmp_path):
     alone, both = read_both(survey, tmp_path, samples, range_m)
     for side in Side:
         assert both.waterfall(side).shape == (120, 256)
@@ -41,7 +44,7 @@ def test_images_and_bottom_track_are_of_the_first_channel(samples, range_m, surv
 
 
 @pytest.mark.parametrize(("samples", "range_m"), [(256, 10.0), (1024, 30.0)])
-def test_commands_use_the_first_channel_and_info_names_it(samples, range_m, survey, tmp_path, capsys):
+def test_commands_use_the_highest_frequency_and_info_names_both(samples, range_m, survey, tmp_path, capsys):
     alone, both = files_of(survey, tmp_path, samples, range_m)
 
     def printed(path, *arguments):
@@ -55,10 +58,13 @@ def test_commands_use_the_first_channel_and_info_names_it(samples, range_m, surv
         assert images[0] == images[1]
     assert printed(alone, "export") == printed(both, "export")
     assert printed(both, "export").splitlines()[1].endswith(",30")
-    info = json.loads(printed(both, "info", "--json"))
-    assert info["samples"] == sorted({256, samples})
-    assert info["frequency_hz"] == [400e3, 900e3]
-    assert info["slant_range_m"] == [min(30.0, range_m), max(30.0, range_m)]
-    assert info["warnings"][-1] == NOTE
+    for arguments, samples_of, frequency_hz, used_m in (
+        ([], 256, FIRST_HZ, 30.0),
+        (["--frequency", "400"], samples, SECOND_HZ, range_m),
+    ):
+        info = json.loads(printed(both, "info", "--json", *arguments))
+        assert (info["samples"], info["frequency_hz"]) == ([samples_of], [frequency_hz])
+        assert info["slant_range_m"] == [used_m, used_m]
+        assert [each["frequency_hz"] for each in info["channel_sets"]] == [FIRST_HZ, SECOND_HZ]
     assert f"  note: {NOTE}\n" in printed(both, "info")
-    assert "several channels" not in printed(alone, "info")
+    assert "channel sets" not in printed(alone, "info")

@@ -27,7 +27,11 @@ DESCRIPTION_ERRORS = [
     ('positions = "degrees"', "", "positions"),
     ("sonar_id", "sonarid", "sonarid"),
     ("line.csv", "absent.csv", "No such file"),
-    ("line.port.png", "absent.png", "not a regular file"),
+    ("line.port.png", "absent.png", "No such file"),
+    ("line.port.png", "./line.port.png", "port: got './line.port.png', expected"),
+    ("line.port.png", "a\\u0000b", "port"),
+    ("line.csv", "..", "navigation"),
+    ("line.csv", 128 * "é", "navigation"),
     ("sonar_id =", "sonar_id", "TOML"),
     ('positions = "degrees"\n', 'positions = "degrees"\n[columns]\nlat = "a"\n', "columns"),
     ('positions = "degrees"\n', 'positions = "degrees"\n[columns]\nlat_deg = "y"\n', "no 'y'"),
@@ -88,11 +92,11 @@ def test_nan_navigation_is_unknown_and_out_of_range_is_reported(small_survey, tm
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", ["scotsman-iver2", "000_1236"])
 def test_derived_images_match_recordings(data_dir, tmp_path, name):
-    derived = data_dir / "surveys" / "derived"
+    for part in ("port.png", "stbd.png", "nav.csv"):
+        (tmp_path / part).symlink_to(data_dir / "surveys" / "derived" / f"{name}.xtf.{part}")
     path = tmp_path / "line.waterfall.toml"
     path.write_text(
-        f'port = "{derived}/{name}.xtf.port.png"\nstarboard = "{derived}/{name}.xtf.stbd.png"\n'
-        f'navigation = "{derived}/{name}.xtf.nav.csv"\n'
+        'port = "port.png"\nstarboard = "stbd.png"\nnavigation = "nav.csv"\n'
         'port_order = "farthest_first"\npositions = "degrees"\nknots = true\nzero_is_unknown = true\n'
         '[columns]\nlat_deg = "y_or_lat"\nlon_deg = "x_or_lon"\ntime_utc = "utc"\nslant_range_m = "slant_range"\n'
         'heading_deg = "heading"\naltitude_m = "alt"\nspeed_mps = "speed"\n'

@@ -110,7 +110,7 @@ def test_memory_does_not_depend_on_the_length(tmp_path, monkeypatch):
 
 def test_recording_without_line_is_rejected(tmp_path):
     survey = line(pings=30)
-    bare = replace(survey, pings=tuple(replace(ping, heading_deg=None) for ping in survey.pings))
+    bare = replace(survey, pings=tuple(replace(ping, lat_deg=None, lon_deg=None) for ping in survey.pings))
     for changed, message in ((survey, "straight line of at least 20 m"), (bare, "position, heading and altitude")):
         with pytest.raises(SurveyFileError, match=message):
             write_waterfalls(make_xtf(changed, tmp_path), tmp_path, 0.1)

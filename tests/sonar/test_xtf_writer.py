@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import SurveyFileError
+from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
@@ -62,7 +63,8 @@ def test_missing_navigation_is_read_as_none(small_survey, tmp_path):
     read = read_survey(tmp_path / "a.xtf")
     for ping in read:
         assert {ping.lat_deg, ping.lon_deg, ping.heading_deg, ping.altitude_m, ping.speed_mps} == {None}
-    assert read.warnings == ("no position fix in 5 of 5 pings, the first in row 0",)
+    missing = tuple(f"no {what} in 5 of 5 pings, the first in row 0" for what in ("position fix", "heading"))
+    assert read.warnings == missing
     # One ping without navigation; a heading of 0 differs from an unknown one.
     north = tuple(dataclasses.replace(ping, heading_deg=0.0) for ping in survey.pings[1:])
     write_xtf(dataclasses.replace(survey, pings=(without_navigation[0], *north)), tmp_path / "a.xtf")
@@ -79,7 +81,10 @@ def test_dual_frequency_and_ping_without_one_side(small_survey, tmp_path):
     pings[2] = dataclasses.replace(pings[2], channels=pings[2].channels[1:])
     survey = dataclasses.replace(survey, pings=tuple(pings))
     write_xtf(survey, tmp_path / "a.xtf")
-    assert_same(read_survey(tmp_path / "a.xtf"), survey)
+    first = tuple(dataclasses.replace(ping, channels=ping.channels[:2]) for ping in pings)
+    assert_same(read_survey(tmp_path / "a.xtf"), dataclasses.replace(survey, pings=first))
+    second = read_survey(tmp_path / "a.xtf", SurveyOptions(frequency_hz=262_500.0))
+    assert_same(second, dataclasses.replace(survey, pings=(dataclasses.replace(pings[1], channels=(low,)),)))
 
 
 @given(

@@ -20,12 +20,23 @@ import numpy.typing as npt
 
 from sonarpost.detection.matched_filter import Peak
 from sonarpost.detection.normalisation import LevelGrid
+from sonarpost.errors import SurveyFileError
+from sonarpost.limits import limit
 from sonarpost.sonar.survey import FloatImage
 
 Chips = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int64]
 
 PIXEL_M: Final = 0.125
+MAX_PIXELS: Final = limit(
+    1 << 25,
+    "pixels",
+    "claims",
+    surface="recording",
+    source="recording",
+    resource="seabed of one side of a strip, in pixels of 0.125 m",
+    at_limit="the recording is refused",
+)
 FINE_SHAPE: Final = (40, 60)
 """Rows along-track and columns across-track of the fine plane."""
 FINE_CENTRE: Final = (20, 16)
@@ -94,17 +105,22 @@ class ChipBatch:
 
 
 def ground_plane(grid: LevelGrid) -> GroundPlane:
-    """Project one side of a survey to the seabed. A grid without first returns (an image) is resampled only."""
+    """Project one side of a survey to the seabed. A grid without first returns (an image) is resampled only.
+
+    Raises:
+        SurveyFileError: The seabed has more than `MAX_PIXELS`.
+    """
     pings, cells = grid.level.shape
     altitude_m = np.minimum(grid.first_return_cell, cells) * grid.cell_across_m
     finite = np.isfinite(grid.level)
     value, weight = np.where(finite, grid.level, np.float32(0.0)), finite.astype(np.float32)
     furthest_m = max(float((cells * grid.cell_across_m) ** 2 - np.min(altitude_m) ** 2), 0.0) ** 0.5
-    columns = max(1, int(furthest_m / PIXEL_M))
+    columns, rows = max(1, int(furthest_m / PIXEL_M)), max(1, int(pings * grid.row_along_m / PIXEL_M))
+    if max(pings, rows) * columns > MAX_PIXELS:
+        raise SurveyFileError("seabed of a strip", "pixels", f"{rows} × {columns}", f"at most {MAX_PIXELS}")
     edges_m = np.arange(columns + 1) * PIXEL_M
     slant_cells = np.sqrt(edges_m[None, :] ** 2 + altitude_m[:, None] ** 2) / grid.cell_across_m
     value, weight = (_binned_across(plane, slant_cells) for plane in (value, weight))
-    rows = max(1, int(pings * grid.row_along_m / PIXEL_M))
     edges = np.minimum(np.arange(rows + 1) * (PIXEL_M / grid.row_along_m), pings)
     value, weight = (_binned_along(plane, edges) for plane in (value, weight))
     # A column covers a slant interval whose length depends on range; its share of known cells does not.

@@ -68,6 +68,7 @@ class Detection:
         shadow_samples: Length of the shadow in samples.
         position_sigma_m: One standard deviation of `position` along the worse axis of its error ellipse, from the error
             budget of the survey's options; None without a position.
+        position_note: Why the position may be wrong by more than that; None if nothing is known against it.
     """
 
     side: Side
@@ -99,6 +100,7 @@ class Detection:
     position_sigma_m: float | None = None
     p_mine_like: float | None = None
     p_other_object: float | None = None
+    position_note: str | None = None
 
 
 LISTED_CONFIDENCES: Final = (1.0, 0.5, 0.3, 0.1)
@@ -299,6 +301,7 @@ def detection_of(
         position_sigma_m=None if reference is None else reference.sigma_m,
         p_mine_like=contact.p_mine_like,
         p_other_object=contact.p_other_object,
+        position_note=ping.position_note,
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.detection.settings import DetectorSettings
+from sonarpost.limits import limit
 from sonarpost.sonar.bottom_track import altitudes_m
 from sonarpost.sonar.geometry import ping_spacing_m
 from sonarpost.sonar.survey import FloatImage, Side, Survey
@@ -23,6 +24,15 @@ IntVector = npt.NDArray[np.int64]
 FloatVector = npt.NDArray[np.float64]
 FloatTable = npt.NDArray[np.float64]
 
+MIN_ROW_M: Final = limit(
+    0.001,
+    "m",
+    "claims",
+    surface="recording",
+    source="recording",
+    resource="mean distance between pings, from which the filters take their sizes in pings",
+    at_limit="the distance of the settings is assumed",
+)
 _EXCLUDED_RISE = -4.0
 """Rise in octaves that excludes a cell from the bottom path."""
 _NEAR_SEABED_M: Final = 5.0
@@ -88,6 +98,8 @@ def normalise_side(
     if amplitude.shape[1] < 16 or not np.isfinite(amplitude).any():
         return None
     measured_m = ping_spacing_m(survey)
+    if measured_m is not None and measured_m < MIN_ROW_M:
+        measured_m = None
     cell_m = spacing_m * samples_per_cell
     if altitude_m is None:
         altitude_m = altitudes_m(survey)

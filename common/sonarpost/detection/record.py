@@ -28,6 +28,7 @@ def contact_record(detection: Detection, origin: FileOrigin, vehicle_id: str, so
         lat_deg=d.position.lat_deg if d.position else None,
         lon_deg=d.position.lon_deg if d.position else None,
         position_sigma_m=d.position_sigma_m,
+        position_note=d.position_note,
         depth_m=d.depth_m,
         altitude_m=d.altitude_m,
         heading_deg=d.heading_deg,

@@ -26,6 +26,7 @@ from sonarpost.detection.association import DetectionPlace
 from sonarpost.detection.detector import Detection, search
 from sonarpost.detection.difficulty import Difficulty, combined
 from sonarpost.detection.settings import DetectorSettings
+from sonarpost.sonar.channel_sets import is_same_frequency
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.source import Strip, SurveySource, strips
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
@@ -155,12 +156,12 @@ class StreamEnd(Generic[T]):
 
 
 def _same_channels(one: Ping, other: Ping) -> bool:
-    """Return whether two pings can be rows of one image: the same channels, sampled alike."""
+    """Return whether two pings can be rows of one image: the same sides, sampled alike."""
     for side in Side:
-        ours = [channel for channel in one.channels if channel.side is side]
-        theirs = [channel for channel in other.channels if channel.side is side]
-        # A dual-frequency sonar has two channels a side, each with its own range; a file keeps their order.
-        if len(ours) != len(theirs) or not all(map(_same_sampling, ours, theirs)):
+        ours, theirs = one.channel(side), other.channel(side)
+        if (ours is None) != (theirs is None):
+            return False
+        if ours is not None and theirs is not None and not _same_sampling(ours, theirs):
             return False
     return True
 
@@ -170,6 +171,7 @@ def _same_sampling(one: ChannelPing, other: ChannelPing) -> bool:
         one.samples.dtype == other.samples.dtype
         and len(one.samples) == len(other.samples)
         and math.isclose(one.slant_range_m, other.slant_range_m, rel_tol=_RANGE_TOLERANCE)
+        and is_same_frequency(one, other)
     )
 
 

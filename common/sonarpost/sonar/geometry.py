@@ -12,7 +12,7 @@ track, at ground range g, altitude h and slant range r = sqrt(g^2 + h^2):
 * altitude, e: c = e h/g; near the nadir, where h/g has no bound, limited to the possible range of g
 * slope of the bottom, b radians: the bottom at g is g tan(b) higher or lower, which is an altitude error
 * time of the position relative to the ping, t: a = speed t
-* layback of a towed body, l: a
+* layback of a towed body: a = l and 5 % of the layback; c = the layback times the swing of the body (3 degrees)
 """
 
 from __future__ import annotations
@@ -37,6 +37,10 @@ _TRACK_SMOOTHING_S: Final = 4.0
 _MAX_SPEED_RATIO: Final = 1.5
 """Maximum ratio of the distances by speed and by positions; a confusion of knots and m/s is 1.94."""
 _MAX_LATITUDE_DEG: Final = 89.0
+_LAYBACK_SIGMA: Final = 0.05
+"""Standard deviation of a layback as a fraction: the cable sags."""
+_TOW_SWING_RAD: Final = math.radians(3)
+"""Standard deviation of the direction of a towed body, seen from the ship, relative to the track."""
 _DEFAULT_SPEED_MPS: Final = 2.0
 """Typical speed of a survey vehicle, for the time contribution of a ping without speed."""
 
@@ -276,15 +280,20 @@ def georeference(
     range_sigma_m = math.hypot(slant_m * budget.sound_speed, channel.sample_spacing_m / math.sqrt(12))
     slope_m = ground_m * math.tan(math.radians(budget.bottom_slope_deg))
     height_sigma_m = math.hypot(altitude_sigma_m, slope_m)
-    across_m = math.hypot(
-        budget.position_m, _ground_sigma_m(ground_m, altitude_m, slant_m, range_sigma_m, height_sigma_m)
-    )
     speed_mps = _DEFAULT_SPEED_MPS if ping.speed_mps is None else ping.speed_mps
+    heading_sigma_deg = budget.heading_deg if ping.heading_sigma_deg is None else ping.heading_sigma_deg
+    layback_m = options.mounting.layback_m + (ping.layback_m or 0.0)
+    across_m = math.hypot(
+        budget.position_m,
+        _ground_sigma_m(ground_m, altitude_m, slant_m, range_sigma_m, height_sigma_m),
+        layback_m * math.sin(_TOW_SWING_RAD),
+    )
     along_m = math.hypot(
         budget.position_m,
-        ground_m * math.radians(budget.heading_deg),
+        ground_m * math.radians(heading_sigma_deg),
         speed_mps * budget.time_s,
-        budget.layback_m if options.mounting.layback_m else 0.0,
+        budget.layback_m if layback_m else 0.0,
+        layback_m * _LAYBACK_SIGMA,
     )
     bearing_deg = (ping.heading_deg + (90 if side is Side.STARBOARD else -90)) % 360
     return GeoReference(position, ground_m, across_m, along_m, bearing_deg)

@@ -31,6 +31,8 @@ import tifffile
 from PIL import Image
 
 from sonarpost.errors import SurveyFileError
+from sonarpost.files import read_regular
+from sonarpost.limits import limit
 
 GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 _Pixels = npt.NDArray[Any]
@@ -39,13 +41,34 @@ _Pixels = npt.NDArray[Any]
 MAX_PIXELS: Final = 1 << 26
 """Enough for a survey of 30,000 pings of 2,000 samples; snippets are much smaller."""
 MAX_FILE_BYTES: Final = 1 << 28
-_MAX_DECODED_BYTES: Final = 8 * MAX_PIXELS
+MAX_DECODED_BYTES: Final = limit(
+    2 * MAX_PIXELS,
+    "bytes",
+    "claims",
+    surface="image files",
+    source="file",
+    resource="pixels that its header states",
+    at_limit="it is refused before it is decoded",
+)
+MAX_EXPANSION: Final = limit(
+    2000,
+    "bytes for each byte of the file",
+    "claims",
+    surface="image files",
+    source="file",
+    resource="pixels that its header states, beyond 1 MiB",
+    at_limit="it is refused before it is decoded",
+)
 EXPECTED: Final = "a JPEG, PNG or TIFF image"
 
 _PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+_PNG_CHANNELS: Final = {0: 1, 2: 3, 3: 4, 4: 2, 6: 4}
+"""Channels by colour type; a palette is expanded."""
 _PNG_END: Final = b"IEND\xaeB`\x82"
 _JPEG_SIGNATURE: Final = b"\xff\xd8\xff"
 _TIFF_SIGNATURES: Final = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
+_PALETTE: Final = 3
+"""Photometric interpretation of a TIFF with a palette."""
 _ORIENTATION_TAG: Final = 0x0112
 _COLOUR_NOTE: Final = "colour converted to grey (0.299 R + 0.587 G + 0.114 B)"
 _ALPHA_NOTE: Final = "alpha channel applied, transparent pixels are black"
@@ -75,12 +98,7 @@ def read_any_image(path: Path) -> DecodedFile:
         SurveyFileError: Not such a file, damaged, truncated, or larger than `MAX_PIXELS` or `MAX_FILE_BYTES`.
     """
     try:
-        if not path.is_file():
-            raise SurveyFileError(str(path), "", "not a regular file or absent", EXPECTED)
-        size_bytes = path.stat().st_size
-        if size_bytes > MAX_FILE_BYTES:
-            raise SurveyFileError(str(path), "file size", size_bytes, f"at most {MAX_FILE_BYTES} bytes")
-        raw = path.read_bytes()
+        raw = read_regular(path, MAX_FILE_BYTES)
     except OSError as error:
         raise SurveyFileError(str(path), "", error.strerror or str(error), "a readable image") from error
     if raw.startswith(_PNG_SIGNATURE):
@@ -107,7 +125,7 @@ def _decode_png(raw: bytes, path: Path) -> tuple[_Pixels, list[str]]:
     if len(raw) < 33 or raw[12:16] != b"IHDR":
         raise SurveyFileError(str(path), "IHDR", raw[8:16], "a PNG header")
     columns, rows, depth, colour = struct.unpack(">IIBB", raw[16:26])
-    _check_size(path, rows, columns)
+    _check_size(path, rows, columns, max(depth, 8) * _PNG_CHANNELS.get(colour, 4), raw)
     if _PNG_END not in raw:
         # Pillow accepts a file that ends after the last pixel, before the checksum.
         raise SurveyFileError(str(path), "IEND", "absent", "an end chunk: the file is truncated")
@@ -124,7 +142,7 @@ def _decode_png(raw: bytes, path: Path) -> tuple[_Pixels, list[str]]:
 def _decode_jpeg(raw: bytes, path: Path) -> tuple[_Pixels, list[str]]:
     notes: list[str] = []
     with Image.open(io.BytesIO(raw), formats=["JPEG"]) as image:
-        _check_size(path, image.height, image.width)
+        _check_size(path, image.height, image.width, 8 * len(image.getbands()), raw)
         orientation = image.getexif().get(_ORIENTATION_TAG, 1)
         return _oriented(_pillow_pixels(image, notes), orientation, notes), notes
 
@@ -134,14 +152,15 @@ def _decode_tiff(raw: bytes, path: Path) -> tuple[_Pixels, list[str]]:
     with tifffile.TiffFile(io.BytesIO(raw)) as file:
         page = file.pages.first
         rows, columns = int(page.imagelength), int(page.imagewidth)
-        _check_size(path, rows, columns)
-        if int(page.imagedepth) != 1 or (page.is_tiled and int(page.tilewidth) * int(page.tilelength) > MAX_PIXELS):
-            raise SurveyFileError(str(path), "layout", "a volume or a giant tile", "a two-dimensional image")
         channels, bits = int(page.samplesperpixel), int(page.bitspersample)
+        pixel_bits = max(bits, 8) * (channels if int(page.photometric) != _PALETTE else 3)
+        _check_size(path, rows, columns, pixel_bits, raw)
+        if page.is_tiled:
+            _check_size(path, int(page.tilelength), int(page.tilewidth), pixel_bits, raw)
+        if int(page.imagedepth) != 1:
+            raise SurveyFileError(str(path), "layout", "a volume", "a two-dimensional image")
         if channels > 4:
             raise SurveyFileError(str(path), "channels", channels, "1 to 4")
-        if rows * columns * channels * bits > 8 * _MAX_DECODED_BYTES:
-            raise SurveyFileError(str(path), "size", f"{channels} × {bits} bits", f"at most {_MAX_DECODED_BYTES} bytes")
         if len(file.pages) > 1:
             notes.append(f"first of {len(file.pages)} pages used")
         orientation = int(page.tags.valueof(_ORIENTATION_TAG, 1))
@@ -166,9 +185,9 @@ def _decode_tiff(raw: bytes, path: Path) -> tuple[_Pixels, list[str]]:
 def _tiff_colours(page: tifffile.TiffPage, pixels: _Pixels, path: Path, notes: list[str]) -> _Pixels:
     """Return grey or RGB of 8 or 16 bits, with the alpha channel if there is one."""
     photometric, channels = int(page.photometric), int(page.samplesperpixel)
-    if photometric == 3 and channels == 1 and page.colormap is not None:
+    if photometric == _PALETTE and channels == 1 and page.colormap is not None:
         notes.append(_PALETTE_NOTE)
-        return np.moveaxis(np.asarray(page.colormap)[:, pixels] >> 8, 0, -1).astype(np.uint8)
+        return np.moveaxis((np.asarray(page.colormap) >> 8).astype(np.uint8)[:, pixels], 0, -1)
     # Accepted: white is zero, black is zero, RGB; rejected: masks and print colours.
     if photometric not in ((0, 1) if channels < 3 else (2,)):
         expected = "grey, RGB or a palette"
@@ -221,7 +240,7 @@ def _pillow_pixels(image: Image.Image, notes: list[str]) -> _Pixels:
     if mode in ("L", "LA", "RGB", "RGBA", "I", "F"):
         return np.asarray(image)
     if mode.startswith("I;16"):
-        return np.asarray(image).astype(np.uint16)
+        return np.asarray(image).astype(np.uint16, copy=False)
     return np.asarray(image.convert("RGB"))  # the print colours of a JPEG
 
 
@@ -262,6 +281,10 @@ def _grey(pixels: _Pixels, notes: list[str]) -> GreyImage:
     return grey
 
 
-def _check_size(path: Path, rows: int, columns: int) -> None:
+def _check_size(path: Path, rows: int, columns: int, bits: int, raw: bytes) -> None:
+    """Check the size that a header states; `bits` is the number for each pixel."""
     if not (rows and columns and rows * columns <= MAX_PIXELS):
         raise SurveyFileError(str(path), "size", f"{columns} × {rows} px", f"1 to {MAX_PIXELS} pixels")
+    max_bytes = min(MAX_DECODED_BYTES, MAX_EXPANSION * len(raw) + (1 << 20))
+    if rows * columns * bits > 8 * max_bytes:
+        raise SurveyFileError(str(path), "size", f"{columns} × {rows} × {bits} bits", f"at most {max_bytes} bytes")

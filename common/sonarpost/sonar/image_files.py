@@ -114,7 +114,7 @@ def _unused_reason(path: Path) -> str:
 
 
 def write_tiff(path: Path, image: GreyImage, description: str | None = None) -> None:
-    """Write a grey image as uncompressed TIFF, atomically. The same image and description give the same bytes.
+    """Write a grey image as TIFF, atomically, with lossless compression (deflate), which common readers support.
 
     The image has shape (rows, columns), uint8 or uint16. The description, ASCII, is that of the TIFF tag.
 
@@ -140,7 +140,7 @@ def tiff_bytes(path: Path, image: GreyImage, description: str | None = None) -> 
         image,
         byteorder="<",
         photometric="minisblack",
-        compression=None,
+        compression="zlib",
         software=False,  # a version number would make the bytes depend on the installation
         datetime=None,
         metadata=None,

@@ -25,6 +25,8 @@ _MAX_SPEED_MPS: Final = 30.0
 """Maximum speed of a carrier of a side-scan sonar."""
 _MAX_CORRECTION_M: Final = 100.0
 """Maximum correction of the dead reckoning at once, when a vehicle surfaces."""
+_MAX_GAP_S: Final = 600.0
+"""Longest time between fixes that counts: a longer one may be a damaged time."""
 _NEW_PLACE_PINGS: Final = 5
 """Number of consecutive fixes that agree with each other and are then accepted at any distance."""
 
@@ -39,9 +41,9 @@ def is_plausible(name: str, value: float) -> bool:
 
 
 def position_in_degrees(lat_deg: float, lon_deg: float) -> Position | None:
-    """Return a position as stored in a file; None if it is not finite, 0/0 or out of range."""
-    valid = math.isfinite(lat_deg) and math.isfinite(lon_deg) and abs(lat_deg) <= 90 and abs(lon_deg) <= 180
-    return Position(lat_deg, lon_deg) if valid and (lat_deg, lon_deg) != (0.0, 0.0) else None
+    """Return a position as stored in a file, with a longitude of -180 to 360; None if it is 0/0 or out of range."""
+    valid = abs(lat_deg) <= 90 and -180 <= lon_deg <= 360 and (lat_deg, lon_deg) != (0.0, 0.0)  # excludes NaN
+    return Position(lat_deg, lon_deg - 360 if lon_deg > 180 else lon_deg) if valid else None
 
 
 class PositionJumpFilter:
@@ -83,7 +85,7 @@ def _place(ping: Ping) -> _Place | None:
 
 
 def _reachable(start: tuple[float, _Place], end: tuple[float, _Place]) -> bool:
-    limit_m = _MAX_CORRECTION_M + _MAX_SPEED_MPS * max(end[0] - start[0], 0.0)
+    limit_m = _MAX_CORRECTION_M + _MAX_SPEED_MPS * min(max(end[0] - start[0], 0.0), _MAX_GAP_S)
     if isinstance(start[1], tuple) or isinstance(end[1], tuple):
         # A file has one kind of coordinates: two kinds are not comparable.
         return isinstance(start[1], tuple) and isinstance(end[1], tuple) and math.dist(start[1], end[1]) <= limit_m

@@ -26,7 +26,7 @@ def _check_projected_crs(crs: str) -> str:
 
 
 ProjectedCrs = Annotated[str, AfterValidator(_check_projected_crs)]
-"""Projected coordinate system in metres, as pyproj accepts it."""
+"""Projected coordinate system, as pyproj accepts it."""
 
 
 class _Section(BaseModel):
@@ -66,7 +66,9 @@ class ErrorBudget(_Section):
 
     Attributes:
         position_m: Recorded position, along each axis.
-        heading_deg: Heading, mounting included.
+        heading_deg: Heading of the sensor, mounting included.
+        gyro_heading_deg: Heading of the ship or vehicle in place of the sensor's.
+        course_heading_deg: Course over ground in place of a heading: a current makes them differ.
         altitude_m: Altitude from the file.
         tracked_altitude_m: Altitude from bottom tracking (`track_bottom`).
         sound_speed: Sound speed assumed by the recorder, as a fraction.
@@ -77,6 +79,8 @@ class ErrorBudget(_Section):
 
     position_m: _Sigma = 5.0
     heading_deg: _Sigma = 2.0
+    gyro_heading_deg: _Sigma = 3.0
+    course_heading_deg: _Sigma = 10.0
     altitude_m: _Sigma = 0.2
     tracked_altitude_m: _Sigma = 0.5
     sound_speed: Annotated[float, Field(ge=0, le=0.5)] = 0.01
@@ -89,10 +93,16 @@ class SurveyOptions(_Section):
     """Interpretation of survey files where the format leaves a choice.
 
     Attributes:
-        projected_crs: Coordinate system of positions in metres, as pyproj accepts it (`EPSG:32619`). Without it a
-            file in metres has no positions.
-        position_source: Position field of XTF: the sensor's, or the ship's (for a recorder that leaves the sensor's
-            at the ship's or at zero; set a layback as well).
+        projected_crs: Coordinate system of projected positions, in metres or feet, as pyproj accepts it
+            (`EPSG:32619`). Without it a file with projected positions has no positions in degrees.
+        frequency_hz: Frequency whose channels images and contacts are of, the nearest one of the file; None for the
+            highest.
+        heading_source: `sensor`, the heading of the sonar itself; `gyro`, of the ship or vehicle; `course`, the course
+            over ground, as recorded or from the positions. `auto`: the first of them that the file has.
+        position_source: Position field of XTF: the sensor's, or the ship's. `auto`: the ship's if the sensor's is zero
+            in all pings.
+        recorded_layback: Layback of XTF or JSF, or cable length of XTF: `apply` it along the track, or `ignore` it.
+            `auto`: apply it to positions of the ship; elsewhere a note of XTF names it.
         port_order: Order of the port samples of XTF; the format specifies farthest first, some recorders differ.
         humminbird_sample_spacing_m: Slant range of one sample, which Humminbird recordings do not contain.
         humminbird_depth_as_altitude: Use the depth of the echo sounder as altitude, in place of bottom tracking.
@@ -101,7 +111,10 @@ class SurveyOptions(_Section):
     """
 
     projected_crs: ProjectedCrs | None = None
-    position_source: Literal["sensor", "ship"] = "sensor"
+    frequency_hz: Annotated[float, Field(ge=1e3, le=1e7)] | None = None
+    heading_source: Literal["auto", "sensor", "gyro", "course"] = "auto"
+    position_source: Literal["auto", "sensor", "ship"] = "auto"
+    recorded_layback: Literal["auto", "apply", "ignore"] = "auto"
     port_order: Literal["farthest_first", "nearest_first"] = "farthest_first"
     humminbird_sample_spacing_m: Annotated[float, Field(gt=0, le=1)] | None = None
     humminbird_depth_as_altitude: bool = False

@@ -1,4 +1,4 @@
-"""Projected coordinates in metres: their extent in a file, and their conversion to degrees."""
+"""Projected coordinates: their extent in a file, and their conversion to degrees. All are in metres."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from sonarpost.sonar.geometry import Position
 _WGS84: Final = "EPSG:4326"
 MAX_COORDINATE_M: Final = 1e8
 """Maximum easting or northing: twice and a half the circumference of the Earth."""
-_EXPECTED: Final = "a projected coordinate system in metres, for example EPSG:32616"
+_EXPECTED: Final = "a projected coordinate system, for example EPSG:32616"
 
 
 @dataclass(frozen=True, slots=True)
 class GridExtent:
-    """Extent of the coordinates in metres that a file holds; each is (easting, northing).
+    """Extent of the projected coordinates of a file in metres; each is (easting, northing).
 
     Attributes:
         first_m: First coordinates of the recording.
@@ -35,7 +35,7 @@ class GridExtent:
 
 
 def grid_coordinates(easting_m: float, northing_m: float) -> tuple[float, float] | None:
-    """Return coordinates as stored in a file; None if they are 0/0, not finite or beyond any projection."""
+    """Return the coordinates of a file; None if they are 0/0, not finite or beyond any projection."""
     here = (easting_m, northing_m)
     valid = here != (0.0, 0.0) and all(math.isfinite(value) and abs(value) <= MAX_COORDINATE_M for value in here)
     return here if valid else None
@@ -63,8 +63,11 @@ class Projection:
     Args:
         crs: Coordinate system as pyproj accepts it: `EPSG:32619`, a PROJ string, WKT.
 
+    Attributes:
+        unit_m: Unit of the system in metres: 1, or about 0.3048 for feet.
+
     Raises:
-        ValueError: Not a projected coordinate system in metres.
+        ValueError: Not a projected coordinate system.
     """
 
     def __init__(self, crs: str) -> None:
@@ -73,19 +76,19 @@ class Projection:
         except ProjError as error:
             raise ValueError(_EXPECTED) from error
         source = self._transformer.source_crs
-        if (
-            source is None
-            or not source.is_projected
-            or any(axis.unit_conversion_factor != 1 for axis in source.axis_info)
-        ):
+        # A third axis, the height, may have another unit.
+        units_m = set() if source is None else {axis.unit_conversion_factor for axis in source.axis_info[:2]}
+        if source is None or not source.is_projected or len(units_m) != 1:
             raise ValueError(_EXPECTED)
+        self.unit_m: float = units_m.pop()
 
     def position(self, easting_m: float, northing_m: float) -> Position | None:
         """Return the position; None if it is not finite, 0/0 or outside the projection."""
         if not (math.isfinite(easting_m) and math.isfinite(northing_m)) or (easting_m, northing_m) == (0.0, 0.0):
             return None
         try:
-            lon_deg, lat_deg = self._transformer.transform(easting_m, northing_m, errcheck=True)
+            stored = easting_m / self.unit_m, northing_m / self.unit_m
+            lon_deg, lat_deg = self._transformer.transform(*stored, errcheck=True)
         except ProjError:
             return None
         if not (math.isfinite(lon_deg) and math.isfinite(lat_deg) and abs(lat_deg) <= 90):
@@ -94,5 +97,5 @@ class Projection:
 
     def coordinates(self, position: Position) -> tuple[float, float]:
         """Return easting and northing in metres, infinite outside the projection."""
-        easting_m, northing_m = self._transformer.transform(position.lon_deg, position.lat_deg, direction="INVERSE")
-        return float(easting_m), float(northing_m)
+        easting, northing = self._transformer.transform(position.lon_deg, position.lat_deg, direction="INVERSE")
+        return float(easting) * self.unit_m, float(northing) * self.unit_m

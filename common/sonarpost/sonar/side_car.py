@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from pydantic_core import to_json
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.files import write_atomically
+from sonarpost.files import read_regular, write_atomically
 from sonarpost.messages import Contact
 
 _TIME: Final = "time_utc"
@@ -69,10 +69,7 @@ def read_side_car(path: Path, contact_id: str, vehicle_id: str) -> SideCar:
         SurveyFileError: The file cannot be read, a line is not `name: value`, or a value is out of the field's range.
     """
     try:
-        raw = path.read_bytes()
-        if len(raw) > _MAX_TEXT_BYTES:
-            raise SurveyFileError(str(path), "size", len(raw), f"at most {_MAX_TEXT_BYTES} bytes")
-        lines = raw.decode("utf-8-sig").splitlines()
+        lines = read_regular(path, _MAX_TEXT_BYTES).decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise SurveyFileError(str(path), "", str(error), "a readable text file in UTF-8") from error
     fields: dict[str, object] = {"contact_id": contact_id}

@@ -9,6 +9,9 @@ from pathlib import Path
 from typing import Final, Self
 
 from sonarpost.errors import SurveyFileError
+from sonarpost.limits import limit
+from sonarpost.sonar.channel_sets import ChannelChoice, ChannelSet
+from sonarpost.sonar.heading import HeadingChoice
 from sonarpost.sonar.navigation import NavigationChecks, PositionJumpFilter, apply_mounting
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import GridExtent
@@ -16,8 +19,15 @@ from sonarpost.sonar.survey import Ping, Side, Survey
 
 MAX_HELD_BYTES: Final = 1 << 30
 """Maximum size of the samples of a survey in memory; a longer recording is read in strips."""
-STRIP_BYTES: Final = 1 << 26
-"""Target size of the samples of a strip; the detector needs about twenty times as much memory."""
+STRIP_BYTES: Final = limit(
+    1 << 26,
+    "bytes",
+    "claims",
+    surface="recording",
+    source="recording",
+    resource="samples of a strip, each ping counted as the longest; the detector needs about 20 times as much memory",
+    at_limit="strips are shorter; above twice as much in the fewest pings of a strip, the recording is refused",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +41,8 @@ class SurveyInfo:
         ping_count: Number of pings.
         sides: Sides of all pings together, port first.
         warnings: Irregularities of the file, one line each.
-        grid: Extent of the coordinates of a file in metres, as stored; None for a file in degrees.
+        grid: Extent of the projected coordinates of a file, in metres; None for a file in degrees.
+        channel_sets: Frequencies of the sonar, the highest first; the pings are of one of them.
     """
 
     path: Path
@@ -41,6 +52,7 @@ class SurveyInfo:
     sides: tuple[Side, ...]
     warnings: tuple[str, ...]
     grid: GridExtent | None = None
+    channel_sets: tuple[ChannelSet, ...] = ()
 
 
 class SurveySource(ABC):
@@ -101,25 +113,54 @@ class StreamedSource(SurveySource):
         Raises:
             SurveyFileError: The file is damaged, or has no ping with a port or starboard channel.
         """
-        checks = NavigationChecks(self.options.mounting)
-        sides: set[Side] = set()
-        count = 0
+        self._channel_choice = ChannelChoice(self.options.frequency_hz)
+        self._heading_choice = HeadingChoice(self.options)
+        checks, count = NavigationChecks(self.options.mounting), 0
         for ping in self._read_pings(first_pass=True):
-            checks.observe(count, ping)
-            sides.update(channel.side for channel in ping.channels)
-            count += 1
-        if not sides:
+            try:
+                self._channel_choice.observe(ping)
+            except ValueError as error:
+                raise SurveyFileError(str(self.path), "channels", str(error), "those of one sonar") from error
+            if ping.channels:
+                self._heading_choice.observe(ping)
+                checks.observe(count, ping)
+                count += 1
+        self._channel_choice.choose()
+        if not count:
             found = "; ".join([str(count), *self._format_warnings()])
             raise SurveyFileError(str(self.path), "pings", found, "at least one ping with a port or starboard channel")
-        warnings = (*self._format_warnings(), *checks.warnings(count))
-        ordered = tuple(side for side in Side if side in sides)
-        self.info = SurveyInfo(self.path, sonar_id, line_name, count, ordered, warnings, self._grid())
+        if self._channel_choice.left_out:  # rows are those of the pings that `pings` yields
+            checks, count = NavigationChecks(self.options.mounting), 0
+            for ping in self._of_chosen_set(self._read_pings(first_pass=False)):
+                checks.observe(count, ping)
+                count += 1
+        warnings = (
+            *self._format_warnings(),
+            *self._channel_choice.warnings(),
+            *self._heading_choice.warnings(),
+            *checks.warnings(count),
+        )
+        self.info = SurveyInfo(
+            self.path,
+            sonar_id,
+            line_name,
+            count,
+            self._channel_choice.sides,
+            warnings,
+            self._grid(),
+            self._channel_choice.sets,
+        )
+
+    def _of_chosen_set(self, pings: Iterable[Ping]) -> Iterator[Ping]:
+        """Yield the pings of the chosen channel set, with its channels only."""
+        return (selected for ping in pings if (selected := self._channel_choice.select(ping)) is not None)
 
     def pings(self) -> Iterator[Ping]:
-        """Yield the pings without implausible fixes and with the mounting applied."""
+        """Yield the pings of one channel set, without implausible fixes, with heading and mounting applied."""
         jumps = PositionJumpFilter()
-        for ping in self._read_pings(first_pass=False):
-            yield apply_mounting(jumps.filter(ping), self.options.mounting)
+        checked = (jumps.filter(ping) for ping in self._of_chosen_set(self._read_pings(first_pass=False)))
+        for ping in self._heading_choice.apply(checked):
+            yield apply_mounting(ping, self.options.mounting)
 
 
 class InMemorySource(StreamedSource):
@@ -184,7 +225,8 @@ def strips(
         pings: The stream.
         length: Pings of a strip, more than `overlap`; the last strip has fewer, or up to half as many more.
         overlap: Pings that a strip has in common with the next.
-        max_bytes: Target size of the samples in memory; strips of long pings are shorter.
+        max_bytes: Target size of the samples in memory, as many for each ping as the longest one of the strip has;
+            strips of long pings are shorter.
 
     Yields:
         The strips in order; none for an empty stream.
@@ -196,16 +238,19 @@ def strips(
     if overlap < 0 or length <= overlap:
         raise ValueError(f"strips of {length} with overlap {overlap}, expected more than the overlap, from 0")
     held: list[Ping] = []
-    size = first_row = 0
+    longest = first_row = 0
     for ping in pings:
-        if len(held) >= length + length // 2 or (size > max_bytes and len(held) > 2 * overlap + 1):
+        longest = max(longest, _size_bytes(ping))
+        while len(held) >= length + length // 2 or (
+            (len(held) + 1) * longest > max_bytes and len(held) > 2 * overlap + 1
+        ):
             new = max(2 * len(held) // 3, overlap + 1)
             yield Strip(first_row, tuple(held[:new]), is_last=False)
             del held[: new - overlap]
             first_row += new - overlap
-            size = sum(map(_size_bytes, held))
+            longest = max(map(_size_bytes, (*held, ping)))
         held.append(ping)
-        size += _size_bytes(ping)
+        size = len(held) * longest
         if size > 2 * max_bytes:
             # The row is that of the stream, which may have started in another file.
             where = f"survey, row {first_row + len(held) - 1}"

@@ -36,6 +36,7 @@ class ChannelPing:
         slant_range_m: Slant range of the far edge of the last sample.
         frequency_hz: Sonar frequency; None if unknown.
         scale: Factor from `samples` to echo strength: the recorder's gain or weight of this ping.
+        index: Number of the channel in the file, to tell channels of the same side and frequency apart.
     """
 
     side: Side
@@ -43,6 +44,7 @@ class ChannelPing:
     slant_range_m: float
     frequency_hz: float | None = None
     scale: float = 1.0
+    index: int = 0
 
     @property
     def sample_spacing_m(self) -> float:
@@ -61,16 +63,22 @@ class Ping:
     Attributes:
         number: Number in the file.
         time_utc_s: Time of transmission, seconds since 1970-01-01 UTC.
-        channels: Channels of both sides.
+        channels: Channels of both sides. A `SurveySource` yields one channel set only: at most one channel a side.
         lat_deg: Latitude of the sonar, WGS 84, north positive.
         lon_deg: Longitude of the sonar, east positive.
-        heading_deg: Heading, clockwise from true north.
+        heading_deg: Heading of the sonar, clockwise from true north. A reader stores the sensor's; a `SurveySource`
+            replaces it by the one that the options select.
         altitude_m: Altitude above the seabed.
         depth_m: Depth below the surface.
         speed_mps: Speed, forward positive.
         pitch_deg: Pitch as recorded.
         roll_deg: Roll as recorded.
-        grid_m: Easting and northing of a file with coordinates in metres, as recorded; known without a projection.
+        grid_m: Easting and northing of a file with projected coordinates, in metres; known without a projection.
+        gyro_deg: Heading of the ship or vehicle that carries or tows the sonar, from true north.
+        course_deg: Course over ground, from true north.
+        layback_m: Horizontal distance along the track by which the sonar is behind the recorded position, to apply.
+        heading_sigma_deg: Standard deviation of `heading_deg`, if it is not the sensor's.
+        position_note: Why the position may be wrong by more than its standard deviation.
     """
 
     number: int
@@ -85,13 +93,14 @@ class Ping:
     pitch_deg: float | None = None
     roll_deg: float | None = None
     grid_m: tuple[float, float] | None = None
+    gyro_deg: float | None = None
+    course_deg: float | None = None
+    layback_m: float | None = None
+    heading_sigma_deg: float | None = None
+    position_note: str | None = None
 
     def channel(self, side: Side) -> ChannelPing | None:
-        """Return the first channel of `side`, or None.
-
-        A sonar with two frequencies has two channels a side, each with its own samples and range. Images and
-        detection use the first one only: through this method or `Survey.channels`.
-        """
+        """Return the first channel of `side`, or None."""
         return next((c for c in self.channels if c.side is side), None)
 
     def max_slant_range_m(self) -> float | None:
@@ -123,7 +132,7 @@ class Survey:
         return tuple(s for s in Side if s in present)
 
     def channels(self, side: Side) -> Iterator[ChannelPing]:
-        """Yield the first channel of `side` of each ping that has one."""
+        """Yield the channel of `side` of each ping that has one."""
         for ping in self.pings:
             channel = ping.channel(side)
             if channel is not None:
@@ -141,7 +150,7 @@ class Survey:
         """Return the echo strength of one side, shape (pings, samples), float32 in the units of the file.
 
         Row i is `pings[i]`; column 0 is nearest the vehicle. A ping without that side, and samples beyond the end of
-        a shorter ping, are NaN. The first channel of a side is used.
+        a shorter ping, are NaN.
         """
         image = np.full((len(self.pings), self.sample_count(side)), np.nan, dtype=np.float32)
         for row, ping in enumerate(self.pings):

@@ -18,7 +18,7 @@ from sonarpost.files import write_atomically
 from sonarpost.sonar.geometry import Position
 from sonarpost.sonar.navigation import KNOT_MPS
 from sonarpost.sonar.projection import Projection
-from sonarpost.sonar.readers.xtf import NAV_UNITS_DEGREES, NAV_UNITS_METRES
+from sonarpost.sonar.readers.xtf_navigation import NAV_UNITS_DEGREES, NAV_UNITS_METRES
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
@@ -44,11 +44,11 @@ def write_xtf(survey: Survey, path: Path, projected_crs: str | None = None) -> N
     Args:
         survey: The survey.
         path: The file to create or replace.
-        projected_crs: Write positions in metres of this coordinate system, which the file does not name. None for
+        projected_crs: Write positions in the unit of this coordinate system, which the file does not name. None for
             degrees.
 
     Raises:
-        ValueError: Not a projected coordinate system in metres.
+        ValueError: Not a projected coordinate system.
         SurveyFileError: The format cannot represent the survey (more than six channels, a channel whose sample
             size changes, a sonar name over 15 ASCII characters, or a value out of range).
         OSError: The file cannot be written.
@@ -58,19 +58,19 @@ def write_xtf(survey: Survey, path: Path, projected_crs: str | None = None) -> N
     if projected_crs is not None:
         header.NavUnits = NAV_UNITS_METRES
         projection = Projection(projected_crs)
-        survey = replace(survey, pings=tuple(_in_metres(ping, projection) for ping in survey.pings))
+        survey = replace(survey, pings=tuple(_projected(ping, projection) for ping in survey.pings))
     chunks = [bytes(header)]
     for row, ping in enumerate(survey.pings):
         chunks.append(_packet(ping, row, slots, path))
     write_atomically(path, b"".join(chunks))
 
 
-def _in_metres(ping: Ping, projection: Projection) -> Ping:
+def _projected(ping: Ping, projection: Projection) -> Ping:
     """Return the ping with northing and easting in the fields of latitude and longitude."""
     if ping.lat_deg is None or ping.lon_deg is None:
         return ping
     easting_m, northing_m = projection.coordinates(Position(ping.lat_deg, ping.lon_deg))
-    return replace(ping, lat_deg=northing_m, lon_deg=easting_m)
+    return replace(ping, lat_deg=northing_m / projection.unit_m, lon_deg=easting_m / projection.unit_m)
 
 
 def _slots(survey: Survey, path: Path) -> dict[_Slot, ChannelPing]:

@@ -15,15 +15,18 @@ Assumptions where the format is incomplete:
 * The depth is that of the echo sounder under the transducer. The sounder may lose the bottom and continue to record
   values, as in the last third of PyHum's recording. The depth is therefore used as altitude only with the option
   `humminbird_depth_as_altitude`; by default the altitude comes from bottom tracking.
-* The clock of the unit is assumed to be UTC.
+* The clock of the unit is assumed to be UTC. Pings of both sides with the same time are one.
 """
 
 from __future__ import annotations
 
+import heapq
 import math
 import struct
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -33,20 +36,24 @@ from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position
 from sonarpost.sonar.navigation import PingCounter
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.readers.open_file import CheckedFile, SequentialReader
-from sonarpost.sonar.source import StreamedSource
+from sonarpost.sonar.readers.file_source import FileSource
+from sonarpost.sonar.readers.joining import PingPart, joined
+from sonarpost.sonar.readers.open_file import CheckedFile
+from sonarpost.sonar.readers.records import Notes, RecordFormat, records
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 
 SAMPLE_SPACING_M: Final = 2 / math.pi * math.asin(1475 / (0.108 * 455_000))
 
 _START: Final = b"\xc0\xde\xab\x21"
-_HEADER_END: Final = 0x21
+_HEADER_END: Final = b"\x21"
+_MIN_HEADER_BYTES: Final = 20
 _MAX_HEADER_BYTES: Final = 512
 _MAX_SAMPLES: Final = 1 << 16
 _NUMBER, _TIME_MS, _EAST, _NORTH, _HEADING, _SPEED, _DEPTH, _FREQUENCY, _SAMPLES = (
     *(0x80, 0x81, 0x82, 0x83, 0x84, 0x85, 0x87, 0x92),
     0xA0,
 )
+_MIN_TAG: Final = 0x40
 _SIDES: Final = {Side.PORT: "B002.SON", Side.STARBOARD: "B003.SON"}
 _CHANNEL_SUFFIXES: Final = (".son", ".idx")
 _DAT_MAGICS: Final = (0xC1, 0xC3)
@@ -62,38 +69,44 @@ _GEODETIC: Final = 1.006_764_292_7
 """Ratio of the tangents of geodetic and geocentric latitude, International 1924: 1 / (1 - e^2)."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Record:
-    fields: dict[int, int]
-    samples: bytes
+class _PingFormat(RecordFormat):
+    """Pings of one channel."""
+
+    magic = _START
+    head_bytes = _MAX_HEADER_BYTES
+    min_head_bytes = _MIN_HEADER_BYTES
+
+    def __init__(self, file_name: str) -> None:
+        self.name = f"ping of {file_name}"
+
+    def length(self, head: bytes, offset: int) -> int:
+        fields, header_bytes = _header(head)
+        return header_bytes + fields[_SAMPLES] if header_bytes else 0
 
 
-class HumminbirdSource(StreamedSource):
+class HumminbirdSource(FileSource):
     """An open Humminbird recording, given by its DAT file.
 
     Raises:
-        SurveyFileError: The DAT file or both channels are missing, or a file is damaged.
+        SurveyFileError: The DAT file is missing or damaged, or both channels are missing or have no ping.
     """
 
+    SONAR = "Humminbird"
+
     def __init__(self, path: Path, options: SurveyOptions) -> None:
-        super().__init__(path, options)
-        self._files: dict[Side, CheckedFile] = {}
-        self._started_s = _start_time(path)
         self._spacing_m = options.humminbird_sample_spacing_m or SAMPLE_SPACING_M
-        self._without_fix, self._without_heading, self._without_depth = (PingCounter() for _ in range(3))
-        self._pings = 0
+        self._without_depth = PingCounter()
         self._unpaired = 0
-        paths = {side: channel for side, name in _SIDES.items() if (channel := _channel_path(path, name)) is not None}
+        super().__init__(path, options)
+
+    def _data_files(self) -> tuple[Path, ...]:
+        self._started_s = _start_time(self.path)
+        paths = {side: found for side, name in _SIDES.items() if (found := _channel_path(self.path, name)) is not None}
         if not paths:
-            expected = f"B002.SON or B003.SON in {path.with_suffix('')}"
-            raise SurveyFileError(str(path), "side-scan channels", "none", expected)
-        try:
-            for side, channel in paths.items():
-                self._files[side] = CheckedFile(channel)
-            self._validate("Humminbird", path.stem)
-        except BaseException:
-            self.close()
-            raise
+            expected = f"B002.SON or B003.SON in {self.path.with_suffix('')}"
+            raise SurveyFileError(str(self.path), "side-scan channels", "none", expected)
+        self._sides = tuple(paths)
+        return tuple(paths.values())
 
     @staticmethod
     def parts(path: Path) -> tuple[Path, ...]:
@@ -110,11 +123,6 @@ class HumminbirdSource(StreamedSource):
             others = []
         return (path, *sides, *others)
 
-    def close(self) -> None:
-        """Close the channels."""
-        for file in self._files.values():
-            file.close()
-
     def _format_warnings(self) -> list[str]:
         warnings = []
         if self.options.humminbird_sample_spacing_m is None:
@@ -123,71 +131,60 @@ class HumminbirdSource(StreamedSource):
                 "(option humminbird_sample_spacing_m)"
             )
         if len(self._files) == 1:
-            warnings.append(f"only the file of {next(iter(self._files)).value} exists")
+            warnings.append(f"only the file of {self._sides[0].value} exists")
         elif self._unpaired:
             warnings.append(f"only one side in {self._unpaired} of {self._pings} pings")
-        texts: tuple[tuple[PingCounter, str], ...] = (
-            (self._without_fix, "no position fix in"),
-            (self._without_heading, "no heading in"),
-            (self._without_depth, "no depth under the transducer in"),
-        )
+        depths = []
         if not self.options.humminbird_depth_as_altitude:
             warnings.append("echo sounder depth not used as altitude (option humminbird_depth_as_altitude)")
-            texts = texts[:2]
-        return warnings + [f"{text} {counter.summary(self._pings)}" for counter, text in texts if counter.count]
+        elif self._without_depth.count:
+            depths.append(f"no depth under the transducer in {self._without_depth.summary(self._pings)}")
+        return [*warnings, *super()._format_warnings(), *depths]
 
-    def _read_pings(self, *, first_pass: bool) -> Iterator[Ping]:
-        row = 0
-        for time_ms, channels in self._paired_records():
-            ping = self._ping(time_ms, channels)
+    def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
+        channels = [self._parts(side, file, notes) for side, file in zip(self._sides, self._files, strict=True)]
+        parts = heapq.merge(*channels, key=lambda part: part.time_utc_s)
+        for row, part in enumerate(joined(parts, max_gap_s=0.0, by_number=False)):
+            ping = self._ping(part)
             if first_pass:
-                self._count_missing(row, ping)
-            row += 1
+                self._unpaired += len(ping.channels) == 1
+                if ping.altitude_m is None:
+                    self._without_depth.add(row)
             yield ping
-        self._pings = row
-        for file in self._files.values():
-            file.check_unchanged()
 
-    def _count_missing(self, row: int, ping: Ping) -> None:
-        for value, counter in (
-            (ping.lat_deg, self._without_fix),
-            (ping.heading_deg, self._without_heading),
-            (ping.altitude_m, self._without_depth),
-        ):
-            if value is None:
-                counter.add(row)
-        self._unpaired += len(ping.channels) == 1
+    def _parts(self, side: Side, file: CheckedFile, notes: Notes) -> Iterator[PingPart[dict[int, int]]]:
+        """Yield the pings of one channel, without those whose time is not between the times before and after."""
+        found = records(file, _PingFormat(file.path.name), 0, notes)
+        parsed = ((place, raw, *_header(raw[:_MAX_HEADER_BYTES])) for place, _, raw in found)
+        ahead = deque(islice(parsed, 3))  # with two that follow: one of them may be wrong
+        before_ms = 0
+        while ahead:
+            place, raw, fields, header_bytes = ahead.popleft()
+            time_ms = fields[_TIME_MS]
+            after_ms = max((following[_TIME_MS] for _, _, following, _ in ahead), default=math.inf)
+            ahead.extend(islice(parsed, 1))
+            with notes.leaving_out(place):
+                if before_ms <= after_ms and not before_ms <= time_ms <= after_ms:  # else the clock was set back
+                    raise file.error(f"{place}, time", time_ms, f"{before_ms} to {after_ms} ms, as before and after it")
+                before_ms = time_ms
+                channel = ChannelPing(
+                    side=side,
+                    samples=np.frombuffer(raw, np.uint8, offset=header_bytes),
+                    slant_range_m=(len(raw) - header_bytes) * self._spacing_m,
+                    frequency_hz=float(fields.get(_FREQUENCY, 0)) or None,
+                )
+                yield PingPart(fields[_NUMBER], self._started_s + time_ms / 1000, fields, (channel,))
 
-    def _paired_records(self) -> Iterator[tuple[int, dict[Side, _Record]]]:
-        """Yield time and records of both sides; records of the same time are combined."""
-        records = {side: _records(file) for side, file in self._files.items()}
-        current = {side: next(iterator, None) for side, iterator in records.items()}
-        while present := {side: record for side, record in current.items() if record is not None}:
-            time_ms = min(record.fields[_TIME_MS] for record in present.values())
-            paired = {side: record for side, record in present.items() if record.fields[_TIME_MS] == time_ms}
-            for side in paired:
-                current[side] = next(records[side], None)
-            yield time_ms, paired
-
-    def _ping(self, time_ms: int, records: dict[Side, _Record]) -> Ping:
-        fields = next(iter(records.values())).fields
+    def _ping(self, part: PingPart[dict[int, int]]) -> Ping:
+        fields = part.head
         position = _position(fields)
         heading_valid, heading = divmod(fields.get(_HEADING, 0), 1 << 16)
         speed_valid, speed = divmod(fields.get(_SPEED, 0), 1 << 16)
         depth_m = fields.get(_DEPTH, 0) / 10 if self.options.humminbird_depth_as_altitude else 0.0
-        channels = tuple(
-            ChannelPing(
-                side=side,
-                samples=np.frombuffer(record.samples, np.uint8),
-                slant_range_m=len(record.samples) * self._spacing_m,
-                frequency_hz=float(record.fields.get(_FREQUENCY, 0)) or None,
-            )
-            for side, record in records.items()
-        )
         return Ping(
-            number=fields[_NUMBER],
-            time_utc_s=self._started_s + time_ms / 1000,
-            channels=channels,
+            number=part.number,
+            time_utc_s=part.time_utc_s,
+            channels=part.channels,
             lat_deg=position.lat_deg if position else None,
             lon_deg=position.lon_deg if position else None,
             heading_deg=heading / 10 % 360 if heading_valid and heading <= 3600 else None,
@@ -196,52 +193,28 @@ class HumminbirdSource(StreamedSource):
         )
 
 
-def _records(file: CheckedFile) -> Iterator[_Record]:
-    """Yield the pings of one channel.
-
-    Raises:
-        SurveyFileError: The file is damaged or ends inside a ping.
-    """
-    reader = SequentialReader(file)
-    number = 0
-    while reader.remaining:
-        place = f"ping {number} at byte {reader.offset}"
-        start = reader.read(len(_START), place)
-        if start != _START:
-            raise file.error(f"{place}, start", start, f"{_START!r}")
-        fields = _header_fields(reader, file, place)
-        count = fields[_SAMPLES]
-        if not 1 <= count <= _MAX_SAMPLES:
-            raise file.error(f"{place}, number of samples", count, f"1 to {_MAX_SAMPLES}")
-        yield _Record(fields, reader.read(count, place))
-        number += 1
-
-
-def _header_fields(reader: SequentialReader, file: CheckedFile, place: str) -> dict[int, int]:
-    """Read the fields of a header up to its end."""
+@lru_cache(maxsize=8)
+def _header(head: bytes) -> tuple[dict[int, int], int]:
+    """Return the fields of a header by their tags, and its size in bytes; a size of 0 if `head` does not begin one."""
     fields: dict[int, int] = {}
-    first = reader.offset
-    while reader.offset - first < _MAX_HEADER_BYTES:
-        tag = reader.read(1, place)[0]
-        if tag < 0x40:
-            raise file.error(f"{place}, tag", hex(tag), "a field of the header, 0x40 to 0xff")
-        width = 4 if tag & 0x80 else 1
-        fields[tag] = int.from_bytes(reader.read(width, place), "big")
+    place = len(_START)
+    while head.startswith(_START) and place < len(head):
+        tag = head[place]
+        end = place + (5 if tag & 0x80 else 2)
+        if tag < _MIN_TAG or end > len(head):
+            break
+        fields[tag] = int.from_bytes(head[place + 1 : end], "big")
+        place = end
         if tag == _SAMPLES:
-            end = reader.read(1, place)[0]
-            if end != _HEADER_END:
-                raise file.error(f"{place}, end of the header", hex(end), hex(_HEADER_END))
-            missing = [hex(each) for each in (_NUMBER, _TIME_MS) if each not in fields]
-            if missing:
-                raise file.error(f"{place}, fields", f"no {', '.join(missing)}", "record number and time")
-            return fields
-    raise file.error(f"{place}, header", f"over {_MAX_HEADER_BYTES} bytes", "the number of samples at its end")
+            is_end = head[place : place + 1] == _HEADER_END and 1 <= fields[tag] <= _MAX_SAMPLES
+            return fields, place + 1 if is_end and {_NUMBER, _TIME_MS} <= fields.keys() else 0
+    return fields, 0
 
 
 def _position(fields: dict[int, int]) -> Position | None:
     """Return the position of coordinates on the recorder's Mercator map; None without a fix."""
     east_m, north_m = (_signed(fields.get(tag, 0)) for tag in (_EAST, _NORTH))
-    if (east_m, north_m) == (0, 0) or abs(east_m) > math.pi * _RADIUS_M or abs(north_m) > 3 * _RADIUS_M:
+    if (east_m, north_m) == (0, 0) or abs(east_m) > 2 * math.pi * _RADIUS_M or abs(north_m) > 3 * _RADIUS_M:
         return None
     geocentric = 2 * math.atan(math.exp(north_m / _RADIUS_M)) - math.pi / 2
     lat_deg = math.degrees(math.atan(math.tan(geocentric) * _GEODETIC))

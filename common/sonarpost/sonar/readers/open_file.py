@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 from sonarpost.errors import SurveyFileError
+from sonarpost.files import open_regular
 
 _BUFFER_BYTES: Final = 1 << 18
 _LINE_BYTES: Final = 1 << 16
@@ -24,17 +24,12 @@ class CheckedFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            # Non-blocking: a named pipe in the survey folder must not block the service.
-            self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
-            reason = getattr(error, "strerror", None) or str(error)
-            raise SurveyFileError(str(path), "", reason, "a readable survey file") from error
+            self._descriptor = open_regular(path)
+        except OSError as error:
+            raise SurveyFileError(str(path), "", error.strerror or str(error), "a readable survey file") from error
         status = os.fstat(self._descriptor)
         self._stamp = (status.st_size, status.st_mtime_ns)
         self.size_bytes = status.st_size
-        if not stat.S_ISREG(status.st_mode):
-            self.close()
-            raise SurveyFileError(str(path), "", "not a regular file", "a survey file")
 
     def read_at(self, offset: int, count: int, place: str) -> bytes:
         """Return `count` bytes from `offset`.
@@ -117,7 +112,7 @@ class SequentialReader:
     """Buffered sequential reading of an open file. Several readers may use one file at the same time."""
 
     def __init__(self, file: CheckedFile, offset: int = 0) -> None:
-        self._file = file
+        self.file = file
         self.offset = offset
         self._buffer = b""
         self._buffer_offset = offset
@@ -125,7 +120,7 @@ class SequentialReader:
     @property
     def remaining(self) -> int:
         """Number of bytes up to the end of the file."""
-        return self._file.size_bytes - self.offset
+        return self.file.size_bytes - self.offset
 
     def read(self, count: int, place: str) -> bytes:
         """Return the next `count` bytes and advance.
@@ -136,7 +131,23 @@ class SequentialReader:
         start = self.offset - self._buffer_offset
         if start + count > len(self._buffer):
             ahead = max(count, min(_BUFFER_BYTES, self.remaining))
-            self._buffer = self._file.read_at(self.offset, ahead, place)
+            self._buffer = self.file.read_at(self.offset, ahead, place)
             self._buffer_offset, start = self.offset, 0
         self.offset += count
         return self._buffer[start : start + count]
+
+    def peek(self, offset: int, count: int) -> bytes:
+        """Return `count` bytes from `offset`, fewer at the end of the file; the place of `read` stays.
+
+        Raises:
+            SurveyFileError: The file cannot be read.
+        """
+        start = offset - self._buffer_offset
+        count = max(min(count, self.file.size_bytes - offset), 0)
+        if start >= 0 and start + count <= len(self._buffer):
+            return self._buffer[start : start + count]
+        if not 0 <= start <= len(self._buffer):
+            return self.file.read_at(offset, count, f"byte {offset}")  # elsewhere: what is buffered is still needed
+        ahead = max(count, min(_BUFFER_BYTES, self.file.size_bytes - offset))
+        self._buffer, self._buffer_offset = self.file.read_at(offset, ahead, f"byte {offset}"), offset
+        return self._buffer[:count]

@@ -17,8 +17,7 @@ little endian. Offsets from the marker:
 
 Conversions and assumptions:
 
-* Pings are those of the page version with the most pages, of equal ones the lowest. Channels of the other with the same
-  ping number follow its own in the ping. Pages of other versions are skipped.
+* A page version is a frequency. Pages of the same ping number and time are one ping, of other versions are skipped.
 * The slant range is the range of the header. The clock of the recorder counts as UTC.
 * A heading, altitude, depth or speed of exactly 0, and pitch and roll that are both 0, were not recorded.
 """
@@ -26,20 +25,19 @@ Conversions and assumptions:
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from sonarpost.sonar.navigation import PingCounter, is_plausible, position_in_degrees
-from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.readers.open_file import CheckedFile, SequentialReader
-from sonarpost.sonar.source import StreamedSource
+from sonarpost.sonar.navigation import is_plausible, position_in_degrees
+from sonarpost.sonar.readers.file_source import FileSource
+from sonarpost.sonar.readers.joining import PingPart, joined
+from sonarpost.sonar.readers.records import Notes, RecordFormat, records
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Ping, Side
 
 MARKER: Final = b"\xff\xff\xff\xff"
@@ -48,161 +46,107 @@ MAX_PAGE_BYTES: Final = 1 << 24
 SIDE_SCAN_PAGES: Final = (3501, 3502)
 
 _START: Final = struct.Struct("<4sII")
+_VERSIONS: Final = (1000, 9999)
+"""Limits of the page versions; those in use are 3000 to 5004."""
+_HEADER_SIZE: Final = 184
+"""Offset of the size of the header from the marker."""
 _DATA: Final = len(MARKER) + HEADER_BYTES
 """Offset of the samples from the marker."""
+_HEADER: Final = re.compile(
+    rb"\xff(?=\xff{3}.{3}[\x00\x01](?:[\xad\xae]\x0d\x00\x00.{172}\x00\x02\x00\x00|(?![\xad\xae]\x0d)..\x00\x00))",
+    re.DOTALL,
+)
+"""Marker, possible number of bytes and version, and of side-scan pages (0x0DAD, 0x0DAE) the size of the header."""
 _FREQUENCIES_KHZ: Final = (10, 10_000)
-_HELD_PAGES: Final = 8
+_SAME_PING_S: Final = 0.1
+"""Maximum difference of the times of the pages of a ping; pings that are closer have different numbers."""
+_HELD_PINGS: Final = 8
 
 
-@dataclass(frozen=True, slots=True)
-class _Page:
-    """A side-scan page: version, ping number, header from the marker, and the channels, port first."""
+class _Page(RecordFormat):
+    name = "page"
+    magic = MARKER
+    head_bytes = _HEADER_SIZE + 4
+    min_head_bytes = _START.size
 
-    version: int
-    number: int
-    place: str
-    head: bytes
-    channels: tuple[ChannelPing, ...]
+    def length(self, head: bytes, offset: int) -> int:
+        marker, size, version = _START.unpack_from(head)
+        least = HEADER_BYTES if version in SIDE_SCAN_PAGES else _START.size - len(MARKER)
+        valid = marker == MARKER and _VERSIONS[0] <= version <= _VERSIONS[1] and least <= size <= MAX_PAGE_BYTES
+        return len(MARKER) + size if valid else 0
+
+    def candidates(self, data: bytes, offset: int) -> Iterator[int]:
+        """Yield the indices of headers: samples may have the value of the marker, if they are saturated."""
+        return (found.start() for found in _HEADER.finditer(data))
+
+    def is_proved(self, raw: bytes) -> bool:
+        """Return whether it is a side-scan page with as many samples as its header states."""
+        _, _, version = _START.unpack_from(raw)
+        if version not in SIDE_SCAN_PAGES or len(raw) < _DATA + 8:
+            return False
+        want, header_bytes, port = (struct.unpack_from("<I", raw, at)[0] for at in (20, _HEADER_SIZE, _DATA))
+        after = _DATA + 4 + 4 * port
+        if header_bytes != HEADER_BYTES or port not in (0, want) or after + 4 > len(raw):
+            return False
+        (starboard,) = struct.unpack_from("<I", raw, after)
+        return starboard in (0, want) and after + 4 + 4 * starboard <= len(raw)
 
 
-class SdfSource(StreamedSource):
+_PAGE: Final = _Page()
+
+
+class SdfSource(FileSource):
     """An open SDF recording.
 
-    A file that ends inside its last page, as after a power failure, is read up to there with a warning. The cut page
-    may not be longer than the longest one before it.
-
     Raises:
-        SurveyFileError: Not an SDF file, damaged, without a page of a version that is read, or unreadable.
+        SurveyFileError: Not an SDF file, without a page of a version that is read, or unreadable.
     """
 
-    def __init__(self, path: Path, options: SurveyOptions) -> None:
-        super().__init__(path, options)
-        self._file = CheckedFile(path)
-        self._notes: Counter[str] = Counter()
-        self._without_fix, self._without_heading = PingCounter(), PingCounter()
-        self._pings = 0
-        self._cut = ""
-        try:
-            self._version = self._main_version()
-            self._validate("Klein", path.stem)
-        except BaseException:
-            self._file.close()
-            raise
+    SONAR = "Klein"
 
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+    def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
+        for part in joined(self._parts(notes), max_gap_s=_SAME_PING_S, held_pings=_HELD_PINGS):
+            yield _ping(part)
 
-    def _format_warnings(self) -> list[str]:
-        warnings = [self._cut] if self._cut else []
-        warnings += [f"{text} ({count} times)" for text, count in sorted(self._notes.items())]
-        texts = ((self._without_fix, "no position fix in"), (self._without_heading, "no heading in"))
-        return warnings + [f"{text} {counter.summary(self._pings)}" for counter, text in texts if counter.count]
-
-    def _main_version(self) -> int:
-        """Return the page version with the most pages, of those that are read.
+    def _parts(self, notes: Notes) -> Iterator[PingPart[bytes]]:
+        """Yield the side-scan pages with at least one channel.
 
         Raises:
-            SurveyFileError: The file is damaged, or contains only pages of other versions.
+            SurveyFileError: The file has only pages of other versions.
         """
-        counts = Counter(version for _, version, _ in self._raw_pages(with_content=False))
-        found = [version for version in SIDE_SCAN_PAGES if counts[version]]
-        if not found:
-            others = ", ".join(f"{version} ({count} times)" for version, count in counts.most_common(6)) or "none"
+        versions: Counter[int] = Counter()
+        for place, _, raw in records(self._file, _PAGE, 0, notes):
+            _, _, version = _START.unpack_from(raw)
+            versions[version] += 1
+            if version not in SIDE_SCAN_PAGES:
+                notes.add(f"skipped page of version {version}: not side-scan of a UUV-3500 sonar (3501, 3502)")
+                continue
+            part = None
+            with notes.leaving_out(place):
+                part = self._part(place, raw, SIDE_SCAN_PAGES.index(version), notes)
+            if part is not None:
+                yield part
+        if versions and versions.keys().isdisjoint(SIDE_SCAN_PAGES):
+            others = ", ".join(f"{version} ({count} times)" for version, count in versions.most_common(6))
             expected = "3501 or 3502, the side-scan pages of UUV-3500 sonars; pages of other versions are not read"
             raise self._file.error("page version", others, expected)
-        return max(found, key=lambda version: (counts[version], -version))
 
-    def _raw_pages(self, *, with_content: bool) -> Iterator[tuple[str, int, bytes]]:
-        """Yield place, version and content from the marker of every complete page; content only of side-scan pages.
+    def _part(self, place: str, raw: bytes, index: int, notes: Notes) -> PingPart[bytes] | None:
+        """Return the content of a side-scan page; None if it has no channels.
 
         Raises:
-            SurveyFileError: The file is damaged.
+            SurveyFileError: The page contradicts itself.
         """
-        reader = SequentialReader(self._file)
-        longest = 0
-        while remaining := reader.remaining:
-            place = f"page at byte {reader.offset}"
-            start = reader.read(min(_START.size, remaining), place)
-            if start[: len(MARKER)] != MARKER[: len(start)]:
-                raise self._file.error(f"{place}, marker", start[: len(MARKER)].hex(), MARKER.hex())
-            _, size, version = _START.unpack(start.ljust(_START.size, b"\0"))
-            rest = len(MARKER) + size - _START.size
-            if len(start) == _START.size and not 0 <= rest <= MAX_PAGE_BYTES:
-                expected = f"{_START.size - len(MARKER)} to {MAX_PAGE_BYTES} bytes"
-                raise self._file.error(f"{place}, number of bytes", size, expected)
-            if rest > reader.remaining or len(start) < _START.size:
-                if size <= longest:
-                    self._cut = (
-                        f"the file ends inside its last page, as after a power failure: {remaining} bytes are left out"
-                    )
-                    return
-                reader.read(max(rest, reader.remaining + 1), place)  # raises the error of a truncated file
-            longest = max(longest, size)
-            if with_content and version in SIDE_SCAN_PAGES:
-                yield place, version, start + reader.read(rest, place)
-            else:
-                reader.offset += rest
-                yield place, version, b""
+        (header_bytes,) = struct.unpack_from("<I", raw, _HEADER_SIZE)
+        if header_bytes != HEADER_BYTES:
+            raise self._file.error(f"{place}, size of the header", header_bytes, str(HEADER_BYTES))
+        channels = self._channels(place, raw, index, notes)
+        if not channels:
+            return None
+        (number,) = struct.unpack_from("<I", raw, 16)
+        return PingPart(number, self._time(place, raw), raw[:_DATA], channels)
 
-    def _read_pings(self, *, first_pass: bool) -> Iterator[Ping]:
-        notes = self._notes if first_pass else Counter[str]()
-        row = 0
-        for page, other in self._paired(notes):
-            ping = self._ping(page, other)
-            if first_pass:
-                if ping.lat_deg is None:
-                    self._without_fix.add(row)
-                if ping.heading_deg is None:
-                    self._without_heading.add(row)
-            row += 1
-            yield ping
-        self._pings = row
-        self._file.check_unchanged()
-
-    def _paired(self, notes: Counter[str]) -> Iterator[tuple[_Page, _Page | None]]:
-        """Yield the pages of the main version, each with the page of the other one of the same ping number."""
-        current: _Page | None = None
-        others: dict[int, _Page] = {}
-
-        def leave_out(page: _Page) -> None:
-            notes[f"left out page of version {page.version}: none left of its number in version {self._version}"] += 1
-
-        for page in self._pages(notes):
-            if page.version == self._version:
-                if current is not None:
-                    yield current, others.pop(current.number, None)
-                current = page
-                continue
-            if page.number in others:
-                leave_out(page)
-                continue
-            others[page.number] = page
-            if len(others) > _HELD_PAGES:
-                leave_out(others.pop(next(iter(others))))
-        if current is not None:
-            yield current, others.pop(current.number, None)
-        for page in others.values():
-            leave_out(page)
-
-    def _pages(self, notes: Counter[str]) -> Iterator[_Page]:
-        """Yield the side-scan pages with at least one channel."""
-        for place, version, raw in self._raw_pages(with_content=True):
-            if version not in SIDE_SCAN_PAGES:
-                notes[f"skipped page of version {version}: not side-scan of a UUV-3500 sonar (3501, 3502)"] += 1
-                continue
-            if len(raw) < _DATA:
-                expected = f"at least {HEADER_BYTES} for page version {version}"
-                raise self._file.error(f"{place}, number of bytes", len(raw) - len(MARKER), expected)
-            (header_bytes,) = struct.unpack_from("<I", raw, 184)
-            if header_bytes != HEADER_BYTES:
-                raise self._file.error(f"{place}, size of the header", header_bytes, str(HEADER_BYTES))
-            channels = self._channels(place, raw, notes)
-            if channels:
-                (number,) = struct.unpack_from("<I", raw, 16)
-                yield _Page(version, number, place, raw[:_DATA], channels)
-
-    def _channels(self, place: str, raw: bytes, notes: Counter[str]) -> tuple[ChannelPing, ...]:
+    def _channels(self, place: str, raw: bytes, index: int, notes: Notes) -> tuple[ChannelPing, ...]:
         """Return the sides of a page; none if its header contradicts them."""
         want, range_m = struct.unpack_from("<I8xI", raw, 20)
         (frequency_khz,) = struct.unpack_from("<I", raw, 408)
@@ -216,54 +160,55 @@ class SdfSource(StreamedSource):
             if count > max(words - 1, 0):
                 raise self._file.error(f"{place}, number of {side.value} samples", count, f"up to {words - 1}")
             if count not in (0, want):
-                notes["skipped page: a side has another number of samples than its header"] += 1
+                notes.add("skipped page: a side has another number of samples than its header")
                 return ()
             if count:
                 samples = np.frombuffer(raw, "<u4", count, offset + 4).astype(np.uint32)
-                channels.append(ChannelPing(side, samples, float(range_m), frequency_hz))
+                channels.append(ChannelPing(side, samples, float(range_m), frequency_hz, index=index))
             offset += 4 + 4 * count
         if not channels or not 0 < range_m <= MAX_SLANT_RANGE_M:
-            notes["skipped page: no samples, or impossible range"] += 1
+            notes.add("skipped page: no samples, or impossible range")
             return ()
         return tuple(channels)
 
-    def _ping(self, page: _Page, other: _Page | None) -> Ping:
-        head = page.head
-        position = position_in_degrees(*(math.degrees(angle) for angle in struct.unpack_from("<dd", head, 148)))
-        (heading_deg,) = struct.unpack_from("<f", head, 140)
-        pitch_deg, roll_deg, depth_m, altitude_m = struct.unpack_from("<4f", head, 200)
-        attitude_known = pitch_deg != 0 or roll_deg != 0
-
-        def known(name: str, value: float) -> float | None:
-            return value if value != 0 and is_plausible(name, value) else None
-
-        return Ping(
-            number=page.number,
-            time_utc_s=self._time(page),
-            channels=page.channels + (other.channels if other else ()),
-            lat_deg=position.lat_deg if position else None,
-            lon_deg=position.lon_deg if position else None,
-            heading_deg=None if known("heading_deg", heading_deg) is None else heading_deg % 360,
-            altitude_m=known("altitude_m", altitude_m),
-            depth_m=known("depth_m", depth_m),
-            speed_mps=known("speed_mps", struct.unpack_from("<I", head, 36)[0] / 100),
-            pitch_deg=pitch_deg if attitude_known and is_plausible("pitch_deg", pitch_deg) else None,
-            roll_deg=roll_deg if attitude_known and is_plausible("roll_deg", roll_deg) else None,
-        )
-
-    def _time(self, page: _Page) -> float:
+    def _time(self, place: str, head: bytes) -> float:
         """Return the time of a ping, UTC seconds since 1970.
 
         Raises:
             SurveyFileError: The page has no valid date.
         """
-        year, month, day, hour, minute, second = stamp = struct.unpack_from("<6I", page.head, 72)
-        (fraction_s,) = struct.unpack_from("<f", page.head, 220)
+        year, month, day, hour, minute, second = stamp = struct.unpack_from("<6I", head, 72)
+        (fraction_s,) = struct.unpack_from("<f", head, 220)
         try:
             time_s = datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
         except (ValueError, OverflowError):
             time_s = -1.0
         if time_s < 0:
             expected = "year from 1970 on, month, day, hour, minute, second"
-            raise self._file.error(f"{page.place}, date and time", stamp, expected)
+            raise self._file.error(f"{place}, date and time", stamp, expected)
         return time_s + (fraction_s if 0 <= fraction_s < 1 else 0.0)
+
+
+def _ping(part: PingPart[bytes]) -> Ping:
+    head = part.head
+    position = position_in_degrees(*(math.degrees(angle) for angle in struct.unpack_from("<dd", head, 148)))
+    (heading_deg,) = struct.unpack_from("<f", head, 140)
+    pitch_deg, roll_deg, depth_m, altitude_m = struct.unpack_from("<4f", head, 200)
+    attitude_known = pitch_deg != 0 or roll_deg != 0
+
+    def known(name: str, value: float) -> float | None:
+        return value if value != 0 and is_plausible(name, value) else None
+
+    return Ping(
+        number=part.number,
+        time_utc_s=part.time_utc_s,
+        channels=part.channels,
+        lat_deg=position.lat_deg if position else None,
+        lon_deg=position.lon_deg if position else None,
+        heading_deg=None if known("heading_deg", heading_deg) is None else heading_deg % 360,
+        altitude_m=known("altitude_m", altitude_m),
+        depth_m=known("depth_m", depth_m),
+        speed_mps=known("speed_mps", struct.unpack_from("<I", head, 36)[0] / 100),
+        pitch_deg=pitch_deg if attitude_known and is_plausible("pitch_deg", pitch_deg) else None,
+        roll_deg=roll_deg if attitude_known and is_plausible("roll_deg", roll_deg) else None,
+    )

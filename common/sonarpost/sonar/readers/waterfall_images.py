@@ -25,7 +25,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position
@@ -38,16 +38,31 @@ from sonarpost.sonar.navigation import (
     is_plausible,
     position_in_degrees,
 )
-from sonarpost.sonar.options import ProjectedCrs, SurveyOptions
-from sonarpost.sonar.projection import GridExtent, Projection, extended, grid_coordinates
+from sonarpost.sonar.options import ProjectedCrs
+from sonarpost.sonar.projection import Projection, grid_coordinates
+from sonarpost.sonar.readers.file_source import FileSource
 from sonarpost.sonar.readers.open_file import CheckedFile
-from sonarpost.sonar.source import StreamedSource
+from sonarpost.sonar.readers.records import Notes
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Ping, Side
 from sonarpost.wire import first_error
 
 _MAX_TOML_BYTES: Final = 1 << 16
 _COORDINATES: Final = {"degrees": ("lat_deg", "lon_deg"), "metres": ("northing_m", "easting_m")}
+
+
+def _file_name(name: str) -> str:
+    """Return the name of a file in the folder of the description.
+
+    Raises:
+        ValueError: It is longer than a name can be, or leads to another folder.
+    """
+    if name in (".", "..") or not {"/", "\0"}.isdisjoint(name) or len(name.encode()) > 255:
+        raise ValueError("the name of a file beside the description, at most 255 bytes")
+    return name
+
+
 _Name = Annotated[str, Field(min_length=1, max_length=255)]
+_FileName = Annotated[_Name, AfterValidator(_file_name)]
 
 
 class WaterfallDescription(BaseModel):
@@ -56,10 +71,10 @@ class WaterfallDescription(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     sonar_id: str = "unknown"
-    port: _Name | None = None
-    starboard: _Name | None = None
+    port: _FileName | None = None
+    starboard: _FileName | None = None
     port_order: Literal["farthest_first", "nearest_first"] | None = None
-    navigation: _Name
+    navigation: _FileName
     positions: Literal["degrees", "metres"]
     projected_crs: ProjectedCrs | None = None
     frequency_hz: Annotated[float, Field(gt=0)] | None = None
@@ -68,35 +83,32 @@ class WaterfallDescription(BaseModel):
     columns: dict[str, _Name] = Field(default_factory=dict)
 
 
-class WaterfallSource(StreamedSource):
+class WaterfallSource(FileSource):
     """An open waterfall survey.
 
     Raises:
         SurveyFileError: A file is missing or damaged, or the files do not match.
     """
 
-    def __init__(self, path: Path, options: SurveyOptions) -> None:
-        super().__init__(path, options)
-        self._config = _read_description(path)
+    def _data_files(self) -> tuple[Path]:
+        self._config = _read_description(self.path)
         if self._config.port is not None and self._config.port_order is None:
-            raise SurveyFileError(str(path), "port_order", None, "farthest_first or nearest_first")
-        crs = self._config.projected_crs or options.projected_crs
+            raise SurveyFileError(str(self.path), "port_order", None, "farthest_first or nearest_first")
+        crs = self._config.projected_crs or self.options.projected_crs
         if self._config.positions == "metres" and crs is None:
             raise SurveyFileError(
-                str(path), "projected_crs", None, "the coordinate system of positions in metres (--crs)"
+                str(self.path), "projected_crs", None, "the coordinate system of positions in metres (--crs)"
             )
         self._projection = Projection(crs) if crs is not None and self._config.positions == "metres" else None
         self._images = self._read_images()
-        self._table = CheckedFile(path.parent / self._config.navigation)
-        self._without_fix = PingCounter()
         self._implausible: dict[str, PingCounter] = {}
-        self._pings = 0
-        self._extent: GridExtent | None = None
-        try:
-            self._validate(self._config.sonar_id, path.name.removesuffix(".toml").removesuffix(".waterfall"))
-        except BaseException:
-            self._table.close()
-            raise
+        return (self.path.parent / self._config.navigation,)
+
+    def _sonar_name(self) -> str:
+        return self._config.sonar_id
+
+    def _validate(self, sonar_id: str, line_name: str) -> None:
+        super()._validate(sonar_id, line_name.removesuffix(".waterfall"))
 
     @staticmethod
     def parts(path: Path) -> tuple[Path, ...]:
@@ -108,10 +120,6 @@ class WaterfallSource(StreamedSource):
         names = (config.port, config.starboard, config.navigation)
         return (path, *(path.parent / name for name in names if name is not None))
 
-    def close(self) -> None:
-        """Close the table."""
-        self._table.close()
-
     def _read_images(self) -> dict[Side, GreyImage]:
         named = {Side.PORT: self._config.port, Side.STARBOARD: self._config.starboard}
         images = {side: read_image(self.path.parent / name) for side, name in named.items() if name is not None}
@@ -121,41 +129,36 @@ class WaterfallSource(StreamedSource):
             images[Side.PORT] = images[Side.PORT][:, ::-1]
         return images
 
-    def _grid(self) -> GridExtent | None:
-        return self._extent
-
     def _format_warnings(self) -> list[str]:
-        fixes = [f"no position fix in {self._without_fix.summary(self._pings)}"] if self._without_fix.count else []
-        return fixes + [
+        missing = [f"no position fix in {self._without_fix.summary(self._pings)}"] if self._without_fix.count else []
+        return missing + [
             f"{name} out of range in {counter.summary(self._pings)}"
             for name, counter in sorted(self._implausible.items())
         ]
 
-    def _read_pings(self, *, first_pass: bool) -> Iterator[Ping]:
+    def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
         count = -1
         for count, values in enumerate(self._lines()):
             if any(count >= image.shape[0] for image in self._images.values()):
                 break
             yield self._ping(count, values, first_pass=first_pass)
-        self._pings = count + 1
         for side, image in self._images.items():
-            if image.shape[0] != self._pings:
+            if image.shape[0] != count + 1:
                 expected = f"a table of {image.shape[0]} lines, as the {side.value} image has rows"
-                raise self._table.error("lines", self._pings, expected)
-        self._table.check_unchanged()
+                raise self._file.error("lines", count + 1, expected)
 
     def _lines(self) -> Iterator[dict[str, str]]:
         """Yield each line as value name to text."""
-        reader = csv.reader(self._table.text_lines(), strict=True)
+        reader = csv.reader(self._file.text_lines(), strict=True)
         try:
             header = next(reader, [])
             columns = self._column_indices([name.strip() for name in header])
             for line in reader:
                 if len(line) != len(header):
-                    raise self._table.error(f"line {reader.line_num}", f"{len(line)} fields", f"{len(header)} fields")
+                    raise self._file.error(f"line {reader.line_num}", f"{len(line)} fields", f"{len(header)} fields")
                 yield {name: line[column].strip() for name, column in columns.items()}
         except csv.Error as error:
-            raise self._table.error(f"line {reader.line_num}", str(error), "comma-separated values") from error
+            raise self._file.error(f"line {reader.line_num}", str(error), "comma-separated values") from error
 
     def _column_indices(self, header: list[str]) -> dict[str, int]:
         """Return value name to column of the table."""
@@ -164,27 +167,25 @@ class WaterfallSource(StreamedSource):
             if name not in known:
                 raise SurveyFileError(str(self.path), "columns", name, "one of " + ", ".join(known))
             if column not in header:
-                raise self._table.error("header", f"no {column!r}", f"the column that columns.{name} names")
+                raise self._file.error("header", f"no {column!r}", f"the column that columns.{name} names")
         indices = {
             name: header.index(column) for name in known if (column := self._config.columns.get(name, name)) in header
         }
         for name in ("time_utc", "slant_range_m"):
             if name not in indices:
-                raise self._table.error("header", f"no {name!r}", "a column of that name, or one in columns")
+                raise self._file.error("header", f"no {name!r}", "a column of that name, or one in columns")
         return indices
 
     def _ping(self, row: int, values: dict[str, str], *, first_pass: bool) -> Ping:
         slant_range_m = self._number(row, "slant_range_m", values)
         if slant_range_m is None or not 0 < slant_range_m <= MAX_SLANT_RANGE_M:
-            raise self._table.error(
+            raise self._file.error(
                 f"ping {row}, slant_range_m", values["slant_range_m"], f"metres, above 0 to {MAX_SLANT_RANGE_M:.0f}"
             )
         navigation = {name: self._plausible(row, name, values, first_pass=first_pass) for name in NAVIGATION_LIMITS}
         if navigation["heading_deg"] == 360.0:
             navigation["heading_deg"] = 0.0
         position = self._position(row, values)
-        if position is None and first_pass:
-            self._without_fix.add(row)
         channels = tuple(
             ChannelPing(side, image[row].copy(), slant_range_m, self._config.frequency_hz)
             for side, image in self._images.items()
@@ -196,8 +197,13 @@ class WaterfallSource(StreamedSource):
             channels=channels,
             lat_deg=position.lat_deg if position else None,
             lon_deg=position.lon_deg if position else None,
+            heading_deg=navigation["heading_deg"],
+            altitude_m=navigation["altitude_m"],
+            depth_m=navigation["depth_m"],
+            speed_mps=navigation["speed_mps"],
+            pitch_deg=navigation["pitch_deg"],
+            roll_deg=navigation["roll_deg"],
             grid_m=self._coordinates(row, values),
-            **navigation,
         )
 
     def _number(self, row: int, name: str, values: dict[str, str]) -> float | None:
@@ -208,7 +214,7 @@ class WaterfallSource(StreamedSource):
         try:
             value = float(text)
         except ValueError as error:
-            raise self._table.error(f"ping {row}, {name}", text, "a number or an empty field") from error
+            raise self._file.error(f"ping {row}, {name}", text, "a number or an empty field") from error
         return value if math.isfinite(value) else None
 
     def _plausible(self, row: int, name: str, values: dict[str, str], *, first_pass: bool) -> float | None:
@@ -235,7 +241,6 @@ class WaterfallSource(StreamedSource):
         if north is None or east is None or (north, east) == (0.0, 0.0):
             return None
         if self._projection is not None:
-            self._extent = extended(self._extent, east, north)
             return self._projection.position(east, north)
         return position_in_degrees(north, east)
 
@@ -245,7 +250,7 @@ class WaterfallSource(StreamedSource):
         except ValueError:
             seconds = self._iso_time(row, text)
         if not -6.2e10 < seconds < 2.5e11:
-            raise self._table.error(f"ping {row}, time_utc", text, "a time of the years 1 to 9999")
+            raise self._file.error(f"ping {row}, time_utc", text, "a time of the years 1 to 9999")
         return seconds
 
     def _iso_time(self, row: int, text: str) -> float:
@@ -253,7 +258,7 @@ class WaterfallSource(StreamedSource):
             when = datetime.fromisoformat(text)
             return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
         except (ValueError, OverflowError) as error:
-            raise self._table.error(f"ping {row}, time_utc", text, "ISO 8601, or seconds since 1970") from error
+            raise self._file.error(f"ping {row}, time_utc", text, "ISO 8601, or seconds since 1970") from error
 
 
 def _read_description(path: Path) -> WaterfallDescription:
