@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 from builders.common import eventually
 from builders.exports import FIRST_UTC_S, decision, image, mission, store
@@ -78,7 +80,7 @@ INVALID_FILES = {
     "an array": (b"[]", "", "object"),
     "missing field": (b'{"type": "reconstructed_image", "v": 1}', "vessel_id", "a value"),
     "later schema version": (None, "v", "1"),
-    "too large": (b" " * (1 << 20) + b"  ", "size", "at most"),
+    "too large": (b" " * (1 << 20) + b"  ", "", "larger than 1048576 bytes"),
 }
 
 
@@ -112,11 +114,14 @@ def test_unrelated_files_are_ignored_and_unreadable_ones_reported(tmp_path):
     (tmp_path / "vessel-1" / ".half.json").write_text("{")
     (tmp_path / "readme.json").write_text("{")
     assert load_contacts(tmp_path).problems == ()
-    folder = tmp_path / "vessel-1" / "folder.json"
-    folder.mkdir()
+    (tmp_path / "vessel-1" / "folder.json").mkdir()
+    os.mkfifo(tmp_path / "vessel-1" / "pipe.json")
+    (tmp_path / "vessel-1" / "zero.json").symlink_to("/dev/zero")
     found = load_contacts(tmp_path)
     assert len(found.contacts) == 1
-    assert [(p.where, p.value) for p in found.problems] == [(str(folder), "Is a directory")]
+    names = ("folder.json", "pipe.json", "zero.json")
+    expected = [(str(tmp_path / "vessel-1" / name), "not a regular file") for name in names]
+    assert [(p.where, p.value) for p in found.problems] == expected
 
 
 def test_all_kinds_of_contacts(tmp_path):

@@ -1,85 +1,33 @@
-"""The event sender with real sockets: streams, datagrams, TLS, and peers that close, restart or are absent."""
+"""The event sender with real sockets: what it reports equals what the server has received, for every kind of server."""
 
 from __future__ import annotations
 
-import contextlib
 import socket
 import ssl
-import struct
 import threading
 
 import pytest
-from builders.common import eventually, free_port
+from builders.common import WAIT_S, eventually, free_port
+from builders.tak_server import Authority, TakServer
 
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.export.cot_sender import CotSender, Endpoint, TlsFiles, parse_endpoint
-from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
+from sonarpost.export.tak import cot_stream
+from sonarpost.export.tak.cot_sender import DATAGRAMS, MAX_BATCH, CotSender, Endpoint, TlsFiles, parse_endpoint
+from sonarpost.export.tak.cot_stream import ACKNOWLEDGED, READ
 
 EVENTS = (b'<event uid="a"/>', b'<event uid="b"/>')
 STREAM = b'<event uid="a"/>\n<event uid="b"/>\n'
-
-
-class Server:
-    """Listener of a TAK server: stores the data of each connection, and optionally sends a greeting."""
-
-    def __init__(self, context=None, port=0, greeting=b""):
-        self.received: list[bytearray] = []
-        self.ended: list[bool] = []
-        self.connections: list[socket.socket] = []
-        self._greeting = greeting
-        self._context = context
-        self._listener = socket.create_server(("127.0.0.1", port))
-        self.port = self._listener.getsockname()[1]
-        self._thread = threading.Thread(target=self._accept, daemon=True)
-        self._thread.start()
-
-    def _accept(self):
-        while True:
-            try:
-                connection = self._listener.accept()[0]
-                if self._context is not None:
-                    connection = self._context.wrap_socket(connection, server_side=True)
-                if self._greeting:
-                    connection.sendall(self._greeting)
-            except ssl.SSLError:
-                continue
-            except OSError:
-                return
-            self.received.append(bytearray())
-            self.ended.append(False)
-            self.connections.append(connection)
-            threading.Thread(target=self._read, args=(connection, len(self.received) - 1), daemon=True).start()
-
-    def _read(self, connection, number):
-        try:
-            while data := connection.recv(65536):
-                self.received[number] += data
-        except OSError:
-            return
-        self.ended[number] = True
-        connection.close()
-
-    def reset(self):
-        """Reset the newest connection, as a killed process does."""
-        connection = self.connections[-1]
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        connection.shutdown(socket.SHUT_RDWR)
-        connection.close()
-
-    def close(self):
-        self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-        for connection in self.connections:
-            connection.close()
-        self._thread.join()
+OTHER = b"<event uid='other'/>"
+TLS_VERSIONS = (ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3)
+PASSPHRASE = b"atakatak"
 
 
 @pytest.fixture
 def serve():
-    servers: list[Server] = []
+    servers: list[TakServer] = []
 
     def make(*args, **options):
-        servers.append(Server(*args, **options))
+        servers.append(TakServer(*args, **options))
         return servers[-1]
 
     yield make
@@ -87,8 +35,20 @@ def serve():
         server.close()
 
 
-def gives_up(_):
-    return True
+@pytest.fixture
+def authority(tmp_path):
+    return Authority(tmp_path)
+
+
+def sender_to(server, scheme="tcp", tls=None, **options):
+    return CotSender(f"{scheme}://127.0.0.1:{server.port}", tls, **{"settle_s": 0.0, "timeout_s": 600.0, **options})
+
+
+def refused(sender, events=EVENTS):
+    """Return the text of the failure of one attempt."""
+    with pytest.raises(PortError) as caught:
+        sender.send(events, give_up_after_s=0.0)
+    return str(caught.value)
 
 
 def test_endpoint_forms():
@@ -106,41 +66,40 @@ def test_endpoint_forms():
             parse_endpoint(text)
 
 
-def test_batch_is_complete_after_close(serve):
-    server = serve()
+# Servers that receive the events
+
+
+@pytest.mark.parametrize("version", [None, *TLS_VERSIONS])
+@pytest.mark.parametrize("greeting", [b"", OTHER, OTHER * 20_000])
+def test_good_client_is_read_to_its_end(serve, authority, version, greeting):
+    context = None if version is None else authority.server_context(version=version)
+    server = serve(context, greeting=greeting)
+    sender = sender_to(server, "tcp" if version is None else "tls", authority.issue("client"))
     many = tuple(b'<event uid="%d">%s</event>' % (n, b"x" * 5000) for n in range(100))
-    with CotSender(f"tcp://127.0.0.1:{server.port}") as sender:
-        sender.send(many)
-    eventually(lambda: server.ended == [True])
+    assert sender.send(many) == sender.send(EVENTS) == READ
     assert bytes(server.received[0]) == b"".join(event + b"\n" for event in many)
+    assert bytes(server.received[1]) == STREAM
+    assert sender.delivered == server.events() == 102
+    assert sender.send([]) == READ  # a check of the connection
+    assert sender.delivered == 102
 
 
-def test_one_connection_for_many_batches_and_server_data_is_discarded(serve):
-    server = serve(greeting=b"<event uid='other'/>" * 20_000)
-    with CotSender(f"tcp://127.0.0.1:{server.port}") as sender:
-        for _ in range(3):
-            sender.send(EVENTS)
-    eventually(lambda: server.ended == [True])
-    assert bytes(server.received[0]) == STREAM * 3
-    assert len(server.received) == 1
+@pytest.mark.parametrize("version", [None, *TLS_VERSIONS])
+def test_server_that_keeps_the_connection_open(serve, authority, version):
+    context = None if version is None else authority.server_context(version=version)
+    server = serve(context, keeps_open=True)
+    now_s = 0.0
 
+    def clock():
+        nonlocal now_s
+        now_s += server.ended == [True]  # time passes when the server has received all
+        return now_s
 
-@pytest.mark.parametrize("end", ["close", "reset"])
-def test_closed_connection_is_detected_before_the_next_batch(serve, end):
-    server = serve()
-    with CotSender(f"tcp://127.0.0.1:{server.port}", timeout_s=600.0) as sender:
-        sender.send(EVENTS)
-        eventually(lambda: len(server.received) == 1 and bytes(server.received[0]) == STREAM)
-        if end == "reset":
-            server.reset()
-        else:
-            server.connections[0].shutdown(socket.SHUT_RDWR)
-        with contextlib.suppress(ConnectionResetError):
-            # The end of the connection has arrived; without it the first batch after it may be lost.
-            assert sender._socket.recv(1, socket.MSG_PEEK) == b""
-        sender.send(EVENTS)
-    eventually(lambda: server.ended[-1])
-    assert (len(server.received), bytes(server.received[1])) == (2, STREAM)
+    sender = sender_to(
+        server, "tcp" if version is None else "tls", authority.issue("client"), clock=clock, timeout_s=5.0
+    )
+    assert sender.send(EVENTS) == ACKNOWLEDGED
+    assert sender.delivered == server.events() == 2
 
 
 def test_batch_is_sent_when_the_server_starts_later():
@@ -148,13 +107,12 @@ def test_batch_is_sent_when_the_server_starts_later():
 
     def wait(_):
         if not started:
-            started.append(Server(port=port))
+            started.append(TakServer(port=port))
         return False
 
-    with CotSender(f"tcp://127.0.0.1:{port}", wait=wait) as sender:
-        sender.send(EVENTS)
-    eventually(lambda: started[0].ended == [True])
-    assert bytes(started[0].received[0]) == STREAM
+    sender = CotSender(f"tcp://127.0.0.1:{port}", wait=wait, settle_s=0.0)
+    sender.send(EVENTS)
+    assert sender.delivered == started[0].events() == 2
     started[0].close()
 
 
@@ -167,64 +125,228 @@ def test_pauses_increase_until_the_time_limit():
         return False
 
     sender = CotSender(f"tcp://127.0.0.1:{port}", clock=lambda: now[0], wait=wait)
-    with pytest.raises(PortError, match=rf"tcp://127.0.0.1:{port}: 2 events not sent: .*[Rr]efused"):
+    with pytest.raises(PortError, match=rf"tcp://127.0.0.1:{port}: 0 of 2 events delivered: Connection refused$"):
         sender.send(EVENTS, give_up_after_s=20.0)
     assert pauses == [0.2, 0.5, 1.0, 2.0, 5.0, 5.0, 5.0]
+
+
+# Servers that refuse the client
+
+
+@pytest.mark.parametrize("version", TLS_VERSIONS)
+@pytest.mark.parametrize("client", ["another authority", "no certificate", "expired", "revoked"])
+@pytest.mark.parametrize("count", [1, 400])
+def test_refused_client_delivers_nothing_and_is_told_why(serve, authority, tmp_path, version, client, count):
+    good = authority.issue("client")
+    files, reason = {
+        "another authority": (Authority(tmp_path, "other").issue("client"), "unknown CA"),
+        "no certificate": (TlsFiles(), "certificate required|handshake failure"),
+        "expired": (authority.issue("late", expired=True), "certificate expired"),
+        "revoked": (good, "certificate revoked"),
+    }[client]
+    server = serve(authority.server_context(version=version, revoked=[good] if client == "revoked" else ()))
+    files = TlsFiles(good.ca, files.certificate, files.key)
+    # Small batches are written before the refusal; large ones fail in the write.
+    sender = sender_to(server, "tls", files, wait=lambda _: pytest.fail("a refusal is not tried again"))
+    with pytest.raises(PortError, match=rf"0 of {count} events delivered: refused by the server: ({reason})$"):
+        sender.send([b"x" * 10_000] * count)
+    assert sender.delivered == server.events() == 0
+
+
+def test_server_that_does_not_show_acceptance_does_not_count(serve, authority):
+    """Without tickets, data and close_notify, nothing shows that a server of TLS 1.3 accepts the client."""
+    server = serve(authority.server_context(tickets=0))
+    sender = sender_to(server, "tls", authority.issue("client"))
+    assert "0 of 2 events delivered: the server has neither accepted nor refused the client within 600 s" in refused(
+        sender
+    )
+    assert sender.delivered == 0
+
+
+def test_server_of_another_authority_or_with_an_expired_certificate_is_refused(serve, authority, tmp_path):
+    server = serve(authority.server_context())
+    other = Authority(tmp_path, "other").issue("client")
+    assert "certificate verify failed, that of the server: self-signed certificate in certificate chain" in refused(
+        sender_to(server, "tls", other)
+    )
+    late = authority.issue("late", expired=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(late.certificate, late.key)
+    expired = serve(context)
+    assert "certificate has expired" in refused(sender_to(expired, "tls", late))
+    assert server.received == expired.received == []
+
+
+# Servers of another protocol
+
+
+def test_tcp_to_a_tls_port(serve, authority):
+    server = serve(authority.server_context())
+    text = refused(sender_to(server))
+    assert "0 of 2 events delivered" in text
+    assert "a port with TLS needs tls://" in text
+    assert server.received == []
+    # Some servers answer with an alert.
+    alert = serve(greeting=b"\x15\x03\x01\x00\x02\x02\x46", keeps_open=True)
+    assert "refused by the server with a TLS alert: the port needs tls://" in refused(sender_to(alert))
+
+
+@pytest.mark.parametrize("server_options", [{"greeting": OTHER}, {"closes_after": 1}, {"reset_in": 0}, {}])
+def test_tls_to_a_plain_port(serve, authority, server_options):
+    server = serve(**server_options)
+    timeout_s = 600.0 if server_options else 0.01  # the last one does not answer
+    text = refused(sender_to(server, "tls", authority.issue("client"), timeout_s=timeout_s))
+    assert "0 of 2 events delivered: " in text
+    assert "a port without TLS needs tcp://" in text
+    assert all(b"event" not in data for data in server.received)
+
+
+@pytest.mark.parametrize("has_tls", [False, True])
+def test_port_of_http(serve, authority, has_tls):
+    server = serve(authority.server_context() if has_tls else None, greeting=b"HTTP/1.1 400 Bad Request\r\n\r\n")
+    sender = sender_to(server, "tls" if has_tls else "tcp", authority.issue("client"))
+    assert "0 of 2 events delivered: refused by the server with an HTTP reply" in refused(sender)
+
+
+# Servers that stop
+
+
+@pytest.mark.parametrize("version", [None, *TLS_VERSIONS])
+@pytest.mark.parametrize("reset_after", [1, 100_000])
+def test_server_killed_in_mid_stream(serve, authority, version, reset_after):
+    context = None if version is None else authority.server_context(version=version)
+    server = serve(context, reset_in=1, reset_after=reset_after)
+    sender = sender_to(server, "tcp" if version is None else "tls", authority.issue("client"))
+    text = refused(sender, [b"<event>%s</event>" % (b"x" * 2000)] * (MAX_BATCH + 100))
+    assert f"{MAX_BATCH} of {MAX_BATCH + 100} events delivered" in text
+    assert "closed by the server, which has stopped or refused the client" in text
+    assert sender.delivered == server.events() == MAX_BATCH
+    if version is None:
+        assert "some events can have arrived" in text
+
+
+def test_interrupted_batch_is_sent_again(serve):
+    server = serve(reset_in=0)
+    sender = sender_to(server, wait=lambda _: False)
+    assert sender.send(EVENTS) == READ
+    assert sender.delivered == server.events() == 2
+
+
+@pytest.mark.parametrize("version", [None, *TLS_VERSIONS])
+def test_server_that_closes_first_has_not_accepted_the_events(serve, authority, version):
+    """A TAK server that authenticates after the handshake closes the connection of a client that it does not know."""
+    context = None if version is None else authority.server_context(version=version)
+    server = serve(context, closes_after=len(STREAM))
+    sender = sender_to(server, "tcp" if version is None else "tls", authority.issue("client"), settle_s=600.0)
+    text = refused(sender)
+    assert "0 of 2 events delivered" in text
+    assert "which has stopped or refused the client" in text
+    assert sender.delivered == server.events() == 0
+
+
+def test_server_that_reads_nothing(serve):
+    with socket.create_server(("127.0.0.1", 0)) as listener:  # it accepts no connection
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        sender = CotSender(f"tcp://127.0.0.1:{listener.getsockname()[1]}", timeout_s=0.01, settle_s=0.0)
+        text = refused(sender, [b"x" * 60_000] * MAX_BATCH)
+    assert "not acknowledged by the server's TCP within 0.01 s" in text
+    assert sender.delivered == 0
+
+
+# Datagrams
+
+
+def test_server_that_reads_a_few_bytes_a_while(monkeypatch):
+    """Each read is progress, so that a limit of each wait alone would not end the connection."""
+    monkeypatch.setattr(cot_stream, "EXCHANGE_S", 0.5)
+    ended = threading.Event()
+
+    def read():
+        connection, _ = listener.accept()
+        with connection:
+            while not ended.wait(0.01) and connection.recv(512):
+                pass
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        thread = threading.Thread(target=read)
+        thread.start()
+        sender = CotSender(f"tcp://127.0.0.1:{listener.getsockname()[1]}", timeout_s=WAIT_S, settle_s=0.0)
+        with pytest.raises(PortError, match="0 of 1 events delivered"):
+            sender.send([bytes(20_000_000)], give_up_after_s=0.0)
+        ended.set()
+        thread.join(WAIT_S)
 
 
 def test_each_datagram_holds_one_event():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
-        with CotSender(f"udp://127.0.0.1:{receiver.getsockname()[1]}") as sender:
-            sender.send(EVENTS)
+        sender = CotSender(f"udp://127.0.0.1:{receiver.getsockname()[1]}")
+        assert sender.send(EVENTS) == DATAGRAMS
         assert [receiver.recv(65536) for _ in EVENTS] == list(EVENTS)
+    assert sender.delivered == 2
+    assert "Connection refused" in refused(sender, EVENTS[:1])
     multicast = CotSender("udp://239.2.3.1:6969", multicast_ttl=3)
-    with multicast, multicast._open_datagram_socket("239.2.3.1", 6969) as datagrams:
+    with multicast._open_datagram_socket("239.2.3.1", 6969) as datagrams:
         assert datagrams.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == 3
-    with CotSender("udp://127.0.0.1:9") as sender, pytest.raises(PortError, match="65001 bytes"):
-        sender.send([b"x" * 65_001])
+    with pytest.raises(PortError, match="65001 bytes"):
+        CotSender("udp://127.0.0.1:9").send([b"x" * 65_001])
 
 
-@pytest.fixture
-def issue(tmp_path):
-    """Issues certificates of a new authority."""
-    fleet = Fleet.init(tmp_path / "pki", "test")
-
-    def make(name):
-        folder = fleet.issue(name, "vessel", hosts=("127.0.0.1",)).folder
-        return TlsFiles(folder / CA_CERTIFICATE, folder / CERTIFICATE, folder / KEY)
-
-    return make
+# Files of TLS
 
 
-def server_context(files):
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(files.certificate, files.key)
-    context.load_verify_locations(files.ca)
-    context.verify_mode = ssl.CERT_REQUIRED
-    return context
+def test_encrypted_key_and_pkcs12(serve, authority, tmp_path):
+    server = serve(authority.server_context())
+    files = authority.issue("client")
+    client, truststore, key = authority.encrypted(files, PASSPHRASE)
+    passphrase = tmp_path / "passphrase"
+    passphrase.write_bytes(PASSPHRASE + b"\nmore")
+    passphrase.chmod(0o600)
+    for tls in (
+        TlsFiles(files.ca, files.certificate, key, passphrase),
+        TlsFiles(files.ca, client, None, passphrase),
+        TlsFiles(truststore, client, None, passphrase),
+    ):
+        sender_to(server, "tls", tls).send(EVENTS)
+    eventually(lambda: server.events() == 6)
 
 
-def test_mutual_tls(serve, issue):
-    server = serve(server_context(issue("server")), greeting=b"<event uid='other'/>" * 1000)
-    # A write that waits for data after a session ticket would never end.
-    with CotSender(f"tls://127.0.0.1:{server.port}", issue("client"), timeout_s=600.0) as sender:
-        for _ in range(3):
-            sender.send(EVENTS)
-        eventually(lambda: len(server.received) == 1 and bytes(server.received[0]) == STREAM * 3)
-    eventually(lambda: server.ended == [True])
-    assert len(server.received) == 1
+def test_invalid_files_of_tls(authority, tmp_path):
+    files = authority.issue("client")
+    client, truststore, key = authority.encrypted(files, PASSPHRASE)
+    wrong, readable = tmp_path / "wrong", tmp_path / "readable"
+    wrong.write_bytes(b"secret of another key")
+    wrong.chmod(0o600)
+    readable.write_bytes(PASSPHRASE)
+    readable.chmod(0o644)
+    bad = tmp_path / "bad.pem"
+    bad.write_text("no certificate")
+    for tls, text in (
+        (TlsFiles(files.ca, files.certificate, key), "key-locked.pem.*an encrypted key'.*--cot-passphrase-file"),
+        (TlsFiles(files.ca, files.certificate, key, wrong), "key-locked.pem.*an encrypted key'.*--cot-passphrase-file"),
+        (TlsFiles(files.ca, client), "client.p12.*an encrypted or damaged file.*--cot-passphrase-file"),
+        (TlsFiles(files.ca, client, None, wrong), "client.p12.*an encrypted or damaged file"),
+        (TlsFiles(files.ca, files.certificate, key, readable), "readable: mode: got '0644', expected 0600"),
+        (TlsFiles(files.ca, files.certificate, key, tmp_path / "none"), "none.*a readable file"),
+        (TlsFiles(files.ca, truststore, None, wrong), "truststore.p12.*an encrypted or damaged file"),
+        (TlsFiles(tmp_path / "nowhere.pem"), "TLS: got .*nowhere.pem.*expected readable PEM files"),
+        (TlsFiles(bad), "bad.pem"),
+        (TlsFiles(bad.with_suffix(".p12")), "bad.p12"),
+    ):
+        with pytest.raises(ConfigError, match=f"(?s){text}") as caught:
+            CotSender("tls://127.0.0.1:1", tls)
+        assert "secret of" not in str(caught.value)
+    readable.chmod(0o600)
+    with pytest.raises(ConfigError, match=r"truststore.p12.*readable PEM files"):
+        TlsFiles(files.ca, truststore, None, readable).context()
 
 
-def test_server_of_another_authority_is_rejected(serve, issue, tmp_path):
-    server = serve(server_context(issue("server")))
-    other = Fleet.init(tmp_path / "other", "other").issue("vessel-1", "vessel").folder
-    sender = CotSender(f"tls://127.0.0.1:{server.port}", TlsFiles(other / CA_CERTIFICATE), wait=gives_up)
-    with pytest.raises(PortError, match=r"(?i)certificate verify failed"):
-        sender.send(EVENTS)
-    assert server.received == []
-    with pytest.raises(ConfigError, match=r"TLS: got .*nowhere.pem.* expected readable PEM files"):
-        CotSender("tls://127.0.0.1:1", TlsFiles(tmp_path / "nowhere.pem"))
-    (tmp_path / "bad.pem").write_text("no certificate")
-    with pytest.raises(ConfigError, match=r"bad.pem"):
-        CotSender("tls://127.0.0.1:1", TlsFiles(tmp_path / "bad.pem"))
+def test_expected_name_of_the_server(serve, authority):
+    server = serve(authority.server_context(hosts=("takserver",)))
+    files = authority.issue("client")
+    assert "IP address mismatch" in refused(sender_to(server, "tls", files))
+    named = TlsFiles(files.ca, files.certificate, files.key, server_name="takserver")
+    assert sender_to(server, "tls", named).send(EVENTS) == READ
+    other = TlsFiles(files.ca, files.certificate, files.key, server_name="elsewhere")
+    assert "Hostname mismatch" in refused(sender_to(server, "tls", other))

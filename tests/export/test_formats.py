@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 import re
+import tempfile
 import zipfile
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -15,24 +16,27 @@ import numpy as np
 import pytest
 import xmlschema
 from builders.common import GOLDEN_FOLDER
-from builders.exports import FIRST_UTC_S, MISSIONS, as_of_golden_file, decision, golden_files, image, mission, store
+from builders.exports import (
+    FIRST_UTC_S,
+    MISSIONS,
+    as_of_golden_file,
+    decision,
+    export,
+    golden_files,
+    image,
+    mission,
+    store,
+)
 from hypothesis import example, given
 from hypothesis import strategies as st
 from PIL import Image
 
 from sonarpost.archive.image_files import side_car
 from sonarpost.export.contacts import ContactSet, ExportContact, SideCar, load_contacts
-from sonarpost.export.cot import CotOptions, cot_event, cot_events, cot_type
-from sonarpost.export.kml import kml_bytes, kmz_bytes, write_kml, write_kmz
-from sonarpost.export.tables import (
-    COLUMNS,
-    contact_properties,
-    csv_bytes,
-    geojson,
-    geojson_bytes,
-    write_csv,
-    write_geojson,
-)
+from sonarpost.export.formats import write_export
+from sonarpost.export.source import ExportSource, StoredImages
+from sonarpost.export.tables import COLUMNS, contact_properties
+from sonarpost.export.tak.cot import CotOptions, cot_event, cot_events, cot_type
 from sonarpost.export.text import csv_text, html_text, probabilities_text, xml_text
 from sonarpost.messages import Pixels
 from sonarpost.review.measured_size import MeasuredSize
@@ -127,11 +131,11 @@ def test_every_export_states_the_measurements_of_operators():
     measured = {"length_m": 1.2345, "length_sigma_m": 0.06, "height_m": 0.5, "height_sigma_m": 0.125}
     (contact,) = single(image(contact={"length_m": 2.5})).contacts
     contacts = ContactSet((dataclasses.replace(contact, size=MeasuredSize(**measured)),), (), ())
-    properties = geojson(contacts)["features"][0]["properties"]
+    properties = json.loads(export("geojson", contacts))["features"][0]["properties"]
     assert (properties["length_m"], properties["measured_length_m"]) == (2.5, 1.234)
     assert (properties["measured_height_sigma_m"], properties["measured_width_m"]) == (0.125, None)
-    assert csv_bytes(contacts).endswith(b",1.234,0.06,,,,,0.5,0.125\r\n")
-    assert b'<Data name="measured_height_m">\n      <value>0.5<' in kml_bytes(contacts)
+    assert export("csv", contacts).endswith(b",1.234,0.06,,,,,0.5,0.125\r\n")
+    assert b'<Data name="measured_height_m">\n      <value>0.5<' in export("kml", contacts)
     assert "Measured: L 1.23 ± 0.06 m, H 0.50 ± 0.12 m." in cot_event(contacts.contacts[0], NOW_UTC_S).decode()
 
 
@@ -146,16 +150,28 @@ def test_images_of_earlier_versions_have_no_statement_about_authentication_and_d
 
 
 def test_written_files_equal_the_bytes(contacts, tmp_path):
-    write_geojson(tmp_path / "a", contacts)
-    write_kml(tmp_path / "b", contacts)
-    write_csv(tmp_path / "c", contacts)
-    assert write_kmz(tmp_path / "d", contacts) == ()
-    expected = [geojson_bytes(contacts), kml_bytes(contacts), csv_bytes(contacts), kmz_bytes(contacts)[0]]
-    assert [(tmp_path / name).read_bytes() for name in "abcd"] == expected
+    for name in ("geojson", "kml", "csv", "kmz"):
+        assert write_export(name, tmp_path / "file", contacts) == []
+        assert (tmp_path / "file").read_bytes() == export(name, contacts)
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "out"}
+
+
+def test_parts_of_a_large_export_are_in_files_without_a_name(contacts, monkeypatch, tmp_path):
+    expected = {name: export(name, contacts) for name in ("geojson", "kml")}
+    files = []
+
+    def temporary_file(source):
+        files.append(tempfile.TemporaryFile(dir=source.path.parent))  # noqa: SIM115  the writer closes it
+        return files[-1]
+
+    monkeypatch.setattr(ExportSource, "temporary_file", temporary_file)
+    assert {name: export(name, contacts) for name in ("geojson", "kml")} == expected
+    assert len(files) == 7
+    assert all(file.closed for file in files)
 
 
 def test_geojson_has_longitude_first_and_lists_unlocated_contacts(contacts):
-    collection = json.loads(geojson_bytes(contacts))
+    collection = json.loads(export("geojson", contacts))
     assert collection["type"] == "FeatureCollection"
     assert "crs" not in collection  # RFC 7946, section 4: WGS 84 and nothing else
     points = [f["geometry"]["coordinates"] for f in collection["features"]]
@@ -168,7 +184,7 @@ def test_geojson_has_longitude_first_and_lists_unlocated_contacts(contacts):
 
 
 def test_csv_round_trip(contacts):
-    data = csv_bytes(contacts)
+    data = export("csv", contacts)
     assert data.count(b"\r\n") == data.count(b"\n") == 7
     rows = list(csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline="")))
     assert [tuple(row) for row in rows] == [COLUMNS] * 6
@@ -193,7 +209,7 @@ def test_csv_cell_is_never_a_formula_or_several_lines(text):
 
 def kmz_of(folder, *records):
     """Return the KMZ of records, and a function that opens its only picture in a folder."""
-    archive = zipfile.ZipFile(io.BytesIO(kmz_bytes(load_contacts(store(folder, *records)))[0]))
+    archive = zipfile.ZipFile(io.BytesIO(export("kmz", load_contacts(store(folder, *records)))))
 
     def picture(kind):
         (name,) = (n for n in archive.namelist() if n.startswith(f"{kind}/"))
@@ -203,7 +219,7 @@ def kmz_of(folder, *records):
 
 
 def test_kml_groups_contacts_by_verdict(contacts):
-    root = ET.fromstring(kml_bytes(contacts))
+    root = ET.fromstring(export("kml", contacts))
     folders = {f.findtext(f"{KML}name"): f.findall(f"{KML}Placemark") for f in root.iter(f"{KML}Folder")}
     counts = {"Mine-like (1)": 1, "Unsure (1)": 1, "Not reviewed (2)": 2, "Not mine-like (1)": 1}
     assert {name: len(marks) for name, marks in folders.items()} == counts
@@ -214,8 +230,7 @@ def test_kml_groups_contacts_by_verdict(contacts):
 
 
 def test_kmz_contains_all_referenced_files(contacts):
-    data, problems = kmz_bytes(contacts)
-    assert problems == ()
+    data = export("kmz", contacts)
     archive = zipfile.ZipFile(io.BytesIO(data))
     assert archive.namelist()[-1] == "doc.kml"
     text = archive.read("doc.kml").decode()
@@ -234,8 +249,9 @@ def test_kmz_contains_all_referenced_files(contacts):
 def test_unreadable_image_is_omitted_from_kmz(contacts):
     path = contacts.contacts[0].image_path
     path.write_bytes(b"no PNG")
-    data, problems = kmz_bytes(contacts)
-    assert [p.where for p in problems] == [str(path)]
+    images = StoredImages()
+    data = export("kmz", contacts, images)
+    assert [p.where for p in images.problems] == [str(path)]
     assert zipfile.ZipFile(io.BytesIO(data)).read("doc.kml").count(b"<Placemark") == 5
 
 
@@ -338,7 +354,7 @@ def test_tiny_coordinate_has_no_exponent(schema):
     event = cot_event(found.contacts[0], NOW_UTC_S)
     schema.validate(event.decode())
     assert attributes(event)[1]["lat"] == "-0.0000001"
-    assert b"e-" not in kml_bytes(found).split(b"<coordinates>")[1].split(b"</")[0]
+    assert b"e-" not in export("kml", found).split(b"<coordinates>")[1].split(b"</")[0]
 
 
 def test_contact_without_position_has_no_event():
@@ -350,7 +366,7 @@ def test_contact_without_position_has_no_event():
         CotOptions(stale_after_s=0)
     found = single(image().model_copy(update={"contact": None}))
     assert (len(found.unlocated), cot_events(found, NOW_UTC_S)) == (1, ())
-    assert geojson(found)["features"] == []
+    assert json.loads(export("geojson", found))["features"] == []
 
 
 # Untrusted text
@@ -372,16 +388,16 @@ def test_untrusted_text_is_escaped_in_all_formats(schema, remark, mlo_class, ope
     # XML readers normalise line ends.
     if "\r" not in remark + mlo_class + operator:
         assert remarks.endswith(f"Remark: {xml_text(remark)}" if remark else ".")
-    root = ET.fromstring(kml_bytes(found))
+    root = ET.fromstring(export("kml", found))
     data = {d.get("name"): d.findtext(f"{KML}value") for d in root.iter(f"{KML}Data")}
     balloon = root.findtext(f".//{KML}Placemark/{KML}description") or ""
     if "\r" not in remark:
         assert data["remark"] == xml_text(remark)
         assert html_text(remark) in balloon
     assert set(re.findall(r"<(/?\w+)", balloon)) <= {"table", "/table", "tr", "/tr", "td", "/td"}
-    properties = json.loads(geojson_bytes(found))["features"][0]["properties"]
+    properties = json.loads(export("geojson", found))["features"][0]["properties"]
     assert (properties["remark"], properties["notes"]) == (xml_text(remark), xml_text(note))
-    rows = list(csv.reader(io.StringIO(csv_bytes(found).decode("utf-8-sig"), newline="")))
+    rows = list(csv.reader(io.StringIO(export("csv", found).decode("utf-8-sig"), newline="")))
     assert [len(row) for row in rows] == [len(COLUMNS)] * 2
 
 

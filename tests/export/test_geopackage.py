@@ -13,14 +13,14 @@ from builders import gdal
 from builders.exports import mission
 
 from sonarpost.export.contacts import load_contacts
-from sonarpost.export.geopackage import write_geopackage
+from sonarpost.export.formats import write_export
 from sonarpost.export.tables import COLUMNS, contact_properties
 
 
 def test_rows_hold_properties_points_and_pictures(tmp_path):
     contacts = load_contacts(mission(tmp_path / "out"))
     path = tmp_path / "contacts.gpkg"
-    assert write_geopackage(path, contacts) == []
+    assert write_export("gpkg", path, contacts) == []
     with closing(sqlite3.connect(path)) as db:
         assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         assert db.execute("PRAGMA application_id").fetchone() == (0x47504B47,)
@@ -36,10 +36,11 @@ def test_rows_hold_properties_points_and_pictures(tmp_path):
         assert picture == (contact.image_path.read_bytes() if contact.image_path else None)
         point = None if geom is None else struct.unpack("<dd", geom[-16:])[::-1]
         assert point == contact.position
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["contacts.gpkg", "out"]
     # An unreadable picture is reported.
     lost = next(c.image_path for c in contacts.contacts if c.image_path)
     lost.unlink()
-    problems = write_geopackage(tmp_path / "other.gpkg", contacts)
+    problems = write_export("gpkg", tmp_path / "other.gpkg", contacts)
     assert [str(lost) in str(problem) for problem in problems] == [True]
 
 
@@ -47,7 +48,7 @@ def test_rows_hold_properties_points_and_pictures(tmp_path):
 def test_ogr_reads_the_layer(tmp_path):
     contacts = load_contacts(mission(tmp_path / "out"))
     path = tmp_path / "contacts.gpkg"
-    write_geopackage(path, contacts)
+    write_export("gpkg", path, contacts)
     result = subprocess.run(["ogrinfo", "-so", path, "contacts"], capture_output=True, text=True, check=True)
     assert f"Feature Count: {len(contacts.contacts)}" in result.stdout
     assert "Geometry: Point" in result.stdout
@@ -61,8 +62,8 @@ def test_full_disk_leaves_the_former_file(tmp_path, monkeypatch):
     def full(*_):
         raise sqlite3.OperationalError("database or disk is full")
 
-    monkeypatch.setattr("sonarpost.export.geopackage._point", full)
+    monkeypatch.setattr("sonarpost.export.geo.geopackage._point", full)
     with pytest.raises(OSError, match="disk is full"):
-        write_geopackage(path, contacts)
+        write_export("gpkg", path, contacts)
     assert path.read_bytes() == b"former"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["contacts.gpkg", "out"]

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import re
 
-from builders.exports import decision, image, mission, store
+from builders.exports import decision, export, image, mission, store
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.export.contacts import ContactSet, ExportContact, load_contacts
 from sonarpost.export.live import LiveContacts
-from sonarpost.export.reports import caris_text, mine_report, write_caris_text, write_mine_report
+
+
+def caris_text(contacts):
+    return export("caris.txt", contacts).decode()
+
+
+def mine_report(contacts):
+    return export("app11-like.txt", contacts).decode("ascii")
 
 
 def one(**changes):
@@ -27,8 +34,7 @@ def test_caris_lines_have_one_form(tmp_path):
         "41.5251334,-70.6712456,uuv-1/00A7 mine_like a;b\n"
     )
     contacts = load_contacts(mission(tmp_path / "out"))
-    write_caris_text(tmp_path / "a.caris.txt", contacts)
-    rows = [line.split(",") for line in (tmp_path / "a.caris.txt").read_text().splitlines()]
+    rows = [line.split(",") for line in caris_text(contacts).splitlines()]
     assert [row[0] for row in rows] == [f"{n:04}" for n in range(len(contacts.located))]
     assert {len(row) for row in rows} == {15}
     assert [float(row[12]) for row in rows] == [round(c.position[0], 7) for c in contacts.located if c.position]
@@ -52,8 +58,7 @@ def test_mine_report():
 
 def test_contacts_without_position_are_listed(tmp_path):
     contacts = load_contacts(store(tmp_path / "out", image(contact={"lat_deg": None, "depth_m": None})))
-    write_mine_report(tmp_path / "a.app11-like.txt", contacts)
-    text = (tmp_path / "a.app11-like.txt").read_text()
+    text = mine_report(contacts)
     assert "POSITION/UNKNOWN/WGS84/" in text
     assert "WATERDEPTH/UNKNOWN//" in text
     assert caris_text(contacts) == ""

@@ -6,6 +6,7 @@ import hashlib
 import io
 import threading
 import zipfile
+from dataclasses import replace
 from email import message_from_bytes
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -16,18 +17,19 @@ import pytest
 import xmlschema
 from builders.common import free_port
 from builders.exports import decision, image, mission, store
+from builders.tak_server import Authority
 
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.export.contacts import load_contacts
-from sonarpost.export.tak import (
+from sonarpost.export.formats import write_export
+from sonarpost.export.tak.data_package import (
     MANIFEST,
     UploadedPackage,
     attachment_sha256,
     data_package,
     file_transfer_event,
-    write_data_package,
 )
-from sonarpost.export.tak_files import TakFiles
+from sonarpost.export.tak.tak_files import TakFiles
 
 NOW_S = 1_700_000_000.0
 
@@ -48,7 +50,7 @@ def parameters(element):
 
 def test_package_has_every_event_with_its_image(contacts, tmp_path, schema):
     path = tmp_path / "contacts.tak.zip"
-    assert write_data_package(path, contacts) == []
+    assert write_export("tak.zip", path, contacts) == []
     with zipfile.ZipFile(path) as archive:
         assert archive.testzip() is None
         manifest = ET.fromstring(archive.read(MANIFEST))
@@ -71,7 +73,7 @@ def test_package_has_every_event_with_its_image(contacts, tmp_path, schema):
     # An unreadable image is reported, and its event is kept.
     lost = next(c for c in contacts.located if c.image_path)
     lost.image_path.unlink()
-    assert len(write_data_package(path, contacts)) == 1
+    assert len(write_export("tak.zip", path, contacts)) == 1
     with zipfile.ZipFile(path) as archive:
         assert f"{lost.uid}/{lost.uid}.cot" in archive.namelist()
 
@@ -141,6 +143,17 @@ def test_upload(contacts, marti):
     marti.status = 500
     with pytest.raises(PortError, match="status 500"):
         TakFiles(url).upload("a.zip", package, "sonarpost")
+
+
+def test_upload_by_tls_to_a_server_with_another_name(tmp_path, marti):
+    authority = Authority(tmp_path)
+    context, files = authority.server_context(hosts=("takserver",)), authority.issue("client")
+    marti.socket = context.wrap_socket(marti.socket, server_side=True)
+    url = f"https://127.0.0.1:{marti.server_port}"
+    with pytest.raises(PortError, match=r"not uploaded: .*IP address mismatch"):
+        TakFiles(url, files).upload("a.zip", b"zip", "sonarpost")
+    TakFiles(url, replace(files, server_name="takserver")).upload("a.zip", b"zip", "sonarpost")
+    assert marti.uploads == [("a.zip", b"zip")]
 
 
 def test_unreached_server_and_invalid_address_are_errors():

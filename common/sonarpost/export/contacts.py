@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Annotated, Final, Literal, TypeVar
 from pydantic import Field, ValidationError
 
 from sonarpost.errors import BadInputError, StoredFileError
+from sonarpost.files import read_regular
 from sonarpost.messages import (
     Contact,
     Count,
@@ -38,9 +39,6 @@ from sonarpost.wire import first_error
 
 MAX_FILE_BYTES: Final = 1 << 20
 """Larger JSON files are rejected. A side-car with 64 notes of 2000 characters is far smaller."""
-
-MAX_PICTURE_BYTES: Final = 1 << 26
-"""A larger image file is omitted and reported."""
 
 DECISIONS: Final = "decisions"
 
@@ -161,6 +159,9 @@ class ContactSet:
     unmatched: tuple[Decision, ...]
     problems: tuple[BadInputError, ...]
 
+    def __iter__(self) -> Iterator[ExportContact]:
+        return iter(self.contacts)
+
     @property
     def located(self) -> tuple[ExportContact, ...]:
         """Contacts with a position."""
@@ -250,24 +251,6 @@ def read_stored_records(out_dir: Path) -> StoredRecords:
     return StoredRecords(tuple(images), tuple(decisions), tuple(problems))
 
 
-def read_png(contact: ExportContact, problems: list[BadInputError]) -> bytes | None:
-    """Return the PNG of a contact; None without one, and if it cannot be read, which is added to `problems`."""
-    path = contact.image_path
-    if path is None:
-        return None
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_PICTURE_BYTES + 1)
-    except OSError as error:
-        problems.append(StoredFileError(str(path), "", error.strerror or str(error), "a readable PNG"))
-        return None
-    if len(data) > MAX_PICTURE_BYTES:
-        limit = f"{MAX_PICTURE_BYTES} bytes"
-        problems.append(StoredFileError(str(path), "size", f"more than {limit}", f"at most {limit}"))
-        return None
-    return data
-
-
 def match_start_time(start_times: Sequence[Seconds], utc_s: float) -> Seconds | None:
     """Return which of several images with one identifier a record refers to.
 
@@ -307,12 +290,7 @@ def _json_files(folder: Path, problems: list[BadInputError]) -> list[Path]:
 
 def _read(model: type[R], path: Path, problems: list[BadInputError]) -> R | None:
     try:
-        with path.open("rb") as file:
-            text = file.read(MAX_FILE_BYTES + 1)
-        if len(text) <= MAX_FILE_BYTES:
-            return model.model_validate_json(text)
-        limit = f"{MAX_FILE_BYTES} bytes"
-        problems.append(StoredFileError(str(path), "size", f"more than {limit}", f"at most {limit}"))
+        return model.model_validate_json(read_regular(path, MAX_FILE_BYTES))
     except OSError as error:
         problems.append(StoredFileError(str(path), "", error.strerror or str(error), f"a readable {model.TYPE}"))
     except ValidationError as error:

@@ -11,9 +11,9 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from sonarpost.export.contacts import ContactSet, ExportContact
-from sonarpost.export.kml import COLOURS
-from sonarpost.export.tables import geojson
+from sonarpost.export.contacts import ExportContact
+from sonarpost.export.geo.kml import COLOURS
+from sonarpost.export.tables import geojson_feature
 from sonarpost.messages import ReconstructedImage
 from sonarpost.review.rendering import eight_bits, encode_png
 
@@ -109,14 +109,12 @@ def location_fix(image: ReconstructedImage, time_ns: int) -> Document | None:
 
 def contact_map(contacts: Iterable[ExportContact]) -> Document:
     """Return all given contacts with a position as one message, coloured by their review state as in KML."""
-    chosen = tuple(contacts)
-    collection = geojson(ContactSet(chosen, (), ()))
-    features = collection["features"]
-    assert isinstance(features, list)
-    located = [contact for contact in chosen if contact.position is not None]
-    for feature, contact in zip(features, located, strict=True):
-        known = {name: value for name, value in feature["properties"].items() if value is not None}
-        feature["properties"] = known | {"style": {"color": COLOURS[contact.review]}}
+    features = []
+    for contact in contacts:
+        if contact.position is not None:
+            feature = geojson_feature(contact)
+            known = {name: value for name, value in feature["properties"].items() if value is not None}
+            features.append({**feature, "properties": known | {"style": {"color": COLOURS[contact.review]}}})
     document = {"type": "FeatureCollection", "features": features}
     return {"geojson": json.dumps(document, ensure_ascii=False, allow_nan=False)}
 

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 from sonarpost.export.contacts import ExportContact, SideCar, match_start_time
+from sonarpost.limits import limit
 from sonarpost.messages import Decision, ReconstructedImage
 
-MAX_NAMES: Final = 20_000
-"""Image names (vessel, vehicle, identifier) in memory; above it the least recently changed one is dropped."""
+MAX_NAMES: Final = limit(
+    20_000,
+    "images",
+    "shares",
+    surface="live contacts",
+    source="vessel",
+    resource="image names (vessel, vehicle, identifier) in memory",
+    at_limit="The least recently changed one of the vessel with the most is dropped",
+)
 MAX_DECISIONS: Final = 256
 """Decisions about one name; further ones are ignored."""
 MAX_IMAGES: Final = 64
@@ -98,7 +106,8 @@ class LiveContacts:
         name = self._names.setdefault(key, _Name())
         self._names.move_to_end(key)
         if len(self._names) > self._max_names:
-            self._names.popitem(last=False)
+            largest = Counter(vessel for vessel, _, _ in self._names).most_common(1)[0][0]
+            del self._names[next(each for each in self._names if each[0] == largest)]
         return name
 
     def _contact(self, key: tuple[str, str, str], start_s: int) -> ExportContact:

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import re
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
-from sonarpost.export.contacts import ContactSet, ExportContact
+from sonarpost.export.contacts import ExportContact
+from sonarpost.export.source import ExportSource
 from sonarpost.export.text import csv_text
-from sonarpost.files import write_atomically
 from sonarpost.review.decisions import ReviewState
 
 _NOT_MTF: Final = re.compile(r"[^A-Z0-9 .,()?\-]")
@@ -29,16 +28,15 @@ _ASSESSMENTS: Final[dict[ReviewState, str]] = {
 """MILCO is a mine-like contact in the terms of mine countermeasures, NONMILCO one that is not."""
 
 
-def caris_text(contacts: ContactSet) -> str:
-    """Return one line for each contact with a position, its fields separated by commas.
+def write_caris_text(file: IO[bytes], source: ExportSource) -> None:
+    """Write one line for each contact with a position, its fields separated by commas.
 
     Fields 1 to 10 are those of CARIS `ContactSingle`: contact index, key, line index, contact number, creation date,
     time and user, modification date, time and user. Fields 11 to 14 have the form of `ContactMultiPoints`: profile
     number, across-track distance in metres (port negative), latitude and longitude in degrees. Field 15 is a remark.
     """
-    lines = []
     line_names: dict[str, int] = {}
-    for index, contact in enumerate(contacts.located):
+    for index, contact in enumerate(contact for contact in source.contacts if contact.position is not None):
         assert contact.position is not None
         record, decision = contact.image.contact, contact.decision
         assert record is not None
@@ -66,30 +64,21 @@ def caris_text(contacts: ContactSet) -> str:
             f"{lon_deg:.7f}",
             _plain(_remark(contact)),
         )
-        lines.append(",".join(fields) + "\n")
-    return "".join(lines)
+        file.write(f"{','.join(fields)}\n".encode())
 
 
-def write_caris_text(path: Path, contacts: ContactSet) -> None:
-    """Write `caris_text` atomically.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    write_atomically(path, caris_text(contacts).encode())
-
-
-def mine_report(contacts: ContactSet) -> str:
-    """Return a report of sets in the manner of APP-11: fields separated by `/`, each set ended by `//`.
+def write_mine_report(file: IO[bytes], source: ExportSource) -> None:
+    """Write a report of sets in the manner of APP-11: fields separated by `/`, each set ended by `//`.
 
     The first set states that the message is not conformant. Free text is reduced to capital letters, digits and
     punctuation that do not separate fields.
     """
+    contacts = tuple(source.contacts)
     sets = [
         "NOTE/NOT CONFORMANT WITH APP-11. IN THE MANNER OF A MINE REPORT. BY SONARPOST",
-        f"CONTACTS/{len(contacts.contacts)}/WITHOUT POSITION/{len(contacts.unlocated)}",
+        f"CONTACTS/{len(contacts)}/WITHOUT POSITION/{sum(contact.position is None for contact in contacts)}",
     ]
-    for number, contact in enumerate(contacts.contacts, start=1):
+    for number, contact in enumerate(contacts, start=1):
         record, decision = contact.image.contact, contact.decision
         seen_s = contact.image.first_frame_utc_s if record is None or record.time_utc_s is None else record.time_utc_s
         sigma_m = None if record is None else record.position_sigma_m
@@ -104,16 +93,7 @@ def mine_report(contacts: ContactSet) -> str:
             sets.append(f"DECIDED/{_field(decision.operator)}/{_date_time_group(decision.decided_utc_s)}")
             if decision.remark:
                 sets.append(f"REMARK/{_field(decision.remark)}")
-    return "".join(f"{each}//\n" for each in sets)
-
-
-def write_mine_report(path: Path, contacts: ContactSet) -> None:
-    """Write `mine_report` atomically.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    write_atomically(path, mine_report(contacts).encode("ascii"))
+    file.write("".join(f"{each}//\n" for each in sets).encode("ascii"))
 
 
 def _plain(text: str) -> str:

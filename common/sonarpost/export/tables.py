@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
-import io
 import json
+import shutil
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Final
+from typing import IO, Any, Final
 
-from sonarpost.export.contacts import ContactSet, ExportContact
+from sonarpost.export.contacts import ExportContact
+from sonarpost.export.source import ExportSource
 from sonarpost.export.text import csv_text, utc_text, xml_text
-from sonarpost.files import write_atomically
 from sonarpost.review.measured_size import SIZE_FIELDS
 
 Value = str | int | float | bool | None
 
 DEGREE_DECIMALS: Final = 7
 """One unit of the last digit is about 1 cm on the ground."""
-
-BYTE_ORDER_MARK: Final = b"\xef\xbb\xbf"
 
 
 def _degrees(contact: ExportContact, index: int) -> float | None:
@@ -107,55 +105,44 @@ def contact_properties(contact: ExportContact) -> dict[str, Value]:
     return {name: read(contact) for name, read in _PROPERTIES.items()}
 
 
-def csv_bytes(contacts: ContactSet) -> bytes:
-    """Return a CSV table with one row for each contact, including contacts without a position.
+def write_csv(file: IO[bytes], source: ExportSource) -> None:
+    """Write a CSV table with one row for each contact, including contacts without a position.
 
     The text is UTF-8 with a byte order mark, which spreadsheet programs need to recognise the encoding. Lines end with
     CR LF.
     """
-    buffer = io.StringIO(newline="")
-    writer = csv.writer(buffer, lineterminator="\r\n")
+    writer = csv.writer(codecs.getwriter("utf-8-sig")(file), lineterminator="\r\n")
     writer.writerow(COLUMNS)
-    for contact in contacts.contacts:
+    for contact in source.contacts:
         writer.writerow([_cell(value) for value in contact_properties(contact).values()])
-    return BYTE_ORDER_MARK + buffer.getvalue().encode()
 
 
-def write_csv(path: Path, contacts: ContactSet) -> None:
-    """Write the CSV table atomically.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    write_atomically(path, csv_bytes(contacts))
-
-
-def geojson(contacts: ContactSet) -> dict[str, object]:
-    """Return a GeoJSON FeatureCollection of points, longitude first, WGS 84.
+def write_geojson(file: IO[bytes], source: ExportSource) -> None:
+    """Write a GeoJSON FeatureCollection of points as UTF-8 text. Equal contacts give equal bytes.
 
     Contacts without a position are not features. Their properties are in the foreign member `unlocated`.
     """
-    features: list[dict[str, object]] = []
-    for contact in contacts.located:
-        values = _without_control_characters(contact)
-        point = {"type": "Point", "coordinates": [values["lon_deg"], values["lat_deg"]]}
-        features.append({"type": "Feature", "id": contact.uid, "geometry": point, "properties": values})
-    unlocated = [_without_control_characters(contact) for contact in contacts.unlocated]
-    return {"type": "FeatureCollection", "features": features, "unlocated": unlocated}
+    counts = {True: 0, False: 0}
+    file.write(b'{\n "type": "FeatureCollection",\n "features": [')
+    with source.temporary_file() as unlocated:
+        for contact in source.contacts:
+            is_located = contact.position is not None
+            item = geojson_feature(contact) if is_located else _without_control_characters(contact)
+            text = json.dumps(item, ensure_ascii=False, allow_nan=False, indent=1).replace("\n", "\n  ")
+            part: IO[bytes] = file if is_located else unlocated
+            part.write(f"{',' if counts[is_located] else ''}\n  {text}".encode())
+            counts[is_located] += 1
+        file.write(b'%s],\n "unlocated": [' % (b"\n " if counts[True] else b""))
+        unlocated.seek(0)
+        shutil.copyfileobj(unlocated, file)
+        file.write(b"%s]\n}\n" % (b"\n " if counts[False] else b""))
 
 
-def geojson_bytes(contacts: ContactSet) -> bytes:
-    """Return the FeatureCollection as UTF-8 text. Equal contacts give equal bytes."""
-    return (json.dumps(geojson(contacts), ensure_ascii=False, allow_nan=False, indent=1) + "\n").encode()
-
-
-def write_geojson(path: Path, contacts: ContactSet) -> None:
-    """Write the FeatureCollection atomically.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    write_atomically(path, geojson_bytes(contacts))
+def geojson_feature(contact: ExportContact) -> dict[str, Any]:
+    """Return a contact with a position as a GeoJSON point, longitude first, WGS 84."""
+    values = _without_control_characters(contact)
+    point = {"type": "Point", "coordinates": [values["lon_deg"], values["lat_deg"]]}
+    return {"type": "Feature", "id": contact.uid, "geometry": point, "properties": values}
 
 
 def _cell(value: Value) -> str:

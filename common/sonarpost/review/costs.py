@@ -1,15 +1,33 @@
-"""Air time of requests to a vehicle."""
+"""Air time of requests to a vehicle, and when their answers arrive."""
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import accumulate, product
 from typing import Final
 
 from sonarpost.modem.interface import RateInfo
 
 NEW_IMAGE_KINDS: Final = ("wider", "original")
 """Kinds of requests that are answered with an image of its own."""
+
+
+RETRY_S: Final = 20.0
+"""Default of op_modem's `retry_s` and `feedback_interval_s`: wait before a lost packet is repeated."""
+_RETRY_WAITS: Final = (1.0, 1.0, 1.0, 2.0, 4.0, 8.0, 8.0, 8.0)
+_TURN_S: Final = 2.7
+"""Wait of the vessel for a free channel (`holdoff_s`), and the travel time over 1 km."""
+_ANSWER_TURN_S: Final = 5.7
+"""The same of the vehicle."""
+_CODING_S: Final = 2.0
+_PRIOR_LOSS: Final = 0.2
+_PRIOR_PACKETS: Final = 2
+_PRIOR_REQUESTS: Final = 2
+_FACTORS: Final = (0.5, 4.0)
+_SHARE: Final = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,15 +38,13 @@ class RequestCost:
         downlink_s: Air time of the request packet.
         uplink_s: Air time of the vehicle's answer; None if unknown.
         bytes_wanted: Size of the answer; None if unknown.
-        packets: Number of packets of the answer; None if unknown.
-        basis: Assumptions of the estimate, as text for the operator.
+        bytes_total: Length of the stream with the answer; None if unknown.
     """
 
     downlink_s: float
-    uplink_s: float | None
-    bytes_wanted: int | None
-    packets: int | None
-    basis: str
+    uplink_s: float | None = None
+    bytes_wanted: int | None = None
+    bytes_total: int | None = None
 
     @property
     def airtime_s(self) -> float | None:
@@ -79,22 +95,112 @@ def request_cost(
     """
     downlink_s = downlink_rate.airtime_s
     if kind in ("revisit", "prioritise"):
-        result = "the result is a new contact" if kind == "revisit" else "the images are sent in another order"
-        return RequestCost(downlink_s, 0.0, 0, 0, f"one packet down at rate {downlink_rate.number}; {result}")
-    if uplink_rate is None:
-        return RequestCost(downlink_s, None, None, None, "rate of the vehicle unknown: no frame received")
+        return RequestCost(downlink_s, 0.0, 0, 0)
     if bytes_total == 0:
-        return RequestCost(downlink_s, None, None, None, "length of the image stream unknown")
+        return RequestCost(downlink_s)
     total_bytes = 2 * bytes_total if kind == "refine" else bytes_total
     wanted_bytes = max(0, total_bytes - bytes_received)
-    loss = min(0.9, loss or 0.0)
-    packets = packets_for(math.ceil(wanted_bytes / (1 - loss)), uplink_rate, overhead_bytes)
-    size = (
-        f"a new image of {total_bytes} bytes"
-        if kind in (*NEW_IMAGE_KINDS, "region")
-        else f"{wanted_bytes} of {total_bytes} bytes missing"
-    )
-    basis = f"latest rate {uplink_rate.number}, {size}"
-    if loss:
-        basis += f", {loss:.0%} of frames lost"
-    return RequestCost(downlink_s, packets * uplink_rate.airtime_s, wanted_bytes, packets, basis)
+    if uplink_rate is None:
+        return RequestCost(downlink_s, None, wanted_bytes, total_bytes)
+    packets = packets_for(math.ceil(wanted_bytes / (1 - min(0.9, loss or 0.0))), uplink_rate, overhead_bytes)
+    return RequestCost(downlink_s, packets * uplink_rate.airtime_s, wanted_bytes, total_bytes)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkRecord:
+    """What is known of the link to a vehicle.
+
+    Attributes:
+        loss_up: Fraction of recently lost frames of the vehicle; None if unknown.
+        sent: Transmissions of the latest confirmed requests.
+        lost: Of these, those that were repeated.
+        ratios: Time to the answer over the expected time, of the latest answered requests.
+    """
+
+    loss_up: float | None = None
+    sent: int = 0
+    lost: int = 0
+    ratios: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedArrival:
+    """When an answer is complete, in seconds after the request.
+
+    Attributes:
+        median_s: Half of the answers are complete by then.
+        most_s: 90 % are.
+    """
+
+    median_s: float
+    most_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class RequestEstimate:
+    """Cost of a request, when its answer arrives, and on what both rest.
+
+    Attributes:
+        cost: The cost.
+        arrival: When the answer is complete; None if unknown, or if it depends on the track of the vehicle.
+        link: The measurements.
+    """
+
+    cost: RequestCost
+    arrival: ExpectedArrival | None
+    link: LinkRecord
+
+
+@lru_cache(maxsize=256)
+def expected_arrival(cost: RequestCost, rate: RateInfo, overhead_bytes: int, link: LinkRecord) -> ExpectedArrival:
+    """Estimate the time from a request to its complete answer.
+
+    The time is
+
+        g (T + W(n) + A + r (T + A') + m R)
+
+    with T: turn and air time of a packet of the vessel; n: lost copies of the request, P(n) = d^n (1 - d); W(n): the
+    waits before their repetitions, R (1 + 1 + 1 + 2 + 4 + ...), with R = `RETRY_S`; A: turn of the vehicle, coding and
+    the packets of the answer; A': turn and one packet; r: repetitions of a part of the answer, P(r) = (1 - c)^r c with
+    c = P(at least k of the F frames of the answer arrive) at the loss u of the vehicle's frames, and k carry all bytes;
+    m: lost feedback of these repetitions, negative binomial with d. The loss of the vessel's packets is
+    d = (lost + 2 u) / (sent + 2). g = exp(sum(log ratio) / (n + 2)) of n past requests, 0.5 to 4. Without a measurement
+    u = 0.2, the default of `expected_loss`. Other traffic of the vehicle is contained in g only.
+
+    Args:
+        cost: Cost of the request, with a known answer.
+        rate: Rate of the vehicle.
+        overhead_bytes: Header bytes in each frame.
+        link: Measurements.
+    """
+    assert cost.bytes_wanted is not None
+    loss = min(0.9, _PRIOR_LOSS if link.loss_up is None else link.loss_up)
+    down = min(0.9, (link.lost + _PRIOR_PACKETS * loss) / (link.sent + _PRIOR_PACKETS))
+    needed = 1 + math.ceil(
+        cost.bytes_wanted / (rate.frame_bytes - overhead_bytes)
+    )  # one more for confirmation, preview
+    packets = math.ceil(needed / (1 - loss) / rate.frames)
+    frames = packets * rate.frames
+    complete = 1.0 if loss == 0 else sum(_binomial(frames, n, 1 - loss) for n in range(needed, frames + 1))
+    turn_s = _TURN_S + cost.downlink_s
+    round_s = turn_s + _ANSWER_TURN_S + rate.airtime_s
+    first_s = turn_s + _ANSWER_TURN_S + _CODING_S + packets * rate.airtime_s
+    outcomes: list[tuple[float, float]] = []
+    for tries, rounds in product(range(len(_RETRY_WAITS)), repeat=2):
+        share = down**tries * (1 - down) * (1 - complete) ** rounds * complete
+        for lost in range(len(_RETRY_WAITS) if rounds else 1):
+            chance = math.comb(rounds + lost - 1, lost) * down**lost * (1 - down) ** rounds if rounds else 1.0
+            wait_s = RETRY_S * (sum(_RETRY_WAITS[:tries]) + lost)
+            outcomes.append((first_s + wait_s + rounds * round_s, share * chance))
+    outcomes.sort()
+    reached = list(accumulate(chance for _, chance in outcomes))
+    median_s, most_s = (outcomes[bisect_left(reached, share * reached[-1])][0] for share in (0.5, _SHARE))
+    factor = math.exp(sum(map(math.log, link.ratios)) / (len(link.ratios) + _PRIOR_REQUESTS))
+    factor = min(max(factor, _FACTORS[0]), _FACTORS[1])
+    return ExpectedArrival(factor * median_s, factor * most_s)
+
+
+def _binomial(trials: int, successes: int, share: float) -> float:
+    """Return the probability of a number of successes; `share` between 0 and 1. Long streams have many frames."""
+    ways = math.lgamma(trials + 1) - math.lgamma(successes + 1) - math.lgamma(trials - successes + 1)
+    return math.exp(ways + successes * math.log(share) + (trials - successes) * math.log1p(-share))

@@ -1,5 +1,8 @@
 """Lengths on an image in metres, and the height of an object from its shadow, with their uncertainty.
 
+The ends of a length or width move to half brightness (`highlight_ends`). The widths of the beam and of the codec's blur
+are then subtracted in quadrature. `python -m research.lengths` compares the results with simulated objects.
+
 Columns of an image in slant range are converted to metres on a flat seabed for length and width: ground = sqrt(slant² -
 altitude²). A shadow stays in slant range, as the formula of the height requires.
 """
@@ -8,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -16,12 +19,31 @@ import numpy.typing as npt
 
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Contact, ReconstructedImage
-from sonarpost.review.edge_blur import edge_sigma_px
+from sonarpost.review.highlight_ends import Point, snapped_ends
 from sonarpost.review.image_geometry import contact_mark, mark_sigma_m, range_axis, slant_range_m
-from sonarpost.review.rendering import LAYERS
+from sonarpost.review.rendering import eight_bits
+from sonarpost.review.resolution import CODEBOOK_CODECS, FULL_WIDTH, blur_px, codebook_edge_px
 
-CLICK_SIGMA_PX: Final = 0.7
-"""Standard deviation of a point that a person sets on an edge, along each axis."""
+SHADOW_SIGMA_PX: Final = 0.7
+"""Standard deviation of the end of a shadow that a person sets, along each axis."""
+
+SNAPPED_SIGMA_PX: Final = 1.0
+"""Standard deviation of an end at half brightness, along each axis."""
+
+UNSNAPPED_SIGMA_PX: Final = 3.0
+"""The same of an end without half brightness, which stays where a person has set it."""
+
+HIGHLIGHT_SIGMA_M: Final = (0.05, 0.18)
+"""Standard deviation between a highlight and its object, along and across the track.
+
+Across the track the far side of an object is not insonified, and its upper edge is displaced towards the vehicle.
+"""
+
+BLUR_SIGMA: Final = 0.5
+"""Relative standard deviation of the correction for beam and blur."""
+
+NEAR_FIELD_M: Final = 0.12
+"""Width of the beam near the vehicle: the effective length of the array."""
 
 SCALE_SIGMA: Final = 0.025
 """Relative standard deviation of the pixel size, which is transmitted in steps of 2.5 %."""
@@ -38,9 +60,10 @@ The ratio of ground to slant length is 1/cos of the grazing angle: 1.04 to 1.41 
 NADIR_LIMIT: Final = 1.05
 """Least ratio of slant range to altitude at which a column is converted to ground range; nearer is the water column."""
 
-Point = tuple[float, float]
 MeasurementKind = Literal["length", "width", "shadow"]
 Metres = Literal["ground", "slant", "unknown"]
+MEASURED_LAYER: Final = "raw"
+"""Layer of the received pixels."""
 KINDS: Final[tuple[MeasurementKind, ...]] = ("length", "width", "shadow")
 
 
@@ -74,10 +97,11 @@ class Length:
     Attributes:
         value_m: Length.
         sigma_m: Its standard deviation: the root of the sum of the squares of the following four.
-        click_sigma_m: From the ends that a person sets.
-        blur_sigma_m: From the blur of the codec at this number of bytes.
+        edge_sigma_m: From the ends of the line, and from the difference of a highlight to its object.
+        blur_sigma_m: From the correction for beam and blur; of a shadow, from the blur of the codec.
         scale_sigma_m: From the pixel size.
         range_sigma_m: From the conversion to ground range, or from its absence.
+        blur_m: Width of beam and blur along the line, which is subtracted in quadrature from the length of the line.
         along_m: Component along the track.
         across_m: Component across the track.
         metres: Range of the across-track component; "unknown" if the record does not state that of the image.
@@ -86,10 +110,11 @@ class Length:
 
     value_m: float
     sigma_m: float
-    click_sigma_m: float
+    edge_sigma_m: float
     blur_sigma_m: float
     scale_sigma_m: float
     range_sigma_m: float
+    blur_m: float
     along_m: float
     across_m: float
     metres: Metres
@@ -113,44 +138,113 @@ class Height:
     slant_range_m: float
 
 
-def measure_line(image: ReconstructedImage, line: Line) -> dict[str, object]:
+def measure_line(image: ReconstructedImage, line: Line, beam_width_deg: float) -> dict[str, object]:
     """Measure a line on an image; return the fields of a measurement of the console's HTTP interface.
 
-    A shadow lies across the track: the row of its end is that of its start.
+    The ends of a length or width move to half brightness. A shadow lies across the track: the row of its end is that of
+    its start.
+
+    Args:
+        image: Image of the contact.
+        line: Line as a person has drawn it.
+        beam_width_deg: Horizontal beam width of the sonar between half-power points; 0 for no correction.
 
     Raises:
-        NotMeasurableError: The layer is synthesised, no image was received, or see `measure_length`.
+        NotMeasurableError: The layer is another image, no image was received, or see `measure_length`.
     """
-    layer = next((layer for layer in LAYERS if layer.name == line.layer), None)
-    if layer is None:
-        raise NotMeasurableError("image", "layer", line.layer, " or ".join(layer.name for layer in LAYERS))
-    if not layer.measurable:
-        raise NotMeasurableError("image", "layer", line.layer, f"the raw image: {layer.reason}")
+    if line.layer != MEASURED_LAYER:
+        raise NotMeasurableError("image", "layer", line.layer, MEASURED_LAYER)
     if not image.codec:
         raise NotMeasurableError("image", "version", line.version, "a version with received pixels")
-    end = (line.start[0], line.end[1]) if line.kind == "shadow" else line.end
-    missing = image.missing()
-    blur_px = edge_sigma_px(image.codec, image.bytes_received, missing.size)
-    length = measure_length(image.contact, missing, line.start, end, blur_px, to_ground=line.kind != "shadow")
-    body: dict[str, object] = {
+    contact, missing = image.contact, image.missing()
+    codec_px = blur_px(image.codec, image.bytes_received, missing.size)
+    # In an image of codebook entries an edge may be anywhere within a tile on either side.
+    has_codebook = image.codec in CODEBOOK_CODECS
+    tile_px = codebook_edge_px(image.bytes_total or image.bytes_received, missing.size) if has_codebook else 0
+    if line.kind == "shadow":
+        end = line.start[0], line.end[1]
+        sigma_px = math.hypot(SHADOW_SIGMA_PX, tile_px / math.sqrt(3.0))
+        length = measure_length(contact, missing, line.start, end, (sigma_px, sigma_px), to_ground=False)
+        length = _with_shadow_blur(length, contact, codec_px)
+        return {**_body(line, line.start, end, (True, True), length), **_height(contact, length)}
+    # The line as it was drawn is checked first.
+    measure_length(contact, missing, line.start, line.end)
+    places = snapped_ends(eight_bits(image.picture.to_array()), missing, line.start, line.end)
+    found = (places[0] is not None, places[1] is not None)
+    start, end = places[0] or line.start, places[1] or line.end
+    sigmas_px = tuple(
+        math.hypot(SNAPPED_SIGMA_PX if snapped else UNSNAPPED_SIGMA_PX, tile_px / math.sqrt(3.0)) for snapped in found
+    )
+    highlight = measure_length(contact, missing, start, end, (sigmas_px[0], sigmas_px[1]))
+    length = _without_blur(highlight, contact, abs(end[1] - start[1]), codec_px, beam_width_deg)
+    return _body(line, start, end, found, length)
+
+
+def _body(line: Line, start: Point, end: Point, snapped: tuple[bool, bool], length: Length) -> dict[str, object]:
+    return {
         "kind": line.kind,
         "version": line.version,
         "layer": line.layer,
-        "from": list(line.start),
+        "from": list(start),
         "to": list(end),
+        "snapped": list(snapped),
         **asdict(length),
         "height_m": None,
         "height_sigma_m": None,
         "height_inputs": None,
-        "note": "",
     }
-    if line.kind != "shadow" or image.contact is None:
-        return body
-    height = height_from_shadow(image.contact, length)
+
+
+def _height(contact: Contact | None, shadow: Length) -> dict[str, object]:
+    """Return the fields of the height; empty if altitude or range is unknown."""
+    height = None if contact is None else height_from_shadow(contact, shadow)
     if height is None:
-        return {**body, "note": "no height: altitude of the vehicle or range of the object unknown"}
-    inputs = {"shadow_m": length.value_m, "altitude_m": height.altitude_m, "slant_range_m": height.slant_range_m}
-    return {**body, "height_m": height.height_m, "height_sigma_m": height.sigma_m, "height_inputs": inputs}
+        return {}
+    inputs = {"shadow_m": shadow.value_m, "altitude_m": height.altitude_m, "slant_range_m": height.slant_range_m}
+    return {"height_m": height.height_m, "height_sigma_m": height.sigma_m, "height_inputs": inputs}
+
+
+def _without_blur(length: Length, contact: Contact | None, columns: float, codec_px: float, beam_deg: float) -> Length:
+    """Return the length of a highlight without beam and blur, whose widths are subtracted in quadrature.
+
+    The beam blurs along the track. At least half of the length remains.
+
+    Args:
+        length: Length between the places of half brightness.
+        contact: Contact record.
+        columns: Columns of the line.
+        codec_px: Full width of the codec's blur at half maximum.
+        beam_deg: Beam width between half-power points.
+    """
+    if contact is None or contact.pixel_along_m is None:
+        return length
+    range_m = slant_range_m(contact) or 0.0
+    beam_m = math.hypot(NEAR_FIELD_M, range_m * math.radians(beam_deg)) if beam_deg > 0 else 0.0
+    along, across = length.along_m / length.value_m, length.across_m / length.value_m
+    column_m = length.across_m / columns if columns > 0 else 0.0
+    blur_m = math.hypot(along * math.hypot(beam_m, codec_px * contact.pixel_along_m), across * codec_px * column_m)
+    value_m = math.sqrt(max(length.value_m**2 - blur_m**2, (length.value_m / 2) ** 2))
+    highlight_sigmas_m = along * HIGHLIGHT_SIGMA_M[0], across * HIGHLIGHT_SIGMA_M[1]
+    edge_sigma_m = math.hypot(length.edge_sigma_m, *highlight_sigmas_m)
+    blur_sigma_m = BLUR_SIGMA * (length.value_m - value_m)
+    return replace(
+        length,
+        value_m=value_m,
+        sigma_m=math.hypot(edge_sigma_m, blur_sigma_m, length.scale_sigma_m, length.range_sigma_m),
+        edge_sigma_m=edge_sigma_m,
+        blur_sigma_m=blur_sigma_m,
+        blur_m=blur_m,
+        along_m=along * value_m,
+        across_m=across * value_m,
+    )
+
+
+def _with_shadow_blur(shadow: Length, contact: Contact | None, codec_px: float) -> Length:
+    """Return a shadow whose two ends have half of the codec's blur as a further standard deviation."""
+    if contact is None or contact.pixel_across_m is None:
+        return shadow
+    blur_sigma_m = math.sqrt(2.0) * codec_px / FULL_WIDTH / 2 * contact.pixel_across_m
+    return replace(shadow, blur_sigma_m=blur_sigma_m, sigma_m=math.hypot(shadow.sigma_m, blur_sigma_m))
 
 
 class _Line(NamedTuple):
@@ -168,18 +262,18 @@ def measure_length(
     missing: npt.NDArray[np.bool_],
     start: Point,
     end: Point,
-    blur_px: float = 0.0,
+    sigmas_px: tuple[float, float] = (0.0, 0.0),
     *,
     to_ground: bool = True,
 ) -> Length:
-    """Measure the length of a line on an image.
+    """Measure the length of a line on an image, without correction for blur.
 
     Args:
         contact: Contact record with the pixel size.
         missing: Shape (height_px, width_px), true for pixels that were not received.
         start: (row, column) of one end; see `Line`.
         end: (row, column) of the other end.
-        blur_px: Standard deviation of an edge in the image along each axis; see `edge_blur`.
+        sigmas_px: Standard deviations of both ends, along each axis.
         to_ground: Whether to convert slant range to ground range where both range and altitude are known.
 
     Raises:
@@ -218,15 +312,14 @@ def measure_length(
         )
         range_sigma_m = across_m / value_m * difference_m
     along_m, across_m = components(line)
-    point_sigma_m = _point_sigma(components, line)
     value_m = math.hypot(along_m, across_m)
     sigmas = (
-        CLICK_SIGMA_PX * point_sigma_m,
-        blur_px * point_sigma_m,
+        _edge_sigma(components, line, sigmas_px),
+        0.0,
         _change(components, line, line._replace(scale=1.0 + SCALE_SIGMA)),
         range_sigma_m,
     )
-    return Length(value_m, math.hypot(*sigmas), *sigmas, abs(along_m), abs(across_m), metres, missing_fraction)
+    return Length(value_m, math.hypot(*sigmas), *sigmas, 0.0, abs(along_m), abs(across_m), metres, missing_fraction)
 
 
 _Components = Callable[[_Line], tuple[float, float]]
@@ -276,23 +369,25 @@ def _change(components: _Components, line: _Line, changed: _Line) -> float:
     return abs(math.hypot(*components(changed)) - math.hypot(*components(line)))
 
 
-def _point_sigma(components: _Components, line: _Line) -> float:
-    """Return the standard deviation of the length for ends with one pixel of standard deviation along each axis.
-
-    The error of an end is projected on the line.
-    """
+def _edge_sigma(components: _Components, line: _Line, sigmas_px: tuple[float, float]) -> float:
+    """Return the standard deviation of the length from those of its ends along each axis, projected on the line."""
     total = 0.0
     vector = components(line)
     length_m = math.hypot(*vector)
     for axis, (rows, columns) in enumerate(((0.5, 0.0), (0.0, 0.5))):
-        for ahead, behind in (
+        for sigma_px, ahead, behind in (
             (
+                sigmas_px[0],
                 line._replace(start=_moved(line.start, rows, columns)),
                 line._replace(start=_moved(line.start, -rows, -columns)),
             ),
-            (line._replace(end=_moved(line.end, rows, columns)), line._replace(end=_moved(line.end, -rows, -columns))),
+            (
+                sigmas_px[1],
+                line._replace(end=_moved(line.end, rows, columns)),
+                line._replace(end=_moved(line.end, -rows, -columns)),
+            ),
         ):
-            total += (vector[axis] / length_m * (components(ahead)[axis] - components(behind)[axis])) ** 2
+            total += (sigma_px * vector[axis] / length_m * (components(ahead)[axis] - components(behind)[axis])) ** 2
     return math.sqrt(total)
 
 

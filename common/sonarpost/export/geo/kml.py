@@ -8,22 +8,22 @@ from __future__ import annotations
 
 import io
 import math
+import shutil
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import IO, Final
+from typing import IO, Final, Self
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
-from sonarpost.errors import BadInputError
-from sonarpost.export.contacts import ContactSet, ExportContact
+from sonarpost.export.contacts import ExportContact
+from sonarpost.export.source import ExportSource, Pixels, archive_entry
 from sonarpost.export.tables import DEGREE_DECIMALS, Value, contact_properties
 from sonarpost.export.text import VERDICT_WORDS, html_text, utc_text, xml_text
-from sonarpost.files import write_atomically
 from sonarpost.review.decisions import ReviewState
 from sonarpost.review.image_geometry import contact_mark
 from sonarpost.review.true_scale import (
@@ -36,7 +36,7 @@ from sonarpost.review.true_scale import (
     true_image,
 )
 from sonarpost.sonar.geometry import Position, offset_position
-from sonarpost.sonar.image_files import encode_png, read_image
+from sonarpost.sonar.image_files import encode_png
 
 NAMESPACE: Final = "http://www.opengis.net/kml/2.2"
 COLOURS: Final[Mapping[ReviewState, str]] = {
@@ -53,6 +53,7 @@ FOLDERS: Final[Mapping[ReviewState, str]] = {
     "unreviewed": "Not reviewed",
     "not_mine_like": "Not mine-like",
 }
+_OVERLAYS: Final = "overlays"
 UNAUTHENTICATED: Final = " (unauthenticated)"
 """End of the name of a contact whose acoustic frames were received without a key."""
 MAX_OVERLAY_M: Final = 1000.0
@@ -61,26 +62,6 @@ _MAX_OVERLAY_LATITUDE_DEG: Final = 85.0
 _BALLOON_PX: Final = 240
 """Longer side of the image in a balloon."""
 _BALLOON_QUALITY: Final = 75
-_ZIP_TIME: Final = (1980, 1, 1, 0, 0, 0)
-"""Earliest time of the ZIP format. A constant time makes equal contacts give equal bytes."""
-
-
-Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
-
-
-@dataclass(frozen=True, slots=True)
-class ContactImage:
-    """Image of a contact to export.
-
-    Attributes:
-        pixels: Shape (rows, columns).
-        missing: Same shape, true for pixels that were not received; None if unknown.
-        lines: Measured lines to draw.
-    """
-
-    pixels: Pixels
-    missing: npt.NDArray[np.bool_] | None = None
-    lines: tuple[PictureLine, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,123 +72,97 @@ class _Overlay:
     rotation_deg: float
 
 
-def kml_bytes(contacts: ContactSet) -> bytes:
-    """Return a KML document without images, UTF-8."""
-    return _document(contacts, {}, icons=False)
+def write_kml(file: IO[bytes], source: ExportSource) -> None:
+    """Write a KML document without images, UTF-8."""
+    with _Document(source) as document:
+        for contact in source.contacts:
+            document.add(contact)
+        document.write(file, icons=False)
 
 
-def read_stored_image(contact: ExportContact) -> ContactImage | None:
-    """Return the image in a contact's image file; None without a file.
-
-    Raises:
-        BadInputError: The file cannot be read.
-    """
-    return None if contact.image_path is None else ContactImage(read_image(contact.image_path))
-
-
-def add_kmz(
-    file: IO[bytes],
-    contacts: ContactSet,
-    read_contact_image: Callable[[ExportContact], ContactImage | None] = read_stored_image,
-) -> tuple[BadInputError, ...]:
-    """Write a KMZ archive with `doc.kml`, images and icons. It references no network resource.
-
-    One image at a time is in memory, and `doc.kml` is the last file of the archive.
-
-    Args:
-        file: Binary file, open for writing, at its start.
-        contacts: The contacts.
-        read_contact_image: Returns the image of a contact with a position; None if it has no image.
-
-    Returns:
-        One error for each image for which `read_contact_image` raised BadInputError. Its contact has no image.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    images: dict[str, _Overlay | None] = {}
-    problems: list[BadInputError] = []
-    with zipfile.ZipFile(file, "w") as archive:
-        for contact in contacts.located:
-            try:
-                found = read_contact_image(contact)
-            except BadInputError as error:
-                problems.append(error)
-                continue
-            if found is None:
-                continue
-            pixels = _eight_bits(found.pixels)
-            missing = np.zeros(pixels.shape, np.bool_) if found.missing is None else found.missing
-            _add_file(archive, f"pictures/{contact.uid}.jpg", _balloon_jpeg(contact, pixels, missing, found.lines))
-            images[contact.uid] = overlay = _overlay(contact, pixels)
-            if overlay is not None:
-                # A ground overlay has the shape of its box: pixels need not be square.
-                overlay_pixels = _heading_up(contact, stretched(pixels, missing))
-                _add_file(archive, f"overlays/{contact.uid}.png", _overlay_png(overlay_pixels))
-        for review, colour in _styles(contacts).items():
-            _add_file(archive, f"icons/{review}.png", _icon_png(review, colour))
-        _add_file(archive, "doc.kml", _document(contacts, images, icons=True))
-    return tuple(problems)
-
-
-def kmz_bytes(contacts: ContactSet) -> tuple[bytes, tuple[BadInputError, ...]]:
-    """Return a KMZ archive and the errors of its images; see `add_kmz`."""
-    buffer = io.BytesIO()
-    problems = add_kmz(buffer, contacts)
-    return buffer.getvalue(), problems
-
-
-def write_kml(path: Path, contacts: ContactSet) -> None:
-    """Write a KML document atomically.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    write_atomically(path, kml_bytes(contacts))
-
-
-def write_kmz(path: Path, contacts: ContactSet) -> tuple[BadInputError, ...]:
-    """Write a KMZ archive atomically; return one error for each unreadable image.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    archive, problems = kmz_bytes(contacts)
-    write_atomically(path, archive)
-    return problems
-
-
-def _add_file(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
-    entry = zipfile.ZipInfo(name, _ZIP_TIME)
-    # Images are already compressed.
-    entry.compress_type = zipfile.ZIP_DEFLATED if name.endswith(".kml") else zipfile.ZIP_STORED
-    entry.external_attr = 0o644 << 16
-    archive.writestr(entry, data)
+def write_kmz(file: IO[bytes], source: ExportSource) -> None:
+    """Write a KMZ archive: images, icons, and `doc.kml` as the last file. It references no network resource."""
+    with zipfile.ZipFile(file, "w") as archive, _Document(source) as document:
+        for contact in source.contacts:
+            found = None if contact.position is None else source.images.image(contact)
+            overlay = None
+            if found is not None:
+                pixels = _eight_bits(found.pixels)
+                missing = np.zeros(pixels.shape, np.bool_) if found.missing is None else found.missing
+                jpeg = _balloon_jpeg(contact, pixels, missing, found.lines)
+                archive.writestr(archive_entry(f"pictures/{contact.uid}.jpg"), jpeg)
+                overlay = _overlay(contact, pixels)
+                if overlay is not None:
+                    # A ground overlay has the shape of its box: pixels need not be square.
+                    overlay_pixels = _heading_up(contact, stretched(pixels, missing))
+                    archive.writestr(archive_entry(f"overlays/{contact.uid}.png"), _overlay_png(overlay_pixels))
+            document.add(contact, has_image=found is not None, overlay=overlay)
+        for review, colour in document.styles().items():
+            archive.writestr(archive_entry(f"icons/{review}.png"), _icon_png(review, colour))
+        with archive.open(archive_entry("doc.kml"), "w") as text:
+            document.write(text, icons=True)
 
 
 # Document
 
 
-def _document(contacts: ContactSet, images: Mapping[str, _Overlay | None], *, icons: bool) -> bytes:
-    root = ET.Element("kml", {"xmlns": NAMESPACE})
-    document = _child(root, "Document")
-    _child(document, "name", "sonarpost contacts")
-    unlocated = len(contacts.unlocated)
-    _child(document, "description", f"{len(contacts.located)} contacts; {unlocated} more without a position")
-    for review, colour in _styles(contacts).items():
-        _add_style(document, review, colour, icons=icons)
-    for review, title in FOLDERS.items():
-        reviewed = [contact for contact in contacts.located if contact.review == review]
-        if not reviewed:
-            continue
-        folder = _child(document, "Folder")
-        _child(folder, "name", f"{title} ({len(reviewed)})")
-        for contact in reviewed:
-            _add_placemark(folder, contact, has_image=contact.uid in images)
-    _add_overlays(document, contacts, images)
-    ET.indent(root, " ")
-    text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
-    return text + b"\n"
+class _Document:
+    """A KML document in parts, each in a temporary file: the contacts of each verdict, and the overlays.
+
+    Args:
+        source: The source of the export.
+    """
+
+    def __init__(self, source: ExportSource) -> None:
+        self._parts = {name: source.temporary_file() for name in (*FOLDERS, _OVERLAYS)}
+        self._counts = Counter[str]()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        for part in self._parts.values():
+            part.close()
+
+    def add(self, contact: ExportContact, *, has_image: bool = False, overlay: _Overlay | None = None) -> None:
+        """Add a contact; one without a position is counted."""
+        if contact.position is None:
+            self._counts["unlocated"] += 1
+            return
+        self._add(contact.review, _placemark(contact, *contact.position, has_image=has_image))
+        if overlay is not None:
+            self._add(_OVERLAYS, _ground_overlay(contact, overlay))
+
+    def styles(self) -> dict[ReviewState, str]:
+        """Return the colours of the verdicts, that of disputed contacts only if there are any."""
+        return {review: colour for review, colour in COLOURS.items() if review != "disputed" or self._counts[review]}
+
+    def write(self, file: IO[bytes], *, icons: bool) -> None:
+        """Write the document; `icons` is whether the archive has icons."""
+        root = ET.Element("kml", {"xmlns": NAMESPACE})
+        document = _child(root, "Document")
+        _child(document, "name", "sonarpost contacts")
+        located = sum(self._counts[review] for review in FOLDERS)
+        unlocated = self._counts["unlocated"]
+        _child(document, "description", f"{located} contacts; {unlocated} more without a position")
+        for review, colour in self.styles().items():
+            _add_style(document, review, colour, icons=icons)
+        ET.indent(root, " ")
+        head, end, tail = ET.tostring(root, encoding="utf-8", xml_declaration=True).rpartition(b"\n </Document>")
+        file.write(head)
+        titles: dict[str, str] = {review: f"{title} ({self._counts[review]})" for review, title in FOLDERS.items()}
+        for name, title in (titles | {_OVERLAYS: "Images on the seabed"}).items():
+            if self._counts[name]:
+                file.write(f"\n  <Folder>\n   <name>{title}</name>".encode())
+                self._parts[name].seek(0)
+                shutil.copyfileobj(self._parts[name], file)
+                file.write(b"\n  </Folder>")
+        file.write(end + tail + b"\n")
+
+    def _add(self, name: str, element: ET.Element) -> None:
+        ET.indent(element, " ", level=3)
+        self._parts[name].write(b"\n   " + ET.tostring(element, encoding="utf-8"))
+        self._counts[name] += 1
 
 
 def _add_style(document: ET.Element, review: ReviewState, colour: str, *, icons: bool) -> None:
@@ -222,17 +177,9 @@ def _add_style(document: ET.Element, review: ReviewState, colour: str, *, icons:
     _child(_child(style, "BalloonStyle"), "text", "<h3>$[name]</h3>$[description]")
 
 
-def _styles(contacts: ContactSet) -> dict[ReviewState, str]:
-    """Return the colours of the verdicts, that of disputed contacts only if there are any."""
-    disputed = any(contact.review == "disputed" for contact in contacts.located)
-    return {review: colour for review, colour in COLOURS.items() if review != "disputed" or disputed}
-
-
-def _add_placemark(folder: ET.Element, contact: ExportContact, *, has_image: bool) -> None:
-    assert contact.position is not None
-    lat_deg, lon_deg = contact.position
+def _placemark(contact: ExportContact, lat_deg: float, lon_deg: float, *, has_image: bool) -> ET.Element:
     values = contact_properties(contact)
-    placemark = _child(folder, "Placemark", id=contact.uid)
+    placemark = ET.Element("Placemark", {"id": xml_text(contact.uid)})
     _child(placemark, "name", contact.name + (UNAUTHENTICATED if contact.image.authenticated is False else ""))
     _child(placemark, "description", _balloon_html(values, f"pictures/{contact.uid}.jpg" if has_image else None))
     _child(_child(placemark, "TimeStamp"), "when", str(values["seen_utc"] or values["first_frame_utc"]))
@@ -242,6 +189,7 @@ def _add_placemark(folder: ET.Element, contact: ExportContact, *, has_image: boo
         if value is not None:
             _child(_child(extended, "Data", name=name), "value", _value_text(value))
     _child(_child(placemark, "Point"), "coordinates", f"{lon_deg:.{DEGREE_DECIMALS}f},{lat_deg:.{DEGREE_DECIMALS}f}")
+    return placemark
 
 
 def _balloon_html(values: Mapping[str, Value], image_name: str | None) -> str:
@@ -254,25 +202,18 @@ def _balloon_html(values: Mapping[str, Value], image_name: str | None) -> str:
     return f"{image}<table>{rows}</table>"
 
 
-def _add_overlays(document: ET.Element, contacts: ContactSet, images: Mapping[str, _Overlay | None]) -> None:
-    overlays = [(c, images[c.uid]) for c in contacts.located if c.uid in images]
-    if not any(overlay for _, overlay in overlays):
-        return
-    folder = _child(document, "Folder")
-    _child(folder, "name", "Images on the seabed")
-    for contact, overlay in overlays:
-        if overlay is None:
-            continue
-        ground = _child(folder, "GroundOverlay")
-        _child(ground, "name", contact.name)
-        # Initially hidden: a slant-range image is only accurate to a few metres and covers the chart.
-        _child(ground, "visibility", "0")
-        _child(_child(ground, "TimeStamp"), "when", utc_text(contact.image.first_frame_utc_s))
-        _child(_child(ground, "Icon"), "href", f"overlays/{contact.uid}.png")
-        box = _child(ground, "LatLonBox")
-        for name, degrees in overlay.box_deg.items():
-            _child(box, name, repr(round(degrees, DEGREE_DECIMALS)))
-        _child(box, "rotation", repr(round(overlay.rotation_deg, 2)))
+def _ground_overlay(contact: ExportContact, overlay: _Overlay) -> ET.Element:
+    ground = ET.Element("GroundOverlay")
+    _child(ground, "name", contact.name)
+    # Initially hidden: a slant-range image is only accurate to a few metres and covers the chart.
+    _child(ground, "visibility", "0")
+    _child(_child(ground, "TimeStamp"), "when", utc_text(contact.image.first_frame_utc_s))
+    _child(_child(ground, "Icon"), "href", f"overlays/{contact.uid}.png")
+    box = _child(ground, "LatLonBox")
+    for name, degrees in overlay.box_deg.items():
+        _child(box, name, repr(round(degrees, DEGREE_DECIMALS)))
+    _child(box, "rotation", repr(round(overlay.rotation_deg, 2)))
+    return ground
 
 
 def _value_text(value: Value) -> str:

@@ -6,12 +6,10 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from sonarpost.export.geo.geometry import geojson_geometry
 from sonarpost.export.text import utc_text
 from sonarpost.files import write_atomically
 from sonarpost.sonar.maps.coverage import CoveragePolygon
-
-_DEGREE_DECIMALS = 8
-"""One unit of the last digit is about 1 mm on the ground."""
 
 
 def coverage_properties(polygon: CoveragePolygon) -> dict[str, str | int | float]:
@@ -35,12 +33,7 @@ def write_coverage_geojson(path: Path, polygons: Sequence[CoveragePolygon]) -> N
     features = [
         {
             "type": "Feature",
-            "geometry": {
-                "type": "Polygon",
-                "coordinates": [
-                    [[round(p.lon_deg, _DEGREE_DECIMALS), round(p.lat_deg, _DEGREE_DECIMALS)] for p in polygon.ring]
-                ],
-            },
+            "geometry": geojson_geometry("Polygon", [(p.lon_deg, p.lat_deg) for p in polygon.ring]),
             "properties": coverage_properties(polygon),
         }
         for polygon in polygons

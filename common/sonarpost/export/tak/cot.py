@@ -7,12 +7,14 @@ S*U-NB (bottom return, non-mine bottom object).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import IO, Final, Literal
 from xml.etree import ElementTree as ET
 
-from sonarpost.export.contacts import ContactSet, ExportContact
+from sonarpost.export.contacts import ExportContact
+from sonarpost.export.source import ExportSource
 from sonarpost.export.tables import DEGREE_DECIMALS
 from sonarpost.export.text import VERDICT_WORDS, probabilities_text, utc_text, xml_text
 from sonarpost.review.decisions import ReviewState
@@ -140,9 +142,21 @@ def cot_event(
     return xml
 
 
-def cot_events(contacts: ContactSet, now_utc_s: float, options: CotOptions | None = None) -> tuple[bytes, ...]:
+def cot_events(
+    contacts: Iterable[ExportContact], now_utc_s: float, options: CotOptions | None = None
+) -> tuple[bytes, ...]:
     """Return the events of all contacts with a position. Contacts without a position are omitted."""
-    return tuple(cot_event(contact, now_utc_s, options) for contact in contacts.located)
+    return tuple(cot_event(contact, now_utc_s, options) for contact in contacts if contact.position is not None)
+
+
+def write_cot(file: IO[bytes], source: ExportSource) -> None:
+    """Write the events of all contacts with a position within one `events` element, one event a line."""
+    file.write(b'<?xml version="1.0" encoding="UTF-8"?>\n<events>\n')
+    now_utc_s = time.time()
+    for contact in source.contacts:
+        if contact.position is not None:
+            file.write(cot_event(contact, now_utc_s) + b"\n")
+    file.write(b"</events>\n")
 
 
 def _add_detail(event: ET.Element, contact: ExportContact) -> None:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-import http.client
 import uuid
 from typing import Final
 from urllib.parse import urlencode, urlsplit
 
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.export.cot_sender import TlsFiles
-from sonarpost.export.tak import UploadedPackage
+from sonarpost.export.tak.cot_sender import TlsFiles
+from sonarpost.export.tak.data_package import UploadedPackage
+from sonarpost.network import http_client
 
-MAX_REPLY_BYTES: Final = 1 << 16
 _EXPECTED: Final = "https://host:port or http://host:port"
+
+
+class PackageRefusedError(PortError):
+    """The server has not accepted a package."""
 
 
 class TakFiles:
@@ -21,8 +24,8 @@ class TakFiles:
 
     Args:
         url: Address of the server, `https://host:8443` or `http://host:8080`.
-        tls: PEM files for `https`; the server's certificate and name are verified.
-        timeout_s: Time limit of connection and reply.
+        tls: Files for `https`; the server's certificate and name are verified.
+        timeout_s: Time limit of a whole upload.
 
     Raises:
         ConfigError: The address or a file of `tls` is invalid.
@@ -31,14 +34,14 @@ class TakFiles:
     def __init__(self, url: str, tls: TlsFiles | None = None, timeout_s: float = 15.0) -> None:
         try:
             parts = urlsplit(url)
-            host, port = parts.hostname, parts.port
+            host, _ = parts.hostname, parts.port
         except ValueError as error:
             raise ConfigError("TAK server", "", url, _EXPECTED) from error
         if parts.scheme not in ("http", "https") or not host or parts.path.strip("/") or parts.query or parts.username:
             raise ConfigError("TAK server", "", url, _EXPECTED)
         self.url = f"{parts.scheme}://{parts.netloc}"
-        self._host, self._port = host, port
         self._context = (tls or TlsFiles()).context() if parts.scheme == "https" else None
+        self._server_name = (tls or TlsFiles()).server_name or host
         self._timeout_s = timeout_s
 
     def upload(self, name: str, package: bytes, creator: str) -> UploadedPackage:
@@ -50,7 +53,8 @@ class TakFiles:
             creator: Identifier of the sender.
 
         Raises:
-            PortError: The server is not reached, or has not accepted the package.
+            PackageRefusedError: The server has replied, but has not accepted the package.
+            PortError: The server is not reached.
         """
         digest = hashlib.sha256(package).hexdigest()
         query = urlencode({"hash": digest, "filename": name, "creatorUid": creator, "keyword": "missionpackage"})
@@ -62,20 +66,17 @@ class TakFiles:
         )
         body = head.encode() + package + f"\r\n--{boundary}--\r\n".encode()
         headers = {"Content-Type": f"multipart/form-data; boundary={boundary}"}
-        connection = self._connection()
         try:
-            connection.request("POST", f"/Marti/sync/missionupload?{query}", body, headers)
-            reply = connection.getresponse()
-            reply.read(MAX_REPLY_BYTES)
-        except (OSError, http.client.HTTPException) as error:
+            reply = http_client.post(
+                f"{self.url}/Marti/sync/missionupload?{query}",
+                body,
+                headers,
+                context=self._context,
+                server_name=self._server_name,
+                timeout_s=self._timeout_s,
+            )
+        except OSError as error:
             raise PortError(f"{self.url}: package not uploaded: {str(error) or type(error).__name__}") from error
-        finally:
-            connection.close()
         if not 200 <= reply.status < 300:
-            raise PortError(f"{self.url}: package not uploaded: status {reply.status} {reply.reason}")
+            raise PackageRefusedError(f"{self.url}: package not uploaded: status {reply.status} {reply.reason}")
         return UploadedPackage(f"{self.url}/Marti/sync/content?hash={digest}", digest, len(package))
-
-    def _connection(self) -> http.client.HTTPConnection:
-        if self._context is not None:
-            return http.client.HTTPSConnection(self._host, self._port, timeout=self._timeout_s, context=self._context)
-        return http.client.HTTPConnection(self._host, self._port, timeout=self._timeout_s)

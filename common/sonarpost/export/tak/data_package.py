@@ -13,15 +13,13 @@ import uuid
 import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Final
+from typing import IO, Final
 from xml.etree import ElementTree as ET
 
-from sonarpost.errors import BadInputError
-from sonarpost.export.contacts import ContactSet, ExportContact, read_png
-from sonarpost.export.cot import UNKNOWN, CotOptions, cot_event
+from sonarpost.export.contacts import ExportContact
+from sonarpost.export.source import ExportSource, archive_entry
+from sonarpost.export.tak.cot import UNKNOWN, CotOptions, cot_event
 from sonarpost.export.text import utc_text, xml_text
-from sonarpost.files import atomic_file
 
 MANIFEST: Final = "MANIFEST/manifest.xml"
 FILE_TRANSFER: Final = "b-f-t-r"
@@ -29,23 +27,13 @@ FILE_TRANSFER: Final = "b-f-t-r"
 _HUMAN: Final = "h-e"
 """CoT "human, estimated": clients expect it of file transfers."""
 _NAMESPACE: Final = uuid.UUID("6f4f2a0e-54b8-5b2f-9b0c-0a3c4b7d6f11")
-_ZIP_TIME: Final = (1980, 1, 1, 0, 0, 0)
 
 
-def write_data_package(path: Path, contacts: ContactSet) -> list[BadInputError]:
-    """Write a data package of all contacts with a position atomically, one image at a time in memory.
-
-    Returns:
-        One error for each image that cannot be read. Its event has no attachment.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    problems: list[BadInputError] = []
-    pairs = ((contact, read_png(contact, problems)) for contact in contacts.located)
-    with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
-        _fill(archive, path.name.partition(".")[0], pairs, time.time(), None)
-    return problems
+def write_data_package(file: IO[bytes], source: ExportSource) -> None:
+    """Write a data package of all contacts with a position, named after the file."""
+    pairs = ((contact, source.images.png(contact)) for contact in source.contacts if contact.position is not None)
+    with zipfile.ZipFile(file, "w") as archive:
+        _fill(archive, source.path.name.partition(".")[0], pairs, time.time(), None)
 
 
 def data_package(contact: ExportContact, png: bytes, now_utc_s: float, options: CotOptions | None = None) -> bytes:
@@ -141,28 +129,20 @@ def _fill(
         uids.append(contact.uid)
         digest = None if png is None else attachment_sha256(png)
         entry = f"{contact.uid}/{contact.uid}.cot"
-        _add(archive, entry, cot_event(contact, now_utc_s, options, digest))
+        archive.writestr(archive_entry(entry), cot_event(contact, now_utc_s, options, digest))
         _content(contents, entry, {"uid": contact.uid, "name": contact.name})
         if png is not None:
             entry = f"{digest}/{file_name(contact)}.png"
-            _add(archive, entry, png)
+            archive.writestr(archive_entry(entry), png)
             # A file with the identifier of an event is an attachment of it.
             _content(contents, entry, {"uid": contact.uid})
     package_uid = str(uuid.uuid5(_NAMESPACE, json.dumps([name, uids])))
     for key, value in (("uid", package_uid), ("name", name)):
         ET.SubElement(configuration, "Parameter", {"name": key, "value": xml_text(value)})
-    _add(archive, MANIFEST, ET.tostring(manifest, encoding="utf-8", xml_declaration=True))
+    archive.writestr(archive_entry(MANIFEST), ET.tostring(manifest, encoding="utf-8", xml_declaration=True))
 
 
 def _content(contents: ET.Element, entry: str, parameters: dict[str, str]) -> None:
     content = ET.SubElement(contents, "Content", {"ignore": "false", "zipEntry": entry})
     for key, value in parameters.items():
         ET.SubElement(content, "Parameter", {"name": key, "value": xml_text(value)})
-
-
-def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
-    entry = zipfile.ZipInfo(name, _ZIP_TIME)
-    # Images are already compressed.
-    entry.compress_type = zipfile.ZIP_STORED if name.endswith(".png") else zipfile.ZIP_DEFLATED
-    entry.external_attr = 0o644 << 16
-    archive.writestr(entry, data)

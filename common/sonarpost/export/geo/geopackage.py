@@ -11,19 +11,20 @@ import shutil
 import sqlite3
 import struct
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
-from sonarpost.errors import BadInputError
-from sonarpost.export.contacts import ContactSet, ExportContact, read_png
-from sonarpost.export.coverage import coverage_properties
-from sonarpost.export.kml import COLOURS
-from sonarpost.export.tables import COLUMNS, contact_properties
+from sonarpost.export.contacts import ExportContact
+from sonarpost.export.geo.coverage import coverage_properties
+from sonarpost.export.geo.geometry import Point, split_ring
+from sonarpost.export.geo.kml import COLOURS
+from sonarpost.export.source import ExportSource
+from sonarpost.export.tables import COLUMNS, Value, contact_properties
 from sonarpost.export.text import utc_text
 from sonarpost.files import atomic_file
-from sonarpost.sonar.geometry import Position
 from sonarpost.sonar.maps.coverage import CoveragePolygon
 
 _APPLICATION_ID: Final = 0x47504B47
@@ -70,12 +71,13 @@ def _point(contact: ExportContact) -> bytes | None:
     return struct.pack("<2sBBiBIdd", b"GP", 0, 1, 4326, 1, 1, lon_deg, lat_deg)
 
 
-def _polygon(ring: Sequence[Position]) -> bytes:
-    """Return a polygon of one ring as GeoPackage geometry: header with envelope, then WKB, longitude first."""
-    lons, lats = [corner.lon_deg for corner in ring], [corner.lat_deg for corner in ring]
+def _polygons(rings: Sequence[Sequence[Point]], geometry: str) -> bytes:
+    """Return a `POLYGON` of one ring, or a `MULTIPOLYGON`, as GeoPackage geometry: header with envelope, then WKB."""
+    lons, lats = zip(*chain(*rings), strict=True)
     header = struct.pack("<2sBBi4d", b"GP", 0, 3, 4326, min(lons), max(lons), min(lats), max(lats))
-    points = b"".join(struct.pack("<2d", corner.lon_deg, corner.lat_deg) for corner in ring)
-    return header + struct.pack("<BIII", 1, 3, 1, len(ring)) + points
+    count = struct.pack("<BII", 1, 6, len(rings)) if geometry == "MULTIPOLYGON" else b""
+    polygons = (struct.pack(f"<BIII{2 * len(ring)}d", 1, 3, 1, len(ring), *chain(*ring)) for ring in rings)
+    return header + count + b"".join(polygons)
 
 
 def _style() -> str:
@@ -100,17 +102,22 @@ def _rgba(colour: str) -> str:
 
 
 @contextmanager
-def new_geopackage(path: Path) -> Iterator[sqlite3.Connection]:
-    """Create a GeoPackage without layers; when the block ends without an error, it replaces the file atomically.
+def _new_geopackage(file: IO[bytes], folder: Path) -> Iterator[sqlite3.Connection]:
+    """Create a GeoPackage without layers; when the block ends without an error, copy it to a file.
+
+    The database has no name in the folder, so that the operating system deletes it when the process ends.
 
     Raises:
         OSError: The file cannot be written.
     """
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-        database = Path(folder) / "new.gpkg"
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=".gpkg-", delete=False) as complete:
         try:
-            with closing(sqlite3.connect(database)) as db:
-                # The file is written to a temporary folder first.
+            try:
+                new = sqlite3.connect(complete.name)
+            finally:
+                Path(complete.name).unlink()
+            with closing(new) as db:
+                # A journal would need the name.
                 db.execute("PRAGMA journal_mode = OFF")
                 db.execute(f"PRAGMA application_id = {_APPLICATION_ID}")
                 db.execute(f"PRAGMA user_version = {_USER_VERSION}")
@@ -126,59 +133,63 @@ def new_geopackage(path: Path) -> Iterator[sqlite3.Connection]:
                 yield db
                 db.commit()
         except sqlite3.OperationalError as error:
-            raise OSError(errno.EIO, str(error), str(path)) from error
-        with database.open("rb") as complete, atomic_file(path) as file:
-            shutil.copyfileobj(complete, file)
+            raise OSError(errno.EIO, str(error)) from error
+        shutil.copyfileobj(complete, file)
 
 
-def add_layer(
-    db: sqlite3.Connection, name: str, geometry: str, columns: str, positions: Sequence[tuple[float, float]], time: str
-) -> None:
-    """Create a table of features in WGS 84.
+class _Layer:
+    """A table of features in WGS 84, with the columns `fid` and `geom` and others.
 
     Args:
         db: A GeoPackage.
         name: Name of the table.
         geometry: Type of the column `geom`, for example `POINT`.
         columns: Definitions of the other columns, as in SQL.
-        positions: Latitude and longitude of all features, for the bounding box of the layer.
-        time: Time of the last change, ISO 8601.
     """
-    lats, lons = [lat for lat, _ in positions], [lon for _, lon in positions]
-    box = (min(lons), min(lats), max(lons), max(lats)) if positions else (None,) * 4
-    db.execute(f"CREATE TABLE {name} (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom {geometry}, {columns})")
-    db.execute(_CONTENTS, (name, "features", name, time, *box, 4326))
-    db.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, 4326, 0, 0)", (name, geometry))
+
+    def __init__(self, db: sqlite3.Connection, name: str, geometry: str, columns: str) -> None:
+        self._db = db
+        self._name = name
+        self._box: tuple[float, float, float, float] | None = None
+        db.execute(f"CREATE TABLE {name} (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom {geometry}, {columns})")
+        db.execute(_CONTENTS, (name, "features", name, "", *(None,) * 4, 4326))
+        db.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, 4326, 0, 0)", (name, geometry))
+
+    def add(self, geometry: bytes | None, points: Iterable[Point], values: Iterable[Value | bytes]) -> None:
+        """Add a feature: its geometry, the points of it, and the values of the other columns."""
+        for lon_deg, lat_deg in points:
+            west, south, east, north = self._box or (lon_deg, lat_deg) * 2
+            self._box = min(west, lon_deg), min(south, lat_deg), max(east, lon_deg), max(north, lat_deg)
+        row = (None, geometry, *values)
+        self._db.execute(f"INSERT INTO {self._name} VALUES ({', '.join('?' * len(row))})", row)  # noqa: S608  constants
+
+    def finish(self, changed: str) -> None:
+        """Store the bounding box, and the time of the last change, ISO 8601."""
+        box = self._box or (None,) * 4
+        self._db.execute(
+            "UPDATE gpkg_contents SET last_change = ?, min_x = ?, min_y = ?, max_x = ?, max_y = ? WHERE table_name = ?",
+            (changed, *box, self._name),
+        )
 
 
-def write_geopackage(path: Path, contacts: ContactSet) -> list[BadInputError]:
-    """Write a GeoPackage atomically. One image at a time is in memory.
-
-    A contact without a position has no geometry; one without an image has no picture.
-
-    Returns:
-        One error for each image that cannot be read. Its contact has no picture.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    problems: list[BadInputError] = []
-    changed = utc_text(max((c.image.last_frame_utc_s for c in contacts.contacts), default=0.0))
+def write_geopackage(file: IO[bytes], source: ExportSource) -> None:
+    """Write a GeoPackage of contacts. A contact without a position has no geometry; one without an image no picture."""
     columns = ", ".join(f'"{name}" {_column_type(name)}' for name in COLUMNS)
-    positions = [c.position for c in contacts.located if c.position is not None]
-    with new_geopackage(path) as db:
+    changed_utc_s = 0.0
+    with _new_geopackage(file, source.path.parent) as db:
+        layer = _Layer(db, "contacts", "POINT", f"{columns}, picture BLOB")
+        for contact in source.contacts:
+            points = [] if contact.position is None else [contact.position[::-1]]
+            layer.add(_point(contact), points, [*contact_properties(contact).values(), source.images.png(contact)])
+            changed_utc_s = max(changed_utc_s, contact.image.last_frame_utc_s)
+        changed = utc_text(changed_utc_s)
+        layer.finish(changed)
         db.executescript(_STYLES)
-        add_layer(db, "contacts", "POINT", f"{columns}, picture BLOB", positions, changed)
         db.execute(_CONTENTS, ("layer_styles", "attributes", "layer_styles", changed, *(None,) * 4, 0))
         db.execute(
             "INSERT INTO layer_styles VALUES (1, '', '', 'contacts', 'geom', 'review', ?, '', 1, '', '', NULL, ?)",
             (_style(), changed),
         )
-        marks = ", ".join("?" * (len(COLUMNS) + 3))
-        for contact in contacts.contacts:
-            values = (None, _point(contact), *contact_properties(contact).values(), read_png(contact, problems))
-            db.execute(f"INSERT INTO contacts VALUES ({marks})", values)  # noqa: S608 - only question marks
-    return problems
 
 
 def write_coverage_geopackage(path: Path, polygons: Sequence[CoveragePolygon]) -> None:
@@ -187,11 +198,12 @@ def write_coverage_geopackage(path: Path, polygons: Sequence[CoveragePolygon]) -
     Raises:
         OSError: The file cannot be written.
     """
-    changed = utc_text(max((polygon.end_utc_s for polygon in polygons), default=0.0))
-    positions = [(corner.lat_deg, corner.lon_deg) for polygon in polygons for corner in polygon.ring]
+    divided = [split_ring([(corner.lon_deg, corner.lat_deg) for corner in polygon.ring]) for polygon in polygons]
+    # A layer has one type.
+    geometry = "MULTIPOLYGON" if any(len(rings) > 1 for rings in divided) else "POLYGON"
     columns = "line TEXT, first_ping INTEGER, last_ping INTEGER, start_utc TEXT, end_utc TEXT, area_m2 REAL"
-    with new_geopackage(path) as db:
-        add_layer(db, "coverage", "POLYGON", columns, positions, changed)
-        for polygon in polygons:
-            values = (None, _polygon(polygon.ring), *coverage_properties(polygon).values())
-            db.execute("INSERT INTO coverage VALUES (?, ?, ?, ?, ?, ?, ?, ?)", values)
+    with atomic_file(path) as file, _new_geopackage(file, path.parent) as db:
+        layer = _Layer(db, "coverage", geometry, columns)
+        for polygon, rings in zip(polygons, divided, strict=True):
+            layer.add(_polygons(rings, geometry), chain(*rings), coverage_properties(polygon).values())
+        layer.finish(utc_text(max((polygon.end_utc_s for polygon in polygons), default=0.0)))

@@ -1,0 +1,60 @@
+"""The formats of exports by the end of a file name. Each has one writer, for `sonarpost c2 export` and the console."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Final
+
+from sonarpost.errors import BadInputError
+from sonarpost.export.contacts import ExportContact
+from sonarpost.export.geo.geopackage import write_geopackage
+from sonarpost.export.geo.kml import write_kml, write_kmz
+from sonarpost.export.reports import write_caris_text, write_mine_report
+from sonarpost.export.source import ExportSource, StoredImages
+from sonarpost.export.tables import write_csv, write_geojson
+from sonarpost.export.tak.cot import write_cot
+from sonarpost.export.tak.data_package import write_data_package
+from sonarpost.files import atomic_file
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A format: the function that writes it to a seekable binary file, and its media type."""
+
+    write: Callable[[IO[bytes], ExportSource], None]
+    media_type: str
+
+
+FORMATS: Final[Mapping[str, Format]] = {
+    "geojson": Format(write_geojson, "application/geo+json"),
+    "kml": Format(write_kml, "application/vnd.google-earth.kml+xml"),
+    "kmz": Format(write_kmz, "application/vnd.google-earth.kmz"),
+    "csv": Format(write_csv, "text/csv; charset=utf-8"),
+    "gpkg": Format(write_geopackage, "application/geopackage+sqlite3"),
+    "cot.xml": Format(write_cot, "application/xml"),
+    "tak.zip": Format(write_data_package, "application/zip"),
+    "caris.txt": Format(write_caris_text, "text/plain; charset=utf-8"),
+    "app11-like.txt": Format(write_mine_report, "text/plain; charset=us-ascii"),
+}
+
+
+def write_export(name: str, path: Path, contacts: Iterable[ExportContact]) -> list[BadInputError]:
+    """Write contacts from the folder of c2 to a file, atomically.
+
+    Args:
+        name: The format, a key of `FORMATS`.
+        path: The file.
+        contacts: The contacts.
+
+    Returns:
+        One error for each image that cannot be read. Its contact is exported without an image.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    images = StoredImages()
+    with atomic_file(path) as file:
+        FORMATS[name].write(file, ExportSource(contacts, images, path))
+    return images.problems
