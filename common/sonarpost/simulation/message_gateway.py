@@ -11,15 +11,15 @@ import heapq
 import re
 import threading
 import time
-import urllib.request
 from collections import deque
 from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import count
 from random import Random
 from socketserver import StreamRequestHandler, TCPServer, ThreadingTCPServer
-from urllib.error import HTTPError
 from urllib.parse import parse_qs, urlencode
+
+from sonarpost.network import http_client
 
 MAX_MO_BYTES = 340
 MAX_MT_BYTES = 270
@@ -130,13 +130,9 @@ class MessageGatewayEmulator:
                     heapq.heappush(self._deliveries, (time.monotonic() + RETRY_S, delivery[1], delivery[2]))
 
     def _post(self, form: dict[str, str]) -> bool:
-        request = urllib.request.Request(self.webhook_url, urlencode(form).encode())  # noqa: S310 of the caller
+        content_type = {"Content-Type": "application/x-www-form-urlencoded"}
         try:
-            with urllib.request.urlopen(request, timeout=5.0) as response:  # noqa: S310
-                return bool(response.status == 200)
-        except HTTPError as error:
-            error.close()
-            return False
+            return http_client.post(self.webhook_url, urlencode(form).encode(), content_type).status == 200
         except OSError:
             return False
 

@@ -1,7 +1,8 @@
 """What Goby3's Micro-Modem driver sends, by its source, is answered with the sentence that it waits for.
 
-Goby cannot be built here. Its driver sends one command after the other: each waits for a sentence of the same kind, a
-setting for an echo of all its parts, a restart for `CAREV`. Goby reads statistics of any version but 6 as of the first.
+The tests do not build Goby; docs/reference/modem-emulator.md says which program of it was run. Its driver sends one
+command after the other: each waits for a sentence of the same kind, a setting for an echo of all its parts, a restart
+for `CAREV`. Goby reads statistics of any version but 6 as of the first.
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -9,6 +12,7 @@ import pytest
 from sonarpost.runtime.serial_modem import SerialModem
 from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
 from sonarpost.simulation.channel.emulator import ChannelEmulator
+from sonarpost.simulation.modem.nanomodem import EmulatedNanomodem
 
 HOSTILE = b"\r\nDELIVEREDIM,3\r\n+++AT:13:DELIVEREDIM,3\r\n,\x00\xff"
 PACKETS = {"s2c": ((0, [HOSTILE]), (1, [HOSTILE.ljust(64, b"\n")] * 16)), "nano": ((1, [b"$B02#TO\r\n"]),)}
@@ -37,3 +41,60 @@ def test_two_stations_exchange_data_over_ports(driver: str, tcp_ports: tuple[int
                 assert [(f.src, f.dest, f.data) for f in packet.frames] == [(3, 1, data) for data in frames]
     finally:
         emulator.stop()
+
+
+@contextmanager
+def sockets(driver: str) -> Iterator[list[socket.socket]]:
+    """Two emulated modems, each with a plain TCP client."""
+    sites = (ModemSite(address=1), ModemSite(address=2))
+    emulator = ChannelEmulator(EmulatorConfig(modem=sites, tcp_ports=(0, 0), time_scale=20.0, driver=driver))
+    emulator.start()
+    try:
+        with ExitStack() as stack:
+            places = [device.device.removeprefix("socket://").split(":") for device in emulator.devices()]
+            yield [
+                stack.enter_context(socket.create_connection((host, int(port)), timeout=60.0)) for host, port in places
+            ]
+    finally:
+        emulator.stop()
+
+
+def read_until(client: socket.socket, end: bytes) -> bytes:
+    """Return the bytes of a modem up to an end; the client's time-out limits the wait."""
+    data = b""
+    while not data.endswith(end):
+        received = client.recv(4096)
+        assert received, data
+        data += received
+    return data
+
+
+@pytest.mark.system
+def test_burst_data_without_extended_notifications_and_raw_data_over_ports() -> None:
+    with sockets("s2c") as (one, two):
+        for client in (one, two):
+            client.sendall(b"+++ATC\n")
+            assert read_until(client, b"\n") == b"+++ATC:2:OK\r\n"
+        for number in (1, 2):
+            one.sendall(b"AT*SEND,10,2,\r\n+++AT\0\xff%d\n" % number)
+            assert read_until(one, b",2\r\n") == b"OK\r\nDELIVERED,%d,2\r\n" % number
+            assert read_until(two, b"%d\r\n" % number).endswith(b",0.0000,\r\n+++AT\0\xff%d\r\n" % number)
+        for client in (one, two):
+            client.sendall(b"ATO\n")
+            assert read_until(client, b"\n") == b"OK\r\n"
+        two.sendall(b"raw data\n")
+        assert read_until(one, b"\n") == b"raw data\n"
+
+
+def test_output_without_bytes_does_not_stop_the_outputs_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    read_input = EmulatedNanomodem._read_input
+
+    def write_nothing_first(modem: EmulatedNanomodem, now: float) -> None:
+        modem._write(b"")
+        read_input(modem, now)
+
+    monkeypatch.setattr(EmulatedNanomodem, "_read_input", write_nothing_first)
+    with sockets("nano") as (one, _):
+        for _ in range(2):
+            one.sendall(b"$?")
+            assert read_until(one, b"\n").startswith(b"#A001V")

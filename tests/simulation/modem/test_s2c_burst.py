@@ -142,7 +142,7 @@ def test_modem_stores_a_limited_number_of_bursts() -> None:
 
 
 # The commands that other public clients send, as their source code forms them, with the answers that they wait for.
-# The sequences were read from the sources; the programs themselves were not run.
+# The sequences were read from the sources; docs/reference/modem-s2c.md says which of the programs were run.
 CLIENTS = {
     # EvoLogics EviNS, src/fsm_nl_burst.erl and src/role_at.erl: the number of the last burst is read before and after.
     "evins burst": (

@@ -246,12 +246,14 @@ class ChannelEmulator:
     def _flush(self, line: _HostLine) -> None:
         while line.pending and line.port.connected:
             first = line.pending[0]
-            count = line.port.write(first.data[line.written_of_first :])
-            if not count:
+            rest = first.data[line.written_of_first :]
+            # An output without bytes is complete: a port writes none of them, as one that cannot write now.
+            count = line.port.write(rest) if rest else 0
+            if rest and not count:
                 return
             line.written_of_first += count
             line.pending_bytes -= count
-            if line.written_of_first == len(first.data):
+            if count == len(rest):
                 line.pending.popleft()
                 line.written_of_first = 0
                 if first.report is not None:

@@ -16,6 +16,7 @@ Choices where hardware documents are silent, and on which hosts should not rely:
 - Every packet has `CATXP` and `CATXF` (0 bytes for acknowledgements and mini-packets), as hosts wait for the end of an
   automatic reply. `CAXST` is for data, cycle headers and flexible data.
 - `CAREV` is sent after an idle period: hosts take it as the end of any exchange.
+- An unfinished sentence is dropped 10 s after its last byte.
 - An invalid or unknown sentence is answered with `CAERR,hhmmss,NMEA,number,text`.
 """
 
@@ -43,6 +44,7 @@ from sonarpost.simulation.modem.settings import (
 )
 from sonarpost.simulation.modem.transmitter import BusyError, Transmitter, TransponderRanging, TravelTimes
 
+_INPUT_PAUSE_S = 10.0  # longer than the longest sentence takes at 9600 bit/s
 _ERROR_FRAMING, _ERROR_UNKNOWN, _ERROR_FIELD, _ERROR_BUSY = 1, 2, 3, 4
 _UNPRINTABLE = re.compile(r"[^ -~]|[$*,]")
 
@@ -64,6 +66,7 @@ class EmulatedMicroModem:
         self._transmitter = Transmitter(config, self.settings, self.clock, self._write, self._receiver.expect_data)
         self._ranging = TransponderRanging(self.settings, self.clock, self._transmitter, travel_times, self._write)
         self._lines = nmea.LineAssembler("host")
+        self._pause_ends_s = math.inf
         self._outputs: deque[HostOutput] = deque()
         self._rebooted_at_s: float | None = None
         self._next_revision_s = now
@@ -107,6 +110,8 @@ class EmulatedMicroModem:
 
     def receive(self, data: bytes, now: float) -> None:
         """Process bytes from the host; invalid ones are answered with errors."""
+        self._end_pause(now)
+        self._pause_ends_s = now + _INPUT_PAUSE_S
         items = [] if self.rebooting else self._lines.feed(data)
         for item in items:
             if not self.rebooting:
@@ -114,6 +119,7 @@ class EmulatedMicroModem:
 
     def poll(self, now: float) -> None:
         """Do what is due at `now`: end of a transmission, data timeout, automatic replies, revision, reboot."""
+        self._end_pause(now)
         if self._rebooted_at_s is not None:
             if now < self._rebooted_at_s:
                 return
@@ -134,7 +140,7 @@ class EmulatedMicroModem:
         if self._rebooted_at_s is not None:
             return self._rebooted_at_s
         times_s = (self._transmitter.next_deadline_s(), self._receiver.deadline_s, self._ranging.deadline_s)
-        return min([self._next_revision_s, *(time_s for time_s in times_s if time_s is not None)])
+        return min([self._next_revision_s, self._pause_ends_s, *(time_s for time_s in times_s if time_s is not None)])
 
     def arrival_started(self, arrival: ArrivalStarted) -> None:
         """Process the start of a packet at this modem."""
@@ -183,6 +189,11 @@ class EmulatedMicroModem:
     def host_disconnected(self) -> None:
         """Drop an unfinished sentence of the host; cycle and settings stay."""
         self._lines.reset()
+
+    def _end_pause(self, now: float) -> None:
+        if now >= self._pause_ends_s:
+            self._pause_ends_s = math.inf
+            self._lines.reset()
 
     def _process(self, item: Sentence | SentenceError, now: float) -> None:
         if isinstance(item, SentenceError):

@@ -1,14 +1,16 @@
 """Emulated nanomodem v3 on the simulated channel.
 
-It answers `$?`, `$A`, `$B`, `$U`, `$M` and `$P`. Packets take the air time of their length. Sources are those of
-`sonarpost.modem.nano`; how a real modem treats a command during a transmission is not known, here the packet waits.
+It answers `$?`, `$A`, `$B`, `$U`, `$M` and `$P`. Any other command is answered with `E`: its length is not known, so it
+ends with the next `$`, after 7 bytes or after a pause. A command that is cut ends in the same way. Packets take the air
+time of their length. Sources are those of `sonarpost.modem.nano`; how a real modem treats a command during a
+transmission is not known, here the packet waits.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from typing import Final
+from typing import ClassVar, Final
 
 from sonarpost.modem.interface import MAX_ADDRESS
 from sonarpost.modem.nano.messages import TRAVEL_STEP_S
@@ -32,10 +34,11 @@ _LONGEST_HEAD: Final = 7
 class EmulatedNanomodem(PacketModem):
     """One modem."""
 
+    INPUT_PAUSE_S: ClassVar[float] = 0.4  # the developer's driver waits 0.5 s; the longest command takes 0.08 s
+
     def __init__(self, settings: PacketModemSettings) -> None:
         super().__init__(settings)
         self._address = settings.address
-        self._input = bytearray()
         self._awaits: int | None = None
         self._timeout_s = math.inf
 
@@ -44,19 +47,19 @@ class EmulatedNanomodem(PacketModem):
         """The modem's address, as the host has set it."""
         return self._address
 
-    def host_disconnected(self) -> None:
-        """Drop an unfinished command."""
+    def _on_pause(self) -> None:
+        if self._input:
+            self._write(b"E\r\n")
         self._input.clear()
 
-    def receive(self, data: bytes, now: float) -> None:
-        """Execute the commands of the host; bytes after `$` that are none are answered with `E`."""
-        self._input += data
+    def _read_input(self, now: float) -> None:
         while (start := self._input.find(b"$")) >= 0:
             del self._input[:start]
-            match = _COMMAND.match(bytes(self._input[:_LONGEST_HEAD]))
+            head = bytes(self._input[:_LONGEST_HEAD])
+            match = _COMMAND.match(head)
             if match is None:
-                if len(self._input) < _LONGEST_HEAD:
-                    return  # the rest of the command follows
+                if len(head) < _LONGEST_HEAD and b"$" not in head[1:]:
+                    return  # the rest of the command follows, or a pause
                 self._write(b"E\r\n")
                 del self._input[0]
                 continue

@@ -1,7 +1,8 @@
 """Common part of the emulated modems whose transmissions are single packets: their outputs and the channel's side.
 
-A subclass reads its host in `receive`, queues packets with `_transmit` and describes arrivals in `_on_packet`. One
-transmission follows the other; a host that sends faster than the channel waits in a limited queue.
+A subclass reads its host in `_read_input`, queues packets with `_transmit` and describes arrivals in `_on_packet`. One
+transmission follows the other; a host that sends faster than the channel waits in a limited queue. Incomplete input is
+given up after a pause, so that no bytes of a host make a modem silent.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 from sonarpost.modem.interface import RateInfo
 from sonarpost.simulation.channel.events import (
@@ -47,8 +48,12 @@ class PacketModem(ABC):
         settings: Its settings.
     """
 
+    INPUT_PAUSE_S: ClassVar[float]  # incomplete input is given up so long after the last byte of the host
+
     def __init__(self, settings: PacketModemSettings) -> None:
         self.settings = settings
+        self._input = bytearray()
+        self._pause_ends_s = float("inf")
         self._outputs: deque[HostOutput] = deque()
         self._queue: deque[AcousticPacket] = deque()
         self._ready: list[AcousticPacket] = []
@@ -65,9 +70,20 @@ class PacketModem(ABC):
         """Whether a packet is on the air or waits."""
         return self._sending is not None or bool(self._queue)
 
-    @abstractmethod
     def receive(self, data: bytes, now: float) -> None:
         """Process bytes from the host."""
+        self._end_pause(now)
+        self._input += data
+        self._pause_ends_s = now + self.INPUT_PAUSE_S
+        self._read_input(now)
+
+    @abstractmethod
+    def _read_input(self, now: float) -> None:
+        """Process what is complete at the beginning of `_input`, and remove it."""
+
+    def _on_pause(self) -> None:
+        """Give up incomplete input; a subclass can answer it."""
+        self._input.clear()
 
     @abstractmethod
     def _on_packet(self, arrival: ArrivalEnded, now: float) -> bytes:
@@ -79,11 +95,13 @@ class PacketModem(ABC):
     def _on_sent(self, packet: AcousticPacket, now: float) -> None:  # noqa: B027 - optional in subclasses
         """Tell the host that a packet has been transmitted; nothing by default."""
 
-    def host_disconnected(self) -> None:  # noqa: B027 - optional in subclasses
-        """Drop the unfinished input of a host that has disconnected; nothing by default."""
+    def host_disconnected(self) -> None:
+        """Drop the incomplete input of a host that has disconnected."""
+        self._input.clear()
 
     def poll(self, now: float) -> None:
-        """End the present transmission and start the next one, as far as they are due."""
+        """End a pause of the host and the present transmission, and start the next one, as far as they are due."""
+        self._end_pause(now)
         if self._sending is not None and now >= self._ends_s:
             sent, self._sending = self._sending, None
             self._on_sent(sent, now)
@@ -96,8 +114,8 @@ class PacketModem(ABC):
     def next_deadline_s(self) -> float:
         """Return the simulated time at which `poll` has something to do."""
         if self._sending is not None:
-            return self._ends_s
-        return self._ends_s + PROCESSING_S if self._queue else float("inf")
+            return min(self._ends_s, self._pause_ends_s)
+        return min(self._ends_s + PROCESSING_S if self._queue else float("inf"), self._pause_ends_s)
 
     def arrival_started(self, arrival: ArrivalStarted) -> None:  # noqa: B027 - optional in subclasses
         """Process the start of a packet at this modem; nothing by default."""
@@ -123,6 +141,11 @@ class PacketModem(ABC):
         outputs = list(self._outputs)
         self._outputs.clear()
         return outputs
+
+    def _end_pause(self, now: float) -> None:
+        if now >= self._pause_ends_s:
+            self._pause_ends_s = float("inf")
+            self._on_pause()
 
     def _transmit(self, packet: AcousticPacket) -> bool:
         """Queue a packet; return False when too many wait."""

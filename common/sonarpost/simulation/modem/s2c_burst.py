@@ -8,6 +8,7 @@ modems also divide long data into several packets and adapt their bit rate to th
 
 from __future__ import annotations
 
+import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,17 +25,21 @@ TRANSMISSIONS: Final = 4
 IDLE_LIMIT_S: Final = 30.0
 """A connection without packets for so long is closed."""
 MAX_BURSTS: Final = 16
-"""Bursts that a modem stores."""
+"""Bursts of commands that a modem stores."""
+MAX_RAW_BYTES: Final = 65536
+"""Raw data that a modem stores."""
 MAX_BACK_OFF_S: Final = 4.0
 
 _MAX_NUMBER: Final = 0xFFFF
-_NUMBER_BYTES: Final = 2
+_HEADER: Final = struct.Struct(">H?")
+"""Sequence number of a burst, and whether its data is raw."""
 
 
 @dataclass(slots=True)
 class _Burst:
-    """Data of the host: `number` counts the bursts of the modem, 1 to 65535."""
+    """Data of the host: `sequence` counts all bursts, 1 to 65535, `number` those of commands; that of raw data is 0."""
 
+    sequence: int
     number: int
     source: int
     destination: int
@@ -53,7 +58,7 @@ class BurstLink:
         self._transmit = transmit
         self._notify = notify
         self._bursts: deque[_Burst] = deque()
-        self._number = 0
+        self._sequence = self._number = 0
         self._is_started = False
         self._transmissions = 0
         self._wait_until_s = float("inf")
@@ -61,10 +66,12 @@ class BurstLink:
         self._peer: int | None = None
         self._closes_s = 0.0
         self._received: dict[int, int] = {}
+        self.dropped_bytes = 0
+        """Bytes of raw data that were not delivered."""
 
     @property
     def number(self) -> int:
-        """Number of the last burst."""
+        """Number of the last burst of a command."""
         return self._number
 
     def drop(self) -> None:
@@ -74,12 +81,19 @@ class BurstLink:
         self._end_wait()
 
     def add(self, source: int, destination: int, data: bytes) -> bool:
-        """Store a burst; return False when too many are stored."""
-        if len(self._bursts) >= MAX_BURSTS:
+        """Store a burst of a command; return False when too many are stored."""
+        if sum(burst.number > 0 for burst in self._bursts) >= MAX_BURSTS:
             return False
         self._number = self._number % _MAX_NUMBER + 1
-        self._bursts.append(_Burst(self._number, source, destination, data))
+        self._append(self._number, source, destination, data)
         return True
+
+    def add_raw(self, source: int, destination: int, data: bytes) -> None:
+        """Store raw data as a burst, or drop it when too much is stored."""
+        if sum(len(burst.data) for burst in self._bursts if not burst.number) + len(data) > MAX_RAW_BYTES:
+            self._drop_raw(data)
+        else:
+            self._append(0, source, destination, data)
 
     def deadline_s(self) -> float:
         """Return when `poll` has something to do; a time in the past means immediately."""
@@ -100,8 +114,8 @@ class BurstLink:
         self._transmissions += 1
         source, destination = burst.source, burst.destination
         if self._peer == destination:
-            self._awaited = (burst.number,)
-            frames = (burst.number.to_bytes(_NUMBER_BYTES, "big") + burst.data,)
+            self._awaited = (burst.sequence,)
+            frames = (_HEADER.pack(burst.sequence, burst.number == 0) + burst.data,)
             airtime_s = burst_airtime_s(len(burst.data))
             packet = AcousticPacket(PacketKind.DATA, source, destination, BURST_RATE, airtime_s, frames)
         else:
@@ -112,19 +126,19 @@ class BurstLink:
     def on_sent(self, packet: AcousticPacket, now: float) -> None:
         """Start the wait for an answer when a request or data has been transmitted."""
         if packet.kind is not PacketKind.ACK and self._is_started:
-            draws = RandomDraws(0, packet.source, self._bursts[0].number, self._transmissions)
+            draws = RandomDraws(0, packet.source, self._bursts[0].sequence, self._transmissions)
             self._wait_until_s = now + ANSWER_LIMIT_S + MAX_BACK_OFF_S * draws.uniform("back-off")
 
-    def on_packet(self, packet: AcousticPacket, data: bytes | None, now: float) -> bytes | None:
+    def on_packet(self, packet: AcousticPacket, frame: bytes | None, now: float) -> tuple[bytes, bool] | None:
         """Process a packet to this modem.
 
         Args:
             packet: The packet.
-            data: Its frame as received; None if it has none.
+            frame: Its frame as received; None if it has none.
             now: Simulated time.
 
         Returns:
-            Data for the host; None for none or if it has received the same burst before.
+            Data for the host, and whether it is raw; None for none or if it has received the same burst before.
         """
         self._closes_s = now + IDLE_LIMIT_S
         is_expected = self._is_started and self._bursts[0].destination == packet.source
@@ -137,20 +151,31 @@ class BurstLink:
                 else:
                     self._end_wait()
             return None
-        number = 0 if data is None else int.from_bytes(data[:_NUMBER_BYTES], "big")
-        acked = () if data is None else (number,)
+        sequence, is_raw = (0, False) if frame is None else _HEADER.unpack_from(frame)
+        acked = () if frame is None else (sequence,)
         source, destination = packet.destination, packet.source
         self._transmit(
             AcousticPacket(PacketKind.ACK, source, destination, BURST_RATE, ACK_AIRTIME_S, acked_frames=acked)
         )
-        is_new = self._received.get(packet.source) != number
-        self._received[packet.source] = number  # 0 for a request: the bursts of a new connection are new
-        return data[_NUMBER_BYTES:] if data is not None and is_new else None
+        is_new = self._received.get(packet.source) != sequence
+        self._received[packet.source] = sequence  # 0 for a request: the bursts of a new connection are new
+        return (frame[_HEADER.size :], is_raw) if frame is not None and is_new else None
+
+    def _append(self, number: int, source: int, destination: int, data: bytes) -> None:
+        self._sequence = self._sequence % _MAX_NUMBER + 1
+        self._bursts.append(_Burst(self._sequence, number, source, destination, data))
 
     def _end_burst(self, result: str) -> None:
         burst = self._bursts.popleft()
         self._end_wait()
-        self._notify(f"{result},{burst.number},{burst.destination}")
+        if burst.number:
+            self._notify(f"{result},{burst.number},{burst.destination}")
+        elif result == "FAILED":
+            self._drop_raw(burst.data)
+
+    def _drop_raw(self, data: bytes) -> None:
+        self.dropped_bytes += len(data)
+        self._notify(f"DROPCNT,{self.dropped_bytes}")
 
     def _end_wait(self) -> None:
         self._is_started = False

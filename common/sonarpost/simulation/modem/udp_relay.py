@@ -6,6 +6,8 @@ channel, and its frames are lost one by one, as those of a modem. This page's em
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from sonarpost.errors import SentenceError
 from sonarpost.modem.udp.datagram import Datagram, DatagramAssembler, DatagramKind
 from sonarpost.modem.udp.rates import RATES
@@ -18,6 +20,8 @@ _ACK_AIRTIME_S = 0.05
 class UdpRelay(PacketModem):
     """The channel's end of one station's port."""
 
+    INPUT_PAUSE_S: ClassVar[float] = 5.0  # longer than the longest datagram takes at 9600 bit/s
+
     def __init__(self, settings: PacketModemSettings) -> None:
         super().__init__(settings)
         self._assembler = DatagramAssembler()
@@ -26,8 +30,13 @@ class UdpRelay(PacketModem):
         """Drop an unfinished datagram."""
         self._assembler.reset()
 
-    def receive(self, data: bytes, now: float) -> None:
+    def _on_pause(self) -> None:
+        self._assembler.reset()
+
+    def _read_input(self, now: float) -> None:
         """Transmit the datagrams of the host; other bytes are ignored, as a network has no answer for them."""
+        data = bytes(self._input)
+        self._input.clear()
         for item in self._assembler.feed(data):
             if isinstance(item, SentenceError):
                 continue
