@@ -28,7 +28,7 @@ class AtdStubConfig(RetentionConfig, SurveyOptions):
             beside it.
         require_done_marker: A file is complete only when `NAME.done` is beside it.
         confidence_threshold: Minimum ATD confidence (0 to 2) of a contact that is sent.
-        max_contacts: Maximum number of contacts of one survey file, most confident first; 0 for no limit.
+        max_contacts: Maximum number of contacts of one survey file, most confident first, up to 5000; 0 for 5000.
         max_in_flight: Maximum number of contacts between this service and their transmission. The others wait here and
             the most confident is released first. 0 for no limit, with a modem service that publishes no queue_state.
         detector: Object sizes, windows and limits of the detector, as for `--settings` of `sonarpost detect`.

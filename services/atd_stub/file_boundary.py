@@ -6,7 +6,6 @@ continuation file is searched together with it (`sonarpost.detection.stream`), a
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -18,12 +17,9 @@ from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.detection.association import DetectionPlace
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamEnd
-from sonarpost.logs import kv
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub.survey_detection import SurveyEnd, snippets_of
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
-
-log = logging.getLogger(__name__)
 
 FORMAT: Final = 2
 _STATE_PREFIX: Final = "seam:"
@@ -52,15 +48,7 @@ class FileEndStore:
     """
 
     def __init__(self, store: Store) -> None:
-        self._ends: dict[str, StoredEnd] = {}
-        for name, packed in store.states(_STATE_PREFIX).items():
-            try:
-                stored = unpack(packed)
-            except ValueError as error:
-                # It stays in the store for the version that wrote it.
-                log.warning("Ignoring unreadable file end", extra=kv(name=name, reason=str(error)))
-            else:
-                self._ends[stored.end.sonar_id] = stored
+        self._ends = store.read_states(_STATE_PREFIX, _checked)
         self._uncommitted = dict(self._ends)
         self.held_count = self._count_held()
 
@@ -110,6 +98,17 @@ class FileEndStore:
 
     def _count_held(self) -> int:
         return sum(len(stored.end.held) for stored in self._ends.values())
+
+
+def _checked(sonar_id: str, packed: bytes) -> StoredEnd:
+    """Return a stored end with the name of its sonar.
+
+    Raises:
+        ValueError: It is damaged, or a held contact is.
+    """
+    stored = unpack(packed)
+    snippets_of(stored.end.held)
+    return replace(stored, end=replace(stored.end, sonar_id=sonar_id))
 
 
 def pack(stored: StoredEnd) -> bytes:
@@ -208,6 +207,7 @@ _NAVIGATION = (
     "pitch_deg",
     "roll_deg",
 )
+_POSITION = ("layback_m", "heading_sigma_deg", "position_note")
 
 
 def _packed_ping(ping: Ping) -> list[object]:
@@ -215,7 +215,11 @@ def _packed_ping(ping: Ping) -> list[object]:
         [c.side.value, c.samples.dtype.str, c.samples.tobytes(), c.slant_range_m, c.frequency_hz, c.scale]
         for c in ping.channels
     ]
-    return [ping.number, ping.time_utc_s, channels, *(getattr(ping, name) for name in _NAVIGATION), ping.grid_m]
+    values = [getattr(ping, name) for name in _NAVIGATION]
+    position = [getattr(ping, name) for name in _POSITION]
+    if all(value is None for value in position):
+        position = []
+    return [ping.number, ping.time_utc_s, channels, *values, ping.grid_m, *position]
 
 
 def _unpacked_ping(packed: list[Any]) -> Ping:
@@ -224,7 +228,9 @@ def _unpacked_ping(packed: list[Any]) -> Ping:
         ChannelPing(Side(side), np.frombuffer(data, dtype=np.dtype(kind)), slant_range_m, frequency_hz, scale)
         for side, kind, data, slant_range_m, frequency_hz, scale in channels
     )
-    # Format 1 has no coordinates in metres.
-    values = dict(zip(_NAVIGATION, navigation[: len(_NAVIGATION)], strict=True))
-    grid_m = navigation[len(_NAVIGATION)] if len(navigation) > len(_NAVIGATION) else None
+    # Format 1 has no coordinates in metres; what follows them is left out where it is unknown.
+    count = len(_NAVIGATION)
+    values = dict(zip(_NAVIGATION, navigation[:count], strict=True))
+    values |= dict(zip(_POSITION, navigation[count + 1 :], strict=False))
+    grid_m = navigation[count] if len(navigation) > count else None
     return Ping(number, time_utc_s, unpacked, **values, grid_m=None if grid_m is None else (grid_m[0], grid_m[1]))

@@ -5,11 +5,24 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Final
+
+from sonarpost.files import open_regular
+from sonarpost.limits import limit
 
 DONE_SUFFIX = ".done"
+MAX_RECORDING_BYTES: Final = limit(
+    32 << 30,
+    "bytes",
+    "claims",
+    surface="input folder of a vehicle",
+    source="recording",
+    resource="size of its files",
+    at_limit="it is not read, health is degraded with its name",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +49,19 @@ class InputFile:
     def parts(self) -> tuple[Path, ...]:
         """All files that exist, `path` first."""
         return (self.path, *self.others)
+
+
+@dataclass(frozen=True, slots=True)
+class InputFolder:
+    """What one poll of the folder found.
+
+    Attributes:
+        files: Recordings that can be read.
+        unreadable: Why the others cannot be read, by the name of their file.
+    """
+
+    files: tuple[InputFile, ...]
+    unreadable: Mapping[str, str]
 
 
 class StableFiles:
@@ -72,8 +98,8 @@ class StableFiles:
 
 def list_input_files(
     folder: Path, suffixes: tuple[str, ...], parts_of: Callable[[Path], tuple[Path, ...]] | None = None
-) -> tuple[InputFile, ...]:
-    """Return the regular files with these suffixes. Names that begin with a dot are skipped (copy in progress).
+) -> InputFolder:
+    """Find the regular files with these suffixes. Names that begin with a dot are skipped (copy in progress).
 
     Args:
         folder: The folder.
@@ -88,6 +114,7 @@ def list_input_files(
         entries = tuple(found)
     names = {entry.name for entry in entries}
     files = []
+    unreadable: dict[str, str] = {}
     for entry in entries:
         if entry.name.startswith(".") or not entry.name.lower().endswith(suffixes):
             continue
@@ -96,13 +123,21 @@ def list_input_files(
                 continue  # a folder, a pipe or a broken link
             status = entry.stat()
         except OSError as error:
-            if error.errno in (errno.ENOENT, errno.ELOOP):
-                continue  # removed after the folder was listed, or a link to itself
-            raise
+            if error.errno not in (errno.ENOENT, errno.ELOOP):  # removed after the listing, or a link to itself
+                unreadable[entry.name] = str(error)
+            continue
         is_done = entry.name + DONE_SUFFIX in names
         file = InputFile(Path(entry.path), status.st_size, status.st_mtime_ns, is_done=is_done)
-        files.append(file if parts_of is None else _with_parts(file, parts_of(file.path)))
-    return tuple(files)
+        try:
+            file = file if parts_of is None else _with_parts(file, parts_of(file.path))
+        except Exception as error:  # noqa: BLE001  a reader of another package may raise anything
+            unreadable[entry.name] = f"{type(error).__name__}: {error}"
+            continue
+        if file.size_bytes > MAX_RECORDING_BYTES:
+            unreadable[entry.name] = f"{file.size_bytes} bytes, expected at most {MAX_RECORDING_BYTES}"
+        else:
+            files.append(file)
+    return InputFolder(tuple(files), unreadable)
 
 
 def _with_parts(file: InputFile, parts: tuple[Path, ...]) -> InputFile:
@@ -137,5 +172,5 @@ def content_sha256(path: Path) -> str:
     Raises:
         OSError: The file cannot be read.
     """
-    with path.open("rb") as file:
+    with os.fdopen(open_regular(path), "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

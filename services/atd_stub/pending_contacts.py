@@ -20,8 +20,8 @@ class PendingContacts:
     """Snippets in the service's store.
 
     The name of a stored snippet sorts by confidence, then by age. Picks come first, other contacts without confidence
-    last. All
-    content is in the store: a unit of work that is not committed changes nothing. One thread adds, one thread removes.
+    last. All content is in the store: a unit of work that is not committed changes nothing. One thread
+    adds, one thread removes.
 
     Args:
         store: The service's store.
@@ -29,7 +29,8 @@ class PendingContacts:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._next_number = 1 + max((int(name.rpartition(":")[2]) for name in store.state_names(_PREFIX)), default=0)
+        numbers = (name.rpartition(":")[2] for name in store.state_names(_PREFIX))
+        self._next_number = 1 + max((int(number) for number in numbers if number.isdecimal()), default=0)
 
     def __len__(self) -> int:
         return len(self._store.state_names(_PREFIX))
@@ -46,9 +47,9 @@ class PendingContacts:
         """Queue snippets of picks before all others. Those of the same contacts that wait here are removed."""
         picked = {snippet.contact.contact_id for snippet in snippets}
         for name in self._store.state_names(_PREFIX):
-            payload = self._store.get_state(name)
             # The other thread may have removed it.
-            if payload is not None and wire.decode(Snippet, payload, name).contact.contact_id in picked:
+            waiting = self._store.read_state(name, lambda payload: wire.decode(Snippet, payload, "contact"), None)
+            if waiting is not None and waiting.contact.contact_id in picked:
                 effects.delete_state(name)
         for snippet in snippets:
             effects.put_state(f"{_PREFIX}{_PICK_RANK:08d}:{self._next_number:015d}", wire.encode(snippet))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -18,6 +19,7 @@ from sonarpost.detection.picks import (
     parse_picks,
 )
 from sonarpost.detection.stream import FileOrigin, PingOrigin
+from sonarpost.files import open_regular
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.input_folder import InputFile, list_input_files, printable
@@ -48,21 +50,29 @@ class PicksResult:
         return packed
 
 
-def list_picks_files(folder: Path, surveys: Iterable[InputFile]) -> dict[InputFile, InputFile]:
+def handled_lines(packed: bytes) -> tuple[str, ...]:
+    """Return `PicksResult.handled` of a stored result."""
+    return tuple(map(str, msgpack.unpackb(packed)["handled"]))
+
+
+def list_picks_files(
+    folder: Path, surveys: Iterable[InputFile]
+) -> tuple[dict[InputFile, InputFile], Mapping[str, str]]:
     """Return the files of picks in a folder whose survey is among `surveys`, each with its survey.
+
+    The second value is `InputFolder.unreadable`.
 
     Raises:
         OSError: The folder cannot be read.
     """
     by_name = {file.path.name: file for file in surveys}
-    found = {
-        file: by_name.get(file.path.name[: -len(PICKS_SUFFIX)]) for file in list_input_files(folder, (PICKS_SUFFIX,))
-    }
-    return {file: survey for file, survey in found.items() if survey is not None}
+    found = list_input_files(folder, (PICKS_SUFFIX,))
+    surveys_of = {file: by_name.get(file.path.name[: -len(PICKS_SUFFIX)]) for file in found.files}
+    return {file: survey for file, survey in surveys_of.items() if survey is not None}, found.unreadable
 
 
 def contacts_of_picks(
-    survey_path: Path, content: str, picks_path: Path, stored: bytes | None, vehicle_id: str, config: AtdStubConfig
+    survey_path: Path, content: str, picks_path: Path, before: Sequence[str], vehicle_id: str, config: AtdStubConfig
 ) -> PicksResult:
     """Measure the picks of a file that were not handled before.
 
@@ -70,7 +80,7 @@ def contacts_of_picks(
         survey_path: The survey.
         content: Hex SHA-256 of the survey.
         picks_path: The file of picks.
-        stored: `PicksResult.pack` of the last call for this survey; None for the first one.
+        before: `PicksResult.handled` of the last call for this survey; empty for the first one.
         vehicle_id: This vehicle.
         config: Settings of the detector, size of the snippets, and what the survey does not contain.
 
@@ -78,8 +88,7 @@ def contacts_of_picks(
         OSError: A file cannot be read.
         SurveyFileError: The survey cannot be read.
     """
-    before = [] if stored is None else list(msgpack.unpackb(stored)["handled"])
-    with picks_path.open("rb") as file:
+    with os.fdopen(open_regular(picks_path), "rb") as file:
         picks, syntax_errors = parse_picks(file.read(MAX_PICKS_BYTES + 1), printable(picks_path.name))
     # Invalid lines are reported once, like picks are sent once.
     errors = {str(error): None for error in syntax_errors if str(error) not in before}

@@ -55,8 +55,9 @@ class ReleaseCredit:
     def unpack(self, packed: bytes) -> None:
         """Restore the durable part."""
         accepted, times = msgpack.unpackb(packed)
-        self._images_accepted = accepted
-        self._release_times_utc_s = times
+        times_utc_s = [float(time_utc_s) for time_utc_s in times]
+        self._images_accepted = None if accepted is None else int(accepted)
+        self._release_times_utc_s = times_utc_s
 
     def update(self, state: QueueState, now_utc_s: float) -> None:
         """Apply a state of the transmit queue.
@@ -126,8 +127,7 @@ class ContactRelease:
 
     def _restored_credit(self) -> ReleaseCredit:
         credit = ReleaseCredit(self._max_in_flight)
-        if (packed := self._store.get_state(_STATE_NAME)) is not None:
-            credit.unpack(packed)
+        self._store.read_state(_STATE_NAME, credit.unpack, None)
         return credit
 
     @property

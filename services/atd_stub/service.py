@@ -9,6 +9,7 @@ import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import msgpack
 
@@ -24,7 +25,7 @@ from sonarpost.errors import BadInputError, DeliveryError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.logs import kv
 from sonarpost.messages import Record, Snippet, VehicleStatus
-from sonarpost.runtime.retention import INTERVAL_S
+from sonarpost.runtime.retention import INTERVAL_S, SteadyTime
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import FileEndStore
@@ -37,7 +38,7 @@ from sonarpost.services.atd_stub.input_folder import (
     printable,
 )
 from sonarpost.services.atd_stub.picks import STATE_PREFIX as _PICKS
-from sonarpost.services.atd_stub.picks import PicksResult, contacts_of_picks, list_picks_files
+from sonarpost.services.atd_stub.picks import PicksResult, contacts_of_picks, handled_lines, list_picks_files
 from sonarpost.services.atd_stub.release import ContactRelease
 from sonarpost.services.atd_stub.seabed_history import SeabedHistory
 from sonarpost.services.atd_stub.snippet_files import SNIPPET_SUFFIXES, read_snippet, write_snippet
@@ -49,6 +50,8 @@ from sonarpost.sonar.readers import recording_parts, supported_suffixes
 log = logging.getLogger(__name__)
 
 _FILE = "file:"
+MAX_REASONS = 5
+"""Number of faults in the health record."""
 
 
 class AtdStubService(Service[AtdStubConfig]):
@@ -71,7 +74,9 @@ class AtdStubService(Service[AtdStubConfig]):
         self._stable_picks = StableFiles(config.settle_s)
         self._handled_picks: set[InputFile] = set()
         self._retention_due_s = 0.0
+        self._steady_time = SteadyTime()
         self._files_waiting = -1
+        self._unreadable: dict[str, str] = {}
         self._release = ContactRelease(platform, self.store, config.max_in_flight, self.commit)
         self._file_ends = FileEndStore(self.store)
         self._malformed_transmissions = self.interval_log(log, logging.WARNING, "Ignoring malformed transmissions")
@@ -80,6 +85,7 @@ class AtdStubService(Service[AtdStubConfig]):
         )
         self._seabed = SeabedHistory()
         self._status: VehicleStatus | None = None
+        self._position_warning = ""
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Not called: this service consumes no records."""
@@ -117,6 +123,7 @@ class AtdStubService(Service[AtdStubConfig]):
         """Return how many files (-1 before the first poll) and contacts wait, and the difficulty of the seabed."""
         return {
             "files_waiting": float(self._files_waiting),
+            "files_unreadable": float(len(self._unreadable)),
             "contacts_waiting": float(self._release.pending + self._file_ends.held_count),
             "contacts_held": float(self._file_ends.held_count),
             "contacts_in_flight": float(self._release.in_flight),
@@ -129,36 +136,48 @@ class AtdStubService(Service[AtdStubConfig]):
         return self._release.error
 
     def warning(self) -> str:
-        """Return how many contacts wait for release, how many for a continuation file, and whether Pd is low."""
+        """Return what waits for release or a continuation file, whether Pd is low, and why positions may be wrong."""
         waiting = ""
         if held := self._file_ends.held_count:
             until = datetime.fromtimestamp(self._file_ends.held_until_utc_s, UTC).strftime("%H:%M:%S")
             waiting = f"{held} contacts held for a continuation file until {until} UTC"
-        return "; ".join(filter(None, (self._release.status, waiting, self._seabed.warning())))
+        parts = (self._release.status, waiting, self._seabed.warning(), self._position_warning)
+        return "; ".join(filter(None, parts))
 
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Check for free credit after the compressor has accepted or refused a snippet."""
         self._release.wake()
 
     def _poll(self) -> None:
+        steps = (
+            self._release_expired_contacts,
+            self._process_folder,
+            self._save_transmissions,
+            self._process_picks,
+            self._publish_status,
+            self._apply_retention,
+        )
         while not self.stopping.is_set():
-            try:
-                self._release_expired_contacts()
-                self._process_folder()
-                if self._masks:
-                    self._transmissions.save(time.monotonic())
-                self._process_picks()
-                # Repeated, so that a uuv_modem that starts later receives it.
-                if self._status is not None:
-                    self.publish(keys.vehicle_status(self.platform.id), self._status)
-                self._apply_retention(time.time())
-            except (OSError, DeliveryError) as error:
-                self.set_degraded(f"{type(error).__name__}: {error}")
-            else:
-                self.set_degraded("")
+            reasons = []
+            for step in steps:
+                try:
+                    step()
+                except (OSError, DeliveryError) as error:
+                    reasons.append(f"{type(error).__name__}: {error}")
+            reasons += [f"{printable(name)}: {reason}" for name, reason in sorted(self._unreadable.items())]
+            self.set_degraded("; ".join(reasons[:MAX_REASONS]))
             self.stopping.wait(self.config.poll_s)
 
-    def _apply_retention(self, now_utc_s: float) -> None:
+    def _save_transmissions(self) -> None:
+        if self._masks:
+            self._transmissions.save(time.monotonic())
+
+    def _publish_status(self) -> None:
+        """Publish the status repeatedly, so that a uuv_modem that starts later receives it."""
+        if self._status is not None:
+            self.publish(keys.vehicle_status(self.platform.id), self._status)
+
+    def _apply_retention(self) -> None:
         """Remove processed input files and stored snippets by age and total size, and the entries of old files.
 
         Raises:
@@ -167,26 +186,17 @@ class AtdStubService(Service[AtdStubConfig]):
         """
         if time.monotonic() < self._retention_due_s:
             return
-        self._retention_due_s = time.monotonic() + INTERVAL_S
+        self._retention_due_s, now_utc_s = time.monotonic() + INTERVAL_S, self._steady_time.now_utc_s()
         config = self.config
-        entries = {name: msgpack.unpackb(packed) for name, packed in self.store.states(_FILE).items()}
+        entries = self.store.read_states(_FILE, lambda _, packed: _entry(packed))
         effects = UnitOfWork()
-        for name, entry in entries.items():
-            if "processed_utc_s" not in entry:  # stored by version 0.2 or earlier
-                entry["processed_utc_s"] = now_utc_s
-                effects.put_state(_state_name(name), msgpack.packb(entry))
         stored = [
             Stored(file, max(entries[content]["processed_utc_s"], file.modified_ns * 1e-9), file.size_bytes)
             for file, content in self._processed.items()
             if content in entries and "refused" not in entries[content]
         ]
-        removed = select_for_removal(stored, now_utc_s, config.retain_days, config.max_bytes)
-        for file in removed:
-            done = file.path.with_name(file.path.name + DONE_SUFFIX)
-            for path in (*self._own_parts(file), file.path.with_suffix(".txt"), done, picks_path(file.path)):
-                path.unlink(missing_ok=True)
-            _remove_empty_folders(file)
-            log.warning("Input file removed by retention", extra=kv(file=printable(file.path.name)))
+        chosen = select_for_removal(stored, now_utc_s, config.retain_days, config.max_bytes)
+        removed = {file for file in chosen if self._remove(file)}
         present = {content for file, content in self._processed.items() if file not in removed}
         for name, entry in entries.items():
             if name not in present and now_utc_s - entry["processed_utc_s"] > config.retain_days * DAY_S:
@@ -202,18 +212,32 @@ class AtdStubService(Service[AtdStubConfig]):
                 effects.count("snippets_removed", len(snippets))
         self.commit(effects)
 
+    def _remove(self, file: InputFile) -> bool:
+        """Delete a recording and what belongs to it; return whether that was possible."""
+        done = file.path.with_name(file.path.name + DONE_SUFFIX)
+        try:
+            for path in (*self._own_parts(file), file.path.with_suffix(".txt"), done, picks_path(file.path)):
+                path.unlink(missing_ok=True)
+            _remove_empty_folders(file)
+        except OSError as error:
+            log.warning("Input file cannot be removed", extra=kv(file=printable(file.path.name), error=str(error)))
+            return False
+        log.warning("Input file removed by retention", extra=kv(file=printable(file.path.name)))
+        return True
+
     def _process_folder(self) -> None:
         self.config.input_dir.mkdir(parents=True, exist_ok=True)
-        files = list_input_files(
+        self._unreadable = {}
+        found = list_input_files(
             self.config.input_dir, self._suffixes, _known_parts if self.config.mode == "survey" else None
         )
+        files, self._unreadable = found.files, dict(found.unreadable)
         self._present, present = files, set(files)
         self._log_incomplete(files)
         self._processed = {file: content for file, content in self._processed.items() if file in present}
         new = tuple(file for file in files if file not in self._processed)
         complete = self._stable_files.update(new, time.monotonic())
         self._files_waiting = len(new)
-        first_error: OSError | None = None
         for file in complete:
             if self.stopping.is_set():
                 return
@@ -221,13 +245,11 @@ class AtdStubService(Service[AtdStubConfig]):
                 content = self._process(file)
             except OSError as error:
                 # The files after it are processed first; it is tried again with the next poll.
-                first_error = first_error or error
+                self._unreadable[file.path.name] = f"{type(error).__name__}: {error}"
                 continue
             if content:
                 self._processed[file] = content
                 self._files_waiting -= 1
-        if first_error is not None:
-            raise first_error
 
     def _log_incomplete(self, files: tuple[InputFile, ...]) -> None:
         """Log each recording with missing files once."""
@@ -245,22 +267,27 @@ class AtdStubService(Service[AtdStubConfig]):
         """
         if self.config.mode != "survey":
             return
-        surveys = list_picks_files(self.config.input_dir, self._processed)
+        surveys, unreadable = list_picks_files(self.config.input_dir, self._processed)
+        self._unreadable |= unreadable
         self._handled_picks &= surveys.keys()
         new = tuple(file for file in surveys if file not in self._handled_picks)
         for file in self._stable_picks.update(new, time.monotonic()):
             if self.stopping.is_set():
                 return
-            if (result := self._measured_picks(file, surveys[file])) is not None:
-                self._commit_picks(file, self._processed[surveys[file]], result)
+            try:
+                if (result := self._measured_picks(file, surveys[file])) is not None:
+                    self._commit_picks(file, self._processed[surveys[file]], result)
+            except OSError as error:
+                self._unreadable[file.path.name] = f"{type(error).__name__}: {error}"
+                continue
             self._handled_picks.add(file)
 
     def _measured_picks(self, file: InputFile, survey: InputFile) -> PicksResult | None:
         """Return the contacts of a file of picks; None if it was removed, or the survey cannot be read."""
         content = self._processed[survey]
-        stored = self.store.get_state(_PICKS + content)
+        before = self.store.read_state(_PICKS + content, handled_lines, ())
         try:
-            return contacts_of_picks(survey.path, content, file.path, stored, self.platform.id, self.config)
+            return contacts_of_picks(survey.path, content, file.path, before, self.platform.id, self.config)
         except FileNotFoundError:
             return None
         except SurveyFileError as error:
@@ -295,7 +322,7 @@ class AtdStubService(Service[AtdStubConfig]):
             content = _content_of(file)
         except FileNotFoundError:
             return ""
-        if (entry := self.store.get_state(_state_name(content))) is not None:
+        if (entry := self.store.read_state(_state_name(content), _entry, None)) is not None:
             self._skip_known(file, content, entry)
             return content
         return content if self._detect(file, content) else ""
@@ -350,6 +377,8 @@ class AtdStubService(Service[AtdStubConfig]):
             self._seabed.add(result.difficulty, time.monotonic())
             if self._is_newer(result.status):
                 self._status = result.status
+            note = result.position_note
+            self._position_warning = f"{printable(path.name)}: {note}" if note else ""
             if result.difficulty is not None:
                 counts["expected_pd"] = f"{result.difficulty.expected_pd:.2f}"
         log.info(
@@ -419,13 +448,12 @@ class AtdStubService(Service[AtdStubConfig]):
         for snippet in snippets:
             log.info("Held contact released", extra=kv(contact_id=snippet.contact.contact_id, reason=reason))
 
-    def _skip_known(self, file: InputFile, content: str, entry: bytes) -> None:
+    def _skip_known(self, file: InputFile, content: str, entry: Mapping[str, Any]) -> None:
         """Skip a file that was processed before; move one that was refused to the quarantine again."""
-        known = msgpack.unpackb(entry)
-        refused_reason = known.get("refused")
+        refused_reason = entry.get("refused")
         log.info(
             "File already processed",
-            extra=kv(file=file.path.name, processed_as=known.get("file"), refused=refused_reason or "no"),
+            extra=kv(file=file.path.name, processed_as=entry.get("file"), refused=refused_reason or "no"),
         )
         if refused_reason is not None:
             self._move_to_quarantine(file, content, refused_reason)
@@ -488,6 +516,12 @@ def _content_of(file: InputFile) -> str:
     """
     digests = [content_sha256(part) for part in file.parts]
     return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
+
+
+def _entry(packed: bytes) -> dict[str, Any]:
+    """Return the stored entry of a processed file."""
+    entry = dict(msgpack.unpackb(packed))
+    return entry | {"processed_utc_s": float(entry["processed_utc_s"])}
 
 
 def _remove_empty_folders(file: InputFile) -> None:

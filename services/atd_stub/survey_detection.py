@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Final
 
 from pydantic import ValidationError
 
@@ -18,14 +20,52 @@ from sonarpost.detection.record import contact_record
 from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamDetector, StreamEnd
 from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals
+from sonarpost.errors import SurveyFileError
+from sonarpost.limits import limit
 from sonarpost.logs import kv
 from sonarpost.messages import Contact, Pixels, Snippet, VehicleStatus
 from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.sonar.readers import open_survey
+from sonarpost.sonar.readers import open_survey, recording_parts
 from sonarpost.sonar.survey import Ping, Survey
 
 log = logging.getLogger(__name__)
 
+MAX_CONTACTS: Final = limit(
+    5000,
+    "contacts",
+    "claims",
+    surface="input folder of a vehicle",
+    source="recording",
+    resource="contacts",
+    at_limit="the least confident contacts are not sent",
+)
+MAX_SAMPLE_M: Final = limit(
+    1.0,
+    "m for each sample",
+    "claims",
+    surface="input folder of a vehicle",
+    source="recording",
+    resource="slant range of a ping",
+    at_limit="the ping is not searched",
+)
+MAX_SEARCH_S: Final = limit(
+    600.0,
+    "s",
+    "deadlines",
+    surface="input folder of a vehicle",
+    source="recording",
+    resource="time of the search, beside the time for its size",
+    at_limit="the recording is quarantined, the next one is searched",
+)
+MAX_SEARCH_S_PER_MB: Final = limit(
+    100.0,
+    "s for each megabyte",
+    "deadlines",
+    surface="input folder of a vehicle",
+    source="recording",
+    resource="time of the search, by its size",
+    at_limit="the recording is quarantined, the next one is searched",
+)
 SurveyEnd = StreamEnd[bytes]
 """The end of a recording; its contacts are encoded snippets, as they are stored."""
 
@@ -67,6 +107,7 @@ class DetectionResult:
     masked_share: float = 0.0
     difficulty: Difficulty | None = None
     status: VehicleStatus | None = None
+    position_note: str | None = None
 
 
 def detect_in_survey(
@@ -79,6 +120,9 @@ def detect_in_survey(
 ) -> DetectionResult:
     """Detect the contacts of a survey file.
 
+    A file that cannot be searched together with the end of an earlier one is searched alone: the fault may be in the
+    earlier one, whose held contacts are released.
+
     Args:
         path: The file.
         content: Hex SHA-256 of its content; part of the contact identifiers.
@@ -88,20 +132,74 @@ def detect_in_survey(
         transmissions: Times whose pings are masked; None for none.
 
     Raises:
-        SurveyFileError: The file is not a readable survey.
+        SurveyFileError: The file is not a readable survey, or its search takes longer than `MAX_SEARCH_S` and
+            `MAX_SEARCH_S_PER_MB`.
     """
+    size_bytes = sum(part.stat().st_size for part in recording_parts(path) if part.exists())
+    deadline_s = time.monotonic() + MAX_SEARCH_S + MAX_SEARCH_S_PER_MB * size_bytes / 1e6
+    transmissions = transmissions or TransmitIntervals()
+    try:
+        return _detect(path, content, vehicle_id, config, ends or {}, transmissions, deadline_s)
+    except OSError:
+        raise
+    except Exception as error:
+        if not ends:
+            raise
+        alone = _detect(path, content, vehicle_id, config, {}, transmissions, deadline_s)
+        assert alone.ends is not None
+        log.warning(
+            "File searched alone, without the end of an earlier one", extra=kv(file=path.name, reason=str(error))
+        )
+        left = [end for sonar_id, end in ends.items() if sonar_id in alone.ends]
+        return replace(
+            alone,
+            ends={**ends, **alone.ends},
+            not_continued=tuple(snippet for end in left for snippet in snippets_of(end.held)),
+        )
+
+
+class _LimitedSource(MaskedSource):
+    """A source whose iteration ends with an error after a monotonic time. Coarse pings have no samples."""
+
+    deadline_s: float
+    coarse_count = 0
+
+    def pings(self) -> Iterator[Ping]:
+        for ping in super().pings():
+            if time.monotonic() > self.deadline_s:
+                expected = f"at most {MAX_SEARCH_S:g} s and {MAX_SEARCH_S_PER_MB:g} s for each megabyte"
+                raise SurveyFileError(str(self.info.path), "search", "unfinished", expected)
+            is_coarse = any(channel.sample_spacing_m > MAX_SAMPLE_M for channel in ping.channels)
+            self.coarse_count += is_coarse
+            yield replace(ping, channels=()) if is_coarse else ping
+
+
+def _detect(
+    path: Path,
+    content: str,
+    vehicle_id: str,
+    config: AtdStubConfig,
+    ends: Mapping[str, SurveyEnd],
+    transmissions: TransmitIntervals,
+    deadline_s: float,
+) -> DetectionResult:
+    """As `detect_in_survey`."""
 
     def describe(survey: Survey, detection: Detection, origin: PingOrigin) -> bytes:
         return wire.encode(snippet_of(survey, detection, origin.file, vehicle_id, config))
 
-    detector = StreamDetector(describe, config.detector_settings(), ends)
+    settings = config.detector_settings()
+    settings = settings.model_copy(update={"max_contacts": min(settings.max_contacts or MAX_CONTACTS, MAX_CONTACTS)})
+    detector = StreamDetector(describe, settings, ends)
     with open_survey(path, config) as source:
         info = source.info
-        masked = MaskedSource(source, transmissions or TransmitIntervals())
+        masked = _LimitedSource(source, transmissions)
+        masked.deadline_s = deadline_s
         found = detector.add_file(masked, FileOrigin.of(source, content))
     # Contacts are held only while they wait for a continuation.
     at_once = detector.release(info.sonar_id) if config.join_timeout_s == 0 else ()
     ready = sorted(snippets_of((*found.contacts, *at_once)), key=_descending_confidence)
+    coarse = f"{masked.coarse_count} pings have over {MAX_SAMPLE_M:g} m of slant range for each sample: not searched"
     return DetectionResult(
         snippets=tuple(ready),
         contact_count=len(found.contacts) + len(found.held),
@@ -111,12 +209,13 @@ def detect_in_survey(
         not_continued=snippets_of(found.released),
         replaced=tuple(snippet.contact.contact_id for snippet in snippets_of(found.replaced)),
         dropped=tuple(snippet.contact.contact_id for snippet in snippets_of(found.dropped)),
-        warnings=info.warnings,
+        warnings=(*info.warnings, coarse) if masked.coarse_count else info.warnings,
         weaker=found.weaker,
         masked_pings=masked.masked_count,
         masked_share=masked.masked_share,
         difficulty=found.difficulty,
         status=None if masked.newest is None else status_of(masked.newest, vehicle_id),
+        position_note=None if masked.newest is None else masked.newest.position_note,
     )
 
 

@@ -59,14 +59,10 @@ class TransmissionLog:
         self._file = file
         self._lock = threading.Lock()  # for `_ends`: records arrive in threads of Zenoh
         self._ends: dict[float, float] = {}  # end by start, seconds since 1970-01-01 UTC
-        self._stored: dict[str, bytes] = {}
         self._save_due_s = 0.0
-        for name, packed in store.states(_STATE_PREFIX).items():
-            self._stored[name] = packed
-            try:
-                self._ends |= _unpacked(packed)
-            except ValueError as error:
-                log.warning("Discarding unreadable transmissions", extra=kv(name=name, reason=str(error)))
+        for ends in store.read_states(_STATE_PREFIX, lambda _, packed: _unpacked(packed)).values():
+            self._ends |= ends
+        self._stored = {_STATE_PREFIX + name: packed for name, packed in store.states(_STATE_PREFIX).items()}
         self._remove_old(time.time())
 
     def __len__(self) -> int:
@@ -163,14 +159,6 @@ def _as_json(ends: Mapping[float, float]) -> bytes:
 
 
 def _unpacked(packed: bytes) -> dict[float, float]:
-    """Return what `_packed` was called with.
-
-    Raises:
-        ValueError: The content is damaged.
-    """
-    try:
-        pairs = [(start_s, end_s) for start_s, end_s in msgpack.unpackb(packed)]
-        checked = [Transmission(start_utc_s=start_s, end_utc_s=end_s) for start_s, end_s in pairs]
-    except (TypeError, ValueError, msgpack.UnpackException) as error:
-        raise ValueError(f"transmissions: content: got {error}, expected pairs of start and end") from error
+    """Return what `_packed` was called with."""
+    checked = [Transmission(start_utc_s=start_s, end_utc_s=end_s) for start_s, end_s in msgpack.unpackb(packed)]
     return {each.start_utc_s: each.end_utc_s for each in checked}

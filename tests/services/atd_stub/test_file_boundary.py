@@ -11,8 +11,6 @@ import pytest
 from builders.common import GOLDEN_FOLDER, eventually
 from builders.joined_surveys import (
     FEW_CANDIDATES,
-    RANGE_M,
-    SAMPLES,
     START_S,
     Box,
     detect_in_files,
@@ -20,7 +18,6 @@ from builders.joined_surveys import (
     split,
     survey_of,
 )
-from builders.two_frequencies import with_second_frequency
 
 from sonarpost.detection.association import DetectionPlace
 from sonarpost.detection.settings import DetectorTuning
@@ -86,7 +83,11 @@ def test_each_object_of_a_long_file_is_one_contact_in_any_strip(tmp_path):
     assert [len(near(sent, box.row, box.side)) for box in boxes] == [1] * len(boxes)
 
 
-@pytest.mark.parametrize("what", ["later", "elsewhere", "other sonar", "other range", "earlier", "one more channel"])
+def at_frequency(ping, frequency_hz):
+    return replace(ping, channels=tuple(replace(c, frequency_hz=frequency_hz) for c in ping.channels))
+
+
+@pytest.mark.parametrize("what", ["later", "elsewhere", "other sonar", "other range", "earlier", "other frequency"])
 def test_a_file_that_is_no_continuation_is_not_joined(what, tmp_path):
     survey = survey_of(200, Box(97))
     first, second = split(tmp_path, survey, (0, 100), (100, 200))
@@ -100,8 +101,10 @@ def test_a_file_that_is_no_continuation_is_not_joined(what, tmp_path):
             later = tuple(replace(p, channels=tuple(replace(c, slant_range_m=30.0) for c in p.channels)) for p in later)
         case "earlier":
             later = tuple(replace(p, time_utc_s=p.time_utc_s - 3600.0) for p in later)
-        case "one more channel":
-            later = with_second_frequency(replace(survey, pings=later), SAMPLES, RANGE_M).pings
+        case "other frequency":
+            written = replace(survey, pings=tuple(at_frequency(p, 400e3) for p in survey.pings[:100]))
+            write_xtf(replace(written, sonar_id="made"), first)
+            later = tuple(at_frequency(p, 900e3) for p in later)
     write_xtf(replace(survey, pings=later, sonar_id="else" if what == "other sonar" else "made"), second)
     before = detect_in_survey(first, "0" * 64, "uuv-1", HOLDING)
     assert near(list(before.held), 97)

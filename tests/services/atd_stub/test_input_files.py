@@ -210,7 +210,7 @@ def test_only_regular_files_with_a_known_suffix_are_listed(tmp_path):
     os.mkfifo(tmp_path / "pipe.xtf")
     for name in (".hidden.xtf", "notes.txt", "good.XTF"):
         (tmp_path / name).write_bytes(b"x")
-    assert [file.path.name for file in list_input_files(tmp_path, (".xtf",))] == ["good.XTF"]
+    assert [file.path.name for file in list_input_files(tmp_path, (".xtf",)).files] == ["good.XTF"]
 
 
 def test_image_files_are_sent_unchanged_if_they_fit(start_service, compressor, put_image, texture, lines):

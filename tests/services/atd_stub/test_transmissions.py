@@ -117,13 +117,13 @@ def test_retention(store):
     assert not store.states("transmissions:")
 
 
-def test_damaged_transmissions_are_discarded_and_logged(store, caplog):
+def test_damaged_transmissions_are_quarantined(store):
     damaged = [b"\xc1", b"\x01", msgpack.packb([[1.0]]), msgpack.packb([[2.0, 1.0]])]
     with store.transaction() as tx:
         for number, packed in enumerate(damaged):
             tx.put_state(f"transmissions:{number}", packed)
     assert Bench(store).times == []
-    assert caplog.text.count("Discarding unreadable transmissions") == len(damaged)
+    assert (store.states_discarded, store.refused_count()) == (len(damaged), len(damaged))
 
 
 # Service
