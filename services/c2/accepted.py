@@ -15,7 +15,6 @@ from pathlib import Path
 
 import msgpack
 import numpy as np
-from pydantic import ValidationError
 
 from sonarpost import keys
 from sonarpost.archive.journal import FILE_NAME, Accepted, Journal, JournalEntry, JournalRecord, JournalRow
@@ -23,14 +22,16 @@ from sonarpost.archive.shared_journal import SharedJournal
 from sonarpost.archive.shore_database import ShoreDatabase
 from sonarpost.archive.shore_files import decision_path
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex
-from sonarpost.errors import BadInputError, StoredFileError
+from sonarpost.delivery.store import UNREADABLE
+from sonarpost.errors import BadInputError, RejectedByDatabaseError, StoredFileError
 from sonarpost.export.contacts import SideCar
+from sonarpost.files import read_regular
 from sonarpost.logs import kv
 from sonarpost.messages import CodedImage, Decision, Pixels, ReconstructedImage
 from sonarpost.services.c2.archive import Archive, Storage
 from sonarpost.services.c2.shared_archive import SharedArchive
 from sonarpost.services.c2.tasking import Tasking
-from sonarpost.sonar.image_decoding import GreyImage
+from sonarpost.sonar.image_decoding import MAX_FILE_BYTES, GreyImage
 from sonarpost.sonar.image_files import read_image
 
 log = logging.getLogger(__name__)
@@ -203,8 +204,10 @@ class AcceptedRecords:
         for row in rows:
             path = self._folder / row.vessel_id / f"{row.name}.json"
             try:
-                image = stored_image(path.read_bytes(), read_image(path.with_suffix(".tiff")), str(path))
-            except (OSError, ValidationError, BadInputError) as error:
+                image = stored_image(
+                    read_regular(path, MAX_FILE_BYTES), read_image(path.with_suffix(".tiff")), str(path)
+                )
+            except (OSError, *UNREADABLE) as error:
                 self._not_available(path, error)
                 continue
             yield self.image(image, row.name), row.accepted_utc_s
@@ -213,8 +216,8 @@ class AcceptedRecords:
         for row in sorted(rows, key=lambda row: row.accepted_utc_s):
             path = decision_path(self._folder, row.vessel_id, row.decision_id)
             try:
-                decision = Decision.model_validate_json(path.read_bytes())
-            except (OSError, ValidationError) as error:
+                decision = Decision.model_validate_json(read_regular(path, MAX_FILE_BYTES))
+            except (OSError, *UNREADABLE) as error:
                 self._not_available(path, error)
                 continue
             yield self.decision(decision), row.accepted_utc_s
@@ -247,8 +250,19 @@ class AcceptedRecords:
         return self._archive.journal()
 
     def _number_stored(self, entries: Iterable[tuple[JournalEntry, float]]) -> int:
+        return self._number_divided([JournalRecord.of(entry, utc_s) for entry, utc_s in entries])
+
+    def _number_divided(self, records: Sequence[JournalRecord]) -> int:
+        """Number records without those that the database rejects; return their number."""
         assert isinstance(self._archive, SharedArchive)
-        return len(self._archive.number([JournalRecord.of(entry, utc_s) for entry, utc_s in entries]))
+        try:
+            return len(self._archive.number(records))
+        except RejectedByDatabaseError as error:
+            if len(records) > 1:
+                half = len(records) // 2
+                return self._number_divided(records[:half]) + self._number_divided(records[half:])
+            self._not_available(f"database: {records[0].subject}", error)
+            return 0
 
     def _images_of(self, database: ShoreDatabase, rows: Iterable[ImageRow]) -> Iterator[tuple[JournalEntry, float]]:
         for row in rows:
@@ -256,7 +270,7 @@ class AcceptedRecords:
             try:
                 side_car = database.image_files(row.vessel_id, row.name).get(".json", b"")
                 image = stored_image(side_car, self._archive.read_pixels(row.vessel_id, row.name), where)
-            except (ValidationError, BadInputError) as error:
+            except UNREADABLE as error:
                 self._not_available(where, error)
                 continue
             yield self.image(image, row.name), row.accepted_utc_s
@@ -267,7 +281,7 @@ class AcceptedRecords:
         for row in rows:
             try:
                 decision = Decision.model_validate_json(database.decision_content(row))
-            except ValidationError as error:
+            except UNREADABLE as error:
                 self._not_available(f"database: decision {row.vessel_id}/{row.decision_id}", error)
                 continue
             yield self.decision(decision), row.accepted_utc_s

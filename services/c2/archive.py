@@ -231,19 +231,19 @@ class Archive:
     def apply_retention(self, now_utc_s: float) -> list[ImageRow]:
         """Remove images by age and total size; return them."""
         config = self._config
+        index = self.index()
+        oldest_utc_s = index.oldest_utc_s()
+        too_large = index.size_bytes() > config.max_bytes
+        if oldest_utc_s is None or (now_utc_s - oldest_utc_s <= config.retain_days * DAY_S and not too_large):
+            return []
+        # The decisions only matter above the maximum size. Records are stored during the selection.
+        decisions = index.decisions() if too_large else []
+        rows = select_images(index.images(), decisions, now_utc_s, config.retain_days, config.max_bytes)
         with self._lock:
-            index = self.index()
-            oldest_utc_s = index.oldest_utc_s()
-            too_large = index.size_bytes() > config.max_bytes
-            if oldest_utc_s is None or (now_utc_s - oldest_utc_s <= config.retain_days * DAY_S and not too_large):
-                return []
-            # The decisions only matter above the maximum size.
-            decisions = index.decisions() if too_large else []
-            rows = select_images(index.images(), decisions, now_utc_s, config.retain_days, config.max_bytes)
             for row in rows:
                 delete_image_files(self._out_dir, row)
             if rows:
-                index.mark("removed_utc_s", rows, now_utc_s)
+                index.mark("removed_utc_s", rows, time.time())
         log_removed(rows)
         return rows
 

@@ -44,11 +44,12 @@ class C2Config(RetentionConfig):
     Attributes:
         site: Name of this site in keys; relays name it in their upstreams.
         out_dir: Folder of the stored records, with a folder for each vessel and an index.
-        max_bytes: Maximum size of the stored images; above it exported images are removed first, then those with a
-            decision, then the others, each the oldest first. Decisions are never removed.
+        max_bytes: Maximum size of the stored images; above it the vessel with the most bytes loses images: exported
+            ones first, then those without a decision, then the others, each the oldest first. Decisions are never
+            removed. Each of the three files of an image counts at least 16 KiB.
         codebooks: Tile codebooks that vehicles may use: nominal-10, nominal-20 or files. c2 requests others from the
             vessel and keeps them in the folder `codebooks` of state_dir.
-        decode_workers: Processes that decode images, each with about 200 MB of memory.
+        decode_workers: Processes that decode images, each with up to 250 MB of memory.
         database: PostgreSQL database of the records, `postgresql://USER@HOST/DATABASE`, which several c2 can share;
             without one they are in `out_dir`. The connection uses TLS, unless the server is on this host or the address
             ends in `?sslmode=disable`; `sslrootcert=FILE` names the authority.

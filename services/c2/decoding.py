@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +18,8 @@ from sonarpost import keys, wire
 from sonarpost.archive import image_parts
 from sonarpost.archive.decode_worker import Decoded, DecodeWorker
 from sonarpost.delivery.store import Store
-from sonarpost.errors import BadInputError, DeliveryError
+from sonarpost.errors import BadInputError, DeliveryError, can_concern_record
+from sonarpost.limits import Turns, limit
 from sonarpost.logs import kv
 from sonarpost.messages import CodedImage, ImagePart, ReconstructedImage
 from sonarpost.runtime.service import ServiceStoppingError
@@ -26,11 +27,65 @@ from sonarpost.runtime.service import ServiceStoppingError
 log = logging.getLogger(__name__)
 
 BACKLOG: Final = "undecoded/"
-"""Prefix of the states with accepted images, in the order of their acceptance."""
-BATCH_PER_WORKER: Final = 4
+"""Prefix of the states with accepted images: `undecoded/{vessel}/{number}`, in the order of their acceptance."""
+SURFACE: Final = "decoding of images"
+BATCH_PER_WORKER: Final = limit(
+    4,
+    "images",
+    "shares",
+    surface=SURFACE,
+    source="vessel",
+    resource="images for each decoding process before those of other vessels",
+    at_limit="the vessels are served in turn",
+)
+BATCH_BYTES: Final = limit(
+    8 * 1024 * 1024,
+    "bytes",
+    "claims",
+    surface=SURFACE,
+    source="vessel",
+    resource="pixels that are stored in one transaction",
+    at_limit="the images are stored in several transactions, after a failure in halves",
+)
 RETRY_S: Final = 1.0
-MAX_WAITING: Final = 1000
-"""Images of one vessel that wait for codebooks; further ones are quarantined."""
+MAX_RETRY_S: Final = 16.0
+PAUSE_FACTOR: Final = limit(
+    4,
+    "times the time that it took",
+    "shares",
+    surface=SURFACE,
+    source="vessel",
+    resource="pause of a vessel after an image that ended the decoding process",
+    at_limit="its images wait; those of other vessels are decoded",
+)
+MAX_PAUSE_S: Final = 300.0
+FAILURES_ALONE: Final = limit(
+    2,
+    "failures",
+    "blame",
+    surface=SURFACE,
+    source="vessel",
+    resource="failures of an image that is decoded alone, after each of which another image was stored",
+    at_limit="the image is quarantined; `sonarpost store quarantine` queues it again",
+)
+MAX_WAITING: Final = limit(
+    1000,
+    "images",
+    "shares",
+    surface=SURFACE,
+    source="vessel",
+    resource="images that wait for codebooks",
+    at_limit="further ones are quarantined",
+)
+MAX_MODELS: Final = limit(
+    8,
+    "codebooks",
+    "shares",
+    surface="codebooks of vessels",
+    source="vessel",
+    resource="codebooks that images wait for",
+    at_limit="further ones are requested later",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +124,13 @@ class BacklogNames:
 
     def __init__(self, store: Store) -> None:
         names = store.state_names(BACKLOG)
-        self._last = max((int(name.removeprefix(BACKLOG)) for name in names), default=0)
+        numbers = (name.rpartition("/")[2] for name in names)
+        self._last = max((int(number) for number in numbers if number.isdecimal()), default=0)
 
-    def next(self) -> str:
-        """Return a new name."""
+    def next(self, vessel_id: str) -> str:
+        """Return a new name for an image of a vessel."""
         self._last = max(self._last + 1, time.time_ns())
-        return f"{BACKLOG}{self._last:020d}"
+        return f"{BACKLOG}{vessel_id}/{self._last:020d}"
 
 
 @dataclass
@@ -82,55 +138,98 @@ class MissingCodebooks:
     """Codebooks that images of the backlog wait for.
 
     Attributes:
-        vessels: Number of waiting images, by (model, vessel).
+        vessels: Number of waiting images, by vessel and model; the images of models above `MAX_MODELS` count as of "".
         lock: Protects the other attributes.
         on_added: Called after a codebook was found to be missing.
     """
 
-    vessels: Counter[tuple[str, str]] = field(default_factory=Counter)
+    vessels: dict[str, Counter[str]] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
     on_added: Callable[[], None] = lambda: None
 
     def add(self, model: str, vessel: str) -> bool:
         """Count an image; return False if too many of its vessel wait already."""
         with self.lock:
-            if sum(count for (_, name), count in self.vessels.items() if name == vessel) >= MAX_WAITING:
+            models = self.vessels.setdefault(vessel, Counter())
+            if models.total() >= MAX_WAITING:
                 return False
-            is_new = (model, vessel) not in self.vessels
-            self.vessels[model, vessel] += 1
-        if is_new:
+            if model not in models and len(models) >= MAX_MODELS:
+                model = ""
+            is_new = model not in models
+            models[model] += 1
+        if is_new and model:
             self.on_added()
         return True
 
-    def clear(self) -> None:
-        """Forget all, before the backlog is tried again from its beginning."""
+    def clear(self, vessel: str) -> None:
+        """Forget a vessel, before its images are tried again from the first one."""
         with self.lock:
-            self.vessels.clear()
+            self.vessels.pop(vessel, None)
 
-    def pairs(self) -> list[tuple[str, str]]:
-        """Return (model, vessel) of all that images wait for."""
+    def models(self) -> dict[str, list[str]]:
+        """Return the models that images wait for, by vessel."""
         with self.lock:
-            return sorted(self.vessels)
+            return {vessel: sorted(model for model in models if model) for vessel, models in self.vessels.items()}
 
     def warning(self) -> str:
         """Return text for the health record; empty if no image waits."""
         with self.lock:
-            waiting = sorted(self.vessels.items())
-        return ", ".join(f"{count} images of {vessel} wait for codebook {model}" for (model, vessel), count in waiting)
+            waiting = [
+                (v, m, count) for v, models in sorted(self.vessels.items()) for m, count in sorted(models.items())
+            ]
+        return ", ".join(
+            f"{count} images of {vessel} wait for {f'codebook {model}' if model else 'other codebooks'}"
+            for vessel, model, count in waiting
+        )
+
+
+@dataclass(slots=True)
+class _Failing:
+    """An image that was not decoded or stored.
+
+    Attributes:
+        stored: Number of images that were stored before its last failure.
+        alone: Failures that count against it, see `FAILURES_ALONE`.
+    """
+
+    stored: int
+    alone: int = 0
+
+
+@dataclass(slots=True)
+class _Vessel:
+    """Images of one vessel.
+
+    Attributes:
+        after: Name of the last entry that was tried.
+        failing: Images that failed, by name; they are tried again, each alone.
+        failures: Consecutive failures.
+        retry_at_s: When its images are tried again, by the monotonic clock.
+    """
+
+    after: str
+    failing: dict[str, _Failing] = field(default_factory=dict)
+    failures: int = 0
+    retry_at_s: float = 0.0
 
 
 class Decoding:
-    """Decodes the backlog of a store, oldest first, with several processes.
+    """Decodes the backlog of a store with several processes: the vessels in turn, the images of each oldest first.
 
-    An image whose codebook is not known stays in the backlog until the codebook is there.
+    An image whose codebook is not known stays in the backlog until the codebook is there. After a failure that is not
+    known to be one of the image, its vessel pauses and the image is tried again.
 
     Args:
         store: Store of c2.
         workers: The decoding processes.
         keep: Called with decoded images and their entries; writes the images to the disk and publishes them. Raises
-            OSError or DeliveryError if that is not possible now; the images are decoded again.
+            an exception if that is not possible now; the images are decoded again.
         on_undecodable: Called with each image that was quarantined.
         stopping: Set when the service stops.
+        site: Name of the site in keys.
+
+    Attributes:
+        fault: Why images wait; empty if they do not.
     """
 
     def __init__(
@@ -140,6 +239,7 @@ class Decoding:
         keep: Callable[[Sequence[ReconstructedImage], Sequence[AcceptedImage]], None],
         on_undecodable: Callable[[AcceptedImage, str], None],
         stopping: threading.Event,
+        site: str = keys.SHORE,
     ) -> None:
         self._store = store
         self.workers = list(workers)
@@ -148,15 +248,20 @@ class Decoding:
         self._keep = keep
         self._on_undecodable = on_undecodable
         self._stopping = stopping
+        self._site = site
         self._changed = threading.Event()
-        self._from_start = threading.Event()
+        self._from_start: set[str] = set()
+        self._vessels: dict[str, _Vessel] = {}
+        self._turns, self._again_turns = Turns(), Turns()
+        self._stored = 0
+        self._reason = ""
         self.missing = MissingCodebooks()
         self.fault = ""
 
-    def wake(self, *, codebook_added: bool = False) -> None:
-        """Look for new entries; after a codebook was added, also at those that wait."""
-        if codebook_added:
-            self._from_start.set()
+    def wake(self, codebook_of: str = "") -> None:
+        """Look for new entries; after a codebook of a vessel was added, also at those of it that wait."""
+        if codebook_of:
+            self._from_start.add(codebook_of)
         self._changed.set()
 
     def close(self) -> None:
@@ -167,72 +272,188 @@ class Decoding:
 
     def run(self) -> None:
         """Decode until the service stops."""
-        after = BACKLOG
         with ThreadPoolExecutor(len(self.workers), thread_name_prefix="decode") as pool:
             while not self._stopping.is_set():
                 self._changed.clear()
-                if self._from_start.is_set():
-                    self._from_start.clear()
-                    self.missing.clear()
-                    after = BACKLOG
                 try:
-                    found = self._store.states_after(BACKLOG, after, BATCH_PER_WORKER * len(self.workers))
-                    if found:
-                        self._decode(pool, [AcceptedImage.unpack(name, value) for name, value in found])
-                        after = found[-1][0]
-                    self.fault = ""
+                    found = self._round(pool)
                 except ServiceStoppingError:
                     return
-                except (OSError, DeliveryError) as error:
+                except Exception as error:
+                    if not isinstance(error, DeliveryError):
+                        log.exception("Images not decoded after an unexpected exception; trying again")
                     self.fault = f"images cannot be decoded and stored: {error}"
                     log.error("Images cannot be decoded and stored", extra=kv(reason=str(error)))
+                    self._from_start.update(self._vessels)  # the images of this round are tried again
                     self._stopping.wait(RETRY_S)
                     continue
+                failing = sum(len(vessel.failing) for vessel in self._vessels.values())
+                self.fault = f"{failing} images cannot be decoded and stored now: {self._reason}" if failing else ""
                 if not found:
-                    self._changed.wait()
+                    now_s = time.monotonic()
+                    ends_s = [v.retry_at_s for v in self._vessels.values() if v.failing or v.retry_at_s > now_s]
+                    self._changed.wait(max(0.0, min(ends_s) - now_s) if ends_s else None)
+
+    def _round(self, pool: ThreadPoolExecutor) -> bool:
+        """Decode the next images of all vessels, then one that failed before; return whether there were any."""
+        while self._from_start:
+            name = self._from_start.pop()
+            self.missing.clear(name)
+            self._vessels.pop(name, None)
+        next_ = self._next()
+        self._decode(pool, next_)
+        again = [] if self._stopping.is_set() else self._again()
+        self._decode(pool, again)
+        return bool(next_ or again)
+
+    def _next(self) -> list[AcceptedImage]:
+        """Return the next entries, of all vessels in turn."""
+        count = BATCH_PER_WORKER * len(self.workers)
+        names = [name for name in self._names() if self._is_due(name)]
+        share = -(-count // max(1, len(names)))
+        waiting: dict[str, list[tuple[str, bytes]]] = {}
+        for name in names:
+            prefix = f"{BACKLOG}{name}/"
+            waiting[name] = self._store.states_after(prefix, self._vessel(name).after, share)
+        picked = self._turns.pick({name: entries for name, entries in waiting.items() if entries}, count)
+        for name, _ in picked:
+            self._vessel(_vessel_of(name)).after = name
+        return self._parsed(picked)
+
+    def _names(self) -> Iterator[str]:
+        """Yield the vessels with images in the backlog."""
+        after = BACKLOG
+        while found := self._store.states_after(BACKLOG, after, 1):
+            yield (name := _vessel_of(found[0][0]))
+            after = f"{BACKLOG}{name}/\U0010ffff"
+
+    def _vessel(self, name: str) -> _Vessel:
+        return self._vessels.setdefault(name, _Vessel(f"{BACKLOG}{name}/"))
+
+    def _is_due(self, name: str) -> bool:
+        return self._vessel(name).retry_at_s <= time.monotonic()
+
+    def _again(self) -> list[AcceptedImage]:
+        """Return the failed image that has waited longest, if its vessel does not pause."""
+        due = {name: list(v.failing) for name, v in self._vessels.items() if v.failing and self._is_due(name)}
+        names = self._again_turns.pick(due, 1)
+        found = self._parsed([(name, self._store.get_state(name) or b"") for name in names])
+        if not found:
+            for name in names:
+                self._vessel(_vessel_of(name)).failing.pop(name)
+        return found
+
+    def _parsed(self, entries: Sequence[tuple[str, bytes]]) -> list[AcceptedImage]:
+        return list(self._store.readable(dict(entries), AcceptedImage.unpack).values())
 
     def _decode(self, pool: ThreadPoolExecutor, batch: Sequence[AcceptedImage]) -> None:
+        started_s = time.monotonic()
         results = list(pool.map(self._decode_one, batch))
         if self._stopping.is_set():
             return
-        done, images = [], []
+        is_alone = len(batch) == 1
+        failed: dict[str, float] = {}
+        decoded: list[tuple[AcceptedImage, ReconstructedImage]] = []
         for entry, result in zip(batch, results, strict=True):
             if result.image is not None:
-                images.append(result.image)
+                decoded.append((entry, result.image))
+            elif result.failure:
+                counts = is_alone and result.failure == "crash"
+                self._failed(entry, result.reason, counts=counts)
+                failed[entry.vessel_id] = time.monotonic() - started_s if result.failure == "crash" else 0.0
             elif result.missing_model and self.missing.add(result.missing_model, entry.vessel_id):
-                continue
+                self._vessel(entry.vessel_id).failing.pop(entry.name, None)
             else:
                 self._quarantine(entry, result.reason)
-                continue
-            done.append(entry)
-        self._keep(images, done)
-        with self._store.transaction() as tx:
-            for entry in done:
-                tx.delete_state(entry.name)
+        for group in _groups(decoded):
+            failed |= dict.fromkeys(self._keep_parts(group, is_alone=is_alone), 0.0)
+        for name, taken_s in failed.items():
+            vessel = self._vessel(name)
+            pause_s = min(RETRY_S * 2**vessel.failures, MAX_RETRY_S) + min(PAUSE_FACTOR * taken_s, MAX_PAUSE_S)
+            vessel.failures = min(vessel.failures + 1, 10)
+            vessel.retry_at_s = time.monotonic() + pause_s
 
     def _decode_one(self, entry: AcceptedImage) -> Decoded:
         with self._idle_lock:
             worker = self._idle.pop()
         try:
-            image = entry.coded_image()
-            result = worker.decode(image)
-            if result.is_crash and not self._stopping.is_set():
-                # The process may have been killed for another reason than this image.
-                log.error("Decoder crashed; trying the image once more", extra=kv(reason=result.reason))
-                result = worker.decode(image)
+            return worker.decode(entry.coded_image())
         except BadInputError as error:
             return Decoded(reason=str(error))
-        else:
-            return result
+        except Exception as error:
+            log.exception("Image not decoded after an unexpected exception")
+            return Decoded(reason=f"{type(error).__name__}: {error}", failure="crash")
         finally:
             with self._idle_lock:
                 self._idle.append(worker)
 
+    def _keep_parts(self, group: Sequence[tuple[AcceptedImage, ReconstructedImage]], *, is_alone: bool) -> set[str]:
+        """Store images, after a failure in halves; return the vessels of those that cannot be stored."""
+        entries = [entry for entry, _ in group]
+        try:
+            self._keep([image for _, image in group], entries)
+        except ServiceStoppingError:
+            raise
+        except Exception as error:
+            if len(group) > 1:
+                half = len(group) // 2
+                return self._keep_parts(group[:half], is_alone=is_alone) | self._keep_parts(
+                    group[half:], is_alone=is_alone
+                )
+            if not isinstance(error, (OSError, DeliveryError)):
+                log.exception("Image not stored after an unexpected exception")
+            self._failed(entries[0], str(error) or type(error).__name__, counts=is_alone and can_concern_record(error))
+            return {entries[0].vessel_id}
+        with self._store.transaction() as tx:
+            for entry in entries:
+                tx.delete_state(entry.name)
+        self._stored += len(entries)
+        for entry in entries:
+            vessel = self._vessel(entry.vessel_id)
+            vessel.failing.pop(entry.name, None)
+            vessel.failures, vessel.retry_at_s = 0, 0.0
+        return set()
+
+    def _failed(self, entry: AcceptedImage, reason: str, *, counts: bool) -> None:
+        """Try an image again later; quarantine it if it alone has failed and others were stored in between."""
+        self._reason = reason
+        vessel = self._vessel(entry.vessel_id)
+        log.error("Image not decoded and stored; it is tried again", extra=kv(vessel=entry.vessel_id, reason=reason))
+        before = vessel.failing.pop(entry.name, None)
+        alone = before.alone if before else 0
+        if before is not None and counts and before.stored != self._stored:
+            alone += 1
+        if alone >= FAILURES_ALONE:
+            self._quarantine(entry, reason)
+        else:
+            vessel.failing[entry.name] = _Failing(self._stored, alone)  # the last one in turn
+
     def _quarantine(self, entry: AcceptedImage, reason: str) -> None:
         with self._store.transaction() as tx:
-            tx.quarantine("in", keys.shore_part(entry.vessel_id), entry.payload, reason)
+            tx.quarantine("in", keys.shore_part(entry.vessel_id, self._site), entry.payload, reason, is_accepted=True)
             tx.delete_state(entry.name)
+        self._vessel(entry.vessel_id).failing.pop(entry.name, None)
         self._on_undecodable(entry, reason)
+
+
+def _vessel_of(name: str) -> str:
+    return name.removeprefix(BACKLOG).partition("/")[0]
+
+
+def _groups(
+    decoded: Sequence[tuple[AcceptedImage, ReconstructedImage]],
+) -> Iterator[list[tuple[AcceptedImage, ReconstructedImage]]]:
+    """Yield images in groups of at most `BATCH_BYTES` of pixels, at least one each."""
+    group: list[tuple[AcceptedImage, ReconstructedImage]] = []
+    size_bytes = 0
+    for each in decoded:
+        size_bytes += len(each[1].picture.data)
+        if group and size_bytes > BATCH_BYTES:
+            yield group
+            group, size_bytes = [], len(each[1].picture.data)
+        group.append(each)
+    if group:
+        yield group
 
 
 def decode_workers(count: int, codebooks: Sequence[str], folder: Path, state_dir: Path) -> list[DecodeWorker]:

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from typing import Annotated, ClassVar, Final
 
 import zenoh
@@ -20,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sonarpost import keys
 from sonarpost.archive.journal import JournalRow
 from sonarpost.errors import BadInputError, DeliveryError
+from sonarpost.limits import limit
 from sonarpost.logs import kv
 from sonarpost.services.c2.accepted import AcceptedRecords, accepted_fields, payload_of
 from sonarpost.services.c2.json_form import ENCODING, json_payload
@@ -27,12 +29,44 @@ from sonarpost.services.c2.query_parameters import QueryParameters, parse_parame
 
 log = logging.getLogger(__name__)
 
-MAX_BYTES: Final = 256 * 1024
-"""Maximum size of the replies to one query, unless the first record alone is larger."""
+SURFACE: Final = "queries for accepted records"
+MAX_BYTES: Final = limit(
+    256 * 1024,
+    "bytes",
+    "claims",
+    surface=SURFACE,
+    source="client",
+    resource="replies to one query, unless the first record alone is larger",
+    at_limit="the client queries the next page",
+)
+LARGE_BYTES: Final = limit(
+    1024 * 1024,
+    "bytes",
+    "claims",
+    surface=SURFACE,
+    source="client",
+    resource="pixels of a record that is sent at the same time as others",
+    at_limit="larger records are read and sent one at a time",
+)
 THREADS: Final = 2
-MAX_IN_PROGRESS: Final = 8
-"""Maximum number of queries that are answered or wait for it."""
-RATE_PER_S: Final = 20.0
+MAX_IN_PROGRESS: Final = limit(
+    8,
+    "queries",
+    "shares",
+    surface=SURFACE,
+    source="client",
+    resource="queries in progress, of all clients",
+    at_limit="further ones get an error reply and are repeated",
+)
+RATE_PER_S: Final = limit(
+    20.0,
+    "queries a second",
+    "shares",
+    surface=SURFACE,
+    source="client",
+    resource="queries of all clients, after a burst of 40",
+    at_limit="further ones get an error reply and are repeated",
+)
 BURST: Final = 40.0
 BUSY: Final = "busy"
 """Field of the error reply to a query that the client has to repeat."""
@@ -100,6 +134,7 @@ class QueryService:
         self._lock = threading.Lock()
         self._in_progress = 0
         self._rate = RateLimit()
+        self._large = threading.Lock()
         self._session: zenoh.Session | None = None
         self._queryables: list[zenoh.Queryable[None]] = []
         self._is_preferred = True
@@ -213,16 +248,18 @@ class QueryService:
         more, rows = len(rows) > parameters.limit, rows[: parameters.limit]
         sent = size_bytes = unreadable = 0
         for row in rows:
-            payload = self._payload(row, parameters)
-            if payload is None:
-                unreadable += 1
-                continue
-            if sent and size_bytes + len(payload) > MAX_BYTES:
-                more, rows = True, rows[: rows.index(row)]
-                break
-            encoding = ENCODING if parameters.format == "json" else row.encoding
-            query.reply(row.key, payload, encoding=encoding)
-            sent, size_bytes = sent + 1, size_bytes + len(payload)
+            with self._large if _pixel_bytes(row) > LARGE_BYTES else nullcontext():
+                payload = self._payload(row, parameters)
+                if payload is None:
+                    unreadable += 1
+                    continue
+                if sent and size_bytes + len(payload) > MAX_BYTES:
+                    more, rows = True, rows[: rows.index(row)]
+                    break
+                encoding = ENCODING if parameters.format == "json" else row.encoding
+                query.reply(row.key, payload, encoding=encoding)
+                sent, size_bytes = sent + 1, size_bytes + len(payload)
+                del payload
         end = rows[-1].accepted.seq if more else max([last, parameters.after, *(row.accepted.seq for row in rows)])
         page = Page(records=sent, unreadable=unreadable, more=more, next=f"{archive}.{end}")
         self.count("query_records", sent)
@@ -236,9 +273,15 @@ class QueryService:
     def _payload(self, row: JournalRow, parameters: QueryParameters) -> bytes | None:
         try:
             fields = accepted_fields(self._records.fields(row), row.accepted)
-        except (OSError, BadInputError) as error:
+            return json_payload(fields, parameters.picture) if parameters.format == "json" else payload_of(fields)
+        except (OSError, BadInputError, ValueError) as error:
             log.warning("Stored record cannot be read", extra=kv(file=row.name, error=str(error)))
             return None
-        if parameters.format == "json":
-            return json_payload(fields, parameters.picture)
-        return payload_of(fields)
+
+
+def _pixel_bytes(row: JournalRow) -> int:
+    """Return the size of the pixels of a record."""
+    picture = row.fields.get("picture")
+    if not isinstance(picture, dict):
+        return 0
+    return int(picture["height_px"]) * int(picture["width_px"]) * int(picture["bits"]) // 8

@@ -20,7 +20,7 @@ from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem, OutboxItem, platform_of, queue_of
 from sonarpost.delivery.transaction import Transaction
-from sonarpost.errors import DeliveryError, PayloadError
+from sonarpost.errors import DeliveryError, PayloadError, SonarpostError
 from sonarpost.logs import kv
 from sonarpost.messages import (
     Advice,
@@ -98,6 +98,7 @@ class C2Service(Service[C2Config]):
                 self.store,
                 self.count,
                 self.check_capacity,
+                self.before_accepting,
                 self.interval_log(log, logging.WARNING, "Short message refused or not acknowledged"),
             )
         # Of the records that are handled and not committed yet.
@@ -114,23 +115,19 @@ class C2Service(Service[C2Config]):
             self._keep_images,
             self._on_undecodable,
             self.stopping,
+            config.site,
         )
-        self._codebooks = CodebookFetcher(
-            folder,
-            self.decoding.missing.pairs,
-            lambda: self.decoding.wake(codebook_added=True),
-            self.stopping,
-        )
+        self._codebooks = CodebookFetcher(folder, self.decoding.missing.models, self.decoding.wake, self.stopping)
         self.decoding.missing.on_added = self._codebooks.wake
 
     def _owner(self) -> str:
         """Return the identity of this service's store, which is made once: a new store is another owner of records."""
-        known = self.store.get_state(OWNER)
+        known = self.store.read_state(OWNER, lambda value: uuid.UUID(value.decode()).hex, None)
         if known is None:
-            known = uuid.uuid4().hex.encode()
+            known = uuid.uuid4().hex
             with self.store.transaction() as tx:
-                tx.put_state(OWNER, known)
-        return known.decode()
+                tx.put_state(OWNER, known.encode())
+        return known
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Relayed records of all vessels, and advice and commands for them."""
@@ -172,13 +169,12 @@ class C2Service(Service[C2Config]):
             return payload
         prefix = f"{VERSIONS}{keys.part_vessel(key)}/"
         name = image_parts.version_name(prefix, payload)
-        known = tx.get_state(name)
+        known = image_parts.stored_version(tx.get_state(name), name)
         if not image_parts.is_whole(payload):
-            base = None if known is None else wire.decode(ImagePart, known, key)
-            whole = image_parts.expand(wire.decode(ImagePart, payload, key), base, key)
+            whole = image_parts.expand(wire.decode(ImagePart, payload, key), known, key)
             image_parts.coded_image(whole, keys.part_vessel(key), key)
             payload = wire.encode(whole)
-        if known is None or image_parts.version_of(known) < image_parts.version_of(payload):
+        if known is None or known.n < image_parts.version_of(payload):
             tx.put_state(name, payload)
             self._stored_versions += 1
             if self._stored_versions % image_parts.PRUNE_EVERY == 0:
@@ -194,7 +190,7 @@ class C2Service(Service[C2Config]):
         """Store the record of a vessel, or queue advice and commands for one."""
         try:
             self._handle(key, record, effects)
-        except (OSError, DeliveryError, ServiceStoppingError):
+        except (OSError, DeliveryError, MemoryError, ServiceStoppingError):
             raise
         except Exception:
             self._archive.discard(key, effects.payload)
@@ -251,7 +247,7 @@ class C2Service(Service[C2Config]):
     def _accept_image(self, vessel: str, key: str, part: ImagePart, effects: UnitOfWork) -> None:
         """Add a coded image to the backlog of the decoder, and publish it in coded form."""
         image = image_parts.coded_image(part, vessel, key)
-        entry = AcceptedImage(self._backlog_names.next(), vessel, effects.payload)
+        entry = AcceptedImage(self._backlog_names.next(vessel), vessel, effects.payload)
         effects.put_state(entry.name, entry.pack())
         effects.count("images_accepted")
         self._to_publish.append(self._accepted.coded(image))
@@ -284,7 +280,11 @@ class C2Service(Service[C2Config]):
             self._retention.wake()
 
     def _on_undecodable(self, entry: AcceptedImage, reason: str) -> None:
-        self._archive.handled(keys.shore_part(entry.vessel_id, self.config.site), entry.payload)
+        key = keys.shore_part(entry.vessel_id, self.config.site)
+        try:
+            self._archive.discard(key, entry.payload)
+        except DeliveryError:
+            self._archive.handled(key, entry.payload)  # with the next images
         self.count("images_undecodable")
         log.error("Image cannot be decoded", extra=kv(vessel=entry.vessel_id, reason=reason))
 
@@ -382,29 +382,43 @@ class C2Service(Service[C2Config]):
             try:
                 self._publish_changed()
                 self._background_faults.pop("tasking", None)
-            except (OSError, DeliveryError) as error:
-                self._background_faults["tasking"] = f"{type(error).__name__}: {error}"
             except ServiceStoppingError:
                 return
+            except Exception as error:  # noqa: BLE001 - reported
+                self._background_fault("tasking", error)
             self._changed.wait(RETRY_S)
 
     def _publish_changed(self) -> None:
         # Cleared before the states are read: later changes are published again.
         with self._changed_lock:
             names, self._changed_names = self._changed_names, set()
+        fault: Exception | None = None
         try:
             for name in sorted(names):
-                packed = self.store.get_state(name)
-                if packed is None:
-                    continue  # not committed yet
-                item = Tasking.unpack(packed)
-                self._archive.store_tasking([item.row()])
-                state = [self._accepted.state(item)]
-                self._publish_stored(state, self._accepted.number(state))
-                names.discard(name)
+                item = self.store.read_state(name, Tasking.unpack, None)
+                if item is None:
+                    continue  # not committed yet, or it could not be read
+                try:
+                    self._archive.store_tasking([item.row()])
+                    state = [self._accepted.state(item)]
+                    self._publish_stored(state, self._accepted.number(state))
+                except ServiceStoppingError:
+                    raise
+                except Exception as error:  # noqa: BLE001 - the others are published
+                    fault = error
+                else:
+                    names.discard(name)
         finally:
             with self._changed_lock:
                 self._changed_names |= names
+        if fault is not None:
+            raise fault
+
+    def _background_fault(self, name: str, error: Exception) -> None:
+        """Report why a background thread fails; it tries again."""
+        if not isinstance(error, (OSError, SonarpostError)) and name not in self._background_faults:
+            log.error("Background work failed after an unexpected exception", exc_info=error)
+        self._background_faults[name] = f"{name}: {type(error).__name__}: {error}"
 
     # Records of another c2
 
@@ -417,8 +431,8 @@ class C2Service(Service[C2Config]):
                     log.warning("Records of another c2 taken over", extra=kv(records=taken))
                 self._background_faults.pop("take-over", None)
                 self._prefer_others(others=False)
-            except (OSError, DeliveryError) as error:
-                self._background_faults["take-over"] = str(error)
+            except Exception as error:  # noqa: BLE001 - reported
+                self._background_fault("take-over", error)
                 self._prefer_others(others=True)
 
     def _prefer_others(self, *, others: bool) -> None:
@@ -486,9 +500,8 @@ class C2Service(Service[C2Config]):
             try:
                 self._archive.verify(time.time(), VERIFICATION_INTERVAL_S)
                 self._background_faults.pop("verification", None)
-            except (OSError, DeliveryError) as error:
-                self._background_faults["verification"] = f"stored files cannot be verified: {error}"
-                log.error("Verification of stored files failed", extra=kv(reason=str(error)))
+            except Exception as error:  # noqa: BLE001 - reported
+                self._background_fault("verification", error)
 
     def warning(self) -> str:
         """Return how many records are missing, changed or conflicting, and which codebooks are missing."""
@@ -505,6 +518,7 @@ class C2Service(Service[C2Config]):
         faults = (
             self._archive.fault(),
             *self._background_faults.values(),
+            *(() if self._short_messages is None else list(self._short_messages.faults.values())),
             self.decoding.fault,
             self._retention.error,
         )

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from hashlib import sha256
 from pathlib import Path
+from typing import Final
 
 import tifffile
 
@@ -21,6 +22,7 @@ from sonarpost.archive.shore_database import AcceptedRecord, ShoreDatabase, Stor
 from sonarpost.archive.shore_files import decision_text, row_of_image, select_images
 from sonarpost.archive.shore_index import DEFECTS, DecisionRow, ImageRow, TaskingRow
 from sonarpost.errors import DatabaseUnavailableError, StoredFileError
+from sonarpost.limits import limit
 from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage, TaskingKind
 from sonarpost.services.c2.archive import decision_conflict, log_image, log_new_faults, log_removed
@@ -32,6 +34,15 @@ log = logging.getLogger(__name__)
 
 TAKE_OVER_AFTER_S = 60.0
 TAKE_OVER_RECORDS = 64
+TAKE_OVER_BYTES: Final = limit(
+    8 * 1024 * 1024,
+    "bytes",
+    "claims",
+    surface="records of another c2",
+    source="vessel",
+    resource="records that are taken over in one transaction, at least one",
+    at_limit="the others follow; after a failure half as many",
+)
 
 
 class SharedArchive:
@@ -54,6 +65,7 @@ class SharedArchive:
         self._handled: list[AcceptedRecord] = []
         self._defects = dict.fromkeys(DEFECTS, 0)
         self._images_bytes = 0
+        self._take_over_records = TAKE_OVER_RECORDS
 
     def open(self) -> None:
         """Create or migrate the schema; a server that is not reached is logged, and tried again later.
@@ -202,11 +214,15 @@ class SharedArchive:
 
     def take_over(self, store: Callable[[Sequence[tuple[str, bytes]]], None]) -> int:
         """Take over records that another c2 has accepted and not handled in time; return their number."""
-        return self._database.take_over(
+        limit_, self._take_over_records = self._take_over_records, max(1, self._take_over_records // 2)
+        taken = self._database.take_over(
             TAKE_OVER_AFTER_S,
-            TAKE_OVER_RECORDS,
+            limit_,
+            TAKE_OVER_BYTES,
             lambda records: store([(record.key, record.payload) for record in records]),
         )
+        self._take_over_records = TAKE_OVER_RECORDS
+        return taken
 
     # Background work and health
 
@@ -221,7 +237,7 @@ class SharedArchive:
             return []
         rows = self._database.remove_selected(
             lambda images, decisions: select_images(images, decisions, now_utc_s, config.retain_days, config.max_bytes),
-            now_utc_s,
+            time.time(),
         )
         log_removed(rows)
         return rows

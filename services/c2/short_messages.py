@@ -6,7 +6,8 @@ import logging
 import re
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from sonarpost.archive.image_files import PREVIEW_NOTE
 from sonarpost.bearers.receiver import MessageReceiver
 from sonarpost.bearers.rockblock import RockBlockAccount, TerminalMessage, Webhook, WebhookError
 from sonarpost.delivery.store import Store
-from sonarpost.errors import BadInputError, CodebookError, ConfigError, DeliveryError, StreamError
+from sonarpost.delivery.transaction import UnitOfWork
+from sonarpost.errors import BadInputError, ConfigError, DeliveryError
+from sonarpost.link.state import SavedParts
 from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import Decision, ReceivedImage, ReconstructedImage, Relayed
 from sonarpost.services.c2.config import ShortMessageOptions
@@ -64,7 +67,11 @@ class ShortMessages:
         store: Store of c2, with the inbox.
         count: Increases a health counter.
         check_capacity: Raises RetryLaterError if a record on a key cannot be stored now.
+        before_accepting: Commits records to an archive that several c2 share; see `Service.before_accepting`.
         interval_log: Log of refused messages and failed acknowledgements.
+
+    Attributes:
+        faults: Why a vessel's messages are not acknowledged at present, by vessel.
 
     Raises:
         CodebookError: A codebook cannot be read.
@@ -79,6 +86,7 @@ class ShortMessages:
         store: Store,
         count: Callable[[str], None],
         check_capacity: Callable[[str], None],
+        before_accepting: Callable[[Sequence[tuple[str, bytes]]], None],
         interval_log: IntervalLog,
     ) -> None:
         self._config = config
@@ -86,12 +94,15 @@ class ShortMessages:
         self._store = store
         self._count = count
         self._check_capacity = check_capacity
+        self._before_accepting = before_accepting
         self._log = interval_log
         self._access = access
         self._decoder = Decoder(codebooks)
         self._webhook: Webhook | None = None
         self._lock = threading.Lock()
         self._terminals = {vessel: imei for imei, vessel in config.vessels.items()}
+        self._receivers: dict[str, tuple[MessageReceiver, SavedParts]] = {}
+        self.faults: dict[str, str] = {}
 
     @property
     def port(self) -> int:
@@ -130,22 +141,43 @@ class ShortMessages:
 
     def _accept(self, vessel: str, data: bytes) -> None:
         inbox = keys.shore_inbox(vessel, self._site)
-        with self._lock:
+        with self._lock, self._receiver(vessel) as receiver:
             self._check_capacity(inbox)
-            receiver = self._receiver(vessel)
             now_s = time.time()
             records = receiver.receive(data, now_s)
-            payloads = [wire.encode(self._envelope(vessel, record, now_s)) for record in records]
-            with self._store.transaction() as tx:
-                tx.put_state(_state_name(vessel), receiver.pack())
-                for payload in payloads:
-                    tx.accept(inbox, payload)
+            self._save(vessel, [(inbox, wire.encode(self._envelope(vessel, record, now_s))) for record in records])
         for record in records:
             self._count(f"short_{'decisions' if isinstance(record, Decision) else 'contacts'}_received")
 
-    def _receiver(self, vessel: str) -> MessageReceiver:
-        state = self._store.get_state(_state_name(vessel))
-        return MessageReceiver(vessel) if state is None else MessageReceiver.unpack(vessel, state)
+    @contextmanager
+    def _receiver(self, vessel: str) -> Iterator[MessageReceiver]:
+        """Return the receiver of a vessel; after an error its state is read again. Requires the lock."""
+        if vessel not in self._receivers:
+            receiver = MessageReceiver(vessel)
+            saved = self._store.read_states(_prefix(vessel), receiver.restore)
+            self._receivers[vessel] = (receiver, SavedParts(saved))
+        try:
+            yield self._receivers[vessel][0]
+        except BaseException:
+            self._receivers.pop(vessel, None)
+            raise
+
+    def _save(self, vessel: str, accepted: Sequence[tuple[str, bytes]] = ()) -> None:
+        """Commit the state of a receiver together with records for the inbox. Requires the lock."""
+        receiver, saved = self._receivers[vessel]
+        parts = receiver.parts()
+        effects = UnitOfWork()
+        effects.put_states(_prefix(vessel), saved.changes(parts))
+        with self._store.transaction() as tx:
+            if accepted:
+                self._before_accepting(accepted)
+            effects.write(tx)
+            for record in accepted:
+                tx.accept(*record)
+        saved.commit(parts)
+        for _ in range(receiver.take_lost()):
+            self._count("short_decisions_lost")
+            self._log.log(vessel=vessel, reason="fragments of a decision do not fit together, or are too many")
 
     def _envelope(self, vessel: str, record: ReceivedImage | Decision, now_s: float) -> Relayed:
         if isinstance(record, Decision):
@@ -159,43 +191,52 @@ class ShortMessages:
         reason: tuple[str, ...] = ()
         try:
             decoded = self._decoder.decode(image)
-        except (CodebookError, StreamError) as error:
+        except Exception as error:
+            if not isinstance(error, BadInputError):
+                log.exception("Preview not decoded after an unexpected exception")
             reason = (f"the preview cannot be decoded: {error}"[:2000],)
             decoded = self._decoder.decode(image.model_copy(update={"stream": b"", "missing": ()}))
         return decoded.model_copy(update={"notes": (PREVIEW_NOTE, *decoded.notes, *reason), "complete": False})
 
     def run(self, stopping: threading.Event) -> None:
-        """Send acknowledgements until `stopping` is set."""
-        retry_s = 0.0
+        """Send acknowledgements until `stopping` is set. A failure delays those of its vessel only."""
+        retry_s: dict[str, float] = {}
         while not stopping.wait(CHECK_S):
-            if time.monotonic() < retry_s:
-                continue
-            try:
-                for vessel, imei in self._terminals.items():
+            for vessel, imei in self._terminals.items():
+                if stopping.is_set() or time.monotonic() < retry_s.get(vessel, 0.0):
+                    continue
+                try:
                     self._acknowledge(vessel, imei)
-            except DeliveryError as error:
-                retry_s = time.monotonic() + RETRY_S
-                if not stopping.is_set():
-                    self._log.log(error=str(error))
+                    self.faults.pop(vessel, None)
+                except Exception as error:
+                    retry_s[vessel] = time.monotonic() + RETRY_S
+                    self.faults[vessel] = f"short messages of {vessel} not acknowledged: {error}"
+                    self._count("short_acknowledgements_failed")
+                    if not isinstance(error, DeliveryError):
+                        log.exception("Short messages not acknowledged after an unexpected exception")
+                    elif not stopping.is_set():
+                        self._log.log(vessel=vessel, error=str(error))
 
     def _acknowledge(self, vessel: str, imei: str) -> None:
-        name = _state_name(vessel)
-        with self._lock:
-            receiver = self._receiver(vessel)
-            before = receiver.pack()
+        with self._lock, self._receiver(vessel) as receiver:
             acknowledgements = receiver.acknowledgements(time.time())
-        for data in acknowledgements:
-            self._access.account.send(imei, data)
-            self._count("short_messages_acknowledged")
-        with self._lock:
-            # Otherwise messages have arrived since then, and are acknowledged again with these.
-            if acknowledgements and self._store.get_state(name) == before:
-                with self._store.transaction() as tx:
-                    tx.put_state(name, receiver.pack())
+        if not acknowledgements:
+            return
+        try:
+            for data in acknowledgements:
+                self._access.account.send(imei, data)
+                self._count("short_messages_acknowledged")
+        except BaseException:
+            with self._lock:
+                # They are due again, or covered by those of messages that have arrived since.
+                self._receivers.pop(vessel, None)
+            raise
+        with self._lock, self._receiver(vessel):
+            self._save(vessel)
 
 
-def _state_name(vessel: str) -> str:
-    return f"short/{vessel}"
+def _prefix(vessel: str) -> str:
+    return f"short/{vessel}/"
 
 
 def _secret(path: Path, min_characters: int) -> str:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final, cast, get_args
 
 import msgpack
 
 from sonarpost import keys, wire
 from sonarpost.archive.shore_index import TaskingRow
 from sonarpost.errors import PayloadError
+from sonarpost.link.state import unpack_value
 from sonarpost.messages import Advice, Command, DeliveryState, TaskingKind, TaskingState
 
 PREFIX = "tasking/"
+_WHERE: Final = "tasking state"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +61,19 @@ class Tasking:
 
     @classmethod
     def unpack(cls, data: bytes) -> Tasking:
-        """Parse the bytes of `pack`."""
-        return cls(*msgpack.unpackb(data))
+        """Parse the bytes of `pack`.
+
+        Raises:
+            BadInputError: They are not valid.
+        """
+        vessel_id, kind, payload, state, reason, changed_utc_s = unpack_value(
+            tuple[str, str, bytes, str, str, float], data, _WHERE
+        )
+        if kind not in get_args(TaskingKind) or state not in get_args(DeliveryState):
+            raise PayloadError(_WHERE, "kind and state", (kind, state), "those of a tasking state")
+        item = cls(vessel_id, cast("TaskingKind", kind), payload, cast("DeliveryState", state), reason, changed_utc_s)
+        item.row()  # checks the record
+        return item
 
     def state_record(self) -> TaskingState:
         """Return the record for the shore's subscribers."""

@@ -1,7 +1,9 @@
 """Archive of files of c2: comparison with the index, retention, and indexes of earlier versions."""
 
 import logging
+import os
 import sqlite3
+import threading
 from contextlib import closing
 from dataclasses import replace
 
@@ -20,6 +22,7 @@ from sonarpost.cli.main import main
 from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import load_contacts
 from sonarpost.messages import Contact
+from sonarpost.services.c2 import archive as c2_archive
 
 DAY_S = 86400.0
 START_S = 1_700_000_000.0
@@ -68,6 +71,10 @@ def test_index_is_completed_from_the_files(open_files, out):
     first.close()
     delete_index(out)
     (out / "vessel-1" / "broken.json").write_text("{")
+    os.mkfifo(out / "vessel-1" / "pipe.json")
+    (out / "vessel-1" / "zero.json").symlink_to("/dev/zero")
+    (out / "vessel-1" / os.fsdecode(b"not\xffutf-8.json")).write_text("{}")
+    (out / "vessel-1" / "decisions" / "folder.json").mkdir()
     again = open_files().index()
     assert [replace(row, accepted_utc_s=0.0) for row in again.images()] == before
     assert [d.decision_id for d in again.decisions()] == ["d1"]
@@ -146,11 +153,18 @@ def test_retention_removes_exported_images_first_then_the_oldest():
     assert select_images(rows, (), 10.0, None, 400) == []
 
 
-def test_images_without_a_decision_are_removed_last():
+def test_vessel_that_floods_displaces_no_image_of_another():
+    good = [row(f"good-{n}", n, vessel_id="vessel-1", exported_utc_s=9.0) for n in range(20)]
+    junk = [row(f"junk-{n}", 100 + n, vessel_id="vessel-2") for n in range(3000)]
+    removed = select_images([*junk, *good], (), 10.0, None, 5000)
+    assert [r.name for r in removed] == [f"junk-{n}" for n in range(2970)]
+
+
+def test_images_with_a_decision_are_removed_last():
     decision = DecisionRow.of(decision_record(vehicle_id="uuv-1", image_id="BBBB"), 5.0)
     rows = [row("a", 1), row("b", 2, image_id="BBBB"), row("c", 3, exported_utc_s=9.0)]
-    assert [r.name for r in select_images(rows, [decision], 10.0, None, 100)] == ["c", "b"]
-    assert [r.name for r in select_images(rows, [decision], 10.0, None, 0)] == ["c", "b", "a"]
+    assert [r.name for r in select_images(rows, [decision], 10.0, None, 100)] == ["c", "a"]
+    assert [r.name for r in select_images(rows, [decision], 10.0, None, 0)] == ["c", "a", "b"]
 
 
 def test_retention_removes_old_images_below_the_size_limit():
@@ -167,8 +181,9 @@ def test_retention_removes_old_images_below_the_size_limit():
 )
 def test_retention_keeps_the_limits_and_removes_no_more_than_needed(pictures, days, limit):
     rows = [row(str(n), START_S + at, size, 1.0 if done else None) for n, (at, size, done) in enumerate(pictures)]
-    now_utc_s = START_S + 1e6
-    removed = select_images(rows, (), now_utc_s, days, limit)
+    now_utc_s = max((r.accepted_utc_s for r in rows), default=START_S)
+    removed = select_images(rows, (), now_utc_s + 1e6, days, limit)
+    assert removed == select_images(rows, (), now_utc_s, days, limit)
     kept = [r for r in rows if r not in removed]
     assert len(removed) == len(set(removed))
     if days is not None:
@@ -187,12 +202,32 @@ def test_retention_deletes_files_and_keeps_decisions(open_files, out):
         kept.store_image(image(image_id), 5.0)
     kept.store_decision(decision_record())
     kept.flush()
-    assert [r.image_id for r in kept.apply_retention(1e9)] == ["AAAA", "BBBB"]
+    assert [r.image_id for r in kept.apply_retention(1e9)] == ["BBBB", "AAAA"]
     assert [p.name for p in out.rglob("*") if p.is_file() and FILE_NAME not in p.name] == [f"{b'd1'.hex()}.json"]
     assert kept.images_bytes() == 0
-    assert [r.removed_utc_s for r in kept.index().images(removed=True)] == [1e9, 1e9]
+    assert [r.removed_utc_s is None for r in kept.index().images(removed=True)] == [False, False]
     assert len(kept.index().decisions()) == 1
     assert kept.apply_retention(2e9) == []
+
+
+def test_images_are_stored_while_retention_selects(open_files, monkeypatch):
+    archive = open_files(max_bytes=0)
+    archive.store_image(image("AAAA"), 5.0)
+    archive.flush()
+
+    def store():
+        archive.store_image(image("BBBB"), 5.0)
+        archive.flush()
+
+    def select(images, *_):
+        thread = threading.Thread(target=store)
+        thread.start()
+        thread.join(60.0)
+        return images
+
+    monkeypatch.setattr(c2_archive, "select_images", select)
+    assert [r.image_id for r in archive.apply_retention(1e9)] == ["AAAA"]
+    assert [r.image_id for r in archive.index().images()] == ["BBBB"]
 
 
 def test_service_removes_counts_and_logs(begin, relay, out, caplog):
@@ -278,15 +313,14 @@ def test_index_of_version_1_is_read_without_a_migration(version_1, out):
 
 
 def test_index_of_version_1_is_migrated_and_gets_digests(version_1, open_files, out):
-    image_paths(out, version_1[0])[1].write_bytes(b"other size")
     migrated = open_files()
     assert migrated.index().images() == version_1
     assert migrated.verify(1e9, DAY_S) == 11
-    assert migrated.defect_counts() == {"missing": 0, "changed": 1, "unreadable": 0, "conflicting": 0}
+    assert migrated.defect_counts() == {"missing": 0, "changed": 0, "unreadable": 0, "conflicting": 0}
     tiff = image_paths(out, version_1[1])[1]
     tiff.write_bytes(tiff.read_bytes()[:-1] + b"\xff")
     migrated.verify(1e9 + 2 * DAY_S, DAY_S)
-    assert migrated.defect_counts()["changed"] == 2
+    assert migrated.defect_counts()["changed"] == 1
 
 
 @pytest.mark.parametrize("version", [2, 3])

@@ -22,6 +22,7 @@ from sonarpost.messages import Command, ImagePart, ReconstructedImage
 from sonarpost.services.c2.accepted import AcceptedRecords
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
+from sonarpost.services.c2.shared_archive import SharedArchive
 
 VESSEL = "vessel-1"
 INBOX = keys.shore_inbox(VESSEL)
@@ -252,6 +253,42 @@ def test_coded_image_that_a_lost_host_has_not_decoded_is_decoded_by_the_other(
     assert [row.accepted.seq for row in rows] == list(range(1, 9))
 
 
+def test_image_that_the_database_rejects_is_quarantined_alone(begin, relay, archive, parts, refused, monkeypatch):
+    for name in ("RETRY_S", "MAX_RETRY_S"):
+        monkeypatch.setattr(f"sonarpost.services.c2.decoding.{name}", 0.0)
+    host = begin("shore-1", decode_workers=1)
+    with archive.database.transaction() as sql:
+        sql.rows("ALTER TABLE sonarpost.image ADD CONSTRAINT only_others CHECK (image_id <> '0001')")
+    relay.send(keys.shore_part(VESSEL), "c2", *parts)
+    eventually(lambda: len(archive.images()) == 3 and host.health().state == "degraded")
+    for number in range(10, 20):
+        relay.send(keys.shore_part(VESSEL), "c2", parts[0].model_copy(update={"i": f"00{number}"}))
+        eventually(lambda: any(row.image_id == f"00{number}" for row in archive.images()))  # noqa: B023
+        if refused(host):
+            break
+    [(key, reason)] = refused(host)
+    assert key == keys.shore_part(VESSEL)
+    assert "only_others" in reason
+    eventually(lambda: host.health().state == "ok" and archive.accepted_count() == 0)
+
+
+def test_stored_image_that_the_database_rejects_is_omitted_from_the_journal(archive, database_url, tmp_path):
+    config = C2Config(database=database_url, out_dir=tmp_path)
+    shared = SharedArchive(config, config.database_address(), "c2-a")
+    shared.open()
+    for record in numbered(1, 2, 3):
+        shared.store_image(record, 1e9)
+    shared.flush()
+    with archive.database.transaction() as sql:
+        sql.rows("ALTER TABLE sonarpost.record ADD CONSTRAINT only_others CHECK (image_id <> '0002')")
+    accepted = AcceptedRecords(shared, tmp_path, "shore")
+    journal = accepted.journal()
+    rows = journal.page(journal.known_keys(), Criteria(), 0, 100)
+    assert sorted(row.fields["image_id"] for row in rows) == ["0001", "0003"]
+    accepted.close()
+    shared.close()
+
+
 def test_records_of_a_busy_c2_are_not_taken_over(begin, relay, archive, parts, monkeypatch):
     monkeypatch.setattr("sonarpost.services.c2.shared_archive.TAKE_OVER_AFTER_S", 120.0)
     with monkeypatch.context() as patch:
@@ -270,7 +307,7 @@ def test_records_of_a_busy_c2_are_not_taken_over(begin, relay, archive, parts, m
         # The records are old; their c2 is not.
         sql.rows("UPDATE sonarpost.accepted SET accepted_at = accepted_at - interval '1 day'")
     taken = []
-    assert archive.take_over(30.0, 10, taken.extend) == 0
+    assert archive.take_over(30.0, 10, 1000, taken.extend) == 0
     assert counter("records_taken_over", second) == 0
     assert archive.accepted_count() == 4
 

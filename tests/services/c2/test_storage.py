@@ -101,10 +101,15 @@ def test_retention_removes_exported_images_first(open_archive):
 def test_old_images_are_removed_by_default(archive):
     archive.store_image(image(), 5.0)
     archive.flush()
-    accepted_utc_s = archive.index().images()[0].accepted_utc_s
-    assert archive.apply_retention(accepted_utc_s + 364 * DAY_S) == []
-    assert len(archive.apply_retention(accepted_utc_s + 366 * DAY_S)) == 1
-    assert archive.index().images() == []
+    assert archive.apply_retention(time.time() + 400 * DAY_S) == [], "a clock that is ahead makes no image old"
+    with pytest.MonkeyPatch.context() as patch:
+        later_utc_s = time.time() + 366 * DAY_S
+        patch.setattr(time, "time", lambda: later_utc_s)
+        archive.store_image(image("BBBB"), 5.0)
+        archive.flush()
+    assert archive.apply_retention(later_utc_s - 2 * DAY_S) == []
+    assert [row.image_id for row in archive.apply_retention(later_utc_s)] == ["AAAA"]
+    assert [row.image_id for row in archive.index().images()] == ["BBBB"]
     assert C2Config().max_bytes == 50_000_000_000
 
 

@@ -202,3 +202,30 @@ def test_publication_on_the_vessel_is_ignored_by_the_relay(relay, console, publi
     eventually(lambda: len(screen.received) == 1)
     assert "advice_taken" not in service.health().counters
     assert service.store.inbox_depth() == 0
+
+
+def test_tasking_state_that_cannot_be_read_or_published_delays_no_other(runner, expert, relay, op_modem, begin, out):
+    service = begin()
+    with service.store.transaction() as tx:
+        tx.put_state("tasking/vessel-1/advice/a1", b"\xc1")
+        tx.put_state("tasking/vessel-1/command/c0", msgpack.packb(["vessel-1", "command", b"x", "waiting", "", 0.0]))
+        tx.put_state("archive-owner", b"\xff")
+    runner.stop(service)
+    service = begin()
+    store_tasking = service._archive.store_tasking
+
+    def store_or_fail(rows):
+        if rows[0].record_id == "c1":
+            raise RuntimeError("a defect")
+        store_tasking(rows)
+
+    service._archive.store_tasking = store_or_fail
+    expert.send(COMMAND, "c2", command("c1"), command("c2"))
+    relay()
+    op_modem()
+    eventually(lambda: states(out).get(("vessel-1", "command", "c2")) == "delivered")
+    eventually(lambda: "tasking: RuntimeError: a defect" in service.health().detail)
+    assert len(service._owner()) == 32
+    assert service.health().counters["states_discarded"] == 3
+    service._archive.store_tasking = store_tasking
+    eventually(lambda: states(out).get(("vessel-1", "command", "c1")) == "delivered")
