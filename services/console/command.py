@@ -137,9 +137,9 @@ def _list(_parsed: argparse.Namespace, users: Users, _config: ConsoleConfig) -> 
 def _run_training(parsed: argparse.Namespace) -> int:
     # Imported lazily, as below: the management of users needs neither the codecs nor the web server.
     from sonarpost.services.console.state import ConsoleState  # noqa: PLC0415
-    from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator  # noqa: PLC0415
+    from sonarpost.services.console.training.simulator import RATE, VESSEL, TrainingSimulator  # noqa: PLC0415
 
-    config = ConsoleConfig(vessel_lat_deg=56.4495, vessel_lon_deg=-5.6012)
+    config = ConsoleConfig(vessel_lat_deg=56.4495, vessel_lon_deg=-5.6012, assumed_rate=RATE)
     with ExitStack() as stack:
         scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="sonarpost-training-"))
         folder: Path = parsed.state or Path(scratch)
@@ -208,11 +208,11 @@ def _serve(
         print(f"{server.address}  user: {' or '.join(name for name, _ in accounts)}  password: {password}")
         print(f"log-in link of {name}, valid once, for {LINK_S / 60:.0f} minutes: {link}")
         print(note, flush=True)
-        stop = stack.enter_context(stop_on_signals())
         server.start()
         stack.callback(server.stop)
         stack.callback(app.stop)
-        start()
+        start()  # may compile a codec for seconds, which Ctrl-C interrupts as in any command
+        stop = stack.enter_context(stop_on_signals())
         if parsed.open:
             webbrowser.open(link)
         while server.running and not stop.wait(0.5):

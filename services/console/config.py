@@ -54,6 +54,8 @@ class ConsoleConfig(RetentionConfig):
         group_radius_m: Distance limit of looks at one object, for accurate positions.
         mission_gap_s: Contacts at one place whose detection times differ by more are of different missions: not looks
             at one object, but earlier contacts at this place.
+        beam_width_deg: Horizontal beam width of the vehicles' sonars between half-power points, which blurs measured
+            lengths along the track; 0 for no correction.
         session_s: A session ends after this time without use.
         session_max_s: Maximum duration of a session.
         vehicle_stale_s: A vehicle is stale after this time without a frame.
@@ -66,9 +68,9 @@ class ConsoleConfig(RetentionConfig):
         vessel_lon_deg: Longitude of the vessel.
         ring_m: Radii of the range rings on the map.
         tiles_dir: Folder of map tiles, `{z}/{x}/{y}.png`.
-        max_bytes: Maximum size of the images in the console's database; above it images of contacts with a decision are
-            removed first, superseded versions before the newest, each the oldest first. Contacts, decisions and the
-            audit are never removed.
+        max_bytes: Maximum size of the images in the console's database; above it the vehicle with the most bytes, with
+            several vessels the vessel, loses images: superseded versions before the newest, both those of contacts
+            without a decision first, each the oldest first. Contacts, decisions and the audit are never removed.
     """
 
     role: Literal["vessel", "shore"] = "vessel"
@@ -89,6 +91,7 @@ class ConsoleConfig(RetentionConfig):
     assumed_rate: Annotated[int, Field(ge=0, le=MAX_RATE)] | None = None
     group_radius_m: Annotated[float, Field(gt=0, le=1000)] = 8.0
     mission_gap_s: Annotated[float, Field(gt=60, le=1e8)] = 6 * 3600.0
+    beam_width_deg: Annotated[float, Field(ge=0, le=5)] = 0.5
     session_s: Annotated[float, Field(gt=0, le=604800)] = 4 * 3600.0
     session_max_s: Annotated[float, Field(gt=0, le=604800)] = 24 * 3600.0
     vehicle_stale_s: Annotated[float, Field(gt=0, le=86400)] = 120.0

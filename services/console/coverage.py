@@ -1,4 +1,4 @@
-"""The area of seabed that a vehicle has surveyed, from its track and the range of its sonar.
+"""The area of seabed that vehicles have surveyed, from their tracks and the range of their sonars.
 
 Between two following positions the sonar covers a rectangle: the leg, and the smaller of both ranges to each side. The
 area is that of all rectangles together, counted in square cells, so that overlapping lines count once. Gaps below the
@@ -11,6 +11,7 @@ import math
 import sqlite3
 import statistics
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -32,32 +33,36 @@ _Leg = tuple[float, float, float, float, float]
 """x and y of both ends, range to each side; metres."""
 
 
-def surveyed_area(points: Sequence[sqlite3.Row]) -> Json | None:
-    """Return the surveyed area of a vehicle.
+def surveyed_area(tracks: Sequence[Sequence[sqlite3.Row]]) -> Json | None:
+    """Return the area that vehicles have surveyed together.
 
     Args:
-        points: Its positions in the order of arrival, with `time_utc_s`, `lat_deg`, `lon_deg`, `swath_m`.
+        tracks: Positions of each vehicle in the order of arrival, with `time_utc_s`, `lat_deg`, `lon_deg`, `swath_m`.
 
     Returns:
-        `area_m2`, the number of `legs`, and the time of the newest position; None without a leg of known range.
+        `area_m2`, the time of the first counted position (`since_utc_s`), and the `legs`:
+        (lat_deg, lon_deg, lat_deg, lon_deg, range_m); None without a leg of known range.
     """
-    if not points:
+    rows = [row for points in tracks for row in points]
+    if not rows:
         return None
-    frame = LocalFrame(points[0]["lat_deg"], points[0]["lon_deg"])
-    places = frame.to_local([row["lat_deg"] for row in points], [row["lon_deg"] for row in points])
+    frame = LocalFrame(rows[0]["lat_deg"], rows[0]["lon_deg"])
+    places = frame.to_local([row["lat_deg"] for row in rows], [row["lon_deg"] for row in rows])
     legs: list[_Leg] = []
-    for (start, before), (end, row) in zip(
-        zip(places, points, strict=True), zip(places[1:], points[1:], strict=True), strict=False
-    ):
-        if not before["swath_m"] or not row["swath_m"]:
+    drawn: list[tuple[float, ...]] = []
+    since_utc_s = math.inf
+    for (start, before), (end, row) in pairwise(zip(places, rows, strict=True)):
+        if before["vehicle_id"] != row["vehicle_id"] or not before["swath_m"] or not row["swath_m"]:
             continue
         is_joined = 0 < row["time_utc_s"] - before["time_utc_s"] <= MAX_LEG_S
         if is_joined and 0 < math.dist(start, end) <= MAX_LEG_M:
-            legs.append((*start, *end, min(before["swath_m"], row["swath_m"])))
+            range_m = min(before["swath_m"], row["swath_m"])
+            legs.append((*start, *end, range_m))
+            drawn.append((before["lat_deg"], before["lon_deg"], row["lat_deg"], row["lon_deg"], range_m))
+            since_utc_s = min(since_utc_s, before["time_utc_s"])
     if not legs:
         return None
-    newest = max(row["time_utc_s"] for row in points)
-    return {"area_m2": round(covered_area_m2(legs), 1), "legs": len(legs), "time_utc_s": newest}
+    return {"area_m2": round(covered_area_m2(legs), 1), "since_utc_s": since_utc_s, "legs": drawn}
 
 
 def covered_area_m2(legs: Sequence[_Leg]) -> float:

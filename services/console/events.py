@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 import uuid
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from sonarpost.limits import limit
 from sonarpost.services.console.store.serialisers import Json
 
 BUFFERED_EVENTS = 2000
+MAX_BUFFERED_BYTES = limit(
+    16_000_000, "bytes", "claims", surface="event stream", source="vessel", resource="events", at_limit="the oldest end"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +36,9 @@ class EventHub:
     def __init__(self, buffered: int = BUFFERED_EVENTS) -> None:
         self.run = uuid.uuid4().hex[:8]
         self._lock = threading.Lock()
-        self._events: deque[Event] = deque(maxlen=buffered)
+        self._buffered = buffered
+        self._events: deque[Event] = deque()
+        self._bytes = 0
         self._last = 0
         self._subscribers: set[Callable[[], None]] = set()
 
@@ -43,6 +48,9 @@ class EventHub:
         with self._lock:
             self._last += 1
             self._events.append(Event(self._last, name, text))
+            self._bytes += len(text)
+            while len(self._events) > self._buffered or (self._bytes > MAX_BUFFERED_BYTES and len(self._events) > 1):
+                self._bytes -= len(self._events.popleft().data)
         self.notify_all()
 
     def subscribe(self, notify: Callable[[], None]) -> None:
@@ -89,19 +97,3 @@ class EventHub:
         """Return the number in an event identifier; None if it is of another run."""
         run, _, number = identifier.partition("-")
         return int(number) if run == self.run and number.isdecimal() and len(number) < 16 else None
-
-
-class RateLimiter:
-    """Limits how often something happens, separately for each name."""
-
-    def __init__(self, interval_s: float) -> None:
-        self._interval_s = interval_s
-        self._last_s: dict[str, float] = {}
-
-    def allows(self, name: str, now_s: float | None = None) -> bool:
-        """Return whether the interval since the last permitted call for this name has passed; `now_s` is monotonic."""
-        now = time.monotonic() if now_s is None else now_s
-        if now - self._last_s.get(name, -self._interval_s) < self._interval_s:
-            return False
-        self._last_s[name] = now
-        return True

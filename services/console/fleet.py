@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass, field
 
 from sonarpost.detection.difficulty import RELIABLE_PD, unreliable_text
 from sonarpost.messages import AcousticFrame, QueueState, VehicleRange
-from sonarpost.modem.interface import RateInfo
 from sonarpost.monitoring.fleet import FleetTracker, ServiceStatus
 from sonarpost.review.positions import distance_m
 from sonarpost.services.console.chain import SERVICE_STALE_S, ChainHistory, HeardVehicle, RouterState, chain_links
@@ -28,16 +27,10 @@ DETECTOR = "atd_stub"
 
 @dataclass
 class _Link:
-    """Received frames of one vehicle; times of the monotonic clock. Packets: (number, frames, bad frames).
-
-    `airtime_s` is the nominal air time of all received packets, `unknown_rates` the number of packets without a rate.
-    """
+    """Received frames of one vehicle; times of the monotonic clock. Packets: (number, frames, bad frames)."""
 
     frame: AcousticFrame
     received_s: float
-    packet_count: int = 0
-    airtime_s: float = 0.0
-    unknown_rates: int = 0
     packets: deque[tuple[int, int, int]] = field(default_factory=lambda: deque(maxlen=PACKETS_KEPT))
     frames_at_s: deque[float] = field(default_factory=lambda: deque(maxlen=500))
 
@@ -48,21 +41,14 @@ class _Link:
 
 
 class FleetMonitor:
-    """Collects acoustic frames, transmit queues and health, from any thread.
+    """Collects acoustic frames, transmit queues and health, from any thread."""
 
-    Args:
-        stale_s: Time without a frame after which a vehicle is stale.
-        rates: Rates of the vessel's modem; records of earlier versions have no air time.
-    """
-
-    def __init__(self, stale_s: float, rates: Mapping[int, RateInfo]) -> None:
+    def __init__(self) -> None:
         self.services = FleetTracker()
         self.chain_history = ChainHistory()
-        self._stale_s = stale_s
-        self._rates = rates
         self._lock = threading.Lock()
         self._links: dict[str, _Link] = {}
-        self._queues: dict[str, tuple[QueueState, float]] = {}
+        self._queues: dict[str, QueueState] = {}
         self._ranges: dict[str, VehicleRange] = {}
 
     def add_frame(self, vehicle_id: str, frame: AcousticFrame, now_s: float | None = None) -> None:
@@ -79,24 +65,13 @@ class FleetMonitor:
             bad = (quality.bad_frames if quality else None) or 0
             if link.packets and link.packets[-1][0] == frame.packet:
                 link.packets.pop()
-            else:
-                link.packet_count += 1
-                airtime_s = self._airtime_s(frame)
-                link.unknown_rates += airtime_s is None
-                link.airtime_s += airtime_s or 0.0
             link.packets.append((frame.packet, frames, bad))
 
-    def _airtime_s(self, frame: AcousticFrame) -> float | None:
-        """Return the nominal duration of a frame's packet; None if unknown."""
-        if frame.airtime_s is not None or frame.rate is None or frame.rate not in self._rates:
-            return frame.airtime_s
-        return self._rates[frame.rate].airtime_s
-
-    def set_queue(self, state: QueueState, now_s: float | None = None) -> None:
-        """Store the state of a vehicle's transmit queue; `now_s` is monotonic."""
+    def set_queue(self, state: QueueState) -> None:
+        """Store the state of a vehicle's transmit queue."""
         with self._lock:
             if state.platform_id in self._queues or len(self._queues) < MAX_VEHICLES:
-                self._queues[state.platform_id] = (state, time.monotonic() if now_s is None else now_s)
+                self._queues[state.platform_id] = state
 
     def set_range(self, record: VehicleRange) -> None:
         """Store the measured distance of a vehicle."""
@@ -125,25 +100,6 @@ class FleetMonitor:
             link = self._links.get(vehicle_id)
             return None if link is None else link.loss()
 
-    def queue(self, vehicle_id: str) -> QueueState | None:
-        """Return the transmit queue of a vehicle; None if no recent one is known."""
-        with self._lock:
-            state, received_s = self._queues.get(vehicle_id, (None, 0.0))
-            return state if time.monotonic() - received_s <= self._stale_s else None
-
-    def vehicle_names(self) -> list[str]:
-        """Return the names of the vehicles of which frames or a transmit queue are known."""
-        with self._lock:
-            return sorted({*self._links, *self._queues})
-
-    def queue_wait_s(self, vehicle_id: str, now_utc_s: float) -> float | None:
-        """Return the time that the vehicle needs to send its present queue; None if unknown."""
-        with self._lock:
-            if vehicle_id not in self._queues:
-                return None
-            state, _ = self._queues[vehicle_id]
-            return max((image.expected_utc_s - now_utc_s for image in state.images), default=0.0)
-
     def vehicles(self, now_s: float | None = None) -> dict[str, Json]:
         """Return the link and queue state of all vehicles by name."""
         now = time.monotonic() if now_s is None else now_s
@@ -159,49 +115,28 @@ class FleetMonitor:
         return {name: seabed for name, seabed in known if seabed is not None}
 
     def _vehicle_json(self, name: str, now: float) -> Json:
-        link = self._links.get(name)
+        queue, link = self._queues.get(name), self._links.get(name)
+        known = {**unknown_vehicle_json(name), "queue": queue and queue.model_dump(exclude={"platform_id"})}
         if link is None:
-            return {**unknown_vehicle_json(name), "queue": self._queue_json(name, now)}
-        age_s = round(max(0.0, now - link.received_s), 1)
+            return known
+        quality = link.frame.quality
         return {
-            **_frame_quality(name, link.frame),
+            **known,
             "last_heard_utc_s": link.frame.time_utc_s,
-            "age_s": age_s,
-            "stale": age_s > self._stale_s,
+            "rate": link.frame.rate,
+            "snr_in_db": quality and quality.snr_in_db,
+            "snr_out_db": quality and quality.snr_out_db,
             "frames": sum(packet[1] for packet in link.packets),
             "bad_frames": sum(packet[2] for packet in link.packets),
             "loss": link.loss(),
             "frames_per_minute": sum(now - at_s < 60 for at_s in link.frames_at_s),
-            "queue": self._queue_json(name, now),
         }
-
-    def _queue_json(self, name: str, now: float) -> Json | None:
-        if name not in self._queues:
-            return None
-        state, received_s = self._queues[name]
-        age_s = round(max(0.0, now - received_s), 1)
-        body = state.model_dump(exclude={"platform_id", "images"})
-        images = [image.model_dump() for image in state.images]
-        return {**body, "age_s": age_s, "stale": age_s > self._stale_s, "images": images}
 
     def heard_vehicles(self, now_s: float | None = None) -> list[HeardVehicle]:
         """Return the vehicles with a received frame."""
         now = time.monotonic() if now_s is None else now_s
         with self._lock:
             return [HeardVehicle(name, max(0.0, now - link.received_s)) for name, link in sorted(self._links.items())]
-
-    def uplink_json(self, vehicle_id: str) -> Json | None:
-        """Return the air time of a vehicle's received packets since the start; None without a frame."""
-        with self._lock:
-            link = self._links.get(vehicle_id)
-            if link is None:
-                return None
-            return {
-                "packets": link.packet_count,
-                "packets_of_unknown_rate": link.unknown_rates,
-                "airtime_s": round(link.airtime_s, 1),
-                "time_utc_s": link.frame.time_utc_s,
-            }
 
     def service_list(self) -> list[Json]:
         """Return the state of all services."""
@@ -210,24 +145,8 @@ class FleetMonitor:
 
 def unknown_vehicle_json(name: str) -> Json:
     """Return the state of a vehicle without received frames."""
-    unknown = ("last_heard_utc_s", "age_s", "rate", "snr_in_db", "snr_out_db", "loss", "queue", "seabed")
-    zero = ("frames", "bad_frames", "frames_per_minute")
-    return {"vehicle_id": name, **dict.fromkeys(unknown), **dict.fromkeys(zero, 0), "stale": True}
-
-
-def frame_event(vehicle_id: str, frame: AcousticFrame) -> Json:
-    """Return the event of a received frame."""
-    return {**_frame_quality(vehicle_id, frame), "utc_s": frame.time_utc_s, "bytes": len(frame.data)}
-
-
-def _frame_quality(vehicle_id: str, frame: AcousticFrame) -> Json:
-    quality = frame.quality
-    return {
-        "vehicle_id": vehicle_id,
-        "rate": frame.rate,
-        "snr_in_db": quality and quality.snr_in_db,
-        "snr_out_db": quality and quality.snr_out_db,
-    }
+    unknown = ("last_heard_utc_s", "rate", "snr_in_db", "snr_out_db", "loss", "queue", "seabed")
+    return {"vehicle_id": name, **dict.fromkeys(unknown), "frames": 0, "bad_frames": 0, "frames_per_minute": 0}
 
 
 def _service_json(status: ServiceStatus) -> Json:
@@ -244,7 +163,6 @@ def _service_json(status: ServiceStatus) -> Json:
         "state": state,
         "detail": health.detail if health else "",
         "time_utc_s": health and health.time_utc_s,
-        "age_s": None if status.age_s is None else round(status.age_s, 1),
         "stale": stale,
     }
 
@@ -265,8 +183,6 @@ def _seabed_json(status: ServiceStatus) -> Json | None:
         "ripple_strength": _gauge(gauges, "ripple_strength", 1.0),
         "warning": unreliable_text(expected_pd) if expected_pd < RELIABLE_PD else "",
         "time_utc_s": status.health.time_utc_s,
-        "age_s": None if status.age_s is None else round(status.age_s, 1),
-        "stale": status.age_s is None or status.age_s > SERVICE_STALE_S,
     }
 
 
@@ -290,9 +206,9 @@ def fleet_json(
     positions = {
         row["vehicle_id"]: row
         for row in db.execute(
-            "SELECT vehicle_id, vehicle_lat_deg, vehicle_lon_deg,"
+            "SELECT vehicle_id, vehicle_lat_deg, vehicle_lon_deg, heading_deg,"
             " MAX(COALESCE(seen_utc_s, first_frame_utc_s)) AS seen_utc_s"
-            " FROM contact WHERE sealed = 0 AND vehicle_lat_deg IS NOT NULL GROUP BY vehicle_id"
+            " FROM contact WHERE sealed < 2 AND vehicle_lat_deg IS NOT NULL GROUP BY vehicle_id"
         )
     }
     open_requests = dict(
@@ -307,15 +223,15 @@ def fleet_json(
         position = _latest_position(positions.get(name), statuses.get(name))
         range_m = None
         if position is not None and config.vessel_lat_deg is not None and config.vessel_lon_deg is not None:
-            range_m = round(distance_m(config.vessel_lat_deg, config.vessel_lon_deg, *position[:2]), 1)
+            range_m = round(distance_m(config.vessel_lat_deg, config.vessel_lon_deg, *position[1:3]), 1)
         vehicles.append(
             {
                 **(known.get(name) or unknown_vehicle_json(name)),
                 "range_m": range_m,
-                "range_utc_s": position[2] if position is not None and range_m is not None else None,
-                "lat_deg": position and position[0],
-                "lon_deg": position and position[1],
-                "position_utc_s": position and position[2],
+                "position_utc_s": position and position[0],
+                "lat_deg": position and position[1],
+                "lon_deg": position and position[2],
+                "heading_deg": position and position[3],
                 "measured_range": ranges.get(name),
                 "status": status_json(statuses[name]) if name in statuses else None,
                 "open_orders": open_requests.get(name, 0),
@@ -339,11 +255,15 @@ def fleet_json(
     }
 
 
-def _latest_position(contact: sqlite3.Row | None, status: sqlite3.Row | None) -> tuple[float, float, float] | None:
-    """Return (lat_deg, lon_deg, time in UTC seconds) of the last contact or of the status, whichever is newer."""
-    found: list[tuple[float, float, float]] = []
+def _latest_position(
+    contact: sqlite3.Row | None, status: sqlite3.Row | None
+) -> tuple[float, float, float, float | None] | None:
+    """Return UTC seconds, lat_deg, lon_deg and heading_deg of the last contact or of the status, whichever is newer."""
+    found: list[tuple[float, float, float, float | None]] = []
     if contact is not None:
-        found.append((contact["vehicle_lat_deg"], contact["vehicle_lon_deg"], contact["seen_utc_s"]))
+        found.append(
+            (contact["seen_utc_s"], *(contact[n] for n in ("vehicle_lat_deg", "vehicle_lon_deg", "heading_deg")))
+        )
     if status is not None and status["lat_deg"] is not None:
-        found.append((status["lat_deg"], status["lon_deg"], status["time_utc_s"]))
-    return max(found, key=lambda position: position[2], default=None)
+        found.append(tuple(status[name] for name in ("time_utc_s", "lat_deg", "lon_deg", "heading_deg")))
+    return max(found, key=lambda position: position[0], default=None)

@@ -55,9 +55,7 @@ class KnownObjects:
     def advance_request(self, request: SealedRequest, step: str) -> None:
         """Set the delivery state of a request for a sealed contact."""
         with self._state.database.transaction() as db:
-            changed = requests.update_request_state(db, request.command_id, step, "", 1, self._state.clock())
-        if changed is not None:
-            self._state.publish_contact(request.contact_id)
+            requests.update_request_state(db, request.command_id, step, "", 1, self._state.clock())
 
     def newest_image(self, contact_id: str) -> ReconstructedImage:
         """Return the newest image version of a contact."""
@@ -66,15 +64,12 @@ class KnownObjects:
         return self._state.image(contact_id, version)
 
     def reveal(self) -> None:
-        """Publish the objects of contacts whose decision can no longer be taken back, as events `truth`."""
+        """Reveal the objects of contacts whose decision can no longer be taken back."""
         with self._state.database.read() as db:
             if not truth.has_unrevealed(db):
                 return
         with self._state.database.transaction() as db:
-            found = truth.newly_revealed(db, self._state.clock(), self._state.config.take_back_s)
-        for one in found:
-            self._state.events.publish("truth", one)
-            self._state.publish_contact(str(one["contact_id"]))
+            truth.reveal(db, self._state.clock(), self._state.config.take_back_s)
 
     def score_sheet(self, actor: Actor) -> Json:
         """Return the scores that a user may see: experts those of all operators, others their own."""

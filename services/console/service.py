@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import zenoh
@@ -20,7 +19,7 @@ from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import BadInputError, DeliveryError, PayloadError
 from sonarpost.export.contacts import SideCar, read_stored_records
-from sonarpost.logs import kv
+from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import (
     AcousticFrame,
     Advice,
@@ -36,16 +35,15 @@ from sonarpost.messages import (
     VehicleRange,
 )
 from sonarpost.modem.registry import modem_driver
+from sonarpost.network.connections import ConnectionLimits, TrustedProxies
 from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.events import RateLimiter
-from sonarpost.services.console.fleet import frame_event
-from sonarpost.services.console.state import ConsoleState, UnsentRecord
+from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.database import DATABASE_NAME, ID_COLUMN, RECORD_TYPES, Database, Table
+from sonarpost.services.console.store.unsent import UnsentRecord
 from sonarpost.services.console.store.users import FILE_NAME, Users
-from sonarpost.services.console.web.connections import ConnectionLimits, TrustedProxies
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 from sonarpost.sonar.image_files import read_image
 
@@ -61,13 +59,14 @@ C2 = "c2"
 OP_MODEM = "op_modem"
 UPDATE_INTERVAL_S = 1.0
 TOKENS_TIMEOUT_S = 1.0
-FRAME_EVENT_INTERVAL_S = 0.2
 CATCH_UP_BATCH = 50
 SHORE_DELIVERY_MARGIN_S = 2.0
 """Age that a decision must have before the relay's health proves its delivery: health is older than its arrival."""
 _ACKNOWLEDGED = "settled/"
 """Prefix of the store's state entries: {prefix}{table}/{consumer}/{record_id} -> reason of a refusal, or empty."""
 
+_Acknowledgement = tuple[Table, str, str, str | None]
+T = TypeVar("T")
 R = TypeVar("R", bound=Record)
 
 
@@ -92,10 +91,10 @@ class ConsoleService(Service[ConsoleConfig]):
         self.state = ConsoleState(config, self._database, modem=modem_driver(platform.modem.driver).capabilities)
         self._app = ConsoleApp(self.state, self._users, platform.id)
         self._server: WebServer | None = None
-        self._wake = threading.Event()
-        self.state.on_unsent = self._wake.set
-        self._frame_events = RateLimiter(FRAME_EVENT_INTERVAL_S)
-        self._send_error = ""
+        self._send_error = self._fleet_error = ""
+        self._fleet_log = IntervalLog(log, logging.ERROR, "Fleet state not published")
+        self._ignored_log = IntervalLog(log, logging.WARNING, "Invalid record ignored")
+        self._not_stored_log = IntervalLog(log, logging.ERROR, "Record not stored")
         self.state.router = RouterState(
             platform_id=platform.id, reached=False, changed_utc_s=time.time(), detail=", ".join(platform.router)
         )
@@ -161,17 +160,30 @@ class ConsoleService(Service[ConsoleConfig]):
 
     def _send_loop(self) -> None:
         """Queue the records of operators' actions in the outbox, and apply acknowledgements."""
-        while not self.stopping.is_set():
-            self._wake.clear()
+        while not self.stopping.wait(UPDATE_INTERVAL_S):
             try:
-                self._apply_acknowledgements()
-                for item in self.state.unsent_records():
-                    self._send(item)
-                self._send_error = ""
+                states = {_ACKNOWLEDGED + name: value for name, value in self.store.states(_ACKNOWLEDGED).items()}
+                known = self.store.readable(states, _acknowledgement)
+                failed = self._each(self._apply_acknowledgement, known.items())
+                failed = self._each(self._send, self.state.unsent_records()) or failed
+                self._send_error = failed
             except (OSError, DeliveryError) as error:
                 self._send_error = f"{type(error).__name__}: {error}"
                 log.error("Records not queued, trying again", extra=kv(reason=str(error)))
-            self._wake.wait(UPDATE_INTERVAL_S)
+
+    def _each(self, apply: Callable[[T], None], items: Iterable[T]) -> str:
+        """Call `apply` with each item; return the unexpected exception of an item, which does not delay the others."""
+        failed = ""
+        for item in items:
+            try:
+                apply(item)
+            except (OSError, DeliveryError):
+                raise
+            except Exception as error:
+                failed = f"{type(error).__name__}: {error}"
+                if failed != self._send_error:
+                    log.exception("Record not queued after an unexpected exception, trying again")
+        return failed
 
     def _send(self, item: UnsentRecord) -> None:
         effects = UnitOfWork()
@@ -200,15 +212,12 @@ class ConsoleService(Service[ConsoleConfig]):
         """Store an acknowledgement. The send loop applies it to the console's database after this transaction."""
         table, record_id = _table_and_id(item)
         tx.put_state(f"{_ACKNOWLEDGED}{table}/{item.queue}/{record_id}", b"" if reason is None else reason.encode())
-        self._wake.set()
 
-    def _apply_acknowledgements(self) -> None:
-        for name, value in self.store.states(_ACKNOWLEDGED).items():
-            table, consumer, record_id = name.split("/", 2)
-            # A refusal always has a reason.
-            self.state.apply_acknowledgement(cast("Table", table), record_id, consumer, value.decode() or None)
-            with self.store.transaction() as tx:
-                tx.delete_state(_ACKNOWLEDGED + name)
+    def _apply_acknowledgement(self, item: tuple[str, _Acknowledgement]) -> None:
+        name, (table, consumer, record_id, reason) = item
+        self.state.apply_acknowledgement(table, record_id, consumer, reason)
+        with self.store.transaction() as tx:
+            tx.delete_state(name)
 
     # Subscriptions
 
@@ -239,8 +248,8 @@ class ConsoleService(Service[ConsoleConfig]):
             vessel = self.platform.id
             self._subscribe(keys.acoustic_rx(vessel), AcousticFrame, self._on_frame)
             self._subscribe(keys.acoustic_downlink(vessel), DownlinkState, self.state.apply_downlink_state)
-            self._subscribe(keys.contact_decision(vessel), Decision, self._on_decision)
-            self._subscribe(keys.acoustic_status(vessel), ReceivedStatus, self._on_status)
+            self._subscribe(keys.contact_decision(vessel), Decision, self.state.store_decision)
+            self._subscribe(keys.acoustic_status(vessel), ReceivedStatus, self.state.store_status)
             self._subscribe(keys.acoustic_range(vessel), VehicleRange, self.state.fleet.set_range)
             self._subscribe(keys.acoustic_queue_everywhere(), QueueState, self.state.fleet.set_queue)
         else:
@@ -254,13 +263,17 @@ class ConsoleService(Service[ConsoleConfig]):
         def on_sample(sample: zenoh.Sample) -> None:
             if sample.kind != zenoh.SampleKind.PUT:
                 return
+            name = str(sample.key_expr)
             try:
-                apply(wire.decode(record_type, sample.payload.to_bytes(), str(sample.key_expr)))
-            except BadInputError as error:
-                self.count("records_ignored")
-                log.warning("Invalid record ignored", extra=kv(reason=str(error)))
+                record = wire.decode(record_type, sample.payload.to_bytes(), name)
+                _check_key(name, record)
+                apply(record)
             except DeliveryError as error:
-                log.error("Record not stored", extra=kv(reason=str(error)))
+                self._not_stored_log.log(reason=str(error)[:300])
+            except Exception as error:  # noqa: BLE001  concerns this record only
+                self.count("records_ignored")
+                is_expected = isinstance(error, BadInputError)
+                self._ignored_log.log(None if is_expected else error, key=name, reason=str(error)[:300])
 
         self.session.declare_subscriber(key, on_sample)
 
@@ -284,20 +297,7 @@ class ConsoleService(Service[ConsoleConfig]):
     def _on_frame(self, frame: AcousticFrame) -> None:
         if frame.direction != "rx":
             return
-        vehicle = self.config.vehicle_name(frame.source)
-        self.state.fleet.add_frame(vehicle, frame)
-        if self._frame_events.allows(vehicle):
-            self.state.events.publish("frame", frame_event(vehicle, frame))
-
-    def _on_decision(self, record: Decision) -> None:
-        if record.vessel_id != self.platform.id:
-            raise PayloadError(keys.contact_decision(self.platform.id), "vessel_id", record.vessel_id, self.platform.id)
-        self.state.store_decision(record)
-
-    def _on_status(self, record: ReceivedStatus) -> None:
-        if record.vessel_id != self.platform.id:
-            raise PayloadError(keys.acoustic_status(self.platform.id), "vessel_id", record.vessel_id, self.platform.id)
-        self.state.store_status(record)
+        self.state.fleet.add_frame(self.config.vehicle_name(frame.source), frame)
 
     def _update_loop(self) -> None:
         """Publish the fleet state once a second, and fail if the web server has stopped."""
@@ -307,8 +307,10 @@ class ConsoleService(Service[ConsoleConfig]):
             self._update_router_state()
             try:
                 self.state.events.publish("fleet", self.state.fleet_state())
-            except DeliveryError as error:
-                log.error("Fleet state not published", extra=kv(reason=str(error)))
+                self._fleet_error = ""
+            except Exception as error:  # noqa: BLE001  concerns the records of one source; health shows it
+                self._fleet_error = f"fleet state not published: {error}"
+                self._fleet_log.log(None if isinstance(error, DeliveryError) else error, reason=str(error)[:300])
 
     def _update_router_state(self) -> None:
         """Observe the connection to the router, and the liveliness tokens of this platform's services."""
@@ -354,18 +356,34 @@ class ConsoleService(Service[ConsoleConfig]):
         records = stored_records(place)
         try:
             while not self.stopping.is_set() and (batch := list(islice(records, CATCH_UP_BATCH))):
-                new = self.state.store_images([record for record in batch if isinstance(record, ReconstructedImage)])
-                new += sum(self.state.store_decision(record) for record in batch if isinstance(record, Decision))
-                self.count("records_caught_up", new)
+                self.count("records_caught_up", self._store_batch(batch))
         except DeliveryError as error:
             log.error("Records of c2 not stored, trying again at the next start", extra=kv(reason=str(error)))
+
+    def _store_batch(self, batch: Sequence[ReconstructedImage | Decision]) -> int:
+        """Store records in halves down to one that fails, which is left out; return how many are new.
+
+        Raises:
+            DeliveryError: The database cannot be written.
+        """
+        try:
+            new = self.state.store_images([record for record in batch if isinstance(record, ReconstructedImage)])
+            return new + sum(self.state.store_decision(record) for record in batch if isinstance(record, Decision))
+        except DeliveryError:
+            raise
+        except Exception as error:  # noqa: BLE001  concerns one of the records
+            if len(batch) == 1:
+                self.count("records_ignored")
+                self._ignored_log.log(error, key=batch[0].TYPE, reason=str(error)[:300])
+                return 0
+            half = len(batch) // 2
+            return self._store_batch(batch[:half]) + self._store_batch(batch[half:])
 
     # Stop and health
 
     def stop(self) -> None:
         """Stop the web server, which runs also without a session, then the service; close the databases."""
         self.stopping.set()
-        self._wake.set()
         self._retention.wake()
         if self._watch is not None:
             self._watch.stop()
@@ -377,10 +395,10 @@ class ConsoleService(Service[ConsoleConfig]):
         self._users.close()
 
     def degraded_reason(self) -> str:
-        """Return why records are not queued or not received, or old images not removed; empty if they are."""
+        """Return why records are not queued, received or shown, or old images not removed; empty if they are."""
         router = self.state.router
         no_router = "" if router is None or router.reached else f"router {router.detail} not reached"
-        return self._send_error or no_router or self._retention.error
+        return self._send_error or no_router or self._fleet_error or self._retention.error
 
     def warning(self) -> str:
         """Return a warning if there are no users."""
@@ -391,9 +409,26 @@ class ConsoleService(Service[ConsoleConfig]):
         counts = self.state.counts()
         return {
             "contacts": float(counts.total),
-            "contacts_unreviewed": float(counts.unreviewed),
+            "contacts_to_do": float(counts.to_do),
             "pages_open": float(self.state.events.subscriber_count),
         }
+
+
+def _acknowledgement(name: str, value: bytes) -> _Acknowledgement:
+    """Return table, consumer and identifier of an acknowledged record, and the reason of a refusal."""
+    table, consumer, record_id = name.removeprefix(_ACKNOWLEDGED).split("/", 2)
+    if table not in RECORD_TYPES:
+        raise ValueError(f"table {table}")
+    # A refusal always has a reason.
+    return table, consumer, record_id, value.decode() or None
+
+
+def _check_key(key: str, record: Record) -> None:
+    """Raise PayloadError if a record names another vessel or platform than its key."""
+    for field in ("vessel_id", "platform_id"):
+        named = getattr(record, field, None)
+        if named is not None and named not in key.split("/"):
+            raise PayloadError(key, field, named, "the name in the key")
 
 
 def _table_and_id(item: OutboxItem) -> tuple[Table, str]:

@@ -16,9 +16,11 @@ from sonarpost.messages import ReconstructedImage
 from sonarpost.review.objects import AssociationRule
 from sonarpost.review.positions import vehicle_position
 from sonarpost.services.console.store.association import assign_objects
+from sonarpost.services.console.store.database import UNDELIVERED
 from sonarpost.services.console.store.related_images import link_related_images
 from sonarpost.services.console.store.serialisers import (
     CONTACT_QUERY,
+    COUNTS,
     LISTED,
     NEWER_DETAIL,
     Json,
@@ -26,14 +28,12 @@ from sonarpost.services.console.store.serialisers import (
     percent_received,
 )
 
-Sort = Literal["arrived", "updated", "confidence", "vehicle", "received", "review", "name", "range"]
+Sort = Literal["arrived", "updated", "confidence", "received", "name", "range"]
 SORT_COLUMNS: Final[Mapping[Sort, str]] = {
     "arrived": "arrived_utc_s",
     "updated": "updated_utc_s",
     "confidence": "atd_confidence",
-    "vehicle": "vehicle_id",
     "received": "percent",
-    "review": "review",
     "name": "name",
     "range": "range_m",
 }
@@ -49,7 +49,6 @@ _RECORD_COLUMNS: Final = (
     "width_m",
     "height_m",
     "heading_deg",
-    "pixel_along_m",
 )
 _PLACE_COLUMNS: Final = "group_id, parent, lat_deg, lon_deg, position_sigma_m, seen_utc_s, length_m, width_m, height_m"
 _IMAGE_COLUMNS: Final = (
@@ -62,14 +61,19 @@ _IMAGE_COLUMNS: Final = (
     "last_frame_utc_s",
 )
 
+_UNDELIVERED: Final = (
+    f"FROM decision d WHERE {UNDELIVERED} AND {COUNTS} AND elsewhere = 0"  # noqa: S608
+    f" AND seq = (SELECT MAX(seq) FROM decision WHERE contact_id = d.contact_id AND {COUNTS})"
+)
+"""SQL: the decisions of this console that count and are not delivered."""
 
 REVIEW_CONDITIONS: Final[Mapping[str, str]] = {
-    "reviewed": "c.review <> 'unreviewed'",
     "mine_like": "c.review IN ('mine_like', 'disputed')",
     # The plus signs keep SQLite from an index on the state: most contacts may have it, and all would be sorted.
     "unreviewed": "+c.review = 'unreviewed'",
     "to_do": "(+c.review = 'unreviewed' OR +c.contradictory = 1)",
     "newer_detail": NEWER_DETAIL,
+    "undelivered": f"c.id IN (SELECT d.contact_id {_UNDELIVERED})",
 }
 """SQL conditions of values of `review`; any other value is one state."""
 
@@ -78,25 +82,36 @@ class ContactFilter(BaseModel):
     """Filter, order and page of a contact list, as in a query string; None or empty means no restriction.
 
     Attributes:
-        review: State of the contact; `mine_like` includes disputed contacts, `reviewed` all with a decision. `to_do`:
-            without a decision, disputed, or with contradictory verdicts on its object. `newer_detail`: decided on less
-            than has arrived.
-        min_confidence: Minimum confidence of the detector, 0 to 2.
+        review: State of the contact; `mine_like` includes disputed contacts. `to_do`: without a decision, disputed, or
+            with contradictory verdicts on its object. `newer_detail`: decided on less than has arrived. `undelivered`:
+            the verdict has not reached shore site or vehicle, or was refused.
+        from_utc_s: Earliest arrival of the first frame, by the vessel's clock.
+        to_utc_s: Arrival of the first frame before which contacts match.
         text: Part of a name, class or remark; `q` in a query string.
+        find: Contact whose place in the filtered list is returned.
     """
 
     model_config = ConfigDict(frozen=True, populate_by_name=True, allow_inf_nan=False)
 
     review: (
-        Literal["to_do", "unreviewed", "mine_like", "not_mine_like", "unsure", "disputed", "reviewed", "newer_detail"]
+        Literal[
+            "to_do",
+            "unreviewed",
+            "mine_like",
+            "not_mine_like",
+            "unsure",
+            "disputed",
+            "newer_detail",
+            "undelivered",
+        ]
         | None
     ) = None
     vehicle: Annotated[str, Field(max_length=40)] = ""
-    vessel: Annotated[str, Field(max_length=40)] = ""
-    min_confidence: Annotated[float, Field(ge=0, le=2)] | None = None
-    complete: bool | None = None
+    from_utc_s: Annotated[float, Field(ge=0)] | None = None
+    to_utc_s: Annotated[float, Field(ge=0)] | None = None
     group: Annotated[str, Field(max_length=20)] = ""
     text: Annotated[str, Field(max_length=80, alias="q")] = ""
+    find: Annotated[str, Field(max_length=200)] = ""
     sort: Sort = "updated"
     order: Literal["asc", "desc"] = "desc"
     offset: Annotated[int, Field(ge=0, le=10**9)] = 0
@@ -112,10 +127,9 @@ class ContactFilter(BaseModel):
         for condition, value in (
             ("c.review = ?", self.review if special is None else None),
             ("c.vehicle_id = ?", self.vehicle or None),
-            ("c.vessel_id = ?", self.vessel or None),
             ("c.group_id = ?", self.group or None),
-            ("c.atd_confidence >= ?", self.min_confidence),
-            ("c.complete = ?", None if self.complete is None else int(self.complete)),
+            ("c.first_frame_utc_s >= ?", self.from_utc_s),
+            ("c.first_frame_utc_s < ?", self.to_utc_s),
         ):
             if value is not None:
                 conditions.append(condition)
@@ -134,30 +148,27 @@ class NotFoundError(BadInputError):
 
 @dataclass(frozen=True, slots=True)
 class ContactCounts:
-    """Number of contacts, and of contacts without a decision."""
-
-    total: int
-    unreviewed: int
-
-
-@dataclass(frozen=True, slots=True)
-class StoredImage:
-    """Result of storing an image version.
+    """Number of contacts in lists.
 
     Attributes:
-        contact_id: Its contact.
-        is_new_contact: Whether the contact is new.
-        changed: Other contacts whose object has changed.
+        total: All contacts.
+        to_do: Contacts without a decision, disputed, or with contradictory verdicts on their object.
+        undelivered: Contacts whose verdict has not reached shore site or vehicle.
+        refused: Those of them whose verdict was refused, or has expired.
+        authenticated: True if acoustic frames of a contact were authenticated: others without it stand out. False if
+            those of no contact were, and not those of the last one; None if it is not known.
     """
 
-    contact_id: str
-    is_new_contact: bool
-    changed: frozenset[str] = frozenset()
+    total: int
+    to_do: int
+    undelivered: int
+    refused: int
+    authenticated: bool | None
 
 
 def store_image(
     db: sqlite3.Connection, image: ReconstructedImage, rate: int | None, now_utc_s: float, rule: AssociationRule
-) -> StoredImage | None:
+) -> tuple[str, bool] | None:
     """Store an image version, update its contact, and assign the contact to an object.
 
     Args:
@@ -168,7 +179,7 @@ def store_image(
         rule: Limits of the association of looks.
 
     Returns:
-        None if the version is already stored.
+        The contact's identifier, and whether the contact is new; None if the version is already stored.
     """
     contact_id = contact_uid(image)
     added = db.execute(
@@ -178,15 +189,13 @@ def store_image(
     if added.rowcount == 0:
         return None
     known = db.execute(f"SELECT version, {_PLACE_COLUMNS} FROM contact WHERE id = ?", (contact_id,)).fetchone()  # noqa: S608
-    changed: set[str] = set()
     if known is None or known["version"] <= image.version:
         _update_contact(db, contact_id, image, now_utc_s)
         link_related_images(db, contact_id, image)
         place = db.execute(f"SELECT {_PLACE_COLUMNS} FROM contact WHERE id = ?", (contact_id,)).fetchone()  # noqa: S608
         if known is None or tuple(known)[1:] != tuple(place):
-            changed = assign_objects(db, [contact_id], rule)
-    db.execute("UPDATE contact SET versions = versions + 1 WHERE id = ?", (contact_id,))
-    return StoredImage(contact_id, known is None, frozenset(changed - {contact_id}))
+            assign_objects(db, [contact_id], rule)
+    return contact_id, known is None
 
 
 def _update_contact(db: sqlite3.Connection, contact_id: str, image: ReconstructedImage, now_utc_s: float) -> None:
@@ -239,22 +248,29 @@ def list_contacts(db: sqlite3.Connection, query: ContactFilter) -> Json:
     rows = db.execute(f"{CONTACT_QUERY} WHERE c.id IN ({page}) {order}", (*values, query.limit, query.offset))
     items = [contact_json(row) for row in rows.fetchall()]
     matching = db.execute(f"SELECT COUNT(*) FROM contact c WHERE {condition}", values).fetchone()[0]  # noqa: S608
+    index = None
+    if query.find:
+        places = f"SELECT c.id, ROW_NUMBER() OVER ({order}) - 1 AS place FROM contact c WHERE {condition}"  # noqa: S608
+        found = db.execute(f"SELECT place FROM ({places}) WHERE id = ?", (*values, query.find)).fetchone()  # noqa: S608
+        index = None if found is None else found["place"]
     vehicles = [row[0] for row in db.execute("SELECT DISTINCT vehicle_id FROM contact ORDER BY vehicle_id")]
     return {
         **asdict(count_contacts(db)),
         "matching": matching,
+        "index": index,
         "vehicles": vehicles,
         "offset": query.offset,
         "items": items,
     }
 
 
-def list_versions(db: sqlite3.Connection, query: ContactFilter, limit: int) -> list[tuple[str, int]]:
+def list_versions(db: sqlite3.Connection, query: ContactFilter, limit: int = -1) -> list[tuple[str, int]]:
     """Return identifier and newest version of the filtered contacts, by the time of their first frame."""
     condition, values = query.where()
     order = "ORDER BY c.first_frame_utc_s, c.id LIMIT ?"
-    # Nothing about a sealed contact leaves the console.
-    sql = f"SELECT c.id, c.version FROM contact c WHERE c.sealed = 0 AND {condition} {order}"  # noqa: S608
+    # A sealed contact is listed like all others until its decision can no longer be taken back.
+    listed = "(c.sealed = 0 OR c.review = 'unreviewed' OR c.id IN (SELECT contact_id FROM decision WHERE sent = 0))"
+    sql = f"SELECT c.id, c.version FROM contact c WHERE {listed} AND {condition} {order}"  # noqa: S608
     rows = db.execute(sql, (*values, limit))
     return [(str(row["id"]), int(row["version"])) for row in rows]
 
@@ -262,9 +278,16 @@ def list_versions(db: sqlite3.Connection, query: ContactFilter, limit: int) -> l
 def count_contacts(db: sqlite3.Connection) -> ContactCounts:
     """Count the contacts in lists."""
     total = db.execute(f"SELECT COUNT(*) FROM contact c WHERE {LISTED}").fetchone()[0]  # noqa: S608  constants only
-    sql = f"SELECT COUNT(*) FROM contact c WHERE {LISTED} AND review = 'unreviewed'"  # noqa: S608
-    unreviewed = db.execute(sql).fetchone()[0]
-    return ContactCounts(total, unreviewed)
+    sql = f"SELECT COUNT(*) FROM contact c WHERE {LISTED} AND {REVIEW_CONDITIONS['to_do']}"  # noqa: S608
+    to_do = db.execute(sql).fetchone()[0]
+    undelivered, refused = db.execute(
+        "SELECT COUNT(*), COUNT(*) FILTER (WHERE shore = 'refused' OR vehicle IN ('refused', 'expired'))"  # noqa: S608
+        f" {_UNDELIVERED} AND EXISTS (SELECT 1 FROM contact c WHERE c.id = d.contact_id AND {LISTED})"
+    ).fetchone()
+    one = db.execute("SELECT authenticated FROM contact WHERE authenticated = 1 LIMIT 1").fetchone()
+    last = db.execute("SELECT authenticated FROM contact ORDER BY arrived_utc_s DESC LIMIT 1").fetchone()
+    [authenticated] = one or last or [None]
+    return ContactCounts(total, to_do, undelivered, refused, None if authenticated is None else bool(authenticated))
 
 
 def find_contact(db: sqlite3.Connection, contact_id: str) -> sqlite3.Row:

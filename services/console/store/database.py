@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -35,36 +35,28 @@ RECORD_TYPES: Final[dict[Table, type[Decision] | type[Command] | type[Advice]]] 
 }
 
 DATABASE_NAME: Final = "console-review.db"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION: Final = 3
 
 CONTRADICTORY: Final = (
     "COALESCE(MAX(g.review = 'disputed') OR (MAX(g.review = 'mine_like') AND MAX(g.review = 'not_mine_like')), 0)"
 )
 """SQL aggregate over the looks `g` of an object: verdicts on one look, or on several, contradict each other."""
 
+UNDELIVERED: Final = (
+    "(shore IN ('waiting', 'relay', 'refused') OR vehicle IN ('waiting', 'asked', 'sent', 'refused', 'expired'))"
+)
+"""SQL condition of decisions that have not reached the shore site or the vehicle."""
+
 LATITUDE_BANDS_PER_DEGREE: Final = 1000
 LATITUDE_BAND: Final = f"CAST(ROUND(lat_deg * {LATITUDE_BANDS_PER_DEGREE}) AS INTEGER)"
 """SQL number of a band of latitude of about 111 m, in which the index `contact_square` orders contacts by longitude."""
 
-_OBJECT_SCHEMA: Final = (
-    "DROP INDEX IF EXISTS contact_place",
-    f"CREATE INDEX IF NOT EXISTS contact_square ON contact ({LATITUDE_BAND}, lon_deg)",
-    "CREATE INDEX IF NOT EXISTS contact_contradictory ON contact (contradictory, arrived_utc_s, id)",
-    "CREATE TABLE IF NOT EXISTS object (id INTEGER PRIMARY KEY AUTOINCREMENT)",
-    """CREATE TABLE IF NOT EXISTS look_pair (
-    a TEXT NOT NULL, b TEXT NOT NULL, joined INTEGER NOT NULL, PRIMARY KEY (a, b)) WITHOUT ROWID""",
-    "CREATE INDEX IF NOT EXISTS look_pair_b ON look_pair (b)",
-    "CREATE INDEX IF NOT EXISTS decision_batch ON decision (batch) WHERE batch IS NOT NULL",
-)
-"""`object` only issues identifiers. `look_pair`: looks that a person joined or separated. `decision.batch` is common to
-the decisions that one verdict on an object made."""
-
-_SCHEMA = """
+_SCHEMA: Final = f"""
 CREATE TABLE IF NOT EXISTS contact (
     id TEXT PRIMARY KEY, vessel_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
     first_s INTEGER NOT NULL, name TEXT NOT NULL, revision INTEGER NOT NULL DEFAULT 0,
-    version INTEGER NOT NULL, versions INTEGER NOT NULL DEFAULT 0,
-    review TEXT NOT NULL DEFAULT 'unreviewed', mlo_class TEXT, confidence REAL, decided_by TEXT, decided_utc_s REAL,
+    version INTEGER NOT NULL, review TEXT NOT NULL DEFAULT 'unreviewed', mlo_class TEXT, confidence REAL,
+    decided_by TEXT, decided_utc_s REAL,
     effective TEXT, last_decision TEXT, remark TEXT NOT NULL DEFAULT '', advised INTEGER NOT NULL DEFAULT 0,
     atd_class TEXT, atd_confidence REAL, lat_deg REAL, lon_deg REAL, position_sigma_m REAL, range_m REAL,
     vehicle_lat_deg REAL, vehicle_lon_deg REAL, seen_utc_s REAL, first_frame_utc_s REAL NOT NULL,
@@ -73,19 +65,25 @@ CREATE TABLE IF NOT EXISTS contact (
     codec TEXT NOT NULL, has_picture INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL,
     group_id TEXT, authenticated INTEGER, despeckle_strength REAL, p_mine_like REAL, p_other_object REAL,
     parent TEXT, relation TEXT, sealed INTEGER NOT NULL DEFAULT 0, length_m REAL, width_m REAL, height_m REAL,
-    heading_deg REAL, pixel_along_m REAL,
+    heading_deg REAL,
     contradictory INTEGER NOT NULL DEFAULT 0, decided_version INTEGER, decided_bytes INTEGER
 ) WITHOUT ROWID;
 CREATE UNIQUE INDEX IF NOT EXISTS contact_image ON contact (vessel_id, vehicle_id, image_id, first_s);
 CREATE INDEX IF NOT EXISTS contact_updated ON contact (updated_utc_s, id);
 CREATE INDEX IF NOT EXISTS contact_arrived ON contact (arrived_utc_s, id);
 CREATE INDEX IF NOT EXISTS contact_confidence ON contact (atd_confidence, id);
-CREATE INDEX IF NOT EXISTS contact_vehicle ON contact (vehicle_id, id);
 CREATE INDEX IF NOT EXISTS contact_percent ON contact (percent, id);
-CREATE INDEX IF NOT EXISTS contact_review ON contact (review, id);
 CREATE INDEX IF NOT EXISTS contact_name ON contact (name, id);
 CREATE INDEX IF NOT EXISTS contact_range ON contact (range_m, id);
 CREATE INDEX IF NOT EXISTS contact_group ON contact (group_id);
+CREATE INDEX IF NOT EXISTS contact_square ON contact ({LATITUDE_BAND}, lon_deg);
+CREATE INDEX IF NOT EXISTS contact_detection ON contact (vehicle_id, seen_utc_s, lat_deg, lon_deg);
+CREATE INDEX IF NOT EXISTS contact_answers ON contact (parent) WHERE parent IS NOT NULL;
+CREATE INDEX IF NOT EXISTS contact_listed ON contact (review, contradictory, parent, sealed)
+    WHERE parent IS NULL AND sealed < 2;
+CREATE INDEX IF NOT EXISTS contact_contradictory ON contact (contradictory, arrived_utc_s, id);
+CREATE INDEX IF NOT EXISTS contact_first ON contact (contradictory DESC, arrived_utc_s, id);
+CREATE INDEX IF NOT EXISTS contact_authenticated ON contact (id) WHERE authenticated = 1;
 CREATE TABLE IF NOT EXISTS version (
     contact_id TEXT NOT NULL, version INTEGER NOT NULL, received_utc_s REAL NOT NULL, rate INTEGER,
     payload BLOB NOT NULL, removed INTEGER NOT NULL DEFAULT 0, PRIMARY KEY (contact_id, version)) WITHOUT ROWID;
@@ -99,14 +97,18 @@ CREATE TABLE IF NOT EXISTS decision (
     payload BLOB NOT NULL, sent INTEGER NOT NULL, send_after_utc_s REAL, overrules TEXT NOT NULL DEFAULT '[]',
     shown_s REAL, bytes_received INTEGER, batch TEXT);
 CREATE INDEX IF NOT EXISTS decision_contact ON decision (contact_id, seq);
+CREATE INDEX IF NOT EXISTS decision_waiting ON decision (vessel_id, vehicle_id, image_id) WHERE contact_id = '';
 CREATE INDEX IF NOT EXISTS decision_unsent ON decision (seq) WHERE sent = 0;
 CREATE INDEX IF NOT EXISTS decision_relayed ON decision (seq) WHERE shore = 'relay';
+CREATE INDEX IF NOT EXISTS decision_operator ON decision (operator, seq);
+CREATE INDEX IF NOT EXISTS decision_batch ON decision (batch) WHERE batch IS NOT NULL;
+CREATE INDEX IF NOT EXISTS decision_undelivered ON decision (contact_id, seq) WHERE {UNDELIVERED};
 CREATE TABLE IF NOT EXISTS request (
     seq INTEGER PRIMARY KEY AUTOINCREMENT, command_id TEXT NOT NULL UNIQUE, contact_id TEXT NOT NULL,
     vessel_id TEXT NOT NULL, kind TEXT NOT NULL, user TEXT NOT NULL, asked_utc_s REAL NOT NULL, airtime_s REAL,
     state TEXT NOT NULL, times_sent INTEGER NOT NULL DEFAULT 0, reason TEXT NOT NULL DEFAULT '',
     changed_utc_s REAL NOT NULL, payload BLOB NOT NULL, sent INTEGER NOT NULL, base_version INTEGER,
-    base_bytes INTEGER, base_total INTEGER, bytes_wanted INTEGER, earliest_utc_s REAL, expected_utc_s REAL,
+    base_bytes INTEGER, base_total INTEGER, bytes_wanted INTEGER, probable_utc_s REAL, expected_utc_s REAL,
     late_utc_s REAL, arrived_utc_s REAL, result_contact TEXT, result_version INTEGER, result_bytes INTEGER);
 CREATE INDEX IF NOT EXISTS request_contact ON request (contact_id, seq);
 CREATE INDEX IF NOT EXISTS request_unsent ON request (seq) WHERE sent = 0;
@@ -117,6 +119,7 @@ CREATE TABLE IF NOT EXISTS advice (
     advised_utc_s REAL NOT NULL, state TEXT, reason TEXT NOT NULL DEFAULT '', payload BLOB NOT NULL,
     sent INTEGER NOT NULL);
 CREATE INDEX IF NOT EXISTS advice_contact ON advice (contact_id, seq);
+CREATE INDEX IF NOT EXISTS advice_waiting ON advice (vessel_id, vehicle_id, image_id) WHERE contact_id = '';
 CREATE INDEX IF NOT EXISTS advice_unsent ON advice (seq) WHERE sent = 0;
 CREATE TABLE IF NOT EXISTS measurement (
     id INTEGER PRIMARY KEY AUTOINCREMENT, contact_id TEXT NOT NULL, utc_s REAL NOT NULL, body TEXT NOT NULL,
@@ -131,9 +134,6 @@ CREATE TRIGGER IF NOT EXISTS audit_is_not_changed BEFORE UPDATE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit is only added to'); END;
 CREATE TRIGGER IF NOT EXISTS audit_is_not_deleted BEFORE DELETE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit is only added to'); END;
-"""
-
-_LATER_SCHEMA = """
 CREATE TABLE IF NOT EXISTS truth (
     contact_id TEXT PRIMARY KEY, is_mine_like INTEGER NOT NULL, label TEXT NOT NULL, sealed INTEGER NOT NULL,
     revealed_utc_s REAL, added_utc_s REAL NOT NULL) WITHOUT ROWID;
@@ -141,74 +141,53 @@ CREATE TABLE IF NOT EXISTS notice (
     id INTEGER PRIMARY KEY AUTOINCREMENT, user TEXT NOT NULL, kind TEXT NOT NULL, contact_id TEXT NOT NULL,
     decision_id TEXT NOT NULL, by_decision_id TEXT NOT NULL, acknowledged_utc_s REAL);
 CREATE INDEX IF NOT EXISTS notice_open ON notice (user, id) WHERE acknowledged_utc_s IS NULL;
-CREATE INDEX IF NOT EXISTS decision_operator ON decision (operator, seq);
-CREATE TABLE IF NOT EXISTS given_back (
-    decision_id TEXT PRIMARY KEY, contact_id TEXT NOT NULL, bytes_left INTEGER NOT NULL, seconds REAL NOT NULL,
-    basis TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS track (
-    seq INTEGER PRIMARY KEY AUTOINCREMENT, vehicle_id TEXT NOT NULL, received_utc_s REAL NOT NULL,
-    time_utc_s REAL NOT NULL, lat_deg REAL, lon_deg REAL, heading_deg REAL, speed_mps REAL, depth_m REAL,
-    altitude_m REAL, swath_m REAL, battery REAL, images_waiting INTEGER, disk_free_bytes INTEGER,
-    authenticated INTEGER NOT NULL);
+    seq INTEGER PRIMARY KEY AUTOINCREMENT, vessel_id TEXT NOT NULL, vehicle_id TEXT NOT NULL,
+    received_utc_s REAL NOT NULL, time_utc_s REAL NOT NULL, lat_deg REAL, lon_deg REAL, heading_deg REAL,
+    speed_mps REAL, depth_m REAL, altitude_m REAL, swath_m REAL, battery REAL, images_waiting INTEGER,
+    disk_free_bytes INTEGER, authenticated INTEGER NOT NULL);
+CREATE INDEX IF NOT EXISTS track_vessel ON track (vessel_id, vehicle_id);
 CREATE INDEX IF NOT EXISTS track_vehicle ON track (vehicle_id, seq);
+CREATE TABLE IF NOT EXISTS object (id INTEGER PRIMARY KEY AUTOINCREMENT);
+CREATE TABLE IF NOT EXISTS look_pair (
+    a TEXT NOT NULL, b TEXT NOT NULL, joined INTEGER NOT NULL, PRIMARY KEY (a, b)) WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS look_pair_b ON look_pair (b);
 """
-"""Tables and indexes that databases of version 0.2 do not have."""
+"""`object` only issues identifiers. `look_pair`: looks that a person joined or separated. `decision.batch` is common to
+the decisions that one verdict on an object made."""
 
+_TRACKING: Final = """
+PRAGMA temp_store = MEMORY;
+CREATE TEMP TABLE changed (id TEXT NOT NULL, is_new INTEGER NOT NULL);
+CREATE TEMP TRIGGER contact_1 AFTER INSERT ON contact BEGIN INSERT INTO changed VALUES (new.id, 1); END;
+CREATE TEMP TRIGGER contact_2 AFTER UPDATE ON contact BEGIN INSERT INTO changed VALUES (new.id, 0); END;
+CREATE TEMP TRIGGER contact_3 AFTER UPDATE OF group_id ON contact WHEN old.group_id IS NOT new.group_id
+    BEGIN INSERT INTO changed SELECT id, 0 FROM contact WHERE group_id IN (old.group_id, new.group_id); END;
+CREATE TEMP TRIGGER version_1 AFTER INSERT ON version BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
+CREATE TEMP TRIGGER decision_1 AFTER INSERT ON decision BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
+CREATE TEMP TRIGGER decision_2 AFTER UPDATE ON decision WHEN old.sent IS new.sent
+    BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
+CREATE TEMP TRIGGER request_1 AFTER INSERT ON request BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
+CREATE TEMP TRIGGER request_2 AFTER UPDATE ON request WHEN old.sent IS new.sent
+    BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
+CREATE TEMP TRIGGER advice_1 AFTER INSERT ON advice BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
+CREATE TEMP TRIGGER advice_2 AFTER UPDATE ON advice WHEN old.sent IS new.sent
+    BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
+CREATE TEMP TRIGGER measurement_1 AFTER INSERT ON measurement
+    BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
+CREATE TEMP TRIGGER measurement_2 AFTER UPDATE ON measurement
+    BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
+CREATE TEMP TRIGGER audit_1 AFTER INSERT ON audit BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
+CREATE TEMP TRIGGER truth_2 AFTER UPDATE ON truth BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
+"""
+"""Triggers of this connection that collect the contacts which a transaction changes: their own columns, the looks of
+their object, their records. `sent` is not displayed."""
 
-_ADDED_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
-    "contact": {
-        "authenticated": "INTEGER",
-        "despeckle_strength": "REAL",
-        "p_mine_like": "REAL",
-        "p_other_object": "REAL",
-        "parent": "TEXT",
-        "relation": "TEXT",
-        "sealed": "INTEGER NOT NULL DEFAULT 0",
-        "length_m": "REAL",
-        "width_m": "REAL",
-        "height_m": "REAL",
-        "contradictory": "INTEGER NOT NULL DEFAULT 0",
-        "decided_version": "INTEGER",
-        "decided_bytes": "INTEGER",
-        "heading_deg": "REAL",
-        "pixel_along_m": "REAL",
-    },
-    "version": {"removed": "INTEGER NOT NULL DEFAULT 0"},
-    "measurement": {"withdrawn_by": "TEXT", "withdrawn_utc_s": "REAL"},
-    "decision": {
-        "send_after_utc_s": "REAL",
-        "overrules": "TEXT NOT NULL DEFAULT '[]'",
-        "shown_s": "REAL",
-        "bytes_received": "INTEGER",
-        "batch": "TEXT",
-    },
-    "request": {
-        "base_version": "INTEGER",
-        "base_bytes": "INTEGER",
-        "base_total": "INTEGER",
-        "bytes_wanted": "INTEGER",
-        "earliest_utc_s": "REAL",
-        "expected_utc_s": "REAL",
-        "late_utc_s": "REAL",
-        "arrived_utc_s": "REAL",
-        "result_contact": "TEXT",
-        "result_version": "INTEGER",
-        "result_bytes": "INTEGER",
-    },
-}
-"""Columns that databases of earlier versions lack, by table."""
-
-_ADDED_INDEXES: Final = (
-    "DROP INDEX IF EXISTS contact_seen",
-    "CREATE INDEX IF NOT EXISTS contact_detection ON contact (vehicle_id, seen_utc_s, lat_deg, lon_deg)",
-    "DROP INDEX IF EXISTS contact_parent",
-    "CREATE INDEX IF NOT EXISTS contact_answers ON contact (parent) WHERE parent IS NOT NULL",
-    (
-        "CREATE INDEX IF NOT EXISTS contact_listed ON contact (review, contradictory, parent, sealed)"
-        " WHERE parent IS NULL AND sealed < 2"
-    ),
-    "CREATE INDEX IF NOT EXISTS contact_first ON contact (contradictory DESC, arrived_utc_s, id)",
+_CHANGED: Final = (
+    "SELECT COALESCE(c.parent, c.id) AS id, MAX(n.is_new AND c.parent IS NULL) AS is_new"
+    " FROM changed n JOIN contact c ON c.id = n.id GROUP BY 1 ORDER BY 1"
 )
+"""The changed contacts; an image that answers a request is a layer of its contact."""
 
 
 class SqliteFile:
@@ -216,14 +195,14 @@ class SqliteFile:
 
     Args:
         path: The file.
-        schema: SQL that creates the tables if they do not exist.
+        schema: SQL that creates the tables of a new file, also if another process does so at the same time.
         version: Schema version.
 
     Raises:
         DeliveryError: The file cannot be opened, or has another schema version.
     """
 
-    def __init__(self, path: Path, schema: str, version: int = 0) -> None:
+    def __init__(self, path: Path, schema: str, version: int) -> None:
         self.path = path
         self._lock = threading.RLock()
         try:
@@ -233,12 +212,14 @@ class SqliteFile:
             self._db.row_factory = sqlite3.Row
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.execute("PRAGMA synchronous=FULL")
-            found = int(self._db.execute("PRAGMA user_version").fetchone()[0])
-            if found not in (0, version):
+            [is_new] = self._db.execute("SELECT COUNT(*) = 0 FROM sqlite_master").fetchone()
+            [found] = self._db.execute("PRAGMA user_version").fetchone()
+            if is_new:
+                self._db.executescript(f"BEGIN IMMEDIATE; {schema} PRAGMA user_version={version}; COMMIT;")
+            elif found != version:
                 self._db.close()
-                raise DeliveryError(f"{path}: schema version {found}, expected {version}")
-            if found == 0:
-                self._db.executescript(f"BEGIN; {schema} PRAGMA user_version={version}; COMMIT;")
+                remedy = "written by another version of sonarpost; move it away to start with an empty file"
+                raise DeliveryError(f"{path}: schema version {found}, expected {version}: {remedy}")
         except (OSError, sqlite3.Error) as error:
             raise DeliveryError(f"{path}: cannot be opened as an SQLite file: {error}") from error
 
@@ -274,32 +255,32 @@ class SqliteFile:
 
 
 class Database(SqliteFile):
-    """The database of the console."""
+    """The database of the console.
+
+    Attributes:
+        on_change: Called after each transaction that has changed contacts, in the order of the transactions, with
+            contact identifier -> whether the contact is new.
+    """
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, _SCHEMA, SCHEMA_VERSION)
-        with self.transaction() as db:
-            for table, columns in _ADDED_COLUMNS.items():
-                known = {row["name"] for row in db.execute(f"PRAGMA table_info({table})")}
-                for name, kind in columns.items():
-                    if name not in known:
-                        db.execute(f"ALTER TABLE {table} ADD COLUMN {name} {kind}")
-            for statement in (*_LATER_SCHEMA.strip().split(";")[:-1], *_ADDED_INDEXES, *_OBJECT_SCHEMA):
-                db.execute(statement)
-            _migrate_groups(db)
+        self.on_change: Callable[[Mapping[str, bool]], None] = lambda changed: None
+        self._db.executescript(_TRACKING)
 
+    @contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """Run the block in a transaction, then call `on_change` if it has changed contacts.
 
-def _migrate_groups(db: sqlite3.Connection) -> None:
-    """Make objects of the groups of version 0.2 or earlier, with the same identifiers."""
-    if db.execute("SELECT 1 FROM sqlite_master WHERE name = 'look_group'").fetchone() is None:
-        return
-    db.execute("INSERT OR IGNORE INTO object (id) SELECT MAX(id) FROM look_group HAVING MAX(id) IS NOT NULL")
-    db.execute("DROP TABLE look_group")
-    db.execute(
-        "UPDATE contact SET decided_version = (SELECT version FROM decision WHERE decision_id = effective),"  # noqa: S608
-        f" contradictory = (SELECT {CONTRADICTORY} FROM contact g"
-        " WHERE g.id = contact.id OR g.group_id = contact.group_id)"
-    )
+        Raises:
+            DeliveryError: The transaction failed, for example because of a full disk, and was rolled back.
+        """
+        with self._lock:
+            with super().transaction() as db:
+                yield db
+                changed = {str(row["id"]): bool(row["is_new"]) for row in db.execute(_CHANGED)}
+                db.execute("DELETE FROM changed")
+            if changed:
+                self.on_change(changed)
 
 
 def insert_row(db: sqlite3.Connection, table: str, values: Mapping[str, object]) -> int:

@@ -27,22 +27,12 @@ from sonarpost.services.console.store.database import (
     find_record,
     insert_row,
 )
-from sonarpost.services.console.store.requests import is_later_state
-from sonarpost.services.console.store.serialisers import Json, contact_json, decision_json, decode_image
+from sonarpost.services.console.store.requests import check_waiting, is_later_state
+from sonarpost.services.console.store.serialisers import Json, decode_image
 
 
 class ConflictError(SonarpostError):
-    """The contact has changed since it was displayed.
-
-    Attributes:
-        contact: The contact at present.
-        decision: Its last decision; None if there is none.
-    """
-
-    def __init__(self, contact: Json, decision: Json | None) -> None:
-        super().__init__("another operator has decided on this contact")
-        self.contact = contact
-        self.decision = decision
+    """The contact has changed since it was displayed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +44,7 @@ class DecisionInput:
         mlo_class: Class of mine-like object; None if not stated.
         remark: Free text; with `overrules` the reason.
         overrules: Whether the decision replaces those of other operators with another verdict.
-        shown_s: Time from the display of the image to the verdict; None if unknown.
+        shown_s: Time from the first frame with the image to the verdict; None if unknown.
     """
 
     revision: int
@@ -105,7 +95,9 @@ def add_decision(
         ConflictError: The decision overrules others, and one was stored after the contact was displayed.
         BadInputError: The displayed image is not a version of this contact, or there is no decision to overrule.
     """
-    row = _check_revision(db, contact_id, entered.revision) if entered.overrules else find_contact(db, contact_id)
+    row = find_contact(db, contact_id)
+    if entered.overrules and row["revision"] != entered.revision:
+        raise ConflictError("another operator has decided on this contact")
     image = _check_displayed_image(db, contact_id, entered.displayed)
     others = [
         one
@@ -127,7 +119,7 @@ def add_decision(
         (entered.shown_s, image.bytes_received, record.decision_id),
     )
     detail = record.model_dump(include={"decision_id", "verdict", "confidence", "mlo_class", "remark"})
-    detail["revision"] = entered.revision
+    detail |= {"revision": entered.revision, "shown_s": entered.shown_s}
     kind = "overrules" if entered.overrules else "disputes"
     if others and (entered.overrules or find_contact(db, contact_id)["review"] == "disputed"):
         detail[kind] = [one.model_dump(include={"decision_id", "operator", "verdict"}) for one in others]
@@ -238,9 +230,7 @@ def acknowledge_notice(db: sqlite3.Connection, notice_id: int, actor: Actor, now
     Raises:
         NotFoundError: The user has no such notice.
     """
-    row = None
-    if notice_id < 2**63:  # larger numbers exceed the integers of SQLite
-        row = db.execute("SELECT * FROM notice WHERE id = ? AND user = ?", (notice_id, actor.user)).fetchone()
+    row = db.execute("SELECT * FROM notice WHERE id = ? AND user = ?", (notice_id, actor.user)).fetchone()
     if row is None:
         raise NotFoundError("notice", "id", notice_id, f"a notice of {actor.user}")
     db.execute("UPDATE notice SET acknowledged_utc_s = ? WHERE id = ?", (now_utc_s, notice_id))
@@ -248,23 +238,25 @@ def acknowledge_notice(db: sqlite3.Connection, notice_id: int, actor: Actor, now
     add_audit_entry(db, row["contact_id"], actor, "acknowledge", now_utc_s, DisplayedImage(), detail)
 
 
-def store_received_decision(
-    db: sqlite3.Connection, record: Decision, now_utc_s: float, *, at_shore: bool
-) -> str | None:
-    """Store a decision of another program or console. A decision without its image is kept until the image arrives.
+def store_received_decision(db: sqlite3.Connection, record: Decision, now_utc_s: float, *, at_shore: bool) -> bool:
+    """Store a decision of another program or console; return whether it is new.
 
-    Returns:
-        The contact identifier; None if the decision is already stored or its image is not.
+    A decision without its image is kept until the image arrives.
+
+    Raises:
+        BadInputError: Too many decisions of the vessel wait for their images.
     """
     if find_record(db, "decision", record.decision_id) is not None:
-        return None
+        return False
     contact_id = find_contact_of_image(db, record.vessel_id, record.vehicle_id, record.image_id, record.decided_utc_s)
+    if contact_id is None:
+        check_waiting(db, record)
     delivery = DeliveryStates("delivered", "none") if at_shore else DeliveryStates("relay", "waiting")
     displayed = DisplayedImage(record.image_version)
     _insert(db, contact_id or "", record, displayed, now_utc_s, delivery, received=True)
     if contact_id is not None:
         _update_contact(db, contact_id, now_utc_s)
-    return contact_id
+    return True
 
 
 def attach_waiting_records(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> None:
@@ -285,23 +277,22 @@ def attach_waiting_records(db: sqlite3.Connection, contact_id: str, now_utc_s: f
         _update_contact(db, contact_id, now_utc_s)
 
 
-def apply_downlink_state(db: sqlite3.Connection, state: DownlinkState) -> bool:
-    """Update the delivery of a decision to the vehicle; return whether it has changed."""
+def apply_downlink_state(db: sqlite3.Connection, state: DownlinkState) -> None:
+    """Update the delivery of a decision to the vehicle."""
     row = find_record(db, "decision", state.record_id)
     if row is None or not is_later_state(row["vehicle"], row["times_sent"], state.state, state.times_sent):
-        return False
+        return
     db.execute(
         "UPDATE decision SET vehicle = ?, reason = ?, times_sent = ?, changed_utc_s = MAX(changed_utc_s, ?)"
         " WHERE decision_id = ?",
         (state.state, state.reason, state.times_sent, state.changed_utc_s, state.record_id),
     )
-    return True
 
 
 def apply_acknowledgement(
     db: sqlite3.Connection, decision_id: str, consumer: str, reason: str | None, now_utc_s: float
-) -> str | None:
-    """Update a decision after a consumer stored or refused it; return the contact identifier, None without a change.
+) -> None:
+    """Update a decision after a consumer stored or refused it.
 
     Args:
         db: Connection in a transaction.
@@ -313,33 +304,22 @@ def apply_acknowledgement(
     row = find_record(db, "decision", decision_id)
     column, stored = ("shore", "relay") if consumer == "relay" else ("vehicle", "asked")
     if row is None or row[column] != "waiting":
-        return None
+        return
     db.execute(
         f"UPDATE decision SET {column} = ?, reason = ?, changed_utc_s = ? WHERE decision_id = ?",  # noqa: S608
         (stored if reason is None else "refused", reason or row["reason"], now_utc_s, decision_id),
     )
     if column == "shore" and reason is None:
         db.execute("UPDATE decision SET relayed_utc_s = ? WHERE decision_id = ?", (now_utc_s, decision_id))
-    return str(row["contact_id"])
 
 
-def mark_delivered_to_shore(db: sqlite3.Connection, before_utc_s: float) -> list[str]:
-    """Mark decisions that the relay stored before a time as delivered to shore; return their identifiers."""
-    rows = db.execute(
+def mark_delivered_to_shore(db: sqlite3.Connection, before_utc_s: float) -> None:
+    """Mark decisions that the relay stored before a time as delivered to shore."""
+    db.execute(
         "UPDATE decision SET shore = 'delivered', changed_utc_s = MAX(changed_utc_s, ?)"
-        " WHERE shore = 'relay' AND COALESCE(relayed_utc_s, changed_utc_s) < ? RETURNING decision_id",
+        " WHERE shore = 'relay' AND COALESCE(relayed_utc_s, changed_utc_s) < ?",
         (before_utc_s, before_utc_s),
     )
-    return [str(row["decision_id"]) for row in rows.fetchall()]
-
-
-def _check_revision(db: sqlite3.Connection, contact_id: str, revision: int) -> sqlite3.Row:
-    """Return the row of a contact if it still has the displayed revision."""
-    row = find_contact(db, contact_id)
-    if row["revision"] != revision:
-        last = None if row["last_decision"] is None else find_record(db, "decision", row["last_decision"])
-        raise ConflictError(contact_json(row), None if last is None else decision_json(last))
-    return row
 
 
 def _check_displayed_image(db: sqlite3.Connection, contact_id: str, displayed: DisplayedImage) -> ReconstructedImage:

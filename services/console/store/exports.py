@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 from sonarpost import wire
 from sonarpost.archive.image_files import side_car
 from sonarpost.export.contacts import ExportContact, SideCar
-from sonarpost.messages import Decision
+from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review.measured_size import measured_size
 from sonarpost.review.true_scale import PictureLine
 from sonarpost.services.console.store.contacts import find_version
@@ -18,7 +19,22 @@ from sonarpost.services.console.store.serialisers import Json, decode_image
 _LETTERS = {"length": "L", "width": "W", "shadow": "shadow"}
 
 
-def find_export_contact(db: sqlite3.Connection, contact_id: str, version: int) -> ExportContact | None:
+@dataclass(frozen=True, slots=True)
+class StoredContact:
+    """A contact of the database.
+
+    Attributes:
+        contact: The contact with its decisions and measured size.
+        image: The image version.
+        lines: Measured lines to draw.
+    """
+
+    contact: ExportContact
+    image: ReconstructedImage
+    lines: tuple[PictureLine, ...]
+
+
+def find_stored_contact(db: sqlite3.Connection, contact_id: str, version: int) -> StoredContact | None:
     """Return a contact with an image version, its decisions and measurements; None if the version was deleted."""
     row = find_version(db, contact_id, version)
     if row is None:
@@ -27,11 +43,12 @@ def find_export_contact(db: sqlite3.Connection, contact_id: str, version: int) -
         "SELECT payload FROM decision WHERE contact_id = ? ORDER BY decided_utc_s, seq", (contact_id,)
     ).fetchall()
     decisions = tuple(wire.decode(Decision, bytes(row["payload"]), "decision") for row in rows)
-    size = measured_size(list_measurements(db, contact_id))
-    return ExportContact(SideCar.model_validate(side_car(decode_image(row))), decisions, None, size)
+    measurements, image = list_measurements(db, contact_id), decode_image(row)
+    contact = ExportContact(SideCar.model_validate(side_car(image)), decisions, None, measured_size(measurements))
+    return StoredContact(contact, image, _picture_lines(measurements))
 
 
-def picture_lines(measurements: Iterable[Json]) -> tuple[PictureLine, ...]:
+def _picture_lines(measurements: Iterable[Json]) -> tuple[PictureLine, ...]:
     """Return the measured lines to draw; withdrawn ones are excluded."""
     found = []
     for body in measurements:

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 import sqlite3
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any, Final
 
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Contact
-from sonarpost.review.objects import AssociationRule, Look, fuse_positions
-from sonarpost.review.positions import LocalFrame, destination
+from sonarpost.review.objects import AssociationRule, Look, fuse_positions, looks_within_gate
+from sonarpost.review.positions import LocalFrame, destination, distance_m
 from sonarpost.services.console.store.association import (
-    find_look,
+    IS_LOOK,
     join_looks,
     looks_near,
     looks_of_object,
@@ -35,14 +35,6 @@ from sonarpost.services.console.store.serialisers import Json, contact_json, dec
 
 MAX_OBJECT_LOOKS: Final = 50
 """Maximum number of looks of an object that a person joins, that is displayed, and that one verdict decides."""
-
-MAX_JOIN_M: Final = 1000.0
-"""Maximum distance of two objects that a person joins."""
-
-NEARBY_M: Final = 100.0
-"""Distance of other objects that are offered for joining."""
-
-MAX_NEARBY: Final = 6
 
 
 def aspect_deg(record: Contact) -> float | None:
@@ -81,7 +73,10 @@ def object_json(db: sqlite3.Connection, object_id: str, rule: AssociationRule) -
         "width_m": _extent_json([min(pair) for pair in sized]),
         "height_m": _extent_json([look.height_m for look in looks if look.height_m is not None]),
         "contradictory": any(item["contact"]["contradictory"] for item in items),
-        "nearby": _nearby(db, object_id, looks[0]),
+        "nearby": [
+            {"contact": contact_json(find_contact(db, contact_id)), "distance_m": apart_m}
+            for apart_m, contact_id in sorted(_near_objects(db, looks, rule).values())
+        ],
     }
 
 
@@ -98,7 +93,7 @@ def _look_json(db: sqlite3.Connection, look: Look) -> dict[str, Any]:
     assert newest is not None
     image = decode_image(newest)
     record = image.contact
-    names = ("heading_deg", "channel", "pixel_along_m", "pixel_across_m", "length_m", "width_m", "height_m")
+    names = ("heading_deg", "channel", "pixel_along_m", "pixel_across_m")
     return {
         "contact": contact_json(row),
         "sha256": image.picture_sha256,
@@ -117,29 +112,22 @@ def _extent_json(values_m: Sequence[float]) -> Json | None:
     return {"value": fmean(values_m), "sigma": sigma_m, "looks": len(values_m)}
 
 
-def _nearby(db: sqlite3.Connection, object_id: str, look: Look) -> list[Json]:
-    """Return the nearest look of each other object nearby, nearest first."""
-    others = looks_near(db, look, NEARBY_M)
-    points = LocalFrame(look.lat_deg, look.lon_deg).to_local([o.lat_deg for o in others], [o.lon_deg for o in others])
-    found: list[Json] = []
-    seen = {object_id}
-    for other, point in sorted(
-        zip(others, points, strict=True), key=lambda one: (math.hypot(*one[1]), one[0].contact_id)
-    ):
-        other_object = object_of(db, other.contact_id)
-        if other_object in seen:
-            continue
-        seen.add(other_object)
-        found.append({"contact": contact_json(find_contact(db, other.contact_id)), "distance_m": math.hypot(*point)})
-        if len(found) == MAX_NEARBY:
-            break
+def _near_objects(db: sqlite3.Connection, looks: Sequence[Look], rule: AssociationRule) -> dict[str, tuple[float, str]]:
+    """Return distance in metres and contact of the nearest look of each other object within the association gate."""
+    found: dict[str, tuple[float, str]] = {}
+    for look in looks:
+        for other in looks_within_gate(look, looks_near(db, look, rule.search_m, IS_LOOK), rule):
+            apart_m = distance_m(look.lat_deg, look.lon_deg, other.lat_deg, other.lon_deg)
+            name = object_of(db, other.contact_id)
+            found[name] = min(found.get(name, (math.inf, "")), (apart_m, other.contact_id))
+    found.pop(object_of(db, looks[0].contact_id), None)
     return found
 
 
 def split_look(
     db: sqlite3.Connection, object_id: str, contact_id: str, rule: AssociationRule, actor: Actor, now_utc_s: float
-) -> set[str]:
-    """Separate a look from the other looks of its object for good; return the changed contacts.
+) -> None:
+    """Separate a look from the other looks of its object for good.
 
     Raises:
         NotFoundError: There is no such object.
@@ -148,36 +136,30 @@ def split_look(
     others = {look.contact_id for look in _looks(db, object_id)} - {contact_id}
     if object_of(db, contact_id) != object_id or not others:
         raise BadInputError("split", "contact", contact_id, f"one of several looks of object {object_id}")
-    changed = separate_look(db, contact_id, others, rule)
+    separate_look(db, contact_id, others, rule)
     detail: Json = {"object": object_id, "looks": sorted(others), "new_object": object_of(db, contact_id)}
     add_audit_entry(db, contact_id, actor, "split", now_utc_s, DisplayedImage(), detail)
-    return changed
 
 
 def merge_objects(
     db: sqlite3.Connection, object_id: str, contact_id: str, rule: AssociationRule, actor: Actor, now_utc_s: float
-) -> set[str]:
-    """Join the object of a contact with an object for good; return the changed contacts.
+) -> None:
+    """Join the object of a contact with an object for good.
 
     Raises:
         NotFoundError: There is no such object or contact.
-        BadInputError: The contact has no position or is a look of the object, or a limit is exceeded.
+        BadInputError: No position of the contact's object agrees with one of the object, or it has too many looks.
     """
     ones = _looks(db, object_id)
     other_id = object_of(db, str(find_contact(db, contact_id)["id"]))
-    look = find_look(db, contact_id)
-    if look is None or other_id in ("", object_id):
-        raise BadInputError("merge", "contact", contact_id, "a contact with a position, of another object")
+    if other_id not in _near_objects(db, ones, rule):
+        raise BadInputError("merge", "contact", contact_id, "a contact of another object within the association gate")
     others = _looks(db, other_id)
     if len(ones) + len(others) > MAX_OBJECT_LOOKS:
         raise BadInputError("merge", "contact", contact_id, f"at most {MAX_OBJECT_LOOKS} looks together")
-    apart_m = math.hypot(*LocalFrame(ones[0].lat_deg, ones[0].lon_deg).to_local([look.lat_deg], [look.lon_deg])[0])
-    if apart_m > MAX_JOIN_M:
-        raise BadInputError("merge", "contact", contact_id, f"a contact within {MAX_JOIN_M:.0f} m")
-    changed = join_looks(db, [one.contact_id for one in ones], [other.contact_id for other in others], rule)
+    join_looks(db, [one.contact_id for one in ones], [other.contact_id for other in others], rule)
     detail: Json = {"object": object_id, "merged_object": other_id, "looks": sorted(o.contact_id for o in others)}
     add_audit_entry(db, contact_id, actor, "merge", now_utc_s, DisplayedImage(), detail)
-    return changed
 
 
 def decide_object(
@@ -186,7 +168,7 @@ def decide_object(
     entered: Mapping[str, DecisionInput],
     actor: Actor,
     now_utc_s: float,
-    delivery: Callable[[str], DeliveryStates],
+    delivery: DeliveryStates,
 ) -> list[tuple[str, StoredDecision]]:
     """Store one verdict as a decision on each of several looks; return contact and decision of each.
 
@@ -198,7 +180,7 @@ def decide_object(
         entered: Contact -> decision, with the image that was displayed.
         actor: The operator.
         now_utc_s: Time of the decision.
-        delivery: Returns the initial delivery for a contact.
+        delivery: Initial delivery of the decisions.
 
     Raises:
         NotFoundError: There is no such object.
@@ -209,29 +191,22 @@ def decide_object(
     for contact_id, decision in entered.items():
         if contact_id not in known:
             raise BadInputError("decision", "looks", contact_id, f"a look of object {object_id}")
-        stored.append((contact_id, add_decision(db, contact_id, decision, actor, now_utc_s, delivery(contact_id))))
+        stored.append((contact_id, add_decision(db, contact_id, decision, actor, now_utc_s, delivery)))
     batch = f"b-{uuid.uuid4().hex}"
     db.executemany("UPDATE decision SET batch = ? WHERE decision_id = ?", [(batch, s.decision_id) for _, s in stored])
     return stored
 
 
 def undo_rest(
-    db: sqlite3.Connection, decision_id: str, actor: Actor, now_utc_s: float, delivery: Callable[[str], DeliveryStates]
-) -> list[tuple[str, str]]:
-    """Withdraw the other decisions that were made with a decision and still stand.
-
-    Returns:
-        Contact and new decision of each.
-    """
+    db: sqlite3.Connection, decision_id: str, actor: Actor, now_utc_s: float, delivery: DeliveryStates
+) -> None:
+    """Withdraw the other decisions that were made with a decision and still stand."""
     rows = db.execute(
         "SELECT o.contact_id, o.decision_id FROM decision d"
         " JOIN decision o ON o.batch = d.batch WHERE d.decision_id = ? AND o.decision_id <> ? ORDER BY o.seq",
         (decision_id, decision_id),
     ).fetchall()
-    undone: list[tuple[str, str]] = []
     for contact_id, other_id in rows:
         if other_id in standing_decisions(db, contact_id):
             # No image of this contact is displayed during the undo.
-            new_id = undo_decision(db, contact_id, other_id, DisplayedImage(), actor, now_utc_s, delivery(contact_id))
-            undone.append((contact_id, new_id))
-    return undone
+            undo_decision(db, contact_id, other_id, DisplayedImage(), actor, now_utc_s, delivery)

@@ -1,4 +1,4 @@
-"""Images that answer a request about another contact: more seabed around it, or the image without despeckling.
+"""Images that answer a request about another contact: more seabed, a region, or the image without despeckling.
 
 The acoustic link does not carry the identifier of the contact that a requested image belongs to. Both images have the
 same contact record, except for image and pixel sizes, because the vehicle makes them from one detection.
@@ -7,15 +7,16 @@ same contact record, except for image and pixel sizes, because the vehicle makes
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 from sonarpost import wire
 from sonarpost.codec.region import RegionBox
+from sonarpost.limits import limit
 from sonarpost.messages import Command, Contact, ReconstructedImage
 from sonarpost.modem.interface import RateInfo
 from sonarpost.review.image_matching import EXPAND_FACTOR, place_in_wider
-from sonarpost.services.console.store.serialisers import Json, contact_record_json, decode_image, version_json
+from sonarpost.services.console.store.serialisers import Json, decode_image, versions_json
 
 Relation = Literal["wider", "original", "region"]
 """Kind of the request that the image answers."""
@@ -23,6 +24,15 @@ Relation = Literal["wider", "original", "region"]
 SIZE_TOLERANCE: Final = 0.06
 """Relative deviation of a ratio of pixel sizes; the link transmits them in steps of 2.5 %."""
 
+MAX_RELATED: Final = limit(
+    20,
+    "images",
+    "claims",
+    surface="contacts of the console",
+    source="vehicle",
+    resource="related",
+    at_limit="the newest",
+)
 MAX_COMPARED: Final = 20
 """Contacts of one detection that are compared with a new image."""
 
@@ -68,16 +78,15 @@ def _size_ratios(record: Contact, other: Contact) -> tuple[float, float] | None:
     return along_m / other_along_m, across_m / other_across_m
 
 
-def link_related_images(db: sqlite3.Connection, contact_id: str, image: ReconstructedImage) -> list[str]:
-    """Store which image answers a request about another contact; return the identifiers of the linked images.
+def link_related_images(db: sqlite3.Connection, contact_id: str, image: ReconstructedImage) -> None:
+    """Store which image answers a request about another contact.
 
     The image can be the answer, or the contact of an answer that has arrived earlier. An image with a decision stays a
     contact.
     """
     row = db.execute("SELECT * FROM contact WHERE id = ?", (contact_id,)).fetchone()
     if row["parent"] is not None or row["seen_utc_s"] is None:
-        return []
-    linked: list[str] = []
+        return
     others = db.execute(
         "SELECT id, version, review FROM contact"
         " WHERE vehicle_id = ? AND seen_utc_s = ? AND vessel_id = ? AND id <> ? AND parent IS NULL"
@@ -95,11 +104,9 @@ def link_related_images(db: sqlite3.Connection, contact_id: str, image: Reconstr
         other_image = decode_image(stored)
         if row["review"] == "unreviewed" and (relation := relation_of(image, other_image)):
             _link(db, contact_id, other["id"], relation)
-            return [contact_id]
+            return
         if other["review"] == "unreviewed" and (relation := relation_of(other_image, image)):
             _link(db, other["id"], contact_id, relation)
-            linked.append(other["id"])
-    return linked
 
 
 def _link(db: sqlite3.Connection, contact_id: str, parent: str, relation: Relation) -> None:
@@ -109,48 +116,48 @@ def _link(db: sqlite3.Connection, contact_id: str, parent: str, relation: Relati
 
 
 def related_images_json(db: sqlite3.Connection, contact_id: str, rates: Mapping[int, RateInfo]) -> list[Json]:
-    """Return the images that answer requests about a contact, the earliest first; `rates` are those of the modem."""
-    found: list[Json] = []
-    contact = db.execute(
-        "SELECT v.* FROM version v JOIN contact c ON c.id = v.contact_id AND c.version = v.version WHERE c.id = ?",
-        (contact_id,),
-    ).fetchone()
+    """Return the newest images that answer requests about a contact, latest last; `rates` are those of the modem."""
     rows = db.execute(
-        "SELECT id, relation, image_id FROM contact WHERE parent = ? ORDER BY arrived_utc_s, id", (contact_id,)
-    ).fetchall()
+        "SELECT id, relation, image_id FROM contact WHERE parent = ? ORDER BY arrived_utc_s DESC, id DESC LIMIT ?",
+        (contact_id, MAX_RELATED),
+    ).fetchall()[::-1]
+    found: list[Json] = []
     for row in rows:
-        versions = db.execute("SELECT * FROM version WHERE contact_id = ? ORDER BY version", (row["id"],)).fetchall()
-        newest = decode_image(versions[-1])
-        place = _place(decode_image(contact), newest) if row["relation"] == "wider" else None
-        found.append(
-            {
-                "id": row["id"],
-                "relation": row["relation"],
-                "image_id": row["image_id"],
-                "record": contact_record_json(newest),
-                "place": place,
-                "versions": [version_json(version, rates) for version in versions],
-                "place_px": _place_of_region(db, contact_id, row["id"]) if row["relation"] == "region" else None,
-            }
-        )
+        box: Sequence[int] | None = None
+        if row["relation"] == "wider":
+            newest = db.execute(
+                "SELECT * FROM version WHERE contact_id = ? ORDER BY version DESC LIMIT 1", (row["id"],)
+            )
+            box = _box_in_wider(db, contact_id, decode_image(newest.fetchone()))
+        elif row["relation"] == "region":
+            box = _box_of_region(db, contact_id, row["id"])
+        images = versions_json(db, row["id"], rates)
+        found.append({**{name: row[name] for name in ("id", "relation", "image_id")}, "box": box, "versions": images})
     return found
 
 
-def _place_of_region(db: sqlite3.Connection, contact_id: str, region_id: str) -> list[int] | None:
+def _box_of_region(db: sqlite3.Connection, contact_id: str, region_id: str) -> Sequence[int] | None:
     """Return first row and column, last row + 1 and column + 1 of a region in its contact; None if unknown."""
-    request = db.execute(
-        "SELECT payload FROM request WHERE contact_id = ? AND result_contact = ?", (contact_id, region_id)
+    row = db.execute(
+        "SELECT r.payload, c.height_px, c.width_px FROM request r JOIN contact c ON c.id = r.contact_id"
+        " WHERE r.contact_id = ? AND r.result_contact = ?",
+        (contact_id, region_id),
     ).fetchone()
-    if request is None:
+    command = None if row is None else wire.decode(Command, bytes(row["payload"]), f"request about {contact_id}")
+    if command is None or command.box is None:
         return None
-    command = wire.decode(Command, bytes(request["payload"]), f"request about {contact_id}")
-    whole = db.execute("SELECT height_px, width_px FROM contact WHERE id = ?", (contact_id,)).fetchone()
-    return None if command.box is None else [*RegionBox(*command.box).pixels(whole["height_px"], whole["width_px"])]
+    return RegionBox(*command.box).pixels(row["height_px"], row["width_px"])
 
 
-def _place(image: ReconstructedImage, wider: ReconstructedImage) -> list[int] | None:
-    """Return [row, column] of the upper left corner of an image in the wider image; None if it is not known."""
-    if not image.codec or not wider.codec:
+def _box_in_wider(db: sqlite3.Connection, contact_id: str, wider: ReconstructedImage) -> Sequence[int] | None:
+    """Return the box of a contact's image in the wider image, as that of a region; None if it is not found."""
+    newest = db.execute(
+        "SELECT v.* FROM version v JOIN contact c ON c.id = v.contact_id AND c.version = v.version WHERE c.id = ?",
+        (contact_id,),
+    ).fetchone()
+    image = decode_image(newest)
+    place = place_in_wider(image.picture.to_array(), wider.picture.to_array()) if image.codec and wider.codec else None
+    if place is None:
         return None
-    place = place_in_wider(image.picture.to_array(), wider.picture.to_array())
-    return None if place is None else list(place)
+    height, width = (size // EXPAND_FACTOR for size in (image.picture.height_px, image.picture.width_px))
+    return [*place, place[0] + height, place[1] + width]

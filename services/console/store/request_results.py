@@ -1,79 +1,53 @@
-"""Results of requests: expected time of arrival, and the image that answers a request."""
+"""Results of requests: what they show of the link, when they are expected, and the image that answers a request."""
 
 from __future__ import annotations
 
 import sqlite3
-import statistics
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Final
 
 from sonarpost import wire
 from sonarpost.codec.region import RegionBox
 from sonarpost.messages import Command
-from sonarpost.review.costs import NEW_IMAGE_KINDS, RequestCost
+from sonarpost.review.costs import NEW_IMAGE_KINDS, LinkRecord, RequestEstimate
 from sonarpost.services.console.store.serialisers import Json
 
-RECENT_RESULTS: Final = 5
-"""Answered requests of a vehicle from which the duration of the next one is estimated."""
+RECENT_RESULTS: Final = 20
+"""Latest requests of a vehicle from which the next one is estimated."""
 UNKNOWN_COST_LATE_S: Final = 3600.0
-FIRST_REQUEST_LATE_FACTOR: Final = 20.0
-"""Without an answered request: a request is late after this multiple of its air time and queue."""
 LATE_FACTOR: Final = 2.0
 LATE_MARGIN_S: Final = 300.0
 
 
-@dataclass(frozen=True, slots=True)
-class ExpectedTimes:
-    """When the result of a request is expected, UTC; None if unknown.
-
-    Attributes:
-        earliest_utc_s: After the queue of the vehicle and the air time. Turns of other stations add to it.
-        expected_utc_s: From the durations of the vehicle's last answered requests.
-        late_utc_s: After this time a request without a result is late.
-    """
-
-    earliest_utc_s: float | None = None
-    expected_utc_s: float | None = None
-    late_utc_s: float | None = None
-
-
-def expected_times(
-    db: sqlite3.Connection, vehicle_id: str, cost: RequestCost, kind: str, wait_s: float | None, now_utc_s: float
-) -> ExpectedTimes:
-    """Return when the result of a new request is expected.
-
-    The result of a `revisit` depends on the track of the vehicle: it has no expected time.
-    """
-    if kind in ("revisit", "prioritise"):
-        return ExpectedTimes()
-    if cost.airtime_s is None:
-        return ExpectedTimes(late_utc_s=now_utc_s + UNKNOWN_COST_LATE_S)
-    shortest_s = cost.airtime_s + (wait_s or 0.0)
+def link_record(db: sqlite3.Connection, vehicle_id: str, loss_up: float | None) -> LinkRecord:
+    """Return what the latest requests to a vehicle show of its link; `loss_up`: see `LinkRecord`."""
     rows = db.execute(
-        "SELECT (r.arrived_utc_s - r.asked_utc_s) / r.airtime_s FROM request r JOIN contact c ON c.id = r.contact_id"
-        " WHERE c.vehicle_id = ? AND r.arrived_utc_s IS NOT NULL AND r.airtime_s > 0 AND r.kind <> 'revisit'"
-        " ORDER BY r.seq DESC LIMIT ?",
+        "SELECT r.*, (r.arrived_utc_s - r.asked_utc_s) / (r.expected_utc_s - r.asked_utc_s) AS ratio"
+        " FROM request r JOIN contact c ON c.id = r.contact_id WHERE c.vehicle_id = ? ORDER BY r.seq DESC LIMIT ?",
         (vehicle_id, RECENT_RESULTS),
     ).fetchall()
-    if not rows:
-        late_s = FIRST_REQUEST_LATE_FACTOR * shortest_s + LATE_MARGIN_S
-        return ExpectedTimes(now_utc_s + shortest_s, None, now_utc_s + late_s)
-    expected_s = max(shortest_s, statistics.median(row[0] for row in rows) * cost.airtime_s)
-    late_s = LATE_FACTOR * expected_s + LATE_MARGIN_S
-    return ExpectedTimes(now_utc_s + shortest_s, now_utc_s + expected_s, now_utc_s + late_s)
+    tries = [row["times_sent"] for row in rows if row["state"] == "confirmed" and row["times_sent"]]
+    ratios = tuple(row["ratio"] for row in rows if row["ratio"] is not None and row["ratio"] > 0)
+    return LinkRecord(loss_up, sum(tries), sum(tries) - len(tries), ratios)
 
 
-def request_columns(
-    db: sqlite3.Connection, contact: sqlite3.Row, kind: str, cost: RequestCost, wait_s: float | None, now_utc_s: float
-) -> Json:
-    """Return the columns of a new request by which its result is recognised."""
-    times = expected_times(db, contact["vehicle_id"], cost, kind, wait_s, now_utc_s)
+def request_columns(contact: sqlite3.Row, kind: str, estimate: RequestEstimate, now_utc_s: float) -> Json:
+    """Return the columns of a new request by which its result is recognised.
+
+    The answer is expected at `expected_utc_s`, with 90 % by `probable_utc_s`, and after `late_utc_s` it is late. The
+    result of a `revisit` depends on the track of the vehicle: it has no expected time.
+    """
+    arrival, late_s = estimate.arrival, None
+    if kind not in ("revisit", "prioritise"):
+        late_s = UNKNOWN_COST_LATE_S if arrival is None else LATE_FACTOR * arrival.most_s + LATE_MARGIN_S
     return {
         "base_version": contact["version"],
         "base_bytes": contact["bytes_received"],
         "base_total": contact["bytes_total"],
-        "bytes_wanted": cost.bytes_wanted,
-        **asdict(times),
+        "bytes_wanted": estimate.cost.bytes_wanted,
+        "expected_utc_s": arrival and now_utc_s + arrival.median_s,
+        "probable_utc_s": arrival and now_utc_s + arrival.most_s,
+        "late_utc_s": late_s and now_utc_s + late_s,
     }
 
 
@@ -94,8 +68,8 @@ class _Result:
     is_whole: bool
 
 
-def update_results(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> list[str]:
-    """Store the results of the requests about a contact after an image has arrived; return the changed requests.
+def update_results(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> None:
+    """Store the results of the requests about a contact after an image has arrived.
 
     Args:
         db: Connection in a transaction.
@@ -106,7 +80,6 @@ def update_results(db: sqlite3.Connection, contact_id: str, now_utc_s: float) ->
     open_requests = db.execute(
         "SELECT * FROM request WHERE contact_id = ? AND arrived_utc_s IS NULL AND state <> 'refused'", (contact_id,)
     ).fetchall()
-    changed: list[str] = []
     for request in open_requests:
         result = _result_of(db, request, contact)
         known = (request["result_contact"], request["result_version"], request["result_bytes"])
@@ -123,8 +96,6 @@ def update_results(db: sqlite3.Connection, contact_id: str, now_utc_s: float) ->
                 request["command_id"],
             ),
         )
-        changed.append(str(request["command_id"]))
-    return changed
 
 
 def _result_of(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite3.Row) -> _Result | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sqlite3
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final, Literal
 
 from pydantic import ValidationError
@@ -13,13 +12,13 @@ from pydantic import ValidationError
 from sonarpost import wire
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError
-from sonarpost.messages import Advice, Command, CommandKind, DownlinkState, TaskingState
-from sonarpost.review.costs import NEW_IMAGE_KINDS, RequestCost
+from sonarpost.limits import limit
+from sonarpost.messages import Advice, Command, CommandKind, Decision, DownlinkState, TaskingState
+from sonarpost.review.costs import NEW_IMAGE_KINDS, RequestEstimate
 from sonarpost.services.console.store.contacts import find_contact, find_contact_of_image
 from sonarpost.services.console.store.database import (
     Actor,
     DisplayedImage,
-    Table,
     add_audit_entry,
     find_record,
     insert_row,
@@ -28,8 +27,25 @@ from sonarpost.services.console.store.request_results import request_columns
 from sonarpost.services.console.store.serialisers import Json
 from sonarpost.wire import first_error
 
-REQUEST_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "revisit", "wider", "original")
-"""Kinds in the order of the page. `wider` is displayed as "expand", `original` as "unfiltered image"."""
+MAX_WAITING: Final = limit(
+    1000,
+    "records",
+    "shares",
+    surface="records of the console",
+    source="vessel",
+    resource="decisions that arrived before their images; comments, too",
+    at_limit="a further one is refused",
+)
+REQUEST_KINDS: Final[tuple[CommandKind, ...]] = (
+    "refine",
+    "region",
+    "wider",
+    "original",
+    "resend",
+    "prioritise",
+    "revisit",
+)
+"""Kinds in the order of the page."""
 
 _STATE_ORDER: Final = {
     "none": 0,
@@ -50,28 +66,19 @@ _UNSUPPORTED: Final = "unsupported"
 """Reason of a vehicle without a consumer for a kind of command, as op_modem states it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Obstacle:
-    """Why a kind of request is not possible.
-
-    Attributes:
-        code: Name of the reason, for translation.
-        text: The reason in English.
-    """
-
-    code: Literal[
-        "no_downlink",
-        "unsupported",
-        "no_position",
-        "complete",
-        "fixed_codec",
-        "no_image",
-        "not_despeckled",
-        "despeckling_unknown",
-        "here",
-        "related",
-    ]
-    text: str
+Obstacle = Literal[
+    "no_downlink",
+    "unsupported",
+    "no_position",
+    "complete",
+    "no_image",
+    "fixed_codec",
+    "despeckling_unknown",
+    "not_despeckled",
+    "here",
+    "related",
+]
+"""Why a kind of request is not possible; docs/specifications/console-api.md explains them."""
 
 
 def find_obstacle(
@@ -87,37 +94,20 @@ def find_obstacle(
         has_downlink: Whether this console can send requests to vehicles.
     """
     codec, despeckling = row["codec"], row["despeckle_strength"]
-    is_unsupported = _is_unsupported(db, row["vehicle_id"], kind, now_utc_s)
-    has_no_position = row["lat_deg"] is None or row["lon_deg"] is None
-    is_here = kind in NEW_IMAGE_KINDS and _is_here(db, row["id"], kind)
-    obstacles: tuple[tuple[bool, Obstacle], ...] = (
-        (not has_downlink, Obstacle("no_downlink", "this vessel sends no requests: no downlink is configured")),
-        (is_unsupported, Obstacle("unsupported", f"{row['vehicle_id']} cannot do this")),
-        (
-            kind == "revisit" and has_no_position,
-            Obstacle("no_position", "the position of the contact is unknown"),
-        ),
-        (kind == "resend" and bool(row["complete"]), Obstacle("complete", "the image is complete")),
-        (
-            kind in ("refine", "original") and not codec,
-            Obstacle("no_image", "no part of the image was received"),
-        ),
-        (
-            kind == "refine" and not default_registry().is_embedded(codec),
-            Obstacle("fixed_codec", f"the codec {codec} cannot add detail"),
-        ),
-        (
-            kind == "original" and despeckling is None,
-            Obstacle("despeckling_unknown", "the stream of the image states no despeckling"),
-        ),
-        (kind == "original" and not despeckling, Obstacle("not_despeckled", "the image is not despeckled")),
-        (is_here, Obstacle("here", "this image is complete")),
-        (
-            kind in NEW_IMAGE_KINDS and row["parent"] is not None,
-            Obstacle("related", "a request about the contact of this image"),
-        ),
-    )
-    return next((obstacle for applies, obstacle in obstacles if applies), None)
+    is_new_image, is_original = kind in NEW_IMAGE_KINDS, kind == "original"
+    obstacles: dict[Obstacle, bool] = {
+        "no_downlink": not has_downlink,
+        "unsupported": _is_unsupported(db, row["vehicle_id"], kind, now_utc_s),
+        "no_position": kind == "revisit" and (row["lat_deg"] is None or row["lon_deg"] is None),
+        "complete": kind in ("resend", "prioritise") and bool(row["complete"]),
+        "no_image": kind in ("refine", "original", "region") and not codec,
+        "fixed_codec": kind == "refine" and not default_registry().is_embedded(codec),
+        "despeckling_unknown": is_original and despeckling is None,
+        "not_despeckled": is_original and not despeckling,
+        "here": is_new_image and _is_here(db, row["id"], kind),
+        "related": is_new_image and row["parent"] is not None,
+    }
+    return next((obstacle for obstacle, applies in obstacles.items() if applies), None)
 
 
 def _is_unsupported(db: sqlite3.Connection, vehicle_id: str, kind: CommandKind, now_utc_s: float) -> bool:
@@ -154,8 +144,7 @@ def add_request(
     actor: Actor,
     now_utc_s: float,
     *,
-    cost: RequestCost,
-    wait_s: float | None,
+    estimate: RequestEstimate,
     has_downlink: bool,
     arguments: Mapping[str, object],
 ) -> str:
@@ -168,19 +157,18 @@ def add_request(
         airtime_s: The displayed estimate, for the audit.
         actor: The user.
         now_utc_s: Present time.
-        cost: The present estimate.
-        wait_s: Time that the vehicle needs for its present queue; None if unknown.
+        estimate: The present estimate.
         has_downlink: Whether this console can send requests to vehicles.
-        arguments: Further fields of the command: `box` and `stream_bytes`, or `place`.
+        arguments: Further fields of the command: `box` and `stream_bytes`.
 
     Raises:
         BadInputError: The request is not possible, or one of this kind has no result yet.
     """
     row = find_contact(db, contact_id)
     if obstacle := find_obstacle(db, row, kind, now_utc_s, has_downlink=has_downlink):
-        raise BadInputError("request", "kind", kind, f"another kind: {obstacle.text}")
+        raise BadInputError("request", "kind", kind, f"another kind: {obstacle}")
     earlier = db.execute("SELECT * FROM request WHERE contact_id = ? AND kind = ?", (contact_id, kind))
-    if kind not in ("region", "prioritise") and any(is_pending(request, now_utc_s) for request in earlier):
+    if kind != "region" and any(is_pending(request, now_utc_s) for request in earlier):
         raise BadInputError("request", "kind", kind, "a kind without a request in progress")
     has_position = kind == "revisit"
     fields = {
@@ -192,6 +180,7 @@ def add_request(
         "lon_deg": row["lon_deg"] if has_position else None,
         "issued_by": actor.user,
         "issued_utc_s": now_utc_s,
+        "place": "first" if kind == "prioritise" else None,
     }
     try:
         record = Command.model_validate({**fields, **arguments})
@@ -209,7 +198,7 @@ def add_request(
         "changed_utc_s": now_utc_s,
         "payload": wire.encode(record),
         "sent": 0,
-        **request_columns(db, row, kind, cost, wait_s, now_utc_s),
+        **request_columns(row, kind, estimate, now_utc_s),
     }
     insert_row(db, "request", values)
     detail = {"command_id": record.command_id, "kind": kind, "airtime_s": airtime_s, **arguments}
@@ -229,45 +218,41 @@ def is_later_state(known: str, known_times_sent: int, state: str, times_sent: in
 
 def update_request_state(
     db: sqlite3.Connection, command_id: str, state: str, reason: str, times_sent: int | None, utc_s: float
-) -> str | None:
-    """Update the delivery state of a request; return the contact identifier, None if nothing has changed."""
+) -> None:
+    """Update the delivery state of a request."""
     row = find_record(db, "request", command_id)
     if row is None or not is_later_state(row["state"], row["times_sent"], state, times_sent):
-        return None
+        return
     db.execute(
         "UPDATE request SET state = ?, reason = ?, times_sent = ?, changed_utc_s = ? WHERE command_id = ?",
         (state, reason, row["times_sent"] if times_sent is None else times_sent, utc_s, command_id),
     )
-    return str(row["contact_id"])
 
 
-def apply_downlink_state(db: sqlite3.Connection, state: DownlinkState) -> str | None:
-    """Update the delivery of a request to the vehicle; return the contact identifier, None if nothing has changed."""
-    return update_request_state(db, state.record_id, state.state, state.reason, state.times_sent, state.changed_utc_s)
+def apply_downlink_state(db: sqlite3.Connection, state: DownlinkState) -> None:
+    """Update the delivery of a request to the vehicle."""
+    update_request_state(db, state.record_id, state.state, state.reason, state.times_sent, state.changed_utc_s)
 
 
-def apply_tasking_state(db: sqlite3.Connection, state: TaskingState) -> tuple[Table, str] | None:
-    """Update the delivery of a request or comment to the vessel; return its table and contact if it has changed."""
+def apply_tasking_state(db: sqlite3.Connection, state: TaskingState) -> None:
+    """Update the delivery of a request or comment to the vessel."""
     if state.kind == "command":
-        contact_id = update_request_state(db, state.record_id, state.state, state.reason, None, state.changed_utc_s)
-        return None if contact_id is None else ("request", contact_id)
+        update_request_state(db, state.record_id, state.state, state.reason, None, state.changed_utc_s)
+        return
     row = find_record(db, "advice", state.record_id)
     if row is None or row["state"] in (None, "delivered", "refused") or row["state"] == state.state:
-        return None
+        return
     db.execute(
         "UPDATE advice SET state = ?, reason = ? WHERE advice_id = ?", (state.state, state.reason, state.record_id)
     )
-    return "advice", str(row["contact_id"])
 
 
-def refuse_advice(db: sqlite3.Connection, advice_id: str, reason: str) -> str | None:
-    """Mark a comment as refused by c2; return the contact identifier, None if it is unknown."""
+def refuse_advice(db: sqlite3.Connection, advice_id: str, reason: str) -> None:
+    """Mark a comment as refused by c2."""
     db.execute(
         "UPDATE advice SET state = 'refused', reason = ? WHERE advice_id = ? AND state = 'waiting'",
         (reason, advice_id),
     )
-    row = find_record(db, "advice", advice_id)
-    return None if row is None else str(row["contact_id"])
 
 
 def add_advice(db: sqlite3.Connection, contact_id: str, record: Advice, actor: Actor) -> None:
@@ -278,17 +263,25 @@ def add_advice(db: sqlite3.Connection, contact_id: str, record: Advice, actor: A
     add_audit_entry(db, contact_id, actor, "advise", record.advised_utc_s, displayed, detail)
 
 
-def store_received_advice(db: sqlite3.Connection, record: Advice) -> str | None:
+def store_received_advice(db: sqlite3.Connection, record: Advice) -> None:
     """Store a comment from the shore site. A comment without its image is kept until the image arrives.
 
-    Returns:
-        The contact identifier; None if the comment is already stored or its image is not.
+    Raises:
+        BadInputError: Too many comments wait for their images.
     """
     if find_record(db, "advice", record.advice_id) is not None:
-        return None
+        return
     contact_id = find_contact_of_image(db, record.vessel_id, record.vehicle_id, record.image_id, record.advised_utc_s)
+    if contact_id is None:
+        check_waiting(db, record)
     _insert_advice(db, contact_id or "", record, None)
-    return contact_id
+
+
+def check_waiting(db: sqlite3.Connection, record: Decision | Advice) -> None:
+    """Raise `BadInputError` if too many decisions or comments of a vessel wait for their images."""
+    count = f"SELECT COUNT(*) FROM {record.TYPE} WHERE contact_id = '' AND vessel_id = ?"  # noqa: S608  constants only
+    if db.execute(count, (record.vessel_id,)).fetchone()[0] >= MAX_WAITING:
+        raise BadInputError(record.TYPE, "image_id", record.image_id, f"an image; {MAX_WAITING} others have none yet")
 
 
 def _insert_advice(db: sqlite3.Connection, contact_id: str, record: Advice, state: str | None) -> None:

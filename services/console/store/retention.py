@@ -8,7 +8,8 @@ from typing import Final
 import numpy as np
 
 from sonarpost import wire
-from sonarpost.archive.retention import DAY_S, Stored, select_for_removal
+from sonarpost.archive.retention import DAY_S, Stored, select_for_removal, vehicle_source
+from sonarpost.errors import BadInputError
 from sonarpost.messages import Pixels, ReconstructedImage
 from sonarpost.services.console.store.serialisers import decode_image
 
@@ -21,8 +22,8 @@ _NOTE: Final = "image removed by retention"
 def remove_images(db: sqlite3.Connection, now_utc_s: float, retain_days: float, max_bytes: int) -> int:
     """Remove the pixels of image versions by age and total size; contacts, decisions and the audit stay.
 
-    Because of the total size, versions of contacts with a decision are removed before those of contacts without one,
-    and superseded versions before the newest one.
+    Because of the total size, the vehicle with the most bytes loses versions first, with several vessels the vessel:
+    superseded versions before the newest ones, in both groups those of contacts without a decision before the others.
 
     Args:
         db: Connection in a transaction.
@@ -40,14 +41,18 @@ def remove_images(db: sqlite3.Connection, now_utc_s: float, retain_days: float, 
         return 0
     rows = db.execute(
         "SELECT v.contact_id, v.version, v.received_utc_s, LENGTH(v.payload),"
-        " 2 * (c.review = 'unreviewed') + (v.version = c.version)"
+        " 2 * (v.version = c.version) + (c.review <> 'unreviewed'),"
+        " CASE WHEN (SELECT COUNT(DISTINCT vessel_id) FROM contact) > 1 THEN c.vessel_id ELSE c.vehicle_id END"
         " FROM version v JOIN contact c ON c.id = v.contact_id WHERE v.removed = 0"
     )
-    stored = [Stored((str(row[0]), int(row[1])), row[2], row[3], row[4]) for row in rows]
+    stored = [Stored((str(row[0]), int(row[1])), row[2], row[3], row[4], vehicle_source(row[5])) for row in rows]
     selected = select_for_removal(stored, now_utc_s, retain_days, max_bytes)[:MAX_IMAGES_AT_ONCE]
     for key in selected:
         row = db.execute("SELECT * FROM version WHERE contact_id = ? AND version = ?", key).fetchone()
-        payload = wire.encode(without_pixels(decode_image(row)))
+        try:
+            payload = wire.encode(without_pixels(decode_image(row)))
+        except BadInputError:
+            payload = b""  # it cannot be shown either
         db.execute("UPDATE version SET payload = ?, removed = 1 WHERE contact_id = ? AND version = ?", (payload, *key))
         db.execute("UPDATE contact SET has_picture = 0 WHERE id = ? AND version = ?", key)
     return len(selected)

@@ -9,34 +9,48 @@ from dataclasses import asdict
 from typing import Final, Literal
 
 from sonarpost import wire
+from sonarpost.limits import limit
 from sonarpost.messages import ReconstructedImage
 from sonarpost.modem.interface import RateInfo
 from sonarpost.review.costs import airtime_of_frames, least_airtime_s
-from sonarpost.review.edge_blur import edge_sigma_px
 from sonarpost.review.image_geometry import contact_box, contact_mark, range_axis
-from sonarpost.review.rendering import LAYERS
 from sonarpost.review.resolution import CODEBOOK_CODECS, codebook_edge_px, sharp_to_m
 from sonarpost.services.console.store.database import Table
 
 Json = dict[str, object]
 Stage = Literal["record", "preview", "part", "sent", "refined"]
 
+MAX_VERSIONS: Final = limit(
+    50,
+    "versions",
+    "claims",
+    surface="contacts of the console",
+    source="vehicle",
+    resource="shown",
+    at_limit="the newest",
+)
+
 NEWER_DETAIL: Final = (
     "(c.version > c.decided_version AND (c.decided_bytes IS NULL OR c.bytes_received > c.decided_bytes))"
 )
 """SQL condition: the decision was made on fewer bytes than the newest version has."""
 
+COUNTS: Final = "vehicle NOT IN ('disputed', 'withdrawn') AND shore <> 'withdrawn'"
+"""SQL condition of decisions whose delivery is displayed, if they are the latest one: neither taken back before they
+were sent, nor of a verdict that does not count."""
+
 CONTACT_QUERY: Final = f"""
-SELECT c.*, {NEWER_DETAIL} AS newer_detail,
+SELECT c.*, {NEWER_DETAIL} AS newer_detail, t.label, t.is_mine_like,
     d.shore AS d_shore, d.vehicle AS d_vehicle, d.reason AS d_reason, d.times_sent AS d_times_sent,
     d.changed_utc_s AS d_changed_utc_s,
     (SELECT COUNT(*) FROM contact g WHERE g.group_id = c.group_id AND g.sealed < 2) AS looks,
     (SELECT COUNT(*) FROM request r WHERE r.contact_id = c.id AND r.arrived_utc_s IS NULL
-        AND r.state NOT IN ('refused', 'expired')
+        AND r.state NOT IN ('refused', 'expired') AND (r.kind <> 'prioritise' OR r.state <> 'confirmed')
         AND COALESCE(r.late_utc_s, r.asked_utc_s + 86400) > CAST(strftime('%s') AS REAL)) AS asking,
     (SELECT MIN(MAX(r.base_bytes, r.base_total)) FROM request r
         WHERE r.contact_id = c.id AND r.kind = 'refine') AS refine_base
-FROM contact c LEFT JOIN decision d ON d.decision_id = c.last_decision
+FROM contact c LEFT JOIN truth t ON t.contact_id = c.id AND t.revealed_utc_s IS NOT NULL
+LEFT JOIN decision d ON d.seq = (SELECT MAX(seq) FROM decision WHERE contact_id = c.id AND {COUNTS})
 """  # noqa: S608  constants only
 """Start of every query for rows of `contact_json`."""
 
@@ -46,21 +60,21 @@ LISTED: Final = "c.parent IS NULL AND c.sealed < 2"
 _CONTACT_COLUMNS: Final = (
     "id name vessel_id vehicle_id image_id revision version review mlo_class confidence decided_by decided_utc_s"
     " atd_class atd_confidence p_mine_like p_other_object lat_deg lon_deg position_sigma_m range_m seen_utc_s"
-    " first_frame_utc_s last_frame_utc_s updated_utc_s bytes_received bytes_total height_px width_px"
+    " first_frame_utc_s bytes_received bytes_total height_px width_px"
 )
 _DELIVERY_COLUMNS: Final = "shore vehicle reason times_sent changed_utc_s"
 _DECISION_COLUMNS: Final = (
     "decision_id verdict confidence mlo_class remark operator decided_utc_s version sha256 layer undoes"
 )
 _REQUEST_COLUMNS: Final = (
-    "command_id kind user asked_utc_s airtime_s state times_sent reason changed_utc_s bytes_wanted earliest_utc_s"
+    "command_id kind user asked_utc_s airtime_s state times_sent reason changed_utc_s bytes_wanted probable_utc_s"
     " expected_utc_s late_utc_s arrived_utc_s"
 )
 _ADVICE_COLUMNS: Final = "advice_id version verdict confidence mlo_class remark author advised_utc_s"
 _AUDIT_COLUMNS: Final = "seq utc_s user role address action version sha256 layer"
 _VERSION_FIELDS: Final = (
-    "version codec model complete missing_fraction bytes_received bytes_total first_frame_utc_s last_frame_utc_s"
-    " authenticated despeckle_strength"
+    "version codec model complete missing_fraction bytes_received bytes_total first_frame_utc_s authenticated"
+    " despeckle_strength"
 )
 
 
@@ -70,7 +84,6 @@ def _select(row: sqlite3.Row, columns: str, prefix: str = "") -> Json:
 
 def contact_json(row: sqlite3.Row) -> Json:
     """Return a contact as in lists."""
-    grouped = (row["looks"] or 0) > 1
     decided_on, bytes_decided = row["decided_version"], row["decided_bytes"]
     return {
         **_select(row, _CONTACT_COLUMNS),
@@ -84,9 +97,7 @@ def contact_json(row: sqlite3.Row) -> Json:
             refine_base=row["refine_base"],
         ),
         "has_picture": bool(row["has_picture"]),
-        "thumbnail": f"/api/contacts/{row['id']}/versions/{row['version']}/thumbnail.png",
-        "group": row["group_id"] if grouped else None,
-        "looks": row["looks"] if grouped else 1,
+        "looks": max(1, row["looks"]),
         "object": row["group_id"],
         "contradictory": bool(row["contradictory"]),
         "decided_on": None if decided_on is None else {"version": decided_on, "bytes": bytes_decided},
@@ -95,6 +106,7 @@ def contact_json(row: sqlite3.Row) -> Json:
         "delivery": None if row["d_shore"] is None else _select(row, _DELIVERY_COLUMNS, "d_"),
         "open_requests": row["asking"],
         "authenticated": None if row["authenticated"] is None else bool(row["authenticated"]),
+        "known": None if row["label"] is None else {"label": row["label"], "is_mine_like": bool(row["is_mine_like"])},
     }
 
 
@@ -188,6 +200,15 @@ def _airtime(image: ReconstructedImage, rate: RateInfo | None) -> Json:
     return {"airtime_s": least_airtime_s(image.bytes_received, rate), "airtime_is": "at_least"}
 
 
+def versions_json(
+    db: sqlite3.Connection, contact_id: str, rates: Mapping[int, RateInfo], refine_base: int | None = None
+) -> list[Json]:
+    """Return the newest `MAX_VERSIONS` image versions of a contact, the latest last; see `version_json`."""
+    sql = "SELECT * FROM version WHERE contact_id = ? ORDER BY version DESC LIMIT ?"
+    # One image is in memory at a time.
+    return [version_json(row, rates, refine_base) for row in db.execute(sql, (contact_id, MAX_VERSIONS))][::-1]
+
+
 def version_json(row: sqlite3.Row, rates: Mapping[int, RateInfo], refine_base: int | None = None) -> Json:
     """Return an image version; `rates` are those of the modem, `refine_base`: see `stage_of`."""
     image = decode_image(row)
@@ -195,13 +216,11 @@ def version_json(row: sqlite3.Row, rates: Mapping[int, RateInfo], refine_base: i
     has_codebook = image.codec in CODEBOOK_CODECS
     pixels = image.picture.height_px * image.picture.width_px
     percent = percent_received(image) if image.complete or image.bytes_total else None
-    size = image.picture.height_px, image.picture.width_px
     return {
         **{name: getattr(image, name) for name in _VERSION_FIELDS.split()},
         "received_utc_s": row["received_utc_s"],
         "height_px": image.picture.height_px,
         "width_px": image.picture.width_px,
-        "bits": image.picture.bits,
         "sha256": image.picture_sha256,
         "percent_received": percent,
         "stage": stage_of(
@@ -213,19 +232,16 @@ def version_json(row: sqlite3.Row, rates: Mapping[int, RateInfo], refine_base: i
         ),
         "frames_received": image.frames_received or None,
         "sharp_to_m": sharp_to_m(image),
-        "missing_halves": list(image.missing_halves),
         **_airtime(image, rates.get(row["rate"])),
         "pixel_along_m": contact.pixel_along_m if contact else None,
         "pixel_across_m": contact.pixel_across_m if contact else None,
         "range_axis": range_axis(contact),
         **_mark_json(image),
-        "edge_sigma_px": edge_sigma_px(image.codec, image.bytes_received, size[0] * size[1]) if image.codec else None,
         "notes": list(image.notes),
         "texture": "codebook" if has_codebook else None,
         "texture_edge_px": codebook_edge_px(image.bytes_total or image.bytes_received, pixels)
         if has_codebook
         else None,
-        "layers": [asdict(layer) for layer in LAYERS],
     }
 
 
@@ -234,11 +250,3 @@ def _mark_json(image: ReconstructedImage) -> Json:
     size = image.picture.height_px, image.picture.width_px
     mark, box = contact_mark(image.contact, *size), contact_box(image.contact, *size)
     return {"mark": None if mark is None else asdict(mark), "box": None if box is None else asdict(box)}
-
-
-def contact_record_json(image: ReconstructedImage) -> Json | None:
-    """Return the contact record with the side of the nadir; None if no contact record was received."""
-    if image.contact is None:
-        return None
-    # If the channel is known, the vehicle mirrors images so that the nadir is on the left.
-    return {**image.contact.model_dump(), "nadir_side": "left" if image.contact.channel else None}

@@ -1,8 +1,8 @@
 """Known objects of contacts: all contacts of training, and sealed contacts of the calibrated watch.
 
 The table `truth` states what a contact shows. The page receives it after a decision, when the operator can no longer
-take the decision back. The score counts the first such decision of each operator on
-each contact, if the operator made it before the page received the object.
+take the decision back. The score counts the first decision of each operator on each contact that is not withdrawn, if
+the operator made it before the page received the object.
 
 The column `contact.sealed` is 1 for a sealed contact, and 2 after its object was revealed: then lists omit it.
 """
@@ -10,6 +10,8 @@ The column `contact.sealed` is 1 for a sealed contact, and 2 after its object wa
 from __future__ import annotations
 
 import sqlite3
+import statistics
+from collections import Counter, defaultdict
 from dataclasses import asdict, dataclass
 from typing import Final
 
@@ -25,9 +27,8 @@ _SCORED: Final = """
 SELECT d.contact_id, d.operator, d.verdict, d.shown_s, d.decided_utc_s, d.bytes_received, c.name, t.is_mine_like,
     t.label, MIN(d.seq)
 FROM truth t JOIN decision d ON d.contact_id = t.contact_id JOIN contact c ON c.id = d.contact_id
-LEFT JOIN decision u ON u.undoes = d.decision_id
-WHERE d.undoes IS NULL AND d.decided_utc_s <= ? AND d.decided_utc_s <= COALESCE(t.revealed_utc_s, d.decided_utc_s)
-    AND (u.decision_id IS NULL OR u.decided_utc_s - d.decided_utc_s > ?)
+WHERE d.undoes IS NULL AND NOT d.undone AND d.decided_utc_s <= ?
+    AND d.decided_utc_s <= COALESCE(t.revealed_utc_s, d.decided_utc_s)
 GROUP BY d.contact_id, d.operator ORDER BY d.decided_utc_s DESC
 """
 
@@ -57,24 +58,21 @@ def add_truth(db: sqlite3.Connection, contact_id: str, truth: Truth, now_utc_s: 
             isolate_look(db, contact_id)
 
 
-def is_sealed(db: sqlite3.Connection, contact_id: str) -> bool:
-    """Return whether a contact was added by the calibrated watch."""
-    row = db.execute("SELECT sealed FROM truth WHERE contact_id = ?", (contact_id,)).fetchone()
-    return row is not None and bool(row["sealed"])
+def withhold_sealed(db: sqlite3.Connection) -> None:
+    """Mark the released decisions and the requests about sealed contacts as sent: none of them is ever queued."""
+    unsent = "sent = 0 AND contact_id IN (SELECT contact_id FROM truth WHERE sealed)"
+    db.execute(
+        "UPDATE decision SET sent = 1, shore = iif(shore = 'waiting', 'none', shore),"  # noqa: S608  constants only
+        f" vehicle = iif(vehicle = 'waiting', 'none', vehicle) WHERE send_after_utc_s IS NULL AND {unsent}"
+    )
+    db.execute(f"UPDATE request SET sent = 1 WHERE {unsent}")  # noqa: S608  constants only
 
 
-def truth_json(db: sqlite3.Connection, contact_id: str, now_utc_s: float, take_back_s: float) -> Json | None:
+def truth_json(db: sqlite3.Connection, contact_id: str) -> Json | None:
     """Return the object of a contact; None before a decision that can no longer be taken back."""
-    row = db.execute("SELECT * FROM truth WHERE contact_id = ?", (contact_id,)).fetchone()
+    sql = "SELECT * FROM truth WHERE contact_id = ? AND revealed_utc_s IS NOT NULL"
+    row = db.execute(sql, (contact_id,)).fetchone()
     if row is None:
-        return None
-    decided = db.execute(
-        "SELECT MIN(d.decided_utc_s) FROM decision d LEFT JOIN decision u ON u.undoes = d.decision_id"
-        " WHERE d.contact_id = ? AND d.undoes IS NULL"
-        " AND (u.decision_id IS NULL OR u.decided_utc_s - d.decided_utc_s > ?)",
-        (contact_id, take_back_s),
-    ).fetchone()[0]
-    if decided is None or now_utc_s < decided + take_back_s:
         return None
     return {"is_mine_like": bool(row["is_mine_like"]), "label": row["label"], "sealed": bool(row["sealed"])}
 
@@ -85,18 +83,19 @@ def has_unrevealed(db: sqlite3.Connection) -> bool:
     return db.execute(sql).fetchone() is not None
 
 
-def newly_revealed(db: sqlite3.Connection, now_utc_s: float, take_back_s: float) -> list[Json]:
-    """Mark the objects that may be shown since the last call; return them with the decision."""
+def reveal(db: sqlite3.Connection, now_utc_s: float, take_back_s: float) -> None:
+    """Mark the objects that may be shown since the last call."""
     sql = f"SELECT * FROM ({_SCORED}) WHERE contact_id IN (SELECT contact_id FROM truth WHERE revealed_utc_s IS NULL)"  # noqa: S608
-    rows = db.execute(sql, (now_utc_s - take_back_s, take_back_s)).fetchall()
+    rows = db.execute(sql, (now_utc_s - take_back_s,)).fetchall()
     reveals = [(now_utc_s, row["contact_id"]) for row in rows]
     db.executemany("UPDATE truth SET revealed_utc_s = ? WHERE contact_id = ? AND revealed_utc_s IS NULL", reveals)
     db.executemany("UPDATE contact SET sealed = 2 WHERE sealed = 1 AND id = ?", [(row["contact_id"],) for row in rows])
-    return [_decided_json(row) for row in rows]
 
 
 def score_sheet(db: sqlite3.Connection, operator: str | None, now_utc_s: float, take_back_s: float) -> Json:
-    """Return the scores of all operators, or of one.
+    """Return the scores of all operators, or of one, and the decisions of all operators on all contacts.
+
+    A withdrawn decision does not count.
 
     Args:
         db: Connection for reading.
@@ -104,7 +103,7 @@ def score_sheet(db: sqlite3.Connection, operator: str | None, now_utc_s: float, 
         now_utc_s: Current time.
         take_back_s: Time in which an operator can take a decision back.
     """
-    rows = db.execute(_SCORED, (now_utc_s - take_back_s, take_back_s)).fetchall()
+    rows = db.execute(_SCORED, (now_utc_s - take_back_s,)).fetchall()
     if operator is not None:
         rows = [row for row in rows if row["operator"] == operator]
     operators: list[Json] = []
@@ -114,7 +113,39 @@ def score_sheet(db: sqlite3.Connection, operator: str | None, now_utc_s: float, 
             {"above_bytes": low, "up_to_bytes": high, **asdict(one)} for low, high, one in score_by_bytes(decisions)
         ]
         operators.append({"operator": name, **asdict(score(decisions)), "by_bytes": groups})
-    return {"operators": operators, "decisions": [_decided_json(row) for row in rows[:MAX_LISTED]]}
+    return {
+        "operators": operators,
+        "decisions": [_decided_json(row) for row in rows[:MAX_LISTED]],
+        "watch": _decisions_by_operator(db),
+    }
+
+
+def _decisions_by_operator(db: sqlite3.Connection) -> list[Json]:
+    """Return the contacts of each operator by latest verdict, and the median time from arrival to first verdict."""
+    rows = db.execute(
+        "SELECT d.operator, d.verdict, d.contact_id, d.decided_utc_s, d.decided_utc_s - c.arrived_utc_s AS delay_s"
+        " FROM decision d JOIN contact c ON c.id = d.contact_id WHERE d.undoes IS NULL AND NOT d.undone ORDER BY d.seq"
+    )
+    latest: dict[str, dict[str, str]] = defaultdict(dict)  # operator, contact: verdict
+    delays: defaultdict[str, list[float]] = defaultdict(list)
+    newest_utc_s: dict[str, float] = {}
+    decided: set[str] = set()
+    for row in rows:
+        operator = row["operator"]
+        latest[operator][row["contact_id"]] = row["verdict"]
+        newest_utc_s[operator] = row["decided_utc_s"]
+        if row["contact_id"] not in decided:
+            decided.add(row["contact_id"])
+            delays[operator].append(max(0.0, row["delay_s"]))
+    return [
+        {
+            "operator": operator,
+            "verdicts": dict(Counter(of_contacts.values())),
+            "median_s": round(statistics.median(delays[operator]), 1) if delays[operator] else None,
+            "time_utc_s": newest_utc_s[operator],
+        }
+        for operator, of_contacts in sorted(latest.items())
+    ]
 
 
 def _scored(row: sqlite3.Row) -> ScoredDecision:

@@ -15,15 +15,25 @@ from pathlib import Path
 from typing import Literal
 
 from sonarpost.errors import BadInputError
+from sonarpost.limits import limit
 from sonarpost.services.console.store.database import ROLES, Role, SqliteFile
 
 FILE_NAME = "console-users.db"
+SCHEMA_VERSION = 1
 SCRYPT_COST, SCRYPT_PARALLEL = 2**15, 3
 """Parameters n and p of scrypt with r = 8: 32 MiB for each check, and three times the time of p = 1. This is one of the
 minimum settings of OWASP's password storage cheat sheet. Checks run one at a time."""
 SCRYPT_MAX_BYTES = 2**26
 MIN_PASSWORD, MAX_PASSWORD = 10, 200
-MAX_SESSIONS_OF_USER = 10
+MAX_SESSIONS_OF_USER = limit(
+    10,
+    "sessions",
+    "shares",
+    surface="log-in of the console",
+    source="user",
+    resource="sessions",
+    at_limit="the least recently used session ends",
+)
 MAX_DEVICES_OF_USER = 20
 DEVICE_S = 90 * 86400.0
 """A browser is known for this time after its last log-in."""
@@ -39,7 +49,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}")
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS user (
     name TEXT PRIMARY KEY, role TEXT NOT NULL, salt BLOB NOT NULL, hash BLOB NOT NULL, cost INTEGER NOT NULL,
-    changed_utc_s REAL NOT NULL) WITHOUT ROWID;
+    parallel INTEGER NOT NULL, changed_utc_s REAL NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS session (
     token_sha256 BLOB PRIMARY KEY, name TEXT NOT NULL, csrf TEXT NOT NULL, begun_utc_s REAL NOT NULL,
     used_utc_s REAL NOT NULL) WITHOUT ROWID;
@@ -52,8 +62,6 @@ CREATE TABLE IF NOT EXISTS link (
 CREATE TABLE IF NOT EXISTS setting (
     user TEXT NOT NULL, name TEXT NOT NULL, value TEXT NOT NULL, PRIMARY KEY (user, name)) WITHOUT ROWID;
 """
-_PARALLEL_COLUMN = "ALTER TABLE user ADD COLUMN parallel INTEGER NOT NULL DEFAULT 1"
-"""Hashes of version 0.2.0 and before have p = 1; they are replaced at the next log-in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,14 +80,14 @@ class Session:
     Attributes:
         token: Value of the browser's cookie. Only its hash is stored.
         csrf: Token that the page sends with each POST request.
-        expires_utc_s: Time at which an unused session ends.
+        begun_utc_s: Time of the log-in.
     """
 
     token: str
     name: str
     role: Role
     csrf: str
-    expires_utc_s: float
+    begun_utc_s: float
 
 
 class Users(SqliteFile):
@@ -92,7 +100,7 @@ class Users(SqliteFile):
         clock: UTC seconds.
 
     Raises:
-        DeliveryError: The file cannot be opened.
+        DeliveryError: The file cannot be opened, or has another schema version.
     """
 
     def __init__(
@@ -102,14 +110,11 @@ class Users(SqliteFile):
         session_max_s: float = 24 * 3600.0,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        super().__init__(path, _SCHEMA)
+        super().__init__(path, _SCHEMA, SCHEMA_VERSION)
         self._session_s = session_s
         self._session_max_s = session_max_s
         self._clock = clock
         self._hash_lock = threading.Lock()
-        with self.transaction() as db:
-            if "parallel" not in {row["name"] for row in db.execute("PRAGMA table_info(user)")}:
-                db.execute(_PARALLEL_COLUMN)
 
     # Users
 
@@ -318,9 +323,7 @@ class Users(SqliteFile):
         if is_use and now - row["used_utc_s"] > min(60.0, self._session_s / 10):
             with self.transaction() as db:
                 db.execute("UPDATE session SET used_utc_s = ? WHERE token_sha256 = ?", (now, _token_hash(token)))
-        used_utc_s = now if is_use else row["used_utc_s"]
-        expires_utc_s = min(used_utc_s + self._session_s, row["begun_utc_s"] + self._session_max_s)
-        return Session(token, row["name"], row["role"], row["csrf"], expires_utc_s)
+        return Session(token, row["name"], row["role"], row["csrf"], row["begun_utc_s"])
 
     def end_session(self, token: str) -> None:
         """End a session."""

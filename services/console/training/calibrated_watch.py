@@ -22,9 +22,11 @@ from sonarpost.export.contacts import contact_uid
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.logs import kv
 from sonarpost.messages import Contact, ReconstructedImage
+from sonarpost.review.objects import Look, looks_within_gate
 from sonarpost.review.positions import destination, vehicle_position
 from sonarpost.services.console.known_objects import KnownObjects, SealedRequest
 from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.store.association import looks_near
 from sonarpost.services.console.store.truth import Truth
 from sonarpost.services.console.training import sealed_images
 from sonarpost.sonar.survey import Side
@@ -35,6 +37,7 @@ DELAY_S: Final = (20.0, 180.0)
 """Shortest and longest time between a contact of a vehicle and the sealed contact that imitates it."""
 DISTANCE_M: Final = (40.0, 150.0)
 """Shortest and longest distance between both, so that they do not form one object."""
+POSITION_DRAWS: Final = 10
 MAX_WAITING: Final = 50
 IMAGE_ID_STEPS: Final = (5, 400)
 STEP_S: Final = 1.0
@@ -96,8 +99,9 @@ class CalibratedWatch:
         while not self._stop.wait(STEP_S):
             try:
                 self.step(time.monotonic())
-            except SonarpostError as error:
-                log.error("Sealed contact not added", extra=kv(reason=str(error)))
+            except Exception as error:
+                is_defect = not isinstance(error, SonarpostError)
+                log.error("Sealed contact not added", exc_info=is_defect, extra=kv(reason=str(error)))
 
     def step(self, now_s: float) -> None:
         """Add the sealed contacts that are due, and answer requests; `now_s` is monotonic."""
@@ -119,6 +123,9 @@ class CalibratedWatch:
             log.info("No sealed contact: the detector finds no object in the simulated survey")
             return
         position = self._position(contact, known)
+        if position is None:
+            log.info("No sealed contact: there are other contacts at the place")
+            return
         image_id = format_image_id(int(reference.image_id, 36) + self._draws.randint(*IMAGE_ID_STEPS))
         record = sealed_images.sealed_record(known, reference, image_id, position, self._state.clock())
         truth = Truth(known.target.is_mine_like, known.target.kind.value.replace("_", " "), sealed=True)
@@ -126,7 +133,19 @@ class CalibratedWatch:
             self._snippets[contact_uid(record)] = known.snippet
             self._count()
 
-    def _position(self, contact: Contact, known: sealed_images.KnownObject) -> tuple[float, float]:
+    def _position(self, contact: Contact, known: sealed_images.KnownObject) -> tuple[float, float] | None:
+        """Return a position at which there is no look; None without one. A sealed contact is no look at its object."""
+        rule = self._state.rule
+        for _ in range(POSITION_DRAWS):
+            position = self._draw_position(contact, known)
+            look = Look("", *position, contact.position_sigma_m)
+            with self._state.database.read() as db:
+                near = looks_near(db, look, rule.search_m)
+            if not looks_within_gate(look, near, rule):
+                return position
+        return None
+
+    def _draw_position(self, contact: Contact, known: sealed_images.KnownObject) -> tuple[float, float]:
         """Return a position on the line of the vehicle, some distance before or after a contact."""
         along_m = self._draws.choice((-1, 1)) * self._draws.uniform(*DISTANCE_M)
         lat, lon = contact.lat_deg, contact.lon_deg

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import random
+import sqlite3
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from sonarpost import keys, wire
 from sonarpost.codec.region import RegionBox
+from sonarpost.errors import ConfigError
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.messages import (
     AcousticFrame,
@@ -27,7 +29,7 @@ from sonarpost.messages import (
 from sonarpost.modem.registry import modem_driver
 from sonarpost.review.costs import NEW_IMAGE_KINDS
 from sonarpost.services.console.chain import RouterState
-from sonarpost.services.console.fleet import DETECTOR, frame_event
+from sonarpost.services.console.fleet import DETECTOR
 from sonarpost.services.console.known_objects import KnownObjects
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.truth import Truth
@@ -83,6 +85,8 @@ class TrainingSimulator:
         self._known = KnownObjects(state)
         self._max_contacts = contacts
         self._interval_s = interval_s
+        self._seed = seed
+        self._shift_s = 0.0
         self._random = random.Random(seed)  # noqa: S311  not used for secrets
         self._source: Iterator[SimulatedContact] = simulated_contacts(seed, time.time() - 3600.0)
         self._contacts = 0
@@ -98,23 +102,76 @@ class TrainingSimulator:
         self._thread = threading.Thread(target=self._run, name="training", daemon=True)
 
     def load_backlog(self, contacts: int) -> None:
-        """Store contacts that arrived before the start."""
+        """Continue the training in the database, and store contacts that arrived before the start.
+
+        Raises:
+            ConfigError: The database holds a training with another seed.
+        """
+        with self._state.database.read() as db:
+            rows = db.execute("SELECT * FROM contact WHERE vessel_id = ?", (VESSEL,)).fetchall()
+        stored = {str(row["image_id"]): row for row in rows}
+        while format_image_id(-self._requested_images - 1) in stored:
+            self._requested_images += 1
+        arrived = len(stored) - self._requested_images
         start_utc_s = time.time() - 30.0 * contacts
         records: list[ReconstructedImage] = []
         truths: dict[str, Truth] = {}
-        for number in range(contacts):
-            contact = next(self._source)
-            self._contacts += 1
-            first = start_utc_s + 30.0 * number
-            versions = range(len(contact.versions))
-            self._add_to_cache(_Transfer(contact, first, len(versions)))
-            records += [contact.record(VESSEL, version, first, first + 6.0 * version) for version in versions]
-            truths[contact.image_id] = contact.truth
-            if len(records) >= BACKLOG_BATCH or number == contacts - 1 or self._stop.is_set():
+        for number in range(max(contacts, arrived)):
+            contact = self._next_contact(stored.get(format_image_id(0)))
+            if contact.image_id in stored:
+                self._resume_contact(contact, stored[contact.image_id])
+            else:
+                first = start_utc_s + 30.0 * number
+                versions = range(len(contact.versions))
+                self._add_to_cache(_Transfer(contact, first, len(versions)))
+                records += [contact.record(VESSEL, version, first, first + 6.0 * version) for version in versions]
+                truths[contact.image_id] = contact.truth
+            if len(records) >= BACKLOG_BATCH or number >= contacts - 1 or self._stop.is_set():
                 self._state.store_images(records, truths)
                 records.clear()
             if self._stop.is_set():
                 return
+        self._resume_downlink(time.time())
+
+    def _next_contact(self, first: sqlite3.Row | None) -> SimulatedContact:
+        """Return the next contact of the survey, with the time of the survey in the database.
+
+        Args:
+            first: The first contact of the survey in the database; None in a new training.
+        """
+        simulated = next(self._source)
+        contact = simulated.contact
+        if first is not None and self._contacts == 0:
+            if (first["lat_deg"], first["lon_deg"]) != (contact.lat_deg, contact.lon_deg):
+                raise ConfigError("console", "--seed", self._seed, "the seed of the training in the folder of --state")
+            self._shift_s = first["seen_utc_s"] - (contact.time_utc_s or 0.0)
+        self._contacts += 1
+        shifted = None if contact.time_utc_s is None else contact.time_utc_s + self._shift_s
+        return replace(simulated, contact=contact.model_copy(update={"time_utc_s": shifted}))
+
+    def _resume_contact(self, contact: SimulatedContact, row: sqlite3.Row) -> None:
+        """Continue a stored contact: the vehicle has sent some versions of its image, or more than planned."""
+        while len(contact.versions) < row["version"]:
+            contact = contact.with_next_version(refine=True)
+        transfer = _Transfer(contact, row["first_frame_utc_s"], row["version"])
+        if row["version"] == len(contact.versions):
+            self._add_to_cache(transfer)
+        elif row["review"] in ("unreviewed", "unsure"):
+            self._transfers.append(transfer)
+        else:
+            self._stopped[contact.image_id] = transfer
+
+    def _resume_downlink(self, now_utc_s: float) -> None:
+        """Continue the delivery of decisions, and of commands without an answer."""
+        with self._state.database.read() as db:
+            decisions = db.execute("SELECT payload FROM decision WHERE vehicle IN ('asked', 'sent')").fetchall()
+            commands = db.execute(
+                "SELECT payload FROM request WHERE state IN ('asked', 'sent', 'confirmed') AND arrived_utc_s IS NULL"
+            ).fetchall()
+        for row in decisions:
+            self._send(wire.decode(Decision, bytes(row["payload"]), "decision"), now_utc_s)
+        for row in commands:
+            self._send(wire.decode(Command, bytes(row["payload"]), "request"), now_utc_s)
 
     def start(self) -> None:
         """Start the simulation thread."""
@@ -152,8 +209,7 @@ class TrainingSimulator:
     def receive_packet(self, now_utc_s: float) -> None:
         """Simulate one packet of a vehicle and the image version that follows from it."""
         if self._contacts < self._max_contacts and len(self._transfers) < 3:
-            self._transfers.append(_Transfer(next(self._source), now_utc_s))
-            self._contacts += 1
+            self._transfers.append(_Transfer(self._next_contact(None), now_utc_s))
         self._packet += 1
         transfer = self._transfers[self._packet % len(self._transfers)] if self._transfers else None
         self._receive_frame(
@@ -229,7 +285,7 @@ class TrainingSimulator:
         confidence = record.contact.atd_confidence if record.contact else None
         is_likely = confidence is not None and confidence > 1.1
         return Advice(
-            advice_id=f"training-{self._packet}",
+            advice_id=f"training-{record.image_id}-{record.version}",
             vessel_id=VESSEL,
             vehicle_id=record.vehicle_id,
             image_id=record.image_id,
@@ -266,7 +322,6 @@ class TrainingSimulator:
             quality=quality,
         )
         self._state.fleet.add_frame(vehicle, frame)
-        self._state.events.publish("frame", frame_event(vehicle, frame))
 
     def _update_queues(self, now_utc_s: float) -> None:
         for vehicle in VEHICLES:
@@ -324,8 +379,11 @@ class TrainingSimulator:
                 self._state.apply_acknowledgement(item.table, item.record_id, "relay", None)
             if isinstance(item.record, (Decision, Command)) and item.to_vehicle:
                 self._state.apply_acknowledgement(item.table, item.record_id, "op_modem", None)
-                steps: list[tuple[float, DownlinkStep]] = [(now_utc_s + 4.0, "sent"), (now_utc_s + 10.0, "confirmed")]
-                self._downlink.append(_DownlinkRecord(item.record, steps))
+                self._send(item.record, now_utc_s)
+
+    def _send(self, record: Decision | Command, now_utc_s: float) -> None:
+        steps: list[tuple[float, DownlinkStep]] = [(now_utc_s + 4.0, "sent"), (now_utc_s + 10.0, "confirmed")]
+        self._downlink.append(_DownlinkRecord(record, steps))
 
     def advance_downlink(self, now_utc_s: float) -> None:
         """Apply all delivery steps up to now, and execute delivered commands."""

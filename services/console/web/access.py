@@ -2,33 +2,39 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Final, TypeVar
+from typing import Final, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from starlette.concurrency import run_in_threadpool
-from starlette.requests import Request
+from starlette.convertors import IntegerConvertor, register_url_convertor
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from sonarpost.errors import BadInputError, DeliveryError
-from sonarpost.logs import kv
+from sonarpost.limits import limit
+from sonarpost.logs import IntervalLog
+from sonarpost.network.connections import TrustedProxies
 from sonarpost.review.measurement import NotMeasurableError
 from sonarpost.services.console.store.contacts import NotFoundError
 from sonarpost.services.console.store.database import Actor, Permission, Side
 from sonarpost.services.console.store.decisions import ConflictError
-from sonarpost.services.console.store.serialisers import Json
 from sonarpost.services.console.store.users import Session, Users, is_equal_secret
-from sonarpost.services.console.web.connections import TrustedProxies
+from sonarpost.services.console.web.shares import ThreadShares, TooManyRequestsError
 from sonarpost.wire import first_error
 
 log = logging.getLogger(__name__)
 
 COOKIE: Final = "sonarpost_session"
-MAX_BODY_BYTES: Final = 65536
+"""Begin of the name of a session's cookie; see `cookie_name`."""
+MAX_BODY_BYTES: Final = limit(
+    65536, "bytes", "claims", surface="HTTP interface of the console", source="client", resource="body", at_limit="413"
+)
 SECURITY_HEADERS: Final[Mapping[str, str]] = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
     "connect-src 'self'; font-src 'self'; "
@@ -41,13 +47,44 @@ SECURITY_HEADERS: Final[Mapping[str, str]] = {
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
 }
 _LOCAL_NAMES: Final = ("127.0.0.1", "localhost", "[::1]")
+RETRY_S: Final = 2
+_failed_log: Final = IntervalLog(log, logging.ERROR, "Request failed")
+
+
+ErrorCode = Literal[
+    "bad_host",
+    "bad_origin",
+    "bad_request",
+    "busy",
+    "cancelled",
+    "conflict",
+    "csrf",
+    "defect",
+    "forbidden",
+    "link_expired",
+    "link_unknown",
+    "link_used",
+    "no_session",
+    "not_found",
+    "not_measurable",
+    "not_now",
+    "too_large",
+    "too_many",
+    "wrong_login",
+]
+"""Codes of error responses. The page has a text for each in its languages, `error.CODE` or `error.CODE.FIELD`."""
 
 
 class ApiError(Exception):
     """An error response of the HTTP interface; docs/specifications/console-api.md lists the codes."""
 
     def __init__(
-        self, status: int, code: str, message: str, field: str | None = None, headers: Mapping[str, str] | None = None
+        self,
+        status: int,
+        code: ErrorCode,
+        message: str,
+        field: str | None = None,
+        headers: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(message)
         self.status = status
@@ -62,6 +99,8 @@ class RequestBody(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
 
+A = TypeVar("A")
+R = TypeVar("R")
 B = TypeVar("B", bound=RequestBody)
 M = TypeVar("M", bound=BaseModel)
 
@@ -80,6 +119,10 @@ class Call:
         """The user; only for requests that need a session."""
         assert self.session is not None
         return Actor(self.session.name, self.session.role, self.address)
+
+    def cookie_name(self, name: str) -> str:
+        """Return the name of a cookie of this console."""
+        return cookie_name(name, self.request.headers.get("host", ""))
 
     def parse_body(self, model: type[B]) -> B:
         """Return the validated body; raise ApiError with the name of an invalid field."""
@@ -119,10 +162,11 @@ class AccessControl:
         self._users = users
         self._side = side
         self._proxies = TrustedProxies() if proxies is None else proxies
+        self._shares = ThreadShares()
 
     def session_of(self, request: Request, *, is_use: bool = True) -> Session | None:
         """Return the session of a request; None if it has none. See `Users.find_session`."""
-        token = request.cookies.get(COOKIE, "")
+        token = request.cookies.get(cookie_name(COOKIE, request.headers.get("host", "")), "")
         if self._users is None or not 0 < len(token) < 200:
             return None
         return self._users.find_session(token, is_use=is_use)
@@ -135,7 +179,7 @@ class AccessControl:
     def endpoint(
         self, handler: Handler, *, permission: Permission | None = None, needs_session: bool = True
     ) -> Endpoint:
-        """Return an endpoint that checks a request, and calls the handler in a thread.
+        """Return an endpoint that checks a request, and calls the handler in a thread of the user's share.
 
         Args:
             handler: Handler of the request; it may block.
@@ -143,16 +187,20 @@ class AccessControl:
             needs_session: Whether the user must be logged in.
         """
 
-        def call(request: Request, body: bytes) -> Response:
-            session = self.session_of(request)
-            if needs_session:
-                self._check(request, session, permission)
-            return handler(Call(request, body, session, self.address_of(request)))
-
         async def serve(request: Request) -> Response:
             try:
                 body = await _read_body(request) if request.method == "POST" else b""
-                return await run_in_threadpool(_with_error_responses, call, request, body)
+                session = await asyncio.to_thread(_with_error_responses, self.session_of, request)
+                if needs_session:
+                    self._check(request, session, permission)
+                call = Call(request, body, session, self.address_of(request))
+                if session is None:  # `LoginLimiter` limits the log-ins
+                    return await run_in_threadpool(_with_error_responses, handler, call)
+                return await self._shares.run(session.name, _with_error_responses, handler, call)
+            except TooManyRequestsError:
+                headers = {"Retry-After": str(RETRY_S)}
+                message = f"too many requests at a time: try again in {RETRY_S} s"
+                return error_response(ApiError(429, "too_many", message, headers=headers))
             except ApiError as error:
                 return error_response(error)
 
@@ -168,28 +216,30 @@ class AccessControl:
             raise ApiError(403, "forbidden", f"the role {session.role} may not {permission} on this {site}")
 
 
-def _with_error_responses(call: Callable[[Request, bytes], Response], request: Request, body: bytes) -> Response:
-    """Call a handler, and convert its exceptions to error responses."""
+def _with_error_responses(function: Callable[[A], R], argument: A) -> R:
+    """Call a function, and convert its exceptions to error responses."""
     try:
-        return call(request, body)
-    except ApiError:
-        raise
+        return function(argument)
     except ConflictError as error:
-        conflict: Json = {"contact": error.contact, "decision": error.decision}
-        return JSONResponse({**_error_json("conflict", str(error), None), **conflict}, 409)
+        raise ApiError(409, "conflict", str(error)) from error
     except NotMeasurableError as error:
-        extra: Json = {"measurable": False, "reason": str(error)}
-        return JSONResponse({**_error_json("not_measurable", str(error), error.field), **extra}, 409)
+        raise ApiError(409, "not_measurable", str(error), error.field) from error
     except NotFoundError as error:
         raise ApiError(404, "not_found", str(error), error.field) from error
     except BadInputError as error:
         raise ApiError(400, "bad_request", str(error), error.field) from error
     except (DeliveryError, OSError) as error:
-        log.error("Request failed", extra=kv(path=request.url.path, reason=str(error)))
+        _failed_log.log(reason=str(error))
         raise ApiError(503, "not_now", "the console cannot read or write its disk at present") from error
-    except Exception as error:
-        log.exception("Unhandled exception in a request", extra=kv(path=request.url.path))
-        raise ApiError(500, "defect", "internal error: see the log of the console") from error
+
+
+def cookie_name(name: str, host: str) -> str:
+    """Return the name of a cookie of the console at `host`, the value of the header Host: with its port.
+
+    Browsers send a cookie to all ports of a host, so that two consoles on one host need two names.
+    """
+    port = host.removeprefix(_without_port(host)).removeprefix(":")
+    return f"{name}_{port}" if port.isdecimal() else name
 
 
 async def _read_body(request: Request) -> bytes:
@@ -201,13 +251,10 @@ async def _read_body(request: Request) -> bytes:
     return bytes(body)
 
 
-def _error_json(code: str, message: str, field: str | None) -> Json:
-    return {"error": {"code": code, "message": message, "field": field}}
-
-
 def error_response(error: ApiError) -> Response:
     """Return the response of an error."""
-    return JSONResponse(_error_json(error.code, str(error), error.field), error.status, error.headers)
+    body = {"error": {"code": error.code, "message": str(error), "field": error.field}}
+    return JSONResponse(body, error.status, error.headers)
 
 
 class SecurityMiddleware:
@@ -227,6 +274,7 @@ class SecurityMiddleware:
         self._headers = [(name.lower().encode(), value.encode()) for name, value in SECURITY_HEADERS.items()]
         if tls:
             self._headers.append((b"strict-transport-security", b"max-age=31536000"))
+        self._defects = IntervalLog(log, logging.ERROR, "Unhandled exception in a request")
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
@@ -243,7 +291,12 @@ class SecurityMiddleware:
             await send(message)
 
         error = self._check(Request(scope))
-        await (self._app if error is None else error_response(error))(scope, receive, send_with_headers)
+        try:
+            await (self._app if error is None else error_response(error))(scope, receive, send_with_headers)
+        except ClientDisconnect:
+            pass
+        except Exception as defect:  # noqa: BLE001  has its response; the server would log each traceback
+            self._defects.log(defect, path=scope["path"][:100])
 
     def _check(self, request: Request) -> ApiError | None:
         host = request.headers.get("host", "").lower()
@@ -253,6 +306,15 @@ class SecurityMiddleware:
         if request.method != "GET" and origin is not None and origin.lower().partition("://")[2] != host:
             return ApiError(403, "bad_origin", "the request comes from a page of another site")
         return None
+
+
+class NumberConvertor(IntegerConvertor):
+    """A number in a path, `{name:number}`. Longer ones than any number of the console match no route."""
+
+    regex = "[0-9]{1,9}"
+
+
+register_url_convertor("number", NumberConvertor())
 
 
 def _without_port(host: str) -> str:

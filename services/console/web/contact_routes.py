@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field
+import numpy.typing as npt
+from pydantic import Field
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
@@ -17,23 +18,22 @@ from sonarpost.messages import (
     BoxEnd,
     BoxStart,
     CommandKind,
-    QueuePlace,
     ReconstructedImage,
     Verdict,
 )
 from sonarpost.review import rendering, true_scale
 from sonarpost.review.measurement import Line, MeasurementKind
-from sonarpost.review.rendering import LAYERS, MAPS
 from sonarpost.services.console.state import ConsoleState
-from sonarpost.services.console.store.contacts import ContactFilter, NotFoundError
+from sonarpost.services.console.store.contacts import ContactFilter
 from sonarpost.services.console.store.database import Permission
-from sonarpost.services.console.web.access import AccessControl, ApiError, Call, RequestBody
+from sonarpost.services.console.store.related_images import Relation
+from sonarpost.services.console.web.access import AccessControl, Call, RequestBody
 
 MAX_REGION_BYTES = 512
 """Longest stream of a region: what a vehicle sends of an image without a further command by default."""
 
 Version = Annotated[int, Field(ge=1, le=2**31)]
-Layer = Annotated[str, Field(max_length=20)]
+Layer = Literal["raw", Relation]
 _Point = tuple[Annotated[float, Field(ge=0, le=4096)], Annotated[float, Field(ge=0, le=4096)]]
 
 
@@ -61,20 +61,6 @@ class _RequestBody(RequestBody):
     airtime_s: Annotated[float, Field(ge=0, le=1e6)] | None = None
     box: tuple[BoxStart, BoxStart, BoxEnd, BoxEnd] | None = None
     stream_bytes: Annotated[int, Field(ge=MIN_REGION_BYTES, le=MAX_REGION_BYTES)] | None = None
-    place: QueuePlace | None = None
-
-
-class _ImageQuery(BaseModel):
-    layer: Literal["raw", "enhanced", "grain"] = "raw"
-    map: Annotated[str, Field(pattern=f"^({'|'.join(MAPS)})$")] = "grey"
-    low: Annotated[float, Field(ge=0, le=99)] = 0
-    high: Annotated[float, Field(ge=1, le=100)] = 100
-    gamma: Annotated[float, Field(ge=0.2, le=5)] = 1
-
-
-class _MaskQuery(BaseModel):
-    layer: Literal["raw", "enhanced"] = "raw"
-    kind: Literal["missing", "guessed"] = "missing"
 
 
 class ContactRoutes:
@@ -86,7 +72,7 @@ class ContactRoutes:
     def routes(self, access: AccessControl) -> list[Route]:
         """Return the routes."""
         contact = "/api/contacts/{id}"
-        version = contact + "/versions/{version:int}"
+        version = contact + "/versions/{version:number}"
         read, state = access.endpoint, self._state
 
         def write(path: str, handler: Callable[[Call], Response], permission: Permission) -> Route:
@@ -97,62 +83,34 @@ class ContactRoutes:
                 "/api/contacts", read(lambda call: JSONResponse(state.list_contacts(call.parse_query(ContactFilter))))
             ),
             Route(contact, read(lambda call: JSONResponse(state.contact_detail(contact_id(call))))),
-            Route(contact + "/costs", read(self._costs)),
             Route(version + "/picture.png", read(self._image)),
             Route(version + "/mask.png", read(self._mask)),
             Route(version + "/thumbnail.png", read(self._thumbnail)),
             write(contact + "/measure", self._measure, "measure"),
-            write(contact + "/measure/{measurement:int}/withdraw", self._withdraw_measurement, "measure"),
+            write(contact + "/measure/{measurement:number}/withdraw", self._withdraw_measurement, "measure"),
             write(contact + "/requests", self._add_request, "request"),
             write(contact + "/advice", self._add_advice, "advise"),
         ]
 
-    def _costs(self, call: Call) -> Response:
-        return JSONResponse({"costs": self._state.request_costs(contact_id(call))})
-
     # Images
 
     def _image(self, call: Call) -> Response:
-        query = call.parse_query(_ImageQuery)
-        if query.low >= query.high:
-            raise ApiError(400, "bad_request", "less than high", "low")
-
-        def draw(image: ReconstructedImage) -> bytes:
-            grey = rendering.eight_bits(image.picture.to_array())
-            if query.layer == "enhanced":
-                grey = rendering.enhance(grey, image.missing())
-            return rendering.encode_png(rendering.render(grey, query.map, query.low, query.high, query.gamma))
-
-        if query.layer == "grain":
-            raise NotFoundError("image", "layer", query.layer, "a layer of this version")
-        measurable = next(known.measurable for known in LAYERS if known.name == query.layer)
-        response = self._png_response(call, draw)
-        response.headers["X-Measurable"] = "true" if measurable else "false"
-        return response
+        return self._png_response(call, lambda image: rendering.eight_bits(image.picture.to_array()))
 
     def _mask(self, call: Call) -> Response:
-        query = call.parse_query(_MaskQuery)
-
-        def draw(image: ReconstructedImage) -> bytes:
-            mask = image.missing()
-            if query.kind == "guessed":
-                # Enhancement changes all received pixels. Missing pixels stay black.
-                mask = ~mask if query.layer != "raw" else np.zeros_like(mask)
-            return rendering.encode_png(np.where(mask, np.uint8(255), np.uint8(0)))
-
-        return self._png_response(call, draw)
+        return self._png_response(call, lambda image: np.where(image.missing(), np.uint8(255), np.uint8(0)))
 
     def _thumbnail(self, call: Call) -> Response:
-        def draw(image: ReconstructedImage) -> bytes:
+        def draw(image: ReconstructedImage) -> npt.NDArray[np.uint8]:
             grey = rendering.eight_bits(image.picture.to_array())
-            return rendering.encode_png(true_scale.thumbnail(grey, image.missing(), image.contact))
+            return true_scale.thumbnail(grey, image.missing(), image.contact)
 
         return self._png_response(call, draw)
 
-    def _png_response(self, call: Call, draw: Callable[[ReconstructedImage], bytes]) -> Response:
+    def _png_response(self, call: Call, draw: Callable[[ReconstructedImage], npt.NDArray[np.uint8]]) -> Response:
         image = self._state.image(contact_id(call), int(call.request.path_params["version"]))
         headers = {"Cache-Control": "private, max-age=86400, immutable", "X-Image-SHA256": image.picture_sha256}
-        return Response(draw(image), media_type="image/png", headers=headers)
+        return Response(rendering.encode_png(draw(image)), media_type="image/png", headers=headers)
 
     # Actions
 
@@ -168,7 +126,7 @@ class ContactRoutes:
 
     def _add_request(self, call: Call) -> Response:
         body = call.parse_body(_RequestBody)
-        arguments = body.model_dump(include={"box", "stream_bytes", "place"}, exclude_none=True)
+        arguments = body.model_dump(include={"box", "stream_bytes"}, exclude_none=True)
         found = self._state.add_request(contact_id(call), body.kind, body.airtime_s, call.actor, arguments)
         return JSONResponse(found, 201)
 

@@ -55,7 +55,7 @@ class DecisionRoutes:
             Route("/api/decisions/last", endpoint(self._last)),
             Route("/api/notices", endpoint(self._notices)),
             Route(
-                "/api/notices/{id:int}/acknowledge",
+                "/api/notices/{id:number}/acknowledge",
                 endpoint(self._acknowledge, permission="decide"),
                 methods=["POST"],
             ),

@@ -13,21 +13,31 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
+from sonarpost.limits import limit
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.web.access import AccessControl, ApiError, error_response
 
 KEEP_ALIVE_S = 5.0
-MAX_STREAMS_OF_USER = 8
-MAX_STREAMS = 100
+MAX_STREAMS_OF_USER = limit(
+    8,
+    "streams",
+    "shares",
+    surface="event stream",
+    source="user",
+    resource="of one user",
+    at_limit="429 with Retry-After",
+)
+MAX_STREAMS = limit(
+    100, "streams", "shares", surface="event stream", source="all users", resource="in total", at_limit="503"
+)
 RETRY_S = 10
 
 
 class EventStream:
     """Route of the event stream."""
 
-    def __init__(self, state: ConsoleState, *, training: bool) -> None:
+    def __init__(self, state: ConsoleState) -> None:
         self._state = state
-        self._training = training
         self._open: Counter[str] = Counter()
         self._stopped = False
 
@@ -41,7 +51,7 @@ class EventStream:
             headers = {"Retry-After": str(RETRY_S)}
             if self._open[session.name] >= MAX_STREAMS_OF_USER:
                 message = f"{session.name} has {MAX_STREAMS_OF_USER} open pages, no more are permitted: close one"
-                return error_response(ApiError(429, "too_many", message, headers=headers))
+                return error_response(ApiError(429, "too_many", message, "pages", headers))
             if self._open.total() >= MAX_STREAMS:
                 return error_response(ApiError(503, "busy", "too many open pages", headers=headers))
             last_id = request.headers.get("last-event-id") or request.query_params.get("last", "")
@@ -66,14 +76,14 @@ class EventStream:
         self._open[user] += 1
         try:
             number = hub.parse_event_id(last_id) if last_id else hub.last
-            hello = {"now_utc_s": self._state.clock(), "training": self._training}
-            yield _event_text("hello", json.dumps(hello), hub.event_id(hub.last if number is None else number))
+            hello = json.dumps({"now_utc_s": self._state.clock()})
+            yield _event_text("hello", hello, hub.event_id(hub.last if number is None else number))
             session_checked_s = clock_sent_s = time.monotonic()
             while not self._stopped:
                 if time.monotonic() - session_checked_s >= KEEP_ALIVE_S:
                     session_checked_s = time.monotonic()
                     if await asyncio.to_thread(access.session_of, request, is_use=False) is None:
-                        yield _event_text("session", json.dumps({"ends": "the session has ended"}), None)
+                        yield _event_text("session", "{}", None)
                         return
                 notified.clear()
                 events = None if number is None else hub.events_after(number)

@@ -1,66 +1,70 @@
-"""Routes of exports."""
+"""Routes of exports, and the documents that they and reports write: one of each user, in turn."""
 
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import shutil
 import tempfile
 import threading
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO, Final, Literal
 
+from anyio import from_thread
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from sonarpost.delivery.store import HANDLING_RESERVE_BYTES
-from sonarpost.export.contacts import ContactSet, ExportContact
-from sonarpost.export.cot import cot_events
-from sonarpost.export.kml import ContactImage, add_kmz
-from sonarpost.export.tables import csv_bytes, geojson_bytes
+from sonarpost.errors import BadInputError
+from sonarpost.export.contacts import ExportContact
+from sonarpost.export.formats import FORMATS, Format
+from sonarpost.export.source import ContactImage, ExportSource
+from sonarpost.limits import limit
+from sonarpost.logs import IntervalLog
 from sonarpost.review import rendering
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import ContactFilter, list_versions
-from sonarpost.services.console.store.exports import find_export_contact, picture_lines
-from sonarpost.services.console.store.measurements import list_measurements
+from sonarpost.services.console.store.database import Database
+from sonarpost.services.console.store.exports import StoredContact, find_stored_contact
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call
+from sonarpost.sonar.image_files import png_bytes
 
-MAX_CONTACTS: Final = 5000
-MAX_BYTES: Final = 268_435_456
-MAX_EXPORTS: Final = 4
-"""Exports at a time, of different users: one runs, the others wait or are downloaded."""
+SURFACE: Final = "exports and reports of the console"
+MAX_DOCUMENTS: Final = limit(
+    4, "documents", "shares", surface=SURFACE, source="all users", resource="in total", at_limit="503 with Retry-After"
+)
+limit(1, "document", "shares", surface=SURFACE, source="user", resource="of one user", at_limit="429 with Retry-After")
 RETRY_S: Final = 10
+TURN_S: Final = 1.0
+"""Interval at which a waiting document checks whether it is still wanted."""
+CONNECTION_INTERVAL: Final = 16
+"""Contacts between two checks of the connection, which take about as long as a contact."""
 CHUNK_BYTES: Final = 65536
-
-
-def _cot_bytes(contacts: ContactSet) -> bytes:
-    events = b"\n".join(cot_events(contacts, time.time()))
-    return b'<?xml version="1.0" encoding="UTF-8"?>\n<events>\n' + events + b"\n</events>\n"
-
-
-KMZ: Final = "contacts.kmz"
-_FORMATS: Final[Mapping[str, tuple[Callable[[ContactSet], bytes] | None, str]]] = {
-    "contacts.geojson": (geojson_bytes, "application/geo+json"),
-    "contacts.csv": (csv_bytes, "text/csv; charset=utf-8"),
-    KMZ: (None, "application/vnd.google-earth.kmz"),
-    "contacts.cot.xml": (_cot_bytes, "application/xml"),
+_skipped_log: Final = IntervalLog(logging.getLogger(__name__), logging.ERROR, "Contact left out of a document")
+NAMES: Final[Mapping[str, Format]] = {
+    f"contacts.{name}": FORMATS[name] for name in ("geojson", "kmz", "csv", "gpkg", "cot.xml")
 }
 
+Writer = Callable[[IO[bytes], "DocumentContacts"], None]
 
-@dataclass
+
+@dataclass(eq=False)
 class ExportProgress:
-    """Progress of one export.
+    """Progress of one export or report.
 
     Attributes:
         name: Name of the file.
-        state: Waiting for another export, writing the file, or sending it.
+        state: Waiting for its first turn, writing the file, or sending it.
         done: Contacts in the file.
         total: Contacts of the filter; None before they are counted.
         size_bytes: Size of the file.
         cancelled: Whether the user cancelled it.
+        is_disconnected: Returns whether the browser has closed the connection.
+        least_free_bytes: Free disk below which the export ends.
     """
 
     name: str
@@ -69,42 +73,65 @@ class ExportProgress:
     total: int | None = None
     size_bytes: int = 0
     cancelled: bool = False
+    is_disconnected: Callable[[], bool] = lambda: False
+    least_free_bytes: int = 0
 
 
 class _ExportQueue:
-    """Limits exports: one runs at a time, and each user has at most one."""
+    """Limits documents to one of each user. They are written in turn, one contact at a time."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._condition = threading.Condition()
         self._exports: dict[str, ExportProgress] = {}
-        self.worker = threading.Lock()
+        """Documents by user, in the order of their turns."""
 
     def enter(self, user: str, name: str) -> ExportProgress:
-        """Add an export of a user; return its progress.
+        """Add a document of a user; return its progress.
 
         Raises:
             ApiError: 429 if the user has one already; 503 if the queue is full.
         """
         headers = {"Retry-After": str(RETRY_S)}
-        with self._lock:
+        with self._condition:
             if user in self._exports:
                 message = f"an export of {user} is not finished: try again in {RETRY_S} s"
-                raise ApiError(429, "too_many", message, headers=headers)
-            if len(self._exports) >= MAX_EXPORTS:
-                message = f"{MAX_EXPORTS} exports are not finished: try again in {RETRY_S} s"
+                raise ApiError(429, "too_many", message, "exports", headers)
+            if len(self._exports) >= MAX_DOCUMENTS:
+                message = f"{MAX_DOCUMENTS} exports are not finished: try again in {RETRY_S} s"
                 raise ApiError(503, "busy", message, headers=headers)
             self._exports[user] = progress = ExportProgress(name)
         return progress
 
     def find(self, user: str) -> ExportProgress | None:
-        """Return the progress of a user's export; None without one."""
-        with self._lock:
+        """Return the progress of a user's document; None without one."""
+        with self._condition:
             return self._exports.get(user)
 
+    def end_turn(self, progress: ExportProgress) -> None:
+        """Let the documents of the other users continue."""
+        with self._condition:
+            user = next(user for user, one in self._exports.items() if one is progress)
+            self._exports[user] = self._exports.pop(user)
+            self._condition.notify_all()
+
+    def wait_for_turn(self, progress: ExportProgress) -> bool:
+        """Wait at most `TURN_S` for the turn of a document; return whether it has come."""
+        with self._condition:
+            return self._condition.wait_for(
+                lambda: next(one for one in self._exports.values() if one.state != "sending") is progress, TURN_S
+            )
+
+    def start_sending(self, progress: ExportProgress) -> None:
+        """End the turns of a document that is complete."""
+        with self._condition:
+            progress.state = "sending"
+            self._condition.notify_all()
+
     def leave(self, user: str) -> None:
-        """Remove the export of a user."""
-        with self._lock:
+        """Remove the document of a user."""
+        with self._condition:
             self._exports.pop(user, None)
+            self._condition.notify_all()
 
 
 class _TemporaryFileResponse(StreamingResponse):
@@ -127,9 +154,9 @@ class _TemporaryFileResponse(StreamingResponse):
 
 
 class ExportRoutes:
-    """Routes of exports.
+    """Routes of exports, and the writer of documents.
 
-    An export is written to a temporary file without a name in the folder of the database: the operating system
+    A document is written to a temporary file without a name in the folder of the database: the operating system
     deletes it when the process ends, also after a crash. The file lives as long as the request that created it.
     """
 
@@ -147,7 +174,7 @@ class ExportRoutes:
         ]
 
     def stop(self) -> None:
-        """End the running export, so that the process can stop."""
+        """End the documents that are written, so that the process can stop."""
         self._stopped = True
 
     def _progress(self, call: Call) -> Response:
@@ -164,76 +191,129 @@ class ExportRoutes:
 
     def _export(self, call: Call) -> Response:
         name = str(call.request.path_params["name"])
-        if name not in _FORMATS:
-            raise ApiError(404, "not_found", "one of " + ", ".join(_FORMATS))
-        query, user = call.parse_query(ContactFilter), call.actor.user
-        headers = {"Content-Disposition": f'attachment; filename="{name}"', "Content-Type": _FORMATS[name][1]}
+        if name not in NAMES:
+            raise ApiError(404, "not_found", "one of " + ", ".join(NAMES))
+        query, chosen = call.parse_query(ContactFilter), NAMES[name]
+        headers = {"Content-Disposition": f'attachment; filename="{name}"', "Content-Type": chosen.media_type}
+        path = self._state.database.path.with_name(name)
+
+        def write(file: IO[bytes], contacts: DocumentContacts) -> None:
+            chosen.write(file, ExportSource(contacts, contacts, path))
+
+        return self.document(call, name, headers, query, write)
+
+    def document(
+        self, call: Call, name: str, headers: Mapping[str, str], query: ContactFilter, write: Writer
+    ) -> Response:
+        """Return the response with a document of the contacts of a filter.
+
+        Args:
+            call: The request.
+            name: Name of the file.
+            headers: Headers of the response.
+            query: The filter.
+            write: Writes the document to a binary file.
+
+        Raises:
+            ApiError: There are too many documents, or this one is not wanted any more, or is too large.
+        """
+        user = call.actor.user
         progress = self._queue.enter(user, name)
+        progress.is_disconnected = lambda: from_thread.run(call.request.is_disconnected)
         try:
-            with self._queue.worker:
-                progress.state = "writing"
-                file = self._write(name, query, progress)
+            file = self._write(query, progress, write)
         except BaseException:
             self._queue.leave(user)
             raise
-        progress.state = "sending"
+        self._queue.start_sending(progress)
         return _TemporaryFileResponse(file, lambda: self._queue.leave(user), headers)
 
-    def _write(self, name: str, query: ContactFilter, progress: ExportProgress) -> IO[bytes]:
-        """Write an export to a temporary file, and return the file."""
-        file: IO[bytes] = tempfile.TemporaryFile(dir=self._state.database.path.parent)  # noqa: SIM115  closed below
+    def _write(self, query: ContactFilter, progress: ExportProgress, write: Writer) -> IO[bytes]:
+        """Write a document to a temporary file, and return the file."""
+        folder = self._state.database.path.parent
+        file: IO[bytes] = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed below
         try:
-            convert = _FORMATS[name][0]
-            contacts = self._contacts(query, file, progress, counts=convert is not None)
-            if convert is None:
-                add_kmz(file, contacts, lambda contact: self._image(contact, file, progress))
-            else:
-                file.write(convert(contacts))
+            self._wait_for_turn(file, progress)
+            progress.state = "writing"
+            progress.least_free_bytes = shutil.disk_usage(folder).free // 2
+
+            def next_contact() -> None:
+                self._queue.end_turn(progress)
+                self._wait_for_turn(file, progress)
+                self._check(file, progress)
+
+            write(file, DocumentContacts(self._state.database, query, progress, next_contact))
             progress.size_bytes = file.tell()
         except BaseException:
             file.close()
             raise
         return file
 
-    def _contacts(self, query: ContactFilter, file: IO[bytes], progress: ExportProgress, *, counts: bool) -> ContactSet:
-        """Read the contacts; `counts` is whether reading them is the main part of the work."""
-        with self._state.database.read() as db:
-            versions = list_versions(db, query, MAX_CONTACTS + 1)
-        if len(versions) > MAX_CONTACTS:
-            raise ApiError(413, "too_large", f"more than {MAX_CONTACTS} contacts: select fewer in the queue")
-        progress.total = len(versions)
-        found: list[ExportContact] = []
-        for contact_id, version in versions:
+    def _wait_for_turn(self, file: IO[bytes], progress: ExportProgress) -> None:
+        while not self._queue.wait_for_turn(progress):
             self._check(file, progress)
-            # Other requests use the database between two contacts.
-            with self._state.database.read() as db:
-                contact = find_export_contact(db, contact_id, version)
-            if contact is not None:
-                found.append(contact)
-            progress.done += counts
-        contacts = ContactSet(tuple(found), (), ())
-        if not counts:
-            progress.total = len(contacts.located)  # only these have an image in a KMZ
-        return contacts
-
-    def _image(self, contact: ExportContact, file: IO[bytes], progress: ExportProgress) -> ContactImage | None:
-        self._check(file, progress)
-        progress.done += 1
-        if not contact.image.codec:
-            return None
-        image = self._state.image(contact.uid, contact.image.version)
-        with self._state.database.read() as db:
-            lines = picture_lines(list_measurements(db, contact.uid))
-        return ContactImage(rendering.eight_bits(image.picture.to_array()), image.missing(), lines)
 
     def _check(self, file: IO[bytes], progress: ExportProgress) -> None:
-        """Check for a cancellation, the size of an export and the free space between two contacts."""
+        """End a document that is not wanted any more, or leaves too little of the disk; called before each contact."""
         progress.size_bytes = file.tell()
-        if progress.cancelled:
+        if progress.cancelled or (progress.done % CONNECTION_INTERVAL == 0 and progress.is_disconnected()):
             raise ApiError(409, "cancelled", "the export was cancelled")
         if self._stopped:
             raise ApiError(503, "busy", "the console is stopping")
-        if progress.size_bytes > MAX_BYTES:
-            raise ApiError(413, "too_large", f"more than {MAX_BYTES >> 20} MiB: select fewer contacts in the queue")
-        if shutil.disk_usage(self._state.database.path.parent).free < HANDLING_RESERVE_BYTES:
+        free_bytes = shutil.disk_usage(self._state.database.path.parent).free
+        if free_bytes < HANDLING_RESERVE_BYTES:
             raise OSError(errno.ENOSPC, "the disk reserve is reached")
+        if free_bytes < progress.least_free_bytes:
+            raise ApiError(413, "too_large", "more than half of the free disk: select fewer contacts")
+
+
+class DocumentContacts:
+    """The contacts of a document with their images, read from the database one at a time."""
+
+    def __init__(
+        self, database: Database, query: ContactFilter, progress: ExportProgress, next_contact: Callable[[], None]
+    ) -> None:
+        with database.read() as db:
+            self._versions = list_versions(db, query)
+        self._database = database
+        self._progress = progress
+        self._next_contact = next_contact
+        self._last: StoredContact | None = None
+        progress.total = len(self._versions)
+
+    def __iter__(self) -> Iterator[ExportContact]:
+        for contact_id, version in self._versions:
+            self._next_contact()
+            # Other requests use the database between two contacts.
+            try:
+                with self._database.read() as db:
+                    self._last = find_stored_contact(db, contact_id, version)
+            except BadInputError as error:
+                _skipped_log.log(contact=contact_id, reason=str(error)[:300])
+                self._last = None
+            if self._last is not None:
+                yield self._last.contact
+            self._progress.done += 1
+
+    def __len__(self) -> int:
+        return len(self._versions)
+
+    def image(self, contact: ExportContact) -> ContactImage | None:
+        """Return the image of the last contact; None if it has none."""
+        stored = self.stored(contact)
+        if not stored.image.codec:
+            return None
+        pixels = rendering.eight_bits(stored.image.picture.to_array())
+        return ContactImage(pixels, stored.image.missing(), stored.lines)
+
+    def png(self, contact: ExportContact) -> bytes | None:
+        """Return the image of the last contact as PNG, as c2 stores it; None if it has none."""
+        image = self.stored(contact).image
+        # Without a codec only the contact record was received; its image is black.
+        return png_bytes(Path(contact.uid), image.picture.to_array()) if image.codec else None
+
+    def stored(self, contact: ExportContact) -> StoredContact:
+        """Return the last contact as it is stored."""
+        assert self._last is not None
+        assert self._last.contact is contact
+        return self._last

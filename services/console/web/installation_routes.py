@@ -1,10 +1,11 @@
-"""Routes that make the page installable: web manifest and service worker."""
+"""Page of the console with the list of its scripts, and what makes it installable: web manifest, service worker."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +15,30 @@ from starlette.routing import Route
 
 MANIFEST: Final = "manifest.webmanifest"
 WORKER: Final = "service_worker.js"
+_IMPORT: Final = re.compile(r'^import [^;]*?from "(\.[^"]+)";', re.MULTILINE)
+_START: Final = '  <script type="module" src="/static/js/app.js">'
 _NO_CACHE: Final = {"Cache-Control": "no-cache"}
+
+
+def imported_scripts(script: Path) -> list[Path]:
+    """Return the scripts that a script imports, directly or through others, sorted and without itself."""
+    found: set[Path] = set()
+    waiting = [script.resolve()]
+    while waiting:
+        one = waiting.pop()
+        found.add(one)
+        others = {(one.parent / name).resolve() for name in _IMPORT.findall(one.read_text(encoding="utf-8"))}
+        waiting += others - found
+    return sorted(found - {script.resolve()})
+
+
+@functools.cache
+def index_page(static: Path) -> str:
+    """Return the page of the console, with links by which the browser loads all its scripts at once."""
+    scripts = imported_scripts(static / "js" / "app.js")
+    names = [path.relative_to(static.resolve()).as_posix() for path in scripts]
+    links = "".join(f'  <link rel="modulepreload" href="/static/{name}">\n' for name in names)
+    return (static / "index.html").read_text(encoding="utf-8").replace(_START, links + _START)
 
 
 @functools.cache

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
+from sonarpost.limits import limit
 from sonarpost.services.console.web.access import ApiError
 
 
@@ -20,13 +21,43 @@ class Rate:
     interval_s: float
 
 
-RATE_OF_SOURCE: Final = Rate(5, 60.0)
+RATE_OF_SOURCE: Final = Rate(
+    limit(
+        5,
+        "attempts",
+        "shares",
+        surface="log-in of the console",
+        source="known browser; address",
+        resource="wrong passwords of a user",
+        at_limit="429 with Retry-After, one more attempt after 60 s",
+    ),
+    60.0,
+)
 """Wrong passwords of one user from one source: a known browser, a network address, or a session."""
-RATE_OF_ADDRESS: Final = Rate(20, 15.0)
+RATE_OF_ADDRESS: Final = Rate(
+    limit(
+        20,
+        "attempts",
+        "shares",
+        surface="log-in of the console",
+        source="address",
+        resource="wrong passwords of all users",
+        at_limit="429 with Retry-After, one more attempt after 15 s",
+    ),
+    15.0,
+)
 """Wrong passwords from unknown browsers at one network address."""
 RATE_OF_USER: Final = Rate(100, 10.0)
 """Wrong passwords of one user from all unknown browsers."""
-MAX_CHECKS: Final = 8
+MAX_CHECKS: Final = limit(
+    8,
+    "checks",
+    "shares",
+    surface="log-in of the console",
+    source="all unknown browsers",
+    resource="password checks that run or wait",
+    at_limit="503 with Retry-After",
+)
 """Password checks at a time, running and waiting, of unknown browsers; as many again of known ones."""
 BUSY_RETRY_S: Final = 5
 ROUNDING_S: Final = 1e-3

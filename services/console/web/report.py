@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final
@@ -17,7 +17,6 @@ from sonarpost.messages import Contact, ReconstructedImage
 from sonarpost.review import rendering
 from sonarpost.review.image_geometry import contact_mark
 from sonarpost.review.true_scale import (
-    PictureLine,
     auto_gain,
     draw_lines,
     north_in_image,
@@ -25,6 +24,7 @@ from sonarpost.review.true_scale import (
     scale_strip,
     true_image,
 )
+from sonarpost.services.console.store.exports import StoredContact
 from sonarpost.services.console.store.serialisers import Json
 
 PICTURE_PX: Final = 900
@@ -47,19 +47,15 @@ class ReportContact:
 
     Attributes:
         detail: Result of `ConsoleState.contact_detail`.
-        contact: The contact with its decisions and measurements.
-        image: Image version to show.
-        lines: Measured lines to draw.
+        stored: The contact with its decisions, measured lines and the image version to show.
     """
 
     detail: Json
-    contact: ExportContact
-    image: ReconstructedImage
-    lines: tuple[PictureLine, ...]
+    stored: StoredContact
 
 
-def report_html(contacts: Iterable[ReportContact], now_utc_s: float, title: str, *, training: bool) -> str:
-    """Return a document with one sheet for each contact. Text of operators is escaped.
+def report_parts(contacts: Iterable[ReportContact], now_utc_s: float, title: str, *, training: bool) -> Iterator[str]:
+    """Yield the parts of a document with one sheet for each contact. Text of operators is escaped.
 
     Args:
         contacts: The contacts.
@@ -67,13 +63,14 @@ def report_html(contacts: Iterable[ReportContact], now_utc_s: float, title: str,
         title: Title of the document.
         training: Whether the contacts are simulated.
     """
-    sheets = "".join(_sheet(each, now_utc_s, training=training) for each in contacts)
-    return (
+    yield (
         "<!DOCTYPE html>\n<html lang='en'><head><meta charset='utf-8'>"
         f"<title>{html.escape(title)}</title><link rel='icon' href='/static/icon.svg'>"
-        "<link rel='stylesheet' href='/static/report.css'></head>"
-        f"<body class='report'><main>{sheets}</main></body></html>\n"
+        "<link rel='stylesheet' href='/static/report.css'></head><body class='report'><main>"
     )
+    for each in contacts:
+        yield _sheet(each, now_utc_s, training=training)
+    yield "</main></body></html>\n"
 
 
 def degrees_minutes(value_deg: float, letters: str) -> str:
@@ -86,7 +83,7 @@ def degrees_minutes(value_deg: float, letters: str) -> str:
 
 
 def _sheet(given: ReportContact, now_utc_s: float, *, training: bool) -> str:
-    contact, detail = given.contact, given.detail
+    contact, detail = given.stored.contact, given.detail
     name = html.escape(contact.name)
     mark = "<p class='training'>TRAINING: simulated contact</p>" if training else ""
     audit = detail["audit"]
@@ -106,19 +103,19 @@ def _sheet(given: ReportContact, now_utc_s: float, *, training: bool) -> str:
 
 def _figure(given: ReportContact) -> str:
     """Return the image in true metres with its caption."""
-    image, record = given.image, given.image.contact
+    image, record = given.stored.image, given.stored.image.contact
     grey, missing = rendering.eight_bits(image.picture.to_array()), image.missing()
     scaled = true_image(grey, missing, *pixel_size_m(record), PICTURE_PX)
     strip = scale_strip(scaled.pixels.shape[1], PICTURE_PX, scaled.px_per_m, north_in_image(record))
     mark = contact_mark(record, *grey.shape)
     place = None if mark is None else (mark.row, mark.column)
-    png = rendering.encode_png(np.vstack([draw_lines(scaled, given.lines, place), strip]))
+    png = rendering.encode_png(np.vstack([draw_lines(scaled, given.stored.lines, place), strip]))
     low, high = auto_gain(grey, missing)
     caption = [_scale_text(image), f"automatic gain {low:.0f} to {high:.0f} % (98 % of the received pixels)"]
     if record is not None and record.channel is not None:
         caption.append("nadir left, heading down" + ("; mirror image" if record.channel == "starboard" else ""))
     return (
-        f"<figure><img alt='Sonar image of contact {html.escape(given.contact.name)}'"
+        f"<figure><img alt='Sonar image of contact {html.escape(given.stored.contact.name)}'"
         f" src='data:image/png;base64,{base64.b64encode(png).decode()}'>"
         f"<figcaption>{html.escape('; '.join(caption))}</figcaption></figure>"
     )
@@ -127,9 +124,9 @@ def _figure(given: ReportContact) -> str:
 def _facts(given: ReportContact) -> list[Fact]:
     """Return the facts; those that are None are left out, those that are empty are unknown."""
     return [
-        *_decision_facts(given.contact),
-        *_position_facts(given.contact),
-        *_detector_facts(given.contact),
+        *_decision_facts(given.stored.contact),
+        *_position_facts(given.stored.contact),
+        *_detector_facts(given.stored.contact),
         *_image_facts(given),
     ]
 
@@ -195,7 +192,7 @@ def _detector_facts(contact: ExportContact) -> list[Fact]:
 
 
 def _image_facts(given: ReportContact) -> list[Fact]:
-    image = given.image
+    image = given.stored.image
     total = f" of {image.bytes_total}" if image.bytes_total else ""
     missing = 100 * float(image.missing().mean())
     return [
@@ -208,7 +205,7 @@ def _image_facts(given: ReportContact) -> list[Fact]:
 
 def _integrity_text(given: ReportContact) -> str:
     """Return what of the original the image contains."""
-    image, versions = given.image, given.detail["versions"]
+    image, versions = given.stored.image, given.detail["versions"]
     assert isinstance(versions, list)
     version: Json = next((v for v in versions if v["version"] == image.version), {})
     if not image.codec:

@@ -16,7 +16,7 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import PathLike, StaticFiles
 from starlette.types import ASGIApp, Scope
@@ -24,37 +24,27 @@ from starlette.types import ASGIApp, Scope
 from sonarpost.config import TlsConfig
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.logs import kv
-from sonarpost.review.rendering import MAPS
+from sonarpost.network.connections import ConnectionLimits, LimitedListener, TrustedProxies
 from sonarpost.services.console.chain import SERVICE_STALE_S
+from sonarpost.services.console.known_objects import KnownObjects
 from sonarpost.services.console.state import ConsoleState
-from sonarpost.services.console.store.requests import REQUEST_KINDS
 from sonarpost.services.console.store.users import MAX_PASSWORD, MIN_PASSWORD, Users
 from sonarpost.services.console.web.access import (
     AccessControl,
     ApiError,
     Call,
-    Endpoint,
     SecurityMiddleware,
     error_response,
 )
-from sonarpost.services.console.web.airtime_routes import AirTimeRoutes
-from sonarpost.services.console.web.connections import (
-    CHECK_INTERVAL_S,
-    ConnectionDeadlines,
-    ConnectionLimits,
-    LimitedListener,
-    TrustedProxies,
-)
+from sonarpost.services.console.web.connections import ConnectionDeadlines
 from sonarpost.services.console.web.contact_routes import ContactRoutes
 from sonarpost.services.console.web.decision_routes import DecisionRoutes
 from sonarpost.services.console.web.event_stream import EventStream
 from sonarpost.services.console.web.export_routes import ExportRoutes
-from sonarpost.services.console.web.installation_routes import installation_routes
+from sonarpost.services.console.web.installation_routes import index_page, installation_routes
 from sonarpost.services.console.web.map_routes import MapRoutes
-from sonarpost.services.console.web.mission_routes import MissionRoutes
 from sonarpost.services.console.web.object_routes import ObjectRoutes
 from sonarpost.services.console.web.report_routes import ReportRoutes
-from sonarpost.services.console.web.score_routes import ScoreRoutes
 from sonarpost.services.console.web.session_routes import SessionRoutes
 from sonarpost.services.console.web.settings_routes import SettingsRoutes
 
@@ -76,30 +66,28 @@ class ConsoleApp:
         self._training = training
         self._map = MapRoutes(state)
         self._exports = ExportRoutes(state)
-        self._stream = EventStream(state, training=training)
+        self._stream = EventStream(state)
         access = AccessControl(users, config.role, TrustedProxies(config.trusted_proxies))
         sessions = SessionRoutes(users, config.role, tls=config.tls, max_age_s=config.session_max_s)
+        known = KnownObjects(state)
         routes = [
             Route("/api/info", access.endpoint(self._info)),
             *sessions.routes(access),
             *SettingsRoutes(users).routes(access),
             *ContactRoutes(state).routes(access),
-            *AirTimeRoutes(state).routes(access),
             *DecisionRoutes(state).routes(access),
             *ObjectRoutes(state).routes(access),
             *self._map.routes(access),
-            *MissionRoutes(state).routes(access),
-            *ScoreRoutes(state).routes(access),
+            Route("/api/score", access.endpoint(lambda call: JSONResponse(known.score_sheet(call.actor)))),
             *self._exports.routes(access),
-            *ReportRoutes(state, training=training).routes(access),
+            *ReportRoutes(state, self._exports, training=training).routes(access),
             *self._stream.routes(access),
-            Route("/", _page_endpoint(access, "index.html")),
-            Route("/password", _page_endpoint(access, "password.html")),
+            Route("/", access.endpoint(_index, needs_session=False)),
             Route("/login", lambda _: page(STATIC / "login.html")),
             *installation_routes(STATIC),
             Mount("/static", StaticFolder(directory=STATIC)),
         ]
-        app = Starlette(routes=routes, exception_handlers={HTTPException: routing_error})
+        app = Starlette(routes=routes, exception_handlers={HTTPException: routing_error, Exception: defect_response})
         self.asgi: ASGIApp = SecurityMiddleware(app, (config.host, *config.names), tls=config.tls)
 
     def stop(self) -> None:
@@ -118,9 +106,6 @@ class ConsoleApp:
                 "known_objects": self._training or config.calibration_share > 0,
                 "now_utc_s": self._state.clock(),
                 "classes": [{"group": name, "classes": found} for name, found in config.class_groups().items()],
-                "take_back_s": config.take_back_s,
-                "maps": list(MAPS),
-                "requests": list(REQUEST_KINDS),
                 "password_characters": [MIN_PASSWORD, MAX_PASSWORD],
                 "stale_after_s": {
                     "service": SERVICE_STALE_S,
@@ -132,13 +117,11 @@ class ConsoleApp:
         )
 
 
-def _page_endpoint(access: AccessControl, name: str) -> Endpoint:
-    """Return the endpoint of a page, which redirects to the log-in page without a session."""
-
-    def serve(call: Call) -> Response:
-        return RedirectResponse("/login", 303) if call.session is None else page(STATIC / name)
-
-    return access.endpoint(serve, needs_session=False)
+def _index(call: Call) -> Response:
+    """Return the page of the console; without a session, the way to the log-in page."""
+    if call.session is None:
+        return RedirectResponse("/login", 303)
+    return HTMLResponse(index_page(STATIC), headers={"Cache-Control": "no-cache"})
 
 
 class StaticFolder(StaticFiles):
@@ -163,6 +146,11 @@ async def routing_error(_request: Request, error: Exception) -> Response:
     if isinstance(error, HTTPException) and error.status_code != 404:
         return error_response(ApiError(error.status_code, "bad_request", "this route does not accept the method"))
     return error_response(ApiError(404, "not_found", "no such route"))
+
+
+async def defect_response(_request: Request, _error: Exception) -> Response:
+    """Return the response to a request with an unexpected exception."""
+    return error_response(ApiError(500, "defect", "internal error: see the log of the console"))
 
 
 class _Server(uvicorn.Server):
@@ -209,8 +197,8 @@ class WebServer:
                 # Other event loops do not use the socket's `accept`.
                 loop="asyncio",
                 backlog=BACKLOG,
-                callback_notify=self.limits.close_overdue,
-                timeout_notify=CHECK_INTERVAL_S,
+                callback_notify=self._close_overdue,
+                timeout_notify=1,
                 log_config=None,
                 access_log=False,
                 ws="none",
@@ -259,6 +247,9 @@ class WebServer:
                 self._server.force_exit = True
                 self._thread.join(timeout=STOP_S)
         self._socket.close()
+
+    async def _close_overdue(self) -> None:
+        self.limits.close_overdue()
 
     def _run(self) -> None:
         self._server.run(sockets=[self._socket])

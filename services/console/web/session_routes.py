@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from typing import Final
 
 from pydantic import Field
@@ -10,17 +11,17 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from sonarpost.logs import kv
+from sonarpost.network.connections import address_group
 from sonarpost.services.console.store.database import PERMISSIONS, Actor, Side
 from sonarpost.services.console.store.serialisers import Json
 from sonarpost.services.console.store.users import DEVICE_S, LINK_S, MAX_PASSWORD, MIN_PASSWORD, Session, Users
-from sonarpost.services.console.web.access import COOKIE, AccessControl, ApiError, Call, RequestBody
-from sonarpost.services.console.web.connections import address_group
+from sonarpost.services.console.web.access import COOKIE, AccessControl, ApiError, Call, ErrorCode, RequestBody
 from sonarpost.services.console.web.login_limiter import LoginLimiter
 
 log = logging.getLogger(__name__)
 
 LOGIN: Final = "/api/login"
-_LINK_PROBLEMS: Final = {
+_LINK_PROBLEMS: Final[Mapping[str, tuple[ErrorCode, str]]] = {
     "unknown": ("link_unknown", "this log-in link is not valid"),
     "used": ("link_used", "this log-in link was used before; it is valid once"),
     "expired": ("link_expired", f"this log-in link has expired; it is valid for {LINK_S / 60:.0f} minutes"),
@@ -70,7 +71,7 @@ class SessionRoutes:
 
     def _login(self, call: Call) -> Response:
         body = call.parse_body(_LoginBody)
-        device = call.request.cookies.get(DEVICE_COOKIE, "")[:200]
+        device = call.request.cookies.get(call.cookie_name(DEVICE_COOKIE), "")[:200]
         known = self._users.is_known_device(body.user, device)
         buckets = self._limiter.buckets_of_login(body.user, address_group(call.address), device if known else None)
         with self._limiter.attempt(buckets, known=known) as refund:
@@ -80,7 +81,7 @@ class SessionRoutes:
             refund()
         device = self._users.add_device(body.user, device)
         response = self._log_in(call, body.user)
-        self._set_cookie(response, DEVICE_COOKIE, device, LOGIN, DEVICE_S)
+        self._set_cookie(call, response, DEVICE_COOKIE, device, LOGIN, DEVICE_S)
         return response
 
     def _login_link(self, call: Call) -> Response:
@@ -98,12 +99,18 @@ class SessionRoutes:
         session = self._users.start_session(name)
         log.info("User logged in", extra=kv(user=session.name, role=session.role, address=call.address))
         response = JSONResponse(self._session_json(session))
-        self._set_cookie(response, COOKIE, session.token, "/", self._max_age_s)
+        self._set_cookie(call, response, COOKIE, session.token, "/", self._max_age_s)
         return response
 
-    def _set_cookie(self, response: Response, name: str, value: str, path: str, max_age_s: float) -> None:
+    def _set_cookie(self, call: Call, response: Response, name: str, value: str, path: str, max_age_s: float) -> None:
         response.set_cookie(
-            name, value, max_age=int(max_age_s), path=path, httponly=True, samesite="strict", secure=self._tls
+            call.cookie_name(name),
+            value,
+            max_age=int(max_age_s),
+            path=path,
+            httponly=True,
+            samesite="strict",
+            secure=self._tls,
         )
 
     def _session_json(self, session: Session) -> Json:
@@ -112,7 +119,7 @@ class SessionRoutes:
             "user": session.name,
             "role": session.role,
             "csrf": session.csrf,
-            "expires_utc_s": session.expires_utc_s,
+            "begun_utc_s": session.begun_utc_s,
             "may": {permission: actor.may(permission, self._side) for permission in PERMISSIONS},
         }
 
@@ -124,7 +131,7 @@ class SessionRoutes:
         assert call.session is not None
         self._users.end_session(call.session.token)
         response = Response(status_code=204)
-        response.delete_cookie(COOKIE, httponly=True, samesite="strict", secure=self._tls)
+        response.delete_cookie(call.cookie_name(COOKIE), httponly=True, samesite="strict", secure=self._tls)
         return response
 
     def _password(self, call: Call) -> Response:

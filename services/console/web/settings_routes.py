@@ -13,7 +13,7 @@ from sonarpost.services.console.web.access import AccessControl, ApiError, Call,
 
 SETTINGS: Final = ("keys", "language", "map", "review", "sort", "theme", "type")
 """Names of the settings that are stored. The page keeps all others in the browser alone."""
-MAX_VALUE: Final = 4000
+MAX_VALUE: Final = 100
 """Characters of a value."""
 
 

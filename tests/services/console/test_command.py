@@ -159,6 +159,42 @@ def test_training_delivers_decisions_and_requests(console):
     assert any(vehicle["snr_in_db"] is not None and vehicle["queue"] for vehicle in vehicles)
 
 
+def test_training_continues_after_a_restart_with_the_same_seed(console):
+    def start(contacts: int, seed: int = 1) -> TrainingSimulator:
+        simulator = TrainingSimulator(console.state, contacts, seed, interval_s=0.01)
+        simulator.load_backlog(contacts * 2 // 3)
+        return simulator
+
+    anna = console.browser("anna")
+    listed = lambda: {row["id"]: row for row in anna.get("/api/contacts").json()["items"]}  # noqa: E731
+    first = start(3)
+    first.receive_packet(time.time())  # the first of several versions
+    before = listed()
+    assert len(before) == 3
+    anna.decide(anna.get("/api/contacts", sort="name", order="asc").json()["items"][0]["id"])
+    now = time.time() + console.state.config.take_back_s
+    console.state.clock = lambda: now
+    first.accept_records(now)
+    for _ in range(2):
+        again = start(3)
+        assert listed().keys() == before.keys()
+    # What was in progress continues: the image of the third contact, and the decision.
+    for _ in range(8):
+        again.receive_packet(time.time())
+    again.advance_downlink(time.time() + 11.0)
+    rows = listed()
+    assert rows.keys() == before.keys()
+    assert sum(row["version"] for row in rows.values()) > sum(row["version"] for row in before.values())
+    assert sum((row["delivery"] or {}).get("vehicle") == "confirmed" for row in rows.values()) == 1
+    # More contacts are of the same survey.
+    start(6)
+    added = [row for row in listed().values() if row["id"] not in before]
+    assert len(added) == 1
+    assert abs(added[0]["seen_utc_s"] - max(row["seen_utc_s"] for row in before.values())) < 600
+    with pytest.raises(ConfigError, match="--seed"):
+        start(3, seed=2)
+
+
 @pytest.mark.parametrize("kind", ["wider", "original"])
 def test_training_sends_a_new_image_once(kind, console):
     simulator = TrainingSimulator(console.state, contacts=1, interval_s=0.01)

@@ -16,13 +16,8 @@ from builders.console import PASSWORD, Browser, EventReader, server_certificate
 from starlette.responses import PlainTextResponse, Response
 from starlette.testclient import TestClient
 
-from sonarpost.services.console.web.connections import (
-    CHUNK_BYTES,
-    ConnectionDeadlines,
-    ConnectionLimits,
-    TrustedProxies,
-    address_group,
-)
+from sonarpost.network.connections import ConnectionLimits, TrustedProxies, address_group
+from sonarpost.services.console.web.connections import CHUNK_BYTES, ConnectionDeadlines
 from sonarpost.services.console.web.server import WebServer
 
 HALF_A_REQUEST = b"GET /login HTTP/1.1\r\nHost: 127.0.0.1\r\n"
@@ -198,7 +193,7 @@ def test_time_to_read_a_response_is_that_of_each_chunk(clock, chunk_s, received)
 
     async def send(message):
         clock.now_s += chunk_s
-        await limits.close_overdue()
+        limits.close_overdue()
         left.append(("a", 1) in limits)
 
     async def receive():
@@ -266,7 +261,7 @@ def test_deadlines_with_a_clock(clock):
     assert limits.add(peers[3], pairs[3][0])
     assert ("a", 2) not in limits  # it waited longest of those that wait
     clock.now_s = 11
-    asyncio.run(limits.close_overdue())
+    limits.close_overdue()
     assert [peer in limits for peer in peers] == [True, False, False, False]
     limits.remove(("a", 1), pairs[1][0])
     assert ("a", 1) in limits

@@ -39,6 +39,8 @@ def test_page_of_contacts_is_read_in_the_order_of_an_index(console, query, index
     # The contacts are counted without reading them.
     assert plan.count("USING COVERING INDEX contact_listed") == 3
     assert "contact_answers" not in plan
+    assert "USING INDEX decision_undelivered" in plan
+    assert "USING INDEX contact_authenticated" in plan
 
 
 def test_looks_at_a_place_are_found_by_latitude_and_longitude(console):

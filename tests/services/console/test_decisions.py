@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import pytest
-from builders.console import Clock, contact_id, image_record
+from builders.console import Clock, advice_record, contact_id, image_record
+from builders.records import decision_record
 from pydantic import ValidationError
 
+from sonarpost.errors import BadInputError
 from sonarpost.messages import Decision
 from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.store import requests
 from sonarpost.services.console.store.database import Database
 
 ID = contact_id()
@@ -38,6 +41,48 @@ def test_decision_is_sent_after_the_take_back_time(console, clock):
     assert sent(console) == [(decision["decision_id"], "mine_like", True)]
     assert sent(console) == []
     assert anna.contact(ID)["decisions"][0]["take_back_utc_s"] is None
+
+
+def test_record_that_cannot_be_decoded_delays_no_other(console, clock):
+    console.state.store_image(image_record("00A8"))
+    anna = console.browser("anna")
+    for image_id in ("00A7", "00A8"):
+        assert anna.decide(contact_id(image_id)).status_code == 201
+    clock.advance(8.0)
+    with console.state.database.transaction() as db:
+        db.execute("UPDATE decision SET payload = x'c1' WHERE image_id = '00A7'")
+        db.execute("UPDATE version SET payload = x'c1' WHERE contact_id = ?", (ID,))
+    assert [item.record.image_id for item in console.state.unsent_records()] == ["00A8"]
+    table = anna.get("/api/export/contacts.csv")
+    assert ("00A7" in table.text, "00A8" in table.text) == (False, True)
+    assert anna.get("/report").text.count("class='sheet'") == 1
+    console.state.config = console.state.config.model_copy(update={"max_bytes": 0})
+    assert console.state.remove_images(clock.now_utc_s) == 2
+    assert anna.get("/api/contacts").json()["total"] == 2
+
+
+def test_decisions_without_images_are_limited_for_each_vessel(console, clock, monkeypatch):
+    monkeypatch.setattr(requests, "MAX_WAITING", 3)
+    records = [
+        decision_record(image_id=f"B00{number}", decision_id=f"d-{number}", decided_utc_s=1.7e9) for number in range(4)
+    ]
+    for record in records[:3]:
+        assert console.state.store_decision(record)
+    with pytest.raises(BadInputError, match="3 others have none yet"):
+        console.state.store_decision(records[3])
+    assert console.state.store_decision(records[3].model_copy(update={"vessel_id": "vessel-2", "decision_id": "d-9"}))
+    console.state.store_image(image_record("B000"))
+    assert console.state.store_decision(records[3])
+
+
+def test_comments_without_images_are_limited(console, monkeypatch):
+    monkeypatch.setattr(requests, "MAX_WAITING", 3)
+    for number in range(3):
+        console.state.store_advice(advice_record(f"B00{number}", advice_id=f"a-{number}"))
+    with pytest.raises(BadInputError, match="3 others have none yet"):
+        console.state.store_advice(advice_record("B003", advice_id="a-3"))
+    console.state.store_image(image_record("B000"))
+    console.state.store_advice(advice_record("B003", advice_id="a-3"))
 
 
 def test_decision_taken_back_in_time_is_not_sent(console, clock):
@@ -98,9 +143,9 @@ def test_undo_is_audited_with_the_image_on_the_screen(console, clock):
     assert second != decision["sha256"]
     # The digest of another version is refused.
     assert anna.undo(ID, decision["decision_id"], sha256=decision["sha256"]).json()["error"]["field"] == "sha256"
-    assert anna.undo(ID, decision["decision_id"], layer="enhanced").status_code == 201
+    assert anna.undo(ID, decision["decision_id"], layer="wider").status_code == 201
     entry = anna.contact(ID)["audit"][-1]
-    assert [entry[name] for name in ("action", "version", "sha256", "layer")] == ["undo", 2, second, "enhanced"]
+    assert [entry[name] for name in ("action", "version", "sha256", "layer")] == ["undo", 2, second, "wider"]
 
 
 def test_only_own_decisions_can_be_undone(console, clock):
@@ -176,7 +221,6 @@ def test_overruling_needs_a_reason_and_is_announced_to_the_overruled_operator(co
     )
     stale = bo.decide(ID, verdict="not_mine_like", overrules=True, remark="a boulder", revision=0)
     assert (stale.status_code, stale.json()["error"]["code"]) == (409, "conflict")
-    assert stale.json()["decision"]["decision_id"] == first["decision_id"]
     answer = bo.decide(ID, verdict="not_mine_like", overrules=True, remark="a boulder").json()
     assert (answer["contact"]["review"], answer["decision"]["overrules"]) == ("not_mine_like", [first["decision_id"]])
     entry = anna.contact(ID)["audit"][-1]
@@ -201,7 +245,7 @@ def test_observer_has_no_decision_to_undo_or_acknowledge(console, clock):
 def test_image_response_has_the_digest_that_a_decision_states(console, clock):
     anna = console.browser("anna")
     path = f"/api/contacts/{ID}/versions/1/picture.png"
-    for layer in ("raw", "enhanced"):
+    for layer in ("raw", "wider"):
         digest = anna.get(path, layer=layer).headers["X-Image-SHA256"]
         assert digest == anna.contact(ID)["versions"][0]["sha256"]
     assert anna.decide(ID, sha256=digest).status_code == 201

@@ -10,7 +10,7 @@ import pytest
 from builders.common import eventually
 from builders.console import EventReader, image_record, web_server
 
-from sonarpost.services.console.events import EventHub, RateLimiter
+from sonarpost.services.console.events import EventHub
 from sonarpost.services.console.web.event_stream import MAX_STREAMS_OF_USER
 
 
@@ -45,7 +45,7 @@ def test_page_receives_events_of_an_interruption(console, open_stream):
     eventually(lambda: "contact" in first.names(), what="event")
     [(_, identifier, data)] = [event for event in first.events if event[0] == "contact"]
     assert data["contact"]["image_id"] == "0001"
-    assert (data["new"], data["total"], data["unreviewed"]) == (True, 1, 1)
+    assert (data["new"], data["total"], data["to_do"]) == (True, 1, 1)
     first.close()
     # At other positions: a look at the same object would change the first contact too.
     console.state.store_image(image_record("0002", position=(56.1, -5.0)))
@@ -114,6 +114,15 @@ def test_unhandled_exception_is_logged_and_answered(console, monkeypatch, caplog
     assert "internal detail" not in answer.text
 
 
+def test_large_events_do_not_fill_the_memory():
+    hub = EventHub()
+    for number in range(40):
+        hub.publish("fleet", {"n": number, "detail": "x" * 1_000_000})
+    assert len(hub.events_after(39) or ()) == 1
+    assert len(hub.events_after(26) or ()) == 14
+    assert hub.events_after(20) is None
+
+
 def test_event_buffer():
     hub = EventHub(buffered=3)
     notified = []
@@ -133,9 +142,3 @@ def test_event_buffer():
         assert hub.parse_event_id(other) is None
     with pytest.raises(ValueError, match="Out of range"):
         hub.publish("contact", {"n": float("nan")})
-
-
-def test_rate_limiter_is_separate_for_each_name():
-    limiter = RateLimiter(1.0)
-    times = [("a", 0.0), ("a", 0.5), ("b", 0.5), ("a", 1.0), ("a", 1.9), ("a", 2.0)]
-    assert [limiter.allows(*at) for at in times] == [True, False, True, True, False, True]

@@ -5,7 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import os
+import shutil
 import signal
+import socket
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -17,9 +20,11 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import httpx2
+import numpy as np
 import pytest
 from builders.common import eventually
-from builders.console import PASSWORD, Browser, contact_id, image_record, web_server
+from builders.console import PASSWORD, Browser, contact_id, image_record, session_cookie, web_server
+from PIL import Image
 
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.state import ConsoleState
@@ -42,9 +47,16 @@ def test_exports_contain_the_filtered_contacts(console):
     only = anna.get("/api/export/contacts.geojson", review="mine_like").json()
     assert [feature["properties"]["name"] for feature in only["features"]] == ["uuv-1/0001"]
     assert only["unlocated"] == []
+    for ending in ("csv", "geojson", "kmz", "gpkg", "cot.xml"):
+        assert b"0002" not in anna.get(f"/api/export/contacts.{ending}", to_utc_s="1700000000").content, ending
     with zipfile.ZipFile(io.BytesIO(anna.get("/api/export/contacts.kmz").content)) as archive:
         assert any(name.endswith(".kml") for name in archive.namelist())
         assert any(name.endswith(".png") for name in archive.namelist())
+    with sqlite3.connect(":memory:") as db:
+        db.deserialize(anna.get("/api/export/contacts.gpkg").content)
+        rows = db.execute("SELECT name, review, geom IS NULL, picture FROM contacts ORDER BY fid").fetchall()
+    assert [row[:3] for row in rows] == [("uuv-1/0001", "mine_like", 0), ("uuv-2/0002", "unreviewed", 1)]
+    assert np.array_equal(Image.open(io.BytesIO(rows[0][3])), image_record("0001").picture.to_array())
     events = ET.fromstring(anna.get("/api/export/contacts.cot.xml").content)
     assert (events.tag, [child.tag for child in events]) == ("events", ["event"])
     assert anna.get("/api/export/contacts.exe").status_code == 404
@@ -94,7 +106,7 @@ def client_of(console):
     with web_server(console) as server:
 
         def make(user):
-            cookies = {"sonarpost_session": console.users.start_session(user).token}
+            cookies = {session_cookie(server.address): console.users.start_session(user).token}
             clients.append(httpx2.Client(base_url=server.address, cookies=cookies, timeout=120))
             return clients[-1]
 
@@ -131,6 +143,22 @@ def test_exports_run_one_at_a_time_and_their_number_is_limited(console, client_o
     assert watch.get("/api/export/contacts.csv").status_code == 200
 
 
+def test_reports_are_limited_like_exports(console, client_of, held):
+    watch, anna = client_of("watch"), client_of("anna")
+    with ThreadPoolExecutor(4) as pool:
+        first = pool.submit(watch.get, "/report")
+        assert held.entered.acquire(timeout=120)
+        for path in ("/report", "/api/export/contacts.csv"):
+            answer = watch.get(path)
+            assert error_of(answer) == (429, "too_many")
+            assert int(answer.headers["retry-after"]) > 0
+        assert anna.get("/login").status_code == 200
+        assert anna.get(f"/report/{ID}").status_code == 200
+        held.leave.set()
+        assert first.result().text.count("class='sheet'") == 1
+    assert anna.get("/report").status_code == 200
+
+
 def test_aborted_download_ends_the_export(console, client_of):
     console.state.store_image(image_record())
     watch = client_of("watch")
@@ -151,19 +179,36 @@ def test_failed_export_does_not_stay_in_the_queue(console, monkeypatch):
     assert watch.get("/api/export/contacts.csv").status_code == 200
 
 
-def test_size_of_exports_is_limited(console, monkeypatch):
-    for number in range(3):
-        console.state.store_image(image_record(f"000{number}", first_utc_s=1_700_000_000.0 + number))
+def test_export_leaves_half_of_the_free_disk(console, monkeypatch):
+    console.state.store_image(image_record())
     watch = console.browser("watch")
-    monkeypatch.setattr(export_routes, "MAX_CONTACTS", 2)
-    answer = watch.get("/api/export/contacts.csv")
-    assert error_of(answer) == (413, "too_large")
-    assert "more than 2 contacts" in answer.json()["error"]["message"]
-    assert watch.get("/api/export/contacts.csv", q="0001").status_code == 200
-    monkeypatch.setattr(export_routes, "MAX_CONTACTS", 3)
-    assert watch.get("/api/export/contacts.kmz").status_code == 200
-    monkeypatch.setattr(export_routes, "MAX_BYTES", 1000)
-    assert error_of(watch.get("/api/export/contacts.kmz")) == (413, "too_large")
+    free = iter((2**40, 2**39, 2**40, 2**39 - 1))
+    monkeypatch.setattr(export_routes.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2**41, 0, next(free)))
+    assert watch.get("/api/export/contacts.csv").status_code == 200
+    assert error_of(watch.get("/api/export/contacts.csv")) == (413, "too_large")
+
+
+def test_cut_connection_ends_the_export(console, client_of, monkeypatch):
+    console.state.store_image(image_record())
+    started, leave, check = threading.Event(), threading.Event(), ExportRoutes._check
+
+    def repeat(*arguments):
+        started.set()
+        while not leave.is_set():
+            check(*arguments)
+
+    monkeypatch.setattr(ExportRoutes, "_check", repeat)
+    watch = client_of("watch")
+    try:
+        with socket.create_connection((watch.base_url.host, watch.base_url.port)) as connection:
+            cookie = "; ".join(f"{name}={value}" for name, value in watch.cookies.items())
+            host = watch.base_url.netloc.decode()
+            head = f"GET /api/export/contacts.gpkg HTTP/1.1\r\nHost: {host}\r\nCookie: {cookie}\r\n\r\n"
+            connection.sendall(head.encode())
+            assert started.wait(120)
+        eventually(lambda: console.app._exports._queue._exports == {}, what="end of the export")
+    finally:
+        leave.set()
 
 
 def test_images_of_an_export_are_in_memory_one_at_a_time(console, monkeypatch):
@@ -192,8 +237,10 @@ def test_stop_ends_a_running_export(console):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
-def test_no_file_remains_after_the_end_of_the_process(tmp_path, end):
+@pytest.mark.parametrize(
+    ("end", "ending"), [(signal.SIGTERM, "kmz"), (signal.SIGKILL, "kmz"), (signal.SIGKILL, "gpkg")]
+)
+def test_no_file_remains_after_the_end_of_the_process(tmp_path, end, ending):
     state, temporary = tmp_path / "state", tmp_path / "tmp"
     temporary.mkdir()
     database = Database(state / "console-review.db")
@@ -212,7 +259,7 @@ def test_no_file_remains_after_the_end_of_the_process(tmp_path, end):
             with httpx2.Client(base_url=address, timeout=120) as client, ThreadPoolExecutor() as pool:
                 eventually(lambda: is_served(client), what="server")
                 assert Browser(client).login("watch", PASSWORD).status_code == 200
-                export = pool.submit(client.get, "/api/export/contacts.kmz")
+                export = pool.submit(client.get, f"/api/export/contacts.{ending}")
                 eventually(lambda: is_exporting(process.pid, state) or export.done(), what="export")
                 assert not export.done()
                 process.send_signal(end)

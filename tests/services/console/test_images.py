@@ -13,10 +13,11 @@ from builders.console import contact_id, image_record
 from PIL import Image
 
 from sonarpost.detection.snippets import cut_snippet
-from sonarpost.messages import Contact
+from sonarpost.messages import Contact, Pixels
 from sonarpost.review import rendering
 from sonarpost.review.image_geometry import contact_box, contact_mark, range_axis
 from sonarpost.review.measurement import NotMeasurableError, height_from_shadow, measure_length
+from sonarpost.services.console.store import serialisers
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.survey import Side
 
@@ -36,56 +37,22 @@ def pixels_of(answer) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(answer.content)))
 
 
-def test_raw_layer_equals_the_received_pixels(anna):
+def test_image_equals_the_received_pixels(anna):
     answer = anna.get(f"{VERSION}/picture.png")
     assert (pixels_of(answer) == image_record(missing_rows=10).picture.to_array()).all()
-    assert answer.headers["x-measurable"] == "true"
     assert "immutable" in answer.headers["cache-control"]
-
-
-def test_enhanced_layer_is_marked_as_not_measurable(anna):
-    answer = anna.get(f"{VERSION}/picture.png", layer="enhanced")
-    assert answer.headers["x-measurable"] == "false"
-    image = pixels_of(answer)
-    assert (image[-10:] == 0).all()
-    assert (image != image_record(missing_rows=10).picture.to_array()).any()
-    layers = anna.contact(ID)["versions"][0]["layers"]
-    assert {layer["name"]: layer["measurable"] for layer in layers} == {"raw": True, "enhanced": False}
-    assert anna.get(f"{VERSION}/picture.png", layer="grain").status_code == 404
-
-
-def test_masks_and_thumbnail_show_missing_and_guessed_pixels(anna):
-    missing = pixels_of(anna.get(f"{VERSION}/mask.png"))
-    assert (missing[:-10] == 0).all()
-    assert (missing[-10:] == 255).all()
-    assert (pixels_of(anna.get(f"{VERSION}/mask.png", kind="guessed")) == 0).all()
-    guessed = pixels_of(anna.get(f"{VERSION}/mask.png", kind="guessed", layer="enhanced"))
-    assert (guessed == 255 - missing).all()
-    # The thumbnail hatches missing areas.
-    small = pixels_of(anna.get(f"{VERSION}/thumbnail.png"))
-    assert max(small.shape) <= 96
-    assert (small[-9:] > 60).all()
-
-
-def test_colour_maps_are_monotonic_and_apply_levels():
-    ramp = np.arange(256, dtype=np.uint8)[None, :]
-    for name in rendering.MAPS:
-        colours = rendering.render(ramp, name)
-        assert colours.shape == ((1, 256) if name == "grey" else (1, 256, 3))
-        steps = np.diff(colours.reshape(256, -1).astype(int).sum(axis=1))
-        assert (steps <= 0).all() if name == "inverse" else (steps >= 0).all()
-    narrow = rendering.render(ramp, low_percent=20, high_percent=60)[0]
-    assert (narrow[:51] == 0).all()
-    assert (narrow[154:] == 255).all()
-    assert rendering.render(ramp, gamma=0.5)[0, 64] == 128
     # Sixteen bits become the most significant eight.
     assert rendering.eight_bits(np.array([[0, 255, 256, 65535]], np.uint16)).tolist() == [[0, 0, 1, 255]]
 
 
-def test_error_names_the_invalid_parameter(anna):
-    for name, value in (("low", "100"), ("gamma", "0"), ("map", "jet"), ("layer", "best"), ("high", "x")):
-        answer = anna.get(f"{VERSION}/picture.png", **{name: value})
-        assert (answer.status_code, answer.json()["error"]["field"]) == (400, name)
+def test_mask_and_thumbnail_show_missing_pixels(anna):
+    missing = pixels_of(anna.get(f"{VERSION}/mask.png"))
+    assert (missing[:-10] == 0).all()
+    assert (missing[-10:] == 255).all()
+    # The thumbnail hatches missing areas.
+    small = pixels_of(anna.get(f"{VERSION}/thumbnail.png"))
+    assert max(small.shape) <= 96
+    assert (small[-9:] > 60).all()
 
 
 def measure(anna, **changes):
@@ -100,40 +67,67 @@ def test_height_from_shadow_with_uncertainty(anna):
     assert found["height_m"] == pytest.approx(2.0 * 5 / 15)
     assert found["height_inputs"] == {"shadow_m": 2.0, "altitude_m": 5.0, "slant_range_m": 13.0}
     assert found["metres"] == "slant"
-    # 40 x 60 px of 200 bytes; clicks, blur and 2.5 % of the pixel size.
-    assert found["sigma_m"] == pytest.approx(math.hypot(0.05 * math.sqrt(2) * math.hypot(0.7, 0.58), 0.05), rel=0.01)
+    # 40 x 60 px of 200 bytes, details of 2.4 px: ends, half of the blur, and 2.5 % of the pixel size.
+    ends_px = math.sqrt(2) * math.hypot(0.7, 2.4 / 2.355 / 2)
+    assert found["sigma_m"] == pytest.approx(math.hypot(0.05 * ends_px, 0.05), rel=0.01)
     assert 0 < found["height_sigma_m"] < 0.1
     assert found["id"] is None
     assert anna.contact(ID)["measurements"] == []
     # A shadow lies across the track.
     found = measure(anna, to=[14.0, 50.0]).json()
-    assert (found["to"], found["along_m"]) == ([10.0, 50.0], 0.0)
+    assert (found["to"], found["along_m"], found["snapped"]) == ([10.0, 50.0], 0.0, [True, True])
+
+
+def test_ends_move_to_half_brightness_and_beam_and_blur_are_subtracted(make_console):
+    image = image_record()
+    pixels = np.full((40, 60), 60, np.uint8)
+    pixels[10:26, 20:26] = 200
+    console = make_console(beam_width_deg=0.5)
+    picture = Pixels.from_array(pixels)
+    console.state.store_image(image.model_copy(update={"picture": picture, "picture_sha256": picture.sha256}))
+    anna = console.browser("anna")
+    found = measure(anna, kind="length", **{"from": [7.5, 23.0], "to": [27.0, 23.0]}).json()
+    # The middle of the last dark and the first bright row.
+    assert (found["from"], found["to"]) == ([pytest.approx(10.0), 23.0], [pytest.approx(26.0), 23.0])
+    assert found["snapped"] == [True, True]
+    # 16 rows of 0.1 m. Beam of 0.5° at 13 m, and near the vehicle; details of 2.4 px.
+    assert found["blur_m"] == pytest.approx(math.hypot(0.12, 13.0 * math.radians(0.5), 0.24))
+    assert found["value_m"] == pytest.approx(math.sqrt(1.6**2 - found["blur_m"] ** 2))
+    assert found["along_m"] == pytest.approx(found["value_m"])
+    parts = [found[f"{name}_sigma_m"] for name in ("edge", "blur", "scale", "range")]
+    assert found["sigma_m"] == pytest.approx(math.hypot(*parts))
+    # An end on seabed without an edge within 7 px stays; its standard deviation is larger.
+    stays = measure(anna, kind="length", **{"from": [10.5, 23.0], "to": [35.0, 23.0]}).json()
+    assert (stays["to"], stays["snapped"]) == ([35.0, 23.0], [True, False])
+    assert stays["edge_sigma_m"] > 2 * found["edge_sigma_m"]
+    # Across the track the beam has no effect.
+    width = measure(anna, kind="width", **{"from": [18.0, 18.5], "to": [18.0, 27.0]}).json()
+    assert width["blur_m"] == pytest.approx(2.4 * width["across_m"] / width["value_m"] * 0.05 * 13 / 12, rel=0.05)
 
 
 def test_stored_measurement_is_in_the_audit(anna):
     found = measure(anna, kind="length", **{"from": [0.0, 10.0], "to": [20.0, 10.0]}, keep=True).json()
-    assert (found["value_m"], found["height_m"]) == (pytest.approx(2.0), None)
+    assert found["height_m"] is None
     detail = anna.contact(ID)
     assert detail["measurements"] == [found]
     [entry] = detail["audit"]
     assert (entry["action"], entry["user"], entry["detail"]["value_m"]) == ("measure", "anna", found["value_m"])
 
 
-def test_missing_or_synthesised_pixels_and_unknown_sizes_are_not_measurable(anna, make_console):
+def test_missing_pixels_other_layers_and_unknown_sizes_are_not_measurable(anna, make_console):
     for changes, field in (
-        ({"layer": "enhanced"}, "layer"),
+        ({"layer": "wider"}, "layer"),
         ({"kind": "length", "to": [38.0, 50.0]}, "line"),
         ({"to": [10.0, 10.0]}, "to"),
         ({"to": [10.0, 60.5]}, "to"),
-        ({"layer": "grain"}, "layer"),
     ):
         answer = measure(anna, **changes)
-        assert answer.status_code == 409
-        assert (answer.json()["measurable"], answer.json()["error"]["field"]) == (False, field)
+        assert (answer.status_code, answer.json()["error"]["code"]) == (409, "not_measurable")
+        assert answer.json()["error"]["field"] == field
     other = make_console()
     other.state.store_image(image_record(pixel_along_m=None))
     answer = measure(other.browser("anna"))
-    assert (answer.status_code, answer.json()["measurable"]) == (409, False)
+    assert (answer.status_code, answer.json()["error"]["code"]) == (409, "not_measurable")
 
 
 def test_height_needs_altitude_and_range():
@@ -154,10 +148,10 @@ FAR = {"contact_id": "c", "vehicle_id": "v", "pixel_along_m": 0.1, "pixel_across
 def test_length_uncertainty_equals_a_monte_carlo_simulation():
     contact = Contact(**FAR, altitude_m=5.0, ground_range_m=12.0)
     missing = np.zeros((200, 200), np.bool_)
-    length = measure_length(contact, missing, (50, 50), (90, 130), 2.0)
+    length = measure_length(contact, missing, (50, 50), (90, 130), (2.0, 3.0))
     rng = np.random.default_rng(1)
     count = 40_000
-    ends = np.array([50, 50, 90, 130]) + rng.normal(0, math.hypot(0.7, 2.0), (count, 4))
+    ends = np.array([50, 50, 90, 130]) + rng.normal(0, 1, (count, 4)) * [2.0, 2.0, 3.0, 3.0]
     scale = rng.normal(1, 0.025, count)
     altitude_m = rng.normal(5.0, 0.25, count)
     # The contact is between columns 50 and 100, at slant range 13 m.
@@ -234,7 +228,6 @@ def test_version_states_mark_box_and_range_axis_where_they_are_known(anna):
     assert version["range_axis"] == "slant"
     assert version["mark"] == {"row": 20.5, "column": 23.0, "columns": [15.5, 30.5], "range_m": 13.0}
     assert version["box"] == {"rows": [10.5, 30.5], "columns": [0.0, 50.5]}
-    assert version["edge_sigma_px"] == pytest.approx(0.58)
 
 
 def test_withdrawn_measurement_is_stored_and_does_not_count(anna):
@@ -262,3 +255,12 @@ def test_line_over_one_missing_pixel_is_rejected():
     with pytest.raises(NotMeasurableError, match="not received"):
         measure_length(contact, missing, (20.5, 10.0), (20.5, 50.0))
     assert measure_length(contact, missing, (21.5, 10.0), (21.5, 50.0)).value_m == pytest.approx(2.0)
+
+
+def test_many_versions_of_an_image_are_shown_in_part(console, monkeypatch):
+    monkeypatch.setattr(serialisers, "MAX_VERSIONS", 3)
+    for version in range(1, 7):
+        console.state.store_image(image_record(version=version))
+    detail = console.browser("watch").contact(contact_id())
+    assert [one["version"] for one in detail["versions"]] == [4, 5, 6]
+    assert detail["contact"]["version"] == 6

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import sqlite3
 import ssl
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +12,7 @@ import pytest
 from builders.common import eventually
 from builders.console import PASSWORD, Browser, web_server
 
+from sonarpost.network.connections import ConnectionLimits
 from sonarpost.services.console.store.users import (
     FILE_NAME,
     MAX_DEVICES_OF_USER,
@@ -22,7 +22,6 @@ from sonarpost.services.console.store.users import (
     Users,
 )
 from sonarpost.services.console.web.access import ApiError
-from sonarpost.services.console.web.connections import ConnectionLimits
 from sonarpost.services.console.web.login_limiter import MAX_CHECKS, RATE_OF_ADDRESS, RATE_OF_SOURCE, LoginLimiter
 from sonarpost.services.console.web.session_routes import DEVICE_COOKIE
 
@@ -145,7 +144,7 @@ def test_wrong_passwords_from_many_addresses_delay_unknown_browsers_of_the_user(
 
 def test_known_browser_has_its_own_limit_for_its_user_only(console):
     anna = console.browser("anna")
-    token = anna.client.cookies[DEVICE_COOKIE]
+    token = anna.client.cookies[f"{DEVICE_COOKIE}_8470"]
     assert console.users.is_known_device("anna", token)
     assert not console.users.is_known_device("bo", token)
     assert not console.users.is_known_device("anna", "")
@@ -153,7 +152,7 @@ def test_known_browser_has_its_own_limit_for_its_user_only(console):
     assert console.browser().login("anna").status_code == 200
     # A second user of the browser keeps the token; a token that the server did not issue is replaced.
     assert anna.login("bo").status_code == 200
-    assert anna.client.cookies[DEVICE_COOKIE] == token
+    assert anna.client.cookies[f"{DEVICE_COOKIE}_8470"] == token
     assert console.users.is_known_device("bo", token)
     invented = console.users.add_device("anna", "x" * 43)
     assert invented != "x" * 43
@@ -196,17 +195,12 @@ def test_scrypt_parameters_are_among_the_minimum_ones_of_owasp():
     assert (SCRYPT_COST, SCRYPT_PARALLEL) in {(2**17, 1), (2**16, 2), (2**15, 3), (2**14, 5), (2**13, 10)}
 
 
-def test_hash_of_an_earlier_version_is_replaced_at_the_next_log_in(tmp_path):
+def test_hash_with_other_parameters_is_replaced_at_the_next_log_in(tmp_path):
     old = hashlib.scrypt(PASSWORD.encode(), salt=bytes(16), n=2**12, r=8, p=1, dklen=32)
     path = tmp_path / FILE_NAME
-    with sqlite3.connect(path) as db:
-        db.execute(
-            "CREATE TABLE user (name TEXT PRIMARY KEY, role TEXT NOT NULL, salt BLOB NOT NULL, hash BLOB NOT NULL,"
-            " cost INTEGER NOT NULL, changed_utc_s REAL NOT NULL) WITHOUT ROWID"
-        )
-        db.execute("INSERT INTO user VALUES ('anna', 'operator', ?, ?, 4096, 7.0)", (bytes(16), old))
-    db.close()
     users = Users(path)
+    with users.transaction() as db:
+        db.execute("INSERT INTO user VALUES ('anna', 'operator', ?, ?, 4096, 1, 7.0)", (bytes(16), old))
     token = users.start_session("anna").token
     assert not users.verify_password("anna", "wrong password")
     assert users.verify_password("anna", PASSWORD)

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 import random
-import sqlite3
 
 import pytest
 from builders.console import FIRST_UTC_S, image_record
 
 from sonarpost.review.positions import destination
 from sonarpost.services.console.store import association
-from sonarpost.services.console.store.contacts import ContactFilter
-from sonarpost.services.console.store.database import Database
 
 PLACE = (56.0, -5.0)
 
@@ -104,6 +101,31 @@ def test_large_areas_stay_limited(console, monkeypatch):
     with console.state.database.read() as db:
         first = db.execute("SELECT id FROM contact WHERE image_id = '0000'").fetchone()[0]
     assert object_of(console, near) == object_of(console, first)
+
+
+def test_many_contacts_of_a_vehicle_at_one_place_are_compared_in_part(console, monkeypatch):
+    """A flood of one vehicle neither makes each image slower, nor hides the looks of another vehicle."""
+    monkeypatch.setattr(association, "MAX_LOOKS", 5)
+    monkeypatch.setattr(association, "MAX_NEAR", 5)
+    steps, compare = [0], association.possible_partners
+
+    def possible_partners(look, others, rule):
+        steps[-1] += len(others)
+        return compare(look, others, rule)
+
+    monkeypatch.setattr(association, "possible_partners", possible_partners)
+    first = store(console, "2000", 3.0, vehicle="uuv-2")
+    for number in range(60):
+        steps.append(0)
+        store(console, f"{number:04}", time_utc_s=FIRST_UTC_S + 100.0 * number)
+    assert max(steps[30:]) <= 2 * (association.MAX_LOOKS + 1) * association.MAX_NEAR * 2
+    assert max(map(len, partition(console))) <= 4 * association.MAX_LOOKS
+    other = store(console, "2001", 3.0, vehicle="uuv-2", time_utc_s=FIRST_UTC_S + 500.0)
+    with console.state.database.read() as db:
+        [look] = association.looks_of_object(db, object_of(console, other))[:1]
+        near = {one.contact_id for one in association.looks_near(db, look, 64.0)}
+    assert first in near | {look.contact_id}
+    assert sum("uuv-1" in one for one in near) == association.MAX_NEAR
 
 
 def test_object_of_two_looks(console):
@@ -201,30 +223,38 @@ def test_split_survives_new_looks(console):
 
 
 def test_merge_survives_new_looks_and_is_reversed_by_split(console):
-    one, far = store(console, "0001"), store(console, "0002", 30.0, vehicle="uuv-2")
+    # On one pass, looks more than a quarter of the radius apart are two objects.
+    one, near = store(console, "0001"), store(console, "0002", 6.0)
     anna = console.browser("anna")
     object_id = object_of(console, one)
-    answer = anna.post(f"/api/objects/{object_id}/merge", {"contact": far})
+    assert object_of(console, near) != object_id
+    answer = anna.post(f"/api/objects/{object_id}/merge", {"contact": near})
     assert answer.status_code == 200, answer.text
     assert answer.json()["number_of_looks"] == 2
-    store(console, "0003", 31.0, vehicle="uuv-3")
-    assert object_of(console, one) == object_of(console, far) == object_id
-    assert anna.contact(far)["audit"][0]["action"] == "merge"
+    store(console, "0003", 7.0, vehicle="uuv-3")
+    assert object_of(console, one) == object_of(console, near) == object_id
+    assert anna.contact(near)["audit"][0]["action"] == "merge"
     anna.post(f"/api/objects/{object_id}/split", {"contact": one})
-    assert object_of(console, one) != object_of(console, far)
+    assert object_of(console, one) != object_of(console, near)
 
 
-def test_merge_has_limits(console, monkeypatch):
-    one, far = store(console, "0001"), store(console, "0002", 1100.0, vehicle="uuv-2")
-    console.state.store_image(image_record("0003", position=None))
+def test_objects_within_the_association_gate_can_be_joined(console, monkeypatch):
+    one, near = store(console, "0001", position_sigma_m=0.8), store(console, "0002", 6.0, position_sigma_m=0.8)
+    far = store(console, "0003", 28.0, position_sigma_m=0.8)
+    console.state.store_image(image_record("0004", position=None))
     anna = console.browser("anna")
-    path = f"/api/objects/{object_of(console, one)}/merge"
-    without_position = anna.get("/api/contacts", q="0003").json()["items"][0]["id"]
+    path = f"/api/objects/{object_of(console, one)}"
+    candidates = anna.get(path).json()["nearby"]
+    assert [(each["contact"]["id"], round(each["distance_m"], 1)) for each in candidates] == [(near, 6.0)]
+    without_position = anna.rows()["0004"]["id"]
     for contact_id, status in ((far, 400), (one, 400), (without_position, 400), ("unknown", 404)):
-        assert anna.post(path, {"contact": contact_id}).status_code == status
+        assert anna.post(path + "/merge", {"contact": contact_id}).status_code == status
+    # A position of 8 m at one standard deviation agrees with one 24 m away.
+    uncertain = store(console, "0005", 52.0, position_sigma_m=8.0)
+    found = anna.get(f"/api/objects/{object_of(console, uncertain)}").json()["nearby"]
+    assert [each["contact"]["id"] for each in found] == [far]
     monkeypatch.setattr("sonarpost.services.console.store.objects.MAX_OBJECT_LOOKS", 1)
-    near = store(console, "0004", 30.0, vehicle="uuv-4")
-    assert anna.post(path, {"contact": near}).status_code == 400
+    assert anna.post(path + "/merge", {"contact": near}).status_code == 400
 
 
 def test_contradictory_verdicts_come_first(console):
@@ -238,6 +268,7 @@ def test_contradictory_verdicts_come_first(console):
     rows = to_do()
     assert [(row["id"], row["contradictory"]) for row in rows][2:] == [(newer, False)]
     assert {row["id"] for row in rows[:2] if row["contradictory"]} == {one, other}
+    assert console.state.counts().to_do == len(rows)
     assert anna.get(f"/api/objects/{object_of(console, one)}").json()["contradictory"]
     anna.decide(other, verdict="mine_like")
     assert not anna.contact(one)["contact"]["contradictory"]
@@ -270,31 +301,3 @@ def test_earlier_contacts_of_past_missions(make_console):
     assert [(row["id"], row["review"]) for row in detail["earlier"]] == [(old, "unreviewed"), (older, "not_mine_like")]
     assert detail["contact"]["looks"] == 1
     assert [row["id"] for row in anna.contact(old)["earlier"]] == [older]
-
-
-def test_database_of_an_earlier_version_is_migrated(console):
-    one, other = store_two_looks(console)
-    console.browser("anna").decide(one)
-    path = console.state.database.path
-    console.state.database.close()
-    old = sqlite3.connect(path)
-    old.executescript("""
-        DROP INDEX contact_square; DROP INDEX contact_contradictory; DROP INDEX contact_first;
-        DROP INDEX contact_listed; DROP INDEX decision_batch;
-        DROP TABLE object; DROP TABLE look_pair;
-        CREATE TABLE look_group (id INTEGER PRIMARY KEY AUTOINCREMENT, lat_deg REAL NOT NULL, lon_deg REAL NOT NULL,
-            sigma_m REAL, vehicle_id TEXT NOT NULL, seen_utc_s REAL);
-        INSERT INTO look_group VALUES (7, 56.0, -5.0, NULL, 'uuv-1', NULL);
-        UPDATE contact SET group_id = 'g7';
-    """)
-    for column in ("length_m", "width_m", "height_m", "decided_version", "decided_bytes", "contradictory"):
-        old.execute(f"ALTER TABLE contact DROP COLUMN {column}")
-    old.execute("ALTER TABLE decision DROP COLUMN batch")
-    old.commit()
-    old.close()
-    console.state.database = Database(path)
-    assert object_of(console, other) == "g7"
-    rows = {row["id"]: row for row in console.state.list_contacts(ContactFilter())["items"]}
-    assert rows[one]["decided_on"] == {"version": 1, "bytes": None}
-    assert object_of(console, store(console, "0003", 500.0)) == "g8"
-    assert object_of(console, store(console, "0004", 1.0, vehicle="uuv-4")) == "g7"

@@ -1,4 +1,4 @@
-"""Password change by users: errors, end of other sessions, the page, and no password in files or logs."""
+"""Password change by users: errors, end of other sessions, and no password in files or logs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ def test_new_password_ends_only_other_sessions_of_the_user(console):
 @pytest.mark.parametrize("user", ROLES_OF_USERS)
 def test_users_of_every_role_may_change_their_password(console, user):
     browser = console.browser(user)
-    assert browser.get("/password").status_code == 200
     assert browser.post("/api/password", {"old": PASSWORD, "new": NEW}).status_code == 204
 
 
@@ -76,10 +75,10 @@ def test_no_password_in_logs_audit_and_files(console, caplog):
         assert secret.encode() not in stored
 
 
-def test_page_has_no_foreign_links_and_no_inline_script(console):
-    page = console.browser("anna").get("/password").text
+def test_log_in_page_has_no_foreign_links_and_no_inline_script(console):
+    page = console.browser().get("/login").text
     links = re.findall(r"(?:src|href|action)=\"([^\"]*)\"", page)
-    assert "/static/js/password.js" in links
+    assert "/static/js/login.js" in links
     assert all(re.fullmatch(r"/(?!/).*", link) for link in links)
     assert not re.search(r"<style|style=|<script(?![^>]* src=)|\son[a-z]+=", page)
     # Without JavaScript, a form with GET would put the passwords into the URL.

@@ -7,6 +7,7 @@ from builders.console import contact_id, image_record
 from starlette.testclient import TestClient
 
 from sonarpost.services.console.web import report_routes
+from sonarpost.services.console.web.access import COOKIE
 from sonarpost.services.console.web.report import degrees_minutes
 from sonarpost.services.console.web.server import ConsoleApp
 
@@ -52,7 +53,7 @@ def test_report_of_training_is_marked(console):
     console.state.store_image(image_record())
     app = ConsoleApp(console.state, console.users, "vessel-1", training=True)
     with TestClient(app.asgi, base_url="http://127.0.0.1") as client:
-        client.cookies.set("sonarpost_session", console.users.start_session("anna").token)
+        client.cookies.set(COOKIE, console.users.start_session("anna").token)
         assert "<p class='training'>TRAINING" in client.get(f"/report/{ID}").text
 
 

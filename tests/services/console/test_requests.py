@@ -5,6 +5,10 @@ from __future__ import annotations
 import pytest
 from builders.console import FIRST_UTC_S, Clock, contact_id, downlink_state, image_record, partial_record
 
+from sonarpost.messages import Command, Pixels
+from sonarpost.modem.registry import modem_driver
+from sonarpost.review.costs import LinkRecord, RequestCost, expected_arrival
+from sonarpost.services.console.store.request_costs import FRAME_HEADER_BYTES
 from sonarpost.services.console.store.requests import REFUSAL_VALID_S
 
 ID = contact_id()
@@ -24,8 +28,9 @@ def related(kind, version=1, *, complete=True, received=300, **fields):
     return record.model_copy(update={"despeckle_strength": 1.0 if kind == "wider" else 0.0})
 
 
-def ask(console, kind="refine", contact_id=ID, status=201):
-    answer = console.browser("anna").post(f"/api/contacts/{contact_id}/requests", {"kind": kind, "airtime_s": 12.0})
+def ask(console, kind="refine", contact_id=ID, status=201, **body):
+    body |= {"kind": kind, "airtime_s": 12.0}
+    answer = console.browser("anna").post(f"/api/contacts/{contact_id}/requests", body)
     assert answer.status_code == status, answer.text
     return answer.json()
 
@@ -89,9 +94,9 @@ def test_answer_to_a_request_is_a_layer_of_its_contact(kind, console):
     console.state.store_image(related(kind, 2))
     watch = console.browser("watch")
     listed = watch.get("/api/contacts").json()
-    assert (listed["total"], listed["unreviewed"], listed["matching"]) == (1, 1, 1)
+    assert (listed["total"], listed["to_do"], listed["matching"]) == (1, 1, 1)
     assert [row["id"] for row in listed["items"]] == [ID]
-    assert [one["id"] for one in watch.get("/api/map").json()["contacts"]] == [ID]
+    assert [one["id"] for one in watch.chart().values()] == [ID]
     assert watch.get("/api/export/contacts.geojson").text.count('"Feature"') == 1
     detail = watch.contact(ID)
     [layer] = detail["related"]
@@ -139,20 +144,17 @@ def test_vehicle_without_a_consumer_is_remembered(console):
     # Another refusal does not exclude its kind.
     downlink(console, ask(console), "refused", "unknown image")
     found = costs(console, other)
-    reason = [found["revisit"][name] for name in ("available", "reason_code", "reason")]
-    assert reason == [False, "unsupported", "uuv-1 cannot do this"]
-    assert costs(console)["refine"]["available"]
-    assert found["refine"]["available"]
+    assert found["revisit"]["reason_code"] == "unsupported"
+    assert costs(console)["refine"]["reason_code"] is None
+    assert found["refine"]["reason_code"] is None
     ask(console, "revisit", other, 400)
     clock.advance(REFUSAL_VALID_S + 1.0)
-    assert costs(console, other)["revisit"]["available"]
+    assert costs(console, other)["revisit"]["reason_code"] is None
 
 
 def test_vessel_without_downlink_offers_no_requests(make_console):
     console = make_console(command_consumers=())
     store(console)
-    anna = console.browser("anna")
-    assert anna.contact(ID)["costs"] == anna.get(f"/api/contacts/{ID}/costs").json()["costs"]
     assert {cost["reason_code"] for cost in costs(console).values()} == {"no_downlink"}
     ask(console, status=400)
 
@@ -167,18 +169,82 @@ def test_pending_request_excludes_another_of_its_kind_until_it_is_late(console):
     ask(console)
 
 
-def test_expected_time_follows_the_durations_of_earlier_requests(make_console):
+def test_expected_time_follows_the_repetitions_and_durations_of_earlier_requests(make_console):
     console = make_console(assumed_rate=1)
     clock = Clock(console)
     store(console)
+    before = costs(console)["refine"]
     first = ask(console)
-    airtime_s = costs(console)["refine"]["airtime_s"]
-    assert first["expected_utc_s"] is None
-    assert first["earliest_utc_s"] == pytest.approx(clock.now_utc_s + airtime_s)
-    # The displayed air time of the request is 12 s; it was answered after ten times this.
-    clock.advance(120.0)
+    assert first["expected_utc_s"] == pytest.approx(clock.now_utc_s + before["median_s"])
+    assert first["probable_utc_s"] == pytest.approx(clock.now_utc_s + before["most_s"])
+    assert first["late_utc_s"] > first["probable_utc_s"] > first["expected_utc_s"]
+    # The vehicle confirms the third copy, and the answer takes eight times as long as expected.
+    now = console.state.clock()
+    state = downlink_state("refine", first["command_id"], "confirmed", now, times_sent=3)
+    console.state.apply_downlink_state(state)
+    clock.advance(8 * before["median_s"])
     store(console, 2, 400)
-    second = ask(console)
-    airtime_s = second["earliest_utc_s"] - clock.now_utc_s
-    assert second["expected_utc_s"] == pytest.approx(clock.now_utc_s + 10 * airtime_s)
-    assert second["late_utc_s"] > second["expected_utc_s"]
+    store(console, 3, 800)
+    after = costs(console)["wider"]
+    assert (after["packets_sent"], after["packets_lost"], after["past_requests"]) == (3, 2, 1)
+    assert after["loss_up"] is None
+    # 8^(1/3): one ratio of 8 and two of 1.
+    rate = modem_driver().capabilities.rates[1]
+    cost = RequestCost(3.2, 2 * 6.1, after["bytes"], after["bytes"])
+    unscaled = expected_arrival(cost, rate, FRAME_HEADER_BYTES, LinkRecord(None, 3, 2))
+    assert after["median_s"] == pytest.approx(2 * unscaled.median_s)
+    assert ask(console, "wider")["expected_utc_s"] == pytest.approx(clock.now_utc_s + after["median_s"])
+
+
+def test_gain_is_the_smallest_detail_before_and_after(make_console):
+    console = make_console(assumed_rate=1)
+    store(console, received=60)
+    found = costs(console)
+    sharp_to_m = console.browser("anna").contact(ID)["versions"][-1]["sharp_to_m"]
+    for kind in ("refine", "region"):
+        assert found[kind]["detail_m"] == sharp_to_m > found[kind]["new_detail_m"]
+    assert found["wider"]["new_detail_m"] is None
+    assert found["region"]["bytes"] == 192
+
+
+def test_send_next_moves_an_incomplete_image_to_the_front(console):
+    store(console, received=100, complete=False, total=200)
+    assert costs(console)["prioritise"]["airtime_s"] == costs(console)["revisit"]["airtime_s"] > 0
+    request = ask(console, "prioritise")
+    [item] = console.state.unsent_records()
+    assert isinstance(item.record, Command)
+    assert (item.record.kind, item.record.image_id, item.record.place) == ("prioritise", "00A7", "first")
+    ask(console, "prioritise", status=400)
+    assert console.browser("watch").contact(ID)["contact"]["open_requests"] == 1
+    downlink(console, request, "confirmed")
+    assert console.browser("watch").contact(ID)["contact"]["open_requests"] == 0
+    # Another image may have been sent before it since then.
+    ask(console, "prioritise")
+    store(console, 2, 200)
+    assert costs(console)["prioritise"]["reason_code"] == "complete"
+
+
+def test_invalid_regions_are_rejected(console):
+    console.state.store_image(partial_record())
+    whole, stream = {"box": [0, 0, 32, 32]}, {"stream_bytes": 96}
+    boxes = [{"box": box} | stream for box in ([8, 0, 8, 32], [0, 0, 33, 32])]
+    for body in (whole, stream, *boxes, whole | {"stream_bytes": 513}, whole | {"stream_bytes": 23}):
+        ask(console, "region", status=400, **body)
+    assert console.state.unsent_records() == []
+
+
+def test_region_arrives_as_a_layer_with_its_place(console):
+    whole = partial_record(received=200, complete=True)
+    console.state.store_image(whole)
+    height, width = whole.picture.height_px, whole.picture.width_px
+    ask(console, "region", box=[0, 16, 16, 32], stream_bytes=96)
+    pixels = Pixels.from_array(whole.picture.to_array()[: -(-height // 2), width // 2 :])
+    part = partial_record("00B0", received=96, complete=True, first_utc_s=FIRST_UTC_S + 60)
+    changes = {"contact": whole.contact, "picture": pixels, "picture_sha256": pixels.sha256, "missing_mask": b""}
+    console.state.store_image(part.model_copy(update=changes | {"despeckle_strength": None}))
+    detail = console.browser("watch").contact(ID)
+    [layer] = detail["related"]
+    assert (layer["relation"], layer["box"]) == ("region", [0, width // 2, -(-height // 2), width])
+    [request] = detail["requests"]
+    assert request["arrived_utc_s"] is not None
+    ask(console, "region", box=[0, 0, 16, 16], stream_bytes=96)

@@ -13,7 +13,7 @@ import pytest
 from builders.common import REPOSITORY, eventually, free_port
 from builders.console import Browser, EventReader, image_record, server_certificate, web_server
 
-from sonarpost.services.console.web.connections import ConnectionLimits, TrustedProxies
+from sonarpost.network.connections import ConnectionLimits, TrustedProxies
 
 CONFIGURATION = REPOSITORY / "packaging" / "nginx" / "sonarpost-console.conf"
 NGINX = os.environ.get("SONARPOST_NGINX") or shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")

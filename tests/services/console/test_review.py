@@ -34,7 +34,6 @@ def test_image_versions_belong_to_one_contact(console):
     assert detail["contact"]["complete"]
     assert detail["contact"]["percent_received"] == 100.0
     assert detail["record"]["altitude_m"] == 5.0
-    assert detail["record"]["nadir_side"] == "left"
     # A late older version does not replace the newer one.
     console.state.store_image(image_record(version=4))
     console.state.store_image(image_record(version=3, missing_rows=10))
@@ -47,17 +46,19 @@ def test_list_filter_sort_and_pages(console):
     for number in range(25):
         changes = {"vehicle": f"uuv-{number % 2 + 1}", "missing_rows": 10 * (number % 2)}
         place = {"position": (56 + number / 100, -5.0), "atd_confidence": number / 20}
-        console.state.store_image(image_record(f"{number:04d}", **changes, **place))
+        console.state.store_image(image_record(f"{number:04d}", first_utc_s=1000.0 + number, **changes, **place))
     watch = console.browser("watch")
     first = watch.get("/api/contacts", sort="confidence", order="asc", limit=10).json()
     second = watch.get("/api/contacts", sort="confidence", order="asc", limit=10, offset=10).json()
     confidences = [row["atd_confidence"] for row in first["items"] + second["items"]]
     assert confidences == [number / 20 for number in range(20)]
-    assert (first["total"], first["matching"], first["unreviewed"]) == (25, 25, 25)
+    assert (first["total"], first["matching"], first["to_do"]) == (25, 25, 25)
     assert first["vehicles"] == ["uuv-1", "uuv-2"]
-    found = watch.get("/api/contacts", vehicle="uuv-2", min_confidence="1.0", complete="false").json()
+    found = watch.get("/api/contacts", vehicle="uuv-2", from_utc_s="1020").json()
     assert {row["image_id"] for row in found["items"]} == {"0021", "0023"}
     assert found["matching"] == 2
+    found = watch.get("/api/contacts", from_utc_s="1003", to_utc_s="1006").json()
+    assert {row["image_id"] for row in found["items"]} == {"0003", "0004", "0005"}
     assert [row["image_id"] for row in watch.get("/api/contacts", q="0_").json()["items"]] == []
     assert watch.get("/api/contacts", q="/0007").json()["items"][0]["image_id"] == "0007"
 
@@ -69,7 +70,8 @@ def test_error_names_the_invalid_parameter(console):
         ("limit", "501"),
         ("limit", "1.5"),
         ("offset", "-1"),
-        ("min_confidence", "nan"),
+        ("from_utc_s", "-1"),
+        ("to_utc_s", "inf"),
         ("review", "maybe"),
         ("order", "up"),
         ("q", "x" * 81),
@@ -86,8 +88,9 @@ def test_looks_at_one_object_are_grouped(console):
     console.state.store_image(image_record("0004", position=None))
     watch = console.browser("watch")
     rows = {row["image_id"]: row for row in watch.get("/api/contacts").json()["items"]}
-    assert rows["0001"]["group"] == rows["0002"]["group"] is not None
-    assert (rows["0001"]["looks"], rows["0003"]["looks"], rows["0003"]["group"]) == (2, 1, None)
+    assert rows["0001"]["object"] == rows["0002"]["object"] != rows["0003"]["object"] is not None
+    assert [rows[name]["looks"] for name in ("0001", "0002", "0003", "0004")] == [2, 2, 1, 1]
+    assert rows["0004"]["object"] is None
     detail = watch.get(f"/api/contacts/{rows['0001']['id']}").json()
     assert {row["image_id"] for row in detail["group"]} == {"0001", "0002"}
 
@@ -219,17 +222,17 @@ def test_request_costs_and_no_repeated_request(make_console):
     console = make_console(assumed_rate=1)
     console.state.store_image(image_record(missing_rows=30).model_copy(update={"despeckle_strength": 1.0}))
     anna = console.browser("anna")
-    costs = {cost["kind"]: cost for cost in anna.get(f"/api/contacts/{ID}/costs").json()["costs"]}
+    costs = {cost["kind"]: cost for cost in anna.contact(ID)["costs"]}
     # 150 of 200 bytes are missing: 3 frames of 64 bytes, one packet of 6.1 s, after one of 3.2 s down.
-    assert (costs["resend"]["bytes"], costs["resend"]["packets"]) == (150, 1)
+    assert costs["resend"]["bytes"] == 150
     assert costs["resend"]["airtime_s"] == pytest.approx(9.3)
     # Twice the stream: 350 bytes are missing, 7 frames, three packets.
-    assert (costs["refine"]["bytes"], costs["refine"]["packets"]) == (350, 3)
+    assert costs["refine"]["bytes"] == 350
+    assert costs["refine"]["airtime_s"] == pytest.approx(3.2 + 3 * 6.1)
     assert costs["revisit"]["airtime_s"] == pytest.approx(3.2)
     # A new image of 200 bytes: 4 frames, two packets.
-    assert (costs["wider"]["bytes"], costs["wider"]["packets"]) == (200, 2)
+    assert costs["wider"]["bytes"] == 200
     assert costs["wider"]["airtime_s"] == pytest.approx(3.2 + 2 * 6.1)
-    assert costs["wider"]["basis"] == "latest rate 1, a new image of 200 bytes"
     assert {**costs["original"], "kind": "wider"} == costs["wider"]
     path = f"/api/contacts/{ID}/requests"
     asked = anna.post(path, {"kind": "resend", "airtime_s": 9.3})
@@ -252,9 +255,8 @@ def test_costs_of_new_images_are_those_of_the_first_version_and_unknown_without_
         longer = {"bytes_received": 400, "bytes_total": 400, "despeckle_strength": 1.0}
         console.state.store_image(image_record(version=2).model_copy(update=longer))
         costs = {cost["kind"]: cost for cost in console.browser("anna").contact(ID)["costs"]}
-        expected = [None] * 3 if rate is None else [400, 200, 200]
-        assert [costs[kind]["bytes"] for kind in ("refine", "wider", "original")] == expected
-        assert (costs["refine"]["airtime_s"] is None) == (rate is None)
+        assert [costs[kind]["bytes"] for kind in ("refine", "wider", "original")] == [400, 200, 200]
+        assert [costs["refine"][name] is None for name in ("airtime_s", "median_s", "most_s")] == [rate is None] * 3
 
 
 @pytest.mark.parametrize(
@@ -263,8 +265,8 @@ def test_costs_of_new_images_are_those_of_the_first_version_and_unknown_without_
         ({}, {"refine", "revisit", "wider"}),
         ({"position": None}, {"refine", "wider"}),
         ({"position": None, "codec": "vq"}, {"wider"}),
-        ({"missing_rows": 10, "codec": "vq"}, {"resend", "revisit", "wider"}),
-        ({"missing_rows": 10}, {"refine", "resend", "revisit", "wider"}),
+        ({"missing_rows": 10, "codec": "vq"}, {"resend", "prioritise", "revisit", "wider"}),
+        ({"missing_rows": 10}, {"refine", "resend", "prioritise", "revisit", "wider"}),
         ({"despeckle_strength": 0.0}, {"refine", "revisit", "wider"}),
         ({"despeckle_strength": 0.0625}, {"refine", "revisit", "wider", "original"}),
     ],
@@ -274,9 +276,8 @@ def test_impossible_requests_are_rejected(console, changes, possible):
     image = image_record(**{name: value for name, value in changes.items() if name not in of_codec})
     console.state.store_image(image.model_copy(update=of_codec))
     anna = console.browser("anna")
-    costs = anna.get(f"/api/contacts/{ID}/costs").json()["costs"]
-    assert {cost["kind"] for cost in costs if cost["available"]} == possible
-    assert all(cost["reason"] for cost in costs if not cost["available"])
+    costs = anna.contact(ID)["costs"]
+    assert {cost["kind"] for cost in costs if cost["reason_code"] is None} - {"region"} == possible
     for kind in REQUEST_KINDS:
         answer = anna.post(f"/api/contacts/{ID}/requests", {"kind": kind})
         assert answer.status_code == (201 if kind in possible else 400)

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import json
+import logging
+import re
+from http.cookiejar import CookieJar
 
+import httpx2
 import pytest
-from builders.console import PASSWORD, ROLES_OF_USERS, Browser, contact_id, image_record
+from builders.console import PASSWORD, ROLES_OF_USERS, Browser, contact_id, image_record, web_server
+from starlette.routing import Mount
 from starlette.testclient import TestClient
 
 from sonarpost.errors import BadInputError
 from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.store.contacts import ContactFilter
 from sonarpost.services.console.store.users import Users
 
 ID = contact_id()
@@ -19,12 +25,12 @@ READ_PATHS = [
     "/api/info",
     "/api/contacts",
     ONE,
-    f"{ONE}/costs",
     f"{ONE}/versions/1/picture.png",
     f"{ONE}/versions/1/mask.png",
     f"{ONE}/versions/1/thumbnail.png",
     "/api/fleet",
     "/api/map",
+    "/api/map/tracks",
     "/tiles/1/1/1.png",
     "/api/export/contacts.csv",
     f"/report/{ID}",
@@ -48,14 +54,13 @@ def with_contact(console):
 
 def test_reading_needs_a_session(with_contact):
     browser, invented = with_contact.browser(), with_contact.browser()
-    invented.client.cookies.set("sonarpost_session", "x" * 43)
+    invented.client.cookies.set("sonarpost_session_8470", "x" * 43)
     for path in READ_PATHS:
         answer = browser.get(path)
         assert (answer.status_code, answer.json()["error"]["code"]) == (401, "no_session"), path
         assert invented.get(path).status_code == 401
-    for path in ("/", "/password"):
-        answer = browser.get(path)
-        assert (answer.status_code, answer.headers["location"]) == (303, "/login")
+    answer = browser.get("/")
+    assert (answer.status_code, answer.headers["location"]) == (303, "/login")
 
 
 def test_actions_need_a_session_its_token_and_the_page_of_this_site(with_contact):
@@ -102,11 +107,29 @@ def test_session_cookie_attributes(console, make_console):
     assert "strict-transport-security" in secure
 
 
+def test_consoles_on_two_ports_of_a_host_keep_their_sessions(make_console):
+    """Browsers send a cookie to all ports of its host."""
+    vessel, shore = make_console(), make_console(role="shore")
+    jar = CookieJar()
+    with web_server(vessel) as one, web_server(shore) as other:
+        clients = [httpx2.Client(base_url=server.address, cookies=jar, timeout=120) for server in (one, other)]
+        browsers = [Browser(client) for client in clients]
+        for browser in (*browsers, *browsers):
+            assert browser.login("anna").status_code == 200
+        sessions = [browser.get("/api/session") for browser in browsers]
+        assert [answer.status_code for answer in sessions] == [200, 200]
+        assert [answer.json()["may"]["decide"] for answer in sessions] == [True, False]
+        assert browsers[0].post("/api/logout", {}).status_code == 204
+        assert [browser.get("/api/session").status_code for browser in browsers] == [401, 200]
+        for client in clients:
+            client.close()
+
+
 def test_session_ends_by_log_out_idle_time_and_maximum_time(console, tmp_path):
     browser = console.browser("anna")
-    cookie = browser.client.cookies["sonarpost_session"]
+    cookie = browser.client.cookies["sonarpost_session_8470"]
     assert browser.post("/api/logout", {}).status_code == 204
-    browser.client.cookies.set("sonarpost_session", cookie)
+    browser.client.cookies.set("sonarpost_session_8470", cookie)
     assert browser.get("/api/contacts").status_code == 401
     now = [1000.0]
     users = Users(tmp_path / "users.db", session_s=100, session_max_s=250, clock=lambda: now[0])
@@ -157,7 +180,7 @@ def test_only_known_host_names_are_accepted(console, make_console):
 
 
 def test_all_responses_have_security_headers(console):
-    for path in ("/", "/login", "/password", "/api/contacts", "/nothing", "/static/nothing.js"):
+    for path in ("/", "/login", "/api/contacts", "/nothing", "/static/nothing.js"):
         headers = console.browser().get(path).headers
         assert "default-src 'none'; script-src 'self'" in headers["content-security-policy"]
         assert "unsafe-inline" not in headers["content-security-policy"]
@@ -187,6 +210,111 @@ def test_path_traversal_is_rejected(with_contact):
         assert (answer.status_code, answer.json()["error"]["code"]) == (404, "not_found"), path
 
 
+HOSTILE_VALUES = (
+    "9" * 5000,
+    "9" * 20,
+    "9" * 10,
+    "-1",
+    "1e999",
+    "x" * 5000,
+    "%00",
+    "%FF%FE",
+    "%ED%A0%80",
+    "%D9%A3",
+    "%2e%2e",
+)
+HOSTILE_NUMBERS = (
+    "9" * 5000,
+    "9" * 20,
+    "-1",
+    "1e999",
+    "-1e999",
+    "1e-999",
+    "[" * 9000,
+    '"\\ud800"',
+    "{}",
+    "null",
+    "true",
+)
+BODIES = {
+    "/decisions": {"version": 1, "revision": 0, "sha256": "0" * 64, "verdict": "unsure", "shown_s": 1, "remark": "x"},
+    "/undo": {"decision_id": "x", "version": 1, "sha256": "0" * 64},
+    "/measure": {"version": 1, "kind": "length", "from": [1, 2], "to": [3, 4]},
+    "/requests": {"kind": "region", "airtime_s": 1, "box": [0, 0, 1, 1], "stream_bytes": 100},
+    "/advice": {"version": 1, "verdict": "unsure", "remark": "x"},
+    "/split": {"contact": ID},
+    "/merge": {"contact": ID},
+    "/api/settings": {"settings": {"theme": "x"}},
+    "/api/login": {"user": "anna", "password": "x"},
+    "/api/login-link": {"token": "x"},
+    "/api/password": {"old": "x", "new": "x"},
+}
+
+
+def routes_of(console):
+    """Paths and methods of all routes; each `{}` in a path is a parameter."""
+    for route in console.app.asgi._app.routes:
+        path = re.sub("{.*?}", "{}", route.path)
+        if isinstance(route, Mount):
+            yield f"{path}/{{}}", "GET"
+        else:
+            yield path, "POST" if "POST" in (route.methods or ()) else "GET"
+
+
+def hostile_requests(console):
+    """Yield method, path, query string and body of hostile requests to all routes."""
+    queries = [f"{name}={value}" for name in (*ContactFilter.model_fields, "q", "last") for value in HOSTILE_VALUES]
+    for path, method in routes_of(console):
+        known = path.replace("{}", ID, 1).replace("{}", "1")
+        if method == "POST":
+            body = next((body for ending, body in BODIES.items() if path.endswith(ending)), {"x": 1})
+            for name in body:
+                for value in HOSTILE_NUMBERS:
+                    hostile = json.dumps({**body, name: "HOSTILE"}).replace('"HOSTILE"', value)
+                    yield method, known, "", hostile.encode()
+        elif path in ("/api/contacts", "/report", "/api/export/{}"):
+            for query in queries:
+                yield method, known.replace(ID, "contacts.csv"), query, b""
+        if "{}" in path:
+            for value in HOSTILE_VALUES:
+                yield method, path.replace("{}", value), "", b"{}"
+                yield method, path.replace("{}", ID, 1).replace("{}", value), "", b"{}"
+        yield method, known, "x=" + "9" * 5000, b"{}"
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("user", ["", "anna", "eva"])
+def test_no_hostile_request_is_an_error_of_the_server(with_contact, caplog, user):
+    browser = with_contact.browser(user)
+    number = 0
+    for method, path, query, body in hostile_requests(with_contact):
+        if user and path in ("/events", "/api/logout"):
+            continue  # a stream without an end; the end of the session
+        answer = browser.client.request(
+            method, f"{path}?{query}", content=body, headers={"X-CSRF-Token": browser.csrf}, follow_redirects=False
+        )
+        assert answer.status_code < 500, (method, path[:100], query[:100], body[:100])
+        number += 1
+    assert number > 400
+    assert browser.get("/api/session").status_code == (200 if user else 401)
+    assert sum(len(record.getMessage()) + len(str(record.exc_info or "")) for record in caplog.records) < 100 * number
+    assert [record.getMessage() for record in caplog.records if record.exc_info] == []
+
+
+def test_unexpected_exceptions_are_logged_once_an_interval(with_contact, caplog, monkeypatch):
+    def fail(*_arguments):
+        raise ValueError("x")
+
+    monkeypatch.setattr(with_contact.state, "list_contacts", fail)
+    anna = with_contact.browser("anna")
+    caplog.clear()
+    for _ in range(20):
+        answer = anna.get("/api/contacts")
+        assert (answer.status_code, answer.json()["error"]["code"]) == (500, "defect")
+    [line] = [record for record in caplog.records if record.levelno >= logging.ERROR]
+    assert "in fail" in str(line.exc_text)
+
+
 def test_tiles_are_served_from_their_folder(make_console, tmp_path):
     tile = tmp_path / "tiles" / "3" / "4" / "5.png"
     tile.parent.mkdir(parents=True)
@@ -214,6 +342,7 @@ def test_too_large_and_invalid_bodies_are_rejected(with_contact):
         ("mlo_class", ""),
         ("revision", True),
         ("operator", "another"),
+        ("layer", "enhanced"),
     ):
         answer = anna.decide(ID, **{field: value})
         assert (answer.status_code, answer.json()["error"]["field"]) == (400, field)

@@ -19,7 +19,9 @@ from builders.console import (
     contact_id,
     downlink_state,
     image_record,
+    queue_state,
     received_frame,
+    session_cookie,
 )
 from builders.record_samples import SAMPLES
 from builders.records import decision_record
@@ -103,7 +105,7 @@ def test_images_are_published_and_a_decision_is_sent_to_relay_and_modem(runner, 
     decompressor = runner.peer(VESSEL, "decompressor")
     console = start()
     anna = log_in(console, "anna", "operator")
-    stream = EventReader(console.address, anna.client.cookies["sonarpost_session"])
+    stream = EventReader(console.address, anna.client.cookies[session_cookie(console.address)])
     eventually(lambda: stream.names() == ["hello"], what="stream")
     key = keys.image_reconstructed(VESSEL)
     decompressor.send(key, "console", image(1, complete=False))
@@ -130,6 +132,51 @@ def test_images_are_published_and_a_decision_is_sent_to_relay_and_modem(runner, 
     put(client, keys.acoustic_downlink(VESSEL), confirmed)
     eventually(lambda: delivery()["vehicle"] == "confirmed", what="confirmation")
     stream.close()
+
+
+def test_invalid_subscribed_and_stored_records_affect_no_other(start, client, monkeypatch):
+    console = start()
+
+    def fail(_state):
+        raise ValueError("a defect")
+
+    monkeypatch.setattr(console.state, "apply_tasking_state", fail)
+    monkeypatch.setattr(console.state, "fleet_state", dict)
+    with console.store.transaction() as tx:
+        tx.put_state("settled/invalid", b"")
+        tx.put_state("settled/decision/relay/d-1", b"\xff")
+    console._subscribe(keys.tasking_state(VESSEL), TaskingState, fail)
+    state = TaskingState(vessel_id=VESSEL, kind="command", record_id="c-1", state="delivered", changed_utc_s=1.0)
+    put(client, keys.tasking_state(VESSEL), state)
+    put(client, keys.acoustic_queue("uuv-8"), queue_state([], 1.0))
+    put(client, keys.acoustic_queue("uuv-1"), queue_state([], 1.0))
+    eventually(lambda: "uuv-1" in console.state.fleet.vehicles(), what="queue")
+    eventually(lambda: console.health().counters["records_ignored"] == 2, what="ignored records")
+    eventually(lambda: console.store.states("settled/") == {}, what="quarantine")
+    assert console.health().state == "degraded"
+
+
+def test_a_record_that_fails_ends_no_batch(start, monkeypatch):
+    console = start(role="shore")
+    store_images = console.state.store_images
+
+    def fail(images):
+        if any(one.image_id == "0003" for one in images):
+            raise OverflowError("too large")
+        return store_images(images)
+
+    monkeypatch.setattr(console.state, "store_images", fail)
+    records = [image_record(f"{number:04}") for number in range(7)]
+    assert console._store_batch(records) == 6
+    assert console.state.counts().total == 6
+
+
+def test_fleet_state_that_fails_degrades_health_until_it_is_published_again(start, monkeypatch):
+    console = start()
+    with monkeypatch.context() as patched:
+        patched.setattr(console.state, "fleet_state", lambda: 1 / 0)
+        eventually(lambda: "fleet state not published" in console.degraded_reason(), what="degraded")
+    eventually(lambda: console.degraded_reason() == "", what="recovery")
 
 
 def test_empty_relay_means_delivery_to_shore(start, client, runner, monkeypatch, log_in):

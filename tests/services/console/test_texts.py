@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from sonarpost.services.console.web.access import ErrorCode
 from sonarpost.services.console.web.server import STATIC
 
 TEXTS = STATIC / "js" / "texts"
@@ -67,6 +69,11 @@ def test_every_used_text_exists_and_every_text_is_used():
     called = {name for name in re.findall(r'\bt\("([^"]+)"', sources()) if "." in name.strip(" .")}
     assert called - names == set()
     assert {name for name in names if name not in whole and not name.startswith(parts)} == set()
+
+
+def test_every_error_code_of_the_server_has_a_text():
+    codes = {name.split(".")[1] for name, _ in entries("en") if name.startswith("error.")}
+    assert codes - {"busy_for"} == set(get_args(ErrorCode))
 
 
 def test_scripts_have_no_other_texts():

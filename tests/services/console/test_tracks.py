@@ -43,14 +43,11 @@ def test_track_and_latest_position(make_console):
     places = along(90.0, 3)
     for number, place in enumerate(places):
         console.state.store_status(received(number, place, heading_deg=90.0, depth_m=12.4, images_waiting=4))
-    chart = get(console, "/api/map")
-    [track] = chart["tracks"]
+    [track] = get(console, "/api/map/tracks")["tracks"]
     assert track == {"vehicle_id": "uuv-1", "points": [list(place) for place in places]}
-    [vehicle] = chart["vehicles"]
-    assert (vehicle["lat_deg"], vehicle["lon_deg"], vehicle["heading_deg"]) == (*places[-1], 90.0)
-    assert vehicle["utc_s"] == START_S + 180.0
     [vehicle] = get(console, "/api/fleet")["vehicles"]
-    assert (vehicle["lat_deg"], vehicle["position_utc_s"]) == (places[-1][0], START_S + 180.0)
+    assert (vehicle["lat_deg"], vehicle["lon_deg"], vehicle["heading_deg"]) == (*places[-1], 90.0)
+    assert vehicle["position_utc_s"] == START_S + 180.0
     assert vehicle["range_m"] == pytest.approx(300.0, abs=0.1)
     status = vehicle["status"]
     assert (status["depth_m"], status["images_waiting"], status["battery"]) == (12.4, 4, None)
@@ -63,27 +60,24 @@ def test_measured_distance(make_console):
     measured = {"distance_m": 740.0, "measured_utc_s": 1476262840.5}
     [vehicle] = get(console, "/api/fleet")["vehicles"]
     assert (vehicle["vehicle_id"], vehicle["measured_range"], vehicle["range_m"]) == ("uuv-1", measured, None)
-    assert get(console, "/api/map")["ranges"] == [{"vehicle_id": "uuv-1", **measured}]
 
 
 def test_the_newer_of_contact_and_status_is_the_position(console):
     console.state.store_status(received(0, CORNER))
     console.state.store_image(image_record("0001", position=(56.5, -5.0), time_utc_s=START_S + 30.0))
-    [vehicle] = get(console, "/api/map")["vehicles"]
-    assert vehicle["lat_deg"] == pytest.approx(56.5, abs=1e-3)
     assert get(console, "/api/fleet")["vehicles"][0]["lat_deg"] == pytest.approx(56.5, abs=1e-3)
     console.state.store_status(received(1, CORNER))
-    assert get(console, "/api/map")["vehicles"][0]["lat_deg"] == CORNER[0]
+    assert get(console, "/api/fleet")["vehicles"][0]["lat_deg"] == CORNER[0]
     console.state.store_status(received(2, None))
     [vehicle] = get(console, "/api/fleet")["vehicles"]
     assert vehicle["lat_deg"] == pytest.approx(56.5, abs=1e-3), "the latest status has no position"
-    assert len(get(console, "/api/map")["tracks"][0]["points"]) == 2
+    assert len(get(console, "/api/map/tracks")["tracks"][0]["points"]) == 2
 
 
 def test_a_repeated_position_is_one_point(console):
     for number in range(3):
         console.state.store_status(received(number, time_utc_s=START_S))
-    [track] = get(console, "/api/map")["tracks"]
+    [track] = get(console, "/api/map/tracks")["tracks"]
     assert len(track["points"]) == 1
     assert get(console, "/api/fleet")["vehicles"][0]["status"]["received_utc_s"] == START_S + 128.0
 
@@ -98,20 +92,52 @@ def test_points_and_vehicles_are_limited(console, monkeypatch):
     with console.state.database.read() as db:
         counts = dict(db.execute("SELECT vehicle_id, COUNT(*) FROM track GROUP BY vehicle_id").fetchall())
     assert counts == {"uuv-1": 5, "uuv-2": 5}
-    assert [[point[0] for point in track["points"]] for track in get(console, "/api/map")["tracks"]] == [
+    assert [[point[0] for point in track["points"]] for track in get(console, "/api/map/tracks")["tracks"]] == [
         [56.006, 56.007, 56.008]
     ] * 2
 
 
-def test_surveyed_area_of_overlapping_lines(console):
+def test_statuses_of_one_vessel_displace_none_of_the_same_vehicle_of_another(console, monkeypatch):
+    monkeypatch.setattr(tracks, "MAX_POINTS", 2)
+    monkeypatch.setattr(tracks, "MAX_POINTS_DRAWN", 2)
+    places = along(90.0, 1)
+    for number, place in enumerate(places):
+        console.state.store_status(received(number, place))
+    for number in range(5):
+        console.state.store_status(received(number, (10.0, 10.0 + number), vessel="vessel-2"))
+    drawn = [track["points"] for track in get(console, "/api/map/tracks")["tracks"]]
+    assert drawn == [[list(place) for place in places], [[10.0, 13.0], [10.0, 14.0]]]
+
+
+def test_invented_vehicles_of_a_vessel_hide_no_vehicle_of_another(console, monkeypatch):
+    monkeypatch.setattr(tracks, "MAX_VEHICLES", 2)
+    for vehicle in ("a", "b", "c"):
+        console.state.store_status(received(0, vehicle=vehicle, vessel="vessel-2"))
+    console.state.store_status(received(0, vehicle="uuv-1"))
+    assert {one["vehicle_id"] for one in get(console, "/api/fleet")["vehicles"]} == {"a", "b", "uuv-1"}
+
+
+def test_surveyed_area_of_overlapping_lines_and_vehicles(console):
     line = along(90.0, 10)
     back = [destination(*place, 0.0, 100.0) for place in reversed(line)]
     for number, place in enumerate([*line, *back]):
         console.state.store_status(received(number, place, swath_m=100.0))
-    [vehicle] = get(console, "/api/mission")["vehicles"]
+    surveyed = get(console, "/api/map/tracks")["surveyed"]
     # Two lines of 1000 m, 100 m apart, with 100 m to each side, and the turn of 100 m between them.
-    assert vehicle["coverage"]["area_m2"] == pytest.approx(1000 * 300 + 100 * 100, rel=0.02)
-    assert (vehicle["coverage"]["legs"], vehicle["coverage"]["time_utc_s"]) == (21, START_S + 21 * 60.0)
+    assert surveyed["area_m2"] == pytest.approx(1000 * 300 + 100 * 100, rel=0.02)
+    assert (len(surveyed["legs"]), surveyed["since_utc_s"]) == (21, START_S)
+    assert surveyed["legs"][0] == [*line[0], *line[1], 100.0]
+    # Another vehicle on half of the first line adds nothing; 500 m further on it adds its own line.
+    for number, place in enumerate(along(90.0, 5)):
+        console.state.store_status(received(number, place, "uuv-2", swath_m=50.0))
+    surveyed_by_two = get(console, "/api/map/tracks")["surveyed"]
+    assert len(surveyed_by_two["legs"]) == 26
+    assert surveyed_by_two["area_m2"] == pytest.approx(surveyed["area_m2"], rel=0.02)
+    for number, place in enumerate(along(90.0, 5, destination(*CORNER, 180.0, 500.0))):
+        console.state.store_status(received(20 + number, place, "uuv-2", swath_m=50.0))
+    area_m2 = get(console, "/api/map/tracks")["surveyed"]["area_m2"]
+    # The leg of 707 m between both lines is 15 minutes long, and counts too, with half of its width beyond the lines.
+    assert area_m2 > surveyed_by_two["area_m2"] + 500 * 100
 
 
 @pytest.mark.parametrize(
@@ -129,8 +155,7 @@ def test_surveyed_area_of_overlapping_lines(console):
 def test_what_is_no_leg_is_not_counted(console, statuses):
     for status in statuses:
         console.state.store_status(status)
-    [vehicle] = get(console, "/api/mission")["vehicles"]
-    assert vehicle["coverage"] is None
+    assert get(console, "/api/map/tracks")["surveyed"] is None
 
 
 def test_many_wide_legs_are_counted_with_few_cells():

@@ -11,28 +11,24 @@ import { EmptyView } from "./shell/empty_view.js";
 import { startEvents } from "./base/event_stream.js";
 import { openExportDialog } from "./shell/export_dialog.js";
 import { FleetView } from "./views/fleet_view.js";
-import { Header, restoreTheme, toggleTheme, toggleTypeSize } from "./shell/header.js";
+import { Header, restoreTheme } from "./shell/header.js";
 import { registerServiceWorker } from "./base/installation.js";
-import { markKeys } from "./base/keys.js";
 import { KnownObject } from "./contact/known_object.js";
 import { Drawer, onSwipe } from "./base/layout.js";
 import { MapView } from "./map/map_view.js";
-import { MissionView } from "./views/mission_view.js";
-import { openObject, watchObject } from "./views/object_view.js";
+import { watchObject } from "./views/object_view.js";
 import { Queue } from "./queue/queue.js";
 import { QueueFilters } from "./queue/queue_filters.js";
 import { startRegion } from "./requests/region_request.js";
 import { RequestButtons } from "./requests/request_buttons.js";
-import { openRequestDialog } from "./requests/request_dialog.js";
 import { loadSettings } from "./base/settings.js";
 import { openSettings } from "./shell/settings_dialog.js";
-import { shortcutTable, showHelp, startShortcuts } from "./base/shortcuts.js";
+import { shortcutTable, showHelp, startShortcuts, switchKeys } from "./base/shortcuts.js";
 import { emit, listen, setClock, setting, state } from "./base/state.js";
 import { StatusLine } from "./shell/status_line.js";
 import { loadLanguage, t, translate } from "./texts.js";
 
 const PREFETCHED_ROWS = 3;
-const FAILURE_MS = 1000; // a verdict key in this time after a failed change of contact was meant for the other contact
 
 class App {
   constructor() {
@@ -40,29 +36,27 @@ class App {
     this.loader = new ContactLoader((detail) => this.view.prepare(detail));
     this.actions = new ActionQueue();
     this.goal = null; // identifier of the contact that is being loaded for display
-    this.failure = { text: "", dropped: 0, time_ms: -Infinity }; // last contact that could not be loaded
     this.supersede = () => {}; // ends waiting for the goal
     this.status = new StatusLine(() => this.undo());
-    this.decision = new DecisionForm(this.view, this.status, (name, hold) => this.#pressed(name, hold));
+    this.decision = new DecisionForm(this.view, this.status, (name) => this.decide(name));
     this.details = new ContactDetails();
     this.known = new KnownObject();
-    this.requests = new RequestButtons(() => this.request());
+    this.requests = new RequestButtons();
     this.queue = new Queue();
-    this.filters = new QueueFilters(debounce(() => this.queue.show(this.filters.query), 120));
+    this.filters = new QueueFilters(debounce(() => this.#showQueue(), 120), () => this.queue.showGrid(!this.queue.grid));
     listen("fleet", (fleet) => { state.fleet = fleet; }); // first listener: the others read the state
-    this.map = new MapView(() => this.actions.add(() => this.request()));
+    this.map = new MapView();
     this.fleet = new FleetView();
-    this.mission = new MissionView();
     this.empty = new EmptyView();
     this.activeView = "review";
     this.requestNumber = 0; // last request for a contact
     this.displayedNumber = 0; // request whose response is displayed
-    this.panel = h("div", { class: "panel", role: "region", "aria-label": t("app.decision") }, this.decision.element, this.requests.element, this.known.element, this.details.element);
+    this.panel = h("div", { class: "panel", role: "region", "aria-label": t("app.decision") }, this.decision.element, this.requests.element, this.known.element, this.view.data, this.details.element);
     this.drawer = new Drawer(this.panel);
-    this.review = h("section", { class: "review", "aria-label": t("app.review") },
+    this.review = h("section", { class: "review", "aria-label": t("header.view.review") },
       h("div", { class: "side" }, this.filters.element, this.queue.element), this.view.element, this.panel, this.empty.element);
     onSwipe(this.view.stage, () => !this.view.zoomed && !this.view.measurement.active, (step) => this.queue.move(step));
-    document.getElementById("main").append(this.review, this.map.element, this.fleet.element, this.mission.element);
+    document.getElementById("main").append(this.review, this.map.element, this.fleet.element);
     this.keys = shortcutTable({ app: this, queue: this.queue, view: this.view, decision: this.decision, map: this.map });
     this.header = new Header({ exports: () => this.exports(), settings: () => this.settings(), help: () => this.help() });
     this.#hideWithoutContact();
@@ -72,49 +66,62 @@ class App {
 
   #addListeners() {
     const reloadSoon = debounce(() => this.load(), 5, 50);
-    startShortcuts(this.keys, () => this.activeView, { leave: () => this.escape(), send: () => this.submit() });
-    listen("counts", (response) => {
+    startShortcuts(this.keys, () => (this.activeView === "review" && this.queue.grid ? "grid" : this.activeView), () => this.escape());
+    listen("list", (response) => {
       this.filters.update(response);
       // Display the first contact if none is selected.
       if (state.selected === null && this.goal === null && response.matching > 0) queueMicrotask(() => this.queue.move(1));
     });
-    listen("select", ({ id, name }) => this.select(id, name));
+    listen("select", ({ id, name }) => {
+      this.queue.showGrid(false);
+      this.select(id, name);
+    });
+    listen("grid", () => {
+      this.review.classList.toggle("grid", this.queue.grid);
+      this.decision.guard.restart();
+    });
+    listen("show_all", () => this.filters.reset());
+    listen("undelivered", () => { this.show("review"); this.filters.setReview("undelivered"); });
     listen("move", ({ step }) => this.#go((id) => this.queue.rowAfter(id, step)));
     listen("view", ({ name }) => this.show(name));
-    const changed = (id) => {
-      this.loader.forget(id);
-      if (id === state.selected) reloadSoon();
-    };
-    listen("contact", ({ contact }) => changed(contact.id));
-    for (const name of ["decision", "request", "advice", "changed"]) listen(name, ({ id }) => changed(id));
+    listen("contact", ({ contact }) => {
+      this.loader.forget(contact.id);
+      const shown = this.detail?.contact;
+      // The displayed contact has the other looks at its object.
+      if (shown && (shown.id === contact.id || (shown.object !== null && shown.object === contact.object))) reloadSoon();
+    });
     // Without events, what was loaded in advance can be old.
     listen("online", () => this.loader.clear());
     listen("region", () => this.region());
     listen("reload", () => { this.loader.clear(); this.reload(); });
     listen("theme", () => this.view.redraw());
-    listen("session", () => location.assign("/login"));
+    listen("session", () => location.assign("/login?ended"));
+    addEventListener("popstate", ({ state: entry }) => this.#goBack(entry ?? {}));
   }
 
   async start() {
-    this.show("review");
-    const requested = decodeURIComponent(location.hash.slice(1));
+    const requested = addressed();
+    if (history.state === null) history.replaceState({ view: "review", id: requested || null }, "");
+    this.#draw(history.state.view);
     if (requested) this.select(requested);
     await Promise.all([
       this.status.start(),
-      this.queue.show(this.filters.query),
+      this.#showQueue(),
       api.fleet().then((fleet) => emit("fleet", fleet)),
     ]);
+    if (this.queue.rows.matching === 0 && state.counts.total > 0) this.filters.leaveEmptyToDo();
+    const { latest, restored } = this.decision.drafts;
+    if (latest) this.status.draftsRestored(latest, restored.size);
     startEvents();
   }
 
+  #showQueue() {
+    return this.queue.show(this.filters.query).catch(showError);
+  }
+
   /** Reload all data after a long interruption of the event stream. */
-  async reload() {
-    try {
-      emit("fleet", await api.fleet());
-      await Promise.all([this.queue.refresh(), this.load()]);
-    } catch (error) {
-      toast(error.message, { bad: true });
-    }
+  reload() {
+    return Promise.all([api.fleet().then((fleet) => emit("fleet", fleet)), this.queue.refresh(), this.load()]).catch(showError);
   }
 
   #hideWithoutContact() {
@@ -155,19 +162,13 @@ class App {
       return true;
     } catch (error) {
       this.#endLoading();
-      this.failure = { text: t("app.not_loaded", { name: row?.name ?? t("app.next_contact"), reason: error.message }), dropped: 0, time_ms: performance.now() };
-      this.#drop(this.actions.clear());
+      this.actions.clear();
+      this.decision.guard.restart();
+      toast(t("app.not_loaded", { name: row?.name ?? t("app.next_contact"), reason: error.message }), { bad: true });
       // The address of the page can name an unknown contact.
       if (state.selected === null && error.status === 404 && this.queue.rows.matching > 0) queueMicrotask(() => this.queue.move(1));
       return false;
     }
-  }
-
-  /** Report keys that were meant for a contact that could not be loaded. */
-  #drop(count) {
-    this.failure.dropped += count;
-    const { text, dropped } = this.failure;
-    toast(dropped ? `${text} ${t("app.dropped", { count: dropped })}` : text, { bad: true });
   }
 
   #endLoading() {
@@ -179,18 +180,13 @@ class App {
   #display({ detail, prepared, stale = false }) {
     const { id } = detail.contact;
     this.#endLoading();
+    if (state.selected !== null) document.querySelector("#toasts .bad")?.remove(); // it was about the contact before
     state.selected = id;
     this.requestNumber += 1;
-    this.displayedNumber = this.requestNumber;
-    this.detail = detail;
+    this.#render(detail, prepared, this.requestNumber);
     this.#hideWithoutContact();
-    this.view.commit(prepared);
-    this.decision.show(detail);
-    this.known.show(detail);
-    this.details.show(detail);
-    this.requests.show(detail);
-    this.queue.mark(id);
-    history.replaceState(null, "", `#${encodeURIComponent(id)}`);
+    this.queue.mark(id).catch(showError);
+    this.#remember();
     if (state.online) this.loader.prefetch(this.queue.following(id, PREFETCHED_ROWS).map((row) => row.id));
     if (stale) this.load();
   }
@@ -215,23 +211,46 @@ class App {
     }
     // Discard a response that is older than the displayed one.
     if (id !== state.selected || number < this.displayedNumber) return;
+    this.#render(detail, prepared, number);
+  }
+
+  #render(detail, prepared, /** @type {number} */ number) {
     this.displayedNumber = number;
     this.detail = detail;
     this.view.commit(prepared);
-    this.decision.show(detail);
-    this.known.show(detail);
-    this.details.show(detail);
-    this.requests.show(detail);
+    for (const part of [this.decision, this.known, this.details, this.requests]) part.show(detail);
   }
 
   show(name) {
+    this.#draw(name);
+    this.#remember();
+  }
+
+  /** Add the displayed view and contact to the history of the browser, unless it is there. */
+  #remember() {
+    const entry = { view: this.activeView, id: state.selected };
+    const { view, id } = history.state ?? { view: entry.view, id: null };
+    if (view === entry.view && id === entry.id) return;
+    const address = entry.id === null ? null : `#${encodeURIComponent(entry.id)}`;
+    // The first contact does not add an entry to that of the page.
+    if (view === entry.view && id === null) history.replaceState(entry, "", address);
+    else history.pushState(entry, "", address);
+  }
+
+  /** Display an entry of the history; one without view and contact is an address that the user has changed. */
+  #goBack({ view = "review", id = addressed() }) {
+    this.#draw(view);
+    if (id && id !== state.selected) this.select(id);
+  }
+
+  #draw(name) {
     this.activeView = name;
-    for (const [one, element] of [["review", this.review], ["map", this.map.element], ["fleet", this.fleet.element], ["mission", this.mission.element]]) element.classList.toggle("hidden", one !== name);
+    for (const [one, element] of [["review", this.review], ["map", this.map.element], ["fleet", this.fleet.element]]) element.classList.toggle("hidden", one !== name);
     this.header.setView(name);
-    if (name === "map") { this.map.load().catch((error) => toast(error.message, { bad: true })); this.map.focus(); }
+    if (name === "map") { this.map.load().catch(showError); this.map.focus(); }
     if (name === "fleet") { this.fleet.render(); this.fleet.element.focus(); }
-    if (name === "mission") { this.mission.load(); this.mission.element.focus(); }
     if (name === "review") { this.queue.draw(); this.view.redraw(); this.queue.list.focus(); }
+    this.decision.guard.restart();
   }
 
   nextUnreviewed() {
@@ -246,29 +265,9 @@ class App {
 
   /** Send a verdict on the displayed contact, and display the next one without a decision. */
   decide(name) {
-    if (performance.now() - this.failure.time_ms < FAILURE_MS) this.#drop(1);
-    else if (this.decision.isComment) this.choose(name);
-    else this.actions.add(() => this.#decide(() => this.decision.decide(name)));
-  }
-
-  /** Select a verdict, which Enter sends with class and remark. */
-  choose(name) {
-    this.actions.add(() => this.decision.select(name));
-  }
-
-  submit() {
-    this.actions.add(() => this.#decide(() => this.decision.submit()));
-  }
-
-  async #decide(send) {
-    if (send()) await this.#open((id) => this.#nextUnreviewed(id));
-  }
-
-  /** A verdict button (`name`), or the send button (null). */
-  #pressed(name, hold) {
-    if (name === null) this.submit();
-    else if (hold) this.choose(name);
-    else this.decide(name);
+    // A verdict is for the contact in sight: it does not wait until another one is displayed.
+    if (this.actions.running) this.decision.flash();
+    else this.actions.add(async () => { if (await this.decision.decide(name)) await this.#open((id) => this.#nextUnreviewed(id)); });
   }
 
   /** Undo the last decision of the user, and display its contact. */
@@ -294,38 +293,33 @@ class App {
     this.select(next.id, next.name);
   }
 
-  openObject() {
-    if (this.detail) openObject(this.detail.contact);
-  }
-
   search() { this.filters.openSearch(); }
 
-  toggleReview() { this.filters.setReview(this.filters.review === "to_do" ? "" : "to_do"); }
-
   enter() {
-    if (this.view.measurement.active) this.view.measurement.setPoint().then((stored) => stored?.id && this.load());
-    else this.submit();
+    if (this.view.measurement.active) this.view.measurement.setPoint();
   }
 
   region() { if (this.detail) startRegion(this.view, this.detail); }
 
-  async request() {
-    if (this.detail) await openRequestDialog(this.detail.contact);
-  }
+  request() { return this.requests.open(); }
 
-  toggleTheme() { toggleTheme(); }
-  toggleTypeSize() { toggleTypeSize(); }
   help() { showHelp(this.keys); }
-  settings() { openSettings(this.keys); }
+  settings() { openSettings(); }
 
   escape() {
     if (this.view.measurement.active) this.view.measurement.back();
-    else if (this.activeView === "map") this.map.escape();
+    else if (this.activeView === "map") this.map.focus();
+    else if (this.queue.grid) this.queue.showGrid(false);
     else this.queue.list.focus();
   }
 
-  exports() { return openExportDialog(this.filters.query, this.queue.rows.matching, this.detail?.contact ?? null); }
+  exports() { return openExportDialog(this.filters.query, this.detail?.contact ?? null); }
 }
+
+const showError = (/** @type {Error} */ error) => toast(error.message, { bad: true });
+
+/** Identifier of a contact in the address of the page, which the user can have changed; empty without one. */
+const addressed = () => new URLSearchParams(`id=${location.hash.slice(1)}`).get("id");
 
 /** The next animation frame; at once in a page that is not visible, which has none. */
 const nextFrame = () => new Promise((resolve) => { if (document.hidden) resolve(); else requestAnimationFrame(resolve); });
@@ -336,7 +330,7 @@ try {
   setToken(state.session.csrf);
   await loadSettings(state.session.user);
   restoreTheme();
-  markKeys();
+  switchKeys();
   await loadLanguage(setting("language"));
   translate(document);
   setClock(state.info.now_utc_s);

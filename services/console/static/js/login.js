@@ -5,12 +5,11 @@ import { restoreTheme } from "./shell/header.js";
 import { setting } from "./base/state.js";
 import { loadLanguage, t, translate } from "./texts.js";
 
-const LINK_PROBLEMS = ["link_unknown", "link_used", "link_expired"];
-
 restoreTheme();
 await loadLanguage(setting("language"));
 translate(document);
-const form = document.getElementById("login");
+if (location.search === "?ended") document.getElementById("reason").textContent = t("login.ended");
+const form = /** @type {HTMLFormElement & { elements: Record<string, HTMLInputElement> }} */ (document.getElementById("login"));
 const problem = document.getElementById("problem");
 
 /** Log in by the link, if the address is one. The token is removed from the address, and thus from the history. */
@@ -23,7 +22,7 @@ async function useLink() {
     await api.loginLink(token);
     location.replace("/");
   } catch (error) {
-    problem.textContent = LINK_PROBLEMS.includes(error.code) ? t(`login.${error.code}`) : error.message;
+    problem.textContent = error.message;
   }
 }
 

@@ -13,9 +13,9 @@ export class ActionQueue {
     if (!this.running) this.#run();
   }
 
-  /** Remove the waiting actions; returns their number. */
+  /** Remove the waiting actions. */
   clear() {
-    return this.waiting.splice(0).length;
+    this.waiting = [];
   }
 
   async #run() {

@@ -1,7 +1,7 @@
 // Times of past events as text.
 
 import { duration, time } from "./format.js";
-import { now } from "./state.js";
+import { now, state } from "./state.js";
 import { t } from "../texts.js";
 
 const DAY_S = 86400;
@@ -18,6 +18,13 @@ export function date(utc_s) {
   const parts = Object.fromEntries(format.formatToParts(new Date(1000 * utc_s)).map(({ type, value }) => [type, value]));
   return `${parts.day} ${parts.month} ${parts.year}`;
 }
+
+/**
+ * Whether a value is older than a limit, or may be: without events of the server its age is not known.
+ * @param {number} utc_s time of the value
+ * @param {number} limit_s
+ */
+export const isStale = (utc_s, limit_s) => !state.online || now() - utc_s > limit_s;
 
 /** Age of a value: "12 s ago", or the date of one that is older than a day. */
 export function age(utc_s) {

@@ -1,6 +1,7 @@
 // Requests to the server. Every failure becomes an ApiError whose message is shown to the operator.
 
-import { t } from "../texts.js";
+import { emit, state } from "./state.js";
+import { hasText, t } from "../texts.js";
 
 export class ApiError extends Error {
   constructor(status, code, message, body = {}, retry_after_s = 0) {
@@ -12,15 +13,16 @@ export class ApiError extends Error {
   }
 }
 
-/** The error of a response. A response of a proxy has no message of the server. */
+/** The error of a response, in the language of the page. A response of a proxy has no code of the server. */
 async function errorOf(response) {
   const body = await response.json().catch(() => ({}));
   const retry_after_s = Number(response.headers.get("Retry-After")) || 0;
   const busy = response.status === 429 || response.status === 503;
   const { status } = response;
   const text = !busy ? t("api.status", { status }) : retry_after_s ? t("api.busy_for", { status, seconds: retry_after_s }) : t("api.busy", { status });
-  const { code = "error", message = text } = body.error ?? {};
-  return new ApiError(response.status, code, message, body, retry_after_s);
+  const { code = "error", field = null, message = "" } = body.error ?? {};
+  const name = [`error.${code}.${field}`, `error.${code}${busy && retry_after_s ? "_for" : ""}`, `error.${code}`].find(hasText);
+  return new ApiError(status, code, name ? t(name, { message, seconds: retry_after_s }) : text, body, retry_after_s);
 }
 
 let csrf = "";
@@ -41,9 +43,11 @@ async function request(method, path, body) {
   } catch (error) {
     throw new ApiError(0, "no_connection", t("api.no_response"), { cause: String(error) });
   }
+  // Without events, the page does not receive the change that it has made.
+  if (response.ok && method !== "GET" && !state.online) emit("reload");
   if (response.status === 204) return null;
   if (response.ok) return response.json().catch(() => ({}));
-  if (response.status === 401 && !path.startsWith("/api/login")) location.assign("/login");
+  if (response.status === 401 && !path.startsWith("/api/login")) location.assign("/login?ended");
   throw await errorOf(response);
 }
 
@@ -56,7 +60,7 @@ async function download(path) {
   } catch (error) {
     throw new ApiError(0, "no_connection", t("api.interrupted"), { cause: String(error) });
   }
-  if (response.status === 401) location.assign("/login");
+  if (response.status === 401) location.assign("/login?ended");
   throw await errorOf(response);
 }
 
@@ -90,7 +94,7 @@ export const api = {
   session: () => request("GET", "/api/session"),
   info: () => request("GET", "/api/info"),
   contacts: (values) => request("GET", `/api/contacts?${queryString(values)}`),
-  contact: (id) => request("GET", contactPath(id)),
+  contact: (id) => /** @type {Promise<ContactDetail>} */ (request("GET", contactPath(id))),
   measure: (id, body) => request("POST", `${contactPath(id)}/measure`, body),
   withdrawMeasurement: (id, measurement) => request("POST", `${contactPath(id)}/measure/${measurement}/withdraw`),
   decide: (id, body) => request("POST", `${contactPath(id)}/decisions`, body),
@@ -102,21 +106,19 @@ export const api = {
   decideObject: (id, body) => request("POST", `${objectPath(id)}/decisions`, body),
   splitLook: (id, contact) => request("POST", `${objectPath(id)}/split`, { contact }),
   mergeObjects: (id, contact) => request("POST", `${objectPath(id)}/merge`, { contact }),
-  costs: (id) => request("GET", `${contactPath(id)}/costs`),
   request: (id, body) => request("POST", `${contactPath(id)}/requests`, body),
   advise: (id, body) => request("POST", `${contactPath(id)}/advice`, body),
-  airTime: () => request("GET", "/api/airtime"),
   fleet: () => request("GET", "/api/fleet"),
   score: () => request("GET", "/api/score"),
-  mission: () => request("GET", "/api/mission"),
   map: () => request("GET", "/api/map"),
+  tracks: () => request("GET", "/api/map/tracks"),
   export: (format, filter) => download(`/api/export/contacts.${format}?${queryString(filter)}`),
   exportProgress: () => request("GET", "/api/export"),
   cancelExport: () => request("POST", "/api/export/cancel"),
   sheetsUrl: (filter) => `/report?${queryString(filter)}`,
   streamError,
   reportUrl: (id) => `/report/${encodeURIComponent(id)}`,
-  imageUrl: (id, version, layer) => `${contactPath(id)}/versions/${version}/picture.png?${queryString({ layer, map: "grey" })}`,
-  maskUrl: (id, version, kind, layer) => `${contactPath(id)}/versions/${version}/mask.png?${queryString({ kind, layer })}`,
+  imageUrl: (id, version) => `${contactPath(id)}/versions/${version}/picture.png`,
+  maskUrl: (id, version) => `${contactPath(id)}/versions/${version}/mask.png`,
   thumbnailUrl: (id, version) => `${contactPath(id)}/versions/${version}/thumbnail.png`,
 };

@@ -1,5 +1,7 @@
 // Elements without markup: untrusted text always becomes a text node.
 
+import { t } from "../texts.js";
+
 /**
  * Create an element.
  *
@@ -37,18 +39,28 @@ export function toast(message, { bad = false } = {}) {
 /**
  * Show a modal dialog. Resolves to the value of the chosen action, or null if it was closed.
  *
- * `actions`: [{label, value, primary, disabled}]. The chosen input of the body has the focus, otherwise the primary
- * action. Enter in a field of the body is the primary action.
+ * `actions`: [{label, value, primary, disabled, run}], by default "Close"; `run()`, which may be asynchronous, returns
+ * whether the dialog closes. The chosen input of the body, or that with `autofocus`, has the focus, otherwise the primary action, in a
+ * dialog with a scroll bar its title. Enter in a field of the body is the primary action.
+ *
+ * @param {string} title
+ * @param {any} body
+ * @param {{label: string, value: any, primary?: boolean, disabled?: boolean, run?: () => any}[]} [actions]
  */
-export function showDialog(title, body, actions) {
+export function showDialog(title, body, actions = [{ label: t("dialog.close"), value: null, primary: true }]) {
   return new Promise((resolve) => {
     const dialog = h("dialog", { "aria-labelledby": "dialog-title" });
     const close = (value) => { dialog.close(); dialog.remove(); resolve(value); };
     const buttons = actions.map((action) => h("button", {
       type: "button", class: action.primary ? "primary" : "", disabled: action.disabled, text: action.label,
-      data: { action: String(action.value) }, on: { click: () => close(action.value) },
+      data: { action: String(action.value) }, on: { click: async (event) => {
+        event.currentTarget.disabled = Boolean(action.run);
+        if (!action.run || await action.run()) close(action.value);
+        else buttons.forEach((button, i) => { button.disabled = Boolean(actions[i].disabled); });
+      } },
     }));
-    dialog.append(h("h2", { id: "dialog-title", text: title }), ...[body].flat(), h("div", { class: "actions" }, buttons));
+    const heading = h("h2", { id: "dialog-title", tabindex: -1, text: title });
+    dialog.append(heading, ...[body].flat(), h("div", { class: "actions" }, buttons));
     dialog.addEventListener("keydown", (event) => {
       if (event.key !== "Enter" || event.target.tagName !== "INPUT") return;
       event.preventDefault();
@@ -57,8 +69,9 @@ export function showDialog(title, body, actions) {
     dialog.addEventListener("cancel", (event) => { event.preventDefault(); close(null); });
     document.body.append(dialog);
     dialog.showModal();
-    const first = dialog.querySelector("input:checked:enabled");
-    (first ?? buttons.find((_, i) => actions[i].primary && !actions[i].disabled) ?? buttons[0])?.focus();
+    const chosen = dialog.querySelector("input:checked:enabled, [autofocus]");
+    const primary = buttons.find((_, i) => actions[i].primary && !actions[i].disabled) ?? buttons[0];
+    (chosen ?? (dialog.scrollHeight > dialog.clientHeight ? heading : primary))?.focus();
   });
 }
 

@@ -1,9 +1,9 @@
 // The event stream of the server, and the state of its connection.
 
 import { api } from "./api.js";
-import { emit, setClock, state } from "./state.js";
+import { emit, setClock, setCounts, state } from "./state.js";
 
-const NAMES = ["contact", "frame", "decision", "request", "advice", "notice", "fleet", "session", "clock", "truth"];
+const NAMES = ["contact", "notice", "fleet", "session", "clock"];
 const SILENT_MS = 10000; // the server sends its time every 5 s
 const RETRY_MS = 2000;
 
@@ -50,6 +50,7 @@ function open() {
       received(event);
       const detail = JSON.parse(event.data);
       if (name === "clock") setClock(detail.now_utc_s);
+      if (name === "contact") setCounts(detail);
       emit(name, detail);
     });
   }

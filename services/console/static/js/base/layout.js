@@ -9,6 +9,10 @@ const SWIPE_PX = 60;
  * Join a button to an element that it opens and closes, as a menu or a drawer.
  *
  * Escape and a click outside close it. Returns `{button, open, close}`.
+ *
+ * @param {HTMLElement} button
+ * @param {HTMLElement} element
+ * @param {{within?: HTMLElement, changed?: (open: boolean) => void}} options
  */
 export function opener(button, element, { within = element, changed = () => {} } = {}) {
   const isOpen = () => element.classList.contains("open");
@@ -20,43 +24,18 @@ export function opener(button, element, { within = element, changed = () => {} }
   };
   button.setAttribute("aria-expanded", "false");
   button.addEventListener("click", () => set(!isOpen()));
+  const isWithin = (/** @type {HTMLElement} */ area, /** @type {Event} */ event) => area.contains(/** @type {Node} */ (event.target));
   document.addEventListener("keydown", (event) => {
     if (event.key !== "Escape" || !isOpen() || document.querySelector("dialog[open]")) return;
-    if (!within.contains(event.target) && event.target !== button && event.target !== document.body) return;
+    if (!isWithin(within, event) && event.target !== button && event.target !== document.body) return;
     event.stopPropagation();
     set(false);
     button.focus();
   }, { capture: true });
   document.addEventListener("pointerdown", (event) => {
-    if (isOpen() && !within.contains(event.target) && !button.contains(event.target)) set(false);
+    if (isOpen() && !isWithin(within, event) && !isWithin(button, event)) set(false);
   });
   return { button, open: () => set(true), close: () => set(false) };
-}
-
-/**
- * A toolbar of one line with a "more" button, which shows the tools that do not fit.
- *
- * Tools of further lines are invisible, and thus without focus, until the button opens them.
- */
-export function toolbarWithMore(toolbar) {
-  const more = h("button", { type: "button", class: "more hidden", "aria-label": t("layout.more_tools"), title: t("layout.more_tools"), text: "⋯" });
-  const element = h("div", { class: "toolbar" }, toolbar, more);
-  const menu = opener(more, toolbar, { within: element, changed: () => update() });
-  const update = () => {
-    const open = toolbar.classList.contains("open");
-    const first_px = toolbar.firstElementChild?.offsetTop ?? 0;
-    let overflow = false;
-    for (const tool of toolbar.children) {
-      const below = tool.offsetTop > first_px + 0.5 * tool.offsetHeight;
-      overflow ||= below;
-      tool.classList.toggle("below", below && !open);
-    }
-    more.classList.toggle("hidden", !overflow && !open);
-    if (open && !overflow) menu.close();
-  };
-  new ResizeObserver(update).observe(element);
-  new MutationObserver(update).observe(toolbar, { childList: true });
-  return element;
 }
 
 /** Swipe to the left or right with one finger or pen; `allowed()` is asked at its start, `moved(1 or -1)` called at its end. */
@@ -86,7 +65,7 @@ export class Drawer {
     const button = h("button", { type: "button", class: "drawer-button in-bar", "aria-label": t("layout.details"), title: t("layout.details") },
       h("span", { "aria-hidden": "true", text: "▴" }), h("span", { class: "label", text: t("layout.details") }));
     panel.append(button);
-    Object.assign(this, opener(button, panel));
+    this.open = opener(button, panel).open;
   }
 
   /** Focus a field, which may be in the closed drawer. */

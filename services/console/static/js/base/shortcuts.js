@@ -1,137 +1,131 @@
-// Keyboard shortcuts, in one table for the event handler and the help.
+// Keyboard shortcuts, in one table for the event handler and the help; single-character keys can be switched off.
 
 import { h, showDialog } from "./dom.js";
-import { keySettings, keysOf } from "./keys.js";
+import { setting } from "./state.js";
 import { t } from "../texts.js";
 
-const TYPES = new Set(["text", "search", "password", ""]);
+/**
+ * @typedef {(event: KeyboardEvent) => void} Handler
+ * @typedef {object} Shortcut A row of the table.
+ * @property {string[]} keys Names of keys as in `KeyboardEvent.key`; the digits 0 to 3 are keys of any keyboard layout.
+ * @property {string} name Name of a text that states what the key does.
+ * @property {string} [label] Name of a text that the help shows in place of the keys.
+ * @property {boolean} [repeats] Whether a held key repeats the action. All others act once for each press.
+ * @property {Handler} [review] Action in the review.
+ * @property {Handler} [map] Action on the map.
+ * @property {Handler} [always] Action in all views.
+ */
+
+const TYPES = new Set(["text", "search", "password", "datetime-local", ""]);
+const ARROWS = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
 
 /** Whether the focused element accepts text. */
 export function isTextField(target) {
   return target.tagName === "TEXTAREA" || target.tagName === "SELECT" || (target.tagName === "INPUT" && TYPES.has(target.type));
 }
 
+/** Whether the user has switched off the single-character keys. */
+export const keysOff = () => setting("keys") === "off";
+
+/** Switch the single-character keys on or off. The buttons of the page show no keys that are off. */
+export function switchKeys(off = keysOff()) {
+  if (off !== keysOff()) setting("keys", off ? "off" : "on");
+  document.body.dataset.keys = off ? "off" : "on";
+}
+
 /**
- * Table of keys: [group, [[keys, name, handler, {view, label}]]].
+ * Table of keys: [name of the group's text, rows].
  *
- * `group` and `name` are names of texts; the settings store a changed key by its `name`, which is empty for a row that
- * the help leaves out. `view`: the only view in which the key is active. `label`: name of a text in place of the keys.
+ * @returns {[string, Shortcut[]][]}
  */
 export function shortcutTable({ app, queue, view, decision, map }) {
-  const review = { view: "review" };
-  const onMap = { view: "map" };
-  const arrow = (rows, columns) => (event) => {
+  const arrow = (event) => {
+    const [rows, columns] = ARROWS[event.key];
     const far = event.shiftKey ? 5 : event.altKey ? 0.2 : 1;
     if (view.measurement.active) view.measurement.move(...view.views[0].turned(rows * far, columns * far));
     else if (document.activeElement?.id === "queue" && (queue.horizontal ? columns : rows)) queue.move(rows + columns);
     else view.pan(0.1 * columns, 0.1 * rows);
   };
+  const pan = (event) => map.pan(-80 * ARROWS[event.key][1], -80 * ARROWS[event.key][0]);
   return [
     ["shortcuts.queue", [
-      [["j"], "shortcuts.queue.next", () => queue.move(1), review],
-      [["k"], "shortcuts.queue.previous", () => queue.move(-1), review],
-      [["n"], "shortcuts.queue.next_unreviewed", () => app.nextUnreviewed(), review],
-      [["o"], "shortcuts.queue.next_look", () => app.nextLook(), review],
-      [["O"], "object.key", () => app.openObject(), review],
-      [["/"], "shortcuts.queue.search", () => app.search(), review],
-      [["l"], "shortcuts.queue.unreviewed", () => app.toggleReview(), review],
+      { keys: ["j"], name: "shortcuts.queue.next", repeats: true, review: () => queue.move(1), map: () => map.move(1) },
+      { keys: ["k"], name: "shortcuts.queue.previous", repeats: true, review: () => queue.move(-1), map: () => map.move(-1) },
+      { keys: ["n"], name: "shortcuts.queue.next_unreviewed", review: () => app.nextUnreviewed() },
+      { keys: ["o"], name: "shortcuts.queue.next_look", review: () => app.nextLook() },
+      { keys: ["/"], name: "shortcuts.queue.search", review: () => app.search() },
     ]],
     ["shortcuts.decision", [
-      [["1"], "shortcuts.decision.mine_like", () => app.decide("mine_like"), review],
-      [["2"], "shortcuts.decision.not_mine_like", () => app.decide("not_mine_like"), review],
-      [["3"], "shortcuts.decision.unsure", () => app.decide("unsure"), review],
-      [["Shift+1"], "", () => app.choose("mine_like"), review], [["Shift+2"], "", () => app.choose("not_mine_like"), review],
-      [["Shift+3"], "shortcuts.select", () => app.choose("unsure"), { view: "review", label: "shortcuts.shift" }],
-      [["Enter"], "shortcuts.enter", () => app.enter(), review],
-      [["y"], "shortcuts.class", () => app.drawer.focus(decision.mloClass.choice), review],
-      [["g"], "shortcuts.decision.confidence", () => app.drawer.focus(decision.confidence), review],
-      [["w"], "shortcuts.decision.remark", () => app.drawer.focus(decision.remark), review],
-      [["u"], "shortcuts.undo", () => app.undo(), review],
-      [["r"], "shortcuts.decision.request", () => app.request(), review],
+      { keys: ["1"], name: "verdict.mine_like", review: () => app.decide("mine_like") },
+      { keys: ["2"], name: "verdict.not_mine_like", review: () => app.decide("not_mine_like") },
+      { keys: ["3"], name: "verdict.unsure", review: () => app.decide("unsure") },
+      { keys: ["u"], name: "shortcuts.undo", review: () => app.undo() },
+      { keys: ["w"], name: "shortcuts.decision.remark", review: () => app.drawer.focus(decision.remark) },
+      { keys: ["r"], name: "shortcuts.decision.request", review: () => app.request() },
     ]],
     ["shortcuts.image", [
-      [["m"], "shortcuts.image.measure", () => view.startMeasurement(), review],
-      [["4"], "keys.length", () => view.startMeasurement("length"), review],
-      [["5"], "keys.width", () => view.startMeasurement("width"), review],
-      [["6"], "keys.shadow", () => view.startMeasurement("shadow"), review],
-      [["7"], "region_request.key", () => app.region(), review],
-      [["+", "="], "shortcuts.image.zoom_in", () => view.zoom(1.5), review],
-      [["-"], "shortcuts.image.zoom_out", () => view.zoom(1 / 1.5), review],
-      [["0"], "shortcuts.image.whole", () => view.fit(), review],
-      [["ArrowUp"], "", arrow(-1, 0), review], [["ArrowDown"], "", arrow(1, 0), review], [["ArrowLeft"], "", arrow(0, -1), review],
-      [["ArrowRight"], "shortcuts.image.move", arrow(0, 1), { view: "review", label: "shortcuts.arrows" }],
-      [["["], "shortcuts.image.older", () => view.stepVersion(-1), review],
-      [["]"], "shortcuts.image.newer", () => view.stepVersion(1), review],
-      [["e"], "shortcuts.image.layer", () => view.nextLayer(), review],
-      [["s"], "shortcuts.image.compare", () => view.nextCompare(), review],
-      [["c"], "shortcuts.image.map", () => view.nextMap(1), review],
-      [[","], "shortcuts.image.darker", () => view.changeGain(-1), review],
-      [["."], "shortcuts.image.brighter", () => view.changeGain(1), review],
-      [["a"], "shortcuts.image.auto_gain", () => view.changeGain(0), review],
-      [["h"], "shortcuts.image.hatch", () => view.toggleHatch(), review],
-      [["<"], "keys.black_down", () => view.changeBlack(-1), review],
-      [[">"], "keys.black_up", () => view.changeBlack(1), review],
-      [["("], "keys.gamma_down", () => view.changeGamma(-1), review],
-      [[")"], "keys.gamma_up", () => view.changeGamma(1), review],
-      [["I"], "keys.display", () => view.toggleDisplayPanel(), review],
-      [["#"], "keys.grid", () => view.toggleGrid(), review],
-      [["d"], "keys.smooth", () => view.toggleSmooth(), review],
-      [["b"], "keys.ground", () => view.toggleGround(), review],
-      [["v"], "keys.view", () => view.nextOrientation(), review],
-      [["'"], "keys.loupe", () => view.toggleLoupe(), review],
-    ]],
-    ["shortcuts.map", [
-      [["j"], "shortcuts.map.next", () => map.move(1), onMap], [["k"], "shortcuts.map.previous", () => map.move(-1), onMap],
-      [["Enter"], "shortcuts.map.open", () => map.open(), onMap],
-      [["1"], "", () => map.open(), onMap], [["2"], "", () => map.open(), onMap], [["3"], "", () => map.open(), onMap],
-      [["r"], "map.request", () => map.request(), onMap], [["m"], "map.measure", () => map.measure(), onMap],
-      [["+", "="], "shortcuts.map.zoom_in", () => map.zoom(1.5), onMap], [["-"], "shortcuts.map.zoom_out", () => map.zoom(1 / 1.5), onMap], [["0"], "shortcuts.map.fit", () => map.fit(), onMap],
-      [["ArrowUp"], "", () => map.pan(0, 80), onMap], [["ArrowDown"], "", () => map.pan(0, -80), onMap],
-      [["ArrowLeft"], "", () => map.pan(80, 0), onMap], [["ArrowRight"], "", () => map.pan(-80, 0), onMap],
+      { keys: ["m"], name: "shortcuts.image.measure", review: () => view.startMeasurement() },
+      { keys: [","], name: "shortcuts.image.darker", repeats: true, review: () => view.changeGain(-1) },
+      { keys: ["."], name: "shortcuts.image.brighter", repeats: true, review: () => view.changeGain(1) },
+      { keys: ["a"], name: "shortcuts.image.auto_gain", review: () => view.changeGain(0) },
+      { keys: ["+"], name: "shortcuts.image.zoom_in", repeats: true, review: () => view.zoom(1.5), map: () => map.zoom(1.5) },
+      { keys: ["-"], name: "shortcuts.image.zoom_out", repeats: true, review: () => view.zoom(1 / 1.5), map: () => map.zoom(1 / 1.5) },
+      { keys: ["0"], name: "shortcuts.image.whole", review: () => view.fit(), map: () => map.fit() },
+      { keys: Object.keys(ARROWS), name: "shortcuts.image.move", label: "shortcuts.arrows", repeats: true, review: arrow, map: pan },
+      { keys: ["v"], name: "keys.view", review: () => view.nextOrientation() },
+      { keys: ["s"], name: "shortcuts.image.compare", review: () => view.toggleCompare() },
     ]],
     ["shortcuts.all", [
-      [["q"], "shortcuts.all.review", () => app.show("review"), {}], [["p"], "shortcuts.all.view_map", () => app.show("map"), {}], [["f"], "shortcuts.all.fleet", () => app.show("fleet"), {}],
-      [["M"], "shortcuts.all.mission", () => app.show("mission"), {}],
-      [["x"], "shortcuts.all.exports", () => app.exports(), {}], [["t"], "shortcuts.all.theme", () => app.toggleTheme(), {}], [["z"], "shortcuts.all.type", () => app.toggleTypeSize(), {}],
-      [[";"], "shortcuts.all.settings", () => app.settings(), {}],
-      [["?"], "shortcuts.all.help", () => app.help(), {}],
-      [["Escape"], "shortcuts.all.escape", () => app.escape(), {}],
+      { keys: ["q"], name: "shortcuts.all.review", always: () => app.show("review") },
+      { keys: ["p"], name: "shortcuts.all.view_map", always: () => app.show("map") },
+      { keys: ["f"], name: "shortcuts.all.fleet", always: () => app.show("fleet") },
+      { keys: ["Enter"], name: "shortcuts.enter", review: () => app.enter(), map: () => map.open() },
+      { keys: ["?"], name: "shortcuts.all.help", always: () => app.help() },
+      { keys: ["Escape"], name: "shortcuts.all.escape", always: () => app.escape() },
     ]],
   ];
 }
 
-/** Handle the keys of a table; `activeView()` returns the name of the displayed view. */
-export function startShortcuts(keys, activeView, { leave, send }) {
-  const actions = keys.flatMap(([, list]) => list);
+/** Name of the pressed key. The digits 0 to 3 are found by their place: on a French keyboard they need Shift. */
+function keyName(event) {
+  const digit = /^Digit([0-3])$/.exec(event.code)?.[1];
+  return digit && !event.altKey && !event.getModifierState("AltGraph") ? digit : event.key;
+}
+
+/**
+ * Handle the keys of a table.
+ *
+ * @param {[string, Shortcut[]][]} table
+ * @param {() => string} activeView Returns the name of the displayed view.
+ * @param {() => void} leave Called for Escape in a text field.
+ */
+export function startShortcuts(table, activeView, leave) {
+  const rows = table.flatMap(([, list]) => list);
   document.addEventListener("keydown", (event) => {
     if (document.querySelector("dialog[open]")) return;
     if (isTextField(event.target)) {
       if (event.key === "Escape") leave();
-      if (event.key === "Enter" && event.ctrlKey) send();
       return;
     }
     if (event.ctrlKey || event.metaKey) return;
     // Buttons handle Enter, and sliders handle arrow keys.
-    if (event.key === "Enter" && ["BUTTON", "A", "SUMMARY"].includes(event.target.tagName)) return;
-    if (event.key.startsWith("Arrow") && event.target.tagName === "INPUT") return;
-    // With Shift, a digit key has another character, which depends on the keyboard layout: "/" is Shift+7 on a German one.
-    const digit = /^Digit([0-9])$/.exec(event.code)?.[1];
-    const shifted = event.shiftKey && digit && event.key !== digit ? `Shift+${digit}` : null;
-    const settings = keySettings();
-    const active = actions.filter((row) => !row[3].view || row[3].view === activeView());
-    const rowOf = (key) => active.find((row) => keysOf(row, settings).includes(key));
-    const found = (shifted && rowOf(shifted)) ?? rowOf(event.key);
-    if (!found) return;
+    const { tagName } = /** @type {Element} */ (event.target);
+    if (event.key === "Enter" && ["BUTTON", "A", "SUMMARY"].includes(tagName)) return;
+    if (event.key.startsWith("Arrow") && tagName === "INPUT") return;
+    const key = keyName(event);
+    if (key.length === 1 && keysOff()) return;
+    const row = rows.find(({ keys }) => keys.includes(key));
+    const handler = row?.[activeView()] ?? row?.always;
+    if (!handler) return;
     event.preventDefault();
-    found[2](event);
+    if (!event.repeat || row.repeats) handler(event);
   });
 }
 
-/** Show the present keys. */
+/** Show the keys. */
 export function showHelp(table) {
-  const settings = keySettings();
-  const keyNames = (row) => (row[3].label ? [t(row[3].label)] : keysOf(row, settings));
-  const groups = table.map(([title, list]) => [h("h3", { text: t(title) }), list.filter((row) => row[1] && keyNames(row).length).map((row) => h("div", {},
-    h("span", { text: t(row[1]) }), h("span", {}, keyNames(row).map((name) => [h("kbd", { text: name }), " "]))))]);
-  return showDialog(t("shortcuts.title"), [settings.off ? h("p", { text: t("shortcuts.off") }) : null, h("div", { class: "keys" }, groups)].filter(Boolean), [{ label: t("shortcuts.close"), value: null, primary: true }]);
+  const names = (row) => (row.label ? [t(row.label)] : row.keys);
+  const groups = table.map(([title, list]) => [h("h3", { text: t(title) }), list.map((row) => h("div", {},
+    h("span", { text: t(row.name) }), h("span", {}, names(row).map((name) => [h("kbd", { text: name }), " "]))))]);
+  return showDialog(t("shortcuts.title"), [keysOff() ? h("p", { text: t("shortcuts.off") }) : null, h("div", { class: "keys" }, groups)].filter(Boolean));
 }

@@ -3,7 +3,7 @@
 import { api } from "../base/api.js";
 import { decisionText } from "../decision/decision_form.js";
 import { fill, h } from "../base/dom.js";
-import { DASH, authentication, layerName, position, probabilities, quantity, received, time, verdict } from "../base/format.js";
+import { DASH, authentication, className, layerName, position, probabilities, probability, quantity, received, time, verdict } from "../base/format.js";
 import { measurementLine } from "../image/measurement.js";
 import { openObject } from "../views/object_view.js";
 import { requestState, requestTitle } from "../requests/request_state.js";
@@ -21,7 +21,7 @@ function commentList(advice) {
     one.delivery ? h("p", { class: "muted", text: t("contact_details.to_vessel", { state: t(`contact_details.delivery.${one.delivery.state}`), reason: one.delivery.reason }) }) : null)));
 }
 
-function requestList(requests, vehicle) {
+function requestList(/** @type {VehicleRequest[]} */ requests, vehicle) {
   return h("ul", {}, requests.map((one) => {
     const { kind, detail } = requestTitle(one);
     const { text, tone } = requestState(one, vehicle, now());
@@ -33,14 +33,13 @@ function measurementList(measurements) {
   return h("ul", {}, measurements.map((one) => h("li", { class: one.withdrawn_utc_s === null ? "" : "undone" },
     h("p", {}, h("b", { text: measurementLine(one).text })),
     one.height_inputs ? h("p", { class: "muted number", text: t("contact_details.height_formula", { altitude: quantity(one.height_inputs.altitude_m, "m"), range: quantity(one.height_inputs.slant_range_m, "m") }) }) : null,
-    one.note ? h("p", { class: "muted", text: one.note }) : null,
     h("p", { class: "muted", text: t("contact_details.measured_by", { user: one.user, time: time(one.utc_s), version: one.version, layer: layerName(null, one.layer) }) }))));
 }
 
 function lookList(group, id) {
   return h("ul", {}, group.filter((row) => row.id !== id).map((row) => h("li", {},
     h("button", { type: "button", class: "look", on: { click: () => emit("select", { id: row.id }) } },
-      row.has_picture ? h("img", { src: row.thumbnail, alt: "" }) : null,
+      row.has_picture ? h("img", { src: api.thumbnailUrl(row.id, row.version), alt: "" }) : null,
       h("span", {}, h("b", { text: row.name }), ` ${verdict(row.review)}, ${received(row)}, ${time(row.seen_utc_s ?? row.first_frame_utc_s, { date: true })}`)))));
 }
 
@@ -50,12 +49,11 @@ function decisionList(decisions) {
   }))));
 }
 
-function recordFacts(contact, record) {
+function recordFacts(/** @type {Contact} */ contact, record) {
   const r = record ?? {};
   const rows = [
     ["position", position(contact.lat_deg, contact.lon_deg)], ["detected", time(contact.seen_utc_s, { date: true })],
-    ["detector", [contact.atd_class, contact.atd_confidence === null ? null : t("contact_details.of_two", { value: contact.atd_confidence.toFixed(2) })].filter(Boolean).join(", ") || DASH],
-    ...(probabilities(contact) ? [["probabilities", probabilities(contact)]] : []),
+    ["detector", [contact.atd_class && className(contact.atd_class), probabilities(contact) ?? probability(contact)].filter(Boolean).join(", ") || DASH],
     ["size", [quantity(r.length_m, "m"), quantity(r.width_m, "m")].join(" × ")], ["shadow", `${quantity(r.shadow_m, "m")}, ${quantity(r.height_m, "m")}`],
     ["range", `${quantity(r.slant_range_m, "m")}, ${quantity(r.ground_range_m, "m")}`], ["altitude", `${quantity(r.altitude_m, "m")}, ${quantity(r.depth_m, "m")}`],
     ["heading", `${quantity(r.heading_deg, "°", 0)}, ${quantity(r.speed_mps, "m/s")}`], ["side", r.channel ?? DASH], ["pixel", `${quantity(r.pixel_along_m, "m", 3)} × ${quantity(r.pixel_across_m, "m", 3)}`],
@@ -77,7 +75,7 @@ export class ContactDetails {
     this.element.addEventListener("toggle", (event) => this.open.set(event.target.dataset.name, event.target.open), true);
   }
 
-  show(detail) {
+  show(/** @type {ContactDetail} */ detail) {
     const focused = document.activeElement?.closest?.(".details details")?.dataset.name;
     this.#render(detail);
     if (focused) this.element.querySelector(`details[data-name="${CSS.escape(focused)}"] > summary`)?.focus();
@@ -90,12 +88,12 @@ export class ContactDetails {
       part("advice", t("contact_details.comments"), advice.length, () => commentList(advice), state.info.side === "shore" || contact.review !== "unreviewed"),
       part("requests", t("contact_details.requests"), requests.length, () => requestList(requests, contact.vehicle_id)),
       part("measurements", t("contact_details.measurements"), measurements.length, () => measurementList(measurements)),
-      part("looks", t("contact_details.looks"), contact.looks - 1, () => [
-        h("button", { type: "button", on: { click: () => openObject(contact) } }, `${t("object.key")} `, h("kbd", { text: "O" })), lookList(group, contact.id)]),
+      part("looks", t("contact_details.looks"), contact.looks - 1, () => lookList(group, contact.id)),
       part("earlier", t("object.earlier"), earlier.length, () => lookList(earlier, contact.id)),
       decisions.length > 1 ? section("decisions", t("contact_details.decisions"), decisions.length, decisionList(decisions), this.open.get("decisions") ?? false) : null,
       section("record", t("contact_details.record"), 0, recordFacts(contact, record), this.open.get("record")),
       section("audit", t("contact_details.audit"), audit.length, auditList(audit), this.open.get("audit")),
+      contact.object === null ? null : h("p", {}, h("button", { type: "button", class: "open-object", text: t("object.key"), on: { click: () => openObject(contact) } })),
       h("p", {}, h("a", { href: api.reportUrl(contact.id), target: "_blank", rel: "noopener" }, t("contact_details.report"))));
   }
 }

@@ -2,39 +2,31 @@
 
 import { api } from "../base/api.js";
 import { h, fill, toast } from "../base/dom.js";
-import { DASH, layerName, position, probabilities, quantity, received, time } from "../base/format.js";
+import { layerName, position, quantity, received, time } from "../base/format.js";
 import { MAPS, autoRange, loadImage } from "../image/image_data.js";
-import { ImageLevels } from "../image/image_levels.js";
 import { startPointer } from "../image/image_pointer.js";
 import { ORIENTATIONS } from "../image/image_projection.js";
-import { COMPARE_MODES, drawTools } from "../image/image_toolbar.js";
+import { drawTools } from "../image/image_toolbar.js";
 import { ImageView, defaultViewport } from "../image/image_view.js";
-import { integrityStrip } from "./integrity_strip.js";
-import { toolbarWithMore } from "../base/layout.js";
+import { imageFacts, qualityLine } from "./integrity_strip.js";
 import { Loupe } from "../image/loupe.js";
 import { compose, compositionOf, continuesOut, outlinesOf, relatedLayers, relatedVersion } from "./related_images.js";
 import { MeasurementTool, measurementLine } from "../image/measurement.js";
 import { drawSizePanel } from "../image/size_panel.js";
-import { emit, setting, state } from "../base/state.js";
+import { setting, state } from "../base/state.js";
 import { t } from "../texts.js";
 import { drawVersions } from "./versions_bar.js";
 
 const GAIN_STEP = 5;
-const GAMMA_STEP = 1.15;
 const CACHED_IMAGES = 20;
+const TOOLS_REM = { above: 2.1, beside: 7.9, height: 22 }; // size of the tools above the image and beside it, and their least height there
+const RECEIVED = { name: "raw", reason: "" };
 
-/** Second image of a comparison: [version, layer], or null. `choice` has version number, layer and comparison. */
-function secondImage(detail, { version, layer, compare }) {
-  const { versions } = detail;
-  const shown = versions.find((one) => one.version === version);
-  if (compare === "versions" && versions.length > 1) return [versions.find((one) => one.version !== version), "raw"];
-  if (relatedVersion(detail, layer)) return null;
-  const other = compare === "layers" ? shown?.layers.find((one) => one.name !== layer) : null;
-  return other ? [shown, other.name] : null;
-}
+/** Version beside the displayed one in a comparison: the first of the others, or null. */
+const secondImage = ({ versions }, { version, compare }) => (compare && versions.find((one) => one.version !== version)) || null;
 
 /** Slant range, or ground range where the record has no slant range. */
-function rangeText(contact, record) {
+function rangeText(/** @type {Contact} */ contact, record) {
   const slant_m = record?.slant_range_m ?? null;
   return t(slant_m === null ? "contact_view.ground_range" : "contact_view.slant_range", { range: quantity(slant_m ?? contact.range_m, "m", 0) });
 }
@@ -45,13 +37,14 @@ export class ContactView {
     this.version = null; // number of the displayed version
     this.follow = true; // display newer versions when they arrive
     this.layer = "raw";
-    this.compare = "off";
+    this.compare = false;
     this.autoGain = true;
     this.changes = 0; // number of selections and displayed contacts
     this.target = null; // selected choice whose images are being loaded
     this.cache = new Map(); // key of an image → promise
-    this.display = { map: setting("map") in MAPS ? setting("map") : "grey", low: 0, high: 100, gamma: 1, hatch: true, smooth: null, grid: setting("grid") !== "off", ground: setting("ground") === "on", orientation: setting("orientation") ?? "nadir" };
+    this.display = { map: setting("map") in MAPS ? setting("map") : "grey", low: 0, high: 100, smooth: null, grid: setting("grid") !== "off", ground: setting("ground") === "on", orientation: setting("orientation") ?? "nadir" };
     this.loupeOn = false; // also without a measurement
+    this.more = false; // all tools are shown
     this.#build();
     this.measurement = new MeasurementTool(() => this.#displayed(), () => this.#drawLines());
     startPointer(this);
@@ -62,25 +55,25 @@ export class ContactView {
     this.canvases = [t("image.label"), t("image.compared")].map((label) => h("canvas", { role: "img", "aria-label": label }));
     this.views = this.canvases.map((canvas) => new ImageView(canvas, viewport));
     for (const view of this.views) view.display = this.display;
-    this.heading = h("div", { class: "heading", role: "group", tabindex: 0, "aria-label": t("contact_view.heading") });
+    this.heading = h("div", { class: "heading", role: "group", "aria-label": t("contact_view.heading") });
     this.tools = h("div", { class: "tools", role: "toolbar", "aria-label": t("tools.group") });
     this.placeholder = h("p", { class: "placeholder" });
     this.loading = h("p", { class: "loading-name", role: "status" });
     this.loupe = new Loupe(this.views[0], () => this.loupeOn || this.measurement.active);
-    this.levels = new ImageLevels((name, value) => this.setLevel(name, value));
-    this.options = h("div", { class: "tools", role: "toolbar", "aria-label": t("tools.options") });
-    this.displayPanel = h("div", { class: "display hidden" }, this.options, this.levels.element);
     this.sizes = h("div", { class: "size-panel", role: "region", "aria-label": t("measure.panel") });
-    this.stage = h("div", { class: "stage" }, this.canvases, this.placeholder, this.loupe.element, this.displayPanel, this.loading);
-    this.versions = h("div", { class: "versions", role: "toolbar", "aria-label": t("versions_bar.title") });
-    this.strip = h("div", { class: "strip", role: "region", tabindex: 0, "aria-label": t("integrity_strip.title") });
-    this.element = h("section", { class: "contact", "aria-label": t("contact_view.contact") }, this.heading, toolbarWithMore(this.tools), this.stage, this.sizes,
-      h("div", { class: "contact-foot" }, this.versions, this.strip));
+    this.stage = h("div", { class: "stage" }, this.canvases, this.placeholder, this.loupe.element, this.loading);
+    this.versions = h("div", { class: "versions", role: "group", "aria-label": t("versions_bar.title") });
+    this.picture = h("div", { class: "picture" }, h("div", { class: "image-bar" }, this.tools, this.versions), this.stage);
+    new ResizeObserver(() => this.#arrange()).observe(this.picture);
+    this.strip = h("p", { class: "strip number", "aria-label": t("integrity_strip.title") });
+    this.facts = h("dl", { class: "facts number" });
+    this.data = h("details", { class: "image-data" }, h("summary", { text: t("integrity_strip.title") }), this.facts);
+    this.element = h("section", { class: "contact", "aria-label": t("contact_view.contact") }, this.heading, this.picture, this.sizes, this.strip);
   }
 
   get shown() { return this.detail?.versions.find((one) => one.version === this.version) ?? null; }
   /** Layers of the displayed version, and the images that answer requests about the contact. */
-  get layers() { return this.shown ? [...this.shown.layers, ...relatedLayers(this.detail)] : []; }
+  get layers() { return this.shown ? [RECEIVED, ...relatedLayers(this.detail)] : []; }
   get shownLayer() { return this.layers.find((one) => one.name === this.layer) ?? null; }
 
   get zoomed() { return this.views[0].viewport.zoom > 1; }
@@ -157,48 +150,32 @@ export class ContactView {
     await this.#select({ version: number, follow: number === newest });
   }
 
-  async stepVersion(step) {
-    const { version } = this.#choice();
-    const index = this.detail?.versions.findIndex((one) => one.version === version) ?? -1;
-    const next = this.detail?.versions[index + step];
-    if (next) await this.showVersion(next.version);
-  }
-
   async showLayer(name) {
     const layer = this.layers.find((one) => one.name === name);
     if (!layer) return;
     // The wider image shows other seabed: the viewport of one image does not fit the other.
     if (name === "wider" || this.layer === "wider") Object.assign(this.views[0].viewport, defaultViewport());
-    if (!layer.measurable && this.measurement.active) this.measurement.stop();
+    if (layer.reason && this.measurement.active) this.measurement.stop();
     await this.#select({ layer: name });
   }
 
-  async nextLayer() {
-    const names = this.layers.map((one) => one.name);
-    if (names.length) await this.showLayer(names[(names.indexOf(this.#choice().layer) + 1) % names.length]);
+  /** Show the first version beside the newest, or one image. */
+  async toggleCompare() {
+    if (this.detail) await this.#select({ compare: !this.#choice().compare });
   }
 
-  /** Select the next mode of comparison that has a second image. */
-  async nextCompare() {
-    if (!this.detail) return;
-    const choice = this.#choice();
-    do choice.compare = COMPARE_MODES[(COMPARE_MODES.indexOf(choice.compare) + 1) % COMPARE_MODES.length];
-    while (choice.compare !== "off" && !secondImage(this.detail, choice));
-    await this.#select({ compare: choice.compare });
-  }
-
-  /** Second image of the display: [version, layer], or null. */
+  /** Version beside the displayed one, or null. */
   comparedImage() { return secondImage(this.detail, this); }
 
-  #image(detail, [version, layer]) {
+  #image(detail, version) {
     const id = version.contact_id ?? detail.contact.id;
-    const key = `${id} ${version.version} ${layer} ${version.sha256}`;
+    const key = `${id} ${version.version} ${version.sha256}`;
     if (!this.cache.has(key)) {
       if (this.cache.size >= CACHED_IMAGES) this.cache.delete(this.cache.keys().next().value);
       const image = loadImage(
-        { id, version: version.version, layer, sha256: version.sha256 },
-        api.imageUrl(id, version.version, layer),
-        version.missing_fraction > 0 ? api.maskUrl(id, version.version, "missing", layer) : null,
+        { id, version: version.version, layer: "raw", sha256: version.sha256 },
+        api.imageUrl(id, version.version),
+        version.missing_fraction > 0 ? api.maskUrl(id, version.version) : null,
       );
       image.catch(() => this.cache.delete(key));
       this.cache.set(key, image);
@@ -211,16 +188,15 @@ export class ContactView {
     const shown = detail.versions.find((one) => one.version === choice.version);
     const related = relatedVersion(detail, choice.layer);
     const composition = compositionOf(detail, shown, choice.layer);
-    const requested = [related ? [related, "raw"] : shown ? [shown, choice.layer] : null, secondImage(detail, choice)];
-    return Promise.all(requested.map(async (one, index) => {
-      if (index === 0 && composition) return this.#composed(detail, composition, choice.layer);
-      return one && { image: await this.#image(detail, one), version: one[0], layer: one[1] };
+    return Promise.all([related ?? shown ?? null, secondImage(detail, choice)].map(async (version, index) => {
+      if (index === 0 && composition) return this.#composed(detail, composition);
+      return version && { image: await this.#image(detail, version), version, layer: index === 0 ? choice.layer : "raw" };
     }));
   }
 
   /** Load and compose the images of a layer. Its source is the image that answers the request. */
-  async #composed(detail, { base, factor, parts, mark, box }, layer) {
-    const [image, ...others] = await Promise.all([base, ...parts.map((one) => one.version)].map((version) => this.#image(detail, [version, "raw"])));
+  async #composed(detail, { layer, base, factor, parts, mark, box }) {
+    const [image, ...others] = await Promise.all([base, ...parts.map((one) => one.version)].map((version) => this.#image(detail, version)));
     const { source } = [image, ...others].findLast((one) => one.source.id !== detail.contact.id);
     const composed = { ...compose(image, factor, parts.map((one, index) => ({ image: others[index], box: one.box }))), source };
     return { image: composed, version: base, layer, mark: { mark, box } };
@@ -236,9 +212,23 @@ export class ContactView {
       if (images[index]) this.#showOn(view, images[index]);
       else view.show(null, {});
     });
+    this.#arrange();
     this.canvases[0].dataset.shows = this.drawn ? `${this.drawn.id} ${this.drawn.version} ${this.drawn.layer}` : "";
     this.#renderText();
     this.#drawLines();
+  }
+
+  /** Put the tools beside the image or above it: where they leave more room for it. */
+  #arrange() {
+    const [view] = this.views;
+    const { clientWidth: width, clientHeight: height } = this.picture;
+    if (!view.image || width === 0) return;
+    const count = this.comparedImage() ? 2 : 1;
+    const rem_px = parseFloat(getComputedStyle(document.documentElement).fontSize);
+    const { above, beside: column, height: least } = TOOLS_REM;
+    const beside = height >= least * rem_px && view.scaleOn((width - column * rem_px) / count, height) > view.scaleOn(width / count, height - above * rem_px);
+    this.picture.classList.toggle("beside", beside);
+    this.redrawAll();
   }
 
   /** Dim the image while another contact is loaded; null ends it. */
@@ -254,8 +244,7 @@ export class ContactView {
       along_m: (version.pixel_along_m * version.height_px) / image.height,
       across_m: (version.pixel_across_m * version.width_px) / image.width,
     } : null;
-    const title = `${t("contact_view.version", { version: version.version })} · ${layerName(version, version.contact_id ? this.layer : layer)}${version.complete ? "" : ` · ${received(version)}`}`;
-    const synthesised = version.layers.find((one) => one.name === layer)?.synthesised ?? false;
+    const title = `${t("contact_view.version", { version: version.version })} · ${layerName(version, layer)}${version.complete ? "" : ` · ${received(version)}`}`;
     const record = this.detail.record ?? {};
     // A layer may have more pixels than the image; the mark is in pixels of the image. The place of a region alone is unknown.
     const same = version.width_px === image.width && version.height_px === image.height && !(version.contact_id && this.layer === "region");
@@ -263,7 +252,7 @@ export class ContactView {
       scale, range_axis: version.range_axis, ...(mark ?? { mark: same ? version.mark : null, box: same ? version.box : null }),
       altitude_m: record.altitude_m ?? null, heading_deg: record.heading_deg ?? null, side: record.channel ?? null,
     };
-    view.show(image, { geometry, title, synthesised });
+    view.show(image, { geometry, title });
   }
 
   #drawLines() {
@@ -293,18 +282,12 @@ export class ContactView {
     this.canvases[0].focus();
   }
 
-  async keepMeasurement() {
-    const stored = await this.measurement.keep();
-    if (stored) emit("changed", { id: this.detail.contact.id });
-  }
-
   /** Withdraw a stored measurement; it stays in the list of measurements and in the audit. */
   async withdraw(measurement) {
     const { id } = this.detail.contact;
     try {
       await api.withdrawMeasurement(id, measurement);
       toast(t("measure.withdrawn"));
-      emit("changed", { id });
     } catch (error) {
       toast(error.message, { bad: true });
     }
@@ -314,7 +297,7 @@ export class ContactView {
   measurementLock() {
     if (!this.shown) return t("measure.no_image");
     if (!state.session.may.measure) return t("measure.no_permission");
-    if (!this.shownLayer?.measurable) return this.shownLayer?.reason || t("measure.synthetic", { layer: this.layer });
+    if (this.shownLayer?.reason) return this.shownLayer.reason;
     if (!this.views[0].scale) return t("measure.no_scale");
     return "";
   }
@@ -344,30 +327,17 @@ export class ContactView {
       this.autoGain = true;
       const { image } = this.views[0];
       if (image) [this.display.low, this.display.high] = autoRange(image);
-      this.display.gamma = 1;
-      this.#applyColours();
-    } else this.setLevel("high", this.display.high - step * GAIN_STEP);
-  }
-
-  /** Raise (1) or lower (-1) the black point. */
-  changeBlack(step) { this.setLevel("low", this.display.low + step * GAIN_STEP); }
-
-  /** Raise (1) or lower (-1) gamma: brighter or darker shadows. */
-  changeGamma(step) { this.setLevel("gamma", this.display.gamma * GAMMA_STEP ** step); }
-
-  /** Set black point or white point in percent, or gamma. */
-  setLevel(name, value) {
-    this.autoGain = false;
-    const { display } = this;
-    if (name === "gamma") display.gamma = Math.max(0.3, Math.min(3, value));
-    else if (name === "low") display.low = Math.max(0, Math.min(display.high - GAIN_STEP, value));
-    else display.high = Math.max(display.low + GAIN_STEP, Math.min(100 + 10 * GAIN_STEP, value));
+    } else {
+      this.autoGain = false;
+      const { display } = this;
+      display.high = Math.max(display.low + GAIN_STEP, Math.min(100 + 10 * GAIN_STEP, display.high - step * GAIN_STEP));
+    }
     this.#applyColours();
   }
 
-  /** Show or hide the options of the display: gaps, grid, ranges, orientation, black point, white point, gamma. */
-  toggleDisplayPanel() {
-    this.displayPanel.classList.toggle("hidden");
+  /** Show or hide the tools that are used less: grid, ground range, interpolation, loupe, colours. */
+  toggleMore() {
+    this.more = !this.more;
     this.#drawTools();
   }
 
@@ -414,19 +384,9 @@ export class ContactView {
     this.#drawTools();
   }
 
-  nextMap(step = 1) {
-    const names = Object.keys(MAPS);
-    this.setMap(names[(names.indexOf(this.display.map) + step + names.length) % names.length]);
-  }
-
   setMap(name) {
     this.display.map = name;
     setting("map", name);
-    this.#applyColours();
-  }
-
-  toggleHatch() {
-    this.display.hatch = !this.display.hatch;
     this.#applyColours();
   }
 
@@ -444,15 +404,18 @@ export class ContactView {
   #renderText() {
     const { contact, record } = this.detail;
     const sigma = contact.position_sigma_m ? ` ± ${quantity(contact.position_sigma_m, "m", 0)}` : "";
+    const image = relatedVersion(this.detail, this.layer) ?? this.shown;
     fill(this.heading,
       h("h2", { text: contact.name }),
       h("span", { class: "number", text: time(contact.seen_utc_s ?? contact.first_frame_utc_s, { date: true }) }),
-      h("span", { class: "number", text: t("contact_view.detector", { class: contact.atd_class ? `${contact.atd_class} ` : "", confidence: contact.atd_confidence === null ? DASH : contact.atd_confidence.toFixed(2) }) }),
-      probabilities(contact) ? h("span", { class: "number probabilities", text: probabilities(contact) }) : null,
-      h("span", { class: "number", text: [`${position(contact.lat_deg, contact.lon_deg)}${sigma}`, rangeText(contact, record), t("contact_view.altitude", { altitude: quantity(record?.altitude_m, "m") })].join(" · ") }));
+      h("span", { class: "number", text: `${position(contact.lat_deg, contact.lon_deg)}${sigma}` }),
+      h("span", { class: "number", text: rangeText(contact, record) }),
+      h("span", { class: "number", text: t("contact_view.altitude", { altitude: quantity(record?.altitude_m, "m") }) }));
     this.#drawTools();
     drawVersions(this);
-    fill(this.strip, integrityStrip(relatedVersion(this.detail, this.layer) ?? this.shown, this.shownLayer));
+    fill(this.strip, qualityLine(image, contact));
+    fill(this.facts, imageFacts(image));
+    this.data.classList.toggle("hidden", image === null);
   }
 
   #drawTools() {

@@ -1,52 +1,42 @@
-// The data integrity strip: what has been received of the image, its resolution, and what in it is not measured.
+// What qualifies the image: one line below it, and the rest for the details.
 
 import { h } from "../base/dom.js";
-import { authentication, bytes, despeckling, duration, layerName, percent, received, sharpness } from "../base/format.js";
+import { bytes, despeckling, duration, known, percent, probability, received, sharpness } from "../base/format.js";
 import { t } from "../texts.js";
 
-function item(name, value, props = {}) {
-  return h("div", props, h("dt", { text: t(`integrity_strip.${name}`) }), h("dd", { class: "number", text: value }));
+/** Received bytes, of the announced ones while there are more. */
+function receivedBytes(/** @type {Version} */ version) {
+  if (version.stage === "part") return t("integrity_strip.bytes_of", { received: version.bytes_received, total: bytes(version.bytes_total) });
+  return version.stage === "sent" ? bytes(version.bytes_received) : received(version);
 }
 
-function airtime(version) {
+/** Elements of the line below the image: bytes, smallest detail, despeckling, missing area, probability. Unknown values are left out. */
+export function qualityLine(version, contact) {
+  if (!version) return [];
+  const missing = 100 * version.missing_fraction;
+  const detail = sharpness(version);
+  const parts = [
+    [receivedBytes(version), version.complete ? "" : "part"],
+    detail ? [t("integrity_strip.sharp_to", { detail })] : null,
+    known(version.despeckle_strength) ? [t(version.despeckle_strength > 0 ? "integrity_strip.despeckled" : "format.not_despeckled")] : null,
+    version.codec ? [t("integrity_strip.missing", { missing: percent(missing, missing > 0 && missing < 1 ? 1 : 0) }), missing > 0 ? "missing" : ""] : null,
+    version.texture ? [t("integrity_strip.tiles", { edge: version.texture_edge_px }), "part"] : null,
+    probability(contact) ? [probability(contact), "probability"] : null,
+  ];
+  return parts.filter(Boolean).map(([text, name = ""]) => h("span", { class: name, text }));
+}
+
+function airtime(/** @type {Version} */ version) {
   if (version.airtime_s === null) return null;
   return t(version.airtime_is === "at_least" ? "integrity_strip.airtime_shared" : "integrity_strip.airtime_estimated", { time: duration(version.airtime_s) });
 }
 
-/** What the displayed image was decoded from. */
-function source(version) {
-  const values = { received: bytes(version.bytes_received), total: bytes(version.bytes_total), detail: sharpness(version) };
-  if (version.stage === "record") return t("integrity_strip.record_only");
-  if (version.missing_fraction > 0) return t("integrity_strip.with_gaps", values);
-  if (version.stage === "preview") return t("integrity_strip.preview");
-  if (version.stage === "part") return t("integrity_strip.part", values);
-  return t(values.detail ? "integrity_strip.complete_sharp" : "integrity_strip.complete", values);
-}
-
-/** Elements for a version and the displayed layer; null if there is no version. A value that is not known is left out. */
-export function integrityStrip(version, layer) {
-  if (!version) return null;
-  const missing = 100 * version.missing_fraction;
-  const despeckled = despeckling(version);
-  const detail = sharpness(version);
-  const time = airtime(version);
-  const receivedText = [received(version), detail ? t("integrity_strip.sharp_to", { detail }) : null].filter(Boolean).join(" · ");
-  const facts = h("dl", {},
-    version.authenticated === false ? item("frames_origin", t("integrity_strip.unauthenticated"), { class: "missing", title: authentication(version) }) : null,
-    item("received", receivedText, { class: version.complete ? "" : "part" }),
-    version.bytes_total && !version.complete ? item("bytes", t("integrity_strip.bytes_of", { received: version.bytes_received, total: bytes(version.bytes_total) })) : null,
-    version.codec ? item("codec", version.codec, { title: version.model ? t("integrity_strip.model", { model: version.model }) : null }) : null,
-    despeckled ? item("despeckling", despeckled, { title: t("integrity_strip.despeckling_title") }) : null,
-    version.frames_received === null ? null : item("frames", String(version.frames_received)),
-    time ? item("airtime", time, { title: version.airtime_is === "at_least" ? t("integrity_strip.airtime_title") : null }) : null,
-    item("missing", percent(missing, missing > 0 && missing < 1 ? 1 : 0), { class: missing > 0 ? "missing" : "" }),
-    version.texture ? item("texture", t(`integrity_strip.texture_${version.texture}`), { class: "guessed" }) : null,
-    layer?.synthesised ? item("synthetic", t("integrity_strip.synthetic_all"), { class: "guessed" }) : null);
-  const notes = version.notes.length ? h("span", { class: "muted", text: ` ${version.notes.join(" · ")}` }) : null;
-  const name = layer ? layerName(version, layer.name) : layerName(version, "raw");
-  const tiles = version.texture === "codebook" ? ` ${t("integrity_strip.tiles", { edge: version.texture_edge_px })}` : "";
-  const statement = layer?.synthesised
-    ? h("p", { class: "synthesised" }, h("b", { text: t("integrity_strip.not_a_measurement", { name }) }), ` ${layer.reason}`, notes)
-    : h("p", {}, h("b", { text: `${name}: ` }), `${source(version)}${tiles}`, notes);
-  return [facts, statement];
+/** Further facts about an image, as elements of a list of terms; an unknown value is left out. */
+export function imageFacts(/** @type {Version} */ version) {
+  if (!version) return [];
+  const facts = [
+    ["codec", version.codec && [version.codec, version.model].filter(Boolean).join(", ")], ["despeckling", despeckling(version)],
+    ["frames", version.frames_received], ["airtime", airtime(version)], ["sha256", version.sha256.slice(0, 12)], ["notes", version.notes.join(" · ")],
+  ];
+  return facts.filter(([, value]) => value).map(([name, value]) => [h("dt", { text: t(`integrity_strip.${name}`) }), h("dd", { text: String(value) })]);
 }

@@ -7,15 +7,23 @@ export class Drafts {
   /** `user`: the drafts of each user are separate. */
   constructor(user) {
     this.key = `sonarpost.drafts.${user}`;
+    /** @type {Map<string, {name: string, verdict: string | null, confidence: number | null, mlo_class: string, remark: string}>} */
     this.drafts = new Map();
     try { this.drafts = new Map(JSON.parse(localStorage.getItem(this.key) ?? "[]")); } catch { /* kept for this page only */ }
+    this.restored = new Set(this.drafts.keys()); // contacts with a draft of an earlier page
+  }
+
+  /** The contact of the latest draft; null without drafts. */
+  get latest() {
+    const [id, draft] = [...this.drafts].at(-1) ?? [];
+    return id ? { id, name: draft.name ?? id } : null;
   }
 
   get(id) { return { ...EMPTY, ...this.drafts.get(id) }; }
 
   /** Change fields of a draft. A draft without input is removed, and the oldest one of more than 50. */
-  change(id, fields) {
-    const draft = { ...this.get(id), ...fields };
+  change({ id, name }, fields) {
+    const draft = { ...this.get(id), ...fields, name };
     this.drafts.delete(id);
     if (Object.keys(EMPTY).some((name) => draft[name] !== EMPTY[name])) this.drafts.set(id, draft);
     if (this.drafts.size > MAX_DRAFTS) this.drafts.delete(this.drafts.keys().next().value);
@@ -24,6 +32,7 @@ export class Drafts {
 
   remove(id) {
     this.drafts.delete(id);
+    this.restored.delete(id);
     this.#store();
   }
 

@@ -1,8 +1,15 @@
 // Images and masks of the server, gain and colour maps.
 
+/** @typedef {{width: number, height: number, levels: Uint8Array, missing: Uint8Array, source?: {id: string, version: number, layer: string, sha256: string}}} SonarImage */
+
 import { t } from "../texts.js";
 
-/** Load an image; `cache` as in `fetch`. Its digest is null for a mask. */
+/**
+ * Load an image; its digest is null for a mask.
+ *
+ * @param {string} url
+ * @param {RequestCache} cache
+ */
 async function loadGrey(url, cache = "default") {
   let response;
   try {
@@ -30,35 +37,32 @@ async function loadWithDigest(url, sha256) {
 }
 
 /**
- * Load one layer of an image version. An empty mask has no URL (null).
+ * Load an image version. An empty mask has no URL (null).
  *
  * `source`: `{id, version, layer, sha256}` of the image; the server's response must have this digest.
- * Returns `{width, height, levels, missing, guessed, source}`: grey levels 0…255 and two masks, rows along-track, columns across-track.
+ * Returns grey levels 0…255 and a mask, rows along-track, columns across-track.
+ * @returns {Promise<SonarImage>}
  */
-export async function loadImage(source, imageUrl, missingUrl, guessedUrl) {
-  const [image, missing, guessed] = await Promise.all([loadWithDigest(imageUrl, source.sha256), ...[missingUrl, guessedUrl].map((url) => url && loadGrey(url))]);
-  const none = () => new Uint8Array(image.levels.length);
-  return { ...image, source: Object.freeze(source), missing: missing?.levels ?? none(), guessed: guessed?.levels ?? none() };
+export async function loadImage(source, imageUrl, missingUrl) {
+  const [image, missing] = await Promise.all([loadWithDigest(imageUrl, source.sha256), missingUrl && loadGrey(missingUrl)]);
+  return { ...image, source: Object.freeze(source), missing: missing?.levels ?? new Uint8Array(image.levels.length) };
 }
 
 const toByte = (value) => Math.max(0, Math.min(255, Math.round(value)));
 
-// Colour maps: (0…1) → red, green, blue in 0…255. Lightness increases monotonically, except for inverse.
+// Colour maps: (0…1) → red, green, blue in 0…255. Lightness increases monotonically.
 export const MAPS = {
   grey: (v) => [255 * v, 255 * v, 255 * v],
-  inverse: (v) => [255 * (1 - v), 255 * (1 - v), 255 * (1 - v)],
   copper: (v) => [255 * Math.min(1, 1.25 * v), 255 * 0.78 * v, 255 * 0.5 * v],
-  amber: (v) => [255 * Math.min(1, 1.35 * v), 255 * Math.min(1, v ** 1.25), 255 * Math.max(0, v * 2.2 - 1.35)],
-  bone: (v) => [255 * (v < 0.75 ? 0.875 * v : v * 1.375 - 0.375), 255 * (v < 0.375 ? 0.875 * v : 0.83 * v + 0.17 * v * v), 255 * Math.min(1, 0.12 * Math.sin(Math.PI * v) + v)],
 };
 
-/** Table of 256 colours of a map, with black point `low`, white point `high` (percent) and gamma. */
-export function colourTable(map, low, high, gamma) {
+/** Table of 256 colours of a map, with black point `low` and white point `high` in percent. */
+export function colourTable(map, low, high) {
   const colours = new Uint8ClampedArray(256 * 3);
   const black = low * 2.55;
   const span = Math.max(1, (high - low) * 2.55);
   for (let level = 0; level < 256; level += 1) {
-    const value = Math.max(0, Math.min(1, (level - black) / span)) ** (1 / gamma);
+    const value = Math.max(0, Math.min(1, (level - black) / span));
     colours.set((MAPS[map] ?? MAPS.grey)(value).map(toByte), 3 * level);
   }
   return colours;

@@ -1,9 +1,9 @@
 // What is drawn over an image: axes, grid, mark of the contact, north arrow, measurements.
 
-import { niceStep } from "../base/format.js";
+import { niceStep, number } from "../base/format.js";
 import { t } from "../texts.js";
 
-export const MARGIN = { left: 58, top: 24, right: 12, bottom: 40 };
+export const MARGIN = { left: 54, top: 17, right: 10, bottom: 19 };
 const MARK_COLOUR = "#ff4dd8";
 const PROFILE_PX = 34;
 
@@ -12,7 +12,7 @@ const digitsOf = (step) => Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
 /** Multiples of a step within [first, last]. */
 function ticks(first, last, step) {
   const found = [];
-  for (let n = Math.ceil(first / step - 1e-9); n * step <= last + 1e-9; n += 1) found.push(n * step);
+  for (let n = Math.ceil(first / step - 1e-9); n * step <= last + 1e-9; n += 1) found.push(n * step + 0); // no negative zero
   return found;
 }
 
@@ -31,7 +31,7 @@ function outlined(context, colour, width, path) {
 export function axesOf(projection) {
   const { scale, mark, ground, range_axis, rangeError } = projection;
   const first = projection.firstRange;
-  const error = rangeError >= 0.05 ? ` (± ${rangeError.toFixed(1)})` : "";
+  const error = rangeError >= 0.05 ? ` (± ${number(rangeError, 1)})` : "";
   const across = !scale ? t("image.across_px") : first === null ? t("image.across_m")
     : (ground || range_axis === "ground" ? t("image.ground_range") : range_axis === "slant" ? t("image.slant_range") : t("image.unknown_range")) + error;
   const along = !scale ? t("image.along_px") : mark ? t("image.along_contact") : t("image.along_m");
@@ -41,48 +41,55 @@ export function axesOf(projection) {
 /** Draw the frame, axes and grid. `g` is the geometry of the view. */
 export function drawAxes(context, view, g, colour) {
   const { projection } = view;
-  const [right, bottom] = [MARGIN.left + g.box.width, MARGIN.top + g.box.height];
+  const { left, top } = g.box;
+  const [right, bottom] = [left + g.box.width, top + g.box.height];
   const axes = axesOf(projection);
-  const stepOf = (extent, spacing_px, limit_px) => {
+  const [horizontal, vertical] = projection.turned ? ["along", "across"] : ["across", "along"];
+  const steps = {};
+  const values = {};
+  for (const [axis, extent, limit_px] of [["across", projection.extent[0]], ["along", projection.extent[1]]].map((one) => [...one, one[0] === horizontal ? g.box.width : g.box.height])) {
     const length_px = Math.min(extent * g.unit, limit_px);
-    return niceStep(length_px / g.unit, Math.max(1, length_px / spacing_px));
-  };
-  const steps = { across: stepOf(projection.extent[0], 45, g.box.width), along: stepOf(projection.extent[1], 45, g.box.height) };
+    steps[axis] = niceStep(length_px / g.unit, Math.max(1, length_px / 45));
+    values[axis] = ticks(axes[axis].first, axes[axis].first + extent, steps[axis]);
+  }
+  /** Point of the screen where a value of an axis is at the side of the image. */
+  const at = (axis, value) => g.screen(axis === "across" ? [value - axes.across.first, 0] : [0, value - axes.along.first]);
+  const text = (axis, value) => `${axes[axis].first < 0 && value > steps[axis] / 2 ? "+" : ""}${number(value, digitsOf(steps[axis])).replace("-", "−")}`;
   context.strokeStyle = colour.line;
   context.lineWidth = 1;
-  context.strokeRect(MARGIN.left - 0.5, MARGIN.top - 0.5, g.box.width + 1, g.box.height + 1);
-  const values = {
-    across: ticks(axes.across.first, axes.across.first + projection.extent[0], steps.across),
-    along: ticks(axes.along.first, axes.along.first + projection.extent[1], steps.along),
-  };
+  context.strokeRect(left - 0.5, top - 0.5, g.box.width + 1, g.box.height + 1);
   if (view.display.grid) drawGrid(context, view, g, axes, values);
   context.fillStyle = colour.text;
   if (projection.orientation === "north") {
     drawScaleBar(context, g, right, bottom, projection.scale ? "m" : "px");
     return;
   }
-  context.textAlign = "center";
+  // The name of the horizontal axis is at the end of its line.
+  context.textAlign = "right";
   context.textBaseline = "top";
-  for (const value of values.across) {
-    const [x] = g.screen([value - axes.across.first, 0]);
-    if (x < MARGIN.left - 0.5 || x > right + 0.5) continue;
+  const name = axes[horizontal].name;
+  context.fillText(name, right, bottom + 4);
+  const last = right - context.measureText(name).width - 16;
+  context.textAlign = "center";
+  for (const value of values[horizontal]) {
+    const [x] = at(horizontal, value);
+    if (x < left - 0.5 || x > right + 0.5) continue;
     context.fillRect(x - 0.5, bottom, 1, 5);
-    context.fillText(value.toFixed(digitsOf(steps.across)), x, bottom + 6);
+    if (x < last) context.fillText(text(horizontal, value), x, bottom + 4);
   }
-  context.fillText(axes.across.name, (MARGIN.left + right) / 2, bottom + 22);
   context.textAlign = "right";
   context.textBaseline = "middle";
-  for (const value of values.along) {
-    const [, y] = g.screen([0, value - axes.along.first]);
-    if (y < MARGIN.top - 0.5 || y > bottom + 0.5) continue;
-    context.fillRect(MARGIN.left - 6, y - 0.5, 5, 1);
-    context.fillText(`${axes.along.first < 0 && value > steps.along / 2 ? "+" : ""}${value.toFixed(digitsOf(steps.along)).replace("-", "−")}`, MARGIN.left - 9, y);
+  for (const value of values[vertical]) {
+    const [, y] = at(vertical, value);
+    if (y < top - 0.5 || y > bottom + 0.5) continue;
+    context.fillRect(left - 6, y - 0.5, 5, 1);
+    context.fillText(text(vertical, value), left - 8, y);
   }
   context.save();
-  context.translate(10, (MARGIN.top + bottom) / 2);
+  context.translate(left - MARGIN.left + 9, (top + bottom) / 2);
   context.rotate(-Math.PI / 2);
   context.textAlign = "center";
-  context.fillText(axes.along.name, 0, 0);
+  context.fillText(axes[vertical].name, 0, 0);
   context.restore();
 }
 
@@ -107,35 +114,31 @@ function drawScaleBar(context, g, right, bottom, unit) {
   for (const x of [right - length, right - 1]) context.fillRect(x, bottom + 6, 1.5, 11);
   context.textAlign = "right";
   context.textBaseline = "middle";
-  context.fillText(`${metres} ${unit}`, right - length - 8, bottom + 12);
+  context.fillText(`${number(metres, digitsOf(metres))} ${unit}`, right - length - 8, bottom + 12);
 }
 
 /** Draw side, nadir and title above the image. */
 export function drawCaption(context, view, g, colour) {
-  const { projection } = view;
-  const { orientation, side } = projection;
-  const right = MARGIN.left + g.box.width;
-  const y = MARGIN.top - 12;
+  const y = g.box.top - 9;
   context.fillStyle = colour.text;
   context.textBaseline = "middle";
   context.textAlign = "left";
-  const caption = captionOf(projection);
-  context.fillText(caption, MARGIN.left, y);
-  const atRight = orientation === "above" && side === "port";
-  const title = `${view.title}${atRight ? ` · ${t("image.nadir_right")}` : ""}`;
+  const caption = captionOf(view.projection);
+  context.fillText(caption, g.box.left, y);
   context.textAlign = "right";
   const available = g.box.width - context.measureText(caption).width - 12;
-  const short = title.split(" · ").slice(atRight ? -1 : 0)[0];
-  const text = [title, short].find((one) => context.measureText(one).width < available);
-  if (text) context.fillText(text, right, y);
+  const text = [view.title, view.title.split(" · ")[0]].find((one) => context.measureText(one).width < available);
+  if (text) context.fillText(text, g.box.left + g.box.width, y);
 }
 
 /** Statement about nadir, side and handedness of the view. */
-export function captionOf({ orientation, side }) {
+export function captionOf(/** @type {import("./image_projection.js").Projection} */ { orientation, side, turned, matrix: [x, y] }) {
   if (side === null) return t("image.side_unknown");
-  if (orientation === "north") return t("image.north_up", { side: t(`image.${side}`) });
-  if (orientation === "above") return `${side === "starboard" ? `${t("image.nadir_left")} · ` : ""}${t("image.above", { side: t(`image.${side}`) })}`;
-  return `${t("image.nadir_left")} · ${t(`image.${side}_nadir`)}`;
+  const name = t(`image.${side}`);
+  if (orientation === "north") return t("image.north_up", { side: name });
+  const arrow = turned ? (y > 0 ? "▲" : "▼") : x > 0 ? "◀" : "▶";
+  const view = orientation === "above" ? t("image.above", { side: name }) : side === "starboard" ? t("image.starboard_nadir") : t("image.port_nadir", { degrees: turned ? 270 : 180 });
+  return `${t("image.nadir", { arrow })} · ${view}`;
 }
 
 /** Draw corners around the area of the contact, and ticks at its row; return the corners on the screen. */
@@ -177,7 +180,7 @@ export function drawMark(context, view, g) {
 export function drawNorth(context, view, g) {
   const { north, heading_deg } = view.projection;
   if (north === null) return;
-  const [x, y] = [MARGIN.left + g.box.width - 28, MARGIN.top + 28];
+  const [x, y] = [g.box.left + g.box.width - 28, g.box.top + 28];
   const tip = (factor) => [x + north[0] * factor, y + north[1] * factor];
   context.fillStyle = "#000000a0";
   context.beginPath();
@@ -195,7 +198,7 @@ export function drawNorth(context, view, g) {
   context.textAlign = "center";
   context.textBaseline = "middle";
   context.fillText(t("image.north"), ...tip(17));
-  drawLabel(context, t("image.heading", { degrees: heading_deg.toFixed(0) }), x - 34, y + 38, "#ffffff");
+  drawLabel(context, t("image.heading", { degrees: number(heading_deg) }), x - 34, y + 38, "#ffffff");
 }
 
 export function drawLabel(context, text, x, y, colour) {
@@ -210,16 +213,16 @@ export function drawLabel(context, text, x, y, colour) {
 
 /** Draw measurements. Their labels are at the side of the image away from the nadir. */
 export function drawLines(context, view, g) {
-  const right = MARGIN.left + g.box.width;
+  const right = g.box.left + g.box.width;
   const used = [];
   for (const line of view.lines) {
     const [from, to] = [g.toCanvas(line.from), g.toCanvas(line.to)];
     drawLine(context, from, to, line.colour, !line.outline);
-    if (line.profile) drawProfile(context, view, g, line, from, to);
+    if (line.profile) drawProfile(context, view, line, from, to);
     if (!line.label) continue;
     const anchor = from[0] > to[0] ? from : to;
     const width = context.measureText(line.label).width + 10;
-    let y = Math.max(MARGIN.top + 92, Math.min(MARGIN.top + g.box.height - 14, anchor[1] - 30));
+    let y = Math.max(g.box.top + 92, Math.min(g.box.top + g.box.height - 14, anchor[1] - 30));
     while (used.some((other) => Math.abs(other - y) < 22)) y += 22;
     used.push(y);
     const x = right - width / 2 - 4;
@@ -247,7 +250,7 @@ export function drawLine(context, [x0, y0], [x1, y1], colour, marked = true) {
 }
 
 /** Draw the grey levels along a line across the track beside it, as a mean of five rows. */
-function drawProfile(context, view, g, line, from, to) {
+function drawProfile(context, view, line, from, to) {
   const { image } = view;
   const levels = profileOf(image, line.from[0], line.from[1], line.to[1]);
   const length = Math.hypot(to[0] - from[0], to[1] - from[1]);

@@ -12,7 +12,7 @@ export function startPointer(view) {
   const pointers = new Map(); // pointer → [x, y] on the canvas
   let pinch = null; // distance and centre of two fingers
   let line = null; // start of a line that is drawn, in CSS pixels
-  const at = (event) => [event.offsetX, event.offsetY];
+  const at = (event) => /** @type {Point} */ ([event.offsetX, event.offsetY]);
   const measures = (index) => index === 0 && view.measurement.active && view.views[0].image !== null;
 
   const twoFingers = () => {

@@ -2,18 +2,42 @@
 
 /** Orientations of the image on the screen. */
 export const ORIENTATIONS = ["nadir", "above", "north"];
+/** Least ratio of the sides of an image that is turned so that its long side lies along that of the screen. */
+const TURN_RATIO = 1.5;
 
 /**
- * What is known of an image: `scale` {along_m, across_m} of a pixel or null, `mark` and `box` of the contact or null,
- * `range_axis`, and altitude, heading and side of the vehicle or null.
+ * What is known of an image.
+ *
+ * @typedef {object} Geometry
+ * @property {{along_m: number, across_m: number} | null} [scale] size of a pixel
+ * @property {ImageMark | null} [mark] place of the contact
+ * @property {Version["box"]} [box] area of the contact
+ * @property {"slant" | "ground" | null} [range_axis]
+ * @property {number | null} [altitude_m] of the vehicle
+ * @property {number | null} [heading_deg] of the vehicle
+ * @property {string | null} [side] of the vehicle
  */
+
 export class Projection {
-  constructor(image, { scale, mark = null, box = null, range_axis = null, altitude_m = null, heading_deg = null, side = null }) {
-    Object.assign(this, { width: image.width, height: image.height, scale, mark, box, range_axis, altitude_m, heading_deg, side });
+  /**
+   * @param {{width: number, height: number}} image
+   * @param {Geometry} geometry
+   */
+  constructor(image, { scale = null, mark = null, box = null, range_axis = null, altitude_m = null, heading_deg = null, side = null }) {
+    this.width = image.width;
+    this.height = image.height;
+    this.scale = scale;
+    this.mark = mark;
+    this.box = box;
+    this.range_axis = range_axis;
+    this.altitude_m = altitude_m;
+    this.heading_deg = heading_deg;
+    this.side = side;
     this.along = scale?.along_m ?? 1;
     this.across = scale?.across_m ?? 1;
     this.ground = false;
     this.orientation = "nadir";
+    this.turned = false;
   }
 
   /** Whether slant range can be converted to ground range. */
@@ -24,15 +48,25 @@ export class Projection {
     return name === "nadir" || (this.side !== null && (name === "above" || this.heading_deg !== null));
   }
 
-  /** Select ground range and orientation; what is not known stays slant range, and nadir left. */
-  select({ ground, orientation }) {
+  /**
+   * Select ground range and orientation; what is not known stays slant range, as received.
+   *
+   * A long image is turned clockwise by 90° if its long side then lies along the long side of `room`; north stays up.
+   * @param {{ground: boolean, orientation: string}} display
+   * @param {{width: number, height: number}} room
+   */
+  select({ ground, orientation }, room) {
     this.ground = ground && this.convertible;
     this.orientation = this.orientable(orientation) ? orientation : "nadir";
     this.origin = this.ground ? this.groundAt(0) : 0;
     this.extent = [this.#across(this.width), this.height * this.along];
-    const turn = this.orientation === "north" ? (this.heading_deg * Math.PI) / 180 : 0;
+    const [width, height] = this.extent;
+    const isLong = Math.max(width, height) >= TURN_RATIO * Math.min(width, height);
+    this.turned = this.orientation !== "north" && isLong && width > height !== room.width > room.height;
+    const turn = this.orientation === "north" ? (this.heading_deg * Math.PI) / 180 : this.turned ? Math.PI / 2 : 0;
     const [x, y] = this.orientation === "nadir" ? [1, 1] : [this.side === "starboard" ? 1 : -1, -1];
     // Columns of the matrix: directions on the screen of "away from the nadir" and of "next row".
+    /** @type {[number, number, number, number]} */
     this.matrix = [x * Math.cos(turn), x * Math.sin(turn), -y * Math.sin(turn), y * Math.cos(turn)];
   }
 
@@ -44,10 +78,20 @@ export class Projection {
 
   #across(column) { return this.ground ? this.groundAt(column) - this.origin : column * this.across; }
 
-  /** Metres from the first column and first row; [x, y]. */
+  /**
+   * Metres from the first column and first row; [x, y].
+   *
+   * @param {Point} pixel
+   * @returns {Point}
+   */
   toPlane([row, column]) { return [this.#across(column), row * this.along]; }
 
-  /** [row, column] of a point in metres. */
+  /**
+   * [row, column] of a point in metres.
+   *
+   * @param {Point} metres
+   * @returns {Point}
+   */
   fromPlane([x, y]) { return [y / this.along, this.columnAt(x)]; }
 
   columnAt(x) {
@@ -87,7 +131,7 @@ export class Projection {
     const width = Math.max(1, Math.round(this.extent[0] / this.across));
     const step = this.extent[0] / width;
     const size = width * image.height;
-    const out = { width, height: image.height, levels: new Uint8Array(size), missing: new Uint8Array(size), guessed: new Uint8Array(size) };
+    const out = { width, height: image.height, levels: new Uint8Array(size), missing: new Uint8Array(size) };
     for (let x = 0; x < width; x += 1) {
       const column = Math.max(0, Math.min(image.width - 1e-6, this.columnAt((x + 0.5) * step)));
       const nearest = Math.floor(column);
@@ -98,7 +142,7 @@ export class Projection {
         const row = y * image.width;
         const [from, to] = smooth ? [left, right] : [nearest, nearest];
         out.levels[y * width + x] = Math.round((1 - part) * image.levels[row + from] + part * image.levels[row + to]);
-        for (const mask of ["missing", "guessed"]) out[mask][y * width + x] = image[mask][row + nearest];
+        out.missing[y * width + x] = image.missing[row + nearest];
       }
     }
     return out;

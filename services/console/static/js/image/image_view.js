@@ -1,7 +1,7 @@
 // An image on a canvas: true proportions, slant or ground range, orientation, hatched missing areas, overlays.
 
 import { colourTable, colourise, maskCanvas } from "./image_data.js";
-import { MARGIN, axesOf, captionOf, drawAxes, drawCaption, drawCrosshair, drawLabel, drawLine, drawLines, drawMark, drawNorth } from "./image_overlays.js";
+import { MARGIN, axesOf, captionOf, drawAxes, drawCaption, drawCrosshair, drawLine, drawLines, drawMark, drawNorth } from "./image_overlays.js";
 import { Projection } from "./image_projection.js";
 import { t } from "../texts.js";
 
@@ -11,24 +11,15 @@ export const LOUPE_ZOOM = 4;
 /** Default viewport, shared by images side by side. The centre is in fractions of the image's sides. */
 export const defaultViewport = () => ({ zoom: 1, across: 0.5, along: 0.5 });
 
-function pattern(context, draw) {
-  const tile = new OffscreenCanvas(10, 10);
-  draw(tile.getContext("2d"));
-  return context.createPattern(tile, "repeat");
-}
-
-const hatch = (tile) => {
+function hatchPattern(context) {
+  const canvas = new OffscreenCanvas(10, 10);
+  const tile = canvas.getContext("2d");
   tile.strokeStyle = "#ffcf4d";
   tile.lineWidth = 1.4;
   for (const x of [-10, 0, 10]) { tile.moveTo(x, 10); tile.lineTo(x + 10, 0); }
   tile.stroke();
-};
-const dots = (tile) => {
-  tile.fillStyle = "#000000";
-  tile.fillRect(1, 1, 4, 4);
-  tile.fillStyle = "#52e0ff";
-  tile.fillRect(2, 2, 2, 2);
-};
+  return context.createPattern(canvas, "repeat");
+}
 
 export class ImageView {
   constructor(canvas, viewport) {
@@ -36,7 +27,7 @@ export class ImageView {
     this.viewport = viewport;
     this.image = null;
     this.projection = null;
-    this.display = { map: "grey", low: 0, high: 100, gamma: 1, hatch: true, smooth: null, grid: true, ground: false, orientation: "nadir" };
+    this.display = { map: "grey", low: 0, high: 100, smooth: null, grid: true, ground: false, orientation: "nadir" };
     this.lines = []; // measurements: {from: [row, column], to, label, colour, profile, outline: without end marks}
     this.crosshair = null; // [row, column] of the measurement crosshair
     this.title = "";
@@ -51,11 +42,9 @@ export class ImageView {
     return this.display.smooth ?? Math.abs(along / across - 1) > 0.01;
   }
 
-  /**
-   * `geometry`: see `Projection`. `synthesised`: the whole layer is not measurable, and is marked by a frame.
-   */
-  show(image, { geometry = {}, title = "", synthesised = false }) {
-    Object.assign(this, { image, title, synthesised });
+  /** `geometry`: see `Projection`. */
+  show(image, { geometry = {}, title = "" }) {
+    Object.assign(this, { image, title });
     this.projection = image && new Projection(image, geometry);
     this.applyColours();
   }
@@ -63,35 +52,56 @@ export class ImageView {
   /** Apply projection, gain and colour map of `display`. */
   applyColours() {
     if (this.image) {
-      const { map, low, high, gamma } = this.display;
-      this.projection.select(this.display);
+      const { map, low, high } = this.display;
+      this.projection.select(this.display, this.#room());
       const drawn = this.projection.resample(this.image, this.smooth);
-      this.coloured = colourise(drawn, colourTable(map, low, high, gamma));
+      this.coloured = colourise(drawn, colourTable(map, low, high));
       this.missing = maskCanvas(drawn.missing, drawn.width, drawn.height);
-      this.guessed = maskCanvas(drawn.guessed, drawn.width, drawn.height);
     }
     this.draw();
   }
 
+  /** Room for the image on a canvas of a size, by default the present one, in CSS pixels. */
+  #room(width = this.canvas.clientWidth, height = this.canvas.clientHeight) {
+    return { width: Math.max(1, width - MARGIN.left - MARGIN.right), height: Math.max(1, height - MARGIN.top - MARGIN.bottom) };
+  }
+
+  /** Largest scale at which the whole image fits into a room, in CSS pixels per metre. */
+  #fit(room) {
+    const [width, height] = this.projection.extent;
+    const [a, b, c, d] = this.projection.matrix;
+    return Math.min(room.width / (Math.abs(a) * width + Math.abs(c) * height), room.height / (Math.abs(b) * width + Math.abs(d) * height));
+  }
+
+  /** Scale of the whole image on a canvas of another size, in CSS pixels per metre. */
+  scaleOn(width, height) {
+    const room = this.#room(width, height);
+    this.projection.select(this.display, room);
+    return this.#fit(room);
+  }
+
   /** Pixels per metre (`unit`), and functions between metres of the plane, image pixels and the canvas in CSS pixels. */
   #geometry() {
-    const box = { width: Math.max(1, this.canvas.clientWidth - MARGIN.left - MARGIN.right), height: Math.max(1, this.canvas.clientHeight - MARGIN.top - MARGIN.bottom) };
+    const room = this.#room();
     const { projection } = this;
     const [width, height] = projection.extent;
     const [a, b, c, d] = projection.matrix;
-    const fit = Math.min(box.width / (Math.abs(a) * width + Math.abs(c) * height), box.height / (Math.abs(b) * width + Math.abs(d) * height));
-    const unit = fit * this.viewport.zoom;
+    const unit = this.#fit(room) * this.viewport.zoom;
     const centre = [this.viewport.across * width, this.viewport.along * height];
-    const [x0, y0] = [MARGIN.left + box.width / 2, MARGIN.top + box.height / 2];
-    const screen = ([x, y]) => {
+    const [x0, y0] = [MARGIN.left + room.width / 2, MARGIN.top + room.height / 2];
+    // The box is that of the whole image, or the room for an enlarged one.
+    const whole = this.viewport.zoom === 1;
+    const size = { width: whole ? (Math.abs(a) * width + Math.abs(c) * height) * unit : room.width, height: whole ? (Math.abs(b) * width + Math.abs(d) * height) * unit : room.height };
+    const box = { ...size, left: x0 - size.width / 2, top: y0 - size.height / 2 };
+    const screen = (/** @type {Point} */ [x, y]) => {
       const [dx, dy] = [(x - centre[0]) * unit, (y - centre[1]) * unit];
-      return [x0 + a * dx + c * dy, y0 + b * dx + d * dy];
+      return /** @type {Point} */ ([x0 + a * dx + c * dy, y0 + b * dx + d * dy]);
     };
-    const plane = ([x, y]) => {
+    const plane = (/** @type {Point} */ [x, y]) => {
       const [dx, dy] = [(x - x0) / unit, (y - y0) / unit];
-      return [centre[0] + a * dx + b * dy, centre[1] + c * dx + d * dy];
+      return /** @type {Point} */ ([centre[0] + a * dx + b * dy, centre[1] + c * dx + d * dy]);
     };
-    const clip = (context) => { context.beginPath(); context.rect(MARGIN.left, MARGIN.top, box.width, box.height); context.clip(); };
+    const clip = (context) => { context.beginPath(); context.rect(box.left, box.top, box.width, box.height); context.clip(); };
     return { box, unit, screen, plane, clip, toCanvas: (point) => screen(projection.toPlane(point)) };
   }
 
@@ -150,6 +160,7 @@ export class ImageView {
     const style = getComputedStyle(this.canvas);
     const colour = { text: style.color, line: style.borderTopColor };
     context.font = `${Math.max(12, 0.78 * parseFloat(style.fontSize))}px ${style.fontFamily}`;
+    this.projection.select(this.display, this.#room());
     const g = this.#geometry();
     this.#drawImage(context, g);
     drawAxes(context, this, g, colour);
@@ -174,11 +185,7 @@ export class ImageView {
     context.save();
     g.clip(context);
     this.#paint(context, this.coloured, g);
-    if (this.display.hatch) {
-      this.#drawMask(context, this.missing, hatch, g);
-      if (!this.synthesised) this.#drawMask(context, this.guessed, dots, g);
-    }
-    if (this.synthesised) this.#drawFrame(context, g);
+    this.#drawHatch(context, g);
     context.restore();
   }
 
@@ -195,33 +202,16 @@ export class ImageView {
     context.restore();
   }
 
-  /** Draw a pattern over a mask, in screen pixels: it does not change with the zoom. */
-  #drawMask(context, mask, draw, g) {
-    if (!mask) return;
+  /** Hatch missing areas, in screen pixels: the pattern does not change with the zoom. */
+  #drawHatch(context, g) {
+    if (!this.missing) return;
     const layer = new OffscreenCanvas(this.canvas.clientWidth, this.canvas.clientHeight);
     const paint = layer.getContext("2d");
-    this.#paint(paint, mask, g, false);
+    this.#paint(paint, this.missing, g, false);
     paint.globalCompositeOperation = "source-in";
-    paint.fillStyle = pattern(paint, draw);
+    paint.fillStyle = hatchPattern(paint);
     paint.fillRect(0, 0, layer.width, layer.height);
     context.drawImage(layer, 0, 0);
-  }
-
-  /** Mark a synthesised layer with a frame and text: dots would cover the whole image. */
-  #drawFrame(context, g) {
-    const [width, height] = this.projection.extent;
-    const corners = [[0, 0], [width, height], [0, height], [width, 0]].map(g.screen);
-    const limit = (axis, low, high) => [Math.max(low, Math.min(...corners.map((one) => one[axis]))), Math.min(high, Math.max(...corners.map((one) => one[axis])))];
-    const [left, right] = limit(0, MARGIN.left, MARGIN.left + g.box.width);
-    const [top, bottom] = limit(1, MARGIN.top, MARGIN.top + g.box.height);
-    for (const [colour, dash] of [["#000000", []], ["#52e0ff", [8, 8]]]) {
-      context.strokeStyle = colour;
-      context.lineWidth = 4;
-      context.setLineDash(dash);
-      context.strokeRect(left + 2, top + 2, right - left - 4, bottom - top - 4);
-    }
-    context.setLineDash([]);
-    drawLabel(context, t("image.not_measured"), (left + right) / 2, bottom - 18, "#52e0ff");
   }
 
   /** Draw the surroundings of [row, column], enlarged, on another canvas, with measurements. */
@@ -236,7 +226,7 @@ export class ImageView {
     context.setTransform(ratio * LOUPE_ZOOM, 0, 0, ratio * LOUPE_ZOOM, canvas.width / 2 - ratio * LOUPE_ZOOM * x, canvas.height / 2 - ratio * LOUPE_ZOOM * y);
     this.#paint(context, this.coloured, g);
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    const enlarged = (one) => g.toCanvas(one).map((value, axis) => size / 2 + LOUPE_ZOOM * (value - [x, y][axis]));
+    const enlarged = (one) => /** @type {Point} */ (g.toCanvas(one).map((value, axis) => size / 2 + LOUPE_ZOOM * (value - [x, y][axis])));
     for (const line of this.lines) drawLine(context, enlarged(line.from), enlarged(line.to), line.colour, !line.outline);
     drawCrosshair(context, [size / 2, size / 2]);
   }

@@ -1,24 +1,27 @@
-// Measurement on the image with a line, by mouse, touch or keyboard. The server computes value, uncertainty and height,
-// and refuses synthesised layers and missing pixels.
+// Measurement on the image with a line, by mouse, touch or keyboard. The server moves the ends to half brightness,
+// computes value, uncertainty and height, and refuses other layers and missing pixels.
 
 import { api } from "../base/api.js";
 import { toast } from "../base/dom.js";
-import { withSigma } from "../base/format.js";
+import { quantity, withSigma } from "../base/format.js";
 import { t } from "../texts.js";
 
 export const KINDS = ["length", "width", "shadow"];
-export const KIND_KEYS = { length: "4", width: "5", shadow: "6" };
 const COLOURS = { length: "#7dff8a", width: "#6fd3ff", shadow: "#ffb347" };
 
+/**
+ * Line and texts of a measurement.
+ * @param {Record<string, any>} measurement as the server returns it
+ * @returns {{from: number[], to: number[], colour: string, label: string, text: string}}
+ */
 export function measurementLine(measurement) {
   const { kind, metres } = measurement;
-  const height = measurement.height_m === null || measurement.height_m === undefined ? "" : ` → ${t("measure.height")} ${withSigma(measurement.height_m, measurement.height_sigma_m)}`;
-  const range = kind === "shadow" || !metres || metres === "ground" ? "" : ` ${t(`measure.metres_${metres}`)}`;
-  return {
-    from: measurement.from, to: measurement.to, colour: COLOURS[kind],
-    label: `${t(`measure.${kind}`)} ${withSigma(measurement.value_m, measurement.sigma_m)}`,
-    text: `${t(`measure.${kind}`)} ${withSigma(measurement.value_m, measurement.sigma_m)}${range}${height}`,
-  };
+  const known = typeof measurement.height_m === "number";
+  const height = known ? ` → ${t("measure.height")} ${withSigma(measurement.height_m, measurement.height_sigma_m)}` : ` (${t("measure.no_height")})`;
+  const range = !metres || metres === "ground" ? "" : ` ${t(`measure.metres_${metres}`)}`;
+  // An end without an edge stays where it was set.
+  const label = `${t(`measure.${kind}`)} ${withSigma(measurement.value_m, measurement.sigma_m)}${measurement.snapped?.includes(false) ? ` (${t("measure.no_edge")})` : ""}`;
+  return { from: measurement.from, to: measurement.to, colour: COLOURS[kind], label, text: `${label}${kind === "shadow" ? height : range}` };
 }
 
 export class MeasurementTool {
@@ -34,7 +37,8 @@ export class MeasurementTool {
   #reset() {
     this.from = null;
     this.crosshair = null;
-    this.result = null;
+    this.line = null; // the line of the result as it was drawn, [from, to]
+    this.result = null; // its ends are at half brightness
   }
 
   get active() { return this.kind !== null; }
@@ -91,7 +95,7 @@ export class MeasurementTool {
   /** The pointer is pressed: on an end of the result (`grabbed`), or at the start of a line, or at its second end. */
   press(grabbed, point) {
     if (this.result && grabbed) {
-      this.from = this.result[grabbed === "to" ? "from" : "to"];
+      this.from = this.line[grabbed === "to" ? 0 : 1];
       this.result = null;
       this.moveTo(point);
       this.pressed = "second";
@@ -110,24 +114,24 @@ export class MeasurementTool {
   async release(completed, moved) {
     if (!this.active || !this.from) return;
     if (!completed) this.clear();
-    else if (moved || this.pressed === "second") await this.#request([...this.crosshair], false);
+    else if (moved || this.pressed === "second") await this.#request([this.from, [...this.crosshair]], false);
   }
 
   /** Set the first point, then the second one, which requests the result; the third call stores the measurement. */
-  async setPoint() {
+  setPoint() {
     if (this.result) return this.keep();
     if (!this.from) {
       this.from = [...this.crosshair];
       this.changed();
       return null;
     }
-    return this.#request([...this.crosshair], false);
+    return this.#request([this.from, [...this.crosshair]], false);
   }
 
   /** Store the result, and start the next kind. */
   async keep() {
     if (!this.result) return null;
-    const stored = await this.#request(this.result.to, true);
+    const stored = await this.#request(this.line, true);
     if (stored) {
       toast(t("measure.kept", { text: measurementLine(stored).text }));
       this.next();
@@ -135,18 +139,23 @@ export class MeasurementTool {
     return stored;
   }
 
-  async #request(to, keep) {
+  /**
+   * Request the result of a line.
+   * @param {number[][]} line its ends as they were drawn
+   * @param {boolean} keep whether the server stores it
+   */
+  async #request(line, keep) {
     const { id, version, layer } = this.displayed();
     const number = (this.number += 1);
-    const from = this.result?.from ?? this.from;
     try {
-      const result = await api.measure(id, { version, layer, kind: this.kind, from, to, keep });
+      const result = await api.measure(id, { version, layer, kind: this.kind, from: line[0], to: line[1], keep });
       if (number !== this.number) return null;
+      this.line = line;
       this.result = result;
       this.changed();
       return result;
     } catch (error) {
-      toast(error.body?.reason ?? error.message, { bad: true });
+      toast(error.message, { bad: true });
       if (number === this.number) this.clear();
       return null;
     }
@@ -159,6 +168,6 @@ export class MeasurementTool {
     if (this.result) return [{ ...measurementLine(this.result), profile }];
     if (!this.from) return [];
     const length = this.displayed().projection.length(this.from, this.crosshair, { toGround: this.kind !== "shadow" });
-    return [{ from: this.from, to: this.crosshair, colour: COLOURS[this.kind], label: `${t(`measure.${this.kind}`)} ${length.toFixed(2)}\u202fm`, profile }];
+    return [{ from: this.from, to: this.crosshair, colour: COLOURS[this.kind], label: `${t(`measure.${this.kind}`)} ${quantity(length, "m", 2)}`, profile }];
   }
 }

@@ -2,7 +2,7 @@
 
 import { fill, h } from "../base/dom.js";
 import { DASH, withSigma } from "../base/format.js";
-import { KINDS, KIND_KEYS } from "./measurement.js";
+import { KINDS } from "./measurement.js";
 import { t } from "../texts.js";
 
 /** Draw the panel. `size`: measured values of the server by kind. */
@@ -22,8 +22,8 @@ export function drawSizePanel(view, element) {
     return h("span", { class: `size ${measurement.kind === kind ? "active" : ""}`, data: { kind } },
       h("button", {
         type: "button", data: { size: kind }, "aria-pressed": String(measurement.kind === kind), "aria-disabled": locked ? "true" : null,
-        title: `${t("measure.start", { kind: t(`measure.${kind}`) })} (${KIND_KEYS[kind]})`, on: { click: () => view.startMeasurement(kind) },
-      }, t(`measure.${kind}`), " ", h("kbd", { text: KIND_KEYS[kind] })),
+        title: t("measure.start", { kind: t(`measure.${kind}`) }), on: { click: () => view.startMeasurement(kind) },
+      }, t(`measure.${kind}`)),
       h("b", { class: "number", text: live ? withSigma(live.value_m, live.sigma_m) : value ? withSigma(value.value_m, value.sigma_m) : DASH }),
       value && !live && !locked ? h("button", {
         type: "button", class: "withdraw", data: { size: `withdraw-${kind}` }, "aria-label": t("measure.withdraw", { kind: t(`measure.${kind}`) }),
@@ -36,15 +36,18 @@ export function drawSizePanel(view, element) {
   if (focused) element.querySelector(`[data-size="${CSS.escape(focused)}"]`)?.focus();
 }
 
-/** Instruction for the next step. */
+/**
+ * Instruction for the next step, with the button that keeps a result.
+ * @param {any} view view of the contact
+ * @returns {HTMLElement}
+ */
 function hint(view) {
   const { measurement } = view;
+  if (measurement.result) {
+    return h("p", { class: "hint", role: "status" }, `${t(measurement.result.snapped.includes(false) ? "measure.no_edge" : "measure.keep_hint")} `,
+      h("button", { type: "button", class: "primary", data: { size: "keep" }, on: { click: () => measurement.keep() } }, t("measure.keep")));
+  }
   const next = KINDS[KINDS.indexOf(measurement.kind) + 1];
-  const step = measurement.result ? t("measure.keep_hint") : measurement.from ? t("measure.second_end") : t("measure.first_end");
-  const after = next ? t("measure.next", { kind: t(`measure.${next}`) }) : t("measure.last");
-  return h("p", { class: "hint", role: "status" }, h("b", { text: t(`measure.${measurement.kind}`) }), ` — ${step} `,
-    measurement.result ? [
-      h("button", { type: "button", class: "primary", data: { size: "keep" }, on: { click: () => view.keepMeasurement() } }, t("measure.keep")), " ",
-      h("button", { type: "button", data: { size: "discard" }, on: { click: () => measurement.back() } }, t("measure.discard")), " "] : null,
-    h("kbd", { text: "m" }), ` ${after}`);
+  return h("p", { class: "hint", role: "status" }, `${t(measurement.from ? "measure.second_end" : "measure.first_end")} `,
+    h("kbd", { text: "m" }), ` ${next ? t("measure.next", { kind: t(`measure.${next}`) }) : t("measure.last")}`);
 }

@@ -35,25 +35,22 @@ export function offset(from, bearing_deg, range_m) {
   return [lat_deg, from.lon_deg + x_m / metresPerDegree((from.lat_deg + lat_deg) / 2).east];
 }
 
+/**
+ * Rectangle that a vehicle surveys on a leg, to both sides of its track. All have the same sense of rotation, so that
+ * overlapping ones are one area.
+ * @param {{lat_deg: number, lon_deg: number}} from
+ * @param {{lat_deg: number, lon_deg: number}} to
+ * @param {number} range_m of the sonar, to each side
+ */
+export function swath(from, to, range_m) {
+  const { bearing_deg } = rangeBearing(from, to);
+  const [port, starboard] = [bearing_deg - 90, bearing_deg + 90];
+  return [offset(from, starboard, range_m), offset(from, port, range_m), offset(to, port, range_m), offset(to, starboard, range_m)];
+}
+
 /** Points of a circle in metres. */
 export function circle(centre, radius_m, points = 72) {
   return Array.from({ length: points }, (_, index) => offset(centre, (360 * index) / points, radius_m));
-}
-
-/**
- * Band of a contact: from the vehicle across the track to the contact, as long along the track as the image.
- *
- * Null if the vehicle's position, its heading or the length is unknown. All bands have the same sense of rotation, so
- * that overlapping ones are one area.
- */
-export function band(contact) {
-  if (contact.vehicle_lat_deg === null || contact.heading_deg === null || contact.along_m === null) return null;
-  const vehicle = { lat_deg: contact.vehicle_lat_deg, lon_deg: contact.vehicle_lon_deg };
-  const { bearing_deg } = rangeBearing(vehicle, contact);
-  const starboard = Math.sin((bearing_deg - contact.heading_deg) * RADIANS) > 0;
-  const ends = (at) => [0, 180].map((turn) => offset(at, contact.heading_deg + turn, contact.along_m / 2));
-  const [[fore, aft], [farFore, farAft]] = [ends(vehicle), ends(contact)];
-  return starboard ? [aft, fore, farFore, farAft] : [fore, aft, farAft, farFore];
 }
 
 /**

@@ -1,20 +1,21 @@
-// Layers of the map: tiles, frame, range rings, vehicles, bands, and contacts with their clusters.
+// Layers of the map: tiles, frame, range rings, vehicles, surveyed area, and contacts with their clusters.
 
-import { age } from "../base/ages.js";
+import { age, isStale } from "../base/ages.js";
 import { h } from "../base/dom.js";
-import { latitude, longitude, symbol, verdict } from "../base/format.js";
-import { band, circle, clusters, frameLines, metresPerDegree, nearLongitude } from "./map_geometry.js";
+import { latitude, longitude, number, quantity, symbol, verdict } from "../base/format.js";
+import { circle, clusters, frameLines, metresPerDegree, nearLongitude } from "./map_geometry.js";
 import { state } from "../base/state.js";
 import { t } from "../texts.js";
 
 const CLUSTER_PX = 30;
 const NAMED_SYMBOLS = 60; // above this number only the selected contact has its name
 const CIRCLE_PX = 16; // a smaller position circle is hidden by the symbol
-const BAND_PX = 2;
 const LINE_PX = 130; // distance of the frame's lines
+const LETTER_PX = 7.5; // mean width of a letter of a vehicle's label
+const [SYMBOL_PX, HEIGHT_PX, NAME_PX] = [18, 22, 60]; // half width of a symbol, height of a label, width of a symbol with its name
 const TILE_PX = 256;
 
-export const rangeText = (range_m) => (range_m >= 1000 ? `${Number((range_m / 1000).toFixed(2))}\u202fkm` : `${Math.round(range_m)}\u202fm`);
+export const rangeText = (range_m) => (range_m >= 1000 ? `${number(range_m / 1000, 0, { maximumFractionDigits: 2 })}\u202fkm` : quantity(range_m, "m", 0));
 export const latLng = (one) => [one.lat_deg, one.lon_deg];
 
 export class MapLayers {
@@ -25,25 +26,59 @@ export class MapLayers {
     this.select = select;
     this.frame = L.layerGroup().addTo(map);
     this.ground = L.layerGroup().addTo(map);
+    this.vehicles = L.layerGroup().addTo(map);
     this.contacts = L.layerGroup().addTo(map);
+    /** @type {{x: number, y: number, half_px: number}[]} */
+    this.symbols = []; // places of the contacts' symbols, in pixels
     const { tiles } = state.info;
     if (tiles) L.tileLayer(tiles.url, { minZoom: tiles.min_zoom, maxNativeZoom: tiles.max_zoom, maxZoom: map.getMaxZoom() }).addTo(map);
   }
 
-  /** Draw all layers. `contacts` are all contacts, `chosen` is the identifier of the selected one. */
-  draw({ contacts, vehicles, tracks, ranges, vessel, ring_m }, chosen) {
+  /** Draw all layers but the vehicles. `contacts` are all contacts, `chosen` is the identifier of the selected one. */
+  draw({ contacts, tracks, swaths, vessel, ring_m }, chosen) {
     const bounds = this.map.getBounds();
     this.#drawFrame(bounds);
     this.ground.clearLayers();
     this.contacts.clearLayers();
     const wide = bounds.pad(0.3);
     const inside = contacts.filter((one) => wide.contains(latLng(one)));
-    this.#drawBands(inside);
+    if (swaths.length) this.ground.addLayer(this.#shape(swaths, "swath"));
     if (vessel) this.#drawVessel(vessel, ring_m);
-    if (vessel) for (const one of ranges) this.#drawRange(vessel, one);
     for (const track of tracks) this.ground.addLayer(this.#shape(track.points, "track", false));
-    for (const vehicle of vehicles) this.#drawVehicle(vehicle);
     this.#drawContacts(inside, chosen);
+  }
+
+  /** Draw the vehicles of the fleet that have a position, and their measured distances from the vessel. */
+  drawVehicles(vehicles, vessel) {
+    this.vehicles.clearLayers();
+    const placed = vehicles.filter((one) => one.lat_deg !== null);
+    const taken = [...this.symbols, ...placed.map((one) => ({ ...this.#pixel(one), half_px: SYMBOL_PX }))];
+    for (const one of vehicles) {
+      if (vessel && one.measured_range) this.#drawRange(vessel, one.vehicle_id, one.measured_range);
+    }
+    for (const one of placed) this.#drawVehicle(one, taken);
+  }
+
+  /**
+   * Label of a vehicle, at the first of the places around its symbol that is free and on the map.
+   * @param {any} one vehicle
+   * @param {string[]} texts label, and a shorter one for the case that no place is free
+   * @param {{x: number, y: number, half_px: number}[]} taken symbols and labels; the label is added
+   */
+  #label(one, texts, taken) {
+    const { x, y } = this.#pixel(one);
+    const left_px = this.map.latLngToContainerPoint(latLng(one)).x;
+    const places = texts.flatMap((text) => {
+      const half_px = LETTER_PX * text.length / 2;
+      return [[0, 28], [0, -28], [SYMBOL_PX + half_px, 0], [-SYMBOL_PX - half_px, 0], [0, 50], [0, -50]].map(([dx, dy]) => ({ text, half_px, dx, dy }));
+    });
+    const isFree = ({ half_px, dx, dy }) => left_px + dx >= half_px && left_px + dx <= this.map.getSize().x - half_px
+      && taken.every((other) => Math.abs(other.x - x - dx) > other.half_px + half_px || Math.abs(other.y - y - dy) > HEIGHT_PX);
+    const { text, half_px, dx, dy } = places.find(isFree) ?? places.at(-6);
+    taken.push({ x: x + dx, y: y + dy, half_px });
+    const label = h("span", { class: "name", text });
+    Object.assign(label.style, { left: `${dx}px`, top: `${dy}px` });
+    return label;
   }
 
   /** Marker of an element whose origin is the position. */
@@ -75,13 +110,6 @@ export class MapLayers {
     return degree_px / metresPerDegree(this.map.getCenter().lat).east;
   }
 
-  #drawBands(contacts) {
-    const scale = this.#pixelsPerMetre();
-    const bands = contacts.map(band).filter(Boolean);
-    if (!bands.length || !contacts.some((one) => one.along_m * scale > BAND_PX)) return;
-    this.ground.addLayer(this.#shape(bands.map((ring) => [ring]), "band"));
-  }
-
   #drawVessel(vessel, ring_m) {
     for (const radius_m of ring_m) {
       const ring = circle(vessel, radius_m);
@@ -92,21 +120,22 @@ export class MapLayers {
   }
 
   /** Circle around the vessel on which a vehicle was when its distance was measured. */
-  #drawRange(vessel, one) {
-    const ring = circle(vessel, one.distance_m);
-    this.ground.addLayer(this.#shape([ring], "measured-range"));
-    const text = t("map.measured_range", { name: one.vehicle_id, range: rangeText(one.distance_m), age: age(one.measured_utc_s) });
-    this.ground.addLayer(this.#marker({ lat_deg: ring[0][0], lon_deg: ring[0][1] }, "ring-label", h("span", { text })));
+  #drawRange(vessel, name, { distance_m, measured_utc_s }) {
+    const ring = circle(vessel, distance_m);
+    this.vehicles.addLayer(this.#shape([ring], "measured-range"));
+    const text = t("map.measured_range", { name, range: rangeText(distance_m), age: age(measured_utc_s) });
+    this.vehicles.addLayer(this.#marker({ lat_deg: ring[0][0], lon_deg: ring[0][1] }, "ring-label", h("span", { text })));
   }
 
-  #drawVehicle(one) {
+  #drawVehicle(one, taken) {
     const hull = h("i", { class: one.heading_deg === null ? "hull unknown" : "hull" });
     if (one.heading_deg !== null) hull.style.rotate = `${one.heading_deg}deg`;
-    const name = one.stale ? t("map.stale", { name: one.vehicle_id }) : one.vehicle_id;
-    this.ground.addLayer(this.#marker(one, one.stale ? "vehicle old" : "vehicle", [hull, h("span", { class: "name", text: name })]));
+    const stale = isStale(one.position_utc_s, state.info.stale_after_s.vehicle);
+    const name = stale ? t("map.stale", { name: one.vehicle_id, age: age(one.position_utc_s) }) : one.vehicle_id;
+    this.vehicles.addLayer(this.#marker(one, stale ? "vehicle old" : "vehicle", [hull, this.#label(one, [name, one.vehicle_id], taken)]));
   }
 
-  #drawContacts(contacts, chosen) {
+  #drawContacts(/** @type {Contact[]} */ contacts, chosen) {
     const points = [];
     let selected = null;
     for (const contact of contacts) {
@@ -115,6 +144,8 @@ export class MapLayers {
     }
     const found = clusters(points, CLUSTER_PX);
     const named = found.length <= NAMED_SYMBOLS;
+    const half_px = named ? NAME_PX / 2 : SYMBOL_PX;
+    this.symbols = (selected ? [...points, this.#pixel(selected)] : points).map(({ x, y }) => ({ x: x + half_px - SYMBOL_PX, y, half_px }));
     for (const one of found) this.contacts.addLayer(one.contacts.length > 1 ? this.#cluster(one) : this.#contact(one.contacts[0], named));
     if (selected) this.contacts.addLayer(this.#contact(selected, true, true));
   }
@@ -143,7 +174,7 @@ export class MapLayers {
     const mean = (name) => contacts.reduce((sum, one) => sum + one[name], 0) / contacts.length;
     const title = t("map.cluster", { count: contacts.length, verdict: verdict(review) });
     const place = { lat_deg: mean("lat_deg"), lon_deg: mean("lon_deg") };
-    const dot = h("b", { class: "dot" }, h("i", { text: symbol(review) }), h("span", { text: String(contacts.length) }));
+    const dot = h("b", { class: "dot" }, h("i", { text: symbol(review) }), h("span", { text: number(contacts.length) }));
     return this.#marker(place, `cluster ${review}`, dot, { interactive: true, title }).on("click", () => this.select(contacts));
   }
 }

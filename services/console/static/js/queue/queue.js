@@ -1,16 +1,18 @@
-// The review queue. Only visible rows have elements, and only some pages of rows are loaded.
+// The review queue: a list, a film strip on small screens, or a grid of images. Only visible rows have elements, and only
+// some pages of rows are loaded. Rows come from the list of the server only, so that each one matches the filter.
 
 import { hasAlert } from "../shell/alerts.js";
 import { api } from "../base/api.js";
-import { h } from "../base/dom.js";
-import { DASH, authentication, probabilities, quantity, received, symbol, time, verdict } from "../base/format.js";
-import { decidedOnLess } from "../views/object_view.js";
-import { emit, listen, state } from "../base/state.js";
+import { debounce, fill, h, toast } from "../base/dom.js";
+import { emit, listen, setCounts, state } from "../base/state.js";
 import { t } from "../texts.js";
+import { queueRow } from "./queue_row.js";
 
 const MARGIN_ROWS = 6; // rows drawn above and below the visible ones
-const PAGE = 100;
-const MAX_PAGES = 8;
+const PAGE = 50;
+const MAX_PAGES = 16;
+const REFRESH_MS = 50; // changes in this time are one reload of the visible rows
+const MAX_REFRESH_MS = 250;
 
 /** Rows of the queue, loaded in pages. */
 class QueuePages {
@@ -34,14 +36,6 @@ class QueuePages {
       if (within >= 0) return number * PAGE + within;
     }
     return -1;
-  }
-
-  /** Replace the row of a contact; returns whether it was loaded. */
-  replace(row) {
-    const index = this.indexOf(row.id);
-    if (index < 0) return false;
-    this.pages.get(Math.floor(index / PAGE))[index % PAGE] = row;
-    return true;
   }
 
   async #load(number) {
@@ -96,98 +90,36 @@ class QueuePages {
   }
 }
 
-function meter(value_percent, title, tone) {
-  const inner = h("span", {});
-  inner.style.width = `${Math.max(0, Math.min(100, value_percent))}%`;
-  return h("span", { class: `meter ${tone}`, title, "aria-hidden": "true" }, inner);
-}
-
-/** Label of a row for screen readers. */
-function rowLabel(row) {
-  return [
-    row.name, verdict(row.review), row.atd_confidence === null ? t("queue.no_confidence") : t("queue.confidence_label", { value: row.atd_confidence.toFixed(2) }),
-    row.atd_class ? t("queue.class_label", { name: row.atd_class }) : "", probabilities(row) ?? "",
-    received(row), t("queue.seen", { time: time(row.seen_utc_s ?? row.first_frame_utc_s) }),
-    row.looks > 1 ? t("queue.looks", { count: row.looks }) : "", row.contradictory ? t("object.contradictory") : "", decidedOnLess(row) ?? "", row.advised ? t("queue.advised") : "",
-    row.authenticated === false ? t("queue.unauthenticated") : "",
-  ].filter(Boolean).join(", ");
-}
-
-/** Class of the detector; a structure has a frame. */
-function classMark(row) {
-  if (!row.atd_class) return null;
-  const title = probabilities(row) ?? t("queue.class");
-  return h("span", { class: row.atd_class === "structure" ? "class structure" : "class", title, text: row.atd_class });
-}
-
-function marks(row) {
-  const list = [];
-  if (row.authenticated === false) list.push(h("span", { class: "mark bad unauthenticated", title: authentication(row) }, "⚠"));
-  if (row.looks > 1) list.push(h("span", { class: "mark", title: t("queue.looks", { count: row.looks }) }, `×${row.looks}`));
-  if (row.contradictory) list.push(h("span", { class: "mark contradiction", title: t("object.contradictory") }, "▲○"));
-  if (row.advised) list.push(h("span", { class: "mark", title: t("queue.advised") }, "✉"));
-  if (row.open_requests > 0) list.push(h("span", { class: "mark", title: t("queue.open_request") }, "⟳"));
-  if (row.delivery?.vehicle === "confirmed" && ["delivered", "none"].includes(row.delivery?.shore)) {
-    list.push(h("span", { class: "mark good", title: t("queue.delivered") }, "✓"));
-  }
-  if ([row.delivery?.vehicle, row.delivery?.shore].some((step) => step === "refused" || step === "expired")) {
-    list.push(h("span", { class: "mark bad", title: t("queue.not_delivered") }, "!"));
-  }
-  return list;
-}
-
-/** Element of a row; `index` counts from 0, `count` is the length of the list. */
-function queueRow(row, index, count, selected) {
-  const image = row.has_picture
-    ? h("img", { src: row.thumbnail, alt: "", decoding: "async" })
-    : h("span", { class: "nothing", text: t("queue.no_image") });
-  return h("div", {
-    id: `row-${index}`, class: hasAlert(row.id) ? "row alert" : "row", role: "option", "aria-selected": String(selected), "aria-posinset": index + 1, "aria-setsize": count,
-    "aria-label": rowLabel(row), data: { id: row.id, index: String(index), review: row.review },
-  },
-  h("div", { class: "thumb" }, image),
-  h("div", { class: "words" },
-    h("div", { class: "first" },
-      h("b", { text: row.name }),
-      h("span", { class: `badge ${row.review}` }, h("span", { text: symbol(row.review) }), h("span", { class: "verdict", text: ` ${verdict(row.review)}` }))),
-    h("div", { class: "second number" },
-      h("span", { title: t("queue.confidence"), text: t("queue.detector", { value: row.atd_confidence === null ? DASH : row.atd_confidence.toFixed(2) }) }),
-      meter((row.atd_confidence ?? 0) * 50, t("queue.confidence"), "atd"),
-      h("span", { class: "share", text: received(row) }),
-      row.percent_received === null ? null : meter(row.percent_received, t("queue.received_title"), row.complete ? "whole" : "part")),
-    h("div", { class: "third muted number" },
-      h("span", { class: "time", text: time(row.seen_utc_s ?? row.first_frame_utc_s) }),
-      row.newer_detail ? h("span", { class: "newer", title: t("object.newer"), text: decidedOnLess(row) }) : h("span", { class: "range", text: quantity(row.range_m, "m", 0) }),
-      classMark(row),
-      h("span", { class: "marks" }, marks(row)))));
-}
-
 export class Queue {
   constructor() {
     this.rows = new QueuePages();
-    this.drawn = new Map(); // index → element
-    this.selectedIndex = 0;
+    /** @type {Map<number, {row: object, element: HTMLElement}>} by index */
+    this.drawn = new Map();
+    this.selectedIndex = 0; // row of the displayed contact; in the grid, the row that Enter opens
+    this.columns = 1;
+    this.grid = false;
     this.refreshing = false;
     this.refreshAgain = false;
     this.loading = false; // rows for scrolling
     this.space = h("div", { class: "space", role: "presentation" });
     this.list = h("div", {
       id: "queue", class: "list", role: "listbox", tabindex: 0, "aria-label": t("queue.title"),
-      on: { scroll: () => this.draw(), click: (event) => this.#clicked(event) },
+      on: { scroll: () => this.draw(), click: (event) => this.#clicked(event), keydown: (event) => this.#key(event) },
     }, this.space);
-    this.empty = h("p", { class: "empty muted", text: t("queue.empty") });
+    this.empty = h("p", { class: "empty muted", role: "status" });
     this.element = h("div", { class: "listbox" }, this.list, this.empty);
     new ResizeObserver(() => this.#resized()).observe(this.list);
-    listen("contact", ({ contact, new: isNew }) => this.#updateContact(contact, isNew));
+    listen("authentication", () => this.#rebuild());
+    listen("contact", debounce(() => this.refresh().catch((error) => toast(error.message, { bad: true })), REFRESH_MS, MAX_REFRESH_MS));
     listen("theme", () => this.#resized());
-    listen("alerts", () => { for (const element of this.drawn.values()) element.classList.toggle("alert", hasAlert(element.dataset.id)); });
+    listen("alerts", () => { for (const { element } of this.drawn.values()) element.classList.toggle("alert", hasAlert(element.dataset.id)); });
   }
 
   /** Keep the displayed contact visible when direction or size of the list change. */
   #resized() {
-    const before = [this.horizontal, this.rowSize];
+    const before = [this.horizontal, this.rowSize, this.columns].join();
     this.#measureRow();
-    if (before[0] !== this.horizontal || before[1] !== this.rowSize) {
+    if (before !== [this.horizontal, this.rowSize, this.columns].join()) {
       this.#setLength();
       this.#scrollTo(this.selectedIndex);
     } else this.draw();
@@ -199,6 +131,7 @@ export class Queue {
     this.#scroll = 0;
     this.selectedIndex = 0;
     await this.refresh();
+    if (state.selected !== null) await this.mark(state.selected);
   }
 
   /** Reload the visible rows. Calls during a reload cause one more reload. */
@@ -219,58 +152,57 @@ export class Queue {
   }
 
   async #reload() {
-    const top = this.rows.at(Math.floor(this.#scroll / this.rowSize));
+    const before = this.#scroll;
+    const line = Math.floor(before / this.rowSize);
+    const top = this.rows.at(this.columns * line);
+    const wasVisible = this.#isVisible(this.selectedIndex);
     const [first, last] = this.#visibleRange();
     const response = await this.rows.refresh(first, last);
     if (response === null) return;
-    Object.assign(state, { total: response.total, unreviewed: response.unreviewed });
-    emit("counts", response);
-    if (top && this.#scroll > 0) this.#keepScrollPosition(top);
+    setCounts(response);
+    emit("list", response);
+    this.#showEmpty(response);
+    const scrolled = this.#scroll !== before; // by the user during the request
+    if (top && this.#scroll > 0) this.#keepScrollPosition(top, line);
     const index = this.rows.indexOf(state.selected);
     if (index >= 0) this.selectedIndex = index;
-    this.#redraw();
+    this.draw();
+    if (index >= 0 && wasVisible && !scrolled && !this.grid) this.#scrollTo(index);
   }
 
-  /** Keep the visible rows in place when new rows appear above them. */
-  #keepScrollPosition(top) {
+  /** Say why no row is shown, and offer all contacts. */
+  #showEmpty({ matching, total }) {
+    this.empty.classList.toggle("hidden", matching > 0 || total === 0);
+    const all = h("button", { type: "button", text: t("queue.show_all", { total }), on: { click: () => emit("show_all") } });
+    if (matching === 0) fill(this.empty, h("span", { text: t(this.rows.query.q ? "queue.not_found" : "queue.no_match") }), " ", all);
+  }
+
+  /** Keep the visible rows in place when new rows appear above the first one, which was in this line. */
+  #keepScrollPosition(top, /** @type {number} */ line) {
     const index = this.rows.indexOf(top.id);
     if (index < 0) return;
-    const within = this.#scroll % this.rowSize;
     this.#setLength();
-    this.#scroll = index * this.rowSize + within;
+    this.#scroll += (Math.floor(index / this.columns) - line) * this.rowSize;
   }
 
-  #updateContact(row, isNew) {
-    const matches = !this.rows.query.review || this.rows.query.review === row.review
-      || (this.rows.query.review === "mine_like" && row.review === "disputed")
-      || (this.rows.query.review === "to_do" && (row.review === "unreviewed" || row.contradictory))
-      || (this.rows.query.review === "newer_detail" && row.newer_detail)
-      || (this.rows.query.review === "reviewed" && row.review !== "unreviewed");
-    // Contradictory contacts come first.
-    const moves = this.rows.at(this.rows.indexOf(row.id))?.contradictory !== row.contradictory;
-    const known = this.rows.replace(row);
-    if (known) {
-      const element = this.drawn.get(this.rows.indexOf(row.id));
-      if (element) this.#replace(this.rows.indexOf(row.id), row, element);
-    }
-    if (isNew || moves || known !== matches || !["arrived", "name", "vehicle"].includes(this.rows.query.sort)) this.refresh();
+  /** Show a grid of images in place of list and displayed contact, or the list again. */
+  showGrid(/** @type {boolean} */ on) {
+    if (this.grid === on) return;
+    this.grid = on;
+    emit("grid");
+    this.#resized();
+    this.list.focus();
   }
 
-  #replace(index, row, element) {
-    const fresh = queueRow(row, index, this.rows.matching, row.id === state.selected);
-    this.#place(fresh, index);
-    fresh.classList.add("fresh");
-    element.replaceWith(fresh);
-    this.drawn.set(index, fresh);
-  }
-
-  /** Read direction and size of the rows from the style: a list, or a film strip. */
+  /** Read direction and size of the rows from the style: a list, a film strip, or the tiles of a grid. */
   #measureRow() {
     const style = getComputedStyle(this.list);
     this.horizontal = style.getPropertyValue("--direction").trim() === "row";
-    this.rowSize = parseFloat(style.getPropertyValue("--row")) * parseFloat(getComputedStyle(document.documentElement).fontSize);
+    const rem_px = parseFloat(getComputedStyle(document.documentElement).fontSize);
+    this.rowSize = parseFloat(style.getPropertyValue("--row")) * rem_px;
+    this.columns = this.grid ? Math.max(1, Math.floor(this.list.clientWidth / (parseFloat(style.getPropertyValue("--tile")) * rem_px))) : 1;
     this.list.setAttribute("aria-orientation", this.horizontal ? "horizontal" : "vertical");
-    for (const [index, element] of this.drawn) this.#place(element, index);
+    for (const [index, { element }] of this.drawn) this.#place(element, index);
   }
 
   get #scroll() { return this.horizontal ? this.list.scrollLeft : this.list.scrollTop; }
@@ -284,34 +216,46 @@ export class Queue {
   }
 
   #place(element, index) {
-    element.style.transform = `translate${this.horizontal ? "X" : "Y"}(${index * this.rowSize}px)`;
+    const start_px = Math.floor(index / this.columns) * this.rowSize;
+    const across_px = (index % this.columns) * this.list.clientWidth / this.columns;
+    element.style.transform = this.horizontal ? `translateX(${start_px}px)` : `translate(${across_px}px, ${start_px}px)`;
     this.#setSize(element, this.rowSize);
+    if (!this.horizontal) element.style.width = `${100 / this.columns}%`;
   }
 
   #visibleRange() {
     if (!this.rowSize) this.#measureRow();
     const first = Math.floor(this.#scroll / this.rowSize) - MARGIN_ROWS;
     const count = Math.ceil((this.#length || 600) / this.rowSize) + 2 * MARGIN_ROWS;
-    return [Math.max(0, first), Math.max(0, first + count)];
+    return [Math.max(0, first) * this.columns, Math.max(0, first + count) * this.columns];
+  }
+
+  #isVisible(index) {
+    const start_px = Math.floor(index / this.columns) * this.rowSize;
+    return start_px + this.rowSize > this.#scroll && start_px < this.#scroll + this.#length;
+  }
+
+  #isSelected(row, index) {
+    return this.grid ? index === this.selectedIndex : row.id === state.selected;
   }
 
   #setLength() {
-    this.#setSize(this.space, this.rows.matching * this.rowSize);
+    this.#setSize(this.space, Math.ceil(this.rows.matching / this.columns) * this.rowSize);
   }
 
-  #redraw() {
-    for (const element of this.drawn.values()) element.remove();
+  #rebuild() {
+    for (const { element } of this.drawn.values()) element.remove();
     this.drawn.clear();
     this.draw();
   }
 
-  /** Draw the visible rows, and remove the others. */
+  /** Draw the visible rows, and remove the others. An element stays while its row is the same. */
   draw() {
     this.#setLength();
-    this.empty.classList.toggle("hidden", this.rows.matching > 0);
+    const count = this.rows.matching;
     const [first, end] = this.#visibleRange();
-    const last = Math.min(end, this.rows.matching - 1);
-    for (const [index, element] of this.drawn) {
+    const last = Math.min(end, count - 1);
+    for (const [index, { element }] of this.drawn) {
       if (index < first || index > last) {
         element.remove();
         this.drawn.delete(index);
@@ -320,12 +264,20 @@ export class Queue {
     let missing = false;
     for (let index = first; index <= last; index += 1) {
       const row = this.rows.at(index);
+      const known = this.drawn.get(index);
       missing ||= !row;
-      if (this.drawn.has(index) || !row) continue;
-      const element = queueRow(row, index, this.rows.matching, row.id === state.selected);
+      if (!row || known?.row === row) continue;
+      if (known && JSON.stringify(known.row) === JSON.stringify(row)) {
+        known.row = row;
+        known.element.setAttribute("aria-setsize", String(count));
+        continue;
+      }
+      const element = queueRow(row, index, count, this.#isSelected(row, index));
       this.#place(element, index);
-      this.space.append(element);
-      this.drawn.set(index, element);
+      element.classList.toggle("fresh", known?.row.id === row.id);
+      if (known) known.element.replaceWith(element);
+      else this.space.append(element);
+      this.drawn.set(index, { row, element });
     }
     this.#updateActiveRow();
     if (missing) this.#loadVisible(first, last);
@@ -346,20 +298,36 @@ export class Queue {
   }
 
   #updateActiveRow() {
-    const active = [...this.drawn.values()].find((element) => element.dataset.id === state.selected);
+    let active = null;
+    for (const [index, { element }] of this.drawn) {
+      const selected = this.#isSelected(element.dataset, index);
+      element.setAttribute("aria-selected", String(selected));
+      if (selected) active = element;
+    }
     if (active) this.list.setAttribute("aria-activedescendant", active.id);
     else this.list.removeAttribute("aria-activedescendant");
   }
 
-  /** Mark the displayed contact, and scroll to it. */
-  mark(id) {
-    const index = this.rows.indexOf(id);
-    if (index >= 0) {
-      this.selectedIndex = index;
-      this.#scrollTo(index);
-    }
-    for (const element of this.drawn.values()) element.setAttribute("aria-selected", String(element.dataset.id === id));
+  /** Mark the displayed contact, and scroll to it, also to a row that is not loaded. */
+  async mark(id) {
     this.#updateActiveRow();
+    if (!this.rows.generation) return;
+    let index = this.rows.indexOf(id);
+    if (index < 0) ({ index } = await api.contacts({ ...this.rows.query, find: id, limit: 1 }));
+    if (index === null || state.selected !== id) return;
+    this.selectedIndex = index;
+    this.#scrollTo(index);
+  }
+
+  /** Keys of the grid: arrows choose an image, Enter opens it. */
+  #key(event) {
+    if (!this.grid) return;
+    const step = { ArrowLeft: -1, ArrowRight: 1, ArrowUp: -this.columns, ArrowDown: this.columns }[event.key];
+    const row = this.rows.at(this.selectedIndex);
+    if (step) this.#scrollTo(this.selectedIndex = Math.max(0, Math.min(this.rows.matching - 1, this.selectedIndex + step)));
+    else if (event.key === "Enter" && row) emit("select", row);
+    else return;
+    event.preventDefault();
   }
 
   #clicked(event) {
@@ -374,7 +342,7 @@ export class Queue {
   }
 
   /** Row `step` rows after a contact; null in an empty list. The successor of a contact that has left the list is the next one. */
-  async rowAfter(id, step) {
+  rowAfter(id, step) {
     const known = this.rows.indexOf(id);
     if (known >= 0) return this.#row(known + step);
     return this.#row(id === null ? 0 : this.selectedIndex + (step > 0 ? step - 1 : step));
@@ -405,7 +373,7 @@ export class Queue {
   }
 
   #scrollTo(index) {
-    const start = index * this.rowSize;
+    const start = Math.floor(index / this.columns) * this.rowSize;
     if (start < this.#scroll) this.#scroll = start;
     else if (start + this.rowSize > this.#scroll + this.#length) this.#scroll = start + this.rowSize - this.#length;
     this.draw();

@@ -2,16 +2,16 @@
 
 import { api } from "../base/api.js";
 import { h, showDialog, toast } from "../base/dom.js";
-import { duration, quantity } from "../base/format.js";
-import { emit, state } from "../base/state.js";
+import { DASH, duration, quantity } from "../base/format.js";
+import { about } from "./request_buttons.js";
+import { state } from "../base/state.js";
 import { t } from "../texts.js";
 
 const STEPS = 32; // edges of the box along each side
 const LEAST_BYTES = 24;
 const MOST_BYTES = 512;
-const START_BYTES = 192;
 // [bytes a pixel, smallest detail in pixels]: as in sonarpost/review/resolution.py.
-const DETAIL = [[0.0025, 7], [0.00375, 4.9], [0.0075, 3.9], [0.01125, 3.1], [0.015, 2.6], [0.0225, 2.2], [0.03, 2.1], [0.05, 1.6], [0.1, 1.3], [0.2, 1]];
+const DETAIL = [[0.0025, 7.8], [0.00375, 5.1], [0.0075, 3.9], [0.01125, 3.6], [0.015, 3.1], [0.0225, 2.8], [0.03, 2.6], [0.05, 2.4], [0.2, 2.4]];
 
 /** Smallest detail in pixels of an image with this many bytes a pixel. */
 export function detailPx(density) {
@@ -20,7 +20,7 @@ export function detailPx(density) {
     const [[low, from], [high, to]] = [DETAIL[i - 1], DETAIL[i]];
     if (density <= high) return from + (to - from) * Math.log(density / low) / Math.log(high / low);
   }
-  return 1;
+  return DETAIL.at(-1)[1];
 }
 
 /** Edges in 1/32 of the sides of a box between two points [row, column] of the image. */
@@ -69,22 +69,22 @@ async function confirmRegion({ contact, costs, versions }, box, view) {
   const pixels = (bottom - top) / STEPS * view.image.height * (right - left) / STEPS * view.image.width;
   const { pixel_along_m: along_m, pixel_across_m: across_m } = versions.at(-1);
   const wider_m = along_m && across_m ? Math.max(along_m, across_m) : null;
-  // Air time of a byte, from the cost of a request whose size is known.
-  const known = costs.find((cost) => cost.bytes > 0 && cost.uplink_s > 0);
-  const slider = h("input", { type: "range", min: LEAST_BYTES, max: MOST_BYTES, step: 8, value: START_BYTES, "aria-label": t("region_request.bytes") });
+  const cost = costs.find((one) => one.kind === "region");
+  const slider = h("input", { type: "range", min: LEAST_BYTES, max: MOST_BYTES, step: 8, value: cost.bytes, "aria-label": t("region_request.bytes") });
   const estimate = h("output", {});
-  const airtime = () => (known ? known.downlink_s + slider.valueAsNumber * known.uplink_s / known.bytes : null);
+  // Air time of other lengths than that of the cost.
+  const airtime = () => (cost.airtime_s === null ? null : cost.downlink_s + (cost.airtime_s - cost.downlink_s) * slider.valueAsNumber / cost.bytes);
   const draw = () => {
     const detail = detailPx(slider.valueAsNumber / pixels);
     estimate.textContent = t("region_request.estimate", {
-      bytes: slider.value, seconds: known ? duration(airtime()) : t("region_request.unknown"),
-      detail: wider_m ? quantity(detail * wider_m, "m", 2) : quantity(detail, "px"),
+      bytes: slider.value, seconds: duration(airtime()), detail: wider_m ? quantity(detail * wider_m, "m", 2) : quantity(detail, "px"),
+      arrives: cost.median_s === null ? DASH : about(cost.median_s + airtime() - cost.airtime_s),
     });
   };
   slider.addEventListener("input", draw);
   draw();
   const action = await showDialog(t("region_request.title", { name: contact.name }), [h("p", { text: t("region_request.explanation") }), slider, h("p", {}, estimate)],
-    [{ label: t("region_request.send"), value: "send", primary: true }, { label: t("region_request.cancel"), value: null }]);
+    [{ label: t("request_buttons.send"), value: "send", primary: true }, { label: t("dialog.cancel"), value: null }]);
   if (action !== "send") return;
   try {
     await api.request(contact.id, { kind: "region", box, stream_bytes: slider.valueAsNumber, airtime_s: airtime() });
@@ -92,5 +92,4 @@ async function confirmRegion({ contact, costs, versions }, box, view) {
   } catch (error) {
     toast(error.message, { bad: true });
   }
-  emit("changed", { id: contact.id });
 }

@@ -3,10 +3,10 @@
 
 import { h, labelled, showDialog } from "../base/dom.js";
 import { emit, listen, setting, state } from "../base/state.js";
-import { t } from "../texts.js";
+import { number, t } from "../texts.js";
 
 const DEFAULT_THRESHOLD = "1.5";
-const THRESHOLDS = Array.from({ length: 21 }, (_, tenths) => (tenths / 10).toFixed(1)); // 0 to 2
+const THRESHOLDS = ["0", "1", "1.5", "1.8"]; // of 2
 const TONE_HZ = 880;
 const TONE_S = 0.18;
 const TONES = 3;
@@ -20,7 +20,9 @@ export const hasAlert = (id) => unseen.has(id);
 export const alertCount = () => unseen.size;
 
 const isOn = () => setting("alerts.on") === "true";
-const threshold = () => Number(setting("alerts.threshold") ?? DEFAULT_THRESHOLD);
+/** The threshold in use: that of the list which is not above the stored one. */
+const threshold = () => THRESHOLDS.findLast((one) => Number(one) <= Number(setting("alerts.threshold") ?? DEFAULT_THRESHOLD)) ?? "0";
+const thresholdText = (one) => (one === "0" ? t("alerts.every") : number(Number(one), 1));
 const isChosen = (name) => setting(`alerts.${name}`) !== "false";
 
 let audio = null;
@@ -53,7 +55,7 @@ const mayNotify = () => "Notification" in window && Notification.permission === 
 
 function notify(row) {
   const note = new Notification(t("alerts.notification", { name: row.name }), {
-    body: t("alerts.confidence", { confidence: row.atd_confidence.toFixed(2) }), tag: row.id,
+    body: t("alerts.confidence", { confidence: number(row.atd_confidence, 2) }), tag: row.id,
   });
   note.onclick = () => { window.focus(); emit("view", { name: "review" }); emit("select", { id: row.id }); note.close(); };
 }
@@ -74,7 +76,7 @@ function judge(row, isNew) {
   }
   known.add(row.id);
   if (known.size > MAX_KNOWN) known.delete(known.values().next().value);
-  if (isOn() && row.atd_confidence >= threshold() && row.id !== state.selected) alert(row);
+  if (isOn() && row.atd_confidence >= Number(threshold()) && row.id !== state.selected) alert(row);
 }
 
 function opened(id) {
@@ -89,14 +91,14 @@ async function showSettings(draw) {
   const on = checkbox("on", isOn());
   const sound = checkbox("sound", isChosen("sound"));
   const notification = checkbox("notify", isChosen("notify"));
-  const level = h("select", { id: "alerts-threshold" }, THRESHOLDS.map((value) => h("option", { value, text: value })));
-  level.value = threshold().toFixed(1);
+  const level = h("select", { id: "alerts-threshold" }, THRESHOLDS.map((value) => h("option", { value, text: thresholdText(value) })));
+  level.value = threshold();
   const test = h("button", { type: "button", text: t("alerts.test"), on: { click: playTone } });
   const body = h("div", { class: "alert-settings" },
     labelled(t("alerts.on"), on), labelled(t("alerts.threshold"), level), labelled(t("alerts.sound"), sound), test,
     labelled(t("alerts.notify"), notification), h("p", { class: "muted", text: t("alerts.note") }));
   const chosen = await showDialog(t("alerts.title"), body, [
-    { label: t("alerts.save"), value: "save", primary: true }, { label: t("alerts.cancel"), value: null },
+    { label: t("alerts.save"), value: "save", primary: true }, { label: t("dialog.cancel"), value: null },
   ]);
   if (chosen !== "save") return;
   setting("alerts.threshold", level.value);
@@ -115,11 +117,11 @@ export function alertButton() {
   const bell = h("span", { class: "bell", "aria-hidden": "true" });
   const button = h("button", { type: "button", id: "alerts", on: { click: () => showSettings(draw) } }, bell, count);
   const draw = () => {
-    const label = isOn() ? t("alerts.button", { confidence: threshold().toFixed(1), count: unseen.size }) : t("alerts.button_off");
+    const label = isOn() ? t("alerts.button", { confidence: thresholdText(threshold()), count: unseen.size }) : t("alerts.button_off");
     bell.classList.toggle("off", !isOn());
     button.title = label;
     button.setAttribute("aria-label", label);
-    count.textContent = unseen.size ? String(unseen.size) : "";
+    count.textContent = unseen.size ? number(unseen.size) : "";
   };
   listen("contact", ({ contact, new: isNew }) => judge(contact, isNew));
   listen("select", ({ id }) => opened(id));

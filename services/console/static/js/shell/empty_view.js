@@ -17,12 +17,12 @@ function listeningText(fleet) {
 export class EmptyView {
   constructor() {
     this.element = h("div", { class: "no-contacts hidden", role: "status" });
-    for (const name of ["counts", "contact", "fleet"]) listen(name, () => this.render());
+    for (const name of ["counts", "fleet"]) listen(name, () => this.render());
   }
 
   render() {
-    this.element.classList.toggle("hidden", state.total > 0 || !state.fleet);
-    if (state.total > 0 || !state.fleet) return;
+    this.element.classList.toggle("hidden", state.counts.total > 0 || !state.fleet);
+    if (state.counts.total > 0 || !state.fleet) return;
     const text = `${t("empty.none")} ${listeningText(state.fleet)}`.trim();
     if (this.element.textContent !== text) fill(this.element, h("p", { text }));
   }

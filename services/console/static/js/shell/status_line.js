@@ -19,7 +19,9 @@ export class StatusLine {
     this.noticeButton = h("button", { type: "button", id: "notices", class: "hidden", on: { click: () => this.#showNotices() } });
     fill(document.getElementById("result"), this.noticeButton, this.text, this.button, this.open);
     listen("notice", ({ user }) => { if (user === state.session.user) this.loadNotices(); });
-    for (const name of ["reload", "decision"]) listen(name, () => { if (name === "reload" || this.notices.length) this.loadNotices(); });
+    listen("reload", () => this.loadNotices());
+    // A notice ends with the dispute.
+    listen("contact", ({ contact }) => { if (this.notices.some((one) => one.contact_id === contact.id)) this.loadNotices(); });
     setInterval(() => this.#count(), 250);
   }
 
@@ -44,6 +46,11 @@ export class StatusLine {
   /** A decision was not stored; its draft is kept. */
   failed(contact, reason) {
     this.#show(contact, t("status_line.failed", { name: contact.name, reason }), null, true);
+  }
+
+  /** Drafts of an earlier page are in the form again. */
+  draftsRestored(contact, count) {
+    if (!this.last) this.#show(contact, t("status_line.drafts", { count, name: contact.name }), null);
   }
 
   #show({ id, name }, text, until_utc_s, bad = false) {
@@ -90,7 +97,7 @@ export class StatusLine {
             }
           } },
         }))));
-    await showDialog(t("status_line.notices_title"), h("ul", { class: "notices" }, rows), [{ label: t("status_line.close"), value: null, primary: true }]);
+    await showDialog(t("status_line.notices_title"), h("ul", { class: "notices" }, rows));
     await this.loadNotices();
   }
 }

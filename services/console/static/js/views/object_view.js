@@ -2,13 +2,14 @@
 
 import { api } from "../base/api.js";
 import { fill, h, toast } from "../base/dom.js";
-import { DASH, position, quantity, symbol, time, verdict } from "../base/format.js";
+import { SEEN_MS } from "../decision/verdict_guard.js";
+import { DASH, VERDICTS, number, position, quantity, symbol, time, verdict } from "../base/format.js";
 import { autoRange, colourTable, colourise, loadImage } from "../image/image_data.js";
 import { drawLook, drawRing, groundExtent, widestGap } from "./object_drawing.js";
+import { keysOff } from "../base/shortcuts.js";
 import { emit, listen, state } from "../base/state.js";
 import { t } from "../texts.js";
 
-const VERDICTS = ["mine_like", "not_mine_like", "unsure"];
 const bearing = (degrees) => `${String(Math.round(degrees) % 360).padStart(3, "0")}°`;
 const themeColour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
@@ -20,22 +21,23 @@ export function decidedOnLess(row) {
 }
 
 class ObjectPanel {
-  constructor(object, selected) {
-    this.selected = selected; // contact identifier
+  constructor(object) {
+    this.ready = false; // a verdict counts
+    this.timer = 0;
     this.images = new Map(); // contact → {look, image, coloured} that is drawn
     this.head = h("div", { class: "object-head" });
     this.ring = h("canvas", { class: "ring", role: "img" });
     this.grid = h("div", { class: "looks" });
-    this.all = h("input", { type: "checkbox", id: "all-looks", checked: true, on: { change: () => this.#renderButtons() } });
-    this.allText = h("span");
+    this.decided = h("span"); // what a verdict applies to
     this.buttons = VERDICTS.map((name, i) => h("button", {
       type: "button", class: name, data: { verdict: name }, on: { click: () => this.decide(name) },
     }, h("span", { text: symbol(name), "aria-hidden": "true" }), ` ${verdict(name)} `, h("kbd", { text: String(i + 1) })));
-    this.nearby = h("div", { class: "nearby" });
+    this.changes = h("div", { class: "menu-list" });
+    this.menu = h("details", { class: "object-menu" }, h("summary", { text: t("object.menu") }), this.changes);
     this.dialog = h("dialog", { class: "object", "aria-labelledby": "object-title", on: { cancel: (event) => { event.preventDefault(); this.close(); }, keydown: (event) => this.#key(event) } },
-      h("h2", { id: "object-title" }), h("div", { class: "object-top" }, this.head, this.ring), this.grid,
-      h("div", { class: "object-decision" }, h("label", {}, this.all, " ", this.allText), h("div", { class: "verdicts" }, this.buttons)),
-      this.nearby, h("div", { class: "actions" }, h("button", { type: "button", text: t("object.close"), on: { click: () => this.close() } })));
+      h("h2", { id: "object-title", tabindex: -1, autofocus: "" }), h("div", { class: "object-top" }, this.head, this.ring), this.grid,
+      h("div", { class: "object-decision" }, h("div", { class: "verdicts" }, this.buttons), this.decided),
+      h("div", { class: "actions" }, this.menu, h("button", { type: "button", text: t("dialog.close"), on: { click: () => this.close() } })));
     document.body.append(this.dialog);
     this.dialog.showModal();
     this.show(object);
@@ -51,9 +53,8 @@ class ObjectPanel {
   /** Display the object, or its new state. */
   show(object) {
     this.object = object;
-    if (!object.looks.some((look) => look.contact.id === this.selected)) this.selected = object.looks[0].contact.id;
     this.dialog.querySelector("h2").textContent = t("object.title", { count: object.number_of_looks });
-    const extent = (one) => (one ? `${quantity(one.value, "m")}${one.sigma === null || one.sigma < 0.05 ? "" : ` ± ${one.sigma.toFixed(1)}`}` : DASH);
+    const extent = (one) => (one ? `${quantity(one.value, "m")}${one.sigma === null || one.sigma < 0.05 ? "" : ` ± ${number(one.sigma, 1)}`}` : DASH);
     const aspects = object.looks.map((look) => look.aspect_deg).filter((aspect) => aspect !== null);
     const gap = widestGap(aspects);
     fill(this.head,
@@ -64,7 +65,7 @@ class ObjectPanel {
       h("p", { class: "number aspects", text: gap ? t("object.gap", { from: bearing(gap[0]), to: bearing(gap[1]) }) : t(aspects.length ? "object.no_gap" : "object.no_aspect") }));
     this.ring.setAttribute("aria-label", t("object.ring", { aspects: aspects.map(bearing).join(", ") || DASH }));
     fill(this.grid, object.looks.map((look) => this.#tile(look)));
-    this.#renderNearby();
+    this.#renderMenu();
     this.#renderButtons();
     drawRing(this.ring, aspects, themeColour);
     this.#loadImages();
@@ -72,32 +73,26 @@ class ObjectPanel {
 
   #tile(look) {
     const { contact } = look;
-    const split = this.object.number_of_looks > 1 && state.session.may.decide
-      ? h("button", { type: "button", class: "split", text: t("object.split"), title: t("object.split_title"), on: { click: () => this.#change(() => api.splitLook(this.object.id, contact.id)) } }) : null;
     return h("div", { class: "tile", data: { id: contact.id } },
-      h("button", { type: "button", class: "image", "aria-label": t("object.open", { name: contact.name }), on: { click: () => this.#openLook(contact.id) } }, h("canvas", { "aria-hidden": "true" })),
+      h("button", { type: "button", class: "image", "aria-label": t("status_line.open_contact", { name: contact.name }), on: { click: () => this.#openLook(contact.id) } }, h("canvas", { "aria-hidden": "true" })),
       h("p", {}, h("b", { text: contact.name }), " ", h("span", { class: `badge ${contact.review}`, text: `${symbol(contact.review)} ${verdict(contact.review)}` })),
       h("p", { class: "number", text: t("object.look", { time: time(look.seen_utc_s ?? contact.first_frame_utc_s), bytes: contact.bytes_received, aspect: look.aspect_deg === null ? DASH : bearing(look.aspect_deg) }) }),
-      contact.newer_detail ? h("p", { class: "stale", text: decidedOnLess(contact) }) : null, split);
+      contact.newer_detail ? h("p", { class: "stale", text: decidedOnLess(contact) }) : null);
   }
 
-  #renderNearby() {
-    const { nearby } = this.object;
-    fill(this.nearby, nearby.length && state.session.may.decide ? [h("h3", { text: t("object.nearby") }), nearby.map(({ contact, distance_m }) => h("button", {
-      type: "button", data: { merge: contact.id }, title: t("object.merge_title"), text: t("object.merge", { name: contact.name, distance: quantity(distance_m, "m", 0) }),
-      on: { click: () => this.#change(() => api.mergeObjects(this.object.id, contact.id)) },
-    }))] : null);
+  /** Changes of the object: a look that shows another object, and objects within the association gate that are this one. */
+  #renderMenu() {
+    const { looks, nearby, id } = this.object;
+    const button = (text, data, send) => h("button", { type: "button", data, text, on: { click: () => this.#change(send) } });
+    const splits = looks.length > 1 ? looks.map(({ contact }) => button(t("object.split", { name: contact.name }), { split: contact.id }, () => api.splitLook(id, contact.id))) : [];
+    const merges = nearby.map(({ contact, distance_m }) => button(t("object.merge", { name: contact.name, distance: quantity(distance_m, "m") }), { merge: contact.id }, () => api.mergeObjects(id, contact.id)));
+    this.menu.classList.toggle("hidden", !state.session.may.decide || splits.length + merges.length === 0);
+    fill(this.changes, splits, merges);
   }
 
   #renderButtons() {
-    this.allText.textContent = t("object.all", { count: this.object.number_of_looks });
-    for (const tile of this.grid.children) {
-      const { id } = tile.dataset;
-      tile.classList.toggle("selected", id === this.selected);
-      tile.classList.toggle("decides", (this.all.checked || id === this.selected) && this.images.has(id));
-    }
-    const ready = state.session.may.decide && this.#decidedLooks().length > 0;
-    for (const button of this.buttons) button.disabled = !ready;
+    this.decided.textContent = t("object.all", { count: this.images.size });
+    for (const button of this.buttons) button.disabled = !state.session.may.decide || this.images.size === 0;
   }
 
   /** Load the images, then draw all at one scale. */
@@ -109,18 +104,32 @@ class ObjectPanel {
       const known = this.images.get(id);
       if (known?.look.contact.version === version) return { ...known, look };
       try {
-        const image = await loadImage({ id, version, sha256: look.sha256, layer: "raw" }, api.imageUrl(id, version, "raw"), look.has_missing ? api.maskUrl(id, version, "missing", "raw") : null, null);
+        const image = await loadImage({ id, version, sha256: look.sha256, layer: "raw" }, api.imageUrl(id, version), look.has_missing ? api.maskUrl(id, version) : null);
         const [low, high] = autoRange(image);
-        return { look, image, coloured: colourise(image, colourTable("grey", low, high, 1)) };
+        return { look, image, coloured: colourise(image, colourTable("grey", low, high)) };
       } catch (error) {
         toast(`${look.contact.name}: ${error.message}`, { bad: true });
         return null;
       }
     }));
     if (this.object !== object || !this.open) return;
-    this.images = new Map(loaded.filter(Boolean).map((one) => [one.look.contact.id, one]));
+    const drawn = loaded.filter(Boolean);
+    if (drawn.some(({ look, image }) => image !== this.images.get(look.contact.id)?.image)) this.#wait();
+    this.images = new Map(drawn.map((one) => [one.look.contact.id, one]));
     this.draw();
     this.#renderButtons();
+  }
+
+  #setReady(/** @type {boolean} */ ready) {
+    this.ready = ready;
+    this.dialog.dataset.ready = String(ready);
+  }
+
+  /** A verdict counts after each image was in sight for some time, and as long after the verdict before. */
+  #wait() {
+    clearTimeout(this.timer);
+    this.#setReady(false);
+    this.timer = setTimeout(() => this.#setReady(true), SEEN_MS);
   }
 
   draw() {
@@ -139,20 +148,22 @@ class ObjectPanel {
     emit("select", { id });
   }
 
-  /** Looks that a verdict applies to: their images are drawn. */
-  #decidedLooks() {
-    const drawn = [...this.images.values()].map(({ look }) => look);
-    return this.all.checked ? drawn : drawn.filter((look) => look.contact.id === this.selected);
-  }
-
+  /** Decide on all looks whose images are drawn. */
   async decide(name) {
-    const looks = this.#decidedLooks();
+    const looks = [...this.images.values()].map(({ look }) => look);
     if (!looks.length || !state.session.may.decide) return;
+    if (!this.ready) {
+      toast(t("decision_form.early"));
+      return;
+    }
     const body = {
       verdict: name,
       looks: looks.map(({ contact, sha256 }) => ({ contact: contact.id, revision: contact.revision, version: contact.version, sha256, layer: "raw" })),
     };
+    clearTimeout(this.timer);
+    this.#setReady(false);
     const stored = await this.#change(() => api.decideObject(this.object.id, body), (response) => response.object);
+    this.#wait();
     if (stored) toast(t("object.decided", { count: looks.length, verdict: verdict(name) }));
   }
 
@@ -163,7 +174,6 @@ class ObjectPanel {
       const object = objectOf(response);
       if (this.open && object) this.show(object);
       else this.close();
-      emit("changed", { id: state.selected });
       return true;
     } catch (error) {
       toast(error.message, { bad: true });
@@ -173,23 +183,21 @@ class ObjectPanel {
 
   async reload() {
     try {
-      const { contact } = await api.contact(this.selected);
-      if (contact.object !== null && this.open) this.show(await api.object(contact.object));
+      const object = await api.object(this.object.id);
+      if (this.open) this.show(object);
     } catch (error) {
-      toast(error.message, { bad: true });
+      // Its looks are looks of another object now.
+      if (error.status === 404) this.close();
+      else toast(error.message, { bad: true });
     }
   }
 
   #key(event) {
-    const name = VERDICTS[Number(event.key) - 1];
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (name) this.decide(name);
-    else if (event.key === "O") this.close();
-    else if (event.key === "o") {
-      const ids = this.object.looks.map((look) => look.contact.id);
-      this.selected = ids[(ids.indexOf(this.selected) + 1) % ids.length];
-      this.#renderButtons();
-    } else return;
+    if (keysOff() || event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
+    // By the place of the key: on some keyboards digits need Shift.
+    const name = VERDICTS[Number(/^Digit([1-3])$/.exec(event.code)?.[1] ?? event.key) - 1];
+    if (!name) return;
+    this.decide(name);
     event.preventDefault();
   }
 }
@@ -198,12 +206,8 @@ let panel = null;
 
 /** Open the panel of a contact's object. */
 export async function openObject(contact) {
-  if (contact.object === null) {
-    toast(t("object.no_position"));
-    return;
-  }
   try {
-    panel = new ObjectPanel(await api.object(contact.object), contact.id);
+    panel = new ObjectPanel(await api.object(contact.object));
   } catch (error) {
     toast(error.message, { bad: true });
   }
