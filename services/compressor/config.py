@@ -27,7 +27,6 @@ class CompressorConfig(ServiceConfig):
             codec. The v1 link sends `stream_bytes` of [uuv_modem] without a command. Not for the paper's link, which
             sends complete streams.
         cache_images: Maximum number of images in the cache that answers commands.
-        cache_s: Maximum age of an image in the cache.
     """
 
     codec: str = "emb"
@@ -38,7 +37,6 @@ class CompressorConfig(ServiceConfig):
     budget_bytes: Annotated[int, Field(ge=0, le=65542)] = 0
     refine_bytes: Annotated[int, Field(ge=0, le=65535)] = 0
     cache_images: Annotated[int, Field(ge=0, le=10000)] = 200
-    cache_s: Annotated[float, Field(gt=0, le=2592000)] = 86400.0
 
     def check_with(self, platform: PlatformConfig) -> None:
         """Check that codec, model and codebook exist.

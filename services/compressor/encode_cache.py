@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import msgpack
 
+from sonarpost import wire
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
-from sonarpost.errors import PayloadError
+from sonarpost.messages import EncodedImage, Snippet
 
 _INDEX = "kept"
 _ENTRY = "kept/"
@@ -38,61 +39,55 @@ class EncodeCache:
     Args:
         store: The service's store.
         max_images: Maximum number of entries; the oldest are deleted.
-        max_age_s: Maximum age of an entry.
     """
 
-    def __init__(self, store: Store, max_images: int, max_age_s: float) -> None:
+    def __init__(self, store: Store, max_images: int) -> None:
         self._store = store
         self._max_images = max_images
-        self._max_age_s = max_age_s
 
-    def _index(self) -> dict[str, float]:
-        packed = self._store.get_state(_INDEX)
-        return {} if packed is None else {str(name): float(at) for name, at in msgpack.unpackb(packed)}
+    def _index(self) -> list[str]:
+        index = self._store.read_state(_INDEX, _index, None)
+        if index is None:
+            index = [name.removeprefix(_ENTRY) for name in self._store.state_names(_ENTRY)]
+        return index
 
-    def put(self, effects: UnitOfWork, images: Mapping[str, CachedImage], now_utc_s: float) -> None:
-        """Store entries, and delete those that are too old or too many, in one transaction.
+    def put(self, effects: UnitOfWork, images: Mapping[str, CachedImage]) -> None:
+        """Store entries, and delete those that are too many, in one transaction.
 
         Args:
             effects: Receives the writes; call `put` once for each unit of work.
             images: New entries by image identifier, the oldest first.
-            now_utc_s: Current time.
         """
-        index = self._index()
-        for image_id in images:
-            index.pop(image_id, None)
-            index[image_id] = now_utc_s
-        expired = [image_id for image_id, at in index.items() if now_utc_s - at > self._max_age_s]
-        remaining = [image_id for image_id in index if image_id not in expired]
-        expired += remaining[: max(0, len(remaining) - self._max_images)]
-        for image_id in expired:
-            del index[image_id]
+        index = [image_id for image_id in self._index() if image_id not in images] + list(images)
+        surplus = max(0, len(index) - self._max_images)
+        for image_id in index[:surplus]:
             effects.delete_state(_ENTRY + image_id)
-        effects.put_state(_INDEX, msgpack.packb(list(index.items())))
+        index = index[surplus:]
+        effects.put_state(_INDEX, msgpack.packb(index))
         for image_id, cached in images.items():
             if image_id in index:
                 entry = msgpack.packb([cached.image, cached.snippet, cached.expanded_id, cached.original_id])
                 effects.put_state(_ENTRY + image_id, entry)
 
     def get(self, image_id: str) -> CachedImage | None:
-        """Return the entry of an image, None if there is none.
+        """Return the entry of an image, None if there is none."""
+        return self._store.read_state(_ENTRY + image_id, _entry, None)
 
-        Raises:
-            PayloadError: The stored entry is malformed.
-        """
-        packed = self._store.get_state(_ENTRY + image_id)
-        if packed is None:
-            return None
-        match msgpack.unpackb(packed):
-            case [bytes(image), bytes(snippet)]:  # written before expanded images existed
-                return CachedImage(image, snippet)
-            case [bytes(image), bytes(snippet), str(expanded_id)]:
-                # written before images without despeckling existed
-                return CachedImage(image, snippet, expanded_id)
-            case [bytes(image), bytes(snippet), str(expanded_id), str(original_id)]:
-                return CachedImage(image, snippet, expanded_id, original_id)
-            case other:
-                raise PayloadError(entry_location(image_id), "", other, "an image and a snippet")
+
+def _index(packed: bytes) -> list[str]:
+    """Return the identifiers of all entries, the oldest first."""
+    names: list[str] = msgpack.unpackb(packed)
+    if not all(isinstance(name, str) for name in names):
+        raise TypeError("index of the cache: got another type, expected texts")
+    return names
+
+
+def _entry(packed: bytes) -> CachedImage:
+    image, snippet, *ids = msgpack.unpackb(packed)
+    # A damaged record is discarded with its entry.
+    wire.decode(EncodedImage, image, "cached image")
+    wire.decode(Snippet, snippet, "cached snippet")
+    return CachedImage(image, snippet, *map(str, ids))
 
 
 def entry_location(image_id: str) -> str:

@@ -62,7 +62,7 @@ class CompressorService(Service[CompressorConfig]):
             config.codec, replace(resources, strength=0.0)
         )
         super().__init__(platform, config)
-        self._cache = EncodeCache(self.store, config.cache_images, config.cache_s)
+        self._cache = EncodeCache(self.store, config.cache_images)
         log.info("Codec ready", extra=kv(codec=self._codec.name, model=self._codec.model_hash[:16]))
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
@@ -78,7 +78,7 @@ class CompressorService(Service[CompressorConfig]):
         assert isinstance(record, Snippet)
         image_id, cached = self._encode(record, effects, effects.payload, self._codec)
         if self.config.cache_images:
-            self._cache.put(effects, {image_id: cached}, time.time())
+            self._cache.put(effects, {image_id: cached})
 
     def _encode(
         self,
@@ -165,7 +165,7 @@ class CompressorService(Service[CompressorConfig]):
         expanded_id, entry = self._encode(
             snippet, effects, wire.encode(snippet), self._codec, priority=_COMMAND_PRIORITY
         )
-        self._cache.put(effects, {image_id: replace(cached, expanded_id=expanded_id), expanded_id: entry}, time.time())
+        self._cache.put(effects, {image_id: replace(cached, expanded_id=expanded_id), expanded_id: entry})
         effects.count("images_expanded")
         log.info("Expanded image sent", extra=kv(image_id=image_id, expanded_id=expanded_id))
 
@@ -184,7 +184,7 @@ class CompressorService(Service[CompressorConfig]):
         original_id, entry = self._encode(
             snippet, effects, cached.snippet, self._codec_without_despeckling, priority=_COMMAND_PRIORITY
         )
-        self._cache.put(effects, {image_id: replace(cached, original_id=original_id), original_id: entry}, time.time())
+        self._cache.put(effects, {image_id: replace(cached, original_id=original_id), original_id: entry})
         effects.count("images_original")
         log.info("Image without despeckling sent", extra=kv(image_id=image_id, original_id=original_id))
 
@@ -203,7 +203,7 @@ class CompressorService(Service[CompressorConfig]):
             priority=_COMMAND_PRIORITY,
             budget_bytes=command.stream_bytes,
         )
-        self._cache.put(effects, {region_id: entry}, time.time())
+        self._cache.put(effects, {region_id: entry})
         effects.count("images_region")
         log.info("Region sent", extra=kv(image_id=image_id, region_id=region_id, bytes=command.stream_bytes))
 
@@ -223,7 +223,7 @@ class CompressorService(Service[CompressorConfig]):
             longer = refine(codec, image.stream, snippet.picture.to_array())
             if longer != image.stream:
                 image = image.model_copy(update={"stream": longer})
-                self._cache.put(effects, {image_id: replace(cached, image=wire.encode(image))}, time.time())
+                self._cache.put(effects, {image_id: replace(cached, image=wire.encode(image))})
                 effects.count("images_refined")
         if codec is not None:
             stream = transmit_part(codec, image.stream)
@@ -249,6 +249,5 @@ class CompressorService(Service[CompressorConfig]):
         The first is derived from the identity of the store. A vehicle with a new disk therefore does not begin with
         the identifiers of its last mission, which the vessel may still have.
         """
-        stored = self.store.get_state(_NEXT_IMAGE)
-        number = int.from_bytes(self.store.origin[:4], "big") if stored is None else int(stored)
+        number = self.store.read_state(_NEXT_IMAGE, int, int.from_bytes(self.store.origin[:4], "big"))
         return (number - 1) % IMAGE_IDS + 1

@@ -41,8 +41,8 @@ class OpModemConfig(ModemServiceConfig):
             that are not in `vehicles` share one limit.
         downlink_rate: Rate of sent packets; rate 0 of the Micro-Modem has the longest range. The default is that of the
             Micro-Modem; other drivers have their own.
-        retry_s: Wait for a confirmation before a command is repeated; doubled after each repetition, up to eight times
-            this value.
+        retry_s: Wait for a confirmation before a command is repeated; doubled after each repetition from the third on,
+            up to eight times this value.
         command_lifetime_s: Time after its issue for which a command is repeated.
         feedback: Whether feedback is sent to the vehicles.
         feedback_interval_s: Minimum time between two feedback messages to a vehicle, unless feedback_interval_frames
@@ -80,10 +80,10 @@ class OpModemConfig(ModemServiceConfig):
     message_consumers: tuple[ConsumerName, ...] = ()
     status_interval_s: Annotated[float, Field(ge=1, le=86400)] = 5.0
     downlink_rate: RateNumber = 0
-    retry_s: Seconds = 60.0
+    retry_s: Seconds = 20.0
     command_lifetime_s: Annotated[float, Field(gt=0, le=604800)] = 6 * 3600.0
     feedback: bool = True
-    feedback_interval_s: Seconds = 60.0
+    feedback_interval_s: Seconds = 20.0
     feedback_interval_frames: Annotated[int, Field(ge=1, le=65535)] = 48
     mac: Literal["csma", "tdma", "polled"] = "csma"
     holdoff_s: Seconds = 2.0

@@ -93,9 +93,9 @@ class DownlinkService(ModemService[OpModemConfig]):
         they would make images of which a part is not authenticated. Images that have begun are kept; their records say
         that they are not authenticated.
         """
-        saved = self.store.get_state(_AUTHENTICATED_SINCE)
-        if self.key is not None and saved is not None:
-            return float(saved)
+        saved_s = self.store.read_state(_AUTHENTICATED_SINCE, float, None)
+        if self.key is not None and saved_s is not None:
+            return saved_s
         with self.store.transaction() as tx:
             if self.key is None:
                 tx.delete_state(_AUTHENTICATED_SINCE)
@@ -169,15 +169,12 @@ class DownlinkService(ModemService[OpModemConfig]):
             parts = self.store.states(_PARTS)
             self._saved_parts = SavedParts(parts)
             errors = self._link.restore(parts)
-            old = self.store.get_state(_STATE_0_1)
-            if not parts and old is not None:
-                try:
-                    self._link.restore_old(old)
-                except FrameError as error:
-                    errors = {_STATE_0_1: error}
-            for name, reason in errors.items():
-                self.count("states_discarded")
-                log.error("Discarding an unreadable part of the link state", extra=kv(part=name, reason=str(reason)))
+            if not parts:
+                self.store.read_state(_STATE_0_1, self._link.restore_old, None)
+            if errors:
+                with self.store.transaction() as tx:
+                    for name, reason in errors.items():
+                        tx.discard_state(_PARTS + name, parts.get(name, b""), str(reason))
         self._is_committed = False
 
     def _save_state(self, effects: UnitOfWork) -> None:

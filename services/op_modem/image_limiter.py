@@ -12,13 +12,28 @@ from typing import Annotated, Final
 
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import StreamError
+from sonarpost.limits import limit
 from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
 from sonarpost.messages import ReceivedImage
 
-MAX_HELD_IMAGES: Final = 1000
-"""Maximum number of images that wait of each vehicle; further ones are dropped."""
-MAX_HELD_BYTES: Final = 4 * 1024 * 1024
-"""Maximum size of the coded images that wait of each vehicle."""
+MAX_HELD_IMAGES: Final = limit(
+    1000,
+    "images",
+    "shares",
+    surface="acoustic link",
+    source="vehicle",
+    resource="images that wait for the allowance of an hour",
+    at_limit="Further images are dropped; vehicles without a configured name are one source",
+)
+MAX_HELD_BYTES: Final = limit(
+    4 * 1024 * 1024,
+    "bytes",
+    "shares",
+    surface="acoustic link",
+    source="vehicle",
+    resource="coded images that wait for the allowance of an hour",
+    at_limit="Further images are dropped",
+)
 UNLISTED: Final = "unlisted vehicles"
 """Allowance that all vehicles without a configured name share: a forger can choose any of 128 addresses."""
 

@@ -21,7 +21,9 @@ def unpack_partial(saved: bytes) -> tuple[PacketReceived, float] | None:
     """Return the packet of `pack_partial`, without statistics, and its time; None if it has no frames."""
     state = msgpack.unpackb(saved)
     frames = tuple(
-        FrameReceived(src, dest, ack, number, data, 0.0, rate, None)
+        FrameReceived(
+            int(src), int(dest), bool(ack), int(number), memoryview(data).tobytes(), 0.0, rate and int(rate), None
+        )
         for src, dest, ack, number, data, rate in state["frames"]
     )
     if not frames:

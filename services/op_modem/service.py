@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 from pydantic import ValidationError
 
@@ -15,6 +16,7 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.outbox import QueuePolicy
 from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import DeliveryError, FrameError, PayloadError
+from sonarpost.limits import limit
 from sonarpost.link.downlink.vessel_endpoint import ReceivedContent
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.logs import kv
@@ -44,7 +46,15 @@ _QUEUE_0_1 = "decompressor"
 """Queue in which version 0.1 kept received frames."""
 TICK_S = 0.1
 SAVE_RETRY_S = 1.0
-MAX_UNSAVED = 10_000
+MAX_UNSAVED = limit(
+    10_000,
+    "packets",
+    "shares",
+    surface="acoustic link, vessel",
+    source="modem address",
+    resource="packets while the store cannot be written",
+    at_limit="the oldest of the address with the most is dropped",
+)
 
 
 class OpModemService(DownlinkService):
@@ -88,8 +98,7 @@ class OpModemService(DownlinkService):
 
     def on_start(self) -> None:
         """Process the unfinished packet of a killed process, then open the port."""
-        saved = self.store.get_state(_PARTIAL_PACKET)
-        if (interrupted := unpack_partial(saved) if saved is not None else None) is not None:
+        if (interrupted := self.store.read_state(_PARTIAL_PACKET, unpack_partial, None)) is not None:
             self._add_unsaved(*interrupted)
             self._process_received()
         self.publish_open_commands()
@@ -164,11 +173,12 @@ class OpModemService(DownlinkService):
 
     def _add_unsaved(self, packet: PacketReceived, received_utc_s: float) -> None:
         with self._unsaved_lock:
-            if len(self._unsaved) >= MAX_UNSAVED:
-                self._unsaved.popleft()
-                self.count("packets_lost")
-                log.error("Oldest packet in memory dropped", extra=kv(unsaved=len(self._unsaved)))
             self._unsaved.append((packet, received_utc_s))
+            if len(self._unsaved) > MAX_UNSAVED:
+                [(most, _)] = Counter(waiting.src for waiting, _ in self._unsaved).most_common(1)
+                self._unsaved.remove(next(each for each in self._unsaved if each[0].src == most))
+                self.count("packets_lost")
+                log.error("Oldest packet in memory dropped", extra=kv(source=most, unsaved=len(self._unsaved)))
 
     def _process_received(self) -> None:
         """Process the packets in memory, oldest first, then the images whose wait has ended."""
@@ -176,7 +186,20 @@ class OpModemService(DownlinkService):
         with self._unsaved_lock:
             try:
                 while self._unsaved:
-                    self._process_packet(*self._unsaved[0])
+                    packet, received_utc_s = self._unsaved[0]
+                    try:
+                        self._process_packet(packet, received_utc_s)
+                    except DeliveryError:
+                        raise
+                    except Exception as failure:
+                        # Nothing of the packet was committed: its frames are processed one by one.
+                        if len(packet.frames) > 1:
+                            parts = [(replace(packet, frames=(frame,)), received_utc_s) for frame in packet.frames]
+                            self._unsaved.popleft()
+                            self._unsaved.extendleft(reversed(parts))
+                            continue
+                        log.exception("Frame quarantined after an unexpected exception", extra=kv(source=packet.src))
+                        self._refuse_frame(packet, f"{type(failure).__name__}: {failure}")
                     self._unsaved.popleft()
                 self._send_due_images()
             except DeliveryError as caught:
@@ -187,10 +210,16 @@ class OpModemService(DownlinkService):
         elif before and not error:
             log.info("Received frames stored again")
 
+    def _refuse_frame(self, packet: PacketReceived, reason: str) -> None:
+        effects = UnitOfWork()
+        effects.quarantine(keys.acoustic_rx(self.platform.id), packet.frames[0].data, reason)
+        effects.count("frames_refused")
+        self.commit(effects)
+
     def _process_packet(self, packet: PacketReceived, received_utc_s: float) -> None:
         if not packet.frames:
             return
-        number = int(self.store.get_state(_PACKETS) or b"0") + 1
+        number = self.store.read_state(_PACKETS, int, 0) + 1
         effects = UnitOfWork()
         frames: list[AcousticFrame] = []
         modem = self.config.capabilities

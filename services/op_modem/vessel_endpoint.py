@@ -69,14 +69,15 @@ class VesselLink:
 
         Raises:
             PayloadError: The modem address of the vehicle is unknown, the time does not fit the link, or too many
-                commands are open.
+                of its commands are open.
         """
-        if self._config.address_of(record.vehicle_id) is None:
+        address = self._config.address_of(record.vehicle_id)
+        if address is None:
             raise PayloadError(where, "vehicle_id", record.vehicle_id, "a vehicle of [op_modem] vehicles")
         issued = _issued_utc_s(record)
         if issued > LATEST_UTC_S:
             raise PayloadError(where, "time", issued, f"a time to {LATEST_UTC_S} s")
-        if len(self.commands.open_commands) >= MAX_PENDING:
+        if self.commands.is_full(address):
             raise PayloadError(where, "", f"{MAX_PENDING} open commands", "one at most fewer")
 
     def add(self, record: Command | Decision, now: float) -> PendingCommand | None:

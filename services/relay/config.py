@@ -30,8 +30,8 @@ class UpstreamOptions(ServiceConfig):
         router: Zenoh endpoints of the site's own router, tried in turn. By default the site is reached through the
             platform's router and its links.
         bandwidth_bytes_per_s: Bandwidth limit for this site, headers included; no limit by default.
-        max_bytes: Maximum size of this site's queue. Above it images are dropped for this site: later versions before
-            first ones, oldest first. Decisions are never dropped. No limit by default.
+        max_bytes: Maximum size of this site's queue. Above it images of the vehicle with the most bytes are dropped for
+            this site: later versions before first ones, oldest first. Decisions are never dropped. No limit by default.
         terminal: Satellite only: serial port of an Iridium 9602 or 9603, or another URL of pyserial.
         baud: Satellite only: bits a second.
         after_s: Satellite only: time that a record waits for the radio first; not used for a site without radio.

@@ -6,7 +6,7 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import msgpack
 
@@ -15,14 +15,16 @@ from sonarpost.bearers.policy import ByteBudget, Window
 from sonarpost.bearers.sender import (
     MessageSender,
     NextMessage,
+    PendingMessage,
     QueuedItem,
     decision_items,
     image_items,
     image_name,
 )
-from sonarpost.bearers.short_message import MAX_MESSAGE_BYTES
+from sonarpost.bearers.short_message import MAX_MESSAGE_BYTES, WINDOW
 from sonarpost.delivery.store import Store
 from sonarpost.errors import BadInputError, DeliveryError, PortError
+from sonarpost.link.state import Count, Word, from_plain, unpack_value
 from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import Decision, ReceivedImage
 from sonarpost.runtime.service import UnitOfWork
@@ -30,6 +32,7 @@ from sonarpost.services.relay.config import UpstreamOptions
 
 log = logging.getLogger(__name__)
 
+_WHERE = "state of short messages"
 POLL_S = 1.0
 RETRY_S = 30.0
 """Delay after a message that the terminal could not send."""
@@ -73,19 +76,28 @@ class SatelliteUpstream:
         self._checked_s = 0.0
         windows = tuple(Window.parse(text) for text in options.windows)
         self._budget = ByteBudget(options.bytes_per_day, windows)
-        if (counts := store.get_state(f"{self._prefix}budget")) is not None:
-            self._budget.restore(counts)
-        head = store.get_state(f"{self._prefix}head")
-        epoch, next_seq = (secrets.randbits(32), 0) if head is None else msgpack.unpackb(head)
-        number = store.get_state(f"{self._prefix}number")
-        self._next_number = 0 if number is None else int.from_bytes(number, "big")
+        store.read_state(f"{self._prefix}budget", self._budget.restore, None)
+        messages = store.read_states(f"{self._prefix}message/", lambda _, data: PendingMessage.unpack(data))
+        items = store.read_states(f"{self._prefix}item/", lambda _, data: QueuedItem.unpack(data))
+        epoch, next_seq = self._first_numbers(messages.values())
         self._sender = MessageSender(epoch, next_seq, after_s=options.after_s if has_radio else 0.0)
-        messages = store.states(f"{self._prefix}message/")
-        self._sender.restore(self._stored_items(), messages.values(), time.time())
-        self._known = set(store.state_names(f"{self._prefix}item/"))
+        self._sender.restore(items.values(), messages.values(), time.time())
+        number = store.read_state(
+            f"{self._prefix}number", lambda data: from_plain(Count, int.from_bytes(data, "big"), _WHERE), 0
+        )
+        self._next_number = max(number, self._sender.next_number)
+        self._known = {f"{self._prefix}item/{name}" for name in items}
 
-    def _stored_items(self) -> list[QueuedItem]:
-        return [QueuedItem.unpack(data) for data in self._store.states(f"{self._prefix}item/").values()]
+    def _first_numbers(self, messages: Collection[PendingMessage]) -> tuple[int, int]:
+        """Return the epoch and the next sequence number."""
+        head = self._store.read_state(
+            f"{self._prefix}head", lambda data: unpack_value(tuple[Word, Word], data, _WHERE), None
+        )
+        if head is not None or not messages:
+            return head or (secrets.randbits(32), 0)
+        # The numbers are lost. No message was given a number that is a window above one without acknowledgement.
+        oldest = min((each.message for each in messages), key=lambda message: message.seq)
+        return oldest.epoch, oldest.seq + WINDOW
 
     # Records
 
@@ -137,12 +149,17 @@ class SatelliteUpstream:
                 self._take_changes()
                 busy = self._step(stopping)
                 self._fault = ""
-            except (PortError, TerminalError, DeliveryError) as error:
+            except Exception as error:
                 if stopping.is_set():
                     return
                 busy = False
-                self._fault = str(error)
-                self._log.log(site=self.options.site, error=str(error))
+                self._fault = str(error) or type(error).__name__
+                if isinstance(error, (PortError, BadInputError, DeliveryError)):
+                    self._log.log(site=self.options.site, error=str(error))
+                else:  # a defect, or a library's own error: the radio and the other sites continue
+                    log.exception("Short messages failed; retrying", extra=kv(site=self.options.site))
+                    self._count("short_messages_failed")
+                    stopping.wait(RETRY_S)
             if not busy:
                 self._wake.wait(POLL_S)
 
@@ -152,7 +169,8 @@ class SatelliteUpstream:
         with self._lock:
             withdrawn, self._withdrawn = self._withdrawn, []
         new = [name for name in self._store.state_names(f"{self._prefix}item/") if name not in self._known]
-        items = [QueuedItem.unpack(data) for name in new if (data := self._store.get_state(name)) is not None]
+        values = {name: data for name in new if (data := self._store.get_state(name)) is not None}
+        items = self._store.readable(values, lambda _, data: QueuedItem.unpack(data)).values()
         removed = list(self._sender.insert(sorted(items, key=lambda item: item.number)))
         self._known.update(new)
         for name in withdrawn:

@@ -251,10 +251,11 @@ class RelayService(Service[RelayConfig]):
         for queue, key in self._part_keys.items():
             known = None
             if image.version > 1:
-                known = self.store.get_state(image_parts.version_name(f"{VERSIONS}{queue}/", payload))
+                name = image_parts.version_name(f"{VERSIONS}{queue}/", payload)
+                known = image_parts.stored_version(self.store.get_state(name), name)
             sent = payload
             if known is not None:
-                sent = wire.encode(image_parts.difference(whole, wire.decode(ImagePart, known, key)))
+                sent = wire.encode(image_parts.difference(whole, known))
             effects.send_payload(key, queue, sent, ImagePart, priority=priority, topic=topic)
             effects.count("image_differences", int(sent is not payload))
         effects.count("image_bytes_received", image.bytes_received)
@@ -269,18 +270,17 @@ class RelayService(Service[RelayConfig]):
             return False
         prefix = f"{VERSIONS}{item.queue}/"
         name = image_parts.version_name(prefix, item.payload)
-        known, whole = tx.get_state(name), item.payload
+        known, whole = image_parts.stored_version(tx.get_state(name), name), item.payload
         if not (is_whole := image_parts.is_whole(whole)):
-            base = None if known is None else wire.decode(ImagePart, known, item.key)
             try:
-                whole = wire.encode(image_parts.expand(wire.decode(ImagePart, whole, item.key), base, item.key))
+                whole = wire.encode(image_parts.expand(wire.decode(ImagePart, whole, item.key), known, item.key))
             except MissingBaseError as error:
                 # Only if the base was deleted for newer images: the site asks for the whole when it needs it.
                 fields = kv(site_queue=item.queue, reason=str(error))
                 log.warning("Image version not stored: the base of its difference was deleted", extra=fields)
                 return False
         if reason is None:
-            if known is None or image_parts.version_of(known) < image_parts.version_of(whole):
+            if known is None or known.n < image_parts.version_of(whole):
                 tx.put_state(name, whole)
                 self._prune_versions(tx, item.queue, prefix)
             return False

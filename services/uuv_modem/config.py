@@ -79,7 +79,7 @@ class UuvModemConfig(ModemServiceConfig):
     aging_s: Seconds = 600.0
     max_messages: Annotated[int, Field(ge=1, le=100_000)] = 2000
     mac: Literal["continuous", "tdma", "polled", "csma"] = "continuous"
-    tx_burst_s: Seconds = 150.0
+    tx_burst_s: Seconds = 90.0
     rx_window_s: Annotated[float, Field(ge=0, le=86400)] = 5.0
     holdoff_s: Annotated[float, Field(ge=0, le=600)] = 5.0
     tdma_cycle_s: Seconds = 60.0

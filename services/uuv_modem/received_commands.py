@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from sonarpost import keys
+from sonarpost.limits import limit
 from sonarpost.link.downlink.messages import (
     CommandOutcome,
     DecisionMessage,
@@ -28,7 +30,15 @@ from sonarpost.link.state import from_plain
 from sonarpost.messages import Command, CommandKind, Decision
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 
-_MAX_KNOWN: Final = 512
+_MAX_KNOWN: Final = limit(
+    512,
+    "commands",
+    "shares",
+    surface="acoustic link, vehicle",
+    source="modem address",
+    resource="commands that are recognised when they are repeated",
+    at_limit="the oldest of the address with the most is forgotten",
+)
 _KINDS: Final[dict[type, CommandKind]] = {
     RefineMessage: "refine",
     ResendMessage: "resend",
@@ -50,7 +60,7 @@ class CommandRecord:
 
 
 class ReceivedCommands:
-    """The last 512 commands and their outcomes.
+    """The last 512 commands of all modems and their outcomes.
 
     Args:
         platform_id: The vehicle.
@@ -81,7 +91,8 @@ class ReceivedCommands:
         outcome = CommandOutcome.ACCEPTED if is_executed else CommandOutcome.UNSUPPORTED
         self._known[name] = outcome
         while len(self._known) > _MAX_KNOWN:
-            del self._known[next(iter(self._known))]
+            [(most, _)] = Counter(sender for sender, _ in self._known).most_common(1)
+            del self._known[next(each for each in self._known if each[0] == most)]
         return outcome, received if is_executed else None
 
     def _is_executed_by_the_queue(self, command: DownlinkCommand) -> bool:

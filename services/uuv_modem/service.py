@@ -15,6 +15,7 @@ from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import BadInputError, DeliveryError, RetryLaterError
+from sonarpost.limits import limit
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage, Record, VehicleStatus
 from sonarpost.modem.interface import (
@@ -36,8 +37,24 @@ from sonarpost.services.uuv_modem.vehicle_endpoint import VehicleEndpoint
 
 log = logging.getLogger(__name__)
 
-MAX_UNSAVED: Final = 1000
-"""Events that are kept while the store cannot be written; further frames are dropped, and the vessel repeats them."""
+MAX_EVENTS: Final = limit(
+    10_000,
+    "events",
+    "claims",
+    surface="acoustic link, vehicle",
+    source="modem",
+    resource="events that wait for the thread of the link",
+    at_limit="further ones are dropped, except the end of an own packet",
+)
+MAX_UNSAVED: Final = limit(
+    1000,
+    "frames",
+    "shares",
+    surface="acoustic link, vehicle",
+    source="all modems",
+    resource="frames while the store cannot be written",
+    at_limit="further ones are dropped; the vessel repeats them",
+)
 SAVE_AGAIN_S: Final = 0.5
 _ARRIVAL_0_1: Final = "arrival/"
 _MAX_WAIT_S: Final = 0.2
@@ -185,7 +202,10 @@ class UuvModemService(ModemService[UuvModemConfig]):
         if self._transmissions.on_event(event, now_utc_s, time.monotonic()):
             record = self._transmissions.record(self.platform.id, now_utc_s)
             self.publish(keys.acoustic_transmissions(self.platform.id), record)
-        self._events.put(event)
+        if isinstance(event, (PacketSent, PacketFailed)) or self._events.qsize() < MAX_EVENTS:
+            self._events.put(event)
+        else:
+            self.count("frames_dropped")
 
     def _reply_transmissions(self, query: zenoh.Query) -> None:
         """Reply with the latest transmissions; called in a thread of Zenoh."""
@@ -274,17 +294,32 @@ class UuvModemService(ModemService[UuvModemConfig]):
             self._link_error = error
 
     def _save(self) -> None:
-        """Change the endpoint by the events, and commit.
+        """Change the endpoint by the events, and commit. An event that cannot be processed is left out.
 
         Raises:
             DeliveryError: The store cannot be written; the next call repeats the changes.
         """
-        with self._endpoint.step():
-            for change in self._unsaved:
-                change()
-            if self._endpoint.changed:
-                self.commit(UnitOfWork())
-        self._unsaved.clear()
+        size = len(self._unsaved)
+        while True:
+            changes = self._unsaved[:size]
+            try:
+                with self._endpoint.step():
+                    for change in changes:
+                        change()
+                    if self._endpoint.changed:
+                        self.commit(UnitOfWork())
+            except DeliveryError:
+                raise
+            except Exception:
+                # The step has no effect: its events are processed one by one.
+                if size > 1:
+                    size = 1
+                    continue
+                log.exception("Event of the modem left out")
+                self.count("frames_failed")
+            del self._unsaved[:size]
+            if not self._unsaved:
+                return
 
     def _send(self, now: float) -> float:
         """Send a packet if one is due; return the time until then, in seconds.

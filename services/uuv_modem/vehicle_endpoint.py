@@ -114,7 +114,7 @@ class VehicleEndpoint:
             address = self._config.address
             self.authenticator = FrameAuthenticator(self._key, address, Direction.FROM_VEHICLE, first_counter=limit)
         self.queue = self._new_queue()
-        self.images_accepted = int(self._store.get_state(_IMAGES_ACCEPTED) or b"0")
+        self.images_accepted = self._store.read_state(_IMAGES_ACCEPTED, int, 0)
         self._receiver = V1Receiver(protection=self.authenticator)
         self._commands = ReceivedCommands(self._platform_id, self._config)
         self._outcomes: list[tuple[int, CommandOutcome]] = []
@@ -357,7 +357,10 @@ class VehicleEndpoint:
         self._rejection_log.log(source=event.source, reason=str(event.reason))
 
     def _confirm_commands(self, now: float) -> None:
-        """Queue the outcomes of received commands, several in one message."""
+        """Queue the outcomes of received commands, several in one message.
+
+        It is sent once: if it is lost, the vessel repeats the command, which is confirmed again.
+        """
         outcomes, self._outcomes = self._outcomes, []
         for confirmation in confirmations(outcomes):
             self.queue.add_message(
@@ -367,6 +370,7 @@ class VehicleEndpoint:
                 now,
                 priority=_CONFIRMATION_PRIORITY,
                 lifetime_s=_CONFIRMATION_LIFETIME_S,
+                once=True,
             )
 
     # Packets to send

@@ -1,5 +1,7 @@
 """Codebooks that a shore site lacks: fetched from the vessel by their identity, refused if they have another one."""
 
+import threading
+
 import msgpack
 import pytest
 from builders.common import eventually
@@ -39,6 +41,7 @@ def image(texture):
 def start_c2(runner, platform, tmp_path, monkeypatch):
     """c2 without that codebook."""
     monkeypatch.setattr(codebook_transfer, "RETRY_S", 0.2)
+    monkeypatch.setattr(codebook_transfer, "MAX_RETRY_S", 0.2)
     monkeypatch.setattr(codebook_transfer, "REPLY_TIMEOUT_S", 2.0)
     config = C2Config(out_dir=tmp_path / "shore", codebooks=("nominal-20",))
     return lambda: runner.start(C2Service(platform("shore-1"), config))
@@ -77,9 +80,10 @@ def test_hostile_replies_and_another_codebook_are_refused(image, start_c2, send,
     replies = [
         (lambda _: piece(b"x" * 32769), "data: got"),
         (lambda _: piece(b"x" * 100), "magic: got"),
-        (lambda _: piece(b"xy", 1), "data: got '2 bytes', expected at most the 1 bytes"),
+        (lambda _: piece(b"xy", 1), "data: got '2 bytes', expected 1 bytes from offset 0"),
         (lambda _: piece(b"x", 16 * 1024 * 1024 + 1), "size: got 16777217"),
         (lambda _: piece(b"", 10), "data: got"),
+        (lambda _: piece(b"x", 10), "data: got '1 bytes', expected 10 bytes from offset 0"),
         (lambda _: b"\xc1", "payload: got"),
         (lambda offset: piece(other[offset : offset + 32768], len(other)), f"expected {MODEL}…, which was requested"),
     ]
@@ -127,3 +131,83 @@ def test_images_that_wait_are_limited(image, start_c2, send, refused, monkeypatc
     eventually(lambda: len(refused(c2)) == 1)
     assert MODEL in refused(c2)[0][1]
     assert c2.health().gauges["images_undecoded"] == 2.0
+
+
+SIZE = 16 * 1024 * 1024
+
+
+def silent(key, _):
+    raise codebook_transfer._NoReplyError(key, "reply", "none", "a piece of the codebook")
+
+
+@pytest.mark.parametrize(
+    ("hostile", "queries"),
+    [
+        (lambda *_: {"v": 1, "size": SIZE, "data": b"x"}, 1),
+        (silent, 1),
+        (lambda _, offset: {"v": 1, "size": SIZE, "data": bytes(min(32768, SIZE - offset))}, None),
+    ],
+    ids=["one byte a piece", "silent", "16 MB"],
+)
+def test_vessel_does_not_delay_the_codebook_of_another(tmp_path, monkeypatch, hostile, queries):
+    data, queried, stopping = to_bytes(CODEBOOK), [], threading.Event()
+
+    def query(_session, key, offset):
+        vessel = key.split("/")[2]
+        queried.append(vessel)
+        fields = (
+            hostile(key, offset)
+            if vessel == "vessel-2"
+            else {"v": 1, "size": len(data), "data": data[offset : offset + 32768]}
+        )
+        return codebook_transfer._Piece.model_validate(fields)
+
+    def added(vessel):
+        stored.append(vessel)
+        stopping.set()
+
+    stored = []
+    monkeypatch.setattr(codebook_transfer, "_query", query)
+    wanted = {VESSEL: [MODEL], "vessel-2": [f"{number:032x}" for number in range(40)]}
+    fetcher = codebook_transfer.CodebookFetcher(tmp_path, lambda: wanted, added, stopping)
+    fetcher.run(None)
+    pieces = -(-len(data) // 32768)
+    assert stored == [VESSEL]
+    assert queried.count(VESSEL) == pieces
+    # One query of the other vessel for each of this one at most, and none while it pauses.
+    assert queried.count("vessel-2") <= (pieces + 1 if queries is None else queries)
+    assert len(list((tmp_path / "vessel-2").glob("*"))) <= 1 if (tmp_path / "vessel-2").exists() else True
+    assert [path.name for path in (tmp_path / VESSEL).iterdir()] == [f"{MODEL}.tiles"]
+
+
+def test_incomplete_codebook_is_kept_while_the_vessel_is_silent(tmp_path, monkeypatch):
+    data, stopping, offsets = to_bytes(CODEBOOK), threading.Event(), []
+    monkeypatch.setattr(codebook_transfer, "RETRY_S", 0.0)
+
+    def query(_session, key, offset):
+        offsets.append(offset)
+        if len(offsets) % 2 == 0:
+            silent(key, offset)
+        return codebook_transfer._Piece(v=1, size=len(data), data=data[offset : offset + 32768])
+
+    fetcher = codebook_transfer.CodebookFetcher(
+        tmp_path, lambda: {VESSEL: [MODEL, "f" * 32]}, lambda _: stopping.set(), stopping
+    )
+    monkeypatch.setattr(codebook_transfer, "_query", query)
+    fetcher.run(None)
+    assert offsets[::2] == list(range(0, len(data), 32768))
+
+
+def test_folder_that_cannot_be_used_concerns_its_vessel_only(tmp_path, monkeypatch):
+    data, stopping = to_bytes(CODEBOOK), threading.Event()
+    (tmp_path / "vessel-0").write_bytes(b"not a folder")
+
+    def query(_session, _key, offset):
+        return codebook_transfer._Piece(v=1, size=len(data), data=data[offset : offset + 32768])
+
+    monkeypatch.setattr(codebook_transfer, "_query", query)
+    wanted = {"vessel-0": [MODEL], VESSEL: [MODEL]}
+    fetcher = codebook_transfer.CodebookFetcher(tmp_path, lambda: wanted, lambda _: stopping.set(), stopping)
+    fetcher.run(None)
+    assert (tmp_path / VESSEL / f"{MODEL}.tiles").is_file()
+    assert "vessel-0" in fetcher.faults[MODEL, "vessel-0"]

@@ -1,19 +1,27 @@
 """Short messages from the relay of a vessel to c2, through an emulated gateway: both ends restarted, budget, radio."""
 
 import json
+import struct
 from contextlib import closing
+from urllib.error import HTTPError
+from urllib.parse import urlencode
+from urllib.request import urlopen
 
+import msgpack
 import pytest
 from builders.common import eventually
 from builders.records import decision_record, reconstructed_image
-from builders.short_messages import decision
+from builders.short_messages import decision, with_crc
 from builders.short_messages import received as received_image
 from pydantic import ValidationError
 
 from sonarpost import keys
 from sonarpost.archive.image_files import PREVIEW_NOTE, image_file_name
+from sonarpost.bearers.rockblock import RockBlockAccount
+from sonarpost.bearers.short_message import ShortMessage, pack_decision, split
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.errors import ConfigError
+from sonarpost.delivery.store import Store
+from sonarpost.errors import ConfigError, DatabaseUnavailableError, DeliveryError
 from sonarpost.messages import CodedImage, Pixels
 from sonarpost.services.c2.config import C2Config, ShortMessageOptions
 from sonarpost.services.c2.service import C2Service
@@ -188,6 +196,88 @@ def test_c2_refuses_unknown_terminals_and_invalid_messages(begin_c2, gateway):
     eventually(lambda: c2.health().counters.get("short_messages_refused", 0) >= 1)
     assert c2.health().counters.get("short_messages_received", 0) == 0
     assert c2.store.inbox_depth() == 0
+
+
+def deliver(gateway, imei, data):
+    """Deliver a message to the webhook; return the status."""
+    body = urlencode({"imei": imei, "momsn": "1", "data": data.hex()}).encode()
+    try:
+        with urlopen(gateway.webhook_url, body, timeout=60) as reply:
+            return reply.status
+    except HTTPError as error:
+        error.close()
+        return error.code
+
+
+def message(seq, *records):
+    items = tuple(item for n, record in enumerate(records) for item in split(pack_decision(record), n))
+    return ShortMessage(5, seq, seq, items).pack()
+
+
+def test_state_and_errors_of_one_vessel_do_not_delay_the_others(runner, begin_c2, gateway, monkeypatch):
+    vessels = {IMEI: "vessel-1", "300234010753371": "vessel-2", "300234010753372": "vessel-3"}
+    c2 = begin_c2(vessels)
+    with c2.store.transaction() as tx:
+        tx.put_state("short/vessel-2/windows", msgpack.packb([(5, 0, 2**32, {}, 16, 0.0)]))
+        tx.put_state("short/vessel-2/1/1/2/7", b"index above count")
+    runner.stop(c2)
+    c2 = begin_c2(vessels)
+    monkeypatch.setattr(gateway, "_loss", 0.0)
+    send = RockBlockAccount.send
+
+    def send_or_fail(account, imei, data):
+        if imei == "300234010753372":
+            raise RuntimeError("a defect")
+        if imei != IMEI:
+            raise DeliveryError("no such terminal")
+        send(account, imei, data)
+
+    monkeypatch.setattr(RockBlockAccount, "send", send_or_fail)
+    last_number = with_crc(struct.pack(">BIIB", 0xB1, 5, 2**32 - 1, 0))
+    assert deliver(gateway, "300234010753371", last_number) == 400
+    for imei in reversed(vessels):
+        assert deliver(gateway, imei, message(0, decision("d1"))) == 200
+    eventually(lambda: gateway.mailbox(IMEI)[0] is not None)
+    eventually(lambda: {"vessel-2", "vessel-3"} <= set(c2._short_messages.faults))
+    health = c2.health()
+    assert health.state == "degraded"
+    assert health.counters["states_discarded"] == 2
+    assert not c2.stopping.is_set()
+    eventually(lambda: len(c2._archive.index().decisions()) == 3)
+
+
+def test_records_are_committed_to_a_shared_archive_before_the_message_is_accepted(begin_c2, gateway, monkeypatch):
+    c2 = begin_c2()
+    accepted = []
+
+    def accept(records):
+        accepted.extend(records)
+        if len(accepted) == 1:
+            raise DatabaseUnavailableError("database: away")
+
+    monkeypatch.setattr(c2._archive, "accept", accept)
+    assert deliver(gateway, IMEI, message(0, decision("d1"))) == 503
+    assert (c2.store.inbox_depth(), c2.store.state_names("short/")) == (0, ())
+    assert deliver(gateway, IMEI, message(0, decision("d1"))) == 200
+    assert [key for key, _ in accepted] == [keys.shore_inbox("vessel-1")] * 2
+    eventually(lambda: len(c2._archive.index().decisions()) == 1)
+
+
+def test_unreadable_state_of_the_relay_costs_itself_only(runner, source, begin_c2, begin_relay, gateway, tmp_path):
+    relay = begin_relay(terminal="socket://127.0.0.1:1")
+    source.send(CODED, "relay", *(received(n) for n in range(1, 4)))
+    source.send(DECISIONS, "relay", decision("d1"))
+    eventually(lambda: relay.health().counters.get("coded_images_relayed") == 3)
+    eventually(lambda: relay.health().counters.get("decisions_relayed") == 1)
+    eventually(lambda: relay.gauges()["satellite_unacknowledged_shore"] >= 1)
+    runner.stop(relay)
+    with closing(Store(relay.store.path)) as store, store.transaction() as tx:
+        for name in ("head", "number", "budget", "item/x", "message/x"):
+            tx.put_state(f"short/shore/{name}", msgpack.packb(["junk", -1, None]) + bytes(8))
+    c2, relay = begin_c2(), begin_relay()
+    assert relay.health().counters["states_discarded"] == 5
+    eventually(lambda: len(side_cars(tmp_path)) == 3 and not waits(relay))
+    eventually(lambda: len(c2._archive.index().decisions()) == 1)
 
 
 @pytest.mark.parametrize(

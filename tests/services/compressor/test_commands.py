@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import msgpack
 import numpy as np
 import pytest
 from builders.common import eventually
@@ -12,12 +13,16 @@ from sonarpost import wire
 from sonarpost.messages import EncodedImage
 
 
-def test_the_same_image_is_sent_again_while_it_is_in_the_cache(start_service, encoded, send_command, answer, snippet):
+def test_the_same_image_is_sent_again_while_it_is_in_the_cache(
+    start_service, encoded, send_command, answer, snippet, caplog
+):
     service = start_service(cache_images=2)
     first, _, third = encoded(*(snippet(f"c{n}") for n in range(3)))
     send_command("resend", first.image_id)
     send_command("region", "0ZZZ", box=(0, 0, 32, 32), stream_bytes=96)
     eventually(lambda: service.health().counters.get("commands_unknown_image") == 2)
+    missing = [vars(record)["fields"] for record in caplog.records if "not in cache" in record.message]
+    assert [(each["image_id"], each["kind"]) for each in missing] == [(first.image_id, "resend"), ("0ZZZ", "region")]
     assert answer("resend", third.image_id) == third
 
 
@@ -93,3 +98,17 @@ def test_region_is_an_image_of_its_own_with_all_bytes(start_service, encoded, an
     assert shown.shape == inside.shape
     assert np.abs(shown.astype(int) - inside.astype(int)).mean() < 40
     assert service.health().counters["images_region"] == 1
+
+
+@pytest.mark.parametrize("damaged", [b"", b"\xc1", msgpack.packb([b"image", b"snippet"])])
+def test_state_that_cannot_be_read_does_not_stop_the_service(damaged, start_service, encoded, answer, snippet):
+    service = start_service()
+    [first, second] = encoded(snippet("c1"), snippet("c2"))
+    with service.store.transaction() as tx:
+        tx.put_state(f"kept/{first.image_id}", damaged)
+        tx.put_state("kept", damaged)
+        tx.put_state("next_image", damaged)
+    assert answer("resend", second.image_id) == second
+    encoded(snippet("c3"))
+    assert service.health().counters["states_discarded"] >= 2
+    assert not service.failed

@@ -32,6 +32,7 @@ from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.messages import ReconstructedImage
+from sonarpost.runtime import retention
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.service import DecompressorService
 from sonarpost.sonar.image_files import read_image
@@ -352,7 +353,8 @@ def test_record_and_side_car_state_authentication_and_despeckling(
         assert (name in side_car) == (value is not None)
 
 
-def test_old_image_files_are_removed_by_default(begin, decoded, runner, stream, out):
+def test_old_image_files_are_removed_by_default(begin, decoded, runner, stream, out, monkeypatch):
+    monkeypatch.setattr(retention, "FOLLOW_AFTER_S", 0.0)
     service = begin()
     decoded(*(record for name in ("AAAA", "BBBB") for record in updates(*frames_of(name, stream()))))
     runner.stop(service)

@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost import keys, wire
+from sonarpost.delivery.store import Store
 from sonarpost.link import migration
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
@@ -128,6 +129,48 @@ def test_invalid_sentences_are_counted_and_later_frames_processed(modem_pair, be
     line.say(sentences(1, b"good"))
     eventually(lambda: [f.data for f in observed()] == [b"good"])
     assert service.health().state == "ok"
+
+
+def test_unexpected_exception_about_a_frame_loses_that_frame_only(begin, decompressor, refused, monkeypatch):
+    service = begin()
+    accept = V1Receiver.accept
+    bad = preview_frame(2)
+
+    def fail_on_one(self, source, frame, now, **options):
+        return 1 // 0 if frame == bad else accept(self, source, frame, now, **options)
+
+    monkeypatch.setattr(V1Receiver, "accept", fail_on_one)
+    first, third = preview_frame(1), preview_frame(3)
+    service.on_modem_event(packet(received(first, 1), received(bad, 2), received(third, 3), nframes=3))
+    eventually(lambda: numbers(decompressor) == [(1, 1), (3, 1)])
+    assert [(key, "ZeroDivisionError" in reason) for key, reason in refused(service)] == [(RX, True)]
+    assert service.health().counters["frames_refused"] == 1
+    assert not service.failed
+
+
+@pytest.mark.parametrize("damaged", [b"", b"\xc1", b"x", msgpack.packb({"heard_utc_s": 1, "frames": [[1, 2]]})])
+def test_state_that_cannot_be_read_does_not_stop_the_service(damaged, begin, runner, decompressor, refused):
+    service = begin()
+    runner.stop(service)
+    store = Store(service.store.path)
+    with store.transaction() as tx:
+        for name in ("packets", "arriving", "authenticated-since"):
+            tx.put_state(name, damaged)
+    store.close()
+    service = begin()
+    service.on_modem_event(packet(received(preview_frame(1), 1)))
+    eventually(lambda: numbers(decompressor) == [(1, 1)])
+    assert {"state packets", "state arriving", "state authenticated-since"} == {key for key, _ in refused(service)}
+    assert service.health().counters["states_discarded"] == 3
+
+
+def test_packets_in_memory_have_shares_by_address(begin, monkeypatch, unwritable):
+    monkeypatch.setattr(op_modem, "MAX_UNSAVED", 4)
+    service = begin()
+    with unwritable(service):
+        for number, source in enumerate([3, 3, 9, 9, 9, 9, 9, 9], start=1):
+            service.on_modem_event(packet(preview_frame(number), src=source))
+        assert [each.src for each, _ in service._unsaved] == [3, 3, 9, 9]
 
 
 def test_invalid_frames_are_quarantined_and_block_nothing(begin, decompressor, observed, refused, caplog):

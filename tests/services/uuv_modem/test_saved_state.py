@@ -16,8 +16,11 @@ from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink.messages import ResendMessage, pack
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.messages import AcousticFrame, Command, QueueState
-from sonarpost.modem.interface import FrameReceived
+from sonarpost.modem.interface import FrameReceived, PacketFailed
 from sonarpost.services.uuv_modem import service as uuv_modem
+from sonarpost.services.uuv_modem.config import UuvModemConfig
+from sonarpost.services.uuv_modem.received_commands import ReceivedCommands
+from sonarpost.services.uuv_modem.vehicle_endpoint import VehicleEndpoint
 
 IMAGES, MESSAGES = keys.image_encoded("uuv-1"), keys.message_outgoing("uuv-1")
 QUEUE, RX = keys.acoustic_queue("uuv-1"), keys.acoustic_rx("vessel-1")
@@ -111,6 +114,17 @@ def test_commands_received_while_the_store_fails_are_executed_once_and_too_many_
     assert service.health().counters["commands_received"] == 2
 
 
+def test_events_that_wait_for_the_link_are_limited_but_the_end_of_a_packet_is_kept(platform, monkeypatch):
+    monkeypatch.setattr(uuv_modem, "MAX_EVENTS", 3)
+    stopped = uuv_modem.UuvModemService(platform("uuv-1"), UuvModemConfig(port="udp://239.255.0.1:5000", rate=1))
+    for _ in range(5):
+        stopped.on_modem_event(FrameReceived(1, 3, False, 1, b"frame", 0.0, 0, None))
+    stopped.on_modem_event(PacketFailed(1, 1, 1, (), "no answer", maybe_sent=False))
+    waiting = [stopped._events.get_nowait() for _ in range(stopped._events.qsize())]
+    assert [type(event) for event in waiting] == 3 * [FrameReceived] + [PacketFailed]
+    stopped.store.close()
+
+
 def test_records_that_version_0_1_held_before_its_queue_are_queued(start_service, runner, queue_states, queued):
     service = start_service()
     runner.stop(service)
@@ -146,3 +160,40 @@ def test_records_are_not_accepted_below_the_disk_reserve(start_service, runner, 
     monkeypatch.setattr("sonarpost.runtime.service.HANDLING_RESERVE_BYTES", 1 << 62)
     with pytest.raises(RetryLaterError, match="below the reserve"):
         start_service().check_capacity(IMAGES)
+
+
+def test_unexpected_exception_about_a_frame_loses_that_frame_only(start_service, monkeypatch):
+    receive, frames = VehicleEndpoint.receive, []
+
+    def fail_on_one(self, source, frame, now):
+        if frame == b"bad":
+            raise ZeroDivisionError
+        frames.append(frame)
+        receive(self, source, frame, now)
+
+    monkeypatch.setattr(VehicleEndpoint, "receive", fail_on_one)
+    service = start_service()
+    for data in (b"first", b"bad", b"last"):
+        service.on_modem_event(FrameReceived(1, service.config.address, False, 1, data, 0.0, 1, None))
+    eventually(lambda: frames[-1:] == [b"last"])
+    eventually(lambda: service.health().counters.get("frames_failed") == 1)
+    assert not service.failed
+
+
+def test_count_that_cannot_be_read_does_not_stop_the_service(start_service, runner, refused):
+    service = start_service()
+    runner.stop(service)
+    fill(service, images_accepted=b"many")
+    again = start_service()
+    assert again.health().counters["states_discarded"] == 1
+    assert [key for key, _ in refused(again)] == ["state images_accepted"]
+
+
+def test_repeated_commands_are_recognised_by_shares_of_the_modems():
+    commands = ReceivedCommands("uuv-1", UuvModemConfig(port="unused"))
+    own = ResendMessage(0, 1_700_000_000, 1)
+    assert commands.accept(1, own, "0001")[1] is not None
+    for token in range(600):
+        commands.accept(9, ResendMessage(token, 1_700_000_000, 1), "0001")
+    assert commands.accept(1, own, "0001")[1] is None
+    assert len(commands.export()["known"]) == 512

@@ -1,0 +1,37 @@
+"""Every service reports its health before it has reached a router."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+
+import pytest
+from builders.common import REPOSITORY
+
+from sonarpost.config import SERVICES, ServiceConfig, load
+from sonarpost.runtime.service import Service
+
+FILES = ("uuv", "vessel", "shore", "sim")
+
+
+def class_of(service, module_name, base):
+    module = importlib.import_module(f"sonarpost.services.{service}.{module_name}")
+    classes = [c for _, c in inspect.getmembers(module, inspect.isclass) if c.__module__ == module.__name__]
+    [found] = [c for c in classes if issubclass(c, base) and c.__name__.endswith(("Config", "Service"))]
+    return found
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_health_has_the_reason_for_which_the_router_is_not_reached(name, tmp_path, capsys):
+    text = next(t for f in FILES if f"[{name}]" in (t := (REPOSITORY / "config" / f"{f}.toml").read_text()))
+    text = text.replace("/var/lib/sonarpost", str(tmp_path)).replace('"key"', '"none"').replace("acoustic_key", "# ")
+    path = tmp_path / "platform.toml"
+    path.write_text(text)
+    service = class_of(name, "service", Service)(*load(path, name, class_of(name, "config", ServiceConfig), {}))
+    try:
+        service._report_waiting("no connection")
+        health = service.health("degraded")
+    finally:
+        service.stop()
+    assert health.state == "degraded"
+    assert "router not reached: no connection" in health.detail
