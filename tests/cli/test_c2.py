@@ -19,10 +19,11 @@ from builders.store_steps import queued_items
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import router_config
-from sonarpost.cli.c2.stored import WRITERS, RecordFilter, join_decisions, select_images, since_of
+from sonarpost.cli.c2.stored import RecordFilter, join_decisions, select_images, time_of
 from sonarpost.cli.main import main
 from sonarpost.cli.shared import printable
 from sonarpost.errors import ConfigError
+from sonarpost.export.formats import FORMATS
 from sonarpost.messages import Advice, Contact, Pixels, TaskingState
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
@@ -86,6 +87,7 @@ def test_ls_filters(capsys, out):
         ("--all-versions --vessel vessel-1", ["AAAA", "AAAA", "BBBB"]),
         ("--since 2099-01-01", []),
         ("--since 2023-11-14T22:13:20", ["AAAA", "BBBB", "CCCC"]),
+        ("--until 2023-11-14T22:13:20", []),
         ("--since 1h", []),
     ):
         assert sorted(r["image_id"] for r in ls(capsys, out, *options.split())) == expected, options
@@ -162,7 +164,7 @@ def test_get_copies_nothing_if_a_file_is_unreadable(capsys, out, tmp_path):
 
 
 def test_export_writes_all_formats_and_marks_images_as_exported(capsys, out, tmp_path):
-    files = {name: tmp_path / "new" / f"contacts.{name}" for name in WRITERS}
+    files = {name: tmp_path / "new" / f"contacts.{name}" for name in FORMATS}
     options = [part for path in files.values() for part in ("--out", str(path))]
     assert main(["c2", "export", "--archive", str(out), "--vessel", "vessel-1", *options]) == 0
     assert len(json.loads(files["geojson"].read_text())["features"]) == 2
@@ -190,7 +192,7 @@ def test_former_spellings_of_archive_and_out_are_accepted(capsys, out, tmp_path)
 
 def test_export_to_a_file_of_unknown_format_is_an_error(capsys, out, tmp_path):
     assert main(["c2", "export", "--archive", str(out), "--out", str(tmp_path / "contacts.shp")]) == 2
-    expected = "expected a name that ends in .geojson, .kml, .kmz, .csv, .gpkg, .tak.zip, .caris.txt, .app11-like.txt"
+    expected = "expected a name that ends in .geojson, .kml, .kmz, .csv, .gpkg, .cot.xml, .tak.zip, .caris.txt,"
     assert expected in capsys.readouterr().err
 
 
@@ -328,12 +330,12 @@ def test_watch_prints_lines_across_router_restarts_until_ctrl_c():
             hub.close()
 
 
-def test_since_forms():
-    for text, ago_s in (("90m", 5400), ("2h", 7200), ("1.5d", 129600), (None, 1e6)):
-        assert since_of(text, 1e6) == 1e6 - ago_s
+def test_time_forms():
+    for text, ago_s in (("90m", 5400), ("2h", 7200), ("1.5d", 129600)):
+        assert time_of("--since", text, 1e6) == 1e6 - ago_s
     for text in ("", "yesterday", "2h30m", "-1h", "12"):
-        with pytest.raises(ConfigError, match="--since"):
-            since_of(text)
+        with pytest.raises(ConfigError, match="--until"):
+            time_of("--until", text)
 
 
 def test_control_characters_are_not_printed():

@@ -18,6 +18,7 @@ import warnings
 from configparser import ConfigParser
 from contextlib import closing
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from types import SimpleNamespace
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -31,24 +32,28 @@ from paho.mqtt.enums import CallbackAPIVersion
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.c2 import alert as alert_module
+from sonarpost.cli.c2 import live as live_module
+from sonarpost.cli.c2 import tak as tak_module
+from sonarpost.cli.c2 import watch as watch_module
 from sonarpost.cli.c2.alert import AlertService, SentAlerts
-from sonarpost.cli.c2.alert_senders import AlertRefusedError, Mqtt, Webhook
+from sonarpost.cli.c2.alert_senders import AlertNotAcceptedError, AlertRefusedError, Mqtt, Webhook
 from sonarpost.cli.c2.live import ContactChange, ContactStream
 from sonarpost.cli.c2.tak import MAX_IMAGES, REFRESH_S, RETRY_S, CotService
 from sonarpost.cli.main import main
 from sonarpost.errors import PortError, StoredFileError
 from sonarpost.export.alerts import alert_document, needs_alert, score, signature
 from sonarpost.export.contacts import load_contacts
-from sonarpost.export.cot_sender import TlsFiles
 from sonarpost.export.live import LiveContacts
-from sonarpost.export.tak import UploadedPackage, attachment_sha256
+from sonarpost.export.tak.cot_sender import TlsFiles
+from sonarpost.export.tak.data_package import UploadedPackage, attachment_sha256
+from sonarpost.export.tak.tak_files import PackageRefusedError
 from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
 
 SECRET = b"0123456789abcdef"
 
 
-def contact_of(image_id="00A7", **fields):
-    found = LiveContacts().add(image(image_id, fields))
+def contact_of(image_id="00A7", vessel_id="vessel-1", **fields):
+    found = LiveContacts().add(image(image_id, fields, vessel_id=vessel_id))
     assert found is not None
     return found
 
@@ -62,6 +67,34 @@ class Clock:
 
 
 # Contacts of a site
+
+
+class PublishedRecords:
+    """A session whose only subscriber receives the given records."""
+
+    def __init__(self):
+        self.info = SimpleNamespace(routers_zid=lambda: ["router"])
+        self.publish = None
+
+    def declare_subscriber(self, key, on_sample):
+        self.publish = on_sample
+
+
+def test_vessels_have_places_and_turns_of_their_own(monkeypatch):
+    monkeypatch.setattr(watch_module, "MAX_WAITING", 10)
+    session = PublishedRecords()
+    watch = watch_module.Watch(session, keys.SHORE, None)
+    for vessel, count in (("vessel-2", 50), ("vessel-1", 3)):
+        for number in range(count):
+            record = decision(f"{number:04d}", vessel_id=vessel)
+            payload = SimpleNamespace(to_bytes=lambda record=record: wire.encode(record))
+            session.publish(
+                SimpleNamespace(kind=zenoh.SampleKind.PUT, key_expr=keys.shore_decision(vessel), payload=payload)
+            )
+    assert watch.gaps == 40
+    order = [watch.poll().vessel_id for _ in range(13)]
+    assert order[:6].count("vessel-1") == 3
+    assert watch.poll() is None
 
 
 def test_stream_reads_the_folder_first_and_after_an_interruption(tmp_path):
@@ -106,12 +139,15 @@ class Events:
     def __init__(self):
         self.batches = []
         self.is_down = False
+        self.delivered = 0
 
     def send(self, events, give_up_after_s):
         assert give_up_after_s == 0
         if self.is_down:
             raise PortError("tak: down")
         self.batches.append([ET.fromstring(event) for event in events])
+        self.delivered += len(events)
+        return "delivered"
 
 
 class Files:
@@ -150,7 +186,7 @@ def test_image_is_registered_before_its_event_is_sent():
     sender, clock = Events(), Clock()
     files = Files(order)
     send = sender.send
-    sender.send = lambda events, give_up_after_s: (order.append("events"), send(events, give_up_after_s))
+    sender.send = lambda events, give_up_after_s: order.append("events") or send(events, give_up_after_s)
     service = CotService(sender, files, clock=clock)
     service.add(ContactChange(contact_of(), b"png"))
     assert service.send_due() == 1
@@ -177,7 +213,7 @@ def test_failures_are_tried_again():
     assert service.send_due() == 0
     sender.is_down = False
     assert service.send_due() == 0  # waits before the next attempt
-    clock.now_s += RETRY_S
+    clock.now_s += RETRY_S[0]
     assert service.send_due() == 1
     assert len(sender.batches[0]) == 1  # without its image
     files.is_down = False
@@ -194,6 +230,73 @@ def test_memory_is_limited():
         service.add(ContactChange(contact_of(f"{n:04}"), b"png"))
     assert service.send_due() == MAX_IMAGES + 10
     assert len(files.names) == MAX_IMAGES
+
+
+def test_contacts_and_images_have_places_by_vessel():
+    sender, files = Events(), Files([])
+    service = CotService(sender, files, clock=Clock(), max_contacts=MAX_IMAGES)
+    service.add(ContactChange(contact_of("0000"), b"png"))
+    for n in range(MAX_IMAGES + 30):
+        service.add(ContactChange(contact_of(f"{n:04}", "vessel-2"), b"png"))
+    service.send_due()
+    # The vessel with one contact is first, and has kept its place and its image.
+    assert sender.batches[0][0].attrib["uid"].endswith("0000")
+    assert len(files.names) == MAX_IMAGES
+    live = LiveContacts(max_names=3)
+    for image_id, vessel in (("0000", "vessel-1"), *((f"{n:04}", "vessel-2") for n in range(9))):
+        live.add(image(image_id, vessel_id=vessel))
+    names = [(contact.image.vessel_id, contact.image.image_id) for contact in live.located(9)]
+    assert names == [("vessel-1", "0000"), ("vessel-2", "0007"), ("vessel-2", "0008")]
+
+
+def test_refused_package_delays_no_other():
+    sender, files = Events(), Files([])
+    upload = files.upload
+
+    def refuse(name, package, creator):
+        if "0001" in name:
+            raise PackageRefusedError("status 500")
+        return upload(name, package, creator)
+
+    files.upload = refuse
+    service = CotService(sender, files, clock=Clock())
+    for n in range(1, 4):
+        service.add(ContactChange(contact_of(f"{n:04}"), b"png"))
+    assert service.send_due() == 3
+    assert [("0002" in name, "0003" in name) for name in files.names] == [(True, False), (False, True)]
+
+
+def test_contact_that_fails_ends_no_stream_and_no_batch(monkeypatch, tmp_path):
+    def fails_for_0001(function, id_of):
+        return lambda given, *words: 1 / 0 if id_of(given) == "0001" else function(given, *words)
+
+    def image_id(contact):
+        return contact.image.image_id
+
+    sender, alerts, clock = Events(), Alerts(), Clock()
+    cot = CotService(sender, None, clock=Clock())
+    with closing(SentAlerts(tmp_path / "sent.db")) as sent:
+        service = AlertService(alerts, sent, 0.0, clock=clock)
+        monkeypatch.setattr(tak_module, "cot_event", fails_for_0001(tak_module.cot_event, image_id))
+        monkeypatch.setattr(alert_module, "alert_document", fails_for_0001(alert_document, image_id))
+        for n in (1, 2):
+            cot.add(ContactChange(contact_of(f"{n:04}"), None))
+            service.add(contact_of(f"{n:04}", f"vessel-{n}"))
+        assert cot.send_due() == 2
+        assert [[event.attrib["uid"][-4:] for event in batch] for batch in sender.batches] == [["0002"]]
+        assert not service.send_due()
+        clock.now_s += 1
+        assert service.send_due()
+        assert [alert_id[-4:] for alert_id in alerts.ids] == ["0002"]
+    session = PublishedRecords()
+    stream = ContactStream(session, keys.SHORE, None, None)
+    monkeypatch.setattr(live_module, "_png_of", fails_for_0001(live_module._png_of, lambda record: record.image_id))
+    for n in (1, 2):
+        payload = SimpleNamespace(to_bytes=lambda n=n: wire.encode(image(f"{n:04}")))
+        key = keys.shore_image("vessel-1")
+        session.publish(SimpleNamespace(kind=zenoh.SampleKind.PUT, key_expr=key, payload=payload))
+    assert stream.poll() == []
+    assert [change.contact.image.image_id for change in stream.poll()] == ["0002"]
 
 
 def start(*arguments):
@@ -347,6 +450,61 @@ def test_waiting_alerts_and_state_are_limited(tmp_path, monkeypatch, caplog):
     sent.close()
 
 
+def test_alerts_that_are_not_accepted_delay_no_other_vessel(tmp_path):
+    refused = {contact_of(f"{n:04}", "vessel-2").uid for n in range(50)}
+
+    class Filter(Alerts):
+        def send(self, alert_id, vessel_id, body):
+            if alert_id in refused:
+                raise AlertNotAcceptedError("status 403")
+            self.times_s.append(clock.now_s)
+            super().send(alert_id, vessel_id, body)
+
+    clock, sender = Clock(), Filter()
+    sender.times_s = []
+    with closing(SentAlerts(tmp_path / "state.db")) as sent:
+        service = AlertService(sender, sent, 0.5, clock=clock)
+        for n in range(50):
+            service.add(contact_of(f"{n:04}", "vessel-2"))
+
+        def run(duration_s):
+            end_s = clock.now_s + duration_s
+            while clock.now_s < end_s:
+                while service.send_due():
+                    pass
+                clock.now_s += 1
+
+        run(600)
+        for n in range(5):
+            service.add(contact_of(f"{n:04}"))
+        service.add(contact_of("0200", "vessel-2"))
+        added_s = clock.now_s
+        run(60)
+        assert sender.times_s[0] <= added_s + alert_module.MAX_NOT_ACCEPTED_RETRY_S
+        assert sender.times_s[4] <= added_s + 4 * alert_module.MAX_NOT_ACCEPTED_RETRY_S
+        # An alert that was not tried before precedes the failed ones of its vessel.
+        assert contact_of("0200", "vessel-2").uid in sender.ids
+        assert len(sender.ids) == 6
+        refused.clear()
+        run(600)
+        assert len(sender.ids) == 56
+
+
+def test_waiting_alerts_have_places_by_vessel(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(alert_module, "MAX_WAITING", 3)
+    sender = Alerts()
+    with closing(SentAlerts(tmp_path / "state.db")) as sent:
+        service = AlertService(sender, sent, 0.5)
+        for vessel, count in (("vessel-2", 5), ("vessel-1", 3)):
+            for n in range(count):
+                service.add(contact_of(f"{n:04}", vessel))
+        assert caplog.text.count("too many wait") == 2
+        while service.send_due():
+            pass
+    expected = [contact_of(f"{n:04}", vessel).uid for n in range(3) for vessel in ("vessel-1", "vessel-2")]
+    assert sender.ids == expected
+
+
 def test_foreign_state_file_is_an_error(tmp_path):
     path = tmp_path / "state.db"
     path.write_bytes(b"not a database" * 100)
@@ -392,7 +550,13 @@ def test_webhook_is_signed(hook):
 
 
 @pytest.mark.parametrize(
-    ("status", "error"), [(422, AlertRefusedError), (500, PortError), (302, PortError), (401, PortError)]
+    ("status", "error"),
+    [
+        (422, AlertRefusedError),
+        (500, AlertNotAcceptedError),
+        (302, AlertNotAcceptedError),
+        (403, AlertNotAcceptedError),
+    ],
 )
 def test_status_of_the_receiver(status, error, hook):
     hook.statuses.append(status)

@@ -25,7 +25,7 @@ from sonarpost.bus.session import router_config
 from sonarpost.cli.main import main
 from sonarpost.cli.status import age_text, as_json, bytes_text, is_ok, plain_text, rows_of, vehicle_text
 from sonarpost.messages import ReceivedStatus, VehicleRange, VehicleStatus
-from sonarpost.monitoring.fleet import MAX_VEHICLES, FleetState, FleetTracker, VehicleState
+from sonarpost.monitoring.fleet import MAX_VEHICLES, FleetState, FleetTracker, FleetWatcher, VehicleState
 
 RECEIVED_STATUS = SAMPLES["received-status"]
 assert isinstance(RECEIVED_STATUS, ReceivedStatus)
@@ -126,7 +126,25 @@ def test_once_as_text_and_as_json(router, platforms, capsys):
 def test_once_ends_without_a_router(capsys):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     assert main(["status", "--once", "--wait", "0.1", "--router", endpoint]) == 1
-    assert capsys.readouterr().out.splitlines()[0] == f"{endpoint}: router not reached yet"
+    assert capsys.readouterr().out.startswith(f"{endpoint}: router not reached yet")
+
+
+def test_reason_of_an_unreached_router_is_shown_until_one_is_reached():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with FleetWatcher([endpoint], poll_s=0.05) as watcher:
+
+        def shown():
+            return plain_text(watcher.state(), (), endpoint).splitlines()[0]
+
+        refused = f"(no connection: {endpoint}: Connection refused)"
+        eventually(lambda: shown() == f"{endpoint}: router not reached yet {refused}")
+        assert json.loads(as_json(watcher.state(), (), ""))["failure"] == refused[1:-1]
+        for _ in range(2):
+            hub = zenoh.open(router_config([endpoint]))
+            eventually(lambda: watcher.state().connected)
+            assert watcher.state().failure == ""
+            hub.close()
+            eventually(lambda: "Connection refused" in shown())
 
 
 def test_router_from_the_configuration_file(tmp_path, router, platforms, capsys):

@@ -231,3 +231,29 @@ def test_old_records_have_an_age(relay, capsys):
     found = re.search(r"^c2 .* (\d+) s ", capsys.readouterr().out, re.MULTILINE)
     assert found
     assert 1000 <= int(found.group(1)) < 1100
+
+
+# Quarantine
+
+
+def test_quarantined_records_are_listed_and_queued_again(tmp_path, capsys):
+    path = tmp_path / "c2.db"
+    with closing(Store(path)) as store, store.transaction() as tx:
+        tx.quarantine("in", "k/first", b"x" * 300_000, "crashed\x1b[2J", is_accepted=True)
+        tx.quarantine("in", "k/second", b"second", "refused")
+        tx.quarantine("in", "k/cut", b"x" * 300_000, "never accepted")
+        tx.quarantine("out", "k/out", b"out", "refused by a consumer")
+        tx.quarantine("in", "state undecoded/vessel-1", b"state", "cannot be read")
+    assert main(["store", "quarantine", str(path)]) == 0
+    listed = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in listed] == ["number", "1", "2", "3", "4", "5"]
+    assert "\x1b" not in listed[1]
+    assert main(["store", "quarantine", str(path), "--requeue", "1", "4", "9"]) == 1
+    assert capsys.readouterr().out == "1 records queued again\nnot queued: 4, 9\n"
+    assert main(["store", "quarantine", str(path), "--requeue"]) == 0
+    with closing(Store(path)) as store:
+        assert [(item.key, len(item.payload)) for item in store.inbox_items(9)] == [
+            ("k/first", 300_000),
+            ("k/second", 6),
+        ]
+        assert [record.id for record in store.quarantined()] == [3, 4, 5]

@@ -22,7 +22,10 @@ from sonarpost.sonar.xtf_writer import write_xtf
 
 EVERY_OPTION = """
 projected_crs = "EPSG:32616"
+frequency_hz = 455e3
+heading_source = "gyro"
 position_source = "ship"
+recorded_layback = "ignore"
 port_order = "nearest_first"
 humminbird_sample_spacing_m = 0.02
 humminbird_depth_as_altitude = true
@@ -30,6 +33,8 @@ mounting = { forward_m = 0.4, starboard_m = -0.1, layback_m = 3, heading_offset_
 [errors]
 position_m = 1.5
 heading_deg = 1
+gyro_heading_deg = 2
+course_heading_deg = 6
 altitude_m = 0.1
 tracked_altitude_m = 0.7
 sound_speed = 0.02
@@ -38,8 +43,8 @@ time_s = 0.1
 layback_m = 2.0
 """
 WRONG = [
-    (["--crs", "EPSG:4326"], "--crs: projected_crs: got 'EPSG:4326', expected a projected coordinate system in metres"),
-    (["--crs", "nonsense"], "--crs: projected_crs: got 'nonsense', expected a projected coordinate system in metres"),
+    (["--crs", "EPSG:4326"], "--crs: projected_crs: got 'EPSG:4326', expected a projected coordinate system"),
+    (["--crs", "nonsense"], "--crs: projected_crs: got 'nonsense', expected a projected coordinate system"),
     (["--options", "absent.toml"], "absent.toml: got 'No such file or directory'"),
 ]
 

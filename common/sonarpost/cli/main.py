@@ -82,6 +82,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def apply_verbosity(parsed: argparse.Namespace) -> None:
     """Set the log level of this process and of the services that it starts, if -v or -q was given."""
+    if logging.lastResort is not None:  # prints the warnings of a command without -v
+        logging.lastResort.setFormatter(logging.Formatter("%(message)s%(fields)s", defaults={"fields": ""}))
     verbosity = getattr(parsed, "verbosity", None)
     if verbosity == "verbose":
         # Imported lazily: it loads the records.

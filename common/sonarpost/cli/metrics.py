@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import argparse
 import logging
+import threading
 
-from prometheus_client import start_http_server
+from prometheus_client import MetricsHandler
 
 from sonarpost import logs
 from sonarpost.cli.shared import Subparsers, add_router_options, log_level, router_of
 from sonarpost.errors import PortError
 from sonarpost.monitoring.fleet import FleetTracker, FleetWatcher
 from sonarpost.monitoring.metrics import FleetCollector, registry_of
-from sonarpost.stop_signals import stop_on_signals, wait_until_set
+from sonarpost.network.connections import ConnectionLimits, LimitedHandler, LimitedServer
+from sonarpost.stop_signals import stop_on_signals
 
 log = logging.getLogger(__name__)
 
@@ -55,14 +57,17 @@ def run(parsed: argparse.Namespace) -> int:
         watcher = FleetWatcher(endpoints, tls, FleetTracker(parsed.forget_after))
         registry = registry_of(FleetCollector(watcher.state, parsed.stale_after))
         try:
-            server, thread = start_http_server(parsed.port, parsed.address, registry)
+            handler = type("Handler", (LimitedHandler, MetricsHandler.factory(registry)), {})
+            server = LimitedServer((parsed.address, parsed.port), handler, ConnectionLimits())
         except (OSError, OverflowError) as error:
             raise PortError(f"{parsed.address}:{parsed.port}: {error}") from error
+        thread = threading.Thread(target=server.serve_forever, args=(0.2,), name="metrics", daemon=True)
+        thread.start()
         try:
             with watcher:
                 fields = logs.kv(address=parsed.address, port=server.server_port, router=", ".join(endpoints))
                 log.info("Metrics server started", extra=fields)
-                wait_until_set(stop)
+                stop.wait()
         finally:
             server.shutdown()
             server.server_close()

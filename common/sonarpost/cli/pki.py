@@ -8,13 +8,13 @@ from __future__ import annotations
 import argparse
 import getpass
 import json
-import stat
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
 from sonarpost.cli.shared import Subparsers, add_command, aligned, in_new_folder
+from sonarpost.config import read_passphrase
 from sonarpost.files import PUBLIC_FILE, write_atomically, write_new
 from sonarpost.keys import SHORE
 from sonarpost.security.acoustic_key import KEY_NAME, create_key
@@ -176,7 +176,7 @@ def run_init(args: argparse.Namespace) -> int:
     """Create the authority; return 0."""
     secret = None
     if args.passphrase_file is not None:
-        secret = _passphrase_from(args.passphrase_file)
+        secret = read_passphrase(args.passphrase_file)
     elif args.ask_passphrase:
         secret = _ask("Passphrase for the authority's key: ")
         if secret != _ask("Repeat: "):
@@ -318,7 +318,7 @@ def _show(bundle: Bundle) -> None:
 def _fleet(args: argparse.Namespace) -> Fleet:
     def passphrase() -> bytes:
         file = getattr(args, "passphrase_file", None)
-        return _ask("Passphrase of the authority's key: ") if file is None else _passphrase_from(file)
+        return _ask("Passphrase of the authority's key: ") if file is None else read_passphrase(file)
 
     return Fleet(args.folder, passphrase)
 
@@ -327,21 +327,3 @@ def _ask(prompt: str) -> bytes:
     if not sys.stdin.isatty():
         raise PkiError("pki", "passphrase", "no terminal to ask", "--passphrase-file FILE")
     return getpass.getpass(prompt).encode()
-
-
-def _passphrase_from(file: Path) -> bytes:
-    """Return the first line of a file that only its owner can read.
-
-    Raises:
-        PkiError: It cannot be read, others can read it, or it is empty.
-    """
-    try:
-        mode = stat.S_IMODE(file.stat().st_mode)
-        lines = file.read_bytes().splitlines()
-    except OSError as error:
-        raise PkiError(str(file), "passphrase", str(error), "a readable file") from error
-    if mode & 0o077:
-        raise PkiError(str(file), "mode", f"{mode:04o}", "0600: readable by its owner only")
-    if not lines or not lines[0]:
-        raise PkiError(str(file), "passphrase", "an empty first line", "the passphrase")
-    return lines[0]

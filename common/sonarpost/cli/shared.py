@@ -104,12 +104,15 @@ def add_site_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_survey_options(parser: argparse.ArgumentParser) -> None:
-    """Add --options and --crs: what survey files do not contain."""
+    """Add --options, --crs and --frequency: what survey files do not contain, and the choice of their channels."""
     parser.add_argument(
         "--options", type=Path, metavar="FILE.toml", help="survey options: projection, mounting of the sonar, errors"
     )
     parser.add_argument(
-        "--crs", metavar="EPSG:N", help="coordinate system of positions in metres; replaces the one in --options"
+        "--crs", metavar="EPSG:N", help="coordinate system of projected positions; replaces the one in --options"
+    )
+    parser.add_argument(
+        "--frequency", metavar="KHZ", help="frequency of a sonar with several, the nearest one (default: the highest)"
     )
 
 
@@ -117,20 +120,28 @@ def survey_options_of(parsed: argparse.Namespace) -> SurveyOptions:
     """Return the survey options of the command line.
 
     Raises:
-        ConfigError: The options file is invalid, or --crs is not a projected coordinate system in metres.
+        ConfigError: The options file is invalid, --crs is not a projected coordinate system, or --frequency is not one.
     """
-    from sonarpost.sonar.options import SurveyOptions, load_options  # noqa: PLC0415  as in `router_of`
+    from sonarpost.sonar.options import SurveyOptions, checked_options, load_options  # noqa: PLC0415  as in `router_of`
 
     options = load_options(parsed.options) if parsed.options is not None else SurveyOptions()
-    crs = projected_crs_of(parsed)
-    return options if crs is None else options.model_copy(update={"projected_crs": crs})
+    if (crs := projected_crs_of(parsed)) is not None:
+        options = options.model_copy(update={"projected_crs": crs})
+    if parsed.frequency is not None:
+        try:
+            frequency_hz = float(parsed.frequency) * 1000
+        except ValueError:
+            raise ConfigError("command line", "--frequency", parsed.frequency, "a number of kHz") from None
+        checked = checked_options({"frequency_hz": frequency_hz}, "--frequency")
+        options = options.model_copy(update={"frequency_hz": checked.frequency_hz})
+    return options
 
 
 def projected_crs_of(parsed: argparse.Namespace) -> str | None:
     """Return --crs, or None if it is not given.
 
     Raises:
-        ConfigError: Not a projected coordinate system in metres.
+        ConfigError: Not a projected coordinate system.
     """
     from sonarpost.sonar.options import checked_options  # noqa: PLC0415  as in `router_of`
 

@@ -50,7 +50,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument("--truth", type=Path, metavar="FILE.json", help="write the ground truth as JSON")
     parser.add_argument(
-        "--crs", metavar="EPSG:N", help="write positions in metres of this coordinate system, in place of degrees"
+        "--crs", metavar="EPSG:N", help="write positions of this projected coordinate system, in place of degrees"
     )
     parser.add_argument("--force", action="store_true", help="replace existing files")
     parser.set_defaults(run=run_simulate)

@@ -290,6 +290,7 @@ def as_json(state: FleetState, rows: Sequence[Row], time_utc: str) -> str:
     whole = {
         "time_utc": time_utc,
         "connected": state.connected,
+        "failure": state.failure,
         "rejected": state.rejected,
         "services": services,
         "vehicles": vehicles,
@@ -300,7 +301,8 @@ def as_json(state: FleetState, rows: Sequence[Row], time_utc: str) -> str:
 
 def _headline(state: FleetState, router: str) -> str:
     if not state.connected:
-        return f"{router}: router not reached" + (", the data below is old" if state.services else " yet")
+        reason = f" ({printable(state.failure)})" if state.failure else ""
+        return f"{router}: router not reached{', the data below is old' if state.services else ' yet'}{reason}"
     alive = sum(status.alive is True for status in state.services)
     platforms = len({status.platform for status in state.services})
     rejected = f", {state.rejected} records rejected" if state.rejected else ""

@@ -1,4 +1,4 @@
-"""`sonarpost store check` and `salvage`: check the store of a stopped service, and recover a damaged one."""
+"""`sonarpost store check`, `salvage` and `quarantine`: the store of a stopped service."""
 
 from __future__ import annotations
 
@@ -23,6 +23,10 @@ _SALVAGE = """Copy every readable row of a damaged store into a new file, and pr
 with a wrong digest are quarantined in the new store. Exit status: 0 if every row was copied, 1 if rows are missing, 2
 if nothing was written, for example because the service is running."""
 
+_QUARANTINE = """List the quarantined records of a stopped service, oldest first: number, time, direction, key, bytes,
+reason. --requeue moves received records to the inbox; the service handles them after its next start. Exit status: 0, or
+1 if one of the named records cannot be queued, because it is cut, was refused by a consumer, or is no record."""
+
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add the command and its actions."""
@@ -37,6 +41,12 @@ def add_parser(subparsers: Subparsers) -> None:
     copy.add_argument("store", type=Path, metavar="STORE", help="the damaged store")
     copy.add_argument("--out", type=Path, required=True, metavar="NEW", help="new store; the file must not exist")
     copy.set_defaults(run=run_salvage)
+    kept = actions.add_parser("quarantine", help="list quarantined records, queue them again", description=_QUARANTINE)
+    kept.add_argument("store", type=Path, metavar="STORE", help="store of a service, for example c2.db")
+    kept.add_argument(
+        "--requeue", type=int, nargs="*", metavar="ID", help="queue these received records again; all without an ID"
+    )
+    kept.set_defaults(run=run_quarantine)
 
 
 def run_check(parsed: argparse.Namespace) -> int:
@@ -84,6 +94,31 @@ def _print_state(path: Path, state: StoreState) -> None:
         print(printable(line))
     if state.problems:
         print(f"\nRecover the readable records: sonarpost store salvage {path} --out NEW")
+
+
+def run_quarantine(parsed: argparse.Namespace) -> int:
+    """List quarantined records, or queue them again; return 1 if one of them cannot be queued, otherwise 0."""
+    path: Path = parsed.store
+    if not path.is_file():
+        raise StoredFileError(str(path), "", "no such file", "the store of a service, for example c2.db")
+    with closing(Store(path)) as store:
+        found = store.quarantined()
+        if parsed.requeue is None:
+            rows = [("number", "time (UTC)", "direction", "key", "bytes", "reason")]
+            rows += [(str(r.id), time_text(r.at_utc_s), r.direction, r.key, str(r.size_bytes), r.reason) for r in found]
+            for line in aligned(rows):
+                print(printable(line))
+            return 0
+        wanted = set(parsed.requeue or (record.id for record in found if record.can_be_queued))
+        queued = [record.id for record in found if record.id in wanted and record.can_be_queued]
+        with store.transaction() as tx:
+            for number in queued:
+                tx.requeue(number)
+    print(f"{len(queued)} records queued again")
+    left = sorted(wanted.difference(queued))
+    if left:
+        print(f"not queued: {', '.join(map(str, left))}")
+    return EXIT_UNSOUND if left else 0
 
 
 def run_salvage(parsed: argparse.Namespace) -> int:

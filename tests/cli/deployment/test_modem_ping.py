@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+import pty
 import re
 import socket
 from collections.abc import Callable
@@ -72,6 +75,20 @@ def test_a_silent_serial_line_is_status_2(capsys):
 def test_an_absent_port_is_status_2(capsys):
     assert ping("/dev/absent", "--wait", "0.1") == 2
     assert "sonarpost: /dev/absent: " in capsys.readouterr().err
+
+
+def test_a_port_in_use_is_status_2_at_once(capsys):
+    master, slave = pty.openpty()
+    path = os.ttyname(slave)
+    fcntl.flock(slave, fcntl.LOCK_EX)
+    try:
+        assert ping(path, "--wait", "1e9") == 2
+    finally:
+        os.close(slave)
+        os.close(master)
+    err = capsys.readouterr().err
+    assert err.startswith(f"sonarpost: {path}: in use by ")
+    assert err.endswith(f" (process {os.getpid()})\n")
 
 
 def test_an_invalid_destination_is_refused(capsys):

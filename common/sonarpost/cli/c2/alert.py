@@ -4,32 +4,57 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import sqlite3
 import time
-from collections import OrderedDict
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from sonarpost import logs
 from sonarpost.bus.session import open_with_retry
-from sonarpost.cli.c2.alert_senders import AlertRefusedError, AlertSender, Mqtt, Webhook, read_secret
+from sonarpost.cli.c2.alert_senders import (
+    AlertNotAcceptedError,
+    AlertRefusedError,
+    AlertSender,
+    Mqtt,
+    Webhook,
+    read_secret,
+)
 from sonarpost.cli.c2.live import ContactStream, add_live_options
 from sonarpost.cli.shared import Subparsers, in_new_folder, log_level, router_of
 from sonarpost.errors import ConfigError, PortError, StoredFileError
 from sonarpost.export.alerts import alert_document, needs_alert
 from sonarpost.export.contacts import ExportContact
-from sonarpost.export.cot_sender import TlsFiles
+from sonarpost.export.tak.cot_sender import TlsFiles
 from sonarpost.export.text import utc_text
+from sonarpost.limits import Turns, limit
 from sonarpost.logs import kv
 from sonarpost.stop_signals import stop_on_signals
 
 log = logging.getLogger(__name__)
 
 RETRY_S: Final = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
-MAX_WAITING: Final = 1000
-"""Alerts that wait for the receiver; above it further contacts wait in c2's folder for the next start."""
+MAX_NOT_ACCEPTED_RETRY_S: Final = limit(
+    5.0,
+    "s",
+    "blame",
+    surface="alerts",
+    source="vessel",
+    resource="time for which alerts that the receiver does not accept delay those of other vessels",
+    at_limit="The alerts of the other vessels are sent; each failed alert is repeated up to 60 s later",
+)
+MAX_WAITING: Final = limit(
+    1000,
+    "alerts",
+    "shares",
+    surface="alerts",
+    source="vessel",
+    resource="alerts that wait for the receiver",
+    at_limit="Further contacts of this vessel wait in the folder of c2 for the next start",
+)
 MAX_SENT: Final = 200_000
 """Identifiers in the state file; the oldest are deleted."""
 
@@ -71,10 +96,14 @@ def run(parsed: argparse.Namespace) -> int:
         raise ConfigError("command line", "--threshold", parsed.threshold, "0 to 1")
     tls = TlsFiles(parsed.alert_ca, parsed.alert_certificate, parsed.alert_key)
     secret = None if parsed.secret_file is None else read_secret(parsed.secret_file, "--secret-file")
-    sender: AlertSender = Webhook(parsed.webhook, tls, secret) if parsed.webhook else Mqtt(parsed.mqtt, tls, secret)
     endpoints, router_tls = router_of(parsed)
     logs.configure_logging("alert", log_level(parsed))
-    with stop_on_signals() as stop, closing(SentAlerts(in_new_folder(parsed.state))) as sent, closing(sender):
+    with stop_on_signals() as stop, ExitStack() as stack:
+        sender: AlertSender = (
+            Webhook(parsed.webhook, tls, secret, stop=stop) if parsed.webhook else Mqtt(parsed.mqtt, tls, secret)
+        )
+        stack.enter_context(closing(sender))
+        sent = stack.enter_context(closing(SentAlerts(in_new_folder(parsed.state))))
         session = open_with_retry(endpoints, stop, router_tls)
         if session is None:
             return 0
@@ -135,11 +164,18 @@ class SentAlerts:
         self._db.close()
 
 
+@dataclass(slots=True)
+class _Alert:
+    contact: ExportContact
+    failures: int = 0
+    due_s: float = -math.inf
+
+
 class AlertService:
-    """Sends one alert for each contact, at least once, in the order of their arrival.
+    """Sends one alert for each contact, at least once; vessels are served in turn.
 
     An identifier is stored after the receiver has accepted the alert: a crash between both repeats the alert with the
-    same identifier. A refused alert is logged and not repeated.
+    same identifier. A refused alert is logged and not repeated. After a failure, the other alerts are sent first.
 
     Args:
         sender: Way of the alerts.
@@ -163,40 +199,67 @@ class AlertService:
         self._threshold = threshold
         self._clock = clock
         self._utc = utc
-        self._waiting: OrderedDict[str, ExportContact] = OrderedDict()
+        self._waiting: dict[str, dict[str, _Alert]] = {}
+        self._turns = Turns()
         self._failures = 0
         self._next_s = clock()
 
     def add(self, contact: ExportContact) -> None:
         """Queue the alert of a contact, if it needs one that was not sent before."""
-        if contact.uid in self._waiting:
-            self._waiting[contact.uid] = contact
+        vessel = contact.image.vessel_id
+        alerts = self._waiting.get(vessel, {})
+        if contact.uid in alerts:
+            alerts[contact.uid].contact = contact
             return
         if not needs_alert(contact, self._threshold) or contact.uid in self._sent:
             return
-        if len(self._waiting) >= MAX_WAITING:
-            log.error("Alert dropped until the next start: too many wait", extra=kv(contact=contact.uid))
+        if len(alerts) >= MAX_WAITING:
+            log.error("Alert dropped until the next start: too many wait", extra=kv(contact=contact.uid, vessel=vessel))
             return
-        self._waiting[contact.uid] = contact
+        self._waiting.setdefault(vessel, {})[contact.uid] = _Alert(contact)
 
     def send_due(self) -> bool:
-        """Send the first waiting alert if it is time; return whether the receiver has accepted it."""
-        if not self._waiting or self._clock() < self._next_s:
+        """Send an alert if it is time; return whether the receiver has accepted or refused it."""
+        now_s = self._clock()
+        if now_s < self._next_s:
             return False
-        uid, contact = next(iter(self._waiting.items()))
+        due = {
+            vessel: sorted(
+                (alert for alert in alerts.values() if alert.due_s <= now_s), key=lambda alert: alert.failures
+            )
+            for vessel, alerts in self._waiting.items()
+        }
+        for alert in self._turns.pick(due, 1):
+            return self._send(alert)
+        return False
+
+    def _send(self, alert: _Alert) -> bool:
+        contact, vessel = alert.contact, alert.contact.image.vessel_id
         try:
-            self._sender.send(uid, contact.image.vessel_id, alert_document(contact, utc_text(self._utc())))
+            self._sender.send(contact.uid, vessel, alert_document(contact, utc_text(self._utc())))
         except AlertRefusedError as error:
-            log.error("Alert refused; it is not sent again", extra=kv(contact=uid, error=str(error)))
-        except PortError as error:
-            pause_s = RETRY_S[min(self._failures, len(RETRY_S) - 1)]
+            log.error("Alert refused; it is not sent again", extra=kv(contact=contact.uid, error=str(error)))
+        except Exception as error:  # other than of the port: it can concern this alert alone
+            pause_s = _pause_s(self._failures)
+            is_port_error = isinstance(error, PortError)
+            if not is_port_error or isinstance(error, AlertNotAcceptedError):
+                pause_s = min(pause_s, MAX_NOT_ACCEPTED_RETRY_S)
+            now_s = self._clock()
+            self._next_s, alert.due_s = now_s + pause_s, now_s + max(pause_s, _pause_s(alert.failures))
             self._failures += 1
-            self._next_s = self._clock() + pause_s
-            log.warning("Alert not sent; retrying", extra=kv(contact=uid, retry_s=pause_s, error=str(error)))
+            alert.failures += 1
+            fields = kv(contact=contact.uid, retry_s=pause_s, error=str(error))
+            log.warning("Alert not sent; retrying", exc_info=not is_port_error, extra=fields)
             return False
         else:
-            log.info("Alert sent", extra=kv(contact=uid, review=contact.review))
+            log.info("Alert sent", extra=kv(contact=contact.uid, review=contact.review))
         self._failures = 0
-        self._sent.add(uid)
-        del self._waiting[uid]
+        self._sent.add(contact.uid)
+        del self._waiting[vessel][contact.uid]
+        if not self._waiting[vessel]:
+            del self._waiting[vessel]
         return True
+
+
+def _pause_s(failures: int) -> float:
+    return RETRY_S[min(failures, len(RETRY_S) - 1)]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import http.client
 import ssl
+import threading
 import time
 import uuid
 from functools import partial
@@ -13,14 +13,14 @@ from urllib.parse import SplitResult, unquote, urlsplit
 
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.export.alerts import signature
-from sonarpost.export.cot_sender import TlsFiles
+from sonarpost.export.tak.cot_sender import TlsFiles
+from sonarpost.network import http_client
 
 if TYPE_CHECKING:
     # Imported when it is used: it needs the extra `mqtt`.
     from paho.mqtt.client import Client
 
 TIMEOUT_S: Final = 10.0
-MAX_REPLY_BYTES: Final = 1 << 16
 MIN_SECRET_BYTES: Final = 16
 REFUSED_STATUS: Final = (400, 413, 422)
 """Replies that another attempt cannot change."""
@@ -28,6 +28,10 @@ REFUSED_STATUS: Final = (400, 413, 422)
 
 class AlertRefusedError(PortError):
     """The receiver has refused an alert for good."""
+
+
+class AlertNotAcceptedError(PortError):
+    """The receiver has replied, but has not accepted an alert: the cause can be this alert alone."""
 
 
 class AlertSender(Protocol):
@@ -38,7 +42,8 @@ class AlertSender(Protocol):
 
         Raises:
             AlertRefusedError: The receiver has refused it.
-            PortError: The receiver was not reached or did not accept it: send it again.
+            AlertNotAcceptedError: The receiver has replied, but has not accepted it: send it again.
+            PortError: The receiver was not reached or did not reply: send it again.
         """
 
     def close(self) -> None:
@@ -68,19 +73,28 @@ class Webhook:
         url: `https://…` or `http://…`.
         tls: PEM files for `https`.
         secret: Key of the signature; None sends none.
-        timeout_s: Time limit of connection and reply.
+        timeout_s: Time limit of the whole exchange.
+        stop: Ends an exchange.
 
     Raises:
         ConfigError: The address or a file is invalid.
     """
 
-    def __init__(self, url: str, tls: TlsFiles, secret: bytes | None, timeout_s: float = TIMEOUT_S) -> None:
+    def __init__(
+        self,
+        url: str,
+        tls: TlsFiles,
+        secret: bytes | None,
+        timeout_s: float = http_client.TIMEOUT_S,
+        stop: threading.Event | None = None,
+    ) -> None:
         parts = _split("--webhook", url, ("http", "https"))
-        self._parts = parts
+        self._url = url
+        self._netloc = parts.netloc
         self._secret = secret
         self._timeout_s = timeout_s
         self._context = tls.context() if parts.scheme == "https" else None
-        self._target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
+        self._stop = stop
 
     def send(self, alert_id: str, vessel_id: str, body: bytes) -> None:
         """Send an alert; a reply with a status of 200 to 299 accepts it."""
@@ -89,25 +103,16 @@ class Webhook:
         headers = {"Content-Type": "application/json", "X-Sonarpost-Id": alert_id, "X-Sonarpost-Timestamp": timestamp}
         if self._secret is not None:
             headers["X-Sonarpost-Signature"] = signature(self._secret, timestamp, body)
-        connection = self._connection()
         try:
-            connection.request("POST", self._target, body, headers)
-            reply = connection.getresponse()
-            reply.read(MAX_REPLY_BYTES)
-        except (OSError, http.client.HTTPException) as error:
-            raise PortError(f"{self._parts.netloc}: alert not sent: {str(error) or type(error).__name__}") from error
-        finally:
-            connection.close()
+            reply = http_client.post(
+                self._url, body, headers, context=self._context, timeout_s=self._timeout_s, stop=self._stop
+            )
+        except OSError as error:
+            raise PortError(f"{self._netloc}: alert not sent: {str(error) or type(error).__name__}") from error
         if reply.status in REFUSED_STATUS:
-            raise AlertRefusedError(f"{self._parts.netloc}: alert refused: status {reply.status}")
+            raise AlertRefusedError(f"{self._netloc}: alert refused: status {reply.status}")
         if not 200 <= reply.status < 300:
-            raise PortError(f"{self._parts.netloc}: alert not accepted: status {reply.status}")
-
-    def _connection(self) -> http.client.HTTPConnection:
-        host, port = self._parts.hostname or "", self._parts.port
-        if self._context is not None:
-            return http.client.HTTPSConnection(host, port, timeout=self._timeout_s, context=self._context)
-        return http.client.HTTPConnection(host, port, timeout=self._timeout_s)
+            raise AlertNotAcceptedError(f"{self._netloc}: alert not accepted: status {reply.status}")
 
     def close(self) -> None:
         """Do nothing: each alert has a connection of its own."""
@@ -169,7 +174,8 @@ class Mqtt:
             client.username_pw_set(self._user, None if self._password is None else self._password.decode())
         if self._context is not None:
             client.tls_set_context(self._context)
-        client.connect(self._host, self._port)
+        # It limits the TLS handshake as well.
+        client.connect(self._host, self._port, keepalive=max(1, round(self._timeout_s)))
         self._client = client
         client.loop_start()
         return client

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +12,14 @@ import zenoh
 
 from sonarpost.cli.c2.watch import Watch
 from sonarpost.cli.shared import add_router_options, add_site_option
-from sonarpost.errors import BadInputError
-from sonarpost.export.contacts import ExportContact, load_contacts, read_png
+from sonarpost.export.contacts import ExportContact, load_contacts
 from sonarpost.export.live import LiveContacts
+from sonarpost.export.source import StoredImages
+from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review.rendering import eight_bits, encode_png
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +72,12 @@ class ContactStream:
         # The folder is read after the subscription exists: a contact between both is in the folder.
         changes = self._read_archive() if self._watch.gaps != self._gaps_read else []
         if isinstance(record, (ReconstructedImage, Decision)):
-            contact = self._contacts.add(record)
-            if contact is not None:
-                changes.append(ContactChange(contact, _png_of(record)))
+            try:
+                contact = self._contacts.add(record)
+                if contact is not None:
+                    changes.append(ContactChange(contact, _png_of(record)))
+            except Exception:
+                log.exception("Record left out", extra=kv(vessel=record.vessel_id, image_id=record.image_id))
         return changes
 
     def _read_archive(self) -> list[ContactChange]:
@@ -78,13 +85,13 @@ class ContactStream:
         if self._archive is None:
             return []
         stored = load_contacts(self._archive)
-        problems: list[BadInputError] = list(stored.problems)
+        images = StoredImages()
         chosen = (c for c in stored.contacts if self._vessel in (None, c.image.vessel_id))
         changes = [
-            ContactChange(replace(contact, image_path=None), read_png(contact, problems))
+            ContactChange(replace(contact, image_path=None), images.png(contact))
             for contact in self._contacts.restore(chosen)
         ]
-        for problem in problems:
+        for problem in (*stored.problems, *images.problems):
             print(f"rejected: {problem}", file=sys.stderr)
         return changes
 

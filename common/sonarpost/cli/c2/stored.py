@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import math
 import os
 import re
 import sys
@@ -23,35 +24,21 @@ from rich.text import Text
 from sonarpost.archive.reader import ArchivePlace, as_folder, open_reader, place_of, read_image_files
 from sonarpost.archive.shore_files import find_image
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, TaskingRow
+from sonarpost.cli.c2.tak import add_tls_options, tls_files_of
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers, in_new_folder, make_output_folder, printable, time_text
 from sonarpost.config import load
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError
 from sonarpost.export.contacts import ContactSet, ExportContact, load_contacts, match_start_time
-from sonarpost.export.cot import cot_events
-from sonarpost.export.cot_sender import CotSender, TlsFiles
-from sonarpost.export.geopackage import write_geopackage
-from sonarpost.export.kml import write_kml, write_kmz
-from sonarpost.export.reports import write_caris_text, write_mine_report
-from sonarpost.export.tables import write_csv, write_geojson
-from sonarpost.export.tak import write_data_package
+from sonarpost.export.formats import FORMATS, write_export
+from sonarpost.export.tak.cot import cot_events
+from sonarpost.export.tak.cot_sender import CotSender
 from sonarpost.export.text import probabilities_text
 from sonarpost.files import write_atomically
 
 DEMO_IMAGES = Path("demo-out/shore/images")
 SHORE_CONFIG = Path("/etc/sonarpost/shore.toml")
 PIPED_WIDTH = 160
-WRITERS = {
-    "geojson": write_geojson,
-    "kml": write_kml,
-    "kmz": write_kmz,
-    "csv": write_csv,
-    "gpkg": write_geopackage,
-    "tak.zip": write_data_package,
-    "caris.txt": write_caris_text,
-    "app11-like.txt": write_mine_report,
-}
-"""End of a file name -> function that writes the file."""
 FORMER_OPTIONS = ("geojson", "kml", "kmz", "csv")
 EXIT_INCOMPLETE = 1
 
@@ -61,25 +48,28 @@ _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 @dataclass(frozen=True, slots=True)
 class RecordFilter:
-    """Values of --vessel, --vehicle and --since; None for all."""
+    """Values of --vessel, --vehicle, --since and --until; None for all."""
 
     vessel: str | None = None
     vehicle: str | None = None
     since_utc_s: float = 0.0
+    until_utc_s: float = math.inf
 
     @classmethod
     def of(cls, parsed: argparse.Namespace) -> RecordFilter:
         """Return the filter of a command line.
 
         Raises:
-            ConfigError: `--since` is invalid.
+            ConfigError: `--since` or `--until` is invalid.
         """
-        return cls(parsed.vessel, parsed.vehicle, since_of(parsed.since))
+        since_utc_s = 0.0 if parsed.since is None else time_of("--since", parsed.since)
+        until_utc_s = math.inf if parsed.until is None else time_of("--until", parsed.until)
+        return cls(parsed.vessel, parsed.vehicle, since_utc_s, until_utc_s)
 
     def accepts(self, vessel_id: str, vehicle_id: str, time_utc_s: float) -> bool:
         """Return whether a record passes the filter."""
         names = self.vessel in (None, vessel_id) and self.vehicle in (None, vehicle_id)
-        return names and time_utc_s >= self.since_utc_s
+        return names and self.since_utc_s <= time_utc_s < self.until_utc_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,13 +109,12 @@ def add_actions(actions: Subparsers) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="file to write, named *." + ", *.".join(WRITERS) + "; can be repeated",
+        help="file to write, named *." + ", *.".join(FORMATS) + "; can be repeated",
     )
     for name in FORMER_OPTIONS:
         export.add_argument(f"--{name}", type=Path, help=argparse.SUPPRESS)  # former spellings of --out
     export.add_argument("--cot", metavar="URL", help="send events to tcp://host:port, tls://… or udp://…")
-    for name in ("ca", "certificate", "key"):
-        export.add_argument(f"--cot-{name}", type=Path, metavar="PEM", help=f"{name} for --cot tls://…")
+    add_tls_options(export, "--cot tls://…")
     export.add_argument(
         "--cot-wait", type=float, default=10.0, metavar="SECONDS", help="time limit for connecting (default: 10)"
     )
@@ -170,28 +159,27 @@ def archive_of(parsed: argparse.Namespace) -> ArchivePlace:
 
 
 def add_filters(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `archive_of` and `RecordFilter`: the archive of c2, --vessel, --vehicle and --since."""
+    """Add the options of `archive_of` and of `RecordFilter`."""
     _add_archive(parser)
     parser.add_argument("--vessel", metavar="NAME", help="only this vessel")
     parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle")
     parser.add_argument("--since", metavar="TIME", help="first received since 90m, 2h or 3d ago, or since a UTC time")
+    parser.add_argument("--until", metavar="TIME", help="first received before such a time")
 
 
-def since_of(text: str | None, now_utc_s: float | None = None) -> float:
-    """Return the value of --since as UTC seconds: 90m, 2h, 3d ago, or a time like 2026-11-21T08:30:00.
+def time_of(option: str, text: str, now_utc_s: float | None = None) -> float:
+    """Return the value of an option as UTC seconds: 90m, 2h, 3d ago, or a time like 2026-11-21T08:30:00.
 
     Raises:
         ConfigError: The text has another form.
     """
-    if text is None:
-        return 0.0
     if ago := _AGO.fullmatch(text):
         now = time.time() if now_utc_s is None else now_utc_s
         return now - float(ago.group(1)) * _UNIT_S[ago.group(2)]
     try:
         when = datetime.fromisoformat(text)
     except ValueError as error:
-        raise ConfigError("c2", "--since", text, "45s, 90m, 2h, 3d, or a time like 2026-11-21T08:30:00") from error
+        raise ConfigError("c2", option, text, "45s, 90m, 2h, 3d, or a time like 2026-11-21T08:30:00") from error
     return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
 
 
@@ -372,13 +360,13 @@ def _write_contacts(
     problems = list(contacts.problems)
     for name, path in outputs:
         with ProgressDisplay(step=f"writing {path}"):
-            problems += WRITERS[name](in_new_folder(path), contacts) or ()
+            problems += write_export(name, in_new_folder(path), contacts)
         print(f"{path}: {len(contacts.contacts)} contacts, {len(contacts.unlocated)} of them without a position")
     if parsed.cot is not None:
         events = cot_events(contacts, time.time())
-        with CotSender(parsed.cot, TlsFiles(parsed.cot_ca, parsed.cot_certificate, parsed.cot_key)) as sender:
-            sender.send(events, parsed.cot_wait)
-        print(f"{parsed.cot}: {len(events)} events, {len(contacts.unlocated)} contacts without a position omitted")
+        evidence = CotSender(parsed.cot, tls_files_of(parsed)).send(events, parsed.cot_wait)
+        omitted = f"{len(contacts.unlocated)} contacts without a position omitted"
+        print(f"{parsed.cot}: {len(events)} events, {omitted}; {evidence}")
     _mark_exported(place, contacts.contacts)
     for problem in problems:
         print(f"rejected: {problem}", file=sys.stderr)
@@ -389,9 +377,9 @@ def _export_files(parsed: argparse.Namespace) -> list[tuple[str, Path]]:
     """Return format and path of every file to write."""
     files = []
     for path in parsed.out:
-        name = next((name for name in WRITERS if path.name.lower().endswith(f".{name}")), None)
+        name = next((name for name in FORMATS if path.name.lower().endswith(f".{name}")), None)
         if name is None:
-            raise ConfigError("c2 export", "--out", str(path), "a name that ends in ." + ", .".join(WRITERS))
+            raise ConfigError("c2 export", "--out", str(path), "a name that ends in ." + ", .".join(FORMATS))
         files.append((name, path))
     return files + [(name, path) for name in FORMER_OPTIONS if (path := getattr(parsed, name)) is not None]
 

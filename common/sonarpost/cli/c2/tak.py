@@ -4,25 +4,36 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import time
-from collections import OrderedDict
-from collections.abc import Callable
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from sonarpost import logs
+from sonarpost import keys, logs, wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.c2.live import ContactChange, ContactStream, add_live_options
 from sonarpost.cli.shared import Subparsers, log_level, router_of
+from sonarpost.config import PlatformConfig, load
 from sonarpost.errors import PortError
 from sonarpost.export.contacts import ExportContact
-from sonarpost.export.cot import CotOptions, cot_event
-from sonarpost.export.cot_sender import CotSender, TlsFiles
 from sonarpost.export.live import MAX_NAMES
-from sonarpost.export.tak import UploadedPackage, attachment_sha256, data_package, file_name, file_transfer_event
-from sonarpost.export.tak_files import TakFiles
+from sonarpost.export.tak.cot import CotOptions, cot_event
+from sonarpost.export.tak.cot_sender import MAX_BATCH, CotSender, TlsFiles
+from sonarpost.export.tak.data_package import (
+    UploadedPackage,
+    attachment_sha256,
+    data_package,
+    file_name,
+    file_transfer_event,
+)
+from sonarpost.export.tak.tak_files import PackageRefusedError, TakFiles
+from sonarpost.export.text import utc_text
+from sonarpost.limits import Turns, limit
 from sonarpost.logs import kv
+from sonarpost.messages import Health, ServiceState
 from sonarpost.stop_signals import stop_on_signals
 
 log = logging.getLogger(__name__)
@@ -31,10 +42,20 @@ REPEAT_S: Final = (0.0, 5.0, 30.0)
 """Times of an event after its change: clients lose events, above all the first one after they connect."""
 REFRESH_S: Final = 600.0
 """Interval of all events, for clients that connect later."""
-RETRY_S: Final = 5.0
-MAX_IMAGES: Final = 64
-"""Images that wait for their upload; the oldest is dropped, and its contact is sent without it."""
-MAX_BATCH: Final = 500
+RETRY_S: Final = (5.0, 10.0, 30.0, 60.0)
+UPLOAD_RETRY_S: Final = 5.0
+MAX_IMAGES: Final = limit(
+    64,
+    "images",
+    "shares",
+    surface="TAK server",
+    source="vessel",
+    resource="images that wait for their upload",
+    at_limit="The oldest one of the vessel with the most is dropped, and its contact is sent without it",
+)
+HEALTH_INTERVAL_S: Final = 5.0
+NAME: Final = "cot"
+"""Name in health records."""
 SENDER: Final = "sonarpost"
 
 
@@ -53,8 +74,7 @@ def add_actions(actions: Subparsers) -> None:
     """Add the action `cot`."""
     parser = actions.add_parser("cot", help="send the contacts of a shore site to a TAK endpoint, live; Ctrl-C ends it")
     parser.add_argument("url", metavar="URL", help="endpoint: tcp://host:port, tls://… or udp://…")
-    for name in ("ca", "certificate", "key"):
-        parser.add_argument(f"--cot-{name}", type=Path, metavar="PEM", help=f"{name} for tls://… and https://…")
+    add_tls_options(parser, "tls://… and https://…")
     parser.add_argument(
         "--tak-api",
         metavar="URL",
@@ -64,24 +84,58 @@ def add_actions(actions: Subparsers) -> None:
     parser.set_defaults(run=run)
 
 
+def add_tls_options(parser: argparse.ArgumentParser, scheme: str) -> None:
+    """Add the options of `tls_files_of`; `scheme` is what they are for."""
+    for name, help_text in (
+        ("ca", "trusted authorities, PEM or PKCS#12 (*.p12)"),
+        ("certificate", "client certificate, PEM, or PKCS#12 with its key (*.p12)"),
+        ("key", "private key of a PEM certificate"),
+        ("passphrase-file", "passphrase of an encrypted key and of PKCS#12 files; mode 0600"),
+    ):
+        parser.add_argument(f"--cot-{name}", type=Path, metavar="FILE", help=f"{help_text}; for {scheme}")
+    parser.add_argument(
+        "--cot-server-name", metavar="NAME", help=f"name in the server's certificate (default: the host); for {scheme}"
+    )
+
+
+def tls_files_of(parsed: argparse.Namespace) -> TlsFiles:
+    """Return the TLS files of the command line."""
+    return TlsFiles(
+        parsed.cot_ca, parsed.cot_certificate, parsed.cot_key, parsed.cot_passphrase_file, parsed.cot_server_name
+    )
+
+
 def run(parsed: argparse.Namespace) -> int:
     """Send events until interrupted; return 0."""
     endpoints, router_tls = router_of(parsed)
-    tls = TlsFiles(parsed.cot_ca, parsed.cot_certificate, parsed.cot_key)
+    platform = parsed.site
+    if parsed.config is not None:
+        platform = load(parsed.config, "platform", PlatformConfig, os.environ)[0].id
+    tls = tls_files_of(parsed)
     files = None if parsed.tak_api is None else TakFiles(parsed.tak_api, tls)
     logs.configure_logging("cot", log_level(parsed))
-    with stop_on_signals() as stop, CotSender(parsed.url, tls, wait=stop.wait) as sender:
+    sender = CotSender(parsed.url, tls)
+    with stop_on_signals() as stop:
         session = open_with_retry(endpoints, stop, router_tls)
         if session is None:
             return 0
         try:
             stream = ContactStream(session, parsed.site, parsed.vessel, parsed.archive)
             service = CotService(sender, files)
+            token = session.liveliness().declare_token(keys.alive(platform, NAME))
             log.info("Sending contacts", extra=kv(endpoint=sender.endpoint, site=parsed.site))
-            while not stop.is_set():
+            state: ServiceState | None = None
+            health_s = 0.0
+            while state != "stopping":
                 for change in stream.poll():
                     service.add(change)
                 service.send_due()
+                state = "stopping" if stop.is_set() else None
+                if state or time.monotonic() >= health_s:
+                    health_s = time.monotonic() + HEALTH_INTERVAL_S
+                    health = wire.encode(service.health(platform, state))
+                    session.put(keys.health(platform, NAME), health, encoding=wire.encoding_of(Health))
+            token.undeclare()
         finally:
             session.close()
     return 0
@@ -100,7 +154,7 @@ class CotService:
         options: Options of the events.
         clock: Monotonic clock, seconds.
         utc: UTC clock, seconds.
-        max_contacts: Above it the least recently changed contact is dropped.
+        max_contacts: Above it the least recently changed contact of the vessel with the most is dropped.
     """
 
     def __init__(
@@ -121,8 +175,14 @@ class CotService:
         self._max_contacts = max_contacts
         self._markers: OrderedDict[str, _Marker] = OrderedDict()
         self._waiting: OrderedDict[str, bytes] = OrderedDict()
+        self._turns = Turns()
         self._retry_s = self._upload_retry_s = clock()
         self._refresh_s = clock() + REFRESH_S
+        self._started_utc_s = self._delivered_utc_s = utc()
+        self._delivered_before = 0
+        self._is_accepted = False
+        self._failures = 0
+        self._problem = ""
 
     def add(self, change: ContactChange) -> None:
         """Schedule the event of a changed contact. One without a position has none."""
@@ -137,11 +197,18 @@ class CotService:
         if change.png is not None and self._files is not None:
             self._waiting[contact.uid] = change.png
             if len(self._waiting) > MAX_IMAGES:
-                uid, _ = self._waiting.popitem(last=False)
+                uid = self._oldest_of_largest(self._waiting)
+                del self._waiting[uid]
                 log.warning("Image not uploaded: too many wait", extra=kv(contact=uid, limit=MAX_IMAGES))
         if len(self._markers) > self._max_contacts:
-            dropped, _ = self._markers.popitem(last=False)
+            dropped = self._oldest_of_largest(self._markers)
+            del self._markers[dropped]
             self._waiting.pop(dropped, None)
+
+    def _oldest_of_largest(self, uids: Iterable[str]) -> str:
+        vessels = {uid: self._markers[uid].contact.image.vessel_id for uid in uids}
+        largest = Counter(vessels.values()).most_common(1)[0][0]
+        return next(uid for uid, vessel in vessels.items() if vessel == largest)
 
     def send_due(self) -> int:
         """Send the events that are due; return their number, 0 after a failure, which is logged and tried again."""
@@ -152,21 +219,54 @@ class CotService:
                 marker.due_s.append(now_s)
         if now_s < self._retry_s:
             return 0
-        due = [marker for marker in self._markers.values() if any(at_s <= now_s for at_s in marker.due_s)][:MAX_BATCH]
-        if not due:
+        waiting: dict[str, list[_Marker]] = {}
+        for marker in self._markers.values():
+            if any(at_s <= now_s for at_s in marker.due_s):
+                waiting.setdefault(marker.contact.image.vessel_id, []).append(marker)
+        due = self._turns.pick(waiting, MAX_BATCH)
+        if not due and self._is_accepted:
             return 0
+        # Without an event the first connection shows whether the server accepts this client.
+        events: list[bytes] = []
         for marker in due:
-            self._upload(marker)
+            try:
+                self._upload(marker)
+                events += self._events(marker)
+            except Exception:
+                log.exception("Contact left out until its next event", extra=kv(contact=marker.contact.uid))
         try:
-            self._sender.send([event for marker in due for event in self._events(marker)], give_up_after_s=0.0)
+            evidence = self._sender.send(events, give_up_after_s=0.0)
         except PortError as error:
-            self._retry_s = self._clock() + RETRY_S
-            log.warning("Events not sent; retrying", extra=kv(events=len(due), error=str(error)))
+            pause_s = RETRY_S[min(self._failures, len(RETRY_S) - 1)]
+            self._retry_s = self._clock() + pause_s
+            self._failures += 1
+            self._problem = str(error)
+            fields = kv(waiting=len(due), since=utc_text(self._delivered_utc_s), retry_s=pause_s, error=self._problem)
+            log.warning("Nothing delivered; retrying", extra=fields)
             return 0
+        if self._problem or not self._is_accepted:
+            log.info("Server accepts events", extra=kv(delivered=self._sender.delivered, evidence=evidence))
+        self._is_accepted, self._failures, self._problem = True, 0, ""
+        self._delivered_utc_s, self._delivered_before = self._utc(), self._sender.delivered
         for marker in due:
             marker.due_s = [at_s for at_s in marker.due_s if at_s > now_s]
             marker.transfers_left = max(0, marker.transfers_left - 1)
         return len(due)
+
+    def health(self, platform: str, state: ServiceState | None = None) -> Health:
+        """Return the health record of this moment. It is degraded while the server does not accept events."""
+        before = self._delivered_before
+        counts = f"{self._sender.delivered - before} delivered since {utc_text(self._delivered_utc_s)}, {before} before"
+        return Health(
+            platform_id=platform,
+            service=NAME,
+            time_utc_s=self._utc(),
+            started_utc_s=self._started_utc_s,
+            state=state or ("degraded" if self._problem else "ok"),
+            detail=f"{counts}; retrying: {self._problem}" if self._problem else "",
+            counters={"events_delivered": self._sender.delivered},
+            gauges={"contacts": float(len(self._markers)), "images_waiting": float(len(self._waiting))},
+        )
 
     def _upload(self, marker: _Marker) -> None:
         png = self._waiting.get(marker.contact.uid)
@@ -176,7 +276,8 @@ class CotService:
         try:
             marker.package = self._files.upload(f"{file_name(marker.contact)}.zip", package, SENDER)
         except PortError as error:
-            self._upload_retry_s = self._clock() + RETRY_S
+            if not isinstance(error, PackageRefusedError):
+                self._upload_retry_s = self._clock() + UPLOAD_RETRY_S
             log.warning("Image not uploaded; retrying with the next event", extra=kv(error=str(error)))
             return
         marker.attachment, marker.transfers_left = attachment_sha256(png), len(REPEAT_S)

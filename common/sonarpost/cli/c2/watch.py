@@ -4,23 +4,32 @@ from __future__ import annotations
 
 import argparse
 import json
-import queue
 import sys
 import threading
 import time
+from collections import defaultdict, deque
 from collections.abc import Callable
+from typing import Final
 
 import zenoh
 
 from sonarpost import keys, wire
-from sonarpost.bus.session import open_with_retry
+from sonarpost.bus.session import lost_reason, open_with_retry
 from sonarpost.cli.shared import Subparsers, add_router_options, add_site_option, printable, router_of, time_text
 from sonarpost.errors import PayloadError
+from sonarpost.limits import Turns, limit
 from sonarpost.messages import Decision, ReconstructedImage, Record, TaskingState
 
 POLL_S = 0.2
-MAX_WAITING = 4096
-"""Records that wait to be handled; further ones are dropped, and counted."""
+MAX_WAITING: Final = limit(
+    512,
+    "records",
+    "shares",
+    surface="live records of c2, commands",
+    source="vessel",
+    resource="records that wait to be handled",
+    at_limit="further ones are dropped; `c2 cot` and `c2 alert` then read the archive, if they have its folder",
+)
 DISCONNECTED_AFTER_S = 1.0
 
 
@@ -72,7 +81,9 @@ class Watch:
         self._session = session
         self._vessel = vessel
         self.gaps = 0
-        self._samples: queue.Queue[tuple[str, bytes]] = queue.Queue(MAX_WAITING)
+        self._waiting: defaultdict[str, deque[tuple[str, bytes]]] = defaultdict(deque)  # by vessel
+        self._turns = Turns()
+        self._changed = threading.Condition()
         for key in (keys.shore_contact_all(site), keys.tasking_state_all(site)):
             session.declare_subscriber(key, self._on_sample)
         self._disconnected_since_s: float | None = None
@@ -81,10 +92,14 @@ class Watch:
     def _on_sample(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT:
             return
-        try:
-            self._samples.put_nowait((str(sample.key_expr), sample.payload.to_bytes()))
-        except queue.Full:
-            self.gaps += 1
+        key = str(sample.key_expr)
+        with self._changed:
+            waiting = self._waiting[key.split("/")[-2]]
+            if len(waiting) >= MAX_WAITING:
+                self.gaps += 1
+            else:
+                waiting.append((key, sample.payload.to_bytes()))
+                self._changed.notify()
 
     def run(self, show: Callable[[Record], None], count: int | None, stop: threading.Event) -> None:
         """Call `show` for each record until `stop` is set or `count` records were shown."""
@@ -98,10 +113,13 @@ class Watch:
     def poll(self) -> ReconstructedImage | Decision | TaskingState | None:
         """Return the next record; None if there is none for 0.2 s, or if it is invalid or of another vessel."""
         self._check_connection()
-        try:
-            key, payload = self._samples.get(timeout=POLL_S)
-        except queue.Empty:
-            return None
+        with self._changed:
+            self._changed.wait_for(lambda: any(self._waiting.values()), POLL_S)
+            picked = self._turns.pick(self._waiting, 1)
+            if not picked:
+                return None
+            [(key, payload)] = picked
+            self._waiting[key.split("/")[-2]].popleft()
         record = _decode(key, payload)
         return record if record is not None and self._vessel in (None, record.vessel_id) else None
 
@@ -119,7 +137,7 @@ class Watch:
             self._disconnected_since_s = now_s
         elif not self._disconnect_logged and now_s - self._disconnected_since_s > DISCONNECTED_AFTER_S:
             self._disconnect_logged = True
-            _log("router not reached, trying again")
+            _log(f"router not reached, trying again ({lost_reason(self._session)})")
 
 
 def _decode(key: str, payload: bytes) -> ReconstructedImage | Decision | TaskingState | None:

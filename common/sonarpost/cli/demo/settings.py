@@ -112,7 +112,7 @@ class ChainSettings:
     @property
     def feedback_interval_s(self) -> float:
         """Real time between two feedback messages of the vessel, with v1."""
-        return 30.0 / self.time_scale + 0.5
+        return 20.0 / self.time_scale + 0.5
 
     @property
     def reply_timeout_s(self) -> float:
@@ -266,6 +266,6 @@ def _vessel_link(settings: ChainSettings) -> str:
         f'link = "v1"\n{vehicles}holdoff_s = {2 / scale + 0.1:.3f}\nmax_defer_s = {120 / scale + 1:.3f}\n'
         # Rate 0 needs a header before each packet, which can be lost too.
         f"downlink_rate = {settings.rate}\n"
-        f"retry_s = {60 / scale + 0.5:.3f}\nfeedback_interval_s = {settings.feedback_interval_s:.3f}\n"
+        f"retry_s = {20 / scale + 0.5:.3f}\nfeedback_interval_s = {settings.feedback_interval_s:.3f}\n"
         f"reply_timeout_s = {settings.reply_timeout_s:.3f}\n"
     )

@@ -6,21 +6,25 @@ import argparse
 import queue
 import time
 
+from sonarpost.bearers.serial_device import IN_USE
 from sonarpost.cli.shared import Subparsers, add_command
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.modem import interface as ev
 from sonarpost.modem.interface import ModemEvent, RangeMeasured
 from sonarpost.modem.registry import DEFAULT_DRIVER, ModemSettings, modem_driver
-from sonarpost.runtime.modem_port import ModemPort, open_modem_port
+from sonarpost.runtime.modem_port import open_modem_port
 from sonarpost.runtime.modem_runner import ModemRunner
+from sonarpost.runtime.serial_port import ModemPort
 
 EXIT_UNANSWERED = 1
 SOUND_SPEED_M_PER_S = 1500.0
+POLL_S = 0.2
 PING_TIMEOUT_S = 60.0
 """Maximum time of one ping; the driver itself gives up earlier."""
 
 _PING = """Configure a modem as the services do, and ping another modem through the water. Stop the service that uses
-the port first. Exit status: 0 if every ping was answered, 1 if one was not, 2 if the modem itself does not reply."""
+the port first. Exit status: 0 if every ping was answered, 1 if one was not, 2 if the port is
+in use or the modem itself does not reply."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -42,7 +46,7 @@ def run(parsed: argparse.Namespace) -> int:
 
     Raises:
         ConfigError: An option is out of range, or the kind of port is not supported.
-        PortError: The port cannot be opened, or the modem does not reply.
+        PortError: The port is in use or cannot be opened, or the modem does not reply.
     """
     driver = modem_driver(parsed.driver)
     low, high = driver.capabilities.min_address, driver.capabilities.max_address
@@ -53,7 +57,9 @@ def run(parsed: argparse.Namespace) -> int:
         raise ConfigError("command line", "--destination", parsed.destination, expected)
     events: queue.SimpleQueue[ModemEvent] = queue.SimpleQueue()
     port = open_modem_port(parsed.port, parsed.baud)
-    runner = ModemRunner(driver.create(ModemSettings(parsed.address), parsed.port), port, events.put)
+    runner = ModemRunner(
+        driver.create(ModemSettings(parsed.address, stream=port.STREAM), parsed.port), port, events.put
+    )
     runner.start()
     try:
         _wait_until_ready(events, port, parsed.wait)
@@ -69,8 +75,10 @@ def _wait_until_ready(events: queue.SimpleQueue[ModemEvent], port: ModemPort, wa
     waiting_for = ""
     while True:
         try:
-            event = events.get(timeout=max(0.0, deadline_s - time.monotonic()))
+            event = events.get(timeout=min(POLL_S, max(0.0, deadline_s - time.monotonic())))
         except queue.Empty:
+            if time.monotonic() < deadline_s and not (port.error or "").startswith(IN_USE):
+                continue
             reason = port.error if not port.is_open else f"the modem does not reply{waiting_for}"
             raise PortError(f"{port.url}: {reason or 'not open yet'}") from None
         match event:

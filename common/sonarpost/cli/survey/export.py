@@ -21,6 +21,7 @@ from sonarpost.cli.shared import (
     utc_text,
 )
 from sonarpost.errors import SurveyFileError
+from sonarpost.export.geo.geometry import geojson_geometry
 from sonarpost.files import atomic_file
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import SurveySource
@@ -77,7 +78,7 @@ def _no_positions(source: SurveySource) -> SurveyFileError:
         return SurveyFileError(where, "positions", pings, "a recording with positions")
     if source.options.projected_crs is None:
         return SurveyFileError(
-            where, "positions", "metres", "their projection, --crs EPSG:N (see sonarpost survey info)"
+            where, "positions", "projected coordinates", "their projection, --crs EPSG:N (see sonarpost survey info)"
         )
     return SurveyFileError(where, "positions", pings, f"coordinates of {source.options.projected_crs}")
 
@@ -99,7 +100,7 @@ def write_csv(source: SurveySource, out: TextIO) -> None:
 def write_geojson(source: SurveySource, out: TextIO) -> None:
     """Write a FeatureCollection (RFC 7946) with the segments of the track.
 
-    A gap of a minute without fix and the antimeridian end a segment. A segment of a single fix is a Point.
+    A gap of a minute without fix ends a segment. It is a MultiLineString across the 180th meridian, a Point if single.
 
     Raises:
         SurveyFileError: The recording cannot be read.
@@ -124,7 +125,7 @@ def _segments(pings: Iterator[Ping]) -> Iterator[list[Fix]]:
         if ping.lat_deg is None or ping.lon_deg is None:
             continue
         fix = (ping.lon_deg, ping.lat_deg, ping.time_utc_s, ping.number)
-        ended = segment and (fix[2] - segment[-1][2] > _MAX_GAP_S or abs(fix[0] - segment[-1][0]) > 180)
+        ended = segment and fix[2] - segment[-1][2] > _MAX_GAP_S
         if ended or len(segment) >= _MAX_FIXES:
             yield segment
             # After a division by length the next segment begins at the last fix.
@@ -138,14 +139,9 @@ def _segments(pings: Iterator[Ping]) -> Iterator[list[Fix]]:
 
 
 def _write_segment(segment: list[Fix], line_name: str, out: TextIO) -> None:
-    coordinates = [[round(lon_deg, 8), round(lat_deg, 8)] for lon_deg, lat_deg, _, _ in segment]
-    is_line = len(coordinates) > 1
     feature = {
         "type": "Feature",
-        "geometry": {
-            "type": "LineString" if is_line else "Point",
-            "coordinates": coordinates if is_line else coordinates[0],
-        },
+        "geometry": geojson_geometry("LineString", [fix[:2] for fix in segment]),
         "properties": {
             "line": line_name,
             "start_utc": utc_text(segment[0][2]),

@@ -14,13 +14,13 @@ from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.projection import GridExtent, Projection
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import SurveySource
-from sonarpost.sonar.survey import Ping, Side
+from sonarpost.sonar.survey import Ping
 
 _MAX_VALUES = 16
 """Maximum number of sample counts and frequencies in the list."""
 _NAVIGATION = ("lat_deg", "lon_deg", "heading_deg", "altitude_m", "depth_m", "speed_mps")
 _GRID = ("easting_m", "northing_m", "first_m", "last_m")
-"""Coordinates that only files in metres have."""
+"""Coordinates that only files with projected positions have."""
 _STEP_M = 5.0
 """Step of the track length: fixes are often coarse and repeated over many pings."""
 
@@ -45,6 +45,8 @@ def run(parsed: argparse.Namespace) -> int:
             continue
         print(path)
         notes = [(kind, contents.pop(f"{kind}s")) for kind in ("warning", "hint")]
+        sets = source.info.channel_sets
+        contents["channel_sets"] = "; ".join(f"{each} in {each.ping_count} pings" for each in sets)
         for name, value in contents.items():
             if name != "file" and not (name in _GRID and value is None):
                 print(f"  {name:20} {_text(value)}")
@@ -83,6 +85,24 @@ class _Range:
 
 
 @dataclass
+class _LongitudeRange(_Range):
+    """Range from west to east; across the 180th meridian, as 179.99 to -179.99, if that is shorter."""
+
+    least_east: float = 180.0
+    greatest_west: float = -180.0
+
+    def add(self, value: float | None) -> None:
+        super().add(value)
+        if value is not None:
+            self.least_east = min(self.least_east, value if value >= 0 else 180.0)
+            self.greatest_west = max(self.greatest_west, value if value < 0 else -180.0)
+
+    def pair(self) -> list[float] | None:
+        is_across = self.greatest_west - self.least_east + 360 < self.high - self.low
+        return [self.least_east, self.greatest_west] if is_across else super().pair()
+
+
+@dataclass
 class _Statistics:
     """Statistics over the pings of a recording, of constant size."""
 
@@ -92,16 +112,12 @@ class _Statistics:
     frequencies_hz: set[float] = field(default_factory=set)
     fixes: int = 0
     track_m: float = 0.0
-    pings_with_more_channels: int = 0
-    """Pings with more than one channel on a side."""
-    used_frequencies_hz: set[float] = field(default_factory=set)
     _last_position: Position | None = None
 
     def add(self, ping: Ping) -> None:
         self._extend("time", ping.time_utc_s)
         for name in _NAVIGATION:
             self._extend(name, getattr(ping, name))
-        self._add_used_channels(ping)
         for channel in ping.channels:
             self._extend("slant_range_m", channel.slant_range_m)
             self.sample_types.add(channel.samples.dtype.name)
@@ -111,25 +127,6 @@ class _Statistics:
                 self.frequencies_hz.add(channel.frequency_hz)
         if ping.lat_deg is not None and ping.lon_deg is not None:
             self._add_fix(Position(ping.lat_deg, ping.lon_deg))
-
-    def _add_used_channels(self, ping: Ping) -> None:
-        """Add the channels that images and detection use: the first one of each side."""
-        used = [channel for side in Side if (channel := ping.channel(side)) is not None]
-        self.pings_with_more_channels += len(used) < len(ping.channels)
-        for channel in used:
-            self._extend("used_slant_range_m", channel.slant_range_m)
-            if channel.frequency_hz is not None and len(self.used_frequencies_hz) < _MAX_VALUES:
-                self.used_frequencies_hz.add(channel.frequency_hz)
-
-    def warnings(self, total: int) -> list[str]:
-        """Return a warning about the channel in use, if a side has more than one."""
-        used_m = self.ranges.get("used_slant_range_m", _Range()).pair()
-        if not self.pings_with_more_channels or used_m is None:
-            return []
-        frequencies = "".join(f", {hz / 1000:g} kHz" for hz in sorted(self.used_frequencies_hz))
-        ranges = " to ".join(dict.fromkeys(f"{range_m:g}" for range_m in used_m))
-        pings = f"several channels a side in {self.pings_with_more_channels} of {total} pings"
-        return [f"{pings}: images and contacts are of the first{frequencies}, slant range {ranges} m"]
 
     def hints(self, total: int) -> list[str]:
         """Return what is missing in the navigation, and its effect."""
@@ -149,7 +146,7 @@ class _Statistics:
         return hints
 
     def _extend(self, name: str, value: float | None) -> None:
-        self.ranges.setdefault(name, _Range()).add(value)
+        self.ranges.setdefault(name, _LongitudeRange() if name == "lon_deg" else _Range()).add(value)
 
     def _add_fix(self, position: Position) -> None:
         self.fixes += 1
@@ -189,13 +186,17 @@ def describe(source: SurveySource) -> dict[str, object]:
         "track_m": round(statistics.track_m, 1),
         **_stored_coordinates(info.grid),
         **ranges,
-        "warnings": [*info.warnings, *statistics.warnings(info.ping_count)],
+        "channel_sets": [
+            {"frequency_hz": each.frequency_hz, "range_m": each.range_m, "pings": each.ping_count}
+            for each in info.channel_sets
+        ],
+        "warnings": list(info.warnings),
         "hints": [*projection_hints(source, statistics.fixes), *statistics.hints(info.ping_count)],
     }
 
 
 def _stored_coordinates(grid: GridExtent | None) -> dict[str, object]:
-    """Return the coordinates of a file in metres, as they are stored."""
+    """Return the projected coordinates of a file, in metres."""
     if grid is None:
         return dict.fromkeys(_GRID)
     axes = ("easting", "northing")
@@ -207,7 +208,7 @@ def _stored_coordinates(grid: GridExtent | None) -> dict[str, object]:
 
 
 def projection_hints(source: SurveySource, fixes: int) -> list[str]:
-    """Return which projection a file in metres can have, if it has no positions without one."""
+    """Return which projection a file with projected positions can have, if it has no positions in degrees."""
     grid, crs = source.info.grid, source.options.projected_crs
     if grid is None or fixes:
         return []
@@ -216,7 +217,8 @@ def projection_hints(source: SurveySource, fixes: int) -> list[str]:
         return [f"{crs} has no position for these eastings and northings: it is not the projection of this file"]
     if max(abs(west_m), abs(east_m)) <= 180 and max(abs(south_m), abs(north_m)) <= 90:
         return ["the positions look like degrees, but NavUnits (byte 164 of the file) is 0 for metres: write 3 there"]
-    name = "positions are in metres: name their projection with --crs EPSG:N (see the recorder's settings)"
+    settings = "(see the recorder's settings; it may be in feet)"
+    name = f"positions are projected, shown as if in metres: name their projection with --crs EPSG:N {settings}"
     utm = [
         f"EPSG:{code}ZZ at latitude {abs(position.lat_deg):.1f} {letter}"
         for code, letter in (("326", "N"), ("327", "S"))
