@@ -41,7 +41,6 @@ LISTS = (
     "sort=confidence&limit=100&offset=2500",
     "review=unreviewed&sort=arrived&order=asc&limit=100",
     "q=00A&limit=100",
-    "min_confidence=1.2&sort=confidence&limit=100",
 )
 
 

@@ -16,6 +16,7 @@ import statistics
 import tempfile
 import time
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import zenoh
 from playwright.sync_api import Page, sync_playwright
@@ -30,6 +31,7 @@ from sonarpost.services.console.service import ConsoleService
 from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.training.contacts import simulated_contacts
 from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator
+from sonarpost.services.console.web.access import COOKIE, cookie_name
 
 # Time of the first row, in ms since the start of the navigation; time of an awaited change, in ms since 1970.
 WATCH = """() => {
@@ -52,6 +54,7 @@ WATCH = """() => {
   });
 }"""
 ROW = "document.querySelector('.row[data-id*=\".' + argument + '\"]')"
+TO_TOP = "document.getElementById('queue').scrollTop = 0"  # the list keeps the selected row in sight
 IMAGE = "document.querySelector('canvas').dataset.shows?.includes(argument)"
 
 
@@ -80,7 +83,9 @@ def main() -> None:
         browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
         context = browser.new_context(viewport={"width": 1366, "height": 768})
         token = users.start_session("bench").token
-        context.add_cookies([{"name": "sonarpost_session", "value": token, "url": service.address}])
+        context.add_cookies(
+            [{"name": cookie_name(COOKIE, urlsplit(service.address).netloc), "value": token, "url": service.address}]
+        )
         page = context.new_page()
         page.add_init_script(f"({WATCH})()")
         try:
@@ -108,8 +113,9 @@ def measure(page: Page, address: str, session: zenoh.Session, changes: int) -> N
     for number in range(changes):
         image_id = f"Z{number:03d}"
         record = first.model_copy(update={"image_id": image_id, "first_frame_utc_s": time.time()})
+        page.evaluate(TO_TOP)
         rows.append(published_to(page, session, record, ROW, image_id))
-    page.evaluate("document.getElementById('queue').scrollTop = 0")
+    page.evaluate(TO_TOP)
     page.click(f".row[data-id*='.{image_id}']")
     page.wait_for_function("id => document.querySelector('canvas').dataset.shows?.includes(id)", arg=image_id)
     for version in range(2, changes + 2):

@@ -142,6 +142,7 @@ class MissionResult:
         left: Images and messages still queued at the end.
         expired: Messages deleted after their lifetime.
         frames_sent: Frames sent by the vehicles.
+        packets_sent: Packets sent by the vehicles.
         state_bytes: State of all queues and the receiver, every hour.
         restarts: Number of restarts of a vehicle.
     """
@@ -154,6 +155,7 @@ class MissionResult:
     left: int
     expired: int
     frames_sent: int
+    packets_sent: int
     state_bytes: Sequence[int]
     restarts: int
 
@@ -288,7 +290,7 @@ def run_mission(spec: MissionSpec) -> MissionResult:
     cycle_s = (spec.vehicles + 1) * _SLOT_S
     slots = [Tdma(cycle_s, n * _SLOT_S, _SLOT_S, _GUARD_S) for n in range(spec.vehicles)]
     receiver = V1Receiver(ReceiverConfig(max_sources=16))
-    now, hour, restarts = 0.0, 0, 0
+    now, hour, restarts, packets = 0.0, 0, 0, 0
     state_bytes: list[int] = []
     while now < spec.hours * _HOUR_S:
         if now >= hour * _HOUR_S:
@@ -302,6 +304,7 @@ def run_mission(spec: MissionSpec) -> MissionResult:
             packet = vehicle.queue.next_packet(now)
             now += RATES[_RATE].airtime_s
             frames = packet.frames if packet else ()
+            packets += packet is not None
             for frame in frames:
                 if not mission.channel.loses(vehicle.address):
                     for event in receiver.accept(vehicle.address, frame, now):
@@ -320,6 +323,7 @@ def run_mission(spec: MissionSpec) -> MissionResult:
         left=sum(len(v.queue.open_numbers()) + len(v.queue.messages.waiting) for v in vehicles),
         expired=sum(v.queue.messages.expired for v in vehicles),
         frames_sent=sum(v.queue.sender.state.frames_sent for v in vehicles),
+        packets_sent=packets,
         state_bytes=state_bytes,
         restarts=restarts,
     )
@@ -385,8 +389,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"{'':12} {'offered':>8} {'arrived':>8} {'median s':>9} {'longest s':>10}")
     for name, traffic in (*result.messages.items(), ("previews", result.previews), ("images", result.images)):
         print(_line(name, traffic))
-    airtime_s = result.frames_sent / RATES[_RATE].frames * RATES[_RATE].airtime_s
-    print(f"{airtime_s:.0f} s of air time for frames of the vehicles; {result.stopped} images stopped by a verdict")
+    airtime_s = result.packets_sent * RATES[_RATE].airtime_s
+    print(f"{airtime_s:.0f} s of air time of the vehicles; {result.stopped} images stopped by a verdict")
     print(f"{result.frames_sent} frames sent, {result.restarts} restarts, {result.expired} messages expired")
     print(f"{result.left} left; state {max(result.state_bytes) / 1000:.0f} kB at most")
     return 0

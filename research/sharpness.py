@@ -20,6 +20,7 @@ from scipy.ndimage import gaussian_filter
 
 from research.common.command import command_parser, report_progress, run_command
 from research.common.images import simulated_images
+from sonarpost.codec import emb
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.review.resolution import FULL_WIDTH
 
@@ -54,7 +55,7 @@ def blur_sigma_px(scene: Image, decoded: Image) -> float:
 def measure(images: int, budgets: Sequence[int]) -> list[tuple[float, float]]:
     """Return (bytes a pixel, median of the smallest detail in pixels) for each length."""
     samples = [sample for sample in simulated_images(images, with_scenes=True).images if sample.clean is not None]
-    codec = EmbCodec()
+    codec = EmbCodec(strength=emb.DEFAULT_STRENGTH)
     table: list[tuple[float, float]] = []
     for budget in budgets:
         widths: list[float] = []
