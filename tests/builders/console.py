@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from http.client import HTTPResponse
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx2
 import numpy as np
@@ -21,6 +22,7 @@ import numpy.typing as npt
 import pytest
 from starlette.testclient import TestClient
 
+from builders.common import eventually
 from builders.records import reconstructed_image
 from sonarpost import keys, wire
 from sonarpost.config import TlsConfig
@@ -41,6 +43,7 @@ from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import ContactFilter
 from sonarpost.services.console.store.database import Database
 from sonarpost.services.console.store.users import Users
+from sonarpost.services.console.web.access import COOKIE, cookie_name
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 PASSWORD = "correct horse battery"
@@ -243,13 +246,24 @@ class Browser:
         body = {"decision_id": decision_id, **self.displayed(contact_id), **changes}
         return self.post(f"/api/contacts/{contact_id}/undo", body)
 
+    def chart(self) -> dict[str, dict[str, Any]]:
+        """Contacts on the map by image identifier."""
+        found = self.get("/api/map").json()
+        contacts = [dict(zip(found["columns"], row, strict=True)) for row in found["contacts"]]
+        return {one["name"].rpartition("/")[2]: one for one in contacts}
+
     def rows(self, **parameters: Any) -> dict[str, Any]:
         """Rows of the list of contacts by image identifier, in its order."""
         return {row["image_id"]: row for row in self.get("/api/contacts", **parameters).json()["items"]}
 
 
+def session_cookie(address: str) -> str:
+    """The name of the session's cookie of the console at an address."""
+    return cookie_name(COOKIE, urlsplit(address).netloc)
+
+
 class EventReader:
-    """Reads the event stream in a thread, as an open page does.
+    """Reads the event stream in a thread, as an open page does; events after the construction are received.
 
     Args:
         address: URL of the server.
@@ -263,12 +277,14 @@ class EventReader:
         self, address: str, token: str, query: str = "", context: ssl.SSLContext | None = None, **headers: str
     ) -> None:
         request = urllib.request.Request(
-            f"{address}events{query}", None, {"Cookie": f"sonarpost_session={token}", **headers}
+            f"{address}events{query}", None, {"Cookie": f"{session_cookie(address)}={token}", **headers}
         )
         self._stream: HTTPResponse = urllib.request.urlopen(request, timeout=60, context=context)
         self.events: list[tuple[str, str, Any]] = []
         self.ended = False
         threading.Thread(target=self._read, daemon=True).start()
+        # The answer comes before the stream is subscribed, its first event after.
+        eventually(lambda: bool(self.events) or self.ended, what="first event")
 
     def _read(self) -> None:
         identifier = name = ""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import tempfile
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,9 +14,9 @@ from builders.records import decision_record, reconstructed_image
 from sonarpost.archive.image_files import write_image
 from sonarpost.archive.shore_files import decision_file_name
 from sonarpost.export.contacts import ContactSet
-from sonarpost.export.cot import cot_events
-from sonarpost.export.kml import kml_bytes
-from sonarpost.export.tables import csv_bytes, geojson_bytes
+from sonarpost.export.formats import FORMATS
+from sonarpost.export.source import ExportSource, StoredImages
+from sonarpost.export.tak.cot import cot_events
 from sonarpost.messages import Contact, Decision, Pixels, ReconstructedImage
 from sonarpost.review.measured_size import SIZE_FIELDS
 
@@ -136,12 +138,20 @@ NEWER["mission"] = ("authenticated", *NEWER["authenticated"])
 """The last properties of contacts, which the golden files of a mission do not have because they are older."""
 
 
+def export(name: str, contacts: ContactSet, images: StoredImages | None = None) -> bytes:
+    """Return the contacts in a format."""
+    file = io.BytesIO()
+    path = Path(tempfile.gettempdir()) / f"contacts.{name}"
+    FORMATS[name].write(file, ExportSource(contacts, images or StoredImages(), path))
+    return file.getvalue()
+
+
 def golden_files(name: str, contacts: ContactSet) -> dict[str, bytes]:
     """Return all text exports of a mission by the name of their golden file."""
     return {
-        f"{name}.geojson": geojson_bytes(contacts),
-        f"{name}.kml": kml_bytes(contacts),
-        f"{name}.csv": csv_bytes(contacts),
+        f"{name}.geojson": export("geojson", contacts),
+        f"{name}.kml": export("kml", contacts),
+        f"{name}.csv": export("csv", contacts),
         f"{name}.cot": b"\n".join(cot_events(contacts, FIRST_UTC_S + 3600)) + b"\n",
     }
 

@@ -113,7 +113,7 @@ class Bench:
 
     def new_driver(self, number: int) -> Modem:
         """Return a new driver of a station."""
-        return modem_driver(self.subject.driver).create(ModemSettings(number), "test port")
+        return modem_driver(self.subject.driver).create(ModemSettings(number, stream=True), "test port")
 
     def later(self, delay_s: float, action: Callable[[], None]) -> None:
         """Do something after a delay."""

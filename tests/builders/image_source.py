@@ -36,11 +36,11 @@ class ImageSource(Service[ServiceConfig]):
 
     def __init__(self, platform, acknowledged):
         super().__init__(platform, ServiceConfig())
-        self._acknowledged = acknowledged
+        self._on_stored = acknowledged
 
     def on_acknowledged(self, tx, item, reason):
         if reason is None:
-            self._acknowledged(wire.decode(ReconstructedImage, item.payload, item.key))
+            self._on_stored(wire.decode(ReconstructedImage, item.payload, item.key))
 
     def handle(self, key, record, effects):
         raise AssertionError("the source consumes nothing")

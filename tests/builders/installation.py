@@ -14,12 +14,9 @@ import pytest
 
 from builders.common import REPOSITORY
 
-NOBODY = 65534
-# The interpreter may be in the home folder of root. The capability permits reading files, not writing them.
-AS_NOBODY = (
-    *("setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups"),
-    *("--inh-caps=-all,+dac_read_search", "--ambient-caps=-all,+dac_read_search"),
-)
+# Root without capabilities cannot write files without the bit for it; it can read an interpreter in its home folder.
+UNPRIVILEGED = ("setpriv", "--bounding-set=-all", "--inh-caps=-all")
+WRITE = "import sonarpost; open(sonarpost.__file__, 'a')"
 
 
 class Installation:
@@ -27,7 +24,7 @@ class Installation:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._prefix = AS_NOBODY if os.getuid() == 0 else ()
+        self._prefix = UNPRIVILEGED if os.getuid() == 0 else ()
         copied = shutil.ignore_patterns("__pycache__")
         shutil.copytree(REPOSITORY / "common" / "sonarpost", folder / "sonarpost", ignore=copied)
         self.protect()
@@ -38,7 +35,8 @@ class Installation:
 
     def environment(self, **extra: str) -> dict[str, str]:
         kept = {name: value for name, value in os.environ.items() if name not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
-        return {**kept, "HOME": "/nonexistent", "PYTHONPATH": str(self._folder), "OMP_NUM_THREADS": "1", **extra}
+        home = str(self._folder / "no-home")
+        return {**kept, "HOME": home, "PYTHONPATH": str(self._folder), "OMP_NUM_THREADS": "1", **extra}
 
     def command(self, *arguments: str) -> list[str]:
         return [*self._prefix, sys.executable, *arguments]
@@ -54,15 +52,11 @@ class Installation:
 
 @pytest.fixture
 def installation() -> Iterator[Installation]:
-    if os.getuid() == 0:
-        probe = [*AS_NOBODY, sys.executable, "-c", "import os; os.mkdir('/nonexistent')"]
-        if (
-            shutil.which("setpriv") is None
-            or b"PermissionError" not in subprocess.run(probe, check=False, capture_output=True).stderr
-        ):
-            pytest.skip("cannot run the interpreter as user nobody: setpriv is missing or has no capability to pass on")
     with tempfile.TemporaryDirectory() as name:
         installed = Installation(Path(name))
+        refused = installed.run("-c", WRITE)
+        if "PermissionError" not in refused.stderr:
+            pytest.skip(f"cannot start the interpreter without privileges: {refused.stderr}")
         yield installed
         for folder in [Path(name), *Path(name).rglob("*")]:
             if folder.is_dir():

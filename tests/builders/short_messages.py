@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import binascii
 import json
 
 from sonarpost.bearers.short_message import (
@@ -83,6 +84,11 @@ def decision(decision_id: str = "d1", **changes: object) -> Decision:
         "decided_utc_s": 1_700_000_300.0,
     }
     return Decision.model_validate(fields | changes)
+
+
+def with_crc(body: bytes) -> bytes:
+    """Return a message with its CRC."""
+    return body + binascii.crc_hqx(body, 0xFFFF).to_bytes(2, "big")
 
 
 def golden() -> dict[str, str]:

@@ -104,10 +104,16 @@ def make_waterfall(survey: Survey, folder: Path, *, tiff: bool = False) -> Path:
 
 
 def lowrance_frame(version: int, offset: int, samples: bytes, channel: int = 5, **values: float) -> bytes:
-    """Return the frame at an offset of an SL2 or SL3 file; values are fields in the units of the format."""
-    head = bytearray(168 if version == 3 else 144)
+    """Return the frame at an offset of an SL2 or SL3 file; values are fields in the units of the format.
+
+    The size of its header, `header_bytes`, is by default that of SL2 or of `frame_version` 10 of SL3.
+    """
+    head = bytearray(int(values.get("header_bytes", 168 if version == 3 else 144)))
     size = len(head) + len(samples)
-    places = (8, 12, 44, 16, 20, 40, 84, 92, 112, 124) if version == 3 else (28, 32, 34, 36, 40, 60, 100, 108, 128, 140)
+    places = {
+        2: (28, 32, 34, 36, 40, 60, 100, 108, 120, 128, 140),
+        3: (8, 12, 44, 16, 20, 40, 84, 92, 104, 112, 124),
+    }[version]
     fields: tuple[tuple[str, tuple[float, ...]], ...] = (
         ("H", (size,)),
         ("H", (channel,)),
@@ -117,17 +123,18 @@ def lowrance_frame(version: int, offset: int, samples: bytes, channel: int = 5, 
         ("I", (values.get("time_s", 1_378_847_588),)),
         ("f", (values.get("speed", 0.0),)),
         ("ii", (values.get("east", 0), values.get("north", 0))),
+        ("f", (values.get("course", 0.0),)),
         ("f", (values.get("heading", 0.0),)),
         ("i", (values.get("ms", 0),)),
     )
-    struct.pack_into("<I", head, 0, offset)
+    struct.pack_into("<II", head, 0, offset & 0xFFFFFFFF, int(values.get("frame_version", 10)) if version == 3 else 0)
     for place, (kind, content) in zip(places, fields, strict=True):
         struct.pack_into("<" + kind, head, place, *content)
     return bytes(head) + samples
 
 
-def make_lowrance(survey: Survey, folder: Path, version: int = 3) -> Path:
-    """Write a composite recording; every ping follows a frame of the primary channel."""
+def make_lowrance(survey: Survey, folder: Path, version: int = 3, **fields: float) -> Path:
+    """Write a composite recording; every ping follows a frame of the primary channel. `fields` are those of all."""
     polar_radius_m = 6_356_752.3142
     started_s = int(survey.pings[0].time_utc_s)
     content = bytearray(struct.pack("<4H", version, 2, 3200, 1))
@@ -138,8 +145,10 @@ def make_lowrance(survey: Survey, folder: Path, version: int = 3) -> Path:
             "speed": ping.speed_mps * 3600 / 1852,
             "east": round(math.radians(ping.lon_deg) * polar_radius_m),
             "north": round(polar_radius_m * math.asinh(math.tan(math.radians(ping.lat_deg)))),
-            "heading": math.radians(ping.heading_deg) - 2 * math.pi,
+            "course": math.radians(ping.course_deg or 0.0),
+            "heading": 0.0 if ping.heading_deg is None else math.radians(ping.heading_deg) - 2 * math.pi,
             "ms": round((ping.time_utc_s - started_s) * 1000),
+            **fields,
         }
         port, starboard = (ping.channel(side).samples.astype(np.uint8) for side in (Side.PORT, Side.STARBOARD))
         content += lowrance_frame(version, len(content), bytes(16), channel=0, **values)
@@ -161,16 +170,18 @@ def jsf_message(number: int, subsystem: int, channel: int, samples: np.ndarray, 
         subsystem: 20, 21 or 22 for side-scan.
         channel: 0 port, 1 starboard.
         samples: Envelope, shape (n,); or analytic, complex.
-        values: `protocol` and the fields below.
+        values: `protocol` and the fields below; `start` and `end` of the chirp may have more than 16 bits.
     """
     head = bytearray(240)
     analytic = np.iscomplexobj(samples)
+    start, end = (int(values.pop(name, default)) for name, default in (("start", 39_000), ("end", 41_000)))
     parts = np.stack([samples.real, samples.imag], axis=1) if analytic else samples
     fields: tuple[tuple[int, str, str, float], ...] = (
         (0, "i", "seconds", 1_378_847_588),
         (4, "I", "lead", 0),
-        (16, "H", "msb", (len(samples) >> 16) << 8),
+        (16, "H", "msb", start >> 16 | end >> 16 << 4 | len(samples) >> 16 << 8),
         (18, "H", "lsb", 0),
+        (20, "H", "lsb2", 0),
         (30, "H", "valid", 0b1001101101),
         (34, "h", "kind", int(analytic)),
         (80, "i", "x", 0),
@@ -187,11 +198,13 @@ def jsf_message(number: int, subsystem: int, channel: int, samples: np.ndarray, 
         (172, "H", "heading", 0),
         (174, "h", "pitch", 0),
         (176, "h", "roll", 0),
+        (192, "h", "course", 0),
         (194, "h", "speed", 0),
         (200, "I", "day_ms", 0),
+        (228, "f", "layback", 0),
     )
     struct.pack_into("<I", head, 8, number)
-    struct.pack_into("<HH", head, 126, 39_000, 41_000)
+    struct.pack_into("<HH", head, 126, start & 0xFFFF, end & 0xFFFF)
     for offset, kind, name, default in fields:
         struct.pack_into("<" + kind, head, offset, values.get(name, default))
     content = bytes(head) + parts.astype("<i2" if analytic else "<u2").tobytes()
@@ -296,23 +309,28 @@ def svlog_packet(kind: int, payload: bytes) -> bytes:
     return packet + struct.pack("<H", sum(packet) & 0xFFFF)
 
 
-def svlog_session(timestamp: str = "2013-09-10T21:13:00+00:00", os_uptime: float = 1000.0) -> bytes:
+def svlog_session(timestamp: str = "2013-09-10T21:13:00+00:00", os_uptime: float | None = 1000.0) -> bytes:
     """Return the session packet (10)."""
     return svlog_packet(10, json.dumps({"timestamp": timestamp, "os_uptime": os_uptime}).encode())
 
 
-def svlog_position(lat_deg: float, lon_deg: float, heading_deg: float, speed_mps: float) -> bytes:
-    """Return a packet (150) with a MAVLink message GLOBAL_POSITION_INT."""
-    message = {
-        "type": "GLOBAL_POSITION_INT",
-        "lat": round(lat_deg * 1e7),
-        "lon": round(lon_deg * 1e7),
-        "hdg": round(heading_deg * 100),
-        "vx": round(speed_mps * 100),
-        "vy": 0,
-        "time_boot_ms": 1,
-    }
-    return svlog_packet(150, json.dumps({"header": {}, "message": message}).encode())
+def svlog_mavlink(kind: str, **values: float) -> bytes:
+    """Return a packet (150) with a MAVLink message."""
+    return svlog_packet(150, json.dumps({"header": {}, "message": {"type": kind, **values}}).encode())
+
+
+def svlog_position(lat_deg: float, lon_deg: float, heading_deg: float, speed_mps: float, boot_ms: int = 1) -> bytes:
+    """Return a packet with the message GLOBAL_POSITION_INT of a vehicle that moves ahead."""
+    heading_rad = math.radians(heading_deg)
+    return svlog_mavlink(
+        "GLOBAL_POSITION_INT",
+        lat=round(lat_deg * 1e7),
+        lon=round(lon_deg * 1e7),
+        hdg=round(heading_deg * 100),
+        vx=round(speed_mps * 100 * math.cos(heading_rad)),
+        vy=round(speed_mps * 100 * math.sin(heading_rad)),
+        time_boot_ms=boot_ms,
+    )
 
 
 def svlog_profile(number: int, clock_ms: int, channel: int, results: np.ndarray, **values: float) -> bytes:
@@ -321,9 +339,10 @@ def svlog_profile(number: int, clock_ms: int, channel: int, results: np.ndarray,
     Args:
         number: Ping number.
         clock_ms: Clock of the sonar.
-        channel: 0 port, 1 starboard.
+        channel: Channel number.
         results: Values of 16 bits between the least and the greatest decibel, shape (n,).
-        values: `start_mm`, `length_mm`, `max_db`, `min_db`, `heading`, `count`.
+        values: `start_mm`, `length_mm`, `max_db`, `min_db`, `look_angle`, `heading`, `count`. The default look angle is
+            that of port for channel 0, of starboard for channel 1.
     """
     head = struct.pack(
         "<5I3HBx6f",
@@ -340,7 +359,7 @@ def svlog_profile(number: int, clock_ms: int, channel: int, results: np.ndarray,
         10.0,
         values.get("max_db", 48.0),
         values.get("min_db", 0.0),
-        0.0,
+        values.get("look_angle", {0: -90.0, 1: 90.0}.get(channel, 0.0)),
         values.get("heading", 0.0),
     )
     return svlog_packet(2198, head + results.astype("<u2").tobytes())

@@ -1,4 +1,4 @@
-"""Surveys of dual-frequency sonars: a second channel on each side that shows only speckle."""
+"""Surveys of dual-frequency sonars: a second channel on each side, of a lower frequency, that shows only speckle."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
-FIRST_HZ, SECOND_HZ = 400e3, 900e3
+FIRST_HZ, SECOND_HZ = 900e3, 400e3
 
 
 def with_second_frequency(survey: Survey, samples: int, range_m: float) -> Survey:
@@ -20,8 +20,8 @@ def with_second_frequency(survey: Survey, samples: int, range_m: float) -> Surve
 
     def channels(ping: Ping) -> tuple[ChannelPing, ...]:
         noise = {c.side: (rng.rayleigh(0.8, samples) * 2000).astype(np.uint16) for c in ping.channels}
-        high = (ChannelPing(side, noise[side], range_m, SECOND_HZ) for side in Side if side in noise)
-        return (*(replace(c, frequency_hz=FIRST_HZ) for c in ping.channels), *high)
+        second = (ChannelPing(side, noise[side], range_m, SECOND_HZ) for side in Side if side in noise)
+        return (*(replace(c, frequency_hz=FIRST_HZ) for c in ping.channels), *second)
 
     return replace(survey, pings=tuple(replace(ping, channels=channels(ping)) for ping in survey.pings))
 
@@ -40,5 +40,5 @@ def files_of(survey: Survey, folder: Path, samples: int, range_m: float) -> tupl
 def read_both(survey: Survey, folder: Path, samples: int, range_m: float) -> tuple[Survey, Survey]:
     """Return the survey read from the file of its first frequency alone, and from the file of both."""
     alone, both = (read_survey(path) for path in files_of(survey, folder, samples, range_m))
-    assert {len(p.channels) for p in both.pings} == {2 * len(p.channels) for p in alone.pings}
+    assert "2 channel sets" in both.warnings[-1]
     return alone, both

@@ -9,7 +9,15 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from builders.console import Console, console, contact_ids, fast_password_hashes, make_console, users_file
+from builders.console import (
+    Console,
+    console,
+    contact_ids,
+    fast_password_hashes,
+    make_console,
+    session_cookie,
+    users_file,
+)
 from playwright.sync_api import (
     Browser,
     BrowserContext,
@@ -60,12 +68,17 @@ class Browsers:
         if path is None:
             pytest.skip(f"no {name}: apt-get install {COMMANDS[name][-1]}, or set SONARPOST_{name.upper()}")
         if name == "firefox":
-            return playwright.firefox.launch(channel="moz-firefox", executable_path=path)
+            preferences = {"widget.gtk.overlay-scrollbars.enabled": False, "ui.useOverlayScrollbars": 0}
+            return playwright.firefox.launch(
+                channel="moz-firefox", executable_path=path, firefox_user_prefs=preferences
+            )
         # Chromium's sandbox does not run as root, for example in containers.
         arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
         # Only the local host can be resolved.
         arguments += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
-        return playwright.chromium.launch(executable_path=path, args=arguments)
+        # Scroll bars take space, as in the browsers of operators.
+        hidden = ["--hide-scrollbars"]
+        return playwright.chromium.launch(executable_path=path, args=arguments, ignore_default_args=hidden)
 
     def close(self) -> None:
         for browser in self._browsers.values():
@@ -153,6 +166,30 @@ class Visit:
         for key in keys:
             self.page.keyboard.press(key)
 
+    def decide(self, key: str) -> None:
+        """Press a verdict key after the picture has been in sight for the time from which verdicts count."""
+        self.wait(".decision[data-ready=true]")
+        self.press(key)
+
+    def open_dialog(self, name: str) -> None:
+        """Open a dialog by its item of the menu in the header, or by its key."""
+        if len(name) == 1:
+            self.press(name)
+        else:
+            self.page.locator(f"#bar [data-item={name}]").dispatch_event("click")
+        self.wait("dialog[open]")
+
+    def set_appearance(self, *, theme: str = "", size: str = "") -> None:
+        """Set theme (`day`, `night`) and type size (`normal`, `large`) as the menu of the header does."""
+        self.page.evaluate(
+            """async ([theme, size]) => {
+              const { setTheme, setTypeSize } = await import('/static/js/shell/header.js');
+              if (theme) setTheme(theme);
+              if (size) setTypeSize(size);
+            }""",
+            [theme, size],
+        )
+
     def text(self, selector: str) -> str:
         return self.page.locator(selector).first.inner_text()
 
@@ -217,7 +254,7 @@ def visit(browser: Browser) -> Iterator[Callable[..., Visit]]:
         context = browser.new_context(**(defaults | options))
         contexts.append(context)
         if token:
-            context.add_cookies([{"name": "sonarpost_session", "value": token, "url": address}])
+            context.add_cookies([{"name": session_cookie(address), "value": token, "url": address}])
         visits.append(Visit(context, address))
         visits[-1].load(address + path)
         if token and not path:

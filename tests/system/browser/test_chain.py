@@ -110,23 +110,23 @@ def test_contact_is_received_measured_and_decided(
     assert shares[-1].startswith("sent ")
     assert operator.pixels() > 1000
     # Measure the shadow, and decide with one key.
-    operator.press("6", "Enter", *["Shift+ArrowRight"] * 4, "Enter")
+    # The range of this image rises downwards: it is turned so that it fills its stage.
+    operator.press("m", "m", "m", "Enter", *["Shift+ArrowDown"] * 4, "Enter")
     operator.wait(".size-panel >> text=±")
     operator.press("Enter")
     operator.wait('details[data-name="measurements"] >> text=height')
-    operator.press("1")
+    operator.decide("1")
     # The decision is delivered to shore site and vehicle, and the page shows it.
     eventually(lambda: len(autonomy.received) == 1 and len(at_shore) == 1, what="the decision at shore and vehicle")
     for record in (*at_shore, *autonomy.received):
         assert (record.vehicle_id, record.image_id, record.verdict) == ("uuv-1", "0007", "mine_like")
     assert at_shore[0].operator == "anna"
-    operator.wait('.progress >> text="at the shore site"')
-    operator.wait(".progress >> text=on the vehicle")
+    operator.wait(".standing [title='at the shore site']")
+    operator.wait(".standing [title^='on the vehicle']")
     # The image is complete. A revisit is requested after its cost was displayed.
     operator.press("r")
-    operator.wait("dialog .costs input[value=refine]:checked")
-    operator.press("ArrowDown")
-    operator.wait("dialog .costs input[value=revisit]:checked")
+    operator.wait("[data-request=refine]:focus")
+    operator.page.locator("[data-request=revisit]").focus()
     operator.press("Enter")
     eventually(lambda: len(autonomy.received) == 2, what="the command on the vehicle")
     assert autonomy.received[1].kind == "revisit"

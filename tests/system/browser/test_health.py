@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
+from dataclasses import asdict
 
 import pytest
 import zenoh
 from builders.common import eventually, free_port
-from builders.console import VESSEL, contact_ids, encoded_health, image_record, received_frame
+from builders.console import VESSEL, encoded_health, image_record, received_frame
 from builders.services import modem_pair, runner
 
 from sonarpost.bus.session import router_config
@@ -93,6 +94,21 @@ def test_each_lost_place_is_named_in_the_chain_and_in_a_banner(vessel):
     visit.until("() => !document.getElementById('chain').open")
 
 
+def test_unauthenticated_site_is_stated_once_in_the_header(vessel):
+    for image_id in ("0001", "0002"):
+        vessel.state.store_image(image_record(image_id).model_copy(update={"authenticated": False}))
+    visit = vessel.visit()
+    visit.wait_for_contact("0002")
+    visit.wait("#unauthenticated >> text=unauthenticated")
+    visit.until("() => document.querySelectorAll('.row').length === 2")
+    # It is a setting of the site: no mark of a row or image, and not the cause of a fault.
+    assert visit.page.locator(".row .unauthenticated, #banners p").count() == 0
+    # Where other contacts are authenticated, those that are not have a mark.
+    vessel.state.store_image(image_record("0003").model_copy(update={"authenticated": True}))
+    visit.page.locator("#unauthenticated").wait_for(state="hidden")
+    visit.until("() => document.querySelectorAll('.row .unauthenticated').length === 2")
+
+
 def test_each_failure_of_running_services_is_named(platform, runner, modem_pair, tmp_path, visit):
     """A silent vehicle, an unplugged modem, an ended router and an ended server, each at its place on one open page."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -134,7 +150,7 @@ def test_page_whose_stream_is_refused_states_the_reason(vessel, monkeypatch):
     second.expect_errors("429", "establish a connection")
     second.wait(place("browser", "degraded"))
     banner = second.text("#offline")
-    assert "anna has 1 open pages" in banner
+    assert "You have too many open pages of the console" in banner
     assert "No connection" not in banner
     # The server is reached: it has refused the stream.
     assert second.page.locator(place("server", "lost")).count() == 0
@@ -172,11 +188,11 @@ def test_alert_for_an_arriving_contact_above_the_threshold(vessel):
     assert visit.page.evaluate("[window.tones, window.notes.length]") == [0, 0]
     visit.page.click("#alerts")
     visit.page.check("#alerts-on")
-    visit.page.select_option("#alerts-threshold", "1.2")
+    visit.page.select_option("#alerts-threshold", "1")
     visit.page.click('dialog [data-action="save"]')
-    visit.until("() => document.getElementById('alerts').title.includes('1.2')")
+    visit.until("() => document.getElementById('alerts').title.includes('from 1.0;')")
 
-    vessel.state.store_image(image_record("0003", atd_confidence=1.1))
+    vessel.state.store_image(image_record("0003", atd_confidence=0.9))
     visit.wait('.row[data-id*=".0003"]')
     vessel.state.store_image(image_record("0004", atd_confidence=1.25))
     visit.wait(ALERTED.format("0004"))
@@ -186,7 +202,8 @@ def test_alert_for_an_arriving_contact_above_the_threshold(vessel):
     assert visit.page.title().startswith("1 alert · (4)")
     # Neither another version nor a repeated event alerts again.
     vessel.state.store_image(image_record("0004", 2, atd_confidence=1.25))
-    vessel.state.publish_contact(contact_ids(vessel.state)["0004"], new=True)
+    contact = vessel.contact("0004")["contact"]
+    vessel.state.events.publish("contact", {"contact": contact, "new": True, **asdict(vessel.state.counts())})
     # The confidence of a contact can arrive after its first frame.
     vessel.state.store_image(image_record("0005", atd_confidence=None))
     vessel.state.store_image(image_record("0005", 2, atd_confidence=2.0))

@@ -1,4 +1,4 @@
-"""The image in a real browser: mark, axes, orientation, ground range, gain, loupe, measuring by dragging."""
+"""The image in a real browser: size, mark, axes, orientation, ground range, gain, loupe, measuring by dragging."""
 
 from __future__ import annotations
 
@@ -56,10 +56,17 @@ def drag(visit, start, end):
     visit.page.mouse.up()
 
 
-def uniform(image):
-    """The record with an image of constant grey 100, and one darker and one brighter pixel."""
-    pixels = np.full((40, 60), 100, np.uint8)
-    pixels[0, 0], pixels[0, 59] = 0, 255
+def tool(visit, name):
+    """A tool of the image; those that are used less are shown first."""
+    if visit.page.locator(f"[data-tool={name}]").count() == 0:
+        visit.page.locator("[data-tool=more]").click()
+    return visit.page.locator(f"[data-tool={name}]")
+
+
+def uniform(image, height_px=40, width_px=60):
+    """The record with an image of grey 100, and a black and a white pixel: automatic gain keeps the levels."""
+    pixels = np.full((height_px, width_px), 100, np.uint8)
+    pixels[0, 0], pixels[0, -1] = 0, 255
     return with_pixels(image, pixels)
 
 
@@ -86,15 +93,15 @@ def test_nothing_is_marked_where_the_place_is_unknown(served):
     assert visit.page.evaluate(MARK_PIXELS) == 0
     assert "nadir side unknown" in description(visit)
     assert "contact marked" not in description(visit)
-    assert visit.page.locator("[data-tool=ground]").get_attribute("aria-disabled") == "true"
-    visit.press("b")
+    assert tool(visit, "ground").get_attribute("aria-disabled") == "true"
+    tool(visit, "ground").dispatch_event("click")
     visit.wait("#toasts >> text=No ground range")
 
 
 def test_ground_range_view_has_the_computed_width(served):
     visit = opened(served, image_record("00A7", **NEAR))
     assert dataset(visit, "extent") == pytest.approx([1.2, 2.0])
-    visit.press("b")
+    tool(visit, "ground").click()
     visit.until("() => /ground range, m/.test(document.querySelector('.stage canvas').ariaDescription)")
     [version] = served.contact()["versions"]
     mark = version["mark"]
@@ -102,7 +109,7 @@ def test_ground_range_view_has_the_computed_width(served):
     expected = math.sqrt(last**2 - 8.0**2) - math.sqrt(first**2 - 8.0**2)
     assert expected > 1.5 * 1.2
     assert dataset(visit, "extent") == pytest.approx([expected, 2.0], abs=0.01)
-    visit.press("b")
+    tool(visit, "ground").click()
     visit.until("() => /slant range, m/.test(document.querySelector('.stage canvas').ariaDescription)")
 
 
@@ -129,35 +136,81 @@ def test_view_from_above_and_north_up_have_the_true_handedness(served, side):
     assert dataset(visit, "mark") == before
 
 
-def test_gamma_black_point_and_white_point_change_the_pixels(served):
+def test_gain_changes_the_pixels_and_auto_restores_it(served):
     visit = opened(served, uniform(image_record("00A7")))
     visit.expect_errors("willReadFrequently")
-    visit.press("#")
+    tool(visit, "grid").click()
     centre = [sum(axis) / 4 for axis in zip(*dataset(visit, "mark"), strict=True)]
     point = [centre[0] - 3, centre[1] - 3]
+    pressed = "() => document.querySelector('[data-tool=auto]').ariaPressed === "
 
     def grey():
         return visit.page.evaluate(GREY, point)[0]
 
-    visit.press("I")
-    visit.wait("#level-gamma", state="visible")
-
-    def level(name, value):
-        visit.page.locator(f"#level-{name}").evaluate(
-            "(input, value) => { input.value = value; input.dispatchEvent(new Event('input')); }", value
-        )
-
-    for name, value in (("low", 0), ("high", 100), ("gamma", 1)):
-        level(name, value)
+    # The image has levels from 0 to 255: the automatic gain leaves them.
     assert grey() == pytest.approx(100, abs=1)
-    level("gamma", 2)
-    assert grey() == pytest.approx(255 * math.sqrt(100 / 255), abs=2)
-    level("gamma", 1)
-    level("low", 20)
-    assert grey() == pytest.approx((100 - 51) / (255 - 51) * 255, abs=2)
-    assert visit.page.locator("[data-tool=auto]").get_attribute("aria-pressed") == "false"
-    visit.press("(")
-    assert float(visit.page.locator("#level-gamma").input_value()) < 1
+    visit.press(".", ".")
+    visit.until(f"{pressed} 'false'")
+    assert grey() == pytest.approx(100 / 0.9, abs=1)
+    visit.press(",", ",", ",", ",")
+    assert grey() == pytest.approx(100 / 1.1, abs=1)
+    visit.press("a")
+    visit.until(f"{pressed} 'true'")
+    assert grey() == pytest.approx(100, abs=1)
+
+
+# Height and width in pixels, and metres of a pixel, of the contacts of `sonarpost demo` and of training.
+SHAPES = {"demo": (80, 140, 0.1, 0.03), "training": (80, 140, 0.1, 30 / 512)}
+SHARE_OF_GREY = """() => {
+  const canvas = document.querySelector('.stage canvas');
+  const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  let count = 0;
+  for (let i = 0; i < data.length; i += 4) {
+    count += Math.abs(data[i] - 100) < 2 && data[i] === data[i + 1] && data[i + 3] === 255;
+  }
+  return count / (canvas.width / canvas.clientWidth) ** 2 / (innerWidth * innerHeight);
+}"""
+
+
+@pytest.mark.firefox
+@pytest.mark.parametrize("shape", SHAPES)
+def test_image_itself_fills_the_stage_and_what_qualifies_it_is_in_sight(served, shape):
+    height_px, width_px, along_m, across_m = SHAPES[shape]
+    fields = {"p_mine_like": 0.95, "p_other_object": 0.03, "position_sigma_m": 4.0, "heading_deg": 40.0}
+    for version in (1, 2):
+        record = image_record("00A7", version, pixel_along_m=along_m, pixel_across_m=across_m, **fields)
+        record = record.model_copy(update={"despeckle_strength": 1.0, "complete": version == 2})
+        served.state.store_image(uniform(record, height_px, width_px))
+    visit = served.visit()
+    visit.wait_for_contact("00A7")
+    visit.expect_errors("willReadFrequently")
+    tool(visit, "grid").click()
+    visit.page.locator("[data-tool=more]").click()
+    for size, least in (((1366, 768), 0.3), ((1920, 1080), 0.4), ((390, 844), 0.2)):
+        visit.resize(*size)
+        # Pixels under mark and north arrow do not count.
+        share = visit.page.evaluate(SHARE_OF_GREY)
+        print(f"{shape}, {size}: the image is {100 * share:.1f} % of the screen")  # shown by -rP
+        assert share >= least
+        heading, strip = visit.page.locator(".heading"), visit.page.locator(".strip")
+        words = heading.inner_text(), strip.inner_text()
+        for part in ("00A7", "2023-11-14 22:11:40 UTC", "N 005°", "± 4", "range 12", "altitude 5.0"):
+            assert part in words[0].replace("  ", " "), part
+        for part in ("200\u202fB", "sharp to", "despeckled", "image area missing 0", "mine-like 95\u202f%"):
+            assert part in words[1], part
+        for element in (heading, strip):
+            box = element.bounding_box()
+            assert box["x"] >= 0
+            assert box["x"] + box["width"] <= size[0]
+            # Firefox rounds heights to whole pixels.
+            hidden = element.evaluate("e => Math.max(e.scrollWidth - e.clientWidth, e.scrollHeight - e.clientHeight)")
+            assert hidden <= 1
+    # The arrow of north and the caption agree with a long image that lies along the screen.
+    visit.resize(1366, 768)
+    assert description(visit).startswith("▲ nadir" if shape == "demo" else "◀ nadir")
+    first, _, third, _ = dataset(visit, "mark")
+    # Turned clockwise: later rows are at the left, and larger ranges below.
+    assert (first[0] > third[0], first[1] < third[1]) == (shape == "demo", True)
 
 
 def test_pixels_that_are_not_square_are_interpolated_and_surroundings_dark(served):
@@ -170,24 +223,34 @@ def test_pixels_that_are_not_square_are_interpolated_and_surroundings_dark(serve
       for (let i = 4; i < data.length; i += 4) changes += data[i] !== data[i - 4];
       return changes;
     }"""
-    visit.press("#")
+    tool(visit, "grid").click()
     smooth = visit.page.evaluate(colours)
-    assert visit.page.locator("[data-tool=smooth]").get_attribute("aria-pressed") == "true"
-    visit.press("d")
+    assert tool(visit, "smooth").get_attribute("aria-pressed") == "true"
+    tool(visit, "smooth").click()
     assert visit.page.evaluate(colours) < smooth / 2
-    assert visit.page.locator("[data-tool=smooth]").get_attribute("aria-pressed") == "false"
-    for _theme in range(2):
+    assert tool(visit, "smooth").get_attribute("aria-pressed") == "false"
+    for theme in ("day", "night"):
+        visit.set_appearance(theme=theme)
         colour = visit.page.evaluate("getComputedStyle(document.querySelector('.stage')).backgroundColor")
         assert max(int(part) for part in colour[4:-1].split(",")) < 40
-        visit.press("t")
 
 
-def test_one_drag_measures_and_both_ends_can_be_moved(served):
-    visit = opened(served)
-    visit.press("4")
+def test_ends_of_a_drag_move_to_the_edges_and_can_be_moved(served):
+    # An object of rows 14 to 26 and columns 18 to 30.
+    pixels = np.full((40, 60), 60, np.uint8)
+    pixels[14:26, 18:30] = 200
+    visit = opened(served, with_pixels(image_record("00A7"), pixels))
+    visit.press("m")
     visit.wait(".hint >> text=next line is width")
-    left, right = dataset(visit, "mark")[0], dataset(visit, "mark")[2]
-    start, end = (left[0] + 40, left[1] + 30), (right[0] - 40, right[1] - 60)
+    # The corners of the mark are those of the box.
+    (left, top), _, (right, bottom), _ = dataset(visit, "mark")
+    box = served.contact()["versions"][0]["box"]
+
+    def point(row, column):
+        parts = [(at - low) / (high - low) for at, (low, high) in ((column, box["columns"]), (row, box["rows"]))]
+        return left + parts[0] * (right - left), top + parts[1] * (bottom - top)
+
+    start, end = point(12.0, 24.0), point(27.5, 24.0)
     visit.page.mouse.move(*at(visit, *start))
     visit.page.mouse.down()
     visit.page.mouse.move(*at(visit, *end))
@@ -197,33 +260,30 @@ def test_one_drag_measures_and_both_ends_can_be_moved(served):
     visit.page.mouse.up()
     visit.wait(".hint >> text=Enter keeps it")
     first = visit.text(".size[data-kind=length] b")
-    # Both ends can be moved.
-    moved = (end[0], end[1] + 40)
-    drag(visit, end, moved)
-    visit.until("text => document.querySelector('.size[data-kind=length] b').textContent !== text", first)
-    visit.wait(".hint >> text=Enter keeps it")
-    second = visit.text(".size[data-kind=length] b")
-    drag(visit, start, (start[0], start[1] + 20))
-    visit.until("text => document.querySelector('.size[data-kind=length] b').textContent !== text", second)
+    # The drawn ends are at the edges: there they can be dragged. On seabed without an edge an end stays.
+    drag(visit, point(26.0, 24.0), point(36.0, 24.0))
+    visit.wait(".hint >> text=no edge found")
+    assert visit.text(".size[data-kind=length] b") != first
+    drag(visit, point(36.0, 24.0), point(27.0, 24.0))
+    visit.wait(".hint >> text=no edge found", state="detached")
+    drag(visit, point(14.0, 24.0), point(13.0, 24.0))
     visit.wait(".hint >> text=Enter keeps it")
     assert served.contact()["measurements"] == []
     visit.press("Enter")
     visit.wait(".hint >> text=next line is shadow")
     [stored] = served.contact()["measurements"]
-    # The canvas has as many pixels per metre as the mark.
-    box = served.contact()["versions"][0]["box"]
-    unit = (right[1] - left[1]) / ((box["rows"][1] - box["rows"][0]) * 0.1)
-    assert stored["along_m"] == pytest.approx((moved[1] - start[1] - 20) / unit, rel=0.03)
+    # After the first end was moved, the line is stored from end to start.
+    assert [stored["from"][0], stored["to"][0]] == pytest.approx([26.0, 14.0], abs=0.2)
+    assert stored["snapped"] == [True, True]
     image = image_record("00A7")
-    # After both ends were moved, the line is stored from end to start.
-    expected = measure_length(image.contact, image.missing(), tuple(stored["from"]), tuple(stored["to"])).value_m
-    assert stored["value_m"] == pytest.approx(expected)
+    line = measure_length(image.contact, image.missing(), tuple(stored["from"]), tuple(stored["to"]))
+    assert stored["value_m"] == pytest.approx(math.sqrt(line.value_m**2 - stored["blur_m"] ** 2))
     visit.press("Escape")
 
 
 def test_shadow_is_measured_across_the_track(served):
     visit = opened(served)
-    visit.press("6")
+    visit.press("m", "m", "m")
     left, right = dataset(visit, "mark")[0], dataset(visit, "mark")[2]
     drag(visit, (left[0] + 40, left[1] + 60), (right[0] - 20, left[1] + 110))
     visit.wait(".hint >> text=Enter keeps it")
@@ -236,8 +296,8 @@ def test_shadow_is_measured_across_the_track(served):
 
 def test_withdrawn_measurement_leaves_the_panel_and_stays_in_the_database(served):
     visit = opened(served)
-    visit.press("5", "Enter", *["Shift+ArrowRight"] * 3, "Enter")
-    visit.wait(".hint >> text=Enter keeps it")
+    visit.press("m", "m", "Enter", *["Shift+ArrowRight"] * 3, "Enter")
+    visit.wait("[data-size=keep]")
     visit.press("Enter")
     visit.wait("[data-size=withdraw-width]")
     visit.press("Escape")

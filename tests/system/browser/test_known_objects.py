@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 
 from builders.console import advice_record, image_record
@@ -34,17 +35,18 @@ def test_object_is_shown_after_the_decision_and_counted_in_the_score(serve):
     assert not visit.page.is_visible(".known")
     visit.settle()
     least_s = time.monotonic() - shown_s
-    visit.press("1")
+    visit.decide("1")
     visit.wait_for_contact("00A8")
     with served.state.database.read() as db:
         [decided_s] = db.execute("SELECT shown_s FROM decision").fetchone()
     assert least_s <= decided_s <= time.monotonic() - before_s
-    visit.press("1")
-    visit.until("() => document.querySelector('#unreviewed b').textContent === '0'")
+    visit.decide("1")
+    visit.until("() => document.querySelector('#to-do b').textContent === '0'")
     assert "practice mine" not in visit.page.content()
     reveal(served)
     visit.wait("#truth .bad, #truth.bad, #truth.good")
-    visit.page.click("#score")
+    visit.page.click("#menu")
+    visit.page.click('.menu [data-item="score"]')
     visit.wait("dialog .score")
     table = visit.text("dialog")
     assert "practice mine" in table
@@ -64,11 +66,15 @@ def test_comments_are_folded_before_the_decision(served):
     served.state.store_advice(advice_record(verdict="mine_like", mlo_class="manta", remark="seen before, mark 3"))
     visit = served.visit()
     visit.wait_for_contact("00A7")
-    # Without known objects there is no score.
-    assert not visit.page.is_visible("#score")
     folded = '.details [data-name="advice"]'
     visit.wait(folded)
     assert visit.page.get_attribute(folded, "open") is None
-    visit.press("2")
+    visit.decide("2")
     visit.wait(f"{folded}[open]")
     visit.wait(".advice >> text=seen before, mark 3")
+    # Without known objects, the score has the decisions by operator only.
+    visit.page.click("#menu")
+    visit.page.click('.menu [data-item="score"]')
+    visit.wait("dialog .score")
+    assert visit.page.locator("dialog table").count() == 1
+    assert re.search(r"anna\s+1 not mine-like\s", visit.text("dialog"))

@@ -39,7 +39,7 @@ def look(image_id, *, heading_deg, channel, vehicle="uuv-1", north_m=0.0, **fiel
 def store_two_looks(served):
     served.state.store_image(look("0001", heading_deg=0.0, channel="starboard"))
     served.state.store_image(look("0002", heading_deg=90.0, channel="port", vehicle="uuv-2", north_m=1.0))
-    served.state.store_image(look("0003", heading_deg=0.0, channel="port", vehicle="uuv-1", north_m=40.0))
+    served.state.store_image(look("0003", heading_deg=0.0, channel="port", vehicle="uuv-1", north_m=-7.5))
 
 
 def identifier(served, image_id):
@@ -55,7 +55,7 @@ def open_panel(served, **options):
     visit = served.visit(**options)
     visit.page.click(f".row[data-id='{identifier(served, '0001')}']")
     visit.wait_for_contact("0001")
-    visit.page.keyboard.press("Shift+O")
+    visit.page.click(".open-object")
     visit.until(TWO_TILES)
     return visit
 
@@ -79,24 +79,50 @@ def test_looks_are_drawn_north_up_and_not_mirrored(served):
 def test_one_verdict_for_all_looks(served):
     store_two_looks(served)
     visit = open_panel(served)
-    assert "for all 2 looks" in visit.text(".object-decision label")
-    visit.press("1")
+    assert "for all 2 looks" in visit.text(".object-decision")
+    visit.page.evaluate(
+        """() => {
+          window.sent = [];
+          const real = window.fetch;
+          window.fetch = (path, ...all) => {
+            if (path.endsWith('/decisions')) sent.push(path);
+            return real(path, ...all);
+          };
+        }"""
+    )
+    visit.wait("dialog[data-ready=true]")
+    # A bouncing key sends one verdict.
+    visit.page.evaluate(
+        """() => {
+          for (let i = 0; i < 5; i += 1) {
+            const event = new KeyboardEvent('keydown', { key: '1', code: 'Digit1', bubbles: true, cancelable: true });
+            document.querySelector('dialog').dispatchEvent(event);
+          }
+        }"""
+    )
     visit.until("() => document.querySelectorAll('.tile .badge.mine_like').length === 2")
     assert [review(served, one) for one in ("0001", "0002", "0003")] == ["mine_like", "mine_like", "unreviewed"]
-    # Without the box, a verdict applies to the selected look, and `o` selects another one.
-    visit.page.uncheck("#all-looks")
-    visit.press("o", "2")
+    visit.wait("dialog[data-ready=true]")
+    assert len(visit.page.evaluate("window.sent")) == 1
+    # A verdict on one look is made in review; the panel shows the contradiction.
+    contact_id = identifier(served, "0002")
+    served.console.browser("anna").decide(contact_id, verdict="not_mine_like")
     visit.wait(".tile .badge.not_mine_like")
     visit.wait(".contradiction")
-    assert [review(served, one) for one in ("0001", "0002")] == ["mine_like", "not_mine_like"]
     visit.press("Escape")
     visit.until("() => document.querySelectorAll('.row .mark.contradiction').length === 2")
 
 
 def test_separate_and_join_looks(served):
     store_two_looks(served)
+    # 0003 is 7.5 m from 0001: within the gate of 8 m, but too far apart for looks of one pass. 0004 is outside it.
+    served.state.store_image(look("0004", heading_deg=0.0, channel="port", vehicle="uuv-4", north_m=28.0))
     visit = open_panel(served)
-    visit.page.click(f"[data-id='{identifier(served, '0002')}'] .split")
+    visit.page.click(".object-menu summary")
+    assert visit.page.locator("[data-merge]").all_inner_texts() == [
+        "uuv-1/0003, 7.5\u202fm away, is the same object: join"
+    ]
+    visit.page.click(f"[data-split='{identifier(served, '0002')}']")
     visit.until("() => document.querySelectorAll('.tile').length === 1")
     assert "Object, 1 look" in visit.text("#object-title")
     visit.page.click(f"[data-merge='{identifier(served, '0003')}']")
@@ -110,7 +136,7 @@ def test_separate_and_join_looks(served):
 def test_observer_sees_the_object_only(served):
     store_two_looks(served)
     visit = open_panel(served, user="watch")
-    assert visit.page.locator(".split, [data-merge]").count() == 0
+    assert not visit.page.locator(".object-menu").is_visible()
     assert visit.page.locator(".object-decision button:enabled").count() == 0
 
 
@@ -120,7 +146,7 @@ def test_decided_on_less_than_has_arrived(served):
     visit.wait_for_contact("0001")
     served.console.browser("bo").decide(identifier(served, "0001"), verdict="not_mine_like")
     served.state.store_image(image_record("0001", version=2))
-    visit.page.click("[data-review='newer_detail']")
+    visit.page.select_option("#review", "newer_detail")
     visit.until("() => document.querySelector('.row .newer')?.textContent === '○ on 100 B – 200 B are here'")  # noqa: RUF001
 
 

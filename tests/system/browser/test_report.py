@@ -6,7 +6,9 @@ import base64
 import io
 import os
 import re
+import sqlite3
 import threading
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +97,7 @@ def held(served, monkeypatch):
 def test_export_is_cancelled_and_shows_its_progress(served, held, tmp_path):
     visit = served.visit()
     visit.expect_errors("409")
-    visit.press("x")
+    visit.open_dialog("exports")
     visit.page.locator("dialog [data-export=kmz]").click()
     visit.wait("dialog .progress >> text=2 of 4 contacts")
     visit.page.locator("dialog .cancel").click()
@@ -111,6 +113,16 @@ def test_export_is_cancelled_and_shows_its_progress(served, held, tmp_path):
     assert Path(tmp_path / "contacts.kmz").stat().st_size > 1000
     visit.wait("dialog .progress >> text=contacts.kmz is saved")
     assert not visit.page.locator("dialog progress").is_visible()
+    # The times of the dialog restrict the exports and the sheets.
+    visit.page.locator("dialog input").nth(1).fill("2023-11-14T22:13:22")
+    visit.page.locator("dialog input").nth(1).dispatch_event("change")
+    visit.wait("dialog >> text=Exports 2 contacts")
+    assert "to_utc_s=1700000002" in visit.page.locator("dialog .exports a").last.get_attribute("href")
+    with visit.page.expect_download() as download:
+        visit.page.locator("dialog [data-export=gpkg]").click()
+    download.value.save_as(tmp_path / "contacts.gpkg")
+    with closing(sqlite3.connect(tmp_path / "contacts.gpkg")) as db:
+        assert db.execute("SELECT name FROM contacts").fetchall() == [("uuv-1/0000",), ("uuv-1/0001",)]
 
 
 @pytest.mark.realdata

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from builders.common import eventually
-from builders.console import image_record
+from builders.console import image_record, session_cookie
 
 pytestmark = pytest.mark.parametrize("browser", ["chromium"], indirect=True)
 
@@ -17,16 +17,14 @@ def open_page(served, user="anna"):
     return visit
 
 
-def field(visit, action):
-    return visit.page.locator(f'.key-field[data-action="shortcuts.{action}"]')
-
-
 def test_settings_follow_the_user_to_another_computer(served):
     here = open_page(served)
-    here.press(";")
-    here.page.locator(".settings select").nth(1).select_option("night")
-    here.page.locator(".settings select").nth(2).select_option("large")
-    here.page.locator(".settings select").nth(0).select_option("de")
+    here.page.click("#menu")
+    here.page.click("[data-item=theme]")
+    here.page.click("#menu")
+    here.page.click("[data-item=type_size]")
+    here.open_dialog("settings")
+    here.page.locator(".settings select").select_option("de")
     here.until("() => document.documentElement.lang === 'de'")
     stored = {"theme": "night", "type": "large", "language": "de"}
     eventually(lambda: stored.items() <= served.users.settings("anna").items(), what="the settings")
@@ -36,7 +34,13 @@ def test_settings_follow_the_user_to_another_computer(served):
     assert there.page.evaluate("document.documentElement.lang") == "de"
     # Another user in the same browser has settings of their own.
     here.page.context.add_cookies(
-        [{"name": "sonarpost_session", "value": served.users.start_session("bo").token, "url": served.address}]
+        [
+            {
+                "name": session_cookie(served.address),
+                "value": served.users.start_session("bo").token,
+                "url": served.address,
+            }
+        ]
     )
     here.page.reload()
     here.wait_for_contact("0002")
@@ -44,53 +48,26 @@ def test_settings_follow_the_user_to_another_computer(served):
     assert here.page.evaluate("document.documentElement.lang") == "en"
 
 
-def test_key_is_changed_and_a_used_key_is_refused_by_name(served):
-    visit = open_page(served)
-    visit.press(";")
-    field(visit, "queue.next").focus()
-    visit.press("k")
-    visit.wait("dialog [role=alert]:has-text('“k” is the key of “previous contact”.')")
-    assert field(visit, "queue.next").input_value() == "j"
-    # The same key in another view is not a conflict.
-    field(visit, "queue.next").focus()
-    visit.press("$")
-    assert field(visit, "queue.next").input_value() == "$"
-    assert visit.text("dialog [role=alert]") == ""
-    visit.press("Escape", "j")
-    visit.press("$")
-    visit.wait_for_contact("0001")
-    # The help shows the present key, and buttons do not show default keys.
-    visit.press("?")
-    assert "next contact\n$" in visit.text("dialog .keys").replace("\n\n", "\n")
-    visit.press("Escape")
-    assert visit.page.locator(".verdicts kbd").first.is_hidden()
-    visit.page.reload()
-    visit.wait_for_contact("0001")
-    visit.press("k")
-    visit.wait_for_contact("0002")
-    visit.press("$")
-    visit.wait_for_contact("0001")
-    visit.press(";")
-    visit.page.click("#keys-reset")
-    assert field(visit, "queue.next").input_value() == "j"
-
-
 def test_single_character_keys_are_switched_off(served):
     visit = open_page(served)
-    visit.press(";")
+    visit.open_dialog("settings")
     visit.page.check("#keys-off")
-    visit.press("Escape", "j", "p", "?", ";")
+    visit.press("Escape", "j", "p", "?", "1")
     assert visit.page.locator("dialog").count() == 0
     assert visit.page.locator(".map").is_hidden()
     assert visit.text(".heading h2").endswith("0002")
+    # Buttons show no keys that are off.
+    assert visit.page.locator(".verdicts kbd").first.is_hidden()
     # Keys that are no characters remain.
     visit.page.focus("#queue")
     visit.press("ArrowDown")
     visit.wait_for_contact("0001")
-    visit.page.click("#settings")
+    visit.open_dialog("settings")
     visit.page.uncheck("#keys-off")
     visit.press("Escape", "k")
     visit.wait_for_contact("0002")
+    assert visit.page.locator(".verdicts kbd").first.is_visible()
+    assert served.decisions("0002") == []
 
 
 def test_without_the_server_the_page_names_it(served):
@@ -115,8 +92,34 @@ def test_without_the_server_the_page_names_it(served):
     visit.wait("h1:has-text('No connection')")
     assert visit.text("#server") == served.address.split("/")[2]
     assert visit.page.evaluate("getComputedStyle(document.querySelector('.sheet')).borderTopStyle") == "solid"
+    # The page tries again by itself.
     served.restart()
-    visit.page.click("#again")
+    visit.wait_for_contact("0002")
+
+
+def test_back_returns_to_the_view_and_contact_before_and_a_reload_keeps_them(served):
+    visit = open_page(served)
+    visit.press("j")
+    visit.wait_for_contact("0001")
+    visit.press("p", "f")
+    visit.page.locator(".fleet").wait_for()
+    visit.page.reload()
+    visit.page.locator(".fleet").wait_for()
+    visit.wait_for_contact("0001")
+    visit.page.go_back()
+    visit.page.locator(".map").wait_for()
+    visit.page.go_back()
+    visit.page.locator(".review").wait_for()
+    assert visit.text(".heading h2").endswith("0001")
+    visit.page.go_back()
+    visit.wait_for_contact("0002")
+    visit.page.go_forward()
+    visit.wait_for_contact("0001")
+    # An address that is no contact opens the first one.
+    visit.expect_errors("status of 404")
+    visit.page.goto(f"{served.address}#none%")
+    visit.page.reload()
+    visit.wait("#toasts >> text=none% could not be loaded")
     visit.wait_for_contact("0002")
 
 

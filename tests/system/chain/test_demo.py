@@ -178,7 +178,7 @@ def test_demo_fails_when_an_image_is_missing(tmp_path, monkeypatch):
     monkeypatch.setenv("SONARPOST_DECOMPRESSOR__IMAGE_CONSUMERS", "[]")
     done = run_command(tmp_path / "out", "--images", str(snippet_folder(tmp_path)), "--time-scale", "60")
     assert done.returncode == 1
-    assert "FAILED: 2 images missing at the shore site" in " ".join(done.stderr.split())
+    assert "FAILED: 2 images missing at the shore site" in " ".join(done.stderr.split()), done.stderr
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])

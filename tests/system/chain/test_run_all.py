@@ -4,7 +4,6 @@ The user has no home folder and cannot write the installation, as a system user 
 """
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from pathlib import Path
 import pytest
 from builders.chain import snippet
 from builders.common import eventually, free_port
-from builders.installation import NOBODY, installation
+from builders.installation import installation
 
 from sonarpost.cli.demo.outcome import read_images
 from sonarpost.security.acoustic_key import create_key
@@ -47,9 +46,6 @@ class Bench:
             key.write_bytes((folder / "uuv" / "acoustic.key").read_bytes())
             key.chmod(0o600)
         (folder / "uuv" / "incoming").mkdir()
-        if os.getuid() == 0:
-            for path in (folder, *folder.rglob("*")):
-                os.chown(path, NOBODY, NOBODY)
 
     def start(self, name, *arguments, **environment):
         """Start a sonarpost command as the user without a home; its output goes to NAME.log."""

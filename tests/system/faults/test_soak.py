@@ -33,7 +33,7 @@ from sonarpost.sonar.image_files import write_png
 CONTACTS = int(os.environ.get("SONARPOST_SOAK_CONTACTS", "60"))
 IN_FLIGHT = 24
 SAMPLE_S = 2.0
-SHORE_LIMIT_BYTES = 800_000
+SHORE_LIMIT_BYTES = 2_200_000
 """Limit of c2's images, about 45 contacts: retention removes older ones during the run, none that is in flight."""
 MAX_GROWTH_MB = 40.0
 """Growth of a process from a quarter of the contacts to the end."""

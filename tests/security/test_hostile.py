@@ -1,0 +1,36 @@
+"""One vessel, file, user or client harms only itself: the table of attacks, with what other sources measure."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import pytest
+from builders.hostile_rows import ROWS
+from builders.hostile_site import running_site
+
+pytestmark = pytest.mark.system
+
+ATTACK_S = 4.0
+WORKERS = int(os.environ.get("SONARPOST_HOSTILE_WORKERS", "1"))
+ATTACKS = [row for row in ROWS if callable(row.function)]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory, shared_world):
+    with running_site(tmp_path_factory.mktemp("site"), shared_world, WORKERS) as site:
+        for measured in sorted({row.measured for row in ATTACKS}):
+            print(f"{measured}: {max(getattr(site, measured)()):.1f} s without an attack")
+        yield site
+
+
+@pytest.mark.parametrize("row", ATTACKS, ids=lambda row: row.name)
+def test_other_sources_are_served(site, row):
+    with row.function(site):
+        delays_s, begin_s = [], time.monotonic()
+        # Some attacks need a time until they have an effect.
+        while time.monotonic() < begin_s + ATTACK_S:
+            delays_s += getattr(site, row.measured)()
+    print(
+        f"{row.source}, {row.attack}: {len(delays_s)} of {len(delays_s)}, at most {max(delays_s):.1f} s; {site.check()}"
+    )
