@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
@@ -25,7 +25,8 @@ from sonarpost.services.console.store.database import Actor, Database, Displayed
 from sonarpost.services.console.store.decisions import DecisionInput
 from sonarpost.services.console.store.serialisers import Json
 from sonarpost.services.console.store.users import Users
-from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator
+from sonarpost.services.console.training.simulator import RATE, VESSEL, TrainingSimulator
+from sonarpost.services.console.web.access import COOKIE, cookie_name
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "explanation" / "console"
@@ -71,7 +72,9 @@ class Scene:
             color_scheme="dark" if theme == "night" else "light",
             reduced_motion="reduce",
         )
-        context.add_cookies([{"name": "sonarpost_session", "value": token, "url": self.address}])
+        context.add_cookies(
+            [{"name": cookie_name(COOKIE, urlsplit(self.address).netloc), "value": token, "url": self.address}]
+        )
         page = context.new_page()
         page.add_init_script("localStorage.setItem('sonarpost.review', '')")
         page.goto(f"{self.address}#{quote(contact_id, safe='')}")
@@ -84,6 +87,12 @@ def press(page: Page, *keys: str) -> None:
     """Press keys one after the other."""
     for key in keys:
         page.keyboard.press(key)
+
+
+def decide(page: Page, key: str) -> None:
+    """Press the key of a verdict when verdicts count: the image has been in sight for 0.3 s."""
+    page.wait_for_selector('.decision[data-ready="true"]')
+    press(page, key)
 
 
 def save(page: Page, name: str) -> None:
@@ -114,7 +123,7 @@ def measurement(scene: Scene) -> None:
     """Day theme, small: a measured shadow."""
     contact_id = scene.contact(complete=True, index=0)
     with scene.page(SMALL, "day", contact_id) as page:
-        press(page, "6", *["Shift+ArrowLeft"] * 2, "Enter", *["Shift+ArrowRight"] * 3, "Enter")
+        press(page, "m", "m", "m", *["Shift+ArrowLeft"] * 2, "Enter", *["Shift+ArrowRight"] * 3, "Enter")
         page.wait_for_selector(".size-panel >> text=±")
         press(page, "Enter")
         page.wait_for_selector('details[data-name="measurements"]')
@@ -142,13 +151,14 @@ def decision(scene: Scene) -> None:
     )
     scene.state.store_advice(advice)
     with scene.page(LARGE, "night", contact_id) as page:
-        press(page, "Shift+Digit1", "g", *["ArrowRight"] * 6, "w")
+        page.click('[data-confidence="0.9"]')
+        press(page, "w")
         page.keyboard.type("highlight and shadow agree")
-        page.keyboard.press("Control+Enter")
+        press(page, "Escape")
+        decide(page, "1")
         page.wait_for_selector("#result >> text=mine-like")
     with scene.page(LARGE, "night", contact_id) as page:
-        page.wait_for_selector(".progress >> text=on the vehicle")
-        page.wait_for_selector('.progress >> text="at the shore site"')
+        page.wait_for_selector(".standing .counts .good >> nth=1")
         press(page, "s")
         page.wait_for_selector("#toasts p", state="detached")
         save(page, "decision-night-1920")
@@ -158,7 +168,6 @@ def partial_image(scene: Scene) -> None:
     """Night theme, small: an image whose half is missing."""
     halves = [row["id"] for row in scene.rows if not row["complete"] and row["percent_received"] == 50]
     with scene.page(SMALL, "night", str(halves[0])) as page:
-        press(page, "c", "c", "c")
         save(page, "partial-night-1366")
 
 
@@ -166,7 +175,7 @@ def request(scene: Scene) -> None:
     """Day theme, small: the costs of requests."""
     with scene.page(SMALL, "day", scene.contact(complete=False, index=1)) as page:
         press(page, "r")
-        page.wait_for_selector("dialog .costs")
+        page.wait_for_selector("[data-request]:focus")
         save(page, "requests-day-1366")
 
 
@@ -176,13 +185,21 @@ def dispute(scene: Scene) -> None:
     with scene.page(LARGE, "day", contact_id) as page:
         scene.decide(contact_id, "not_mine_like", 0.8, None, "a boulder; no man-made edge")
         page.wait_for_selector(".overrule")
-        press(page, "1")
-        page.wait_for_selector(".overrule.disputed li")
+        decide(page, "1")
+        page.wait_for_selector(".standing .badge.disputed")
         save(page, "disputed-day-1920")
 
 
+def grid(scene: Scene) -> None:
+    """Day theme, small: the images of all contacts."""
+    with scene.page(SMALL, "day", scene.contact(complete=True, index=0)) as page:
+        page.click(".grid-button")
+        page.wait_for_selector(".review.grid .row >> nth=20")
+        save(page, "grid-day-1366")
+
+
 def views(scene: Scene) -> None:
-    """The map, the link, the mission and an object with two looks."""
+    """The map, the link and an object with two looks."""
     contact_id = scene.contact(complete=True, index=0)
     with scene.page(SMALL, "day", contact_id) as page:
         press(page, "p")
@@ -193,14 +210,10 @@ def views(scene: Scene) -> None:
         save(page, "map-day-1366")
     with scene.page(SMALL, "night", contact_id) as page:
         press(page, "f")
-        page.wait_for_selector(".frames li")
+        page.wait_for_selector(".fleet article")
         save(page, "link-night-1366")
-    with scene.page(LARGE, "day", contact_id) as page:
-        press(page, "M")
-        page.wait_for_selector(".mission >> text=All vehicles")
-        save(page, "mission-day-1920")
     with scene.page(SMALL, "night", scene.looks()) as page:
-        press(page, "O")
+        page.click(".open-object")
         page.wait_for_selector("dialog canvas")
         page.wait_for_timeout(1000)
         save(page, "object-night-1366")
@@ -217,8 +230,8 @@ def small_screens(scene: Scene) -> None:
 def score(scene: Scene) -> None:
     """Day theme, tablet: the score of the training."""
     with scene.page(TABLET, "day", scene.contact(complete=True, index=0), user="eva") as page:
-        page.wait_for_selector("#score", state="attached")
-        page.evaluate("document.getElementById('score').click()")
+        page.click("#menu")
+        page.click('.menu [data-item="score"]')
         page.wait_for_selector("dialog .score")
         save(page, "score-day-1024")
 
@@ -231,7 +244,7 @@ def main() -> None:
     OUT.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch, sync_playwright() as playwright:
         folder = Path(scratch)
-        config = ConsoleConfig(port=0, vessel_lat_deg=56.4495, vessel_lon_deg=-5.6012)
+        config = ConsoleConfig(port=0, vessel_lat_deg=56.4495, vessel_lon_deg=-5.6012, assumed_rate=RATE)
         database, users = Database(folder / "review.db"), Users(folder / "users.db")
         for name, role in (("anna", "operator"), ("eva", "expert")):
             users.add(name, role, "correct horse battery")
@@ -247,7 +260,7 @@ def main() -> None:
         try:
             scene = Scene(state, users, server.address, browser)
             add_decisions(scene)
-            for take in (measurement, decision, partial_image, request, dispute, views, small_screens, score):
+            for take in (measurement, decision, partial_image, request, dispute, grid, views, small_screens, score):
                 take(scene)
         finally:
             browser.close()

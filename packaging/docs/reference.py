@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
+import pkgutil
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from importlib import import_module
 from typing import Any
 
 import griffe
@@ -16,7 +18,8 @@ import rates
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from sonarpost import keys, messages
+import sonarpost
+from sonarpost import keys, limits, messages
 from sonarpost.cli.deployment import config_files
 from sonarpost.cli.main import parser
 from sonarpost.config import TABLES, ModemTable, PlatformConfig, ServiceConfig
@@ -216,6 +219,31 @@ def metrics(_: str = "") -> str:
     return table(("metric", "type", "labels", "meaning"), rows)
 
 
+def limit_table(_: str = "") -> str:
+    """Return the table of all declared limits."""
+    for module in pkgutil.walk_packages(sonarpost.__path__, "sonarpost."):
+        if not module.name.endswith("__main__"):
+            import_module(module.name)
+    found = sorted(limits.DECLARED.values(), key=lambda one: (one.surface, one.source, one.resource, one.module))
+    return table(
+        ("surface", "source", "resource", "limit", "at the limit", "rule", "module"),
+        [
+            (
+                *(
+                    one.surface,
+                    one.source,
+                    one.resource,
+                    f"{_number(one.value)} {one.unit}".strip(),
+                    one.at_limit,
+                    one.rule,
+                ),
+                f"`{one.module.removeprefix('sonarpost.')}`",
+            )
+            for one in found
+        ],
+    )
+
+
 GENERATORS: Mapping[str, Callable[[str], str]] = {
     "records": records,
     "keys": key_table,
@@ -225,6 +253,7 @@ GENERATORS: Mapping[str, Callable[[str], str]] = {
     "rates": rate_table,
     "images": image_table,
     "metrics": metrics,
+    "limits": limit_table,
 }
 
 
