@@ -50,7 +50,8 @@ test: setup
 
 # The quick tests beside four busy processes: no test may depend on the speed of the machine.
 test-busy: setup
-	@trap 'kill $$(jobs -p)' EXIT; for _ in 1 2 3 4; do while :; do :; done & done; $(MAKE) --no-print-directory test
+	@for _ in 1 2 3 4; do while :; do :; done & loops="$$loops $$!"; done; trap 'kill $$loops' EXIT; \
+	$(MAKE) --no-print-directory test
 
 # Chains with faults, browsers, TLS, research commands, examples, PostgreSQL, containers, and all property tests with more
 # examples. Longer runs of the tests of faults: docs/research/faults.md.
@@ -61,11 +62,15 @@ test-processes: $(DEV)
 	$(PYTEST) -m "(system or hypothesis) and not containers" --hypothesis-profile thorough \
 		--numprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
 
+DENO = DENO_NO_UPDATE_CHECK=1 $(BIN)/deno --quiet
+SCRIPTS := --config packaging/deno.json services/console/static/js
 check: $(DEV) docs
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(DENO) check $(SCRIPTS)
+	$(DENO) lint $(SCRIPTS) services/console/static/service_worker.js
 	$(BIN)/python tests/check_wheel.py
 
 # The images of docker-compose.yml; without an image registry they are built from Debian and PyPI. If debootstrap is needed
