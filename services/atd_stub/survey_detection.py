@@ -50,20 +50,20 @@ MAX_SAMPLE_M: Final = limit(
 )
 MAX_SEARCH_S: Final = limit(
     600.0,
-    "s",
+    "s of processor time",
     "deadlines",
     surface="input folder of a vehicle",
     source="recording",
-    resource="time of the search, beside the time for its size",
+    resource="search, beside the time for its size",
     at_limit="the recording is quarantined, the next one is searched",
 )
 MAX_SEARCH_S_PER_MB: Final = limit(
     100.0,
-    "s for each megabyte",
+    "s of processor time for each megabyte",
     "deadlines",
     surface="input folder of a vehicle",
     source="recording",
-    resource="time of the search, by its size",
+    resource="search, by its size",
     at_limit="the recording is quarantined, the next one is searched",
 )
 SurveyEnd = StreamEnd[bytes]
@@ -136,7 +136,7 @@ def detect_in_survey(
             `MAX_SEARCH_S_PER_MB`.
     """
     size_bytes = sum(part.stat().st_size for part in recording_parts(path) if part.exists())
-    deadline_s = time.monotonic() + MAX_SEARCH_S + MAX_SEARCH_S_PER_MB * size_bytes / 1e6
+    deadline_s = time.thread_time() + MAX_SEARCH_S + MAX_SEARCH_S_PER_MB * size_bytes / 1e6
     transmissions = transmissions or TransmitIntervals()
     try:
         return _detect(path, content, vehicle_id, config, ends or {}, transmissions, deadline_s)
@@ -159,14 +159,14 @@ def detect_in_survey(
 
 
 class _LimitedSource(MaskedSource):
-    """A source whose iteration ends with an error after a monotonic time. Coarse pings have no samples."""
+    """A source whose iteration ends with an error after a processor time of the thread. Coarse pings have no samples."""
 
     deadline_s: float
     coarse_count = 0
 
     def pings(self) -> Iterator[Ping]:
         for ping in super().pings():
-            if time.monotonic() > self.deadline_s:
+            if time.thread_time() > self.deadline_s:
                 expected = f"at most {MAX_SEARCH_S:g} s and {MAX_SEARCH_S_PER_MB:g} s for each megabyte"
                 raise SurveyFileError(str(self.info.path), "search", "unfinished", expected)
             is_coarse = any(channel.sample_spacing_m > MAX_SAMPLE_M for channel in ping.channels)
