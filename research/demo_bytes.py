@@ -101,10 +101,10 @@ def refine(session: zenoh.Session, image_id: str, number: int) -> None:
 
 def run(settings: ChainSettings, refinements: int) -> bool:
     """Run the chain and print the figures; return whether all images are complete and refined."""
-    with RecordedChain(settings) as chain, Watcher(settings) as watcher:
+    with RecordedChain(settings) as chain, Watcher(settings, chain.check) as watcher:
         session = open_session(f"tcp/127.0.0.1:{settings.router_ports[1]}")
         pixels = PixelRecords(session)
-        watcher.wait_until_started(chain.check)
+        watcher.wait_until_started()
         survey = simulate_survey(SurveySpec(seed=settings.seed, seabed=SeabedKind.SAND, targets=6, clutter=6)).survey
         hidden = settings.incoming / ".simulated.xtf"
         write_xtf(survey, hidden)

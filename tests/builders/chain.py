@@ -48,8 +48,8 @@ class VesselWatcher(Watcher):
             not delivered, again after a restart.
     """
 
-    def __init__(self, settings):
-        super().__init__(settings)
+    def __init__(self, settings, check):
+        super().__init__(settings, check)
         self.images_with_frames = set()
         self.images_received = set()
 
@@ -155,8 +155,8 @@ def start_chain(tmp_path):
             )
             settings = dataclasses.replace(settings, **changes)
             chain = stack.enter_context(Chain(settings))
-            watcher = stack.enter_context(VesselWatcher(settings))
-            watcher.wait_until_started(chain.check)
+            watcher = stack.enter_context(VesselWatcher(settings, chain.check))
+            watcher.wait_until_started()
             run = RunningChain(chain, watcher)
             stack.callback(run.history.close)
             return run

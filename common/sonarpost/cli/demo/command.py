@@ -164,11 +164,11 @@ def _run_chain(
 ) -> int:
     """Run the chain with the given files or the simulated survey; return the exit status."""
     page = OperatorPage(settings) if parsed.console else None
-    with Chain(settings) as chain, Watcher(settings) as watcher:
+    with Chain(settings) as chain, Watcher(settings, chain.check) as watcher:
         # During the start of the services: the vehicle processes files when it is ready.
         files = _deposit(*sources, settings, console)
         with console.status("starting three routers and eight services"):
-            watcher.wait_until_started(chain.check)
+            watcher.wait_until_started()
         console.print(routers_line(settings), highlight=False, soft_wrap=True)
         if page is not None:
             page.show(console, opened=parsed.open)

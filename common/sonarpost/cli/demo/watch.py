@@ -39,6 +39,10 @@ IDLE_GAUGES: Mapping[str, tuple[str, ...]] = {
 class Watcher:
     """Collects the records that the chain publishes.
 
+    Args:
+        settings: Settings of the chain.
+        check: Called repeatedly during the start; raises an exception when a process has ended.
+
     Attributes:
         snippets: By contact identifier.
         encoded: By the identifier that an image has on the vessel.
@@ -50,8 +54,9 @@ class Watcher:
         changes: Number of changes so far.
     """
 
-    def __init__(self, settings: ChainSettings) -> None:
+    def __init__(self, settings: ChainSettings, check: Callable[[], None]) -> None:
         self.settings = settings
+        self._check = check
         self.snippets: dict[str, Snippet] = {}
         self.encoded: dict[str, EncodedImage] = {}
         self.vessel: dict[str, ReconstructedImage] = {}
@@ -82,14 +87,15 @@ class Watcher:
 
     def _open(self, port: int) -> zenoh.Session:
         endpoint = f"tcp/127.0.0.1:{port}"
-        give_up = threading.Event()
-        timer = threading.Timer(CONNECT_S, give_up.set)
-        timer.daemon = True
-        timer.start()
-        session = open_with_retry([endpoint], give_up)
-        timer.cancel()
-        if session is None:
-            raise PortError(f"{endpoint}: no router answered within {CONNECT_S:.0f} s")
+        deadline_s = time.monotonic() + CONNECT_S
+
+        def on_failure(reason: str) -> None:
+            self._check()
+            if time.monotonic() > deadline_s:
+                raise PortError(f"{endpoint}: no router answered within {CONNECT_S:.0f} s: {reason}")
+
+        session = open_with_retry([endpoint], threading.Event(), on_failure=on_failure)
+        assert session is not None
         self._sessions.append(session)
         return session
 
@@ -200,14 +206,11 @@ class Watcher:
         feedback_open = health["op_modem"].gauges.get("feedback_open", 1.0)
         return f"op_modem: feedback_open {feedback_open:g}" if feedback_open else ""
 
-    def wait_until_started(self, check: Callable[[], None]) -> None:
+    def wait_until_started(self) -> None:
         """Wait for the first health report of every service.
 
-        Args:
-            check: Called repeatedly; raises when a process has ended.
-
         Raises:
-            PortError: A service has not reported within 40 s.
+            PortError: A service has not reported in time.
         """
         deadline = time.monotonic() + 2 * CONNECT_S
         while True:
@@ -215,7 +218,7 @@ class Watcher:
                 missing = [service for service in PLATFORM_OF if service not in self.health]
             if not missing:
                 return
-            check()
+            self._check()
             if time.monotonic() > deadline:
                 raise PortError(f"no health report of {', '.join(missing)} within {2 * CONNECT_S:.0f} s")
             time.sleep(0.05)
