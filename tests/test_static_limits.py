@@ -19,7 +19,6 @@ SOCKETS = {
     "common/sonarpost/stop_signals.py": "signals of this process",
 }
 THREADS = {
-    "common/sonarpost/archive/decode_worker.py": "timer that kills a worker",
     "common/sonarpost/bearers/rockblock.py": "serves requests, each in a thread that logs its exceptions",
     "common/sonarpost/bus/router.py": "health of the router",
     "common/sonarpost/cli/c2/tasking.py": "timer that sets an event",

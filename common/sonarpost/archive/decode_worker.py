@@ -33,18 +33,18 @@ from sonarpost.messages import CodedImage, ReconstructedImage
 
 log = logging.getLogger(__name__)
 
-DECODE_TIMEOUT_S: Final = limit(
+MAX_DECODE_S: Final = limit(
     120.0,
-    "s",
+    "s of processor time",
     "deadlines",
     surface="decoding of images",
     source="vessel",
-    resource="time for one image",
-    at_limit="the decoding process is killed; the image is tried again later",
+    resource="work for one image",
+    at_limit="the decoding process ends; the image is tried again later",
 )
-"""It includes the start of the process, and the compilation of the codec at the first image."""
+"""With the compilation of the codec at the first image. Not real time: other programs are not the fault of an image."""
 NICE: Final = 5
-"""Lower priority of the decoder, so that records are accepted first."""
+"""Lower priority after the first image, so that records are accepted first."""
 END_S: Final = 2.0
 EXIT_MACHINE: Final = 75
 """Exit status after an error of the machine, for example a lack of memory."""
@@ -61,7 +61,7 @@ class Decoded:
         reason: Why not.
         missing_model: The codebook that is not known, as in `coded_image`; empty if that is not the reason.
         failure: `machine` if the process did not start or was killed from outside; `crash` if it ended otherwise or
-            exceeded the time, which another program can cause as well; else empty.
+            exceeded its processor time; else empty.
     """
 
     image: ReconstructedImage | None = None
@@ -78,11 +78,11 @@ class DecodeWorker:
         folder: Folder with further codebooks, `{vessel}/{model}.tiles`, which may be added at any time. An image uses
             those of its vessel only.
         state_dir: Folder for the compiled machine code.
-        timeout_s: Maximum duration of one image.
+        max_decode_s: Maximum processor time for one image.
     """
 
     def __init__(
-        self, codebooks: Sequence[str], folder: Path, state_dir: Path, timeout_s: float = DECODE_TIMEOUT_S
+        self, codebooks: Sequence[str], folder: Path, state_dir: Path, max_decode_s: float = MAX_DECODE_S
     ) -> None:
         self._command = [
             sys.executable,
@@ -90,9 +90,10 @@ class DecodeWorker:
             "sonarpost.archive.decode_worker",
             str(folder.absolute()),
             str(state_dir.absolute()),
+            str(max_decode_s),
             *codebooks,
         ]
-        self._timeout_s = timeout_s
+        self._max_decode_s = max_decode_s
         self._process: subprocess.Popen[bytes] | None = None
         self._lock = threading.Lock()
         self._closed = False
@@ -120,14 +121,6 @@ class DecodeWorker:
             process = self._process
         assert process.stdin is not None
         assert process.stdout is not None
-        timed_out = threading.Event()
-
-        def end() -> None:
-            timed_out.set()
-            process.kill()
-
-        timer = threading.Timer(self._timeout_s, end)
-        timer.start()
         answer: bytes | None = None
         is_ready = not is_new
         try:
@@ -137,23 +130,22 @@ class DecodeWorker:
                 answer = _read(process.stdout)
         except OSError:
             answer = None  # the process has ended
-        finally:
-            timer.cancel()
         if answer is None:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(END_S)  # its own status, not that of the kill
             self._end(process)
-            return self._ended(process.returncode, is_ready=is_ready, timed_out=timed_out.is_set())
+            return self._ended(process.returncode, is_ready=is_ready)
         fields = msgpack.unpackb(answer)
         if "payload" not in fields:
             return Decoded(reason=fields["reason"], missing_model=fields["model"])
         return Decoded(wire.decode(ReconstructedImage, fields["payload"], f"image {image.image_id}"))
 
-    def _ended(self, status: int, *, is_ready: bool, timed_out: bool) -> Decoded:
+    def _ended(self, status: int, *, is_ready: bool) -> Decoded:
         if not is_ready:
             return Decoded(reason=f"the decoder does not start: it ended with status {status}", failure="machine")
-        if timed_out:
-            return Decoded(reason=f"the decoder did not finish within {self._timeout_s:g} s", failure="crash")
+        if status == -signal.SIGPROF:
+            reason = f"the decoder did not finish within {self._max_decode_s:g} s of processor time"
+            return Decoded(reason=reason, failure="crash")
         reason = f"the decoder ended with status {status}"
         return Decoded(reason=reason, failure="machine" if status in _MACHINE else "crash")
 
@@ -219,16 +211,21 @@ def _decode(decoder: Decoder, folder: Path, payload: bytes) -> dict[str, object]
 
 def main() -> None:
     """Answer images until standard input ends."""
-    folder, state_dir, *codebooks = sys.argv[1:]
-    os.nice(NICE)
+    folder, state_dir, max_decode_s, *codebooks = sys.argv[1:]
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # output of libraries must not get between the answers
     use_code_folder(Path(state_dir))
     decoder = Decoder(codebooks)
     _write(answers, b"")
+    is_first = True
     while (payload := _read(sys.stdin.buffer)) is not None:
+        signal.setitimer(signal.ITIMER_PROF, float(max_decode_s))  # SIGPROF ends the process
         packed: bytes = msgpack.packb(_decode(decoder, Path(folder), payload))
+        signal.setitimer(signal.ITIMER_PROF, 0)
         _write(answers, packed)
+        if is_first:
+            os.nice(NICE)
+            is_first = False
 
 
 if __name__ == "__main__":

@@ -224,8 +224,8 @@ def test_batches_are_limited_by_their_pixels(backlog, monkeypatch):
 def worker(tmp_path):
     made = []
 
-    def start(*codebooks, timeout_s=60.0):
-        made.append(DecodeWorker(codebooks, tmp_path / "codebooks", tmp_path, timeout_s))
+    def start(*codebooks, max_decode_s=60.0):
+        made.append(DecodeWorker(codebooks, tmp_path / "codebooks", tmp_path, max_decode_s))
         return made[-1]
 
     yield start
@@ -253,10 +253,6 @@ def test_end_of_a_decoder_is_blamed_on_the_machine_unless_it_ends_by_itself(work
 
 
 @pytest.mark.system
-def test_decoder_that_hangs_is_killed_after_its_time(worker, coded):
-    decoder = worker(timeout_s=60.0)
-    assert decoder.decode(coded).image is not None
-    decoder._timeout_s = 0.1
-    os.kill(decoder.pid, signal.SIGSTOP)
-    result = decoder.decode(coded)
-    assert (result.failure, result.reason) == ("crash", "the decoder did not finish within 0.1 s")
+def test_decoder_that_does_not_finish_is_ended_after_its_processor_time(worker, coded):
+    result = worker(max_decode_s=1e-6).decode(coded)
+    assert (result.failure, result.reason) == ("crash", "the decoder did not finish within 1e-06 s of processor time")
