@@ -22,7 +22,6 @@ THREADS = {
     "common/sonarpost/bearers/rockblock.py": "serves requests, each in a thread that logs its exceptions",
     "common/sonarpost/bus/router.py": "health of the router",
     "common/sonarpost/cli/c2/tasking.py": "timer that sets an event",
-    "common/sonarpost/cli/demo/watch.py": "timer that sets an event",
     "common/sonarpost/cli/deployment/run_all.py": "copies the output of a process",
     "common/sonarpost/cli/metrics.py": "serves requests, each in a thread that logs its exceptions",
     "common/sonarpost/cli/progress.py": "prints progress",

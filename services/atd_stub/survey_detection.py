@@ -159,7 +159,7 @@ def detect_in_survey(
 
 
 class _LimitedSource(MaskedSource):
-    """A source whose iteration ends with an error after a processor time of the thread. Coarse pings have no samples."""
+    """A source whose iteration ends with an error after a processor time. Coarse pings have no samples."""
 
     deadline_s: float
     coarse_count = 0
