@@ -46,7 +46,7 @@ DECLARED: Final[dict[tuple[str, str, str], Limit]] = {}
 """The limits of the imported modules, by module, surface and resource."""
 
 
-def limit(value: N, unit: str, rule: Rule, *, surface: str, source: str, resource: str, at_limit: str) -> N:
+def limit(value: N, unit: str, rule: Rule, surface: str, source: str, resource: str, at_limit: str) -> N:
     """Declare a limit in a module; return its value.
 
     Args:

@@ -20,13 +20,7 @@ EXIT_ORPHANED = 1
 _PR_SET_PDEATHSIG = 1
 _NUMBERS: Final = (signal.SIGINT, signal.SIGTERM)
 END_S: Final = limit(
-    4.5,
-    "s",
-    "deadlines",
-    surface="SIGTERM and SIGINT",
-    source="anything that blocks",
-    resource="time from the signal to the end of a process",
-    at_limit="The system ends the process (SIGALRM); accepted records are on the disk",
+    4.5, "s", "deadlines", "SIGTERM and SIGINT", "anything", "to the end of the process", "SIGALRM ends it"
 )
 
 

@@ -15,13 +15,7 @@ from sonarpost.limits import limit
 
 DONE_SUFFIX = ".done"
 MAX_RECORDING_BYTES: Final = limit(
-    32 << 30,
-    "bytes",
-    "claims",
-    surface="input folder of a vehicle",
-    source="recording",
-    resource="size of its files",
-    at_limit="it is not read, health is degraded with its name",
+    32 << 30, "bytes", "claims", "input folder", "recording", "size of its files", "it is not read; degraded"
 )
 
 

@@ -31,40 +31,16 @@ from sonarpost.sonar.survey import Ping, Survey
 log = logging.getLogger(__name__)
 
 MAX_CONTACTS: Final = limit(
-    5000,
-    "contacts",
-    "claims",
-    surface="input folder of a vehicle",
-    source="recording",
-    resource="contacts",
-    at_limit="the least confident contacts are not sent",
+    5000, "contacts", "claims", "input folder", "recording", "contacts", "the least confident ones are not sent"
 )
 MAX_SAMPLE_M: Final = limit(
-    1.0,
-    "m for each sample",
-    "claims",
-    surface="input folder of a vehicle",
-    source="recording",
-    resource="slant range of a ping",
-    at_limit="the ping is not searched",
+    1.0, "m for each sample", "claims", "input folder", "recording", "slant range of a ping", "the ping is not searched"
 )
 MAX_SEARCH_S: Final = limit(
-    600.0,
-    "s of processor time",
-    "deadlines",
-    surface="input folder of a vehicle",
-    source="recording",
-    resource="search, beside the time for its size",
-    at_limit="the recording is quarantined, the next one is searched",
+    600.0, "s (processor)", "deadlines", "input folder", "recording", "search, beside that by size", "it is quarantined"
 )
 MAX_SEARCH_S_PER_MB: Final = limit(
-    100.0,
-    "s of processor time for each megabyte",
-    "deadlines",
-    surface="input folder of a vehicle",
-    source="recording",
-    resource="search, by its size",
-    at_limit="the recording is quarantined, the next one is searched",
+    100.0, "s (processor) a MB", "deadlines", "input folder", "recording", "search, by its size", "it is quarantined"
 )
 SurveyEnd = StreamEnd[bytes]
 """The end of a recording; its contacts are encoded snippets, as they are stored."""

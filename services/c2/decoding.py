@@ -30,61 +30,25 @@ BACKLOG: Final = "undecoded/"
 """Prefix of the states with accepted images: `undecoded/{vessel}/{number}`, in the order of their acceptance."""
 SURFACE: Final = "decoding of images"
 BATCH_PER_WORKER: Final = limit(
-    4,
-    "images",
-    "shares",
-    surface=SURFACE,
-    source="vessel",
-    resource="images for each decoding process before those of other vessels",
-    at_limit="the vessels are served in turn",
+    4, "images", "shares", SURFACE, "vessel", "images of a turn for each decoding process", "the next vessel follows"
 )
 BATCH_BYTES: Final = limit(
-    8 * 1024 * 1024,
-    "bytes",
-    "claims",
-    surface=SURFACE,
-    source="vessel",
-    resource="pixels that are stored in one transaction",
-    at_limit="the images are stored in several transactions, after a failure in halves",
+    8 * 1024 * 1024, "bytes", "claims", SURFACE, "vessel", "pixels stored together", "stored in parts"
 )
 RETRY_S: Final = 1.0
 MAX_RETRY_S: Final = 16.0
 PAUSE_FACTOR: Final = limit(
-    4,
-    "times the time that it took",
-    "shares",
-    surface=SURFACE,
-    source="vessel",
-    resource="pause of a vessel after an image that ended the decoding process",
-    at_limit="its images wait; those of other vessels are decoded",
+    4, "times its duration", "shares", SURFACE, "vessel", "pause after a decoder's crash", "other vessels are served"
 )
 MAX_PAUSE_S: Final = 300.0
 FAILURES_ALONE: Final = limit(
-    2,
-    "failures",
-    "blame",
-    surface=SURFACE,
-    source="vessel",
-    resource="failures of an image that is decoded alone, after each of which another image was stored",
-    at_limit="the image is quarantined; `sonarpost store quarantine` queues it again",
+    2, "failures", "blame", SURFACE, "vessel", "failures alone, others stored since", "the image is quarantined"
 )
 MAX_WAITING: Final = limit(
-    1000,
-    "images",
-    "shares",
-    surface=SURFACE,
-    source="vessel",
-    resource="images that wait for codebooks",
-    at_limit="further ones are quarantined",
+    1000, "images", "shares", SURFACE, "vessel", "images that wait for codebooks", "further ones are quarantined"
 )
 MAX_MODELS: Final = limit(
-    8,
-    "codebooks",
-    "shares",
-    surface="codebooks of vessels",
-    source="vessel",
-    resource="codebooks that images wait for",
-    at_limit="further ones are requested later",
+    8, "codebooks", "shares", "codebooks of vessels", "vessel", "codebooks to wait for", "others wait"
 )
 
 

@@ -31,41 +31,17 @@ log = logging.getLogger(__name__)
 
 SURFACE: Final = "queries for accepted records"
 MAX_BYTES: Final = limit(
-    256 * 1024,
-    "bytes",
-    "claims",
-    surface=SURFACE,
-    source="client",
-    resource="replies to one query, unless the first record alone is larger",
-    at_limit="the client queries the next page",
+    256 * 1024, "bytes", "claims", SURFACE, "client", "replies to a query, or one record", "the next page is queried"
 )
 LARGE_BYTES: Final = limit(
-    1024 * 1024,
-    "bytes",
-    "claims",
-    surface=SURFACE,
-    source="client",
-    resource="pixels of a record that is sent at the same time as others",
-    at_limit="larger records are read and sent one at a time",
+    1024 * 1024, "bytes", "claims", SURFACE, "client", "pixels of a record beside others", "larger ones one at a time"
 )
 THREADS: Final = 2
 MAX_IN_PROGRESS: Final = limit(
-    8,
-    "queries",
-    "shares",
-    surface=SURFACE,
-    source="client",
-    resource="queries in progress, of all clients",
-    at_limit="further ones get an error reply and are repeated",
+    8, "queries", "shares", SURFACE, "client", "queries in progress, of all", "further ones get an error"
 )
 RATE_PER_S: Final = limit(
-    20.0,
-    "queries a second",
-    "shares",
-    surface=SURFACE,
-    source="client",
-    resource="queries of all clients, after a burst of 40",
-    at_limit="further ones get an error reply and are repeated",
+    20.0, "queries a second", "shares", SURFACE, "client", "queries of all, after 40", "further ones get an error"
 )
 BURST: Final = 40.0
 BUSY: Final = "busy"

@@ -35,13 +35,7 @@ log = logging.getLogger(__name__)
 TAKE_OVER_AFTER_S = 60.0
 TAKE_OVER_RECORDS = 64
 TAKE_OVER_BYTES: Final = limit(
-    8 * 1024 * 1024,
-    "bytes",
-    "claims",
-    surface="records of another c2",
-    source="vessel",
-    resource="records that are taken over in one transaction, at least one",
-    at_limit="the others follow; after a failure half as many",
+    8 * 1024 * 1024, "bytes", "claims", "records of another c2", "vessel", "records taken over at once", "others follow"
 )
 
 

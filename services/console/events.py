@@ -13,9 +13,7 @@ from sonarpost.limits import limit
 from sonarpost.services.console.store.serialisers import Json
 
 BUFFERED_EVENTS = 2000
-MAX_BUFFERED_BYTES = limit(
-    16_000_000, "bytes", "claims", surface="event stream", source="vessel", resource="events", at_limit="the oldest end"
-)
+MAX_BUFFERED_BYTES = limit(16_000_000, "bytes", "claims", "event stream", "vessel", "events", "the oldest end")
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,22 +17,10 @@ from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_
 from sonarpost.messages import ReceivedImage
 
 MAX_HELD_IMAGES: Final = limit(
-    1000,
-    "images",
-    "shares",
-    surface="acoustic link",
-    source="vehicle",
-    resource="images that wait for the allowance of an hour",
-    at_limit="Further images are dropped; vehicles without a configured name are one source",
+    1000, "images", "shares", "acoustic link", "vehicle", "images above the allowance", "further ones are dropped"
 )
 MAX_HELD_BYTES: Final = limit(
-    4 * 1024 * 1024,
-    "bytes",
-    "shares",
-    surface="acoustic link",
-    source="vehicle",
-    resource="coded images that wait for the allowance of an hour",
-    at_limit="Further images are dropped",
+    4 * 1024 * 1024, "bytes", "shares", "acoustic link", "vehicle", "their size", "further ones are dropped"
 )
 UNLISTED: Final = "unlisted vehicles"
 """Allowance that all vehicles without a configured name share: a forger can choose any of 128 addresses."""

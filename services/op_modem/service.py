@@ -47,13 +47,7 @@ _QUEUE_0_1 = "decompressor"
 TICK_S = 0.1
 SAVE_RETRY_S = 1.0
 MAX_UNSAVED = limit(
-    10_000,
-    "packets",
-    "shares",
-    surface="acoustic link, vessel",
-    source="modem address",
-    resource="packets while the store cannot be written",
-    at_limit="the oldest of the address with the most is dropped",
+    10_000, "packets", "shares", "acoustic link", "modem address", "packets without a disk", "the oldest is dropped"
 )
 
 

@@ -31,13 +31,7 @@ from sonarpost.messages import Command, CommandKind, Decision
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 
 _MAX_KNOWN: Final = limit(
-    512,
-    "commands",
-    "shares",
-    surface="acoustic link, vehicle",
-    source="modem address",
-    resource="commands that are recognised when they are repeated",
-    at_limit="the oldest of the address with the most is forgotten",
+    512, "commands", "shares", "acoustic link", "modem address", "commands to recognise", "the oldest is forgotten"
 )
 _KINDS: Final[dict[type, CommandKind]] = {
     RefineMessage: "refine",

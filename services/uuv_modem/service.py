@@ -38,22 +38,10 @@ from sonarpost.services.uuv_modem.vehicle_endpoint import VehicleEndpoint
 log = logging.getLogger(__name__)
 
 MAX_EVENTS: Final = limit(
-    10_000,
-    "events",
-    "claims",
-    surface="acoustic link, vehicle",
-    source="modem",
-    resource="events that wait for the thread of the link",
-    at_limit="further ones are dropped, except the end of an own packet",
+    10_000, "events", "claims", "acoustic link", "modem", "events waiting", "further ones are dropped"
 )
 MAX_UNSAVED: Final = limit(
-    1000,
-    "frames",
-    "shares",
-    surface="acoustic link, vehicle",
-    source="all modems",
-    resource="frames while the store cannot be written",
-    at_limit="further ones are dropped; the vessel repeats them",
+    1000, "frames", "shares", "acoustic link", "all modems", "frames without a disk", "further ones are dropped"
 )
 SAVE_AGAIN_S: Final = 0.5
 _ARRIVAL_0_1: Final = "arrival/"

@@ -34,44 +34,20 @@ log = logging.getLogger(__name__)
 
 SURFACE: Final = "codebooks of vessels"
 MAX_CODEBOOK_BYTES: Final = limit(
-    16 * 1024 * 1024,
-    "bytes",
-    "claims",
-    surface=SURFACE,
-    source="vessel",
-    resource="incomplete codebook, on the disk: one of each vessel",
-    at_limit="the codebook is refused",
+    16 * 1024 * 1024, "bytes", "claims", SURFACE, "vessel", "incomplete codebook on the disk", "it is refused"
 )
 MAX_CODEBOOKS: Final = limit(
-    8,
-    "codebooks",
-    "shares",
-    surface=SURFACE,
-    source="vessel",
-    resource="stored codebooks",
-    at_limit="no further codebook is fetched",
+    8, "codebooks", "shares", SURFACE, "vessel", "stored codebooks", "no further codebook is fetched"
 )
 REPLY_TIMEOUT_S: Final = limit(
-    10.0,
-    "s",
-    "deadlines",
-    surface=SURFACE,
-    source="vessel",
-    resource="time for one piece: the longest delay that a vessel causes for the others, in one round",
-    at_limit="the vessel pauses, after each failure twice as long",
+    10.0, "s", "deadlines", SURFACE, "vessel", "one piece: delay of others in a round", "the vessel pauses"
 )
 RETRY_S: Final = 60.0
 """First pause of a vessel from which a codebook cannot be fetched, and interval of the attempts."""
 MAX_RETRY_S: Final = 3600.0
 SLOW_S: Final = 1.0
 PAUSE_FACTOR: Final = limit(
-    4,
-    "times the time of the reply",
-    "shares",
-    surface=SURFACE,
-    source="vessel",
-    resource="pause of a vessel after a reply that took more than 1 s, while other vessels wait",
-    at_limit="the other vessels are queried",
+    4, "times its duration", "shares", SURFACE, "vessel", "pause after a reply of over 1 s", "other vessels are queried"
 )
 PARTIAL: Final = ".partial"
 

@@ -23,13 +23,7 @@ from sonarpost.sonar.image_decoding import MAX_FILE_BYTES
 log = logging.getLogger(__name__)
 
 MIN_FILE_BYTES: Final = limit(
-    16384,
-    "bytes a file",
-    "claims",
-    surface="archive of c2",
-    source="vessel",
-    resource="least size that max_bytes counts",
-    at_limit="Many small files exhaust neither blocks nor inodes of the disk before max_bytes is reached",
+    16384, "bytes a file", "claims", "archive of c2", "vessel", "least size for max_bytes", "small files count as this"
 )
 
 

@@ -28,13 +28,7 @@ POLL_S: Final = 0.3
 SESSION_S: Final = 90.0
 """The terminal itself gives up after about a minute."""
 EXCHANGE_S: Final = limit(
-    150.0,
-    "s",
-    "deadlines",
-    surface="satellite terminal",
-    source="terminal",
-    resource="exchange of a message",
-    at_limit="the port is closed, and the message counts as not sent",
+    150.0, "s", "deadlines", "satellite terminal", "terminal", "exchange of a message", "the message counts as not sent"
 )
 _MO_SENT: Final = 4
 """Highest status of +SBDIX that means that the message was sent."""

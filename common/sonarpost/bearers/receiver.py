@@ -25,22 +25,10 @@ from sonarpost.messages import Decision, ReceivedImage
 ACKNOWLEDGE_AFTER_MESSAGES = 16
 ACKNOWLEDGE_AFTER_S = 60.0
 MAX_WINDOWS: Final = limit(
-    4,
-    "windows",
-    "shares",
-    surface="short messages",
-    source="vessel",
-    resource="windows of sequence numbers",
-    at_limit="the window with the fewest messages is deleted; a late repetition of its messages is stored again",
+    4, "windows", "shares", "short messages", "vessel", "windows", "the one with the fewest messages is deleted"
 )
 MAX_FRAGMENTS_KEPT: Final = limit(
-    3 * WINDOW,
-    "fragments",
-    "shares",
-    surface="short messages",
-    source="vessel",
-    resource="fragments of incomplete decisions",
-    at_limit="the decision that waits longest for a fragment is deleted; valid ones need fewer",
+    3 * WINDOW, "fragments", "shares", "short messages", "vessel", "fragments", "the idlest decision is deleted"
 )
 _WHERE: Final = "state of short messages"
 _WINDOWS: Final = "windows"

@@ -24,33 +24,15 @@ from sonarpost.network.connections import ConnectionLimits, LimitedHandler, Limi
 log = logging.getLogger(__name__)
 
 MAX_BODY_BYTES: Final = limit(
-    4096,
-    "bytes",
-    "claims",
-    surface="webhook",
-    source="client",
-    resource="body of a request",
-    at_limit="the request is refused",
+    4096, "bytes", "claims", "webhook", "client", "body of a request", "the request is refused"
 )
 MAX_FIELDS: Final = 20
 MAX_MT_BYTES: Final = 270
 MAX_CONNECTIONS: Final = limit(
-    64,
-    "connections",
-    "shares",
-    surface="webhook",
-    source="all clients",
-    resource="connections",
-    at_limit="the connection that waits longest for its request is closed; without one, 503",
+    64, "connections", "shares", "webhook", "all clients", "connections", "the idlest is closed, or 503"
 )
 MAX_CONNECTIONS_OF_ADDRESS: Final = limit(
-    16,
-    "connections",
-    "shares",
-    surface="webhook",
-    source="address",
-    resource="connections of an address",
-    at_limit="the connection that waits longest for its request is closed; without one, 503",
+    16, "connections", "shares", "webhook", "address", "connections", "the idlest is closed, or 503"
 )
 _IMEI = re.compile(r"[0-9]{15}")
 _HEX = re.compile(r"(?:[0-9a-fA-F]{2}){0,340}")

@@ -24,30 +24,13 @@ from sonarpost.messages import Record
 
 log = logging.getLogger(__name__)
 
-_PLACES: Final = {"surface": "quarantine of every service", "source": "sender of a record"}
-MAX_QUARANTINED: Final = limit(
-    1000,
-    "records",
-    "shares",
-    resource="quarantined records",
-    at_limit="the oldest records of the sender with the most bytes are deleted",
-    **_PLACES,
-)
+_OLDEST: Final = "the largest source loses its oldest"
+MAX_QUARANTINED: Final = limit(1000, "records", "shares", "quarantine", "sender", "quarantined records", _OLDEST)
 MAX_QUARANTINE_BYTES: Final = limit(
-    256 * 1024 * 1024,
-    "bytes",
-    "shares",
-    resource="size of the quarantine",
-    at_limit="the oldest records of the sender with the most bytes are deleted",
-    **_PLACES,
+    256 * 1024 * 1024, "bytes", "shares", "quarantine", "sender", "size of the quarantine", _OLDEST
 )
 MAX_QUARANTINED_BYTES: Final = limit(
-    256 * 1024,
-    "bytes",
-    "claims",
-    resource="a quarantined record that was not accepted before",
-    at_limit="the record is cut",
-    **_PLACES,
+    256 * 1024, "bytes", "claims", "quarantine", "sender", "record that was not accepted before", "it is cut"
 )
 
 ROW_BYTES: Final = 1024

@@ -29,13 +29,7 @@ Indices = npt.NDArray[np.int64]
 
 PIXEL_M: Final = 0.125
 MAX_PIXELS: Final = limit(
-    1 << 25,
-    "pixels",
-    "claims",
-    surface="recording",
-    source="recording",
-    resource="seabed of one side of a strip, in pixels of 0.125 m",
-    at_limit="the recording is refused",
+    1 << 25, "pixels", "claims", "recording", "recording", "side of a strip, at 0.125 m", "the recording is refused"
 )
 FINE_SHAPE: Final = (40, 60)
 """Rows along-track and columns across-track of the fine plane."""

@@ -25,13 +25,7 @@ FloatVector = npt.NDArray[np.float64]
 FloatTable = npt.NDArray[np.float64]
 
 MIN_ROW_M: Final = limit(
-    0.001,
-    "m",
-    "claims",
-    surface="recording",
-    source="recording",
-    resource="mean distance between pings, from which the filters take their sizes in pings",
-    at_limit="the distance of the settings is assumed",
+    0.001, "m", "claims", "recording", "recording", "mean distance between pings", "that of the settings is used"
 )
 _EXCLUDED_RISE = -4.0
 """Rise in octaves that excludes a cell from the bottom path."""

@@ -12,13 +12,7 @@ from sonarpost.limits import limit
 from sonarpost.messages import Decision, ReconstructedImage
 
 MAX_NAMES: Final = limit(
-    20_000,
-    "images",
-    "shares",
-    surface="live contacts",
-    source="vessel",
-    resource="image names (vessel, vehicle, identifier) in memory",
-    at_limit="The least recently changed one of the vessel with the most is dropped",
+    20_000, "images", "shares", "live contacts", "vessel", "names in memory", "the largest source loses its oldest"
 )
 MAX_DECISIONS: Final = 256
 """Decisions about one name; further ones are ignored."""

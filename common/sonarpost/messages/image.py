@@ -28,13 +28,7 @@ from sonarpost.messages.record import (
 MAX_STREAM_BYTES: Final = 65542
 """Longest stream of an image, header included."""
 MAX_SIDE_PX: Final = limit(
-    512,
-    "px",
-    "claims",
-    surface="records of coded images",
-    source="vessel, vehicle",
-    resource="claimed side of an image",
-    at_limit="The record is refused; pixels of which nothing arrived are decoded black and stored compressed",
+    512, "px", "claims", "coded images", "vessel, vehicle", "claimed side of an image", "the record is refused"
 )
 """Largest side of a coded image, as in `sonarpost.codec.interface`."""
 SidePx = Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]

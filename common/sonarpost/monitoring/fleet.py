@@ -29,30 +29,12 @@ from sonarpost.messages import Health, ReceivedStatus, VehicleRange
 log = logging.getLogger(__name__)
 
 _SURFACE: Final = "state of the fleet"
-MAX_SERVICES: Final = limit(
-    1000,
-    "services",
-    "shares",
-    surface=_SURFACE,
-    source="all platforms",
-    resource="services",
-    at_limit="others are ignored",
-)
+MAX_SERVICES: Final = limit(1000, "services", "shares", _SURFACE, "all platforms", "services", "others are ignored")
 MAX_SERVICES_OF_PLATFORM: Final = limit(
-    40,
-    "services",
-    "shares",
-    surface=_SURFACE,
-    source="platform",
-    resource="its services",
-    at_limit="others are ignored",
+    40, "services", "shares", _SURFACE, "platform", "its services", "others are ignored"
 )
-MAX_HEALTH_BYTES: Final = limit(
-    65536, "bytes", "claims", surface=_SURFACE, source="platform", resource="a health record", at_limit="it is ignored"
-)
-MAX_VEHICLES: Final = limit(
-    200, "vehicles", "shares", surface=_SURFACE, source="vessel", resource="its vehicles", at_limit="others are ignored"
-)
+MAX_HEALTH_BYTES: Final = limit(65536, "bytes", "claims", _SURFACE, "platform", "a health record", "it is ignored")
+MAX_VEHICLES: Final = limit(200, "vehicles", "shares", _SURFACE, "vessel", "its vehicles", "others are ignored")
 
 Name = tuple[str, str]
 

@@ -24,50 +24,18 @@ log = logging.getLogger(__name__)
 
 _SURFACE: Final = "HTTP servers"
 AT_LIMIT: Final = "the connection that waits longest for its request is closed; without one, the new connection"
-MAX_CONNECTIONS: Final = limit(
-    300,
-    "connections",
-    "shares",
-    surface=_SURFACE,
-    source="all clients",
-    resource="connections",
-    at_limit=AT_LIMIT,
-)
+MAX_CONNECTIONS: Final = limit(300, "connections", "shares", _SURFACE, "all clients", "connections", AT_LIMIT)
 MAX_CONNECTIONS_OF_ADDRESS: Final = limit(
-    100,
-    "connections",
-    "shares",
-    surface=_SURFACE,
-    source="address",
-    resource="connections of an address",
-    at_limit=AT_LIMIT,
+    100, "connections", "shares", _SURFACE, "address", "connections of an address", AT_LIMIT
 )
 REQUEST_S: Final = limit(
-    10.0,
-    "s",
-    "deadlines",
-    surface=_SURFACE,
-    source="client",
-    resource="TLS handshake, head and body of a request, from the connection or the last response",
-    at_limit="the connection is closed",
+    10.0, "s", "deadlines", _SURFACE, "client", "request with the TLS handshake", "the connection is closed"
 )
 READ_S: Final = limit(
-    30.0,
-    "s",
-    "deadlines",
-    surface=_SURFACE,
-    source="client",
-    resource="reading 64 KiB of a response",
-    at_limit="the connection is closed",
+    30.0, "s", "deadlines", _SURFACE, "client", "reading 64 KiB of a response", "the connection is closed"
 )
 MAX_REQUEST_BYTES: Final = limit(
-    65536,
-    "bytes",
-    "claims",
-    surface="webhook, metrics",
-    source="client",
-    resource="head and body of a request",
-    at_limit="the request is refused",
+    65536, "bytes", "claims", "webhook, metrics", "client", "head and body of a request", "the request is refused"
 )
 MAX_REFUSED: Final = 16
 """Refused connections that stay open until their clients have read the refusal."""

@@ -21,22 +21,10 @@ if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
 TIMEOUT_S: Final = limit(
-    10.0,
-    "s",
-    "deadlines",
-    surface="HTTP request to a server outside",
-    source="server",
-    resource="time of the exchange, from the resolution of the name to the reply",
-    at_limit="The connection is closed, and the exchange has failed",
+    10.0, "s", "deadlines", "HTTP request", "server", "exchange, with resolving the name", "the exchange has failed"
 )
 MAX_REPLY_BYTES: Final = limit(
-    1 << 16,
-    "bytes",
-    "claims",
-    surface="HTTP request to a server outside",
-    source="server",
-    resource="reply with its heads, those of interim replies included",
-    at_limit="The connection is closed, and the exchange has failed",
+    1 << 16, "bytes", "claims", "HTTP request", "server", "reply with all heads", "the exchange has failed"
 )
 _POLL_S: Final = 0.1
 

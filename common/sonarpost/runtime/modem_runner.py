@@ -22,13 +22,7 @@ _STOP_S = 1.0
 _RETRY_S = 1.0
 _POLL_S = 0.2
 MAX_INPUTS: Final = limit(
-    256,
-    "inputs",
-    "claims",
-    surface="modem port",
-    source="modem or network",
-    resource="received parts that wait for the driver",
-    at_limit="the port is not read further: the system drops what does not fit its own buffer",
+    256, "inputs", "claims", "modem port", "modem or network", "received parts waiting", "the port is not read further"
 )
 
 

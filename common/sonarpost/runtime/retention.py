@@ -20,22 +20,10 @@ log = logging.getLogger(__name__)
 INTERVAL_S = 60.0
 STEP_S = 3600.0
 MAX_BYTES: Final = limit(
-    20_000_000_000,
-    "bytes",
-    "shares",
-    surface="stored images and files",
-    source="vessel, vehicle",
-    resource="default of max_bytes",
-    at_limit="The source with the most bytes loses items first; vehicles without a configured name are one source",
+    20_000_000_000, "bytes", "shares", "stored files", "source", "default of `max_bytes`", "the largest loses items"
 )
 FOLLOW_AFTER_S: Final = limit(
-    86400.0,
-    "s",
-    "shares",
-    surface="clock of the host",
-    source="operator, time server",
-    resource="time until ages follow the start of a service or a step of the clock",
-    at_limit="Nothing is removed because of its age before",
+    86400.0, "s", "shares", "clock of the host", "time server", "after a start or step of the clock", "none goes by age"
 )
 
 RetainDays = Annotated[float, Field(gt=0, le=36500)]

@@ -48,22 +48,10 @@ C = TypeVar("C", bound=ServiceConfig)
 RETRY_AFTER_S = 1.0
 MAX_RETRY_FACTOR = 4
 ALONE_AFTER: Final = limit(
-    2,
-    "failures",
-    "isolation",
-    surface="records of every service",
-    source="sender of a record",
-    resource="attempts of a batch that fails",
-    at_limit="its records are handled one by one, those that fail after the others",
+    2, "failures", "isolation", "all services", "sender", "attempts of a failing batch", "its records one by one"
 )
 FAILURES_ALONE: Final = limit(
-    3,
-    "failures",
-    "blame",
-    surface="records of every service",
-    source="sender of a record",
-    resource="failures of a record that is handled alone, while others are handled",
-    at_limit="the record is quarantined; `sonarpost store quarantine` queues it again",
+    3, "failures", "blame", "all services", "sender", "failures alone while others are handled", "it is quarantined"
 )
 MAX_DETAIL = 2000
 TYPES_KEPT = 1000

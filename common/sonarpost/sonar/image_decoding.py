@@ -42,22 +42,10 @@ MAX_PIXELS: Final = 1 << 26
 """Enough for a survey of 30,000 pings of 2,000 samples; snippets are much smaller."""
 MAX_FILE_BYTES: Final = 1 << 28
 MAX_DECODED_BYTES: Final = limit(
-    2 * MAX_PIXELS,
-    "bytes",
-    "claims",
-    surface="image files",
-    source="file",
-    resource="pixels that its header states",
-    at_limit="it is refused before it is decoded",
+    2 * MAX_PIXELS, "bytes", "claims", "image files", "file", "pixels that its header states", "it is refused"
 )
 MAX_EXPANSION: Final = limit(
-    2000,
-    "bytes for each byte of the file",
-    "claims",
-    surface="image files",
-    source="file",
-    resource="pixels that its header states, beyond 1 MiB",
-    at_limit="it is refused before it is decoded",
+    2000, "bytes a byte", "claims", "image files", "file", "pixels of its header, beyond 1 MiB", "it is refused"
 )
 EXPECTED: Final = "a JPEG, PNG or TIFF image"
 

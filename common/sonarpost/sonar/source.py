@@ -20,13 +20,7 @@ from sonarpost.sonar.survey import Ping, Side, Survey
 MAX_HELD_BYTES: Final = 1 << 30
 """Maximum size of the samples of a survey in memory; a longer recording is read in strips."""
 STRIP_BYTES: Final = limit(
-    1 << 26,
-    "bytes",
-    "claims",
-    surface="recording",
-    source="recording",
-    resource="samples of a strip, each ping counted as the longest; the detector needs about 20 times as much memory",
-    at_limit="strips are shorter; above twice as much in the fewest pings of a strip, the recording is refused",
+    1 << 26, "bytes", "claims", "recording", "recording", "samples of a strip by its longest ping", "shorter strips"
 )
 
 

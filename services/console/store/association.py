@@ -28,21 +28,11 @@ from sonarpost.services.console.store.database import (
 from sonarpost.services.console.store.serialisers import decode_image
 
 _SURFACE: Final = "contacts of the console"
-MAX_LOOKS: Final = limit(
-    50, "looks", "claims", surface=_SURFACE, source="vehicle", resource="associated again", at_limit="the nearest ones"
-)
+MAX_LOOKS: Final = limit(50, "looks", "claims", _SURFACE, "vehicle", "associated again", "the nearest ones")
 """Maximum number of looks that are associated again when one arrives. In a larger area whose looks are all connected
 by their gates, existing objects stay as they are, and the look joins the nearest one with less than four times as
 many."""
-MAX_NEAR: Final = limit(
-    50,
-    "looks",
-    "shares",
-    surface=_SURFACE,
-    source="vehicle",
-    resource="compared",
-    at_limit="the nearest ones are compared",
-)
+MAX_NEAR: Final = limit(50, "looks", "shares", _SURFACE, "vehicle", "compared", "the nearest ones are compared")
 
 MAX_EARLIER: Final = 20
 """Maximum number of earlier contacts at a place."""

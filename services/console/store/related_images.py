@@ -24,15 +24,7 @@ Relation = Literal["wider", "original", "region"]
 SIZE_TOLERANCE: Final = 0.06
 """Relative deviation of a ratio of pixel sizes; the link transmits them in steps of 2.5 %."""
 
-MAX_RELATED: Final = limit(
-    20,
-    "images",
-    "claims",
-    surface="contacts of the console",
-    source="vehicle",
-    resource="related",
-    at_limit="the newest",
-)
+MAX_RELATED: Final = limit(20, "images", "claims", "contacts of the console", "vehicle", "related", "the newest")
 MAX_COMPARED: Final = 20
 """Contacts of one detection that are compared with a new image."""
 

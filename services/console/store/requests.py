@@ -28,13 +28,7 @@ from sonarpost.services.console.store.serialisers import Json
 from sonarpost.wire import first_error
 
 MAX_WAITING: Final = limit(
-    1000,
-    "records",
-    "shares",
-    surface="records of the console",
-    source="vessel",
-    resource="decisions that arrived before their images; comments, too",
-    at_limit="a further one is refused",
+    1000, "records", "shares", "the console's records", "vessel", "decisions before images; comments", "it is refused"
 )
 REQUEST_KINDS: Final[tuple[CommandKind, ...]] = (
     "refine",

@@ -20,15 +20,7 @@ from sonarpost.services.console.store.database import Table
 Json = dict[str, object]
 Stage = Literal["record", "preview", "part", "sent", "refined"]
 
-MAX_VERSIONS: Final = limit(
-    50,
-    "versions",
-    "claims",
-    surface="contacts of the console",
-    source="vehicle",
-    resource="shown",
-    at_limit="the newest",
-)
+MAX_VERSIONS: Final = limit(50, "versions", "claims", "contacts of the console", "vehicle", "shown", "the newest")
 
 NEWER_DETAIL: Final = (
     "(c.version > c.decided_version AND (c.decided_bytes IS NULL OR c.bytes_received > c.decided_bytes))"

@@ -13,9 +13,7 @@ from sonarpost.services.console.store.serialisers import Json
 
 MAX_POINTS: Final = 5000
 """Statuses of a vehicle that are stored of each vessel, the newest ones: 41 hours of one every 30 s."""
-MAX_VEHICLES: Final = limit(
-    200, "vehicles", "shares", surface="tracks of the console", source="vessel", resource="vehicles", at_limit="ignored"
-)
+MAX_VEHICLES: Final = limit(200, "vehicles", "shares", "tracks of the console", "vessel", "vehicles", "ignored")
 MAX_POINTS_DRAWN: Final = 1000
 """Positions of a vehicle on the map, the newest ones."""
 

@@ -26,13 +26,7 @@ minimum settings of OWASP's password storage cheat sheet. Checks run one at a ti
 SCRYPT_MAX_BYTES = 2**26
 MIN_PASSWORD, MAX_PASSWORD = 10, 200
 MAX_SESSIONS_OF_USER = limit(
-    10,
-    "sessions",
-    "shares",
-    surface="log-in of the console",
-    source="user",
-    resource="sessions",
-    at_limit="the least recently used session ends",
+    10, "sessions", "shares", "log-in of the console", "user", "sessions", "the least recently used session ends"
 )
 MAX_DEVICES_OF_USER = 20
 DEVICE_S = 90 * 86400.0

@@ -32,9 +32,7 @@ log = logging.getLogger(__name__)
 
 COOKIE: Final = "sonarpost_session"
 """Begin of the name of a session's cookie; see `cookie_name`."""
-MAX_BODY_BYTES: Final = limit(
-    65536, "bytes", "claims", surface="HTTP interface of the console", source="client", resource="body", at_limit="413"
-)
+MAX_BODY_BYTES: Final = limit(65536, "bytes", "claims", "HTTP interface of the console", "client", "body", "413")
 SECURITY_HEADERS: Final[Mapping[str, str]] = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
     "connect-src 'self'; font-src 'self'; "

@@ -18,18 +18,8 @@ from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.web.access import AccessControl, ApiError, error_response
 
 KEEP_ALIVE_S = 5.0
-MAX_STREAMS_OF_USER = limit(
-    8,
-    "streams",
-    "shares",
-    surface="event stream",
-    source="user",
-    resource="of one user",
-    at_limit="429 with Retry-After",
-)
-MAX_STREAMS = limit(
-    100, "streams", "shares", surface="event stream", source="all users", resource="in total", at_limit="503"
-)
+MAX_STREAMS_OF_USER = limit(8, "streams", "shares", "event stream", "user", "of one user", "429 with Retry-After")
+MAX_STREAMS = limit(100, "streams", "shares", "event stream", "all users", "in total", "503")
 RETRY_S = 10
 
 

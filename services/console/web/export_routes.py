@@ -34,10 +34,8 @@ from sonarpost.services.console.web.access import AccessControl, ApiError, Call
 from sonarpost.sonar.image_files import png_bytes
 
 SURFACE: Final = "exports and reports of the console"
-MAX_DOCUMENTS: Final = limit(
-    4, "documents", "shares", surface=SURFACE, source="all users", resource="in total", at_limit="503 with Retry-After"
-)
-limit(1, "document", "shares", surface=SURFACE, source="user", resource="of one user", at_limit="429 with Retry-After")
+MAX_DOCUMENTS: Final = limit(4, "documents", "shares", SURFACE, "all users", "in total", "503 with Retry-After")
+limit(1, "document", "shares", SURFACE, "user", "of one user", "429 with Retry-After")
 RETRY_S: Final = 10
 TURN_S: Final = 1.0
 """Interval at which a waiting document checks whether it is still wanted."""

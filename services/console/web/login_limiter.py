@@ -23,40 +23,20 @@ class Rate:
 
 RATE_OF_SOURCE: Final = Rate(
     limit(
-        5,
-        "attempts",
-        "shares",
-        surface="log-in of the console",
-        source="known browser; address",
-        resource="wrong passwords of a user",
-        at_limit="429 with Retry-After, one more attempt after 60 s",
+        5, "attempts", "shares", "log-in", "browser, address", "wrong passwords of a user", "429; one more after 60 s"
     ),
     60.0,
 )
 """Wrong passwords of one user from one source: a known browser, a network address, or a session."""
 RATE_OF_ADDRESS: Final = Rate(
-    limit(
-        20,
-        "attempts",
-        "shares",
-        surface="log-in of the console",
-        source="address",
-        resource="wrong passwords of all users",
-        at_limit="429 with Retry-After, one more attempt after 15 s",
-    ),
+    limit(20, "attempts", "shares", "log-in", "address", "wrong passwords of all users", "429; one more after 15 s"),
     15.0,
 )
 """Wrong passwords from unknown browsers at one network address."""
 RATE_OF_USER: Final = Rate(100, 10.0)
 """Wrong passwords of one user from all unknown browsers."""
 MAX_CHECKS: Final = limit(
-    8,
-    "checks",
-    "shares",
-    surface="log-in of the console",
-    source="all unknown browsers",
-    resource="password checks that run or wait",
-    at_limit="503 with Retry-After",
+    8, "checks", "shares", "log-in", "all unknown browsers", "checks that run or wait", "503, Retry-After"
 )
 """Password checks at a time, running and waiting, of unknown browsers; as many again of known ones."""
 BUSY_RETRY_S: Final = 5

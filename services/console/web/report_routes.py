@@ -16,9 +16,7 @@ from sonarpost.services.console.web.access import AccessControl, ApiError, Call
 from sonarpost.services.console.web.export_routes import SURFACE, DocumentContacts, ExportRoutes
 from sonarpost.services.console.web.report import ReportContact, report_parts
 
-MAX_SHEETS: Final = limit(
-    200, "contacts", "claims", surface=SURFACE, source="user", resource="sheets of 0.3 MB in a document", at_limit="413"
-)
+MAX_SHEETS: Final = limit(200, "contacts", "claims", SURFACE, "user", "sheets of 0.3 MB in a document", "413")
 
 
 class ReportRoutes:

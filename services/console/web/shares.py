@@ -11,15 +11,9 @@ from anyio import CapacityLimiter, to_thread
 from sonarpost.limits import limit
 
 _SURFACE: Final = "HTTP interface of the console"
-MAX_THREADS: Final = limit(
-    16, "requests", "shares", surface=_SURFACE, source="all users", resource="handled in total", at_limit="others wait"
-)
-MAX_THREADS_OF_USER: Final = limit(
-    2, "requests", "shares", surface=_SURFACE, source="user", resource="handled at a time", at_limit="others wait"
-)
-MAX_WAITING_OF_USER: Final = limit(
-    64, "requests", "shares", surface=_SURFACE, source="user", resource="waiting", at_limit="429 with Retry-After"
-)
+MAX_THREADS: Final = limit(16, "requests", "shares", _SURFACE, "all users", "handled in total", "others wait")
+MAX_THREADS_OF_USER: Final = limit(2, "requests", "shares", _SURFACE, "user", "handled at a time", "others wait")
+MAX_WAITING_OF_USER: Final = limit(64, "requests", "shares", _SURFACE, "user", "waiting", "429 with Retry-After")
 P = ParamSpec("P")
 R = TypeVar("R")
 

@@ -38,22 +38,10 @@ log = logging.getLogger(__name__)
 
 RETRY_S: Final = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
 MAX_NOT_ACCEPTED_RETRY_S: Final = limit(
-    5.0,
-    "s",
-    "blame",
-    surface="alerts",
-    source="vessel",
-    resource="time for which alerts that the receiver does not accept delay those of other vessels",
-    at_limit="The alerts of the other vessels are sent; each failed alert is repeated up to 60 s later",
+    5.0, "s", "blame", "alerts", "vessel", "delay by alerts that the receiver refuses", "other vessels follow"
 )
 MAX_WAITING: Final = limit(
-    1000,
-    "alerts",
-    "shares",
-    surface="alerts",
-    source="vessel",
-    resource="alerts that wait for the receiver",
-    at_limit="Further contacts of this vessel wait in the folder of c2 for the next start",
+    1000, "alerts", "shares", "alerts", "vessel", "waiting alerts", "further ones are sent after the next start"
 )
 MAX_SENT: Final = 200_000
 """Identifiers in the state file; the oldest are deleted."""

@@ -45,13 +45,7 @@ REFRESH_S: Final = 600.0
 RETRY_S: Final = (5.0, 10.0, 30.0, 60.0)
 UPLOAD_RETRY_S: Final = 5.0
 MAX_IMAGES: Final = limit(
-    64,
-    "images",
-    "shares",
-    surface="TAK server",
-    source="vessel",
-    resource="images that wait for their upload",
-    at_limit="The oldest one of the vessel with the most is dropped, and its contact is sent without it",
+    64, "images", "shares", "TAK server", "vessel", "images to upload", "the largest source sends one without"
 )
 HEALTH_INTERVAL_S: Final = 5.0
 NAME: Final = "cot"

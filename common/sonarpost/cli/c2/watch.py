@@ -22,13 +22,7 @@ from sonarpost.messages import Decision, ReconstructedImage, Record, TaskingStat
 
 POLL_S = 0.2
 MAX_WAITING: Final = limit(
-    512,
-    "records",
-    "shares",
-    surface="live records of c2, commands",
-    source="vessel",
-    resource="records that wait to be handled",
-    at_limit="further ones are dropped; `c2 cot` and `c2 alert` then read the archive, if they have its folder",
+    512, "records", "shares", "live records of c2", "vessel", "records waiting", "others come from the archive"
 )
 DISCONNECTED_AFTER_S = 1.0
 

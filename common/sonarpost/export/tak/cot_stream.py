@@ -28,13 +28,7 @@ SETTLE_S: Final = 2.0
 """Time before the client ends a connection: TAK Server authenticates the client and parses its events in other threads,
 and can drop events of a client that has left."""
 EXCHANGE_S: Final = limit(
-    60.0,
-    "s",
-    "deadlines",
-    surface="CoT connection",
-    source="TAK server",
-    resource="time of one connection",
-    at_limit="The connection is closed; its events are sent again",
+    60.0, "s", "deadlines", "CoT connection", "TAK server", "time of one connection", "its events are sent again"
 )
 POLL_S: Final = 0.02
 _FIN_WAIT2, _CLOSE = 5, 7

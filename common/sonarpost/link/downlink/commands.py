@@ -17,13 +17,7 @@ from sonarpost.link.downlink.messages import CommandOutcome, token_of
 from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
 
 MAX_PENDING: Final = limit(
-    500,
-    "commands",
-    "shares",
-    surface="acoustic link, vessel",
-    source="vehicle",
-    resource="open commands",
-    at_limit="further ones for this vehicle are refused",
+    500, "commands", "shares", "acoustic link, vessel", "vehicle", "open commands", "further ones are refused"
 )
 _MAX_CLOSED: Final = 1000
 _MAX_RETRY_DOUBLINGS: Final = 3
