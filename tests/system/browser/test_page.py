@@ -218,6 +218,17 @@ def test_lost_connection_recovers(served):
     visit.wait('#chain [data-place="server"][data-state="ok"]')
 
 
+@pytest.mark.parametrize("path", ["notices", "contacts?*", "settings"])
+def test_response_that_is_cut_is_reported_as_a_lost_one(served, path):
+    """A reload of the page cuts the responses to the earlier page, too."""
+    add_contacts(served, 1)
+    visit = served.visit()
+    visit.wait_for_contact("0000")
+    visit.page.route(f"**/api/{path}", lambda route: route.fulfill(content_type="application/json", body='{"no'))
+    visit.page.reload()
+    visit.wait("text=No response from the console's server.")
+
+
 HOSTILE = '<img src=x onerror="window.injected=1"><script>window.injected=2</script>'
 
 

@@ -34,19 +34,19 @@ async function request(method, path, body) {
     headers["Content-Type"] = "application/json";
     headers["X-CSRF-Token"] = csrf;
   }
-  let response;
+  let response, content = null;
   try {
     response = await fetch(path, {
       method, headers, credentials: "same-origin", cache: "no-store", redirect: "error",
       body: method === "GET" ? undefined : JSON.stringify(body ?? {}), signal: AbortSignal.timeout(15000),
     });
+    if (response.ok && response.status !== 204) content = await response.json(); // it can be cut, by a reload, too
   } catch (error) {
     throw new ApiError(0, "no_connection", t("api.no_response"), { cause: String(error) });
   }
   // Without events, the page does not receive the change that it has made.
   if (response.ok && method !== "GET" && !state.online) emit("reload");
-  if (response.status === 204) return null;
-  if (response.ok) return response.json().catch(() => ({}));
+  if (response.ok) return content;
   if (response.status === 401 && !path.startsWith("/api/login")) location.assign("/login?ended");
   throw await errorOf(response);
 }
