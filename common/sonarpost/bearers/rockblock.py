@@ -32,7 +32,7 @@ MAX_CONNECTIONS: Final = limit(
     64, "connections", "shares", "webhook", "all clients", "connections", "the idlest is closed, or 503"
 )
 MAX_CONNECTIONS_OF_ADDRESS: Final = limit(
-    16, "connections", "shares", "webhook", "address", "connections", "the idlest is closed, or 503"
+    16, "connections", "shares", "webhook", "address", "those of an address", "the idlest is closed, or 503"
 )
 _IMEI = re.compile(r"[0-9]{15}")
 _HEX = re.compile(r"(?:[0-9a-fA-F]{2}){0,340}")
