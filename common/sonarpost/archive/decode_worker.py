@@ -34,7 +34,7 @@ from sonarpost.messages import CodedImage, ReconstructedImage
 log = logging.getLogger(__name__)
 
 MAX_DECODE_S: Final = limit(
-    120.0, "s (processor)", "deadlines", "decoding of images", "vessel", "one image", "tried again later"
+    120.0, "s of processor time", "deadlines", "decoding of images", "vessel", "one image", "tried again later"
 )
 """With the compilation of the codec at the first image. Not real time: other programs are not the fault of an image."""
 NICE: Final = 5
@@ -138,7 +138,7 @@ class DecodeWorker:
         if not is_ready:
             return Decoded(reason=f"the decoder does not start: it ended with status {status}", failure="machine")
         if status == -signal.SIGPROF:
-            reason = f"the decoder did not finish within {self._max_decode_s:g} s (processor)"
+            reason = f"the decoder did not finish within {self._max_decode_s:g} s of processor time"
             return Decoded(reason=reason, failure="crash")
         reason = f"the decoder ended with status {status}"
         return Decoded(reason=reason, failure="machine" if status in _MACHINE else "crash")

@@ -28,7 +28,7 @@ MAX_WINDOWS: Final = limit(
     4, "windows", "shares", "short messages", "vessel", "windows", "the one with the fewest messages is deleted"
 )
 MAX_FRAGMENTS_KEPT: Final = limit(
-    3 * WINDOW, "fragments", "shares", "short messages", "vessel", "fragments", "the idlest decision is deleted"
+    3 * WINDOW, "fragments", "shares", "short messages", "vessel", "fragments", "the oldest decision is deleted"
 )
 _WHERE: Final = "state of short messages"
 _WINDOWS: Final = "windows"

@@ -29,10 +29,10 @@ MAX_BODY_BYTES: Final = limit(
 MAX_FIELDS: Final = 20
 MAX_MT_BYTES: Final = 270
 MAX_CONNECTIONS: Final = limit(
-    64, "connections", "shares", "webhook", "all clients", "connections", "the idlest is closed, or 503"
+    64, "connections", "shares", "webhook", "all clients", "connections", "an idle one is closed, or 503"
 )
 MAX_CONNECTIONS_OF_ADDRESS: Final = limit(
-    16, "connections", "shares", "webhook", "address", "those of an address", "the idlest is closed, or 503"
+    16, "connections", "shares", "webhook", "address", "those of an address", "an idle one is closed, or 503"
 )
 _IMEI = re.compile(r"[0-9]{15}")
 _HEX = re.compile(r"(?:[0-9a-fA-F]{2}){0,340}")

@@ -45,7 +45,7 @@ MAX_DECODED_BYTES: Final = limit(
     2 * MAX_PIXELS, "bytes", "claims", "image files", "file", "pixels that its header states", "it is refused"
 )
 MAX_EXPANSION: Final = limit(
-    2000, "bytes a byte", "claims", "image files", "file", "pixels of its header, beyond 1 MiB", "it is refused"
+    2000, "bytes for each byte", "claims", "image files", "file", "pixels of its header, beyond 1 MiB", "it is refused"
 )
 EXPECTED: Final = "a JPEG, PNG or TIFF image"
 
