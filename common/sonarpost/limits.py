@@ -6,7 +6,8 @@ Each limit is declared where it is enforced, with `limit`. docs/specifications/l
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, TypeVar
 
@@ -70,6 +71,13 @@ def limit(value: N, unit: str, rule: Rule, surface: str, source: str, resource: 
         raise ValueError(f"limit declared twice: {name}")
     DECLARED[name] = Limit(rule, surface, source, resource, value, unit, at_limit, module)
     return value
+
+
+def oldest_of_largest(items: Iterable[T], source_of: Callable[[T], Hashable]) -> T:
+    """Return the first item of the source with the most items; it makes room for another one."""
+    sources = [(source_of(item), item) for item in items]
+    [(largest, _)] = Counter(source for source, _ in sources).most_common(1)
+    return next(item for source, item in sources if source == largest)
 
 
 class Turns:

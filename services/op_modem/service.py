@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.outbox import QueuePolicy
 from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import DeliveryError, FrameError, PayloadError
-from sonarpost.limits import limit
+from sonarpost.limits import limit, oldest_of_largest
 from sonarpost.link.downlink.vessel_endpoint import ReceivedContent
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.logs import kv
@@ -169,10 +169,11 @@ class OpModemService(DownlinkService):
         with self._unsaved_lock:
             self._unsaved.append((packet, received_utc_s))
             if len(self._unsaved) > MAX_UNSAVED:
-                [(most, _)] = Counter(waiting.src for waiting, _ in self._unsaved).most_common(1)
-                self._unsaved.remove(next(each for each in self._unsaved if each[0].src == most))
+                dropped = oldest_of_largest(self._unsaved, lambda waiting: waiting[0].src)
+                self._unsaved.remove(dropped)
                 self.count("packets_lost")
-                log.error("Oldest packet in memory dropped", extra=kv(source=most, unsaved=len(self._unsaved)))
+                fields = kv(source=dropped[0].src, unsaved=len(self._unsaved))
+                log.error("Oldest packet in memory dropped", extra=fields)
 
     def _process_received(self) -> None:
         """Process the packets in memory, oldest first, then the images whose wait has ended."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Final
 
 from sonarpost import keys
-from sonarpost.limits import limit
+from sonarpost.limits import limit, oldest_of_largest
 from sonarpost.link.downlink.messages import (
     CommandOutcome,
     DecisionMessage,
@@ -85,8 +85,7 @@ class ReceivedCommands:
         outcome = CommandOutcome.ACCEPTED if is_executed else CommandOutcome.UNSUPPORTED
         self._known[name] = outcome
         while len(self._known) > _MAX_KNOWN:
-            [(most, _)] = Counter(sender for sender, _ in self._known).most_common(1)
-            del self._known[next(each for each in self._known if each[0] == most)]
+            del self._known[oldest_of_largest(self._known, itemgetter(0))]
         return outcome, received if is_executed else None
 
     def _is_executed_by_the_queue(self, command: DownlinkCommand) -> bool:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from typing import Final
 
 from sonarpost.export.contacts import ExportContact, SideCar, match_start_time
-from sonarpost.limits import limit
+from sonarpost.limits import limit, oldest_of_largest
 from sonarpost.messages import Decision, ReconstructedImage
 
 MAX_NAMES: Final = limit(
@@ -100,8 +101,7 @@ class LiveContacts:
         name = self._names.setdefault(key, _Name())
         self._names.move_to_end(key)
         if len(self._names) > self._max_names:
-            largest = Counter(vessel for vessel, _, _ in self._names).most_common(1)[0][0]
-            del self._names[next(each for each in self._names if each[0] == largest)]
+            del self._names[oldest_of_largest(self._names, itemgetter(0))]
         return name
 
     def _contact(self, key: tuple[str, str, str], start_s: int) -> ExportContact:

@@ -6,8 +6,8 @@ import argparse
 import logging
 import os
 import time
-from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable
+from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -31,7 +31,7 @@ from sonarpost.export.tak.data_package import (
 )
 from sonarpost.export.tak.tak_files import PackageRefusedError, TakFiles
 from sonarpost.export.text import utc_text
-from sonarpost.limits import Turns, limit
+from sonarpost.limits import Turns, limit, oldest_of_largest
 from sonarpost.logs import kv
 from sonarpost.messages import Health, ServiceState
 from sonarpost.stop_signals import stop_on_signals
@@ -191,18 +191,16 @@ class CotService:
         if change.png is not None and self._files is not None:
             self._waiting[contact.uid] = change.png
             if len(self._waiting) > MAX_IMAGES:
-                uid = self._oldest_of_largest(self._waiting)
+                uid = oldest_of_largest(self._waiting, self._vessel_of)
                 del self._waiting[uid]
                 log.warning("Image not uploaded: too many wait", extra=kv(contact=uid, limit=MAX_IMAGES))
         if len(self._markers) > self._max_contacts:
-            dropped = self._oldest_of_largest(self._markers)
+            dropped = oldest_of_largest(self._markers, self._vessel_of)
             del self._markers[dropped]
             self._waiting.pop(dropped, None)
 
-    def _oldest_of_largest(self, uids: Iterable[str]) -> str:
-        vessels = {uid: self._markers[uid].contact.image.vessel_id for uid in uids}
-        largest = Counter(vessels.values()).most_common(1)[0][0]
-        return next(uid for uid, vessel in vessels.items() if vessel == largest)
+    def _vessel_of(self, uid: str) -> str:
+        return self._markers[uid].contact.image.vessel_id
 
     def send_due(self) -> int:
         """Send the events that are due; return their number, 0 after a failure, which is logged and tried again."""
