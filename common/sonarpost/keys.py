@@ -295,11 +295,6 @@ def shore_coded(vessel: str, site: str = SHORE) -> str:
     return _of(site, f"contact/{_name('vessel', vessel)}/coded")
 
 
-def shore_coded_all(site: str = SHORE) -> str:
-    """Coded images of every vessel that a site's c2 has accepted."""
-    return _of(site, "contact/*/coded")
-
-
 def shore_decision(vessel: str, site: str = SHORE) -> str:
     """A vessel's decision that the site's c2 has stored.
 
@@ -344,11 +339,6 @@ def shore_contact_all(site: str = SHORE) -> str:
 def shore_contact_everywhere() -> str:
     """All records of every vessel that the c2 of any site has stored, for routers."""
     return f"{ROOT}/*/contact/*/*"
-
-
-def json_mirror_all(site: str = SHORE) -> str:
-    """JSON forms of all records that a site's c2 publishes, if its `json_mirror` is set."""
-    return _of(site, "json/**")
 
 
 def json_mirror(key: str) -> str:

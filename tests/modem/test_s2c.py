@@ -433,7 +433,7 @@ def test_destination_and_length_are_checked(address: int) -> None:
         ready_modem().ping(address, 2.0)
     with pytest.raises(FrameError, match="length of frame 1"):
         ready_modem().send_packet(3, 0, [bytes(65)], now=2.0)
-    assert CAPABILITIES.mtu_bytes == 64
+    assert max(rate.frame_bytes for rate in CAPABILITIES.rates.values()) == 64
 
 
 def test_emulated_modem_limits_its_input_and_knows_both_modes() -> None:

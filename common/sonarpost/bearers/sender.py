@@ -236,13 +236,6 @@ class MessageSender:
         [first] = self._turns.pick(waiting, 1)
         return [first, *(item for item in ready if item is not first)]
 
-    def next_due_s(self) -> float | None:
-        """Return when `next_message` returns a message, None while there is none."""
-        times = [pending.due_s for pending in self._pending.values()]
-        if self._queue and self._window_open:
-            times.append(min(item.created_s for item in self._queue.values()) + self.after_s)
-        return min(times, default=None)
-
     @property
     def _window_open(self) -> bool:
         return self.next_seq - min(self._pending, default=self.next_seq) < WINDOW and self.next_seq <= MAX_SEQ

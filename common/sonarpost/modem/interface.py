@@ -86,11 +86,6 @@ class ModemCapabilities:
     polling: bool = False
     short_messages: bool = False
 
-    @property
-    def mtu_bytes(self) -> int:
-        """Length of the longest frame of any rate."""
-        return max(rate.frame_bytes for rate in self.rates.values())
-
     def check_address(self, address: int, where: str, field: str = "address") -> None:
         """Check the address of a modem; `where` and `field` name it in the error.
 
