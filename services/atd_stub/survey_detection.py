@@ -37,22 +37,10 @@ MAX_SAMPLE_M: Final = limit(
     1.0, "m for each sample", "claims", "input folder", "recording", "slant range of a ping", "the ping is not searched"
 )
 MAX_SEARCH_S: Final = limit(
-    600.0,
-    "s of processor time",
-    "deadlines",
-    "input folder",
-    "recording",
-    "search, beside that by size",
-    "it is quarantined",
+    600.0, "s of processor time", "deadlines", "input folder", "recording", "search, beside that by size", "quarantine"
 )
 MAX_SEARCH_S_PER_MB: Final = limit(
-    100.0,
-    "s of processor time a MB",
-    "deadlines",
-    "input folder",
-    "recording",
-    "search, by its size",
-    "it is quarantined",
+    100.0, "s of processor time a MB", "deadlines", "input folder", "recording", "search, by its size", "quarantine"
 )
 SurveyEnd = StreamEnd[bytes]
 """The end of a recording; its contacts are encoded snippets, as they are stored."""

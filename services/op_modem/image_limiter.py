@@ -20,13 +20,7 @@ MAX_HELD_IMAGES: Final = limit(
     1000, "images", "shares", "acoustic link", "vehicle", "images above the allowance", "further ones are dropped"
 )
 MAX_HELD_BYTES: Final = limit(
-    4 * 1024 * 1024,
-    "bytes",
-    "shares",
-    "acoustic link",
-    "vehicle",
-    "bytes above the allowance",
-    "further ones are dropped",
+    4 * 1024 * 1024, "bytes", "shares", "acoustic link", "vehicle", "bytes above the allowance", "further are dropped"
 )
 UNLISTED: Final = "unlisted vehicles"
 """Allowance that all vehicles without a configured name share: a forger can choose any of 128 addresses."""

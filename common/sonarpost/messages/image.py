@@ -151,25 +151,6 @@ class CodedImage(ReceivedImage):
     A later record of the same image has a higher `version` and replaces the earlier ones.
 
     Attributes:
-        vessel_id: Vessel that received it.
-        vehicle_id: Vehicle that sent it, identified by the address of its modem.
-        image_id: Identifier of the image on the acoustic link.
-        version: 1 for the first record of this image; counts up as more of it arrives.
-        contact: The contact as far as the acoustic link carries it. None if the contact frame has not arrived.
-        height_px: Rows of the image, from the contact frame. None if not known.
-        width_px: Columns of the image, from the contact frame. None if not known.
-        stream: The codec's stream, header included, with zeros in the ranges `missing`. Empty if no header has arrived.
-        missing: Ranges of `stream` that have not arrived: first byte and the byte after the last one, ascending.
-        missing_halves: Halves (in the sense of the paper) of which no byte arrived.
-        complete: Everything arrived that the vehicle has planned to send so far.
-        bytes_received: Bytes of the stream that arrived.
-        bytes_total: Length of the stream that the vehicle has planned to send so far; 0 if not known.
-        frames_received: Acoustic frames used; 0 if the wire format does not count them.
-        conflicts: Frames that contradict others of this image.
-        first_frame_utc_s: Arrival of the first frame, by the vessel's clock.
-        last_frame_utc_s: Arrival of the last frame that contributed.
-        authenticated: Whether all acoustic frames that contributed were authenticated with a key. None: not known, in
-            records of earlier versions.
         codec: Name of the codec; empty if only the contact frame arrived, or if the name is not known.
         model: First 32 hexadecimal digits of the identity of the codebook that the decoder needs; empty for a codec
             without codebooks, whose models are part of the software.

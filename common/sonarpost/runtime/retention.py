@@ -20,22 +20,10 @@ log = logging.getLogger(__name__)
 INTERVAL_S = 60.0
 STEP_S = 3600.0
 MAX_BYTES: Final = limit(
-    20_000_000_000,
-    "bytes",
-    "shares",
-    "stored files",
-    "source",
-    "default of `max_bytes`",
-    "the largest source loses items",
+    20_000_000_000, "bytes", "shares", "stored files", "source", "default of `max_bytes`", "the largest loses items"
 )
 FOLLOW_AFTER_S: Final = limit(
-    86400.0,
-    "s",
-    "shares",
-    "clock of the host",
-    "time server",
-    "after a start or step of the clock",
-    "nothing is removed by age",
+    86400.0, "s", "shares", "clock of the host", "time server", "after a start or step", "nothing is removed by age"
 )
 
 RetainDays = Annotated[float, Field(gt=0, le=36500)]
