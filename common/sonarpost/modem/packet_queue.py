@@ -1,15 +1,18 @@
-"""Queue of packets and requests of a driver: limited in number and in age."""
+"""Queue of packets and requests of a driver, limited in number and in age, and the drivers that have one."""
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Generic, TypeVar
 
-from sonarpost.modem.interface import PacketFailed
+from sonarpost.modem.interface import Modem, ModemCapabilities, ModemEvent, PacketFailed, PacketSent
+from sonarpost.modem.registry import ModemSettings
 
 QUEUED_PACKETS: Final = 8
 MAX_DEFER_S: Final = 120.0
+S = TypeVar("S")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +34,13 @@ class WaitingPacket:
     def failed(self, reason: str, *, maybe_sent: bool = False) -> PacketFailed:
         """Return the event of a packet that was not sent."""
         return PacketFailed(self.number, self.destination, self.rate, self.frames, reason, maybe_sent)
+
+    def sent(
+        self, acknowledged: Sequence[int], started_s: float, finished_s: float, *, end_reported: bool = True
+    ) -> PacketSent:
+        """Return the event of a packet that was transmitted."""
+        which = (self.number, self.destination, self.rate, self.frames)
+        return PacketSent(*which, tuple(acknowledged), started_s, finished_s, end_reported)
 
 
 class PacketQueue:
@@ -70,3 +80,69 @@ class PacketQueue:
     def deadline_s(self) -> float | None:
         """Return when the next packet has waited too long, None without one."""
         return self._packets[0].queued_s + self._max_age_s if self._packets else None
+
+
+class QueueingModem(Modem, Generic[S]):
+    """Base class of drivers with a `PacketQueue`, which have one packet or request in progress, `_sending`.
+
+    Args:
+        capabilities: Capabilities of the modem.
+        settings: Settings of the driver.
+        where: Names the port in errors.
+
+    Raises:
+        ConfigError: The modem does not have the address.
+    """
+
+    def __init__(self, capabilities: ModemCapabilities, settings: ModemSettings, where: str) -> None:
+        capabilities.check_address(settings.address, where)
+        self._capabilities = capabilities
+        self._settings = settings
+        self._queue = PacketQueue()
+        self._sending: S | None = None
+        self._next_id = 1
+        self._is_open = False
+        self._received_s = 0.0
+        self._events: list[ModemEvent] = []
+        self._events_since_s = 0.0
+
+    @property
+    def capabilities(self) -> ModemCapabilities:
+        """Capabilities of the driver."""
+        return self._capabilities
+
+    @property
+    def queued(self) -> int:
+        """Number of packets and requests that are queued or in progress."""
+        return len(self._queue) + (self._sending is not None)
+
+    @property
+    def receiving(self) -> bool:
+        """False: the modem does not report the start of a reception."""
+        return False
+
+    def poll(self, now: float) -> list[ModemEvent]:
+        """Do what is due."""
+        self._advance(now)
+        return self._take_events()
+
+    def _advance(self, now: float) -> None:
+        """Do what is due; subclasses extend it."""
+        self._events_since_s = now
+        self._events += map(self._result, self._queue.expire(now))
+
+    def _add(self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool, now: float) -> int:
+        number, self._next_id = self._next_id, self._next_id + 1
+        failed = self._queue.add(WaitingPacket(number, destination, rate, tuple(map(bytes, frames)), ack, now))
+        if failed is not None:
+            self._events.append(self._result(failed))
+        self._advance(now)
+        return number
+
+    def _result(self, failed: PacketFailed) -> ModemEvent:
+        """Return the event of a packet that has failed."""
+        return failed
+
+    def _take_events(self) -> list[ModemEvent]:
+        events, self._events = self._events, []
+        return events

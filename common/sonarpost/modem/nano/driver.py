@@ -17,8 +17,6 @@ from typing import Final
 from sonarpost.errors import SentenceError
 from sonarpost.modem.interface import (
     FrameReceived,
-    Modem,
-    ModemCapabilities,
     ModemError,
     ModemEvent,
     ModemReady,
@@ -26,7 +24,6 @@ from sonarpost.modem.interface import (
     ModemUnresponsive,
     PacketFailed,
     PacketReceived,
-    PacketSent,
     RangeMeasured,
     RequestDone,
     RequestFailed,
@@ -36,7 +33,7 @@ from sonarpost.modem.interface import (
 )
 from sonarpost.modem.nano import messages
 from sonarpost.modem.nano.rates import CAPABILITIES, RATE, airtime_s
-from sonarpost.modem.packet_queue import PacketQueue, WaitingPacket
+from sonarpost.modem.packet_queue import QueueingModem, WaitingPacket
 from sonarpost.modem.registry import ModemSettings
 
 PAUSE_S: Final = 1.0
@@ -81,7 +78,7 @@ class _Sending:
         return self.is_ping or (self.packet.ack and self.packet.destination != CAPABILITIES.broadcast)
 
 
-class NanoModem(Modem):
+class NanoModem(QueueingModem[_Sending]):
     """One nanomodem.
 
     Args:
@@ -93,41 +90,19 @@ class NanoModem(Modem):
     """
 
     def __init__(self, settings: ModemSettings, where: str = "modem port") -> None:
-        CAPABILITIES.check_address(settings.address, where)
-        self._settings = settings
+        super().__init__(CAPABILITIES, settings, where)
         self._assembler = messages.MessageAssembler()
-        self._queue = PacketQueue()
-        self._sending: _Sending | None = None
         self._question: bytes | None = None
         self._asked_s = 0.0
         self._attempts = 0
-        self._is_open = self._is_ready = self._is_unresponsive = False
-        self._received_s = 0.0
+        self._is_ready = self._is_unresponsive = False
         self._message_s: float | None = None
-        self._next_id = 1
         self._out: list[bytes] = []
-        self._events: list[ModemEvent] = []
-        self._events_since_s = 0.0
-
-    @property
-    def capabilities(self) -> ModemCapabilities:
-        """Capabilities of the driver."""
-        return CAPABILITIES
 
     @property
     def ready(self) -> bool:
         """Whether the modem has the address of the settings and answers."""
         return self._is_ready
-
-    @property
-    def queued(self) -> int:
-        """Number of packets and pings that are queued or in progress."""
-        return len(self._queue) + (self._sending is not None)
-
-    @property
-    def receiving(self) -> bool:
-        """False: the modem does not report the start of a reception."""
-        return False
 
     def port_opened(self, now: float) -> None:
         """Request the status of the modem, then set its address if that is another one."""
@@ -153,12 +128,12 @@ class NanoModem(Modem):
     ) -> int:
         """Queue a packet; see `Modem.send_packet`."""
         CAPABILITIES.check_packet(destination, rate, frames)
-        return self._add(destination, tuple(map(bytes, frames)), ack=ack, now=now)
+        return self._add(destination, RATE, frames, ack=ack, now=now)
 
     def ping(self, destination: int, now: float) -> int:
         """Queue a ping; see `Modem.ping`."""
         CAPABILITIES.check_packet(destination, RATE, [b""])
-        return self._add(destination, (), ack=False, now=now)
+        return self._add(destination, RATE, (), ack=False, now=now)
 
     def receive(self, data: bytes, now: float) -> list[ModemEvent]:
         """Process bytes of the modem; invalid ones are reported as events."""
@@ -166,11 +141,6 @@ class NanoModem(Modem):
         self._received_s = now
         if self._is_open:
             self._process(self._assembler.feed(data), now)
-        self._advance(now)
-        return self._take_events()
-
-    def poll(self, now: float) -> list[ModemEvent]:
-        """Do what is due."""
         self._advance(now)
         return self._take_events()
 
@@ -194,9 +164,8 @@ class NanoModem(Modem):
     # Time
 
     def _advance(self, now: float) -> None:
-        self._events_since_s = now
         self._give_up_message(now)
-        self._events += map(_result, self._queue.expire(now))
+        super()._advance(now)
         if self._sending is not None:
             self._advance_sending(self._sending, now)
         if not self._is_open or self._sending is not None:
@@ -246,14 +215,6 @@ class NanoModem(Modem):
 
     # Packets and pings
 
-    def _add(self, destination: int, frames: tuple[bytes, ...], *, ack: bool, now: float) -> int:
-        number, self._next_id = self._next_id, self._next_id + 1
-        failed = self._queue.add(WaitingPacket(number, destination, RATE, frames, ack, now))
-        if failed is not None:
-            self._events.append(_result(failed))
-        self._advance(now)
-        return number
-
     def _start(self, packet: WaitingPacket, now: float) -> None:
         sending = _Sending(packet, b"", airtime_s(0), now)
         if sending.is_ping:
@@ -295,28 +256,18 @@ class NanoModem(Modem):
         packet, self._sending = sending.packet, None
         acknowledged = (1,) if sending.answered else ()
         if not sending.is_ping:
-            self._events.append(
-                PacketSent(
-                    packet.number,
-                    packet.destination,
-                    RATE,
-                    packet.frames,
-                    acknowledged,
-                    sending.started_s,
-                    now,
-                )
-            )
+            self._events.append(packet.sent(acknowledged, sending.started_s, now))
         elif sending.answered:
             self._events.append(RequestDone(packet.number, _PING, packet.destination))
         else:
-            self._events.append(_result(packet.failed("no answer")))
+            self._events.append(self._result(packet.failed("no answer")))
 
     def _fail(self, reason: str, *, maybe_sent: bool) -> None:
         sending, self._sending = self._sending, None
         if sending is not None:
             if sending.confirmed_s is not None and sending.on_air:
                 self._events.append(TransmissionEnded(sending.airtime_s))
-            self._events.append(_result(sending.packet.failed(reason, maybe_sent=maybe_sent)))
+            self._events.append(self._result(sending.packet.failed(reason, maybe_sent=maybe_sent)))
 
     # Messages of the modem
 
@@ -364,11 +315,6 @@ class NanoModem(Modem):
         frame = FrameReceived(source, dest, received.source is None, 1, data, now, RATE, None)
         self._events += [frame, PacketReceived((frame,), 0, 1, source, dest, RATE, None, complete=True)]
 
-    def _take_events(self) -> list[ModemEvent]:
-        events, self._events = self._events, []
-        return events
-
-
-def _result(failed: PacketFailed) -> ModemEvent:
-    """Return the failure of a packet, or of a ping, which is a packet without frames in the queue."""
-    return failed if failed.frames else RequestFailed(failed.packet_id, _PING, failed.dest, failed.reason)
+    def _result(self, failed: PacketFailed) -> ModemEvent:
+        """Return the failure of a packet, or of a ping, which is a packet without frames in the queue."""
+        return failed if failed.frames else RequestFailed(failed.packet_id, _PING, failed.dest, failed.reason)

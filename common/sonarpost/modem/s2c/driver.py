@@ -16,8 +16,6 @@ from typing import Final
 from sonarpost.errors import FrameError, SentenceError
 from sonarpost.modem.interface import (
     FrameReceived,
-    Modem,
-    ModemCapabilities,
     ModemError,
     ModemEvent,
     ModemReady,
@@ -33,7 +31,7 @@ from sonarpost.modem.interface import (
     TransmissionEnded,
     TransmissionStarted,
 )
-from sonarpost.modem.packet_queue import PacketQueue, WaitingPacket
+from sonarpost.modem.packet_queue import QueueingModem
 from sonarpost.modem.registry import ModemSettings
 from sonarpost.modem.s2c.events import UsblPosition
 from sonarpost.modem.s2c.messages import (
@@ -77,7 +75,7 @@ class _Command:
     attempts: int = 1
 
 
-class S2cModem(Modem):
+class S2cModem(QueueingModem[Sending]):
     """One modem.
 
     Args:
@@ -89,14 +87,10 @@ class S2cModem(Modem):
     """
 
     def __init__(self, settings: ModemSettings, where: str = "modem port") -> None:
-        CAPABILITIES.check_address(settings.address, where)
-        self._settings = settings
+        super().__init__(CAPABILITIES, settings, where)
         self._assembler = MessageAssembler()
-        self._queue = PacketQueue()
         self._has_sent_burst = False
         self._pings: set[int] = set()
-        self._next_id = 1
-        self._is_open = False
         self._ready = False
         self._unresponsive = False
         self._failures = 0
@@ -106,29 +100,15 @@ class S2cModem(Modem):
         self._steps: deque[tuple[bytes, bool]] = deque()
         self._command: _Command | None = None
         self._firmware: str | None = None
-        self._sending: Sending | None = None
-        self._received_s = 0.0
         self._answered_s: float | None = None
         self._receiving_until_s: float | None = None
         self._receiving_since_s = 0.0
         self._out = bytearray()
-        self._events: list[ModemEvent] = []
-        self._events_since_s = 0.0
-
-    @property
-    def capabilities(self) -> ModemCapabilities:
-        """Capabilities of the driver."""
-        return CAPABILITIES
 
     @property
     def ready(self) -> bool:
         """Whether the modem is configured and answers."""
         return self._ready
-
-    @property
-    def queued(self) -> int:
-        """Number of packets and pings that are queued or in progress."""
-        return len(self._queue) + (self._sending is not None)
 
     @property
     def receiving(self) -> bool:
@@ -162,7 +142,7 @@ class S2cModem(Modem):
         if rate == BURST_RATE and destination == CAPABILITIES.broadcast:
             raise FrameError("packet to send", "destination", destination, f"the address of one modem at rate {rate}")
         is_acknowledged = ack and destination != CAPABILITIES.broadcast
-        return self._add(destination, rate, tuple(map(bytes, frames)), ack=is_acknowledged, now=now)
+        return self._add(destination, rate, frames, ack=is_acknowledged, now=now)
 
     def ping(self, destination: int, now: float) -> int:
         """Queue an acknowledged message whose travel time is measured; see `Modem.ping`."""
@@ -184,8 +164,7 @@ class S2cModem(Modem):
     def poll(self, now: float) -> list[ModemEvent]:
         """Do what is due."""
         self._give_up_incomplete(now)
-        self._advance(now)
-        return self._take_events()
+        return super().poll(now)
 
     def next_wakeup(self) -> float | None:
         """Return when `poll` has something to do, or None."""
@@ -206,18 +185,8 @@ class S2cModem(Modem):
         self._out.clear()
         return data
 
-    def _add(self, destination: int, rate: int, frames: tuple[bytes, ...], *, ack: bool, now: float) -> int:
-        number, self._next_id = self._next_id, self._next_id + 1
-        failed = self._queue.add(WaitingPacket(number, destination, rate, frames, ack, now))
-        if failed is not None:
-            self._emit_failed(failed)
-        self._advance(now)
-        return number
-
     def _advance(self, now: float) -> None:
-        self._events_since_s = now
-        for failed in self._queue.expire(now):
-            self._emit_failed(failed)
+        super()._advance(now)
         if self._receiving_until_s is not None and now >= self._receiving_until_s:
             self._receiving_until_s = None
         if not self._is_open:
@@ -476,13 +445,12 @@ class S2cModem(Modem):
         else:
             self._events.append(packet.failed(reason, maybe_sent=maybe_sent))
 
-    def _emit_failed(self, failed: PacketFailed) -> None:
-        """Report a packet or a ping that left the queue."""
-        if failed.packet_id in self._pings:
-            self._pings.discard(failed.packet_id)
-            self._events.append(RequestFailed(failed.packet_id, "ping", failed.dest, failed.reason))
-        else:
-            self._events.append(failed)
+    def _result(self, failed: PacketFailed) -> ModemEvent:
+        """Return the failure of a packet or a ping that left the queue."""
+        if failed.packet_id not in self._pings:
+            return failed
+        self._pings.discard(failed.packet_id)
+        return RequestFailed(failed.packet_id, "ping", failed.dest, failed.reason)
 
     def _on_received(self, received: Received, now: float) -> None:
         self._receiving_until_s = None
@@ -499,10 +467,6 @@ class S2cModem(Modem):
         )
         packet = PacketReceived(frames, 0, len(frames), source, destination, rate, quality, complete=True)
         self._events += [*frames, packet]
-
-    def _take_events(self) -> list[ModemEvent]:
-        events, self._events = self._events, []
-        return events
 
 
 def _answers(reply: Reply, command: _Command) -> bool:

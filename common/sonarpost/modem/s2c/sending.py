@@ -66,14 +66,5 @@ class Sending:
 
     def sent(self, now: float, *, delivered: bool) -> PacketSent:
         """Return its result: it was transmitted, as far as known."""
-        packet = self.packet
-        return PacketSent(
-            packet.number,
-            packet.destination,
-            packet.rate,
-            packet.frames,
-            tuple(range(1, len(packet.frames) + 1)) if delivered and packet.ack else (),
-            self.started_s,
-            now,
-            end_reported=self.ended,
-        )
+        acknowledged = range(1, len(self.packet.frames) + 1) if delivered and self.packet.ack else ()
+        return self.packet.sent(acknowledged, self.started_s, now, end_reported=self.ended)

@@ -13,17 +13,14 @@ from typing import Final
 from sonarpost.errors import SentenceError
 from sonarpost.modem.interface import (
     FrameReceived,
-    Modem,
-    ModemCapabilities,
     ModemEvent,
     ModemReady,
     PacketReceived,
-    PacketSent,
     SentenceRejected,
     TransmissionEnded,
     TransmissionStarted,
 )
-from sonarpost.modem.packet_queue import PacketQueue, WaitingPacket
+from sonarpost.modem.packet_queue import QueueingModem, WaitingPacket
 from sonarpost.modem.registry import ModemSettings
 from sonarpost.modem.udp.datagram import Datagram, DatagramAssembler, DatagramKind, parse
 from sonarpost.modem.udp.rates import CAPABILITIES, RATES
@@ -47,7 +44,7 @@ class _Sending:
     on_air: bool = True
 
 
-class UdpModem(Modem):
+class UdpModem(QueueingModem[_Sending]):
     """One station.
 
     Args:
@@ -59,38 +56,15 @@ class UdpModem(Modem):
     """
 
     def __init__(self, settings: ModemSettings, where: str = "modem port") -> None:
-        CAPABILITIES.check_address(settings.address, where)
-        self._settings = settings
+        super().__init__(CAPABILITIES, settings, where)
         self._assembler = DatagramAssembler()
-        self._queue = PacketQueue()
-        self._received_s = 0.0
-        self._sending: _Sending | None = None
         self._seen: dict[Datagram, None] = {}
-        self._is_open = False
-        self._next_id = 1
         self._out: list[bytes] = []
-        self._events: list[ModemEvent] = []
-        self._events_since_s = 0.0
-
-    @property
-    def capabilities(self) -> ModemCapabilities:
-        """Capabilities of the driver."""
-        return CAPABILITIES
 
     @property
     def ready(self) -> bool:
         """Whether the port is open."""
         return self._is_open
-
-    @property
-    def queued(self) -> int:
-        """Number of packets that are queued or in progress."""
-        return len(self._queue) + (self._sending is not None)
-
-    @property
-    def receiving(self) -> bool:
-        """False: a datagram arrives at once."""
-        return False
 
     def port_opened(self, now: float) -> None:
         """Begin to send and receive."""
@@ -115,12 +89,7 @@ class UdpModem(Modem):
     ) -> int:
         """Queue a packet; see `Modem.send_packet`."""
         CAPABILITIES.check_packet(destination, rate, frames)
-        number, self._next_id = self._next_id, self._next_id + 1
-        failed = self._queue.add(WaitingPacket(number, destination, rate, tuple(map(bytes, frames)), ack, now))
-        if failed is not None:
-            self._events.append(failed)
-        self._advance(now)
-        return number
+        return self._add(destination, rate, frames, ack=ack, now=now)
 
     def receive(self, data: bytes, now: float) -> list[ModemEvent]:
         """Process a datagram, or bytes of a stream; invalid ones are reported as events."""
@@ -144,11 +113,6 @@ class UdpModem(Modem):
         except SentenceError as error:
             return [error]
 
-    def poll(self, now: float) -> list[ModemEvent]:
-        """Do what is due."""
-        self._advance(now)
-        return self._take_events()
-
     def next_wakeup(self) -> float | None:
         """Return when `poll` has something to do, or None."""
         times_s = [self._events_since_s if self._events else None, self._queue.deadline_s()]
@@ -161,8 +125,7 @@ class UdpModem(Modem):
         return self._out.pop(0) if self._out else b""
 
     def _advance(self, now: float) -> None:
-        self._events_since_s = now
-        self._events += self._queue.expire(now)
+        super()._advance(now)
         if self._sending is not None:
             self._advance_packet(self._sending, now)
         if self._is_open and self._sending is None and (packet := self._queue.take()) is not None:
@@ -186,19 +149,7 @@ class UdpModem(Modem):
             self._events.append(TransmissionEnded(RATES[sending.packet.rate].airtime_s))
         complete = len(sending.acknowledged) == len(sending.packet.frames)
         if not sending.on_air and (complete or now >= sending.ack_s):
-            packet = sending.packet
-            acknowledged = tuple(sorted(sending.acknowledged))
-            self._events.append(
-                PacketSent(
-                    packet.number,
-                    packet.destination,
-                    packet.rate,
-                    packet.frames,
-                    acknowledged,
-                    sending.started_s,
-                    now,
-                )
-            )
+            self._events.append(sending.packet.sent(sorted(sending.acknowledged), sending.started_s, now))
             self._sending = None
 
     def _on_datagram(self, datagram: Datagram, now: float) -> None:
@@ -240,7 +191,3 @@ class UdpModem(Modem):
 
     def _send(self, datagram: Datagram) -> None:
         self._out.append(datagram.pack())
-
-    def _take_events(self) -> list[ModemEvent]:
-        events, self._events = self._events, []
-        return events
