@@ -95,7 +95,7 @@ def run(parsed: argparse.Namespace) -> int:
         session = open_with_retry(endpoints, stop, router_tls)
         if session is None:
             return 0
-        try:
+        with session:
             stream = ContactStream(session, parsed.site, parsed.vessel, parsed.archive)
             service = AlertService(sender, sent, parsed.threshold)
             log.info("Sending alerts", extra=kv(site=parsed.site, threshold=parsed.threshold))
@@ -104,8 +104,6 @@ def run(parsed: argparse.Namespace) -> int:
                     service.add(change.contact)
                 while not stop.is_set() and service.send_due():
                     pass
-        finally:
-            session.close()
     return 0
 
 

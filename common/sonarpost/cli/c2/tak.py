@@ -113,7 +113,7 @@ def run(parsed: argparse.Namespace) -> int:
         session = open_with_retry(endpoints, stop, router_tls)
         if session is None:
             return 0
-        try:
+        with session:
             stream = ContactStream(session, parsed.site, parsed.vessel, parsed.archive)
             service = CotService(sender, files)
             token = session.liveliness().declare_token(keys.alive(platform, NAME))
@@ -130,8 +130,6 @@ def run(parsed: argparse.Namespace) -> int:
                     health = wire.encode(service.health(platform, state))
                     session.put(keys.health(platform, NAME), health, encoding=wire.encoding_of(Health))
             token.undeclare()
-        finally:
-            session.close()
     return 0
 
 

@@ -9,7 +9,6 @@ import time
 import uuid
 from typing import get_args
 
-import zenoh
 from pydantic import ValidationError
 
 from sonarpost import keys
@@ -166,13 +165,11 @@ def _send(parsed: argparse.Namespace, key: str, record_type: type[Record], field
     timer = threading.Timer(parsed.timeout, timed_out.set)
     timer.daemon = True
     timer.start()
-    session: zenoh.Session | None = None
     try:
         session = open_with_retry(endpoints, timed_out, tls)
         if session is None:
             raise PortError(f"{', '.join(endpoints)}: no router answered within {parsed.timeout:g} s")
-        deliver(session, key, CONSUMER, record, parsed.timeout)
+        with session:
+            deliver(session, key, CONSUMER, record, parsed.timeout)
     finally:
         timer.cancel()
-        if session is not None:
-            session.close()

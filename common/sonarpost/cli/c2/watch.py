@@ -9,6 +9,7 @@ import threading
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final
 
 import zenoh
@@ -48,14 +49,9 @@ def run(parsed: argparse.Namespace) -> int:
     def show(record: Record) -> None:
         print(json.dumps(_fields(record)) if parsed.json else printable(line_of(record)), flush=True)
 
-    try:
+    with session, suppress(KeyboardInterrupt):
         _log(f"watching {parsed.site} at {', '.join(endpoints)}")
         Watch(session, parsed.site, parsed.vessel).run(show, parsed.count, stop)
-    except KeyboardInterrupt:
-        return 0
-    finally:
-        stop.set()
-        session.close()
     return 0
 
 
