@@ -34,7 +34,7 @@ from sonarpost.link.downlink.messages import (
     unpack,
 )
 from sonarpost.link.downlink.status_message import StatusMessage
-from sonarpost.link.frames.contact_record import ContactSummary, atd_class_of
+from sonarpost.link.frames.contact_record import summary_of
 from sonarpost.link.frames.paper.sender import PaperSender
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, unpack_mini
 from sonarpost.link.frames.v1.receiver import V1Receiver
@@ -43,10 +43,9 @@ from sonarpost.link.receiver import FeedbackReceived, FrameRejected, MessageRece
 from sonarpost.link.sender import ImageSender, ImageToSend, OutgoingPacket
 from sonarpost.link.state import SavedParts, below, prefixed, unpack_plain
 from sonarpost.logs import IntervalLog, kv
-from sonarpost.messages import Contact, EncodedImage, OutgoingMessage, QueuedImage, QueueState
+from sonarpost.messages import EncodedImage, OutgoingMessage, QueuedImage, QueueState
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.received_commands import ReceivedCommands
-from sonarpost.sonar.survey import Side
 
 log = logging.getLogger(__name__)
 
@@ -55,8 +54,6 @@ _CONFIRMATION_LIFETIME_S: Final = 900.0
 _COMMAND_PRIORITY: Final = 1
 _STATUS_PRIORITY: Final = 5
 _MAX_IMAGES_PUBLISHED: Final = 500
-_LAST_TIME_UTC_S: Final = 0xFFFF_FFFE
-"""The latest time that a contact record can hold, in the year 2106."""
 
 # Names of the saved parts, below the name of the wire format.
 _QUEUE, _RECEIVER, _COMMANDS, _AUTHENTICATION = "queue/", "receiver/", "orders", "authentication/"
@@ -439,40 +436,3 @@ def image_to_send(record: EncodedImage, *, contact_class: bool = True) -> ImageT
     """Return an encoded image as the transmit queue takes it; `contact_class` as for `summary_of`."""
     contact = summary_of(record.contact, record.height_px, record.width_px, contact_class=contact_class)
     return ImageToSend(record.image_id, record.contact.contact_id, contact, record.stream)
-
-
-def summary_of(contact: Contact, height_px: int, width_px: int, *, contact_class: bool = True) -> ContactSummary:
-    """Return the contact record that is transmitted with an image of this size.
-
-    Values that the record cannot hold are sent as unknown: a wrong clock on the vehicle does not lose the image.
-
-    Args:
-        contact: The contact.
-        height_px: Rows of the image, 16..512.
-        width_px: Columns of the image, 16..512.
-        contact_class: Whether the record carries class and probabilities, see `UuvModemConfig`.
-
-    Raises:
-        FrameError: A side of the image is out of range.
-    """
-    time_utc_s = contact.time_utc_s
-    has_fix = contact.lat_deg is not None and contact.lon_deg is not None
-    return ContactSummary(
-        height_px=height_px,
-        width_px=width_px,
-        lat_deg=contact.lat_deg if has_fix else None,
-        lon_deg=contact.lon_deg if has_fix else None,
-        time_utc_s=time_utc_s if time_utc_s is not None and time_utc_s <= _LAST_TIME_UTC_S else None,
-        confidence=contact.atd_confidence,
-        heading_deg=contact.heading_deg,
-        altitude_m=contact.altitude_m,
-        depth_m=contact.depth_m,
-        side=Side(contact.channel) if contact.channel else None,
-        ground_range_m=contact.ground_range_m if contact.channel else None,
-        pixel_along_m=contact.pixel_along_m,
-        pixel_across_m=contact.pixel_across_m,
-        position_sigma_m=contact.position_sigma_m if has_fix else None,
-        atd_class=atd_class_of(contact.atd_class) if contact_class else None,
-        p_mine_like=contact.p_mine_like if contact_class else None,
-        p_other_object=contact.p_other_object if contact_class else None,
-    )

@@ -17,11 +17,11 @@ from typing import Final
 import msgpack
 
 from sonarpost.errors import BadInputError, PayloadError
-from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary, atd_class_of
+from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary, summary_of
+from sonarpost.link.frames.paper.frame import IMAGE_ID_COUNT, format_image_id
 from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
-from sonarpost.messages import Contact, Decision, ReceivedImage
-from sonarpost.sonar.survey import Side
+from sonarpost.messages import Decision, ReceivedImage
 from sonarpost.wire import validated
 
 MAX_MESSAGE_BYTES: Final = 340
@@ -44,7 +44,6 @@ _CRC_BYTES: Final = 2
 _WHERE: Final = "short message"
 _RECORD_BIT, _COMPLETE_BIT, _AUTHENTICATED_SHIFT = 1, 2, 2
 _AUTHENTICATED: Final = (None, False, True)
-_LAST_TIME_UTC_S: Final = 0xFFFF_FFFE
 _DECISION_FIELDS: Final = (
     "decision_id",
     "vehicle_id",
@@ -209,7 +208,7 @@ def pack_contact(image: ReceivedImage) -> bytes:
     record = b""
     if image.contact is not None:
         flags |= _RECORD_BIT
-        record = _summary(image.contact, image.height_px, image.width_px).pack()
+        record = summary_of(image.contact, image.height_px, image.width_px).pack()
     try:
         head = _CONTACT.pack(
             int(image.image_id, 36).to_bytes(3, "big"),
@@ -343,36 +342,9 @@ def items_bytes(items: Sequence[Item]) -> int:
 
 
 def _image_id(number: int) -> str:
-    digits = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-    if number >= 36**4:
-        raise ShortMessageError(_WHERE, "image_id", number, f"below {36**4}")
-    return "".join(digits[number // 36**power % 36] for power in (3, 2, 1, 0))
-
-
-def _summary(contact: Contact, height_px: int | None, width_px: int | None) -> ContactSummary:
-    """Return the record of 25 bytes; values that it cannot hold are unknown in it."""
-    has_fix = contact.lat_deg is not None and contact.lon_deg is not None
-    has_size = height_px is not None and width_px is not None
-    time_utc_s = contact.time_utc_s
-    return ContactSummary(
-        height_px=height_px if has_size else None,
-        width_px=width_px if has_size else None,
-        lat_deg=contact.lat_deg if has_fix else None,
-        lon_deg=contact.lon_deg if has_fix else None,
-        time_utc_s=time_utc_s if time_utc_s is not None and time_utc_s <= _LAST_TIME_UTC_S else None,
-        confidence=contact.atd_confidence,
-        heading_deg=contact.heading_deg,
-        altitude_m=contact.altitude_m,
-        depth_m=contact.depth_m,
-        side=Side(contact.channel) if contact.channel else None,
-        ground_range_m=contact.ground_range_m if contact.channel else None,
-        pixel_along_m=contact.pixel_along_m,
-        pixel_across_m=contact.pixel_across_m,
-        position_sigma_m=contact.position_sigma_m if has_fix else None,
-        atd_class=atd_class_of(contact.atd_class),
-        p_mine_like=contact.p_mine_like,
-        p_other_object=contact.p_other_object,
-    )
+    if number >= IMAGE_ID_COUNT:
+        raise ShortMessageError(_WHERE, "image_id", number, f"below {IMAGE_ID_COUNT}")
+    return format_image_id(number)
 
 
 def _with_crc(body: bytes) -> bytes:

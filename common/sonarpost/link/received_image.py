@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from sonarpost.errors import FrameError
-from sonarpost.link.frames.contact_record import ContactSummary, atd_class_of
+from sonarpost.link.frames.contact_record import ContactSummary, summary_of
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.messages import Contact, ReceivedImage
-from sonarpost.sonar.survey import Side
 
 
 def received_image(
@@ -78,28 +77,8 @@ def contact_of(summary: ContactSummary, vehicle_id: str, image_id: str) -> Conta
 
 def contact_record(contact: Contact, height_px: int | None, width_px: int | None, image_id: str) -> bytes:
     """Return the contact record of 25 bytes if it represents exactly this contact and size, otherwise no bytes."""
-    if contact.atd_class is not None and atd_class_of(contact.atd_class) is None:
-        return b""
     try:
-        packed = ContactSummary(
-            height_px=height_px,
-            width_px=width_px,
-            lat_deg=contact.lat_deg,
-            lon_deg=contact.lon_deg,
-            time_utc_s=contact.time_utc_s,
-            confidence=contact.atd_confidence,
-            heading_deg=contact.heading_deg,
-            altitude_m=contact.altitude_m,
-            depth_m=contact.depth_m,
-            side=None if contact.channel is None else Side(contact.channel),
-            ground_range_m=contact.ground_range_m,
-            pixel_along_m=contact.pixel_along_m,
-            pixel_across_m=contact.pixel_across_m,
-            position_sigma_m=contact.position_sigma_m,
-            atd_class=atd_class_of(contact.atd_class),
-            p_mine_like=contact.p_mine_like,
-            p_other_object=contact.p_other_object,
-        ).pack()
+        packed = summary_of(contact, height_px, width_px).pack()
         summary = ContactSummary.unpack(packed)
     except FrameError:
         return b""

@@ -15,7 +15,7 @@ from sonarpost import keys, wire
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.errors import ConfigError
-from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.contact_record import ContactSummary, summary_of
 from sonarpost.link.frames.paper.frame import parse_frame
 from sonarpost.link.frames.paper.sender import plan_packets
 from sonarpost.messages import AcousticFrame, Contact, EncodedImage
@@ -25,7 +25,6 @@ from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialPort
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService
-from sonarpost.services.uuv_modem.vehicle_endpoint import summary_of
 from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
 from sonarpost.simulation.channel.emulator import ChannelEmulator
 

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple, get_args
 
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX
 from sonarpost.errors import FrameError
-from sonarpost.messages import PROBABILITY_TOLERANCE, AtdClass
+from sonarpost.messages import PROBABILITY_TOLERANCE, AtdClass, Contact
 from sonarpost.sonar.survey import Side
 
 RECORD_SIZE = 25
@@ -226,6 +226,46 @@ class ContactSummary:
     def rounded(self) -> ContactSummary:
         """Return the record as the receiver reads it: rounded to the steps of its fields."""
         return ContactSummary.unpack(self.pack())
+
+
+def summary_of(
+    contact: Contact, height_px: int | None, width_px: int | None, *, contact_class: bool = True
+) -> ContactSummary:
+    """Return the contact record that is transmitted with an image of this size.
+
+    Values that the record cannot hold are sent as unknown: a wrong clock on the vehicle does not lose the image.
+
+    Args:
+        contact: The contact.
+        height_px: Rows of the image, 16..512; None if not known.
+        width_px: Columns of the image, 16..512; None if not known.
+        contact_class: Whether the record carries class and probabilities.
+
+    Raises:
+        FrameError: A side of the image is out of range.
+    """
+    has_size = height_px is not None and width_px is not None
+    time_utc_s = contact.time_utc_s
+    has_fix = contact.lat_deg is not None and contact.lon_deg is not None
+    return ContactSummary(
+        height_px=height_px if has_size else None,
+        width_px=width_px if has_size else None,
+        lat_deg=contact.lat_deg if has_fix else None,
+        lon_deg=contact.lon_deg if has_fix else None,
+        time_utc_s=time_utc_s if time_utc_s is not None and time_utc_s < _UNKNOWN_U32 else None,
+        confidence=contact.atd_confidence,
+        heading_deg=contact.heading_deg,
+        altitude_m=contact.altitude_m,
+        depth_m=contact.depth_m,
+        side=Side(contact.channel) if contact.channel else None,
+        ground_range_m=contact.ground_range_m if contact.channel else None,
+        pixel_along_m=contact.pixel_along_m,
+        pixel_across_m=contact.pixel_across_m,
+        position_sigma_m=contact.position_sigma_m if has_fix else None,
+        atd_class=atd_class_of(contact.atd_class) if contact_class else None,
+        p_mine_like=contact.p_mine_like if contact_class else None,
+        p_other_object=contact.p_other_object if contact_class else None,
+    )
 
 
 class _Head(NamedTuple):
