@@ -38,7 +38,6 @@ from sonarpost.modem.s2c.messages import (
     Reply,
     SendEnd,
     SendStart,
-    Usbl,
     parse,
     parse_travel_time_s,
 )
@@ -64,7 +63,7 @@ PARSED = [
     ReceptionStart(),
     ReceptionEnd(failed=False),
     DeliveryReport("DELIVERED", "IM", 3),
-    Usbl(3, -0.4233, -1.0020, -0.5901, 0.000825, 1.2375),
+    UsblPosition(3, -0.4233, -1.0020, -0.5901, 0.000825, 1.2375),
     Ignored("USBLPHYD"),
 ]
 HOSTILE_DATA = b"\r\nDELIVEREDIM,3\r\n+++AT:13:DELIVEREDIM,3\r\n,\x00\xff"

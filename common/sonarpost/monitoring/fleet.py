@@ -9,7 +9,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby, islice
@@ -111,6 +112,16 @@ class FleetTracker:
         self._rejected = 0
         self._rejected_log = IntervalLog(log, logging.WARNING, "Record of a service or of a vehicle rejected")
 
+    @contextmanager
+    def _rejecting(self) -> Iterator[None]:
+        """Log, count and drop an invalid record."""
+        try:
+            yield
+        except BadInputError as error:
+            with self._lock:
+                self._rejected += 1
+            self._rejected_log.log(reason=str(error)[:300])
+
     def add(self, key: str, payload: bytes, now_s: float) -> None:
         """Add a health record; an invalid one is logged, counted and dropped.
 
@@ -119,7 +130,7 @@ class FleetTracker:
             payload: The record.
             now_s: Time of arrival, monotonic.
         """
-        try:
+        with self._rejecting():
             name = keys.service_of(key)
             if len(payload) > MAX_HEALTH_BYTES:
                 raise PayloadError(key, "payload", f"{len(payload)} bytes", f"at most {MAX_HEALTH_BYTES} bytes")
@@ -129,16 +140,9 @@ class FleetTracker:
             with self._lock:
                 if name not in self._last_s and len(self._last_s) >= MAX_SERVICES:
                     raise PayloadError(key, "service", name[1], f"no more than {MAX_SERVICES} services")
-                if name not in self._last_s and _number_of(name[0], self._last_s) >= MAX_SERVICES_OF_PLATFORM:
-                    raise PayloadError(
-                        key, "service", name[1], f"no more than {MAX_SERVICES_OF_PLATFORM} of a platform"
-                    )
+                _check_number(key, "service", name, self._last_s, MAX_SERVICES_OF_PLATFORM)
                 self._health[name] = health
                 self._last_s[name] = now_s
-        except BadInputError as error:
-            with self._lock:
-                self._rejected += 1
-            self._rejected_log.log(reason=str(error)[:300])
 
     def add_status(self, key: str, payload: bytes, now_s: float) -> None:
         """Add the status of a vehicle; an invalid one is logged, counted and dropped.
@@ -148,39 +152,29 @@ class FleetTracker:
             payload: The record.
             now_s: Time of arrival, monotonic.
         """
-        try:
+        with self._rejecting():
             record = wire.decode(ReceivedStatus, payload, key)
             at_shore = key.split("/")[-2:] == ["status", record.vessel_id]
             if key != keys.acoustic_status(record.vessel_id) and not at_shore:
                 raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
             name = (record.vessel_id, record.vehicle_id)
             with self._lock:
-                if name not in self._vehicles and _number_of(name[0], self._vehicles) >= MAX_VEHICLES:
-                    raise PayloadError(key, "vehicle_id", record.vehicle_id, f"no more than {MAX_VEHICLES} vehicles")
+                _check_number(key, "vehicle_id", name, self._vehicles, MAX_VEHICLES)
                 known = self._vehicles.get(name)
                 # At a shore site a record can arrive twice, directly and later through the relay.
                 if known is None or known[0] != record:
                     self._vehicles[name] = (record, now_s)
-        except BadInputError as error:
-            with self._lock:
-                self._rejected += 1
-            self._rejected_log.log(reason=str(error)[:300])
 
     def add_range(self, key: str, payload: bytes, now_s: float) -> None:
         """Add the measured distance of a vehicle; an invalid one is logged, counted and dropped. As `add_status`."""
-        try:
+        with self._rejecting():
             record = wire.decode(VehicleRange, payload, key)
             if key != keys.acoustic_range(record.vessel_id):
                 raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
             name = (record.vessel_id, record.vehicle_id)
             with self._lock:
-                if name not in self._ranges and _number_of(name[0], self._ranges) >= MAX_VEHICLES:
-                    raise PayloadError(key, "vehicle_id", record.vehicle_id, f"no more than {MAX_VEHICLES} vehicles")
+                _check_number(key, "vehicle_id", name, self._ranges, MAX_VEHICLES)
                 self._ranges[name] = (record, now_s)
-        except BadInputError as error:
-            with self._lock:
-                self._rejected += 1
-            self._rejected_log.log(reason=str(error)[:300])
 
     def set_alive(self, tokens: Iterable[str] | None, now_s: float, failure: str = "") -> None:
         """Set the keys of all present liveliness tokens; None if the router is not reached, with the reason."""
@@ -218,9 +212,10 @@ class FleetTracker:
         return ServiceStatus(*name, health, age_s, name in self._alive if self._connected else None)
 
 
-def _number_of(source: str, names: Iterable[Name]) -> int:
-    """Return how many of the names are of a platform or vessel."""
-    return sum(name[0] == source for name in names)
+def _check_number(key: str, field: str, name: Name, known: Collection[Name], limit_of_source: int) -> None:
+    """Reject a new name of a platform or vessel that has as many as are permitted."""
+    if name not in known and sum(each[0] == name[0] for each in known) >= limit_of_source:
+        raise PayloadError(key, field, name[1], f"no more than {limit_of_source} of {name[0]}")
 
 
 class FleetWatcher:

@@ -45,7 +45,6 @@ from sonarpost.modem.s2c.messages import (
     Reply,
     SendEnd,
     SendStart,
-    Usbl,
     parse,
     parse_travel_time_s,
 )
@@ -324,17 +323,8 @@ class S2cModem(QueueingModem[Sending]):
                 self._receiving_until_s = None
                 if message.failed:
                     self._events.append(PacketReceived((), 1, None, None, None, None, None, complete=False))
-            case Usbl():
-                self._events.append(
-                    UsblPosition(
-                        message.address,
-                        message.east_m,
-                        message.north_m,
-                        message.up_m,
-                        message.travel_s,
-                        message.accuracy_m,
-                    )
-                )
+            case UsblPosition():
+                self._events.append(message)
             case _:
                 pass
 

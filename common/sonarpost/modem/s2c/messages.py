@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Final
 
 from sonarpost.errors import SentenceError
+from sonarpost.modem.s2c.events import UsblPosition
 
 MAX_TEXT_BYTES: Final = 4096
 """Greatest length of a message."""
@@ -122,25 +123,15 @@ class ReceptionEnd:
 
 
 @dataclass(frozen=True, slots=True)
-class Usbl:
-    """Position of another modem, relative to this one."""
-
-    address: int
-    east_m: float
-    north_m: float
-    up_m: float
-    travel_s: float
-    accuracy_m: float
-
-
-@dataclass(frozen=True, slots=True)
 class Ignored:
     """A notification that the driver does not use."""
 
     name: str
 
 
-Message = Reply | Received | DeliveryReport | SendStart | SendEnd | ReceptionStart | ReceptionEnd | Usbl | Ignored
+Message = (
+    Reply | Received | DeliveryReport | SendStart | SendEnd | ReceptionStart | ReceptionEnd | UsblPosition | Ignored
+)
 
 
 class MessageAssembler:
@@ -337,9 +328,9 @@ def parse_travel_time_s(text: str) -> float | None:
     return travel_s if travel_s > 0 else None
 
 
-def _usbl(fields: list[str]) -> Usbl:
+def _usbl(fields: list[str]) -> UsblPosition:
     east_m, north_m, up_m, accuracy_m = (_decimal("USBLLONG", fields[number]) for number in (6, 7, 8, 15))
-    return Usbl(_address(fields[2]), east_m, north_m, up_m, _seconds(fields[12]), accuracy_m)
+    return UsblPosition(_address(fields[2]), east_m, north_m, up_m, _seconds(fields[12]), accuracy_m)
 
 
 _NOTIFICATIONS: Final[Mapping[str, tuple[int, Callable[[list[str]], Message]]]] = MappingProxyType(
