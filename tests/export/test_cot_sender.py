@@ -286,9 +286,6 @@ def test_each_datagram_holds_one_event():
         assert [receiver.recv(65536) for _ in EVENTS] == list(EVENTS)
     assert sender.delivered == 2
     assert "Connection refused" in refused(sender, EVENTS[:1])
-    multicast = CotSender("udp://239.2.3.1:6969", multicast_ttl=3)
-    with multicast._open_datagram_socket("239.2.3.1", 6969) as datagrams:
-        assert datagrams.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == 3
     with pytest.raises(PortError, match="65001 bytes"):
         CotSender("udp://127.0.0.1:9").send([b"x" * 65_001])
 

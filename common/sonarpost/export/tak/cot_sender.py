@@ -7,7 +7,6 @@ replaces the first one. A datagram is never acknowledged.
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import socket
 import ssl
@@ -50,7 +49,9 @@ class Endpoint:
 
 
 def parse_endpoint(text: str) -> Endpoint:
-    """Parse `tcp://host:port`, `tls://…` (or `ssl://…`) or `udp://…`. UDP hosts may be multicast addresses.
+    """Parse `tcp://host:port`, `tls://…` (or `ssl://…`) or `udp://…`.
+
+    A UDP host may be a multicast address; the hop limit of Linux, 1, keeps its datagrams on the local network.
 
     Raises:
         ConfigError: The text is not an endpoint.
@@ -152,7 +153,6 @@ class CotSender:
         tls: Files for `tls://`.
         timeout_s: Time limit of a connection attempt, and of each wait for progress.
         settle_s: Time between the acknowledgement of a batch by TCP and the end of its connection.
-        multicast_ttl: Hop limit of multicast datagrams; 1 keeps them on the local network.
         clock: Monotonic clock, seconds.
         wait: Waits between attempts, argument in seconds; returns True to stop trying. `threading.Event.wait` fits.
 
@@ -167,7 +167,6 @@ class CotSender:
         *,
         timeout_s: float = 5.0,
         settle_s: float = SETTLE_S,
-        multicast_ttl: int = 1,
         clock: Callable[[], float] = time.monotonic,
         wait: Callable[[float], bool] = _sleep,
     ) -> None:
@@ -178,7 +177,6 @@ class CotSender:
         self._server_name = tls.server_name or self.endpoint.host
         self._timeout_s = timeout_s
         self._settle_s = settle_s
-        self._multicast_ttl = multicast_ttl
         self._clock = clock
         self._wait = wait
 
@@ -223,16 +221,11 @@ class CotSender:
         host, port = self.endpoint.host, self.endpoint.port
         if self.endpoint.scheme != "udp":
             data = b"".join(event + b"\n" for event in events)
-            return deliver(
-                (host, port),
-                data,
-                self._tls,
-                self._server_name,
-                timeout_s=self._timeout_s,
-                settle_s=self._settle_s,
-                clock=self._clock,
-            )
-        with self._open_datagram_socket(host, port) as datagrams:
+            times = (self._timeout_s, self._settle_s, self._clock)
+            return deliver((host, port), data, self._tls, self._server_name, *times)
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        with socket.socket(family, socket.SOCK_DGRAM) as datagrams:
+            datagrams.connect(address)
             for event in events:
                 if len(event) > MAX_DATAGRAM_BYTES:
                     raise PortError(
@@ -242,20 +235,3 @@ class CotSender:
             if number := datagrams.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
                 raise OSError(number, os.strerror(number))
         return DATAGRAMS
-
-    def _open_datagram_socket(self, host: str, port: int) -> socket.socket:
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        datagrams = socket.socket(family, socket.SOCK_DGRAM)
-        if ipaddress.ip_address(str(address[0]).partition("%")[0]).is_multicast:
-            level, option = (
-                (socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS)
-                if family == socket.AF_INET6
-                else (socket.IPPROTO_IP, socket.IP_MULTICAST_TTL)
-            )
-            datagrams.setsockopt(level, option, self._multicast_ttl)
-        try:
-            datagrams.connect(address)
-        except OSError:
-            datagrams.close()
-            raise
-        return datagrams

@@ -16,7 +16,6 @@ import socket
 import ssl
 import struct
 import termios
-import time
 from collections.abc import Callable
 from typing import Final
 
@@ -44,10 +43,9 @@ def deliver(
     data: bytes,
     context: ssl.SSLContext | None,
     server_name: str,
-    *,
     timeout_s: float,
-    settle_s: float = SETTLE_S,
-    clock: Callable[[], float] = time.monotonic,
+    settle_s: float,
+    clock: Callable[[], float],
 ) -> str:
     """Connect, write `data`, end the connection, and return what shows that the server has received all of it.
 
