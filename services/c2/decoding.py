@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final
 
 import msgpack
@@ -207,8 +206,7 @@ class Decoding:
     ) -> None:
         self._store = store
         self.workers = list(workers)
-        self._idle = list(workers)
-        self._idle_lock = threading.Lock()
+        self._idle = list(workers)  # its methods are atomic
         self._keep = keep
         self._on_undecodable = on_undecodable
         self._stopping = stopping
@@ -338,8 +336,7 @@ class Decoding:
             vessel.retry_at_s = time.monotonic() + pause_s
 
     def _decode_one(self, entry: AcceptedImage) -> Decoded:
-        with self._idle_lock:
-            worker = self._idle.pop()
+        worker = self._idle.pop()
         try:
             return worker.decode(entry.coded_image())
         except BadInputError as error:
@@ -348,8 +345,7 @@ class Decoding:
             log.exception("Image not decoded after an unexpected exception")
             return Decoded(reason=f"{type(error).__name__}: {error}", failure="crash")
         finally:
-            with self._idle_lock:
-                self._idle.append(worker)
+            self._idle.append(worker)
 
     def _keep_parts(self, group: Sequence[tuple[AcceptedImage, ReconstructedImage]], *, is_alone: bool) -> set[str]:
         """Store images, after a failure in halves; return the vessels of those that cannot be stored."""
@@ -418,8 +414,3 @@ def _groups(
         group.append(each)
     if group:
         yield group
-
-
-def decode_workers(count: int, codebooks: Sequence[str], folder: Path, state_dir: Path) -> list[DecodeWorker]:
-    """Return workers that are not started yet."""
-    return [DecodeWorker(codebooks, folder, state_dir) for _ in range(count)]

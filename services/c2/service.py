@@ -13,6 +13,7 @@ from functools import partial
 from sonarpost import keys, wire
 from sonarpost.archive import image_parts
 from sonarpost.archive.codebook_transfer import CodebookFetcher
+from sonarpost.archive.decode_worker import DecodeWorker
 from sonarpost.archive.decoder import OTHER_PIXELS
 from sonarpost.archive.journal import Accepted, JournalEntry
 from sonarpost.bus.connectivity import declare_presence
@@ -38,7 +39,7 @@ from sonarpost.services.c2 import tasking
 from sonarpost.services.c2.accepted import AcceptedRecords, accepted_fields, payload_of
 from sonarpost.services.c2.archive import Archive, Storage
 from sonarpost.services.c2.config import C2Config
-from sonarpost.services.c2.decoding import BACKLOG, AcceptedImage, BacklogNames, Decoding, decode_workers
+from sonarpost.services.c2.decoding import BACKLOG, AcceptedImage, BacklogNames, Decoding
 from sonarpost.services.c2.json_form import ENCODING, json_payload
 from sonarpost.services.c2.queries import QueryService
 from sonarpost.services.c2.shared_archive import SharedArchive
@@ -111,7 +112,7 @@ class C2Service(Service[C2Config]):
         folder = platform.state_dir / CODEBOOKS
         self.decoding = Decoding(
             self.store,
-            decode_workers(config.decode_workers, config.codebooks, folder, platform.state_dir),
+            [DecodeWorker(config.codebooks, folder, platform.state_dir) for _ in range(config.decode_workers)],
             self._keep_images,
             self._on_undecodable,
             self.stopping,

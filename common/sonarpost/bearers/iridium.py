@@ -19,7 +19,6 @@ from sonarpost.bearers.serial_device import close_port, open_port
 from sonarpost.errors import BadInputError, PortError
 from sonarpost.limits import limit
 
-MAX_OUTGOING_BYTES: Final = 340
 MAX_INCOMING_BYTES: Final = 270
 MAX_LINE_BYTES: Final = 200
 MAX_LINES: Final = 20
