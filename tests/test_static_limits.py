@@ -35,7 +35,6 @@ THREADS = {
     "common/sonarpost/runtime/serial_port.py": "guarded: reads a port",
     "common/sonarpost/runtime/service.py": "`start_thread`, whose exceptions stop the service; probe of the router",
     "common/sonarpost/simulation/channel/emulator.py": "simulator",
-    "common/sonarpost/simulation/message_gateway.py": "simulator",
     "common/sonarpost/stop_signals.py": "reads signals",
     "services/console/training/calibrated_watch.py": "guarded: counts calibrated contacts",
     "services/console/training/simulator.py": "guarded: simulator of a training",

@@ -13,6 +13,7 @@ from urllib.request import Request, urlopen
 
 import pytest
 from builders.common import eventually
+from builders.message_gateway import MessageGatewayEmulator
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -27,7 +28,6 @@ from sonarpost.bearers.iridium import (
 )
 from sonarpost.bearers.rockblock import MAX_BODY_BYTES, RockBlockAccount, Webhook, WebhookError, parse_webhook
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError, PortError
-from sonarpost.simulation.message_gateway import MessageGatewayEmulator
 
 IMEI = "300234010753370"
 TOKEN = "t0ken"

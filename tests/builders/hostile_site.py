@@ -31,6 +31,7 @@ import zenoh
 from builders.common import REPOSITORY, eventually, free_port
 from builders.exports import image as contact_image
 from builders.fleet_certificates import World
+from builders.message_gateway import MessageGatewayEmulator
 from builders.short_messages import decision
 from sonarpost import keys, wire
 from sonarpost.bearers.short_message import Item, ItemType, ShortMessage, pack_decision
@@ -40,7 +41,6 @@ from sonarpost.delivery.outbox import Outbox, QueuePolicy
 from sonarpost.delivery.store import Store
 from sonarpost.messages import Contact, Health, ImagePart, Pixels, Snippet
 from sonarpost.services.console.store.users import Users
-from sonarpost.simulation.message_gateway import MessageGatewayEmulator
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 from sonarpost.stop_signals import EXIT_WITH_PARENT

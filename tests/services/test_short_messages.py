@@ -10,6 +10,7 @@ from urllib.request import urlopen
 import msgpack
 import pytest
 from builders.common import eventually
+from builders.message_gateway import MessageGatewayEmulator
 from builders.records import decision_record, reconstructed_image
 from builders.short_messages import decision, with_crc
 from builders.short_messages import received as received_image
@@ -27,7 +28,6 @@ from sonarpost.services.c2.config import C2Config, ShortMessageOptions
 from sonarpost.services.c2.service import C2Service
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
 from sonarpost.services.relay.service import RelayService
-from sonarpost.simulation.message_gateway import MessageGatewayEmulator
 
 IMEI = "300234010753370"
 TOKEN = "0123456789abcdef"

@@ -55,7 +55,7 @@ class MessageGatewayEmulator:
         self.lost = 0
         self._loss = loss
         self._max_delay_s = max_delay_s
-        self._random = Random(seed)  # noqa: S311 simulated loss
+        self._random = Random(seed)
         self._lock = threading.Lock()
         self._mailboxes: dict[str, deque[bytes]] = {imei: deque() for imei in imeis}
         self._momsn = dict.fromkeys(imeis, 0)
