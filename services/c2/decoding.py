@@ -309,43 +309,46 @@ class Decoding:
         return list(self._store.readable(dict(entries), AcceptedImage.unpack).values())
 
     def _decode(self, pool: ThreadPoolExecutor, batch: Sequence[AcceptedImage]) -> None:
-        started_s = time.monotonic()
         results = list(pool.map(self._decode_one, batch))
         if self._stopping.is_set():
             return
         is_alone = len(batch) == 1
         failed: dict[str, float] = {}
         decoded: list[tuple[AcceptedImage, ReconstructedImage]] = []
-        for entry, result in zip(batch, results, strict=True):
+        for entry, (result, taken_s) in zip(batch, results, strict=True):
             if result.image is not None:
                 decoded.append((entry, result.image))
             elif result.failure:
                 counts = is_alone and result.failure == "crash"
                 self._failed(entry, result.reason, counts=counts)
-                failed[entry.vessel_id] = time.monotonic() - started_s if result.failure == "crash" else 0.0
+                lost_s = taken_s if result.failure == "crash" else 0.0
+                failed[entry.vessel_id] = max(lost_s, failed.get(entry.vessel_id, 0.0))
             elif result.missing_model and self.missing.add(result.missing_model, entry.vessel_id):
                 self._vessel(entry.vessel_id).failing.pop(entry.name, None)
             else:
                 self._quarantine(entry, result.reason)
         for group in _groups(decoded):
-            failed |= dict.fromkeys(self._keep_parts(group, is_alone=is_alone), 0.0)
-        for name, taken_s in failed.items():
+            failed = dict.fromkeys(self._keep_parts(group, is_alone=is_alone), 0.0) | failed
+        for name, lost_s in failed.items():
             vessel = self._vessel(name)
-            pause_s = min(RETRY_S * 2**vessel.failures, MAX_RETRY_S) + min(PAUSE_FACTOR * taken_s, MAX_PAUSE_S)
+            pause_s = min(RETRY_S * 2**vessel.failures, MAX_RETRY_S) + min(PAUSE_FACTOR * lost_s, MAX_PAUSE_S)
             vessel.failures = min(vessel.failures + 1, 10)
             vessel.retry_at_s = time.monotonic() + pause_s
 
-    def _decode_one(self, entry: AcceptedImage) -> Decoded:
+    def _decode_one(self, entry: AcceptedImage) -> tuple[Decoded, float]:
+        """Decode an image; return the result and the duration in seconds."""
+        started_s = time.monotonic()
         worker = self._idle.pop()
         try:
-            return worker.decode(entry.coded_image())
+            result = worker.decode(entry.coded_image())
         except BadInputError as error:
-            return Decoded(reason=str(error))
+            result = Decoded(reason=str(error))
         except Exception as error:
             log.exception("Image not decoded after an unexpected exception")
-            return Decoded(reason=f"{type(error).__name__}: {error}", failure="crash")
+            result = Decoded(reason=f"{type(error).__name__}: {error}", failure="crash")
         finally:
             self._idle.append(worker)
+        return result, time.monotonic() - started_s
 
     def _keep_parts(self, group: Sequence[tuple[AcceptedImage, ReconstructedImage]], *, is_alone: bool) -> set[str]:
         """Store images, after a failure in halves; return the vessels of those that cannot be stored."""

@@ -3,7 +3,9 @@
 import os
 import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from types import SimpleNamespace
 
 import pytest
 from builders.common import eventually
@@ -183,6 +185,27 @@ def test_archive_that_is_away_quarantines_no_image(backlog):
     backlog.run(lambda: len(backlog.stored) == 8)
     assert backlog.store.refused_count() == 0
     assert any("now: away" in fault for fault in backlog.faults)
+
+
+def test_pause_after_a_crash_does_not_depend_on_other_images_of_the_batch(backlog, monkeypatch):
+    now_s = 0.0
+    monkeypatch.setattr(decoding, "MAX_PAUSE_S", 300.0)
+    duration_s = {"vessel-1/0001": 100.0, "vessel-2/0001": 2.0, "vessel-2/0002": 1.0}
+    failure = {"vessel-2/0001": CRASH, "vessel-2/0002": MACHINE}
+
+    def failing(name):
+        nonlocal now_s
+        now_s += duration_s[name]
+        return failure.get(name)
+
+    backlog.failing = failing
+    for name in duration_s:
+        backlog.add(*name.split("/"))
+    monkeypatch.setattr(decoding, "time", SimpleNamespace(monotonic=lambda: now_s))
+    with ThreadPoolExecutor(1) as pool:
+        backlog.decoding._decode(pool, backlog.decoding._next())
+    assert backlog.stored == ["vessel-1/0001"]
+    assert backlog.decoding._vessel("vessel-2").retry_at_s - now_s == decoding.PAUSE_FACTOR * 2.0
 
 
 def test_images_that_cannot_be_removed_from_the_backlog_are_decoded_again(backlog, monkeypatch):
