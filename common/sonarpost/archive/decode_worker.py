@@ -122,8 +122,8 @@ class DecodeWorker:
             if is_ready:
                 _write(process.stdin, wire.encode(image))
                 answer = _read(process.stdout)
-        except OSError:
-            answer = None  # the process has ended
+        except (OSError, ValueError):
+            answer = None  # the process has ended, or `close` has closed its pipes
         if answer is None:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(END_S)  # its own status, not that of the kill

@@ -11,6 +11,7 @@ import pytest
 from builders.common import eventually
 
 from sonarpost import keys, wire
+from sonarpost.archive import decode_worker
 from sonarpost.archive.decode_worker import Decoded, DecodeWorker
 from sonarpost.archive.decoder import Decoder
 from sonarpost.codec.registry import default_registry
@@ -279,3 +280,19 @@ def test_end_of_a_decoder_is_blamed_on_the_machine_unless_it_ends_by_itself(work
 def test_decoder_that_does_not_finish_is_ended_after_its_processor_time(worker, coded):
     result = worker(max_decode_s=1e-6).decode(coded)
     assert (result.failure, result.reason) == ("crash", "the decoder did not finish within 1e-06 s of processor time")
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("step", ["_write", "_read"])
+def test_stop_between_two_steps_of_a_decoding_is_no_crash(worker, coded, monkeypatch, step):
+    decoder = worker()
+    assert decoder.decode(coded).image is not None
+    original = getattr(decode_worker, step)
+
+    def stopped(*arguments):
+        decoder.close()
+        return original(*arguments)
+
+    monkeypatch.setattr(decode_worker, step, stopped)
+    assert decoder.decode(coded).failure == "machine"
+    assert decoder.decode(coded).reason == "the service stops"
