@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
-from random import SystemRandom
 from typing import TYPE_CHECKING
 
 import pytest
@@ -21,22 +19,13 @@ GOLDEN_FOLDER = REPOSITORY / "tests" / "golden"
 
 WAIT_S = 300.0
 """Default limit of waits: only a test that fails waits so long."""
-PORTS = (10_000, 32_000)
-"""Ports of tests: below those of outgoing connections, which could take a port between two uses."""
 
 
 def free_port() -> int:
-    """Return a random TCP port of `PORTS` that was free a moment ago."""
-    # Seeded by the system, because Hypothesis and tests set the seed of the module's own generator.
-    random = SystemRandom()
-    while True:
-        port = random.randrange(*PORTS)
-        with socket.socket() as probe:
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-        return port
+    """Return a TCP port of `free_ports`."""
+    from sonarpost.cli.demo.settings import free_ports  # the codec tests have no drivers of modems
+
+    return free_ports(1)[0]
 
 
 def eventually(condition: Callable[[], bool], timeout_s: float = WAIT_S, what: str = "condition") -> None:

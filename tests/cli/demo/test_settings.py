@@ -6,7 +6,7 @@ import socket
 
 from builders.common import free_port
 
-from sonarpost.cli.demo.settings import reserved_ports
+from sonarpost.cli.demo.settings import free_ports, reserved_ports
 
 
 def test_free_port_is_reserved_and_can_be_listened_on():
@@ -27,3 +27,9 @@ def test_port_of_another_program_is_skipped():
         with reserved_ports(taken, taken) as ports:
             assert len({taken, *ports}) == 3
             assert all(port > taken for port in ports)
+
+
+def test_free_ports_are_below_those_of_outgoing_connections():
+    ports = free_ports(3)
+    assert len(set(ports)) == 3
+    assert all(port < 32_768 for port in ports)  # the first one of Linux

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from random import SystemRandom
 from typing import Literal
 
 from sonarpost.errors import PortError
@@ -16,6 +17,8 @@ from sonarpost.modem.registry import DEFAULT_DRIVER, modem_driver
 ROUTER_PORTS = (7467, 7457, 7447)
 """Ports of the routers of a demo's vehicle, vessel and shore site, if they are free. 7447 is Zenoh's usual port."""
 CONSOLE_PORT = 8470
+FREE_PORTS = (10_000, 32_000)
+"""Range of `free_ports`: below the ports of outgoing connections, which could take one while no router listens."""
 UUV, VESSEL, SHORE, WATER = "uuv-1", "vessel-1", "shore-1", "water"
 UUV_ADDRESS, VESSEL_ADDRESS = 3, 1
 PLATFORM_OF = {
@@ -134,15 +137,15 @@ class ChainSettings:
 
 
 def free_ports(count: int) -> tuple[int, ...]:
-    """Return different TCP ports that are free now."""
-    probes = [socket.socket() for _ in range(count)]
-    try:
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        return tuple(int(probe.getsockname()[1]) for probe in probes)
-    finally:
-        for probe in probes:
-            probe.close()
+    """Return different random TCP ports of `FREE_PORTS` that are free now."""
+    # Seeded by the system: another process with the same seed would take the same ports.
+    random, found = SystemRandom(), set[int]()
+    while len(found) < count:
+        port = random.randrange(*FREE_PORTS)
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            found.add(port)
+    return tuple(found)
 
 
 @contextmanager
