@@ -8,7 +8,6 @@ import sys
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
@@ -42,16 +41,17 @@ def add_actions(actions: Subparsers) -> None:
 def run(parsed: argparse.Namespace) -> int:
     """Print records until interrupted, or until `--count` lines were printed; return 0."""
     endpoints, tls = router_of(parsed)
-    stop = threading.Event()
-    session = open_with_retry(endpoints, stop, tls)
+    session = open_with_retry(endpoints, threading.Event(), tls)
     assert session is not None
-
-    def show(record: Record) -> None:
-        print(json.dumps(_fields(record)) if parsed.json else printable(line_of(record)), flush=True)
-
+    shown = 0
     with session, suppress(KeyboardInterrupt):
         _log(f"watching {parsed.site} at {', '.join(endpoints)}")
-        Watch(session, parsed.site, parsed.vessel).run(show, parsed.count, stop)
+        watch = Watch(session, parsed.site, parsed.vessel)
+        while parsed.count is None or shown < parsed.count:
+            record = watch.poll()
+            if record is not None:
+                print(json.dumps(_fields(record)) if parsed.json else printable(line_of(record)), flush=True)
+                shown += 1
     return 0
 
 
@@ -90,15 +90,6 @@ class Watch:
             else:
                 waiting.append((key, sample.payload.to_bytes()))
                 self._changed.notify()
-
-    def run(self, show: Callable[[Record], None], count: int | None, stop: threading.Event) -> None:
-        """Call `show` for each record until `stop` is set or `count` records were shown."""
-        shown = 0
-        while not stop.is_set() and (count is None or shown < count):
-            record = self.poll()
-            if record is not None:
-                show(record)
-                shown += 1
 
     def poll(self) -> ReconstructedImage | Decision | TaskingState | None:
         """Return the next record; None if there is none for 0.2 s, or if it is invalid or of another vessel."""
