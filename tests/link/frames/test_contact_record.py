@@ -12,7 +12,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError
-from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary, atd_class_of
+from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary, atd_class_of, summary_of
+from sonarpost.messages import Contact
 from sonarpost.sonar.survey import Side
 
 
@@ -278,3 +279,11 @@ def test_decoded_sigma_gives_the_same_code() -> None:
 def test_other_length_is_rejected(length: int) -> None:
     with pytest.raises(FrameError, match="25 bytes"):
         ContactSummary.unpack(bytes(length))
+
+
+@pytest.mark.parametrize(
+    ("time_utc_s", "expected"), [(4294967294.0, 4294967294.0), (4294967294.5, None), (4294967295.0, None)]
+)
+def test_time_that_the_record_cannot_hold_is_unknown(time_utc_s: float, expected: float | None) -> None:
+    summary = summary_of(Contact(contact_id="c", vehicle_id="uuv-1", time_utc_s=time_utc_s), None, None)
+    assert ContactSummary.unpack(summary.pack()).time_utc_s == expected

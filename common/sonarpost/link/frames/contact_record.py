@@ -252,7 +252,7 @@ def summary_of(
         width_px=width_px if has_size else None,
         lat_deg=contact.lat_deg if has_fix else None,
         lon_deg=contact.lon_deg if has_fix else None,
-        time_utc_s=time_utc_s if time_utc_s is not None and time_utc_s < _UNKNOWN_U32 else None,
+        time_utc_s=time_utc_s if time_utc_s is not None and time_utc_s <= _UNKNOWN_U32 - 1 else None,
         confidence=contact.atd_confidence,
         heading_deg=contact.heading_deg,
         altitude_m=contact.altitude_m,
