@@ -181,11 +181,12 @@ def test_vessel_does_not_delay_the_codebook_of_another(tmp_path, monkeypatch, ho
 
 
 def test_incomplete_codebook_is_kept_while_the_vessel_is_silent(tmp_path, monkeypatch):
-    data, stopping, offsets = to_bytes(CODEBOOK), threading.Event(), []
+    data, stopping, offsets, failures = to_bytes(CODEBOOK), threading.Event(), [], []
     monkeypatch.setattr(codebook_transfer, "RETRY_S", 0.0)
 
     def query(_session, key, offset):
         offsets.append(offset)
+        failures.append(fetcher._vessels[VESSEL].failures)
         if len(offsets) % 2 == 0:
             silent(key, offset)
         return codebook_transfer._Piece(v=1, size=len(data), data=data[offset : offset + 32768])
@@ -196,6 +197,8 @@ def test_incomplete_codebook_is_kept_while_the_vessel_is_silent(tmp_path, monkey
     monkeypatch.setattr(codebook_transfer, "_query", query)
     fetcher.run(None)
     assert offsets[::2] == list(range(0, len(data), 32768))
+    assert len(offsets) > 4
+    assert max(failures) == 1  # each pause is the first one again
 
 
 def test_folder_that_cannot_be_used_concerns_its_vessel_only(tmp_path, monkeypatch):

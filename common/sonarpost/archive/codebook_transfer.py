@@ -179,8 +179,9 @@ class CodebookFetcher:
         taken_s = time.monotonic() - started_s
         if taken_s > SLOW_S and len(self._vessels) > 1:
             known.next_at_s = time.monotonic() + PAUSE_FACTOR * taken_s
+        if is_complete or not known.tried:
+            known.failures = 0  # a piece after a silence shows that the vessel is back
         if is_complete:
-            known.failures = 0
             self.faults.pop((model, vessel), None)
             log.info("Codebook fetched", extra=kv(vessel=vessel, model=model))
             self._added(vessel)
