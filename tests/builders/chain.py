@@ -9,12 +9,13 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
+from builders.common import free_port
 from builders.history import History
 from builders.progress import wait_while_progressing
 from sonarpost import keys
 from sonarpost.cli.demo.chain import Chain
 from sonarpost.cli.demo.outcome import evaluate, last_versions, read_images
-from sonarpost.cli.demo.settings import VESSEL, ChainSettings, free_ports
+from sonarpost.cli.demo.settings import VESSEL, ChainSettings
 from sonarpost.cli.demo.watch import Watcher
 from sonarpost.link.frames.paper.frame import parse_frame
 from sonarpost.messages import AcousticFrame, ReceivedImage
@@ -145,13 +146,12 @@ def start_chain(tmp_path):
     with ExitStack() as stack:
 
         def start(**changes):
-            ports = free_ports(3)
             settings = ChainSettings(
                 folder=tmp_path / "run",
                 mode="snippets",
                 link="paper",
                 time_scale=TIME_SCALE,
-                router_ports=(ports[0], ports[1], ports[2]),
+                router_ports=(free_port(), free_port(), free_port()),
             )
             settings = dataclasses.replace(settings, **changes)
             chain = stack.enter_context(Chain(settings))

@@ -24,7 +24,7 @@ import pytest
 import tifffile
 
 from builders.chain import latest_versions
-from builders.common import REPOSITORY
+from builders.common import REPOSITORY, free_port
 from builders.faulty_link import FaultyLink
 from builders.history import History
 from builders.image_archive import ArchiveLog, name_of
@@ -34,7 +34,7 @@ from builders.progress import wait_while_progressing
 from builders.small_disk import SmallDisk
 from sonarpost import keys
 from sonarpost.cli.demo.chain import ROUTERS, Chain
-from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings, free_ports
+from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
 from sonarpost.config import PlatformConfig
 from sonarpost.sonar.image_files import write_png
 
@@ -300,7 +300,7 @@ def queued_records(path):
 def chaos_chain(folder):
     """Start a chain with v1, 10 % of the frames lost, small disks, and a link between vessel and shore with faults."""
     with ExitStack() as stack:
-        ports = free_ports(3)
+        ports = (free_port(), free_port(), free_port())
         history = History(folder / "history.jsonl")
         stack.callback(history.close)
         link = FaultyLink(ports[2], on_fault=lambda fault: history.fault("link", fault))
@@ -311,7 +311,7 @@ def chaos_chain(folder):
             rate=5,
             loss=0.1,
             time_scale=40.0,
-            router_ports=(ports[0], ports[1], ports[2]),
+            router_ports=ports,
             shore_port_for_vessel=link.port,
             extra=(("relay", "disk_reserve_bytes = 12_000_000"),),
         )

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+import os
+import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from random import SystemRandom
 from typing import TYPE_CHECKING
 
 import pytest
@@ -19,13 +23,32 @@ GOLDEN_FOLDER = REPOSITORY / "tests" / "golden"
 
 WAIT_S = 300.0
 """Default limit of waits: only a test that fails waits so long."""
+PORTS = range(10_000, 32_000)
+"""Ports of tests: below those of outgoing connections, which could take a port between two uses."""
+
+
+def worker_ports() -> Iterator[int]:
+    """Return the ports of this worker of pytest-xdist in turn, without end: no other worker has them."""
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    own = PORTS[worker :: int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))]
+    # Another run of the tests on this host starts at another port; seeded by the system, not by a test.
+    first = SystemRandom().randrange(len(own))
+    return itertools.cycle([*own[first:], *own[:first]])
+
+
+_worker_ports = worker_ports()
 
 
 def free_port() -> int:
-    """Return a TCP port of `free_ports`."""
-    from sonarpost.cli.demo.settings import free_ports  # the codec tests have no drivers of modems
-
-    return free_ports(1)[0]
+    """Return a TCP port of this worker that was free a moment ago; the same one only after some thousands of others."""
+    while True:
+        port = next(_worker_ports)
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+        return port
 
 
 def eventually(condition: Callable[[], bool], timeout_s: float = WAIT_S, what: str = "condition") -> None:

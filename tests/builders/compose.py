@@ -16,6 +16,7 @@ from sonarpost.cli.demo.settings import PLATFORM_OF
 
 PROFILES = ("sim", "uuv", "vessel", "shore")
 ROUTERS = ("router-uuv", "router-vessel", "router-shore", "router-sim")
+PUBLISHED = ("VESSEL_CONSOLE_PUBLISH", "SHORE_CONSOLE_PUBLISH", "SHORE_PUBLISH")
 SERVICES = (*PLATFORM_OF, "console", "console-shore", *ROUTERS)
 # Prints {file name: SHA-256} of the pictures under a folder, each in its latest version, and how many are complete.
 # Earlier versions need not be ashore: a newer one may take their place on the way. A picture's JSON is written last:
@@ -199,7 +200,8 @@ def project():
             "HEALTH_INTERVAL_S": "1.0",
             "JOIN_TIMEOUT_S": "0.0",
             "HEALTH_CHECK_INTERVAL": "3s",
-            "SHORE_PUBLISH": "127.0.0.1:",  # a free port of this host
+            # Free ports of this host: other tests and demos use 8470.
+            **dict.fromkeys(PUBLISHED, "127.0.0.1:"),
         },
     )
     try:

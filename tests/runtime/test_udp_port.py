@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 
 import pytest
-from builders.common import eventually
+from builders.common import WAIT_S, eventually, free_port
 
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.runtime.modem_port import open_modem_port
@@ -13,7 +13,7 @@ from sonarpost.runtime.serial_modem import SerialModem
 from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialPort
 from sonarpost.runtime.udp_port import UdpPort
 
-URL = "udp://239.255.77.1:15707?interface=127.0.0.1&ttl=0"
+URL = f"udp://239.255.77.1:{free_port()}?interface=127.0.0.1&ttl=0"
 
 
 def test_each_write_is_one_datagram_for_all():
@@ -23,13 +23,13 @@ def test_each_write_is_one_datagram_for_all():
         ports[0].write(b"x")
     for port, own in zip(ports, events, strict=True):
         port.start(own.put)
-        assert isinstance(own.get(timeout=30), PortOpened)
+        assert isinstance(own.get(timeout=WAIT_S), PortOpened)
     with pytest.raises(PortError, match="already started"):
         ports[0].start(events[0].put)
     for data in (b"one", b"two"):
         ports[0].write(data)
     for own in events:
-        assert [own.get(timeout=30), own.get(timeout=30)] == [b"one", b"two"]
+        assert [own.get(timeout=WAIT_S), own.get(timeout=WAIT_S)] == [b"one", b"two"]
     for port in ports:
         port.close()
         eventually(lambda port=port: not port.is_open)
@@ -47,7 +47,7 @@ def test_unexpected_exception_counts_as_a_lost_port(monkeypatch):
     monkeypatch.setattr(UdpPort, "_read", staticmethod(failing))
     port, events = UdpPort(URL), queue.SimpleQueue[PortEvent]()
     port.start(events.put)
-    assert [events.get(timeout=30) for _ in range(3)] == [PortOpened(), PortLost("a defect"), PortOpened()]
+    assert [events.get(timeout=WAIT_S) for _ in range(3)] == [PortOpened(), PortLost("a defect"), PortOpened()]
     port.close()
 
 
@@ -55,7 +55,7 @@ def test_two_stations_exchange_packets():
     with SerialModem(URL, address=1, driver="udp") as vessel, SerialModem(URL, address=3, driver="udp") as vehicle:
         sent = vehicle.send([b"hello", b"again"], destination=1, rate=1, ack=True)
         assert sent.acknowledged == (1, 2)
-        packet = vessel.receive(timeout_s=30)
+        packet = vessel.receive(timeout_s=WAIT_S)
         assert packet is not None
         assert [frame.data for frame in packet.frames] == [b"hello", b"again"]
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import socket
+from itertools import islice
 
-from builders.common import free_port
+from builders.common import PORTS, free_port, worker_ports
 
 from sonarpost.cli.demo.settings import free_ports, reserved_ports
 
@@ -33,3 +34,12 @@ def test_free_ports_are_below_those_of_outgoing_connections():
     ports = free_ports(3)
     assert len(set(ports)) == 3
     assert all(port < 32_768 for port in ports)  # the first one of Linux
+
+
+def test_workers_of_the_tests_use_different_ports(monkeypatch):
+    monkeypatch.setenv("PYTEST_XDIST_WORKER_COUNT", "3")
+    found = []
+    for worker in ("gw0", "gw1", "gw2"):
+        monkeypatch.setenv("PYTEST_XDIST_WORKER", worker)
+        found += islice(worker_ports(), len(PORTS) // 3)
+    assert len(found) == len(set(found))

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 import tifffile
-from builders.common import REPOSITORY, eventually
+from builders.common import REPOSITORY, eventually, free_port
 from builders.history import History
 from builders.image_archive import side_cars
 from builders.numbered_snippet import number_of, numbered_snippet
@@ -27,7 +27,7 @@ from builders.progress import wait_while_progressing
 
 from sonarpost.cli.demo.chain import ROUTERS, Chain
 from sonarpost.cli.demo.outcome import read_images
-from sonarpost.cli.demo.settings import PLATFORM_OF, ChainSettings, free_ports
+from sonarpost.cli.demo.settings import PLATFORM_OF, ChainSettings
 from sonarpost.sonar.image_files import write_png
 
 CONTACTS = int(os.environ.get("SONARPOST_SOAK_CONTACTS", "60"))
@@ -44,7 +44,7 @@ class TlsChain(Chain):
 
     def __init__(self, settings):
         super().__init__(settings)
-        self.tls_port = free_ports(1)[0]
+        self.tls_port = free_port()
         self.fleet = settings.folder / "fleet"
 
     def tls_folder(self, platform):
@@ -156,14 +156,13 @@ class Mission:
 
 @pytest.mark.timeout(900 + 4 * CONTACTS)
 def test_services_neither_grow_nor_lose_a_contact_over_a_long_mission(tmp_path):
-    uuv, vessel, shore = free_ports(3)
     settings = ChainSettings(
         folder=tmp_path / "run",
         mode="snippets",
         rate=5,
         loss=0.05,
         time_scale=100.0,
-        router_ports=(uuv, vessel, shore),
+        router_ports=(free_port(), free_port(), free_port()),
         extra=(
             ("c2", f"max_bytes = {SHORE_LIMIT_BYTES}"),
             ("op_modem", "max_images_per_hour = 1000000\nmax_image_bytes_per_hour = 1099511627776"),

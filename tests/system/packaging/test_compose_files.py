@@ -11,6 +11,7 @@ import tomllib
 import pytest
 import yaml
 from builders.common import REPOSITORY
+from builders.compose import PUBLISHED
 
 from sonarpost.config import SERVICES, load, overridden_keys
 from sonarpost.services.atd_stub.config import AtdStubConfig
@@ -63,6 +64,7 @@ def test_networks_of_platforms_lead_nowhere_and_only_routers_meet():
         # Pages are served to this host only, unless the environment names another address.
         [port] = BLOCKS[name]["ports"]
         assert re.fullmatch(r"\$\{\w+:-127\.0\.0\.1:\d+\}:8470", port), name
+    assert set(PUBLISHED) == {name for name in variables(TEXT) if name.endswith("_PUBLISH")}, "free ports in the tests"
     vehicle = [set(block["networks"]) for block in BLOCKS.values() if "uuv" in block.get("profiles", ())]
     assert len(vehicle) >= 4
     assert set.union(*vehicle) == {"uuv", "uuv-line"}
