@@ -22,7 +22,7 @@ import numpy.typing as npt
 import pytest
 from starlette.testclient import TestClient
 
-from builders.common import eventually
+from builders.common import WAIT_S, eventually
 from builders.records import reconstructed_image
 from sonarpost import keys, wire
 from sonarpost.config import TlsConfig
@@ -279,7 +279,7 @@ class EventReader:
         request = urllib.request.Request(
             f"{address}events{query}", None, {"Cookie": f"{session_cookie(address)}={token}", **headers}
         )
-        self._stream: HTTPResponse = urllib.request.urlopen(request, timeout=60, context=context)
+        self._stream: HTTPResponse = urllib.request.urlopen(request, timeout=WAIT_S, context=context)
         self.events: list[tuple[str, str, Any]] = []
         self.ended = False
         threading.Thread(target=self._read, daemon=True).start()

@@ -28,7 +28,7 @@ import msgpack
 import numpy as np
 import zenoh
 
-from builders.common import REPOSITORY, eventually, free_port
+from builders.common import REPOSITORY, WAIT_S, eventually, free_port
 from builders.exports import image as contact_image
 from builders.fleet_certificates import World
 from builders.message_gateway import MessageGatewayEmulator
@@ -53,7 +53,6 @@ USERS = {"eva": "expert", "ben": "observer"}
 """eva is measured, ben is hostile."""
 MEMORY_BYTES = 512 * 1024 * 1024
 """Limit of docker-compose.yml and packaging/kubernetes for each service."""
-ANSWER_S = 120.0
 
 
 def coded_part(number: int, side_px: int = 48) -> ImagePart:
@@ -100,7 +99,7 @@ class Arrivals:
 
     def delays_s(self, sent_s: dict[str, float]) -> list[float]:
         """Wait for all records; return their delays."""
-        eventually(lambda: sent_s.keys() <= self.at_s.keys(), ANSWER_S, f"{len(sent_s)} records")
+        eventually(lambda: sent_s.keys() <= self.at_s.keys(), what=f"{len(sent_s)} records")
         return [self.at_s[name] - sent_s[name] for name in sent_s]
 
 
@@ -302,7 +301,7 @@ class Site:
         begin_s = time.monotonic()
         for process in self.processes.values():
             process.popen.terminate()
-        codes = {name: process.popen.wait(60) for name, process in self.processes.items()}
+        codes = {name: process.popen.wait(WAIT_S) for name, process in self.processes.items()}
         print(f"ended {time.monotonic() - begin_s:.1f} s after SIGTERM: {codes}")
         for process in self.processes.values():
             if process.container:
@@ -347,7 +346,7 @@ class Site:
             status = request(f"http://127.0.0.1:{self.webhook_port}/{TOKEN}", body)
             return status in (200, 400)
 
-        eventually(delivered, ANSWER_S, "delivery of a short message")
+        eventually(delivered, what="delivery of a short message")
         return status
 
     def requests_of_user(self) -> list[float]:
@@ -356,7 +355,7 @@ class Site:
         delays = []
         for path in ("/api/contacts", "/api/map", "/api/fleet", "/api/info", "/login") * 3:
             begin_s = time.monotonic()
-            eventually(lambda path=path: self.get(path, cookie) == 200, ANSWER_S, f"reply to {path}")  # type: ignore[misc]
+            eventually(lambda path=path: self.get(path, cookie) == 200, what=f"reply to {path}")  # type: ignore[misc]
             delays.append(time.monotonic() - begin_s)
         return delays
 
@@ -372,7 +371,7 @@ class Site:
                 errors.extend(reply.err.payload.to_string() for reply in replies if reply.err is not None)
                 return any(reply.ok is not None for reply in replies)
 
-            eventually(answered, ANSWER_S, f"answer to a query after {errors[-3:]}")
+            eventually(answered, what=f"answer to a query after {errors[-3:]}")
             delays.append(time.monotonic() - begin_s)
         return delays
 
@@ -398,7 +397,7 @@ class Site:
         """Wait until a service has logged all words: the consumers of its records do not run."""
         log, delays = self.processes[service].log, []
         for one in words:
-            eventually(lambda one=one: one in log.read_text(), ANSWER_S, one)  # type: ignore[misc]
+            eventually(lambda one=one: one in log.read_text(), what=one)  # type: ignore[misc]
             delays.append(time.monotonic() - begin_s)
         return delays
 
@@ -412,7 +411,7 @@ class Site:
         def received() -> bool:
             return set(names) <= self.alerts.at_s.keys()
 
-        eventually(received, ANSWER_S, "alerts")
+        eventually(received, what="alerts")
         return [self.alerts.at_s[name] - sent_s[name] for name in names]
 
     # HTTP
@@ -432,7 +431,7 @@ class Site:
                 return False
             return True
 
-        eventually(logged_in, ANSWER_S, f"log-in of {user}")
+        eventually(logged_in, what=f"log-in of {user}")
         return cookie
 
     def get(self, path: str, cookie: str = "", method: str = "GET", body: bytes | None = None) -> int:

@@ -18,6 +18,8 @@ from urllib.parse import unquote, urlsplit
 
 import zenoh
 
+from builders.common import WAIT_S
+
 
 def shown(key, payload, encoding):
     """Return a reply or publication in the form of the plugin."""
@@ -51,7 +53,7 @@ class _Handler(BaseHTTPRequestHandler):
         has_time = any(pair.startswith("_time=[") for pair in parameters.split(";"))
         mode = zenoh.ConsolidationMode.NONE if has_time else zenoh.ConsolidationMode.LATEST
         found = []
-        for reply in self.server.session.get(f"{key}?{parameters}", consolidation=mode, timeout=60):
+        for reply in self.server.session.get(f"{key}?{parameters}", consolidation=mode, timeout=WAIT_S):
             if reply.ok is not None:
                 found.append(shown(str(reply.ok.key_expr), reply.ok.payload, reply.ok.encoding))
             elif reply.err is not None:

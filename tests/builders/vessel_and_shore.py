@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from builders.common import REPOSITORY, free_port
+from builders.common import REPOSITORY, WAIT_S, free_port
 from builders.faulty_link import FaultyLink
 from builders.history import History
 from builders.image_archive import ArchiveLog, name_of, side_cars
@@ -212,7 +212,7 @@ class VesselAndShore:
                 process.terminate()
         for process in self._processes.values():
             try:
-                process.wait(timeout=60)
+                process.wait(timeout=WAIT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()

@@ -6,7 +6,7 @@ from collections import Counter
 
 import msgpack
 import pytest
-from builders.common import eventually, publish_once
+from builders.common import WAIT_S, eventually, publish_once
 from builders.records import decision_record, encoded_image, reconstructed_image
 
 from sonarpost import keys, wire
@@ -304,7 +304,7 @@ def ask(client):
         eventually(lambda: querier.matching_status.matching)
         payload = b"".join(i.payload for i in items) if data is None else data
         attached = protocol.attachment(ORIGIN, items[0]) if len(items) == 1 else batch_attachment(ORIGIN, items)
-        content = client.get(WHERE, payload=payload, attachment=attached, timeout=60).recv().ok.payload.to_bytes()
+        content = client.get(WHERE, payload=payload, attachment=attached, timeout=WAIT_S).recv().ok.payload.to_bytes()
         return AckReply.unpack(content, WHERE) if len(items) == 1 else unpack_replies(content, len(items), WHERE)
 
     return query

@@ -104,7 +104,7 @@ def test_deadline_is_for_the_whole_exchange(scheme, sends, reads_body):
     with server_that(sends) as (address, accepted):
         with pytest.raises(TimeoutError, match=r"within 0\.5 s"):
             post(f"{scheme}://{address}/", b"x", {}, reads_body=reads_body, timeout_s=0.5)
-        accepted[0].settimeout(20)
+        accepted[0].settimeout(WAIT_S)
         with suppress(ConnectionResetError):
             while accepted[0].recv(4096):
                 pass  # the request; then the client has closed the connection

@@ -7,7 +7,7 @@ import time
 import tty
 
 import pytest
-from builders.common import eventually
+from builders.common import WAIT_S, eventually
 
 from sonarpost.errors import FrameError, PortError
 from sonarpost.modem.interface import (
@@ -64,7 +64,7 @@ class PtyModem:
             self._plugged = False
             self.path.unlink()
             os.close(self.master)
-            self._thread.join(5.0)
+            self._thread.join(WAIT_S)
 
     def write(self, kind, *fields):
         os.write(self.master, nmea.format(kind, *fields))

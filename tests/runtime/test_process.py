@@ -164,7 +164,7 @@ def test_running_service_notifies_systemd_and_publishes_health_and_liveliness(st
     client.declare_subscriber(key, lambda sample: seen.append(wire.decode(Health, sample.payload.to_bytes(), key)))
 
     def alive():
-        replies = client.liveliness().get(keys.alive("vessel-1", "relay"), timeout=60)
+        replies = client.liveliness().get(keys.alive("vessel-1", "relay"), timeout=WAIT_S)
         return any(reply.ok is not None for reply in replies)
 
     environment = {

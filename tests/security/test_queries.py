@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgpack
 import pytest
 import zenoh
-from builders.common import eventually
+from builders.common import WAIT_S, eventually
 from builders.records import decision_record
 
 from sonarpost import keys, wire
@@ -37,7 +37,7 @@ def c2(world, tmp_path, monkeypatch):
 
 def received(session, selector):
     """Return the payloads of all replies to a query."""
-    replies = session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=60)
+    replies = session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=WAIT_S)
     return [msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
 

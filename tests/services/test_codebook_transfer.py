@@ -4,7 +4,7 @@ import threading
 
 import msgpack
 import pytest
-from builders.common import eventually
+from builders.common import WAIT_S, eventually
 from builders.vessel_frames import CONTACT
 
 from sonarpost import keys, wire
@@ -118,7 +118,7 @@ def test_invalid_offset_and_unknown_codebook_are_errors(client):
     codebook_transfer.declare_codebooks(client, VESSEL, Decoder(("nominal-10",)))
     offsets = ("-1", "x", "9" * 30, str(len(to_bytes(CODEBOOK))))
     for selector in (*(f"{KEY}?offset={offset}" for offset in offsets), keys.codebook(VESSEL, "0" * 32)):
-        [reply] = client.get(selector, timeout=60)
+        [reply] = client.get(selector, timeout=WAIT_S)
         assert reply.ok is None
 
 

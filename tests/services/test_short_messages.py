@@ -9,7 +9,7 @@ from urllib.request import urlopen
 
 import msgpack
 import pytest
-from builders.common import eventually
+from builders.common import WAIT_S, eventually
 from builders.message_gateway import MessageGatewayEmulator
 from builders.records import decision_record, reconstructed_image
 from builders.short_messages import decision, with_crc
@@ -202,7 +202,7 @@ def deliver(gateway, imei, data):
     """Deliver a message to the webhook; return the status."""
     body = urlencode({"imei": imei, "momsn": "1", "data": data.hex()}).encode()
     try:
-        with urlopen(gateway.webhook_url, body, timeout=60) as reply:
+        with urlopen(gateway.webhook_url, body, timeout=WAIT_S) as reply:
             return reply.status
     except HTTPError as error:
         error.close()

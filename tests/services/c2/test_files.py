@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import replace
 
 import pytest
-from builders.common import eventually
+from builders.common import WAIT_S, eventually
 from builders.records import decision_record
 from builders.shore import image, relayed
 from hypothesis import given
@@ -222,7 +222,7 @@ def test_images_are_stored_while_retention_selects(open_files, monkeypatch):
     def select(images, *_):
         thread = threading.Thread(target=store)
         thread.start()
-        thread.join(60.0)
+        thread.join(WAIT_S)
         return images
 
     monkeypatch.setattr(c2_archive, "select_images", select)

@@ -10,7 +10,7 @@ import msgpack
 import numpy as np
 import pytest
 import zenoh
-from builders.common import eventually
+from builders.common import WAIT_S, eventually
 from builders.records import decision_record, reconstructed_image
 from builders.shore import CONTACTS, relayed
 from PIL import Image
@@ -78,7 +78,7 @@ class Shore:
 
     def replies(self, selector):
         """Return the replies of one page and the page."""
-        found = list(self.client.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=60))
+        found = list(self.client.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=WAIT_S))
         errors = [reply.err.payload.to_string() for reply in found if reply.err is not None]
         assert errors == []
         samples = [reply.ok for reply in found]
@@ -104,7 +104,7 @@ class Shore:
         ]
 
     def error(self, selector):
-        [reply] = list(self.client.get(selector, timeout=60))
+        [reply] = list(self.client.get(selector, timeout=WAIT_S))
         assert reply.err is not None
         assert reply.err.encoding == zenoh.Encoding.TEXT_PLAIN
         return str(reply.err.payload.to_string())
@@ -385,14 +385,14 @@ def test_queries_above_the_limits_are_refused_and_records_are_accepted(shore, mo
 
     def wait(self, row):
         blocked.release()
-        released.wait(60)
+        released.wait(WAIT_S)
         return fields(self, row)
 
     monkeypatch.setattr(AcceptedRecords, "fields", wait)
     try:
-        waiting = [shore.client.get(CONTACTS, timeout=60) for _ in range(queries.MAX_IN_PROGRESS)]
+        waiting = [shore.client.get(CONTACTS, timeout=WAIT_S) for _ in range(queries.MAX_IN_PROGRESS)]
         for _ in range(queries.THREADS):
-            assert blocked.acquire(timeout=60)
+            assert blocked.acquire(timeout=WAIT_S)
         eventually(lambda: shore.service._queries._in_progress == queries.MAX_IN_PROGRESS)
         assert shore.error(CONTACTS) == (
             f"{CONTACTS}: busy: got '8 queries in progress', expected at most 8; repeat the query after a second"

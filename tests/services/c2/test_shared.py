@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import msgpack
 import pytest
 import zenoh
-from builders.common import eventually, free_port
+from builders.common import WAIT_S, eventually, free_port
 from builders.records import command_record, decision_record
 from builders.shore import CONTACTS, identity, image, relayed
 
@@ -323,7 +323,7 @@ def give(host, *records):
 
 
 def page(session, selector=CONTACTS):
-    replies = list(session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=60))
+    replies = list(session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=WAIT_S))
     values = [msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
     return [v for v in values if v["type"] != "page"], values[-1]
 

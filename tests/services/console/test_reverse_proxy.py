@@ -10,7 +10,7 @@ import subprocess
 
 import httpx2
 import pytest
-from builders.common import REPOSITORY, eventually, free_port
+from builders.common import REPOSITORY, WAIT_S, eventually, free_port
 from builders.console import Browser, EventReader, image_record, server_certificate, web_server
 
 from sonarpost.network.connections import ConnectionLimits, TrustedProxies
@@ -105,12 +105,12 @@ def test_half_requests_end_in_nginx_and_keep_no_one_out(proxied):
     proxy, _console = proxied
     held = []
     for _ in range(230):
-        held.append(proxy.tls.wrap_socket(socket.create_connection((PROXY, proxy.port), 20), server_hostname=PROXY))
+        held.append(proxy.tls.wrap_socket(socket.create_connection((PROXY, proxy.port), WAIT_S), server_hostname=PROXY))
         held[-1].sendall(b"GET /login HTTP/1.1\r\nHost: 127.0.0.1\r\n")
     with proxy.client() as client:
         assert Browser(client).login("anna").status_code == 200
     for one in held:
-        one.settimeout(30)
+        one.settimeout(WAIT_S)
         try:
             assert one.recv(100)[:12] in (b"", b"HTTP/1.1 408")
         except ConnectionResetError:

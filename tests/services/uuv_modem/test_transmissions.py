@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 import pytest
-from builders.common import eventually
+from builders.common import WAIT_S, eventually
 from builders.records import outgoing_message
 
 from sonarpost import keys, wire
@@ -121,6 +121,6 @@ def test_the_service_publishes_each_transmission_and_replies_to_a_query(
     eventually(lambda: bool(ended()), what="the record of an ended transmission")
     last = ended()[-1].transmissions[-1]
     assert before_s <= last.start_utc_s <= last.end_utc_s <= time.time()
-    replies = [r.ok.payload.to_bytes() for r in client.get(KEY, timeout=60.0) if r.ok is not None]
+    replies = [r.ok.payload.to_bytes() for r in client.get(KEY, timeout=WAIT_S) if r.ok is not None]
     (record,) = [wire.decode(Transmissions, payload, KEY) for payload in replies]
     assert last in record.transmissions

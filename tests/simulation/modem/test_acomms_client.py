@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from builders.common import eventually
+from builders.common import WAIT_S, eventually
 
 from sonarpost.modem.micromodem import RATES
 from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
@@ -69,7 +69,7 @@ class Client:
             never.wait()
 
         connection.readline = sleep
-        assert asleep.wait(60.0)
+        assert asleep.wait(WAIT_S)
         connection._serialport.close()
         self.log._log.removeHandler(self.log._file_handler)
         self.log._file_handler.close()

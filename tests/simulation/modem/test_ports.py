@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+from builders.common import WAIT_S
 
 from sonarpost.runtime.serial_modem import SerialModem
 from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
@@ -36,7 +37,7 @@ def test_two_stations_exchange_data_over_ports(driver: str, tcp_ports: tuple[int
             for rate, frames in PACKETS[driver]:
                 sent = vehicle.send(frames, destination=1, rate=rate, ack=True)
                 assert sent.acknowledged == tuple(range(1, len(frames) + 1))
-                packet = vessel.receive(timeout_s=60)
+                packet = vessel.receive(timeout_s=WAIT_S)
                 assert packet is not None
                 assert [(f.src, f.dest, f.data) for f in packet.frames] == [(3, 1, data) for data in frames]
     finally:
@@ -53,7 +54,8 @@ def sockets(driver: str) -> Iterator[list[socket.socket]]:
         with ExitStack() as stack:
             places = [device.device.removeprefix("socket://").split(":") for device in emulator.devices()]
             yield [
-                stack.enter_context(socket.create_connection((host, int(port)), timeout=60.0)) for host, port in places
+                stack.enter_context(socket.create_connection((host, int(port)), timeout=WAIT_S))
+                for host, port in places
             ]
     finally:
         emulator.stop()

@@ -9,6 +9,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from builders.common import WAIT_S
 from builders.console import (
     Console,
     console,
@@ -33,7 +34,7 @@ from sonarpost.services.console.web.server import ConsoleApp, WebServer
 __all__ = ["console", "fast_password_hashes", "make_console", "users_file"]
 
 SMALL = {"width": 1366, "height": 768}
-TIMEOUT_MS = 60_000
+TIMEOUT_MS = 1000 * WAIT_S
 COMMANDS = {"chromium": ("chromium",), "firefox": ("firefox", "firefox-esr")}
 """Commands of a browser; the last one is the name of its Debian package."""
 BROWSER_MESSAGES = (
@@ -70,7 +71,7 @@ class Browsers:
         if name == "firefox":
             preferences = {"widget.gtk.overlay-scrollbars.enabled": False, "ui.useOverlayScrollbars": 0}
             return playwright.firefox.launch(
-                channel="moz-firefox", executable_path=path, firefox_user_prefs=preferences
+                channel="moz-firefox", executable_path=path, firefox_user_prefs=preferences, timeout=TIMEOUT_MS
             )
         # Chromium's sandbox does not run as root, for example in containers.
         arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
@@ -78,7 +79,9 @@ class Browsers:
         arguments += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
         # Scroll bars take space, as in the browsers of operators.
         hidden = ["--hide-scrollbars"]
-        return playwright.chromium.launch(executable_path=path, args=arguments, ignore_default_args=hidden)
+        return playwright.chromium.launch(
+            executable_path=path, args=arguments, ignore_default_args=hidden, timeout=TIMEOUT_MS
+        )
 
     def close(self) -> None:
         for browser in self._browsers.values():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import asdict
 
@@ -12,6 +13,7 @@ from builders.console import VESSEL, encoded_health, image_record, received_fram
 from builders.services import modem_pair, runner
 
 from sonarpost.bus.session import router_config
+from sonarpost.services.console import chain
 from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
@@ -39,8 +41,9 @@ def publish(served):
 
 
 @pytest.fixture
-def vessel(served):
-    """A console whose places all work."""
+def vessel(served, monkeypatch):
+    """A console whose places all work. A test repeats no reports, however long the browser takes."""
+    monkeypatch.setattr(chain, "SERVICE_STALE_S", math.inf)
     now = time.time()
     times = {"changed_utc_s": now - 600, "listening_since_utc_s": now - 600}
     served.state.router = RouterState(platform_id=VESSEL, reached=True, detail="tcp/127.0.0.1", **times)

@@ -26,7 +26,7 @@ def test_a_vehicle_is_one_line_with_its_numbers_on_request(served):
     served.state.store_status(sample.model_copy(update={"status": status, "received_utc_s": now}))
     served.state.fleet.set_range(SAMPLES["vehicle-range"])
     served.state.fleet.add_frame("uuv-2", received_frame(now))
-    queued = [("0100", 64, now + 90.0), ("0101", 64, now + 400.0)]
+    queued = [("0100", 64, now + 90.0), ("0101", 64, now + 419.0)]
     served.state.fleet.set_queue(queue_state(queued, now).model_copy(update={"platform_id": "uuv-2"}))
     served.state.store_image(image_record("0001", vehicle="uuv-3", time_utc_s=1_378_800_000.0))
     for vehicle, gauges in {

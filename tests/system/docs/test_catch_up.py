@@ -6,7 +6,7 @@ import sys
 
 import pytest
 import zenoh
-from builders.common import REPOSITORY, eventually
+from builders.common import REPOSITORY, WAIT_S, eventually
 from builders.exports import image
 from builders.line_program import run_program
 from builders.record_samples import SAMPLES
@@ -67,7 +67,7 @@ def test_selectors_are_valid_and_zenoh_parses_them(c2, client):
     querier = client.declare_querier(keys.shore_contact_all())
     eventually(lambda: querier.matching_status.matching, what="queryable")
     for selector in SELECTORS:
-        replies = list(client.get(zenoh.Selector(*selector.partition("?")[::2]), timeout=60))
+        replies = list(client.get(zenoh.Selector(*selector.partition("?")[::2]), timeout=WAIT_S))
         assert [reply.err and reply.err.payload.to_string() for reply in replies] == [None], selector
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import msgpack
 import pytest
-from builders.common import REPOSITORY, eventually
+from builders.common import REPOSITORY, WAIT_S, eventually
 from builders.line_program import LineProgram, run_program
 from builders.record_samples import SAMPLES
 
@@ -233,7 +233,7 @@ def test_service_answers_the_example_query_with_the_example_reply(client, platfo
     selector = "sonarpost/v1/vessel-1/contact/decision/handoff/relay"
 
     def ask(payload, attached):
-        replies = client.get(selector, payload=payload, attachment=attached, timeout=60)
+        replies = client.get(selector, payload=payload, attachment=attached, timeout=WAIT_S)
         received = replies.recv()
         assert str(received.ok.key_expr) == selector
         return received.ok.payload.to_bytes()
