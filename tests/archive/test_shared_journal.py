@@ -2,11 +2,14 @@
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from itertools import count
+from types import SimpleNamespace
 
 import pytest
 from builders import shore
 from builders.records import decision_record
 
+from sonarpost.archive import journal as sqlite_journal
 from sonarpost.archive import shore_schema
 from sonarpost.archive.journal import Area, Criteria, Journal, JournalEntry, JournalRecord
 from sonarpost.archive.postgresql import Database, DatabaseAddress
@@ -159,6 +162,19 @@ def test_searches_find_what_those_of_sqlite_find(archive, tmp_path):
             assert found == expected
             lengths.append(len(found))
     assert lengths[:4] == [6, 2, 5, 2]
+    journal.close()
+
+
+def test_search_of_sqlite_is_limited_in_processor_time_and_not_by_a_busy_machine(tmp_path, monkeypatch):
+    clocks = SimpleNamespace(monotonic=count(0, 1000).__next__, thread_time=lambda: 0.0)
+    monkeypatch.setattr(sqlite_journal, "time", clocks)
+    monkeypatch.setattr(sqlite_journal, "_STEPS", 1)
+    journal = Journal(tmp_path)
+    journal.append_dated([(entry(image("0001"), "a"), 100.0)])
+    assert len(journal.page([IMAGES], ALL, 0, 100)) == 1
+    clocks.thread_time = count(0, 1000).__next__
+    with pytest.raises(OSError, match="interrupted"):
+        journal.page([IMAGES], ALL, 0, 100)
     journal.close()
 
 

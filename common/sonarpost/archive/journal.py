@@ -34,7 +34,7 @@ FILE_NAME: Final = "journal.db"
 VERSION: Final = 1
 BUSY_S: Final = 10.0
 MAX_SEARCH_S: Final = 5.0
-"""A search that takes longer is ended with an error."""
+"""A search that takes more processor time is ended with an error."""
 _STEPS: Final = 10_000
 """Instructions of SQLite between two checks of that time."""
 DIGEST_BYTES: Final = 16
@@ -221,7 +221,7 @@ class Journal:
             self._db = self._connect()
             self._open()
             self._search_db = self._connect()
-            self._search_db.set_progress_handler(lambda: time.monotonic() > self._search_end_s, _STEPS)
+            self._search_db.set_progress_handler(lambda: time.thread_time() > self._search_end_s, _STEPS)
         except sqlite3.OperationalError as error:
             raise OSError(f"{self.path}: {error}") from error
         except sqlite3.DatabaseError as error:
@@ -353,7 +353,7 @@ class Journal:
             f"WHERE r.seq > ? AND {' AND '.join(where)} ORDER BY r.seq LIMIT ?"
         )
         with self._search_lock:
-            self._search_end_s = time.monotonic() + MAX_SEARCH_S
+            self._search_end_s = time.thread_time() + MAX_SEARCH_S
             try:
                 rows = self._search_db.execute(sql, (after, *values, limit)).fetchall()
             except sqlite3.Error as error:
