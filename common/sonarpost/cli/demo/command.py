@@ -37,7 +37,7 @@ from sonarpost.sonar.xtf_writer import write_xtf
 MARKER = ".sonarpost-demo"
 QUIET_S = 1.5
 """Real time without a change after which an idle chain has finished."""
-STALLED_S = 60.0
+STALLED_S = 300.0
 """Real time without a change after which the demo ends although the chain is busy."""
 MAX_FEEDBACK_INTERVALS = 60
 """Feedback intervals without a change, on top of `STALLED_S`, while the vessel still repeats feedback."""
