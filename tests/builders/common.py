@@ -23,6 +23,8 @@ GOLDEN_FOLDER = REPOSITORY / "tests" / "golden"
 
 WAIT_S = 300.0
 """Default limit of waits: only a test that fails waits so long."""
+LONG_WAIT_S = 1500.0
+"""Limit of waits for a whole demo, or for the compilation of a codec, which takes 20 s on an idle machine."""
 PORTS = range(10_000, 32_000)
 """Ports of tests: below those of outgoing connections, which could take a port between two uses."""
 

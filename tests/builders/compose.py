@@ -89,7 +89,6 @@ class Project:
             env={**os.environ, **self.environment},
             capture_output=True,
             text=True,
-            timeout=400,
             check=False,
         )
         assert not check or done.returncode == 0, f"{arguments}: {done.stdout}\n{done.stderr}"
@@ -179,7 +178,7 @@ def read_pictures(text):
 
 def docker(*arguments, check=True):
     """Run a docker command; its output."""
-    done = subprocess.run(["docker", *arguments], capture_output=True, text=True, timeout=400, check=False)
+    done = subprocess.run(["docker", *arguments], capture_output=True, text=True, check=False)
     assert not check or done.returncode == 0, f"{arguments}: {done.stdout}\n{done.stderr}"
     # A container's standard error is its log.
     return done.stdout + done.stderr if arguments[0] == "logs" else done.stdout

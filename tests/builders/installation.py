@@ -44,7 +44,7 @@ class Installation:
     def run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         environment = self.environment()
         command = self.command(*arguments)
-        return subprocess.run(command, check=False, env=environment, capture_output=True, text=True, timeout=400)
+        return subprocess.run(command, check=False, env=environment, capture_output=True, text=True)
 
     def machine_code(self) -> list[Path]:
         return list(self._folder.rglob("*.nbc"))

@@ -16,7 +16,7 @@ import threading
 
 import pytest
 import zenoh
-from builders.common import eventually, free_port
+from builders.common import WAIT_S, eventually, free_port
 from builders.fleet import BROKEN, FLEET, Platforms, health, on_terminal, seen
 from builders.record_samples import SAMPLES
 
@@ -30,6 +30,7 @@ from sonarpost.monitoring.fleet import MAX_VEHICLES, FleetState, FleetTracker, F
 RECEIVED_STATUS = SAMPLES["received-status"]
 assert isinstance(RECEIVED_STATUS, ReceivedStatus)
 
+LONG = ("--wait", str(WAIT_S))
 NAMES = ("uuv_modem", "acoustic_channel", "op_modem", "decompressor")
 
 
@@ -109,12 +110,12 @@ def platforms(client):
 
 def test_once_as_text_and_as_json(router, platforms, capsys):
     platforms.run(health())
-    assert main(["status", "--once", "--router", router]) == 0
+    assert main(["status", "--once", *LONG, "--router", router]) == 0
     out = capsys.readouterr().out
     assert out.splitlines()[1].split() == ["PLATFORM", "SERVICE", "STATE", "AGE", "IN", "OUT", "LINK", "DISK"]
     assert "\x1b" not in out
     platforms.run(BROKEN)
-    assert main(["status", "--once", "--json", "--router", router]) == 1
+    assert main(["status", "--once", "--json", *LONG, "--router", router]) == 1
     printed = json.loads(capsys.readouterr().out)
     assert printed["connected"] is True
     services = {(s["platform"], s["service"]): s for s in printed["services"]}
@@ -151,7 +152,7 @@ def test_router_from_the_configuration_file(tmp_path, router, platforms, capsys)
     platforms.run(health())
     config = tmp_path / "shore.toml"
     config.write_text(f'[platform]\nid = "shore-1"\nrouter = ["{router}"]\n')
-    assert main(["status", "--once", "--config", str(config)]) == 0
+    assert main(["status", "--once", *LONG, "--config", str(config)]) == 0
     assert capsys.readouterr().out.startswith(f"{router}: 1 of 1 services alive on 1 platforms\n")
 
 

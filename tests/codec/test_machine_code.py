@@ -55,7 +55,6 @@ def run(cache: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.system
-@pytest.mark.timeout(900)  # compiles everything: 15 s on an idle machine
 def test_first_use_prints_the_message_once_and_prepare_completes_the_cache(tmp_path: Path) -> None:
     cache, images = tmp_path / "cache", tmp_path / "images"
     images.mkdir()

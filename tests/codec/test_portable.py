@@ -18,7 +18,6 @@ from builders.common import REPOSITORY
 
 
 @pytest.mark.system
-@pytest.mark.timeout(900)  # compiles everything: 15 s on an idle machine
 def test_golden_streams_of_emb_on_a_generic_processor(tmp_path: Path) -> None:
     environment = os.environ | {
         "NUMBA_CPU_NAME": "generic",
@@ -30,7 +29,7 @@ def test_golden_streams_of_emb_on_a_generic_processor(tmp_path: Path) -> None:
     assert subprocess.check_output(cpu_name, env=environment, text=True).strip() == "generic"
     tests = [str(path) for path in sorted((REPOSITORY / "tests" / "codec" / "emb").glob("test_*.py"))]
     assert tests
-    options = ["--noconftest", "-p", "no:cacheprovider", "-q", "-o", "timeout=900", "-k", "golden_streams"]
+    options = ["--noconftest", "-p", "no:cacheprovider", "-q", "-k", "golden_streams"]
     command = [sys.executable, "-m", "pytest", *options, *tests]
     found = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=REPOSITORY, check=False)
     assert found.returncode == 0, found.stdout[-3000:] + found.stderr[-1000:]

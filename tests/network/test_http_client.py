@@ -8,7 +8,7 @@ import threading
 from contextlib import contextmanager, suppress
 
 import pytest
-from builders.common import WAIT_S
+from builders.common import WAIT_S, eventually
 
 from sonarpost.network import http_client
 from sonarpost.network.http_client import post
@@ -104,6 +104,7 @@ def test_deadline_is_for_the_whole_exchange(scheme, sends, reads_body):
     with server_that(sends) as (address, accepted):
         with pytest.raises(TimeoutError, match=r"within 0\.5 s"):
             post(f"{scheme}://{address}/", b"x", {}, reads_body=reads_body, timeout_s=0.5)
+        eventually(lambda: accepted, what="connection")
         accepted[0].settimeout(WAIT_S)
         with suppress(ConnectionResetError):
             while accepted[0].recv(4096):

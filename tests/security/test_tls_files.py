@@ -176,7 +176,6 @@ def test_service_with_invalid_files_exits_with_one_line(tmp_path, folder):
         check=False,
         capture_output=True,
         text=True,
-        timeout=400,
     )
     assert done.returncode == 2
     assert "platform.tls.key" in done.stderr

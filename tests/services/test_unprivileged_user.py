@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from builders.common import REPOSITORY, eventually
+from builders.common import LONG_WAIT_S, REPOSITORY, eventually
 from builders.images import snippet as snippet_pixels
 from builders.installation import installation
 from builders.record_samples import SAMPLES
@@ -93,14 +93,13 @@ def run_service(installation, router, tmp_path):
     assert [process.wait(120) for process in started] == [0] * len(started)
 
 
-@pytest.mark.timeout(600)  # compiles encoder and decoder of emb: 20 s on an idle machine
 def test_the_shipped_services_encode_and_decode_and_store_machine_code_in_the_state_folder(
     installation, run_service, runner, snippet, tmp_path
 ):
     modem = runner.peer("uuv-1", "uuv_modem", {keys.image_encoded("uuv-1"): EncodedImage})
     state = run_service("uuv", "compressor")
     runner.peer("uuv-1", "atd_stub").send(keys.contact_detected("uuv-1"), "compressor", snippet("c1"))
-    eventually(lambda: modem.received, 300, what=f"an image; see {tmp_path / 'compressor.log'}")
+    eventually(lambda: modem.received, LONG_WAIT_S, what=f"an image; see {tmp_path / 'compressor.log'}")
     relay = runner.peer("vessel-1", "relay", {keys.image_coded("vessel-1"): CodedImage})
     run_service("vessel", "decompressor")
     coded = modem.received[0]
@@ -116,7 +115,7 @@ def test_the_shipped_services_encode_and_decode_and_store_machine_code_in_the_st
     received = SAMPLES["received-image-classified"].model_copy(update=changes)
     assert isinstance(received, ReceivedImage)
     runner.peer("vessel-1", "op_modem").send(keys.acoustic_image("vessel-1"), "decompressor", received)
-    eventually(lambda: relay.received, 200, what=f"an image; see {tmp_path / 'decompressor.log'}")
+    eventually(lambda: relay.received, LONG_WAIT_S, what=f"an image; see {tmp_path / 'decompressor.log'}")
     stored = list((state / "machine-code").rglob("*.nbc"))
     assert stored
     assert not installation.machine_code()

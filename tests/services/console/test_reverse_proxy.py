@@ -61,7 +61,7 @@ def proxied(make_console, tmp_path):
             f"http {{ access_log off; {folders} include {tmp_path}/console.conf; }}\n"
         )
         words = [str(NGINX), "-e", "stderr", "-p", str(tmp_path), "-c", str(tmp_path / "nginx.conf")]
-        subprocess.run([*words, "-t"], check=True, timeout=400)
+        subprocess.run([*words, "-t"], check=True)
         with subprocess.Popen(words) as process:
             eventually(lambda: is_open(port), what="nginx")
             yield Proxied(port, certificate), console

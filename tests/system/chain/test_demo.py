@@ -41,7 +41,7 @@ def demo(out, *options):
 
 
 def run_command(out, *options):
-    return subprocess.run(demo(out, *options), capture_output=True, text=True, timeout=500, check=False)
+    return subprocess.run(demo(out, *options), capture_output=True, text=True, check=False)
 
 
 def run_demo(out, *options):

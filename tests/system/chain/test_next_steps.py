@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 from builders.chain import snippet
-from builders.common import REPOSITORY, eventually
+from builders.common import LONG_WAIT_S, REPOSITORY, eventually
 
 from sonarpost.cli.demo.settings import reserved_ports
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
@@ -32,7 +32,7 @@ TERMINAL = {name: value for name, value in os.environ.items() if name != "VIRTUA
 def run_demo(folder, *options):
     """Run a demo to its end; return what it prints."""
     command = [*DEMO, *options]
-    done = subprocess.run(command, cwd=folder, env=TERMINAL, capture_output=True, text=True, timeout=500, check=False)
+    done = subprocess.run(command, cwd=folder, env=TERMINAL, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stderr
 
@@ -65,7 +65,7 @@ def pasted(command, folder, errors):
 
 def list_contacts(command, folder):
     done = subprocess.run(
-        ["bash", "-c", command], cwd=folder, env=TERMINAL, capture_output=True, text=True, timeout=400, check=False
+        ["bash", "-c", command], cwd=folder, env=TERMINAL, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     assert done.stderr == "sonarpost c2: folder demo-out/shore/images\n"
@@ -116,12 +116,12 @@ def test_commands_work_while_the_chain_is_kept_running(folder):
     with text.open("w") as errors:
         demo = subprocess.Popen([*DEMO, "--survey", "line.xtf", "--keep"], cwd=folder, env=TERMINAL, stderr=errors)
     try:
-        eventually(lambda: "send another survey" in text.read_text(), 400, "the end of the demo")
+        eventually(lambda: "send another survey" in text.read_text(), LONG_WAIT_S, "the end of the demo")
         ls, _, subscriber, simulate = printed_commands(text.read_text())
         listed = list_contacts(ls, folder)
         with (folder / "errors.txt").open("w") as errors, pasted(subscriber, folder, errors) as process:
             eventually(lambda: "subscribed" in (folder / "errors.txt").read_text(), what="subscription")
-            subprocess.run(["bash", "-c", simulate], cwd=folder, env=TERMINAL, timeout=400, check=True)
+            subprocess.run(["bash", "-c", simulate], cwd=folder, env=TERMINAL, check=True)
             assert process.stdout.readline().startswith("reconstructed_image uuv-1 ")
             # The example prints a record before it writes the image.
             eventually(lambda: any((folder / "demo-out").glob("uuv-1_*.pgm")), what="the image")

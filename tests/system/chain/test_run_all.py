@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from builders.chain import snippet
-from builders.common import eventually, free_port
+from builders.common import LONG_WAIT_S, eventually, free_port
 from builders.installation import installation
 
 from sonarpost.cli.demo.outcome import read_images
@@ -85,7 +85,6 @@ def bench(tmp_path, installation):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-@pytest.mark.timeout(900)  # compiles the codec for encoder and decoder
 def test_contacts_reach_the_shore_site_from_the_shipped_configurations(bench):
     emulator = bench.start("modems", "modem-emulator", "--modems", "2", "--tcp", "--time-scale", str(TIME_SCALE))
     eventually(lambda: bench.log("modems").count("\n") >= 1, what="the emulated modems")
@@ -110,7 +109,7 @@ def test_contacts_reach_the_shore_site_from_the_shipped_configurations(bench):
     def complete():
         return len({image.image_id for image in read_images(pictures).values() if image.complete})
 
-    eventually(lambda: complete() == IMAGES, 600, f"complete images at the shore site; see {bench.folder}")
+    eventually(lambda: complete() == IMAGES, LONG_WAIT_S, f"complete images at the shore site; see {bench.folder}")
     assert "Traceback" not in bench.log("uuv") + bench.log("vessel") + bench.log("shore")
     assert list((bench.folder / "uuv" / "state" / "machine-code").rglob("*.nbc"))
 

@@ -74,7 +74,7 @@ def host():
     image = f"{os.environ['SONARPOST_IMAGE']}-systemd"
     text = DOCKERFILE.format(image=os.environ["SONARPOST_IMAGE"])
     build = ["docker", "build", "--quiet", "--tag", image, "-"]
-    done = subprocess.run(build, input=text, text=True, capture_output=True, check=False, timeout=400)
+    done = subprocess.run(build, input=text, text=True, capture_output=True, check=False)
     if done.returncode != 0:
         pytest.skip(f"no image with systemd: {done.stderr[-300:]}")
     label = f"com.docker.compose.project={project}"

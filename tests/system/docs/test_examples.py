@@ -38,7 +38,6 @@ BLOCK = re.compile(
     r"^ *```(?P<language>\w*)(?: title=\"(?P<title>[^\"]*)\")?\n(?P<text>.*?)^ *```$",
     re.MULTILINE | re.DOTALL,
 )
-TIMEOUT_S = 500
 
 
 @dataclass(frozen=True)
@@ -157,7 +156,7 @@ def run_shell(block):
             output = process.stdout.readline() if block.mark == "stop" else ""
             if block.mark == "stop":
                 os.killpg(process.pid, signal.SIGINT)
-            output += process.communicate(timeout=TIMEOUT_S)[0]
+            output += process.communicate()[0]
         finally:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)

@@ -84,7 +84,7 @@ def test_c2_killed_while_its_store_grows_stores_each_image_once(system):
     system.assert_all_delivered_once()
 
 
-@pytest.mark.timeout(600 + 30 * KILLS)
+@pytest.mark.timeout(1800 + 30 * KILLS)
 def test_random_kills_of_all_processes_lose_and_duplicate_nothing(system):
     rng = random.Random(KILLS)
     order = []

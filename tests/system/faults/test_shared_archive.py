@@ -266,7 +266,7 @@ def read_late(session):
     return found
 
 
-@pytest.mark.timeout(2 * DURATION_S + 900)
+@pytest.mark.timeout(2 * DURATION_S + 1800)
 def test_two_c2_and_their_database_are_killed_and_nothing_is_lost_or_doubled(shore):
     with ExitStack() as stack:
         traffic = Traffic(shore, stack)

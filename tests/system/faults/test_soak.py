@@ -154,7 +154,7 @@ class Mission:
                 self.history.add("handled", "decompressor", record, detail=base)
 
 
-@pytest.mark.timeout(900 + 4 * CONTACTS)
+@pytest.mark.timeout(1800 + 4 * CONTACTS)
 def test_services_neither_grow_nor_lose_a_contact_over_a_long_mission(tmp_path):
     settings = ChainSettings(
         folder=tmp_path / "run",

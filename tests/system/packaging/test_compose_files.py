@@ -196,7 +196,6 @@ def compose_config(command, folder, *options):
         env=environment,
         capture_output=True,
         text=True,
-        timeout=400,
         check=False,
     )
     assert done.returncode == 0, done.stderr

@@ -40,7 +40,6 @@ def images(host, **variables):
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
-        timeout=400,
         check=False,
     )
 
@@ -78,7 +77,6 @@ def progress(before, script, **variables):
         env={**os.environ, **variables},
         capture_output=True,
         text=True,
-        timeout=400,
         check=False,
     )
 

@@ -15,15 +15,12 @@ from packaging.requirements import Requirement
 from sonarpost.cli.demo.settings import PLATFORM_OF
 from sonarpost.sonar.image_files import write_png
 
-TIMEOUT_S = 900
-pytestmark = pytest.mark.timeout(TIMEOUT_S)
-
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(REPOSITORY)]
-    subprocess.run(command, check=True, capture_output=True, timeout=TIMEOUT_S)
+    subprocess.run(command, check=True, capture_output=True)
     [path] = folder.glob("*.whl")
     return path
 
@@ -43,7 +40,7 @@ def minimal(wheel, tmp_path_factory):
     environment = tmp_path_factory.mktemp("minimal")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(environment)], check=True)
     pip = [sys.executable, "-m", "pip", "--python", str(environment / "bin" / "python"), "install", "--no-deps"]
-    subprocess.run([*pip, "--no-index", "--quiet", str(wheel)], check=True, timeout=TIMEOUT_S)
+    subprocess.run([*pip, "--no-index", "--quiet", str(wheel)], check=True)
     [site] = environment.glob("lib/python3*/site-packages")
     [metadata] = site.glob("sonarpost-*.dist-info")
     names = closure(importlib.metadata.Distribution.at(metadata).requires)
@@ -70,7 +67,6 @@ def run(program, *arguments, status=0, cwd, **environment):
         env={"PATH": "/usr/bin:/bin", "HOME": str(cwd), **environment},
         capture_output=True,
         text=True,
-        timeout=TIMEOUT_S,
         check=False,
     )
     assert result.returncode == status, result.stderr
