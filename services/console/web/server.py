@@ -105,6 +105,7 @@ class ConsoleApp:
                 "training": self._training,
                 "known_objects": self._training or config.calibration_share > 0,
                 "now_utc_s": self._state.clock(),
+                "last_event": self._state.events.event_id(self._state.events.last),
                 "classes": [{"group": name, "classes": found} for name, found in config.class_groups().items()],
                 "password_characters": [MIN_PASSWORD, MAX_PASSWORD],
                 "stale_after_s": {

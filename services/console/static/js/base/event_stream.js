@@ -31,7 +31,7 @@ function lost(refused = "") {
   emit("online");
 }
 
-const streamUrl = () => (lastId ? `/events?last=${encodeURIComponent(lastId)}` : "/events");
+const streamUrl = () => `/events?last=${encodeURIComponent(lastId)}`;
 
 function open() {
   source?.close();
@@ -91,7 +91,9 @@ async function check() {
   if (!(closed && (await explain()))) open();
 }
 
+/** Receive the events after those that the data of the page contains. */
 export function startEvents() {
+  lastId = state.info.last_event;
   state.last_event_ms = performance.now();
   open();
   setInterval(check, 1000);
