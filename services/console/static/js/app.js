@@ -6,7 +6,7 @@ import { ContactDetails } from "./contact/contact_details.js";
 import { ContactLoader } from "./contact/contact_loader.js";
 import { ContactView } from "./contact/contact_view.js";
 import { DecisionForm } from "./decision/decision_form.js";
-import { debounce, h, toast } from "./base/dom.js";
+import { debounce, h, notUpdated, showError, toast } from "./base/dom.js";
 import { EmptyView } from "./shell/empty_view.js";
 import { startEvents } from "./base/event_stream.js";
 import { openExportDialog } from "./shell/export_dialog.js";
@@ -104,11 +104,7 @@ class App {
     if (history.state === null) history.replaceState({ view: "review", id: requested || null }, "");
     this.#draw(history.state.view);
     if (requested) this.select(requested);
-    await Promise.all([
-      this.status.start(),
-      this.#showQueue(),
-      api.fleet().then((fleet) => emit("fleet", fleet)),
-    ]);
+    await Promise.all([this.status.start().catch(notUpdated), this.#showQueue(), this.#loadFleet().catch(notUpdated)]);
     if (this.queue.rows.matching === 0 && state.counts.total > 0) this.filters.leaveEmptyToDo();
     const { latest, restored } = this.decision.drafts;
     if (latest) this.status.draftsRestored(latest, restored.size);
@@ -116,16 +112,19 @@ class App {
   }
 
   #showQueue() {
-    return this.queue.show(this.filters.query).catch(showError);
+    return this.queue.show(this.filters.query).catch(notUpdated);
   }
+
+  async #loadFleet() { emit("fleet", await api.fleet()); }
 
   /** Reload all data after a long interruption of the event stream. */
   reload() {
-    return Promise.all([api.fleet().then((fleet) => emit("fleet", fleet)), this.queue.refresh(), this.load()]).catch(showError);
+    return Promise.all([this.#loadFleet(), this.queue.refresh(), this.load()]).catch(notUpdated);
   }
 
   #hideWithoutContact() {
     for (const part of [this.view.element, this.panel]) part.classList.toggle("hidden", state.selected === null);
+    this.decision.guard.restart();
   }
 
   select(id, name = id) {
@@ -177,8 +176,9 @@ class App {
     this.view.showLoading(null);
   }
 
-  #display({ detail, prepared, stale = false }) {
+  #display({ detail, prepared, stale }) {
     const { id } = detail.contact;
+    this.loader.forget(id);
     this.#endLoading();
     if (state.selected !== null) document.querySelector("#toasts .bad")?.remove(); // it was about the contact before
     state.selected = id;
@@ -196,22 +196,20 @@ class App {
     const id = state.selected;
     if (id === null) return;
     const number = (this.requestNumber += 1);
-    let detail;
-    let prepared;
+    // A response is discarded if it is older than the displayed one.
+    const outdated = () => id !== state.selected || number < this.displayedNumber;
+    let detail, prepared;
     try {
       detail = await api.contact(id);
       prepared = await this.view.prepare(detail);
       await nextFrame();
     } catch (error) {
+      if (outdated()) return;
       if (error.status === 404) { state.selected = null; this.#hideWithoutContact(); }
-      // Without a response, the request is repeated while the contact is selected.
-      if (error.status === 0) setTimeout(() => { if (id === state.selected && number === this.requestNumber) this.load(); }, 1000);
-      else toast(error.message, { bad: true });
+      notUpdated(error);
       return;
     }
-    // Discard a response that is older than the displayed one.
-    if (id !== state.selected || number < this.displayedNumber) return;
-    this.#render(detail, prepared, number);
+    if (!outdated()) this.#render(detail, prepared, number);
   }
 
   #render(detail, prepared, /** @type {number} */ number) {
@@ -247,7 +245,7 @@ class App {
     this.activeView = name;
     for (const [one, element] of [["review", this.review], ["map", this.map.element], ["fleet", this.fleet.element]]) element.classList.toggle("hidden", one !== name);
     this.header.setView(name);
-    if (name === "map") { this.map.load().catch(showError); this.map.focus(); }
+    if (name === "map") { this.map.load().catch(notUpdated); this.map.focus(); }
     if (name === "fleet") { this.fleet.render(); this.fleet.element.focus(); }
     if (name === "review") { this.queue.draw(); this.view.redraw(); this.queue.list.focus(); }
     this.decision.guard.restart();
@@ -316,8 +314,6 @@ class App {
   exports() { return openExportDialog(this.filters.query, this.detail?.contact ?? null); }
 }
 
-const showError = (/** @type {Error} */ error) => toast(error.message, { bad: true });
-
 /** Identifier of a contact in the address of the page, which the user can have changed; empty without one. */
 const addressed = () => new URLSearchParams(`id=${location.hash.slice(1)}`).get("id");
 
@@ -338,5 +334,7 @@ try {
   registerServiceWorker();
 } catch (error) {
   if (error.status !== 401) toast(error.message, { bad: true });
+  // Without a response, the page is empty: it is loaded again.
+  if (error.status === 0) setTimeout(() => location.reload(), 3000);
   if (!("status" in error)) throw error;
 }

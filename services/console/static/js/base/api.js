@@ -28,40 +28,49 @@ async function errorOf(response) {
 let csrf = "";
 export const setToken = (token) => { csrf = token; };
 
-async function request(method, path, body) {
-  const headers = { Accept: "application/json" };
-  if (method !== "GET") {
-    headers["Content-Type"] = "application/json";
-    headers["X-CSRF-Token"] = csrf;
-  }
-  let response, content = null;
+/** Send a request, and return what `read` reads of its response, which can be cut, by a reload, too. `lost`: text of this case. */
+async function send(path, read, options = {}, lost = "api.no_response") {
+  let response, content;
   try {
-    response = await fetch(path, {
-      method, headers, credentials: "same-origin", cache: "no-store", redirect: "error",
-      body: method === "GET" ? undefined : JSON.stringify(body ?? {}), signal: AbortSignal.timeout(15000),
-    });
-    if (response.ok && response.status !== 204) content = await response.json(); // it can be cut, by a reload, too
+    response = await fetch(path, { credentials: "same-origin", cache: "no-store", redirect: "error", ...options });
+    if (response.ok) content = await read(response);
   } catch (error) {
-    throw new ApiError(0, "no_connection", t("api.no_response"), { cause: String(error) });
+    throw new ApiError(0, "no_connection", t(lost), { cause: String(error) });
   }
-  // Without events, the page does not receive the change that it has made.
-  if (response.ok && method !== "GET" && !state.online) emit("reload");
   if (response.ok) return content;
   if (response.status === 401 && !path.startsWith("/api/login")) location.assign("/login?ended");
   throw await errorOf(response);
 }
 
-/** Download a file. The server prepares exports one at a time, so that the response may take minutes. */
-async function download(path) {
-  let response;
-  try {
-    response = await fetch(path, { credentials: "same-origin", cache: "no-store", redirect: "error" });
-    if (response.ok) return await response.blob();
-  } catch (error) {
-    throw new ApiError(0, "no_connection", t("api.interrupted"), { cause: String(error) });
+async function request(method, path, body) {
+  const headers = { Accept: "application/json" };
+  const options = { method, headers, signal: AbortSignal.timeout(15000) };
+  if (method !== "GET") {
+    Object.assign(headers, { "Content-Type": "application/json", "X-CSRF-Token": csrf });
+    options.body = JSON.stringify(body ?? {});
   }
-  if (response.status === 401) location.assign("/login?ended");
-  throw await errorOf(response);
+  const content = await send(path, (response) => (response.status === 204 ? null : response.json()), options);
+  // Without events, the page does not receive the change that it has made.
+  if (method !== "GET" && !state.online) emit("reload");
+  return content;
+}
+
+/** Download a file. The server prepares exports one at a time, so that the response may take minutes. */
+const download = (path) => send(path, (response) => response.blob(), {}, "api.interrupted");
+
+/** Load an image: its file, and its digest, which is null for a mask. */
+const image = (path, cache) => send(path, async (response) => ({ file: await response.blob(), sha256: response.headers.get("X-Image-SHA256") }), { cache });
+
+/** A load that is called again: the answer to an earlier call that arrives after that to a later one is the later one. */
+export function inOrder(load) {
+  let sent = 0;
+  let newest = { number: 0, answer: null };
+  return async () => {
+    const number = (sent += 1);
+    const answer = await load();
+    if (number > newest.number) newest = { number, answer };
+    return newest.answer;
+  };
 }
 
 /** Return why the event stream is refused; null if it is accepted. */
@@ -117,6 +126,7 @@ export const api = {
   cancelExport: () => request("POST", "/api/export/cancel"),
   sheetsUrl: (filter) => `/report?${queryString(filter)}`,
   streamError,
+  image,
   reportUrl: (id) => `/report/${encodeURIComponent(id)}`,
   imageUrl: (id, version) => `${contactPath(id)}/versions/${version}/picture.png`,
   maskUrl: (id, version) => `${contactPath(id)}/versions/${version}/mask.png`,

@@ -1,5 +1,6 @@
 // Elements without markup: untrusted text always becomes a text node.
 
+import { emit, state } from "./state.js";
 import { t } from "../texts.js";
 
 /**
@@ -34,6 +35,16 @@ export function toast(message, { bad = false } = {}) {
   const note = h("p", { class: bad ? "bad" : "", text: message, title: message });
   fill(document.getElementById("toasts"), note);
   setTimeout(() => note.remove(), bad ? 9000 : 4500);
+}
+
+export const showError = (/** @type {Error} */ error) => toast(error.message, { bad: true });
+
+const reloadSoon = debounce(() => { if (state.online || state.refused) emit("reload"); }, 1000);
+
+/** Report that displayed data could not be updated. Without a response, all data is loaded again; after an interruption, by the event stream. */
+export function notUpdated(error) {
+  showError(error);
+  if (error.status === 0) reloadSoon();
 }
 
 /**

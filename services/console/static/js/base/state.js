@@ -8,8 +8,8 @@ export const state = {
   last_event_ms: 0, // performance.now() of the last event of the server
   offset_s: 0, // clock of the server minus clock of this computer
   // Of the contacts in lists: all, without a decision, with a verdict that is not delivered, those of them that were
-  // refused or have expired; whether acoustic frames of one were authenticated, null if it is not known.
-  counts: { total: 0, to_do: 0, undelivered: 0, refused: 0, authenticated: null },
+  // refused or have expired; whether acoustic frames of one were authenticated; null if it is not known.
+  counts: { total: null, to_do: 0, undelivered: 0, refused: 0, authenticated: null },
   selected: null, // identifier of the displayed contact: row, heading, form and image
   fleet: null,
 };

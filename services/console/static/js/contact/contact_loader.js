@@ -22,23 +22,20 @@ export class ContactLoader {
     return this.entries.get(id);
   }
 
-  /** Load a contact, or take it from those loaded in advance; `stale` of the result: it has changed since. */
+  /** Load a contact, or take it from those loaded in advance: `{detail, prepared, stale}`, `stale` when it has changed since. */
   async load(id) {
     const entry = this.#entry(id);
-    const loaded = await entry.ready;
-    this.forget(id, entry.stale);
-    return { ...loaded, stale: entry.stale };
+    return Object.assign(entry, await entry.ready);
   }
 
   prefetch(ids) {
     for (const id of ids) this.#entry(id);
   }
 
-  /** Discard what was loaded of a contact, because it has changed. */
-  forget(id, stale = true) {
+  /** Discard what was loaded of a contact: it has changed, or is displayed. */
+  forget(id) {
     const entry = this.entries.get(id);
-    if (!entry) return;
-    entry.stale = stale;
+    if (entry) entry.stale = true;
     this.entries.delete(id);
   }
 

@@ -1,7 +1,7 @@
 // Contact view: the image with toolbar, versions and data integrity strip.
 
 import { api } from "../base/api.js";
-import { h, fill, toast } from "../base/dom.js";
+import { h, fill, showError, toast } from "../base/dom.js";
 import { layerName, position, quantity, received, time } from "../base/format.js";
 import { MAPS, autoRange, loadImage } from "../image/image_data.js";
 import { startPointer } from "../image/image_pointer.js";
@@ -213,7 +213,10 @@ export class ContactView {
       else view.show(null, {});
     });
     this.#arrange();
-    this.canvases[0].dataset.shows = this.drawn ? `${this.drawn.id} ${this.drawn.version} ${this.drawn.layer}` : "";
+    const shows = this.drawn ? `${this.drawn.id} ${this.drawn.version} ${this.drawn.layer}` : "";
+    // A region is drawn on one image.
+    if (this.canvases[0].dataset.shows !== shows) document.querySelector(".region-layer")?.remove();
+    this.canvases[0].dataset.shows = shows;
     this.#renderText();
     this.#drawLines();
   }
@@ -283,14 +286,8 @@ export class ContactView {
   }
 
   /** Withdraw a stored measurement; it stays in the list of measurements and in the audit. */
-  async withdraw(measurement) {
-    const { id } = this.detail.contact;
-    try {
-      await api.withdrawMeasurement(id, measurement);
-      toast(t("measure.withdrawn"));
-    } catch (error) {
-      toast(error.message, { bad: true });
-    }
+  withdraw(measurement) {
+    return api.withdrawMeasurement(this.detail.contact.id, measurement).then(() => toast(t("measure.withdrawn")), showError);
   }
 
   /** Reason why measurements are locked; empty if they are not. */

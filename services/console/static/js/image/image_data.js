@@ -2,6 +2,7 @@
 
 /** @typedef {{width: number, height: number, levels: Uint8Array, missing: Uint8Array, source?: {id: string, version: number, layer: string, sha256: string}}} SonarImage */
 
+import { api } from "../base/api.js";
 import { t } from "../texts.js";
 
 /**
@@ -11,21 +12,15 @@ import { t } from "../texts.js";
  * @param {RequestCache} cache
  */
 async function loadGrey(url, cache = "default") {
-  let response;
-  try {
-    response = await fetch(url, { credentials: "same-origin", cache });
-  } catch {
-    throw new Error(t("image_data.no_connection"));
-  }
-  if (!response.ok) throw new Error(t("image_data.status", { status: response.status }));
-  const bitmap = await createImageBitmap(await response.blob(), { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+  const { file, sha256 } = await api.image(url, cache);
+  const bitmap = await createImageBitmap(file, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
   const canvas = new OffscreenCanvas(bitmap.width, bitmap.height);
   const context = canvas.getContext("2d", { willReadFrequently: true });
   context.drawImage(bitmap, 0, 0);
   const { data } = context.getImageData(0, 0, bitmap.width, bitmap.height);
   const levels = new Uint8Array(bitmap.width * bitmap.height);
   for (let i = 0; i < levels.length; i += 1) levels[i] = data[4 * i];
-  return { width: bitmap.width, height: bitmap.height, levels, sha256: response.headers.get("X-Image-SHA256") };
+  return { width: bitmap.width, height: bitmap.height, levels, sha256 };
 }
 
 /** Load an image with a digest. The browser's cache can hold one from before the server removed its pixels. */

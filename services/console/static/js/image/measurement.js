@@ -46,10 +46,8 @@ export class MeasurementTool {
   start(kind) {
     const { image } = this.displayed();
     this.kind = kind;
-    this.from = null;
-    this.result = null;
     this.crosshair ??= [image.height / 2, image.width / 2];
-    this.changed();
+    this.clear();
   }
 
   /** Start the next kind of measurement; after the last kind, stop. */
@@ -66,7 +64,7 @@ export class MeasurementTool {
     this.changed();
   }
 
-  /** Remove the points. */
+  /** Remove the points; a result that is on its way is not theirs. */
   clear() {
     this.result = null;
     this.from = null;

@@ -1,7 +1,7 @@
 // Map without internet: contacts, vehicles and vessel by latitude and longitude, with a list of the contacts in the view.
 
-import { api } from "../base/api.js";
-import { debounce, fill, h, toast } from "../base/dom.js";
+import { api, inOrder } from "../base/api.js";
+import { debounce, fill, h, notUpdated, toast } from "../base/dom.js";
 import { area, className, position, probability, quantity, received, symbol, time, verdict } from "../base/format.js";
 import { since } from "../base/ages.js";
 import { nearLongitude, rangeBearing, swath } from "./map_geometry.js";
@@ -48,7 +48,8 @@ export class MapView {
       h("div", { class: "chart-side" }, this.chart, h("div", { class: "north", "aria-hidden": "true" }, h("i"), "N"), this.readout, bar),
       h("aside", { class: "legend", tabindex: 0, "aria-label": t("map.legend") }, h("h2", { text: t("header.view.map") }), this.#legend(), this.count, this.surveyed, this.card));
     new ResizeObserver(() => this.#resize()).observe(this.chart);
-    this.loadSoon = debounce(() => this.#load(), 300, 1500);
+    this.loadSoon = debounce(() => this.load().catch(notUpdated), 300, 1500);
+    this.request = inOrder(() => Promise.all([loadLeaflet(), api.map(), api.tracks()]));
     for (const name of ["contact", "reload"]) listen(name, () => { if (this.visible) this.loadSoon(); });
     this.newestStatus_s = 0;
     listen("fleet", () => {
@@ -71,7 +72,7 @@ export class MapView {
   /** Load the contacts, and Leaflet at the first call. */
   async load() {
     this.newestStatus_s = newestStatus();
-    const [L, { columns, contacts: rows, ...chart }, { tracks, surveyed }] = await Promise.all([loadLeaflet(), api.map(), api.tracks()]);
+    const [L, { columns, contacts: rows, ...chart }, { tracks, surveyed }] = await this.request();
     const contacts = rows.map((row) => Object.fromEntries(columns.map((name, index) => [name, row[index]])));
     this.reference_deg = (chart.vessel ?? contacts.at(-1))?.lon_deg ?? 0;
     for (const one of contacts) one.lon_deg = this.#near(one.lon_deg);
@@ -94,14 +95,6 @@ export class MapView {
 
   #drawVehicles() {
     if (this.data && this.visible) this.layers.drawVehicles(this.#vehicles, this.data.vessel);
-  }
-
-  async #load() {
-    try {
-      await this.load();
-    } catch (error) {
-      toast(error.message, { bad: true });
-    }
   }
 
   #create(L) {

@@ -3,7 +3,7 @@
 
 import { hasAlert } from "../shell/alerts.js";
 import { api } from "../base/api.js";
-import { debounce, fill, h, toast } from "../base/dom.js";
+import { debounce, fill, h, notUpdated } from "../base/dom.js";
 import { emit, listen, setCounts, state } from "../base/state.js";
 import { t } from "../texts.js";
 import { queueRow } from "./queue_row.js";
@@ -110,7 +110,7 @@ export class Queue {
     this.element = h("div", { class: "listbox" }, this.list, this.empty);
     new ResizeObserver(() => this.#resized()).observe(this.list);
     listen("authentication", () => this.#rebuild());
-    listen("contact", debounce(() => this.refresh().catch((error) => toast(error.message, { bad: true })), REFRESH_MS, MAX_REFRESH_MS));
+    listen("contact", debounce(() => this.refresh().catch(notUpdated), REFRESH_MS, MAX_REFRESH_MS));
     listen("theme", () => this.#resized());
     listen("alerts", () => { for (const { element } of this.drawn.values()) element.classList.toggle("alert", hasAlert(element.dataset.id)); });
   }
@@ -291,6 +291,8 @@ export class Queue {
     let response = null;
     try {
       response = await this.rows.ensure(first, last);
+    } catch (error) {
+      notUpdated(error);
     } finally {
       this.loading = false;
     }

@@ -1,7 +1,7 @@
 // A request for a region: a box drawn on the image, and a dialog with the cost and the expected detail.
 
 import { api } from "../base/api.js";
-import { h, showDialog, toast } from "../base/dom.js";
+import { h, showDialog, showError, toast } from "../base/dom.js";
 import { DASH, duration, quantity } from "../base/format.js";
 import { about } from "./request_buttons.js";
 import { state } from "../base/state.js";
@@ -86,10 +86,6 @@ async function confirmRegion({ contact, costs, versions }, box, view) {
   const action = await showDialog(t("region_request.title", { name: contact.name }), [h("p", { text: t("region_request.explanation") }), slider, h("p", {}, estimate)],
     [{ label: t("request_buttons.send"), value: "send", primary: true }, { label: t("dialog.cancel"), value: null }]);
   if (action !== "send") return;
-  try {
-    await api.request(contact.id, { kind: "region", box, stream_bytes: slider.valueAsNumber, airtime_s: airtime() });
-    toast(t("region_request.sent", { name: contact.name }));
-  } catch (error) {
-    toast(error.message, { bad: true });
-  }
+  await api.request(contact.id, { kind: "region", box, stream_bytes: slider.valueAsNumber, airtime_s: airtime() })
+    .then(() => toast(t("region_request.sent", { name: contact.name })), showError);
 }

@@ -1,7 +1,7 @@
 // Buttons for requests to the vehicle with their cost, and the state of the latest request of each kind.
 
 import { api } from "../base/api.js";
-import { fill, h, showDialog, toast } from "../base/dom.js";
+import { fill, h, showDialog, showError } from "../base/dom.js";
 import { bytes, duration, percent, quantity, requestKind } from "../base/format.js";
 import { isPending, requestState } from "./request_state.js";
 import { emit, now, state } from "../base/state.js";
@@ -47,11 +47,7 @@ async function sendRequest(contact, cost) {
     ]);
     if (action !== "send") return;
   }
-  try {
-    await api.request(contact.id, { kind: cost.kind, airtime_s: cost.airtime_s });
-  } catch (error) {
-    toast(error.message, { bad: true });
-  }
+  await api.request(contact.id, { kind: cost.kind, airtime_s: cost.airtime_s }).catch(showError);
 }
 
 export class RequestButtons {

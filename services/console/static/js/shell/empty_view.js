@@ -21,8 +21,9 @@ export class EmptyView {
   }
 
   render() {
-    this.element.classList.toggle("hidden", state.counts.total > 0 || !state.fleet);
-    if (state.counts.total > 0 || !state.fleet) return;
+    const hidden = state.counts.total !== 0 || !state.fleet;
+    this.element.classList.toggle("hidden", hidden);
+    if (hidden) return;
     const text = `${t("empty.none")} ${listeningText(state.fleet)}`.trim();
     if (this.element.textContent !== text) fill(this.element, h("p", { text }));
   }

@@ -3,7 +3,7 @@
 import { alertButton, alertCount } from "./alerts.js";
 import { api } from "../base/api.js";
 import { Chain, chainBanner } from "./chain.js";
-import { fill, h, toast } from "../base/dom.js";
+import { fill, h, showError } from "../base/dom.js";
 import { time } from "../base/format.js";
 import { opener } from "../base/layout.js";
 import { openPasswordDialog } from "./password_dialog.js";
@@ -32,14 +32,7 @@ export function restoreTheme() {
   document.documentElement.dataset.type = setting("type") ?? "normal";
 }
 
-async function logout() {
-  try {
-    await api.logout();
-    location.assign("/login");
-  } catch (error) {
-    toast(error.message, { bad: true });
-  }
-}
+const logout = () => api.logout().then(() => location.assign("/login"), showError);
 
 export class Header {
   /** @param {{exports: () => void, settings: () => void, help: () => void}} actions Items of the menu that other parts of the page handle. */

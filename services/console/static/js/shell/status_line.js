@@ -1,7 +1,7 @@
 // The line at the foot of the page: the last decision with its take-back time, and notices of other operators' decisions.
 
-import { api } from "../base/api.js";
-import { fill, h, showDialog, toast } from "../base/dom.js";
+import { api, inOrder } from "../base/api.js";
+import { fill, h, notUpdated, showDialog, showError } from "../base/dom.js";
 import { symbol, time, verdict } from "../base/format.js";
 import { emit, listen, now, state } from "../base/state.js";
 import { t } from "../texts.js";
@@ -11,6 +11,7 @@ export class StatusLine {
   constructor(undo) {
     this.last = null; // {id, text, until_utc_s}
     this.notices = [];
+    this.load = inOrder(api.notices);
     this.text = h("span", { role: "status" });
     this.seconds = h("span", { class: "number", "aria-hidden": "true" });
     this.label = h("span", {});
@@ -71,9 +72,9 @@ export class StatusLine {
 
   async loadNotices() {
     try {
-      ({ notices: this.notices } = await api.notices());
+      ({ notices: this.notices } = await this.load());
     } catch (error) {
-      toast(error.message, { bad: true });
+      notUpdated(error);
       return;
     }
     const count = this.notices.length;
@@ -89,12 +90,7 @@ export class StatusLine {
         h("button", { type: "button", text: t("status_line.open_contact", { name: one.name }), on: { click: (event) => { event.target.closest("dialog").querySelector("[data-action=null]").click(); emit("select", { id: one.contact_id, name: one.name }); } } }),
         h("button", {
           type: "button", text: t("status_line.acknowledge"), data: { acknowledge: String(one.id) }, on: { click: async (event) => {
-            try {
-              await api.acknowledge(one.id);
-              event.target.closest("li").remove();
-            } catch (error) {
-              toast(error.message, { bad: true });
-            }
+            await api.acknowledge(one.id).then(() => event.target.closest("li").remove(), showError);
           } },
         }))));
     await showDialog(t("status_line.notices_title"), h("ul", { class: "notices" }, rows));

@@ -154,8 +154,6 @@ export default {
   "password.done": "Ihr Passwort ist geändert. Diese Sitzung läuft weiter; Ihre anderen Sitzungen sind beendet.",
   // format.js
   // image_data.js
-  "image_data.no_connection": "keine Antwort vom Server der Konsole",
-  "image_data.status": "der Server meldet für das Bild den Status {status}",
   "image_data.other_digest": "der Server lieferte ein anderes Bild als das des Kontakts",
   // contact_view.js
   "contact_view.no_image": "Bisher ist nur der Kontaktdatensatz empfangen. Das Bild folgt.",

@@ -154,8 +154,6 @@ export default {
   "password.done": "Your password is changed. This session continues; your other sessions have ended.",
   // format.js
   // image_data.js
-  "image_data.no_connection": "no response from the console's server",
-  "image_data.status": "the server returned status {status} for the image",
   "image_data.other_digest": "the server returned another image than the one of the contact",
   // contact_view.js
   "contact_view.no_image": "Only the contact record has been received so far. The image follows.",

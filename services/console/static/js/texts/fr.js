@@ -154,8 +154,6 @@ export default {
   "password.done": "Le mot de passe est changé. Cette session continue ; vos autres sessions sont terminées.",
   // format.js
   // image_data.js
-  "image_data.no_connection": "pas de réponse du serveur de la console",
-  "image_data.status": "le serveur a renvoyé le code {status} pour l'image",
   "image_data.other_digest": "le serveur a renvoyé une autre image que celle du contact",
   // contact_view.js
   "contact_view.no_image": "Seule la fiche du contact est reçue à cette heure. L'image suit.",

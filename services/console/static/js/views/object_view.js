@@ -1,7 +1,7 @@
 // The object panel: all looks at one object side by side, one verdict for them, split and merge.
 
-import { api } from "../base/api.js";
-import { fill, h, toast } from "../base/dom.js";
+import { api, inOrder } from "../base/api.js";
+import { fill, h, notUpdated, toast } from "../base/dom.js";
 import { SEEN_MS } from "../decision/verdict_guard.js";
 import { DASH, VERDICTS, number, position, quantity, symbol, time, verdict } from "../base/format.js";
 import { autoRange, colourTable, colourise, loadImage } from "../image/image_data.js";
@@ -25,6 +25,7 @@ class ObjectPanel {
     this.ready = false; // a verdict counts
     this.timer = 0;
     this.images = new Map(); // contact → {look, image, coloured} that is drawn
+    this.load = inOrder(() => api.object(this.object.id));
     this.head = h("div", { class: "object-head" });
     this.ring = h("canvas", { class: "ring", role: "img" });
     this.grid = h("div", { class: "looks" });
@@ -66,7 +67,6 @@ class ObjectPanel {
     this.ring.setAttribute("aria-label", t("object.ring", { aspects: aspects.map(bearing).join(", ") || DASH }));
     fill(this.grid, object.looks.map((look) => this.#tile(look)));
     this.#renderMenu();
-    this.#renderButtons();
     drawRing(this.ring, aspects, themeColour);
     this.#loadImages();
   }
@@ -90,19 +90,15 @@ class ObjectPanel {
     fill(this.changes, splits, merges);
   }
 
-  #renderButtons() {
-    this.decided.textContent = t("object.all", { count: this.images.size });
-    for (const button of this.buttons) button.disabled = !state.session.may.decide || this.images.size === 0;
-  }
-
-  /** Load the images, then draw all at one scale. */
+  /** Draw the images that stay, load the others, then draw all at one scale. */
   async #loadImages() {
     const { object } = this;
     const pictures = object.looks.filter((look) => look.contact.has_picture);
+    const stays = ({ contact }) => this.images.get(contact.id)?.look.contact.version === contact.version;
+    this.#display(pictures.filter(stays).map((look) => ({ ...this.images.get(look.contact.id), look })));
     const loaded = await Promise.all(pictures.map(async (look) => {
       const { id, version } = look.contact;
-      const known = this.images.get(id);
-      if (known?.look.contact.version === version) return { ...known, look };
+      if (this.images.has(id)) return this.images.get(id);
       try {
         const image = await loadImage({ id, version, sha256: look.sha256, layer: "raw" }, api.imageUrl(id, version), look.has_missing ? api.maskUrl(id, version) : null);
         const [low, high] = autoRange(image);
@@ -115,9 +111,15 @@ class ObjectPanel {
     if (this.object !== object || !this.open) return;
     const drawn = loaded.filter(Boolean);
     if (drawn.some(({ look, image }) => image !== this.images.get(look.contact.id)?.image)) this.#wait();
+    this.#display(drawn);
+  }
+
+  /** Draw images; a verdict is on these. */
+  #display(drawn) {
     this.images = new Map(drawn.map((one) => [one.look.contact.id, one]));
     this.draw();
-    this.#renderButtons();
+    this.decided.textContent = t("object.all", { count: drawn.length });
+    for (const button of this.buttons) button.disabled = !state.session.may.decide || drawn.length === 0;
   }
 
   #setReady(/** @type {boolean} */ ready) {
@@ -183,12 +185,12 @@ class ObjectPanel {
 
   async reload() {
     try {
-      const object = await api.object(this.object.id);
+      const object = await this.load();
       if (this.open) this.show(object);
     } catch (error) {
       // Its looks are looks of another object now.
       if (error.status === 404) this.close();
-      else toast(error.message, { bad: true });
+      else notUpdated(error);
     }
   }
 
@@ -204,10 +206,11 @@ class ObjectPanel {
 
 let panel = null;
 
-/** Open the panel of a contact's object. */
+/** Open the panel of a contact's object, unless the operator has moved on to another contact or dialog. */
 export async function openObject(contact) {
   try {
-    panel = new ObjectPanel(await api.object(contact.object));
+    const object = await api.object(contact.object);
+    if (state.selected === contact.id && !document.querySelector("dialog[open]")) panel = new ObjectPanel(object);
   } catch (error) {
     toast(error.message, { bad: true });
   }
@@ -218,5 +221,6 @@ export function watchObject() {
   listen("contact", ({ contact }) => {
     if (panel?.open && (contact.object === panel.object.id || panel.object.looks.some((look) => look.contact.id === contact.id))) panel.reload();
   });
+  listen("reload", () => { if (panel?.open) panel.reload(); });
   addEventListener("resize", () => { if (panel?.open) panel.draw(); });
 }
