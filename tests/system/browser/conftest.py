@@ -39,7 +39,7 @@ COMMANDS = {"chromium": ("chromium",), "firefox": ("firefox", "firefox-esr")}
 """Commands of a browser; the last one is the name of its Debian package."""
 BROWSER_MESSAGES = (
     # Firefox reports the end of an event stream, for example when the page is closed.
-    "/events.",
+    "/events?last=",
     "was interrupted while the page was loading",
     # Playwright adds a style to the page for screenshots in Firefox; the page's policy refuses it.
     "an inline style (style-src-elem)",
