@@ -208,6 +208,7 @@ def main() -> None:
     folder, state_dir, max_decode_s, *codebooks = sys.argv[1:]
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # output of libraries must not get between the answers
+    signal.signal(signal.SIGPROF, signal.SIG_DFL)  # a parent can have ignored it
     use_code_folder(Path(state_dir))
     decoder = Decoder(codebooks)
     _write(answers, b"")
