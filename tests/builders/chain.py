@@ -9,7 +9,7 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from builders.common import free_port
+from builders.common import eventually, free_port
 from builders.history import History
 from builders.progress import wait_while_progressing
 from sonarpost import keys
@@ -37,6 +37,18 @@ def snippet(number):
 def latest_versions(folder):
     """Return the last version of each image of a folder, an image that has two sets of files twice."""
     return last_versions(read_images(folder))
+
+
+def send_signal(chain, name, number):
+    """Send a signal to a process of a chain.
+
+    Emulated modems that are killed leave links to their terminals. The emulator of another test can get terminals of
+    these names, and the vehicle of this one would transmit into its channel: the links are removed first.
+    """
+    if (name, number) == ("acoustic_channel", signal.SIGKILL):
+        for link in chain.settings.ports_folder.glob("*"):
+            link.unlink()
+    os.kill(chain.pid(name), number)
 
 
 class VesselWatcher(Watcher):
@@ -87,7 +99,8 @@ class RunningChain:
 
     def kill(self, name):
         self.history.fault(name, "SIGKILL")
-        self.chain.kill(name)
+        send_signal(self.chain, name, signal.SIGKILL)
+        eventually(lambda: self.chain.status(name) is not None, what=f"end of {name}")
 
     def assert_delivered_once(self):
         """Check that each encoded image is at the vessel and at the shore site, once and unchanged.

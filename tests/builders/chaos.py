@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 import pytest
 import tifffile
 
-from builders.chain import latest_versions
+from builders.chain import latest_versions, send_signal
 from builders.common import REPOSITORY, free_port
 from builders.faulty_link import FaultyLink
 from builders.history import History
@@ -211,7 +211,7 @@ class ChaosChain:
             self._disks[name].fill()
             self._ends.append((now_s + fault.duration_s, self._disks[name].empty))
         elif self.chain.status(fault.target) is None:
-            os.kill(self.chain.pid(fault.target), signal.Signals[fault.kind])
+            send_signal(self.chain, fault.target, signal.Signals[fault.kind])
             if fault.kind == "SIGSTOP":
                 pid = self.chain.pid(fault.target)
                 self._ends.append((now_s + fault.duration_s, lambda: os.kill(pid, signal.SIGCONT)))

@@ -44,9 +44,21 @@ def run_command(out, *options):
     return subprocess.run(demo(out, *options), capture_output=True, text=True, check=False)
 
 
+def evidence(out, done):
+    """Return what a failed demo printed, which images were encoded of which contacts, and all warnings."""
+    logs = [(path.stem, path.read_text(errors="replace").splitlines()) for path in sorted((out / "logs").glob("*.log"))]
+    lines = [
+        f"{name}: {line[:200]}"
+        for name, log in logs
+        for line in log
+        if re.search("Contact detected|encoded|Z [WE]", line)
+    ]
+    return "\n".join([done.stderr[-2000:], *lines[-40:]])
+
+
 def run_demo(out, *options):
     done = run_command(out, *options, "--json")
-    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.returncode == 0, evidence(out, done)
     result = json.loads(done.stdout.splitlines()[-1])
     assert {name: type(value) for name, value in result.items()} == FIELDS
     return result
@@ -137,7 +149,7 @@ def test_own_images_arrive_with_positions_and_every_change_is_named(tmp_path):
     out = tmp_path / "out"
     options = ("--images", str(own_image_folder(tmp_path)), "--time-scale", "60", "--fit", "resize", "--json")
     done = run_command(out, *options)
-    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.returncode == 0, evidence(out, done)
     result = json.loads(done.stdout.splitlines()[-1])
     assert result["contacts"] == result["images_complete"] == 3
     for text in (

@@ -79,7 +79,7 @@ def bench(tmp_path, installation):
     folder.mkdir()
     started = Bench(folder, installation)
     yield started
-    for process in started.processes.values():
+    for process in reversed(started.processes.values()):  # the emulated modems last
         process.kill()
         process.wait()
 

@@ -51,11 +51,6 @@ class Processes:
         """Process identifier of a process."""
         return self._processes[name].pid
 
-    def kill(self, name: str) -> None:
-        """End a process at once (SIGKILL), as a power cut would."""
-        self._processes[name].kill()
-        self._processes[name].wait()
-
     def status(self, name: str) -> int | None:
         """Return the exit status of a process, None while it runs."""
         return self._processes[name].poll()

@@ -154,10 +154,13 @@ class PtyPort(HostPort):
         return not self.connected
 
     def close(self) -> None:
-        """Close the terminal; remove the link unless another process has replaced it."""
-        os.close(self._master)
+        """Remove the link unless another process has replaced it, then close the terminal.
+
+        In this order: the next terminal that any program makes can have the same name.
+        """
         if self._link.is_symlink() and str(self._link.readlink()) == self._slave_name:
             self._link.unlink()
+        os.close(self._master)
 
 
 class TcpPort(HostPort):
