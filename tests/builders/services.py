@@ -10,6 +10,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -238,12 +239,14 @@ class SerialCable:
 
     Args:
         device: Port of the emulated modem, or None for a cable that is connected to nothing.
+        port: Path of the service's end; a link, because another program can get the name of a closed terminal.
     """
 
-    def __init__(self, device):
+    def __init__(self, device, port):
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
-        self.port = os.ttyname(self._slave)
+        port.symlink_to(os.ttyname(self._slave))
+        self.port = str(port)
         self._modem = -1
         if device is not None:
             self._modem = os.open(device, os.O_RDWR | os.O_NOCTTY)
@@ -267,6 +270,7 @@ class SerialCable:
                     os.write(ends[end], data)
 
     def close(self):
+        Path(self.port).unlink()
         self._stop.set()
         self._thread.join()
         for descriptor in (self._master, self._slave, self._modem):
@@ -275,12 +279,12 @@ class SerialCable:
 
 
 @pytest.fixture
-def serial_cable():
+def serial_cable(tmp_path):
     """Make serial cables."""
     made: list[SerialCable] = []
 
     def make(device):
-        made.append(SerialCable(device))
+        made.append(SerialCable(device, tmp_path / f"cable-{len(made)}"))
         return made[-1]
 
     yield make
