@@ -8,8 +8,10 @@ from collections.abc import Callable, Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
+import httpx2
 import pytest
 from builders.common import WAIT_S
+from builders.console import Browser as HttpBrowser
 from builders.console import (
     Console,
     console,
@@ -280,6 +282,7 @@ class Served:
         self.state = console.state
         self.users = console.users
         self._visit = visit
+        self._clients: list[httpx2.Client] = []
         self._app = console.app
         self._server = WebServer(self._app.asgi, "127.0.0.1", 0)
         self._server.start()
@@ -288,6 +291,13 @@ class Served:
     def visit(self, user: str = "anna", **options: Any) -> Visit:
         """Open the page with a session of a user; without a session for an empty name."""
         return self._visit(self.address, self.users.start_session(user).token if user else "", **options)
+
+    def client(self, user: str) -> HttpBrowser:
+        """A logged-in client of the server. One in this process (`Console.browser`) would have another event loop."""
+        self._clients.append(httpx2.Client(base_url=self.address, timeout=WAIT_S))
+        client = HttpBrowser(self._clients[-1])
+        assert client.login(user).status_code == 200
+        return client
 
     def contact(self, image_id: str = "00A7") -> Any:
         """The contact of an image, with its decisions, measurements and requests."""
@@ -301,6 +311,8 @@ class Served:
         return [item.record for item in self.state.unsent_records() if isinstance(item.record, kind)]
 
     def stop(self) -> None:
+        for client in self._clients:
+            client.close()
         self._app.stop()
         self._server.stop()
 

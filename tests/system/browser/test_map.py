@@ -207,7 +207,7 @@ def test_cluster_has_the_worst_verdict(serve):
     for number in range(6):
         served.state.store_image(image_record(f"000{number}", position=(56.0, -5.0 + 3e-5 * number)))
     served.state.store_image(image_record("0006", position=(56.1, -5.0)))
-    browser = served.console.browser("anna")
+    browser = served.client("anna")
     points = {image_id: one["id"] for image_id, one in browser.chart().items()}
     for number, verdict in (("0000", "not_mine_like"), ("0003", "unsure")):
         assert browser.decide(points[number], verdict=verdict).status_code == 201

@@ -106,7 +106,7 @@ def test_one_verdict_for_all_looks(served):
     assert len(visit.page.evaluate("window.sent")) == 1
     # A verdict on one look is made in review; the panel shows the contradiction.
     contact_id = identifier(served, "0002")
-    served.console.browser("anna").decide(contact_id, verdict="not_mine_like")
+    served.client("anna").decide(contact_id, verdict="not_mine_like")
     visit.wait(".tile .badge.not_mine_like")
     visit.wait(".contradiction")
     visit.press("Escape")
@@ -144,7 +144,7 @@ def test_decided_on_less_than_has_arrived(served):
     served.state.store_image(image_record("0001", missing_rows=20))
     visit = served.visit()
     visit.wait_for_contact("0001")
-    served.console.browser("bo").decide(identifier(served, "0001"), verdict="not_mine_like")
+    served.client("bo").decide(identifier(served, "0001"), verdict="not_mine_like")
     served.state.store_image(image_record("0001", version=2))
     visit.page.select_option("#review", "newer_detail")
     visit.until("() => document.querySelector('.row .newer')?.textContent === '○ on 100 B – 200 B are here'")  # noqa: RUF001

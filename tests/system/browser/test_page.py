@@ -384,7 +384,7 @@ def test_list_of_thousands_of_contacts(served):
     held = []
     visit.page.route("**/api/contacts?*", lambda route: route.continue_() if held is None else held.append(route))
     with visit.page.expect_request("**/api/contacts?*"):
-        served.console.browser("bo").decide(contact_ids(served.state)["0500"], verdict="unsure")
+        served.client("bo").decide(contact_ids(served.state)["0500"], verdict="unsure")
     visit.page.evaluate("document.getElementById('queue').scrollTop = 1e9")
     waiting, held = held, None
     for route in waiting:
@@ -408,7 +408,7 @@ def test_list_of_thousands_of_contacts(served):
 @pytest.mark.firefox
 def test_search_is_over_all_contacts_and_ends_with_its_text(served):
     add_contacts(served, 3)
-    served.console.browser("bo").decide(contact_ids(served.state)["0001"], verdict="not_mine_like")
+    served.client("bo").decide(contact_ids(served.state)["0001"], verdict="not_mine_like")
     visit = served.visit()
     visit.wait(".filters .sum >> text=2 of 3 shown")
     visit.press("/")
@@ -428,7 +428,7 @@ def test_search_is_over_all_contacts_and_ends_with_its_text(served):
 @pytest.mark.firefox
 def test_rows_marks_and_counts_follow_each_change(served):
     add_contacts(served, 3)
-    ids, state, anna = contact_ids(served.state), served.state, served.console.browser("anna")
+    ids, state, anna = contact_ids(served.state), served.state, served.client("anna")
     visit = served.visit()
     visit.wait_for_contact("0002")
     visit.page.evaluate(

@@ -49,7 +49,7 @@ def drawn_shape(page: Page, number: int = 0) -> tuple[float, float]:
 
 def test_report_is_one_page_in_true_metres(served):
     served.state.store_image(image_record("00A7", missing_rows=5, **SIZES))
-    anna = served.console.browser("anna")
+    anna = served.client("anna")
     anna.decide(ID)
     report = served.visit("bo", path=f"report/{ID}").page
     assert_pages(report, 1)
@@ -102,7 +102,7 @@ def test_export_is_cancelled_and_shows_its_progress(served, held, tmp_path):
     visit.wait("dialog .progress >> text=2 of 4 contacts")
     visit.page.locator("dialog .cancel").click()
     visit.wait("dialog .progress >> text=The export was cancelled")
-    assert served.console.browser("anna").get("/api/export").json() == {"export": None}
+    assert served.client("anna").get("/api/export").json() == {"export": None}
     # Another export starts.
     visit.page.locator("dialog [data-export=kmz]").click()
     visit.wait("dialog .progress >> text=2 of 4 contacts")
@@ -139,7 +139,7 @@ def test_report_of_a_real_contact_is_one_page_in_true_metres(served, data_dir):
         update={"contact": record, "picture": picture, "picture_sha256": picture.sha256}
     )
     served.state.store_image(image)
-    served.console.browser("anna").decide(ID)
+    served.client("anna").decide(ID)
     report = served.visit("bo", path=f"report/{ID}").page
     height, width = drawn_shape(report)
     metres = picture.height_px * record.pixel_along_m, picture.width_px * record.pixel_across_m
