@@ -529,7 +529,8 @@ class Service(ABC, Generic[C]):
         """Return the health record of this moment."""
         detail = self._degraded
         if self._inbox is not None and self._inbox.storage_failing:
-            detail = detail or "records cannot be stored"
+            # With the cause, for example a database that is not reached.
+            detail = detail or "; ".join(filter(None, ("records cannot be stored", self.degraded_reason())))
         now_utc_s = time.time()
         detail = (
             detail
