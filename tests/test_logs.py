@@ -197,6 +197,16 @@ def test_context_holds_vehicle_image_and_contact_of_a_record():
     assert context_of_payload(wire.encode(decision)) == {"vehicle": decision.vehicle_id, "image_id": decision.image_id}
 
 
+def test_a_batch_has_one_line_with_counts_and_first_and_last_record(caplog):
+    caplog.set_level(logging.INFO)
+    payloads = [wire.encode(COMPLETE_IMAGE.model_copy(update={"image_id": name})) for name in ("0001", "0002", "0003")]
+    logs.log_batch(logging.getLogger("n"), "Queued", payloads, images=3)
+    logs.log_batch(logging.getLogger("n"), "Queued", payloads[2:], images=1)
+    several, one = (line.__dict__["fields"] for line in caplog.records)
+    assert several == {"first": "uuv-1/0001", "last": "uuv-1/0003", "images": 3}
+    assert (one["vehicle"], one["image_id"], one["images"]) == ("uuv-1", "0003", 1)
+
+
 def relayed(payload):
     key = keys.image_reconstructed("vessel-1")
     return wire.encode(Relayed(vessel_id="vessel-1", key=key, payload=payload, relayed_utc_s=1.0))

@@ -13,7 +13,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -102,6 +102,21 @@ def _unpacked(payload: bytes) -> Mapping[str, object]:
         return unpack_map(payload, "")
     except PayloadError:
         return {}
+
+
+def log_batch(logger: logging.Logger, message: str, payloads: Sequence[bytes], /, **counts: int) -> None:
+    """Log one line at level info for records that were handled together; at level debug, each has its own line.
+
+    Args:
+        logger: Logger of the module.
+        message: Message of the line.
+        payloads: The records as msgpack. One record gives the fields of its log context, several give `first` and
+            `last`, each with vehicle and image.
+        **counts: Further fields, for example the number of records of each type.
+    """
+    names = [context_of_payload(payload) for payload in (payloads[0], payloads[-1])]
+    ends = {end: "/".join([*found.values()][:2]) for end, found in zip(("first", "last"), names, strict=True)}
+    logger.info(message, extra=kv(**(ends if len(payloads) > 1 else names[0]), **counts))
 
 
 def fields_of(record: logging.LogRecord) -> dict[str, object]:

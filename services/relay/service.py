@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 
@@ -21,7 +22,7 @@ from sonarpost.delivery.records import InboxItem, OutboxItem, Topic, consumer_of
 from sonarpost.delivery.store import DiskReserve
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import MissingBaseError, PayloadError
-from sonarpost.logs import kv
+from sonarpost.logs import kv, log_batch
 from sonarpost.messages import (
     Advice,
     CodedImage,
@@ -115,6 +116,7 @@ class RelayService(Service[RelayConfig]):
             upstream.queue: keys.shore_part(platform.id, upstream.options.site) for upstream in upstreams
         }
         self._stored_versions = 0
+        self._queued: Counter[str] = Counter()  # records for the shore of the batch in progress, by type
         self._inboxes = {upstream.queue: keys.shore_inbox(platform.id, upstream.options.site) for upstream in upstreams}
         sites = [self._monitored(upstream) for upstream in upstreams]
         self._site_monitor = SiteMonitor(platform.id, sites, platform.tls)
@@ -240,7 +242,8 @@ class RelayService(Service[RelayConfig]):
         for queue, inbox in self._inboxes.items():
             effects.send_payload(inbox, queue, payload, Relayed, priority=priority, topic=topic)
         effects.count(f"{record.TYPE}s_relayed")
-        log.info("Record queued for the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
+        self._queued[record.TYPE] += 1
+        log.debug("Record queued for the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
 
     def _queue_image(self, image: CodedImage, effects: UnitOfWork) -> None:
         """Queue for each site the difference to the version that it has acknowledged last, or the whole image."""
@@ -260,7 +263,8 @@ class RelayService(Service[RelayConfig]):
             effects.count("image_differences", int(sent is not payload))
         effects.count("image_bytes_received", image.bytes_received)
         effects.count("coded_images_relayed")
-        log.info("Image queued for the shore", extra=kv(version=image.version, bytes=len(payload)))
+        self._queued[image.TYPE] += 1
+        log.debug("Image queued for the shore", extra=kv(version=image.version, bytes=len(payload)))
 
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> bool:
         """Store which version of an image a site has; send the whole image if the site has refused a difference."""
@@ -301,7 +305,10 @@ class RelayService(Service[RelayConfig]):
 
     def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """Commit, then apply the quota of each site's queue."""
+        queued, self._queued = self._queued, Counter()
         superseded = super().commit_batch(handled)
+        if queued:
+            log_batch(log, "Records queued for the shore", [effects.payload for effects, _ in handled], **queued)
         for satellite in self._satellites:
             satellite.committed()
         if superseded:

@@ -41,6 +41,22 @@ def test_records_are_relayed_unchanged_in_an_envelope(begin, c2, source, image, 
     assert seen == [], "envelopes are not published"
 
 
+def test_a_batch_is_one_line_and_each_record_has_its_own_at_level_debug(platform, capsys):
+    for level in ("info", "debug"):
+        service = RelayService(platform("vessel-1"), RelayConfig())
+        with service.store.transaction() as tx:
+            for name in ("d1", "d2"):
+                tx.accept(DECISIONS, wire.encode(decision_record(name)))
+        logs.configure_logging("relay", level)
+        items = service.store.inbox_items(2)
+        service._handle_batch(items)
+        service.store.close()
+        lines = [line for line in capsys.readouterr().err.splitlines() if "queued for the shore" in line]
+        assert [line.split()[1] for line in lines] == (["DEBUG"] * 2 if level == "debug" else []) + ["INFO"]
+        assert "Records queued for the shore first=uuv-1/" in lines[-1]
+        assert lines[-1].endswith(" decision=2")
+
+
 def test_records_wait_for_the_shore_and_decisions_are_first(begin, runner, c2, source, image):
     service = begin()
     source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(3)))

@@ -119,6 +119,7 @@ def modem_is_ready_since(run, service, since_utc_s):
 
 def test_contacts_at_rate_0_are_followed_in_the_logs_from_detection_to_the_shore(start_chain, monkeypatch):
     monkeypatch.setenv("SONARPOST_PLATFORM__LOG_FORMAT", "json")
+    monkeypatch.setenv("SONARPOST_PLATFORM__LOG_LEVEL", "debug")
     run = start_chain(rate=0)
     run.deposit(2)
     until_all_complete(run)
