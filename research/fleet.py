@@ -523,15 +523,16 @@ def figures(
         "sha256_wrong": received.wrong,
         "seconds": round(duration_s, 1),
         "contacts_per_s": round(queued / duration_s, 2),
-        **_percentiles("acknowledged", [entry["acknowledged_utc_s"] - entry["queued_utc_s"] for entry in entries]),
-        **_percentiles("shown", list(received.latency_s.values())),
+        **percentiles("acknowledged", [entry["acknowledged_utc_s"] - entry["queued_utc_s"] for entry in entries]),
+        **percentiles("shown", list(received.latency_s.values())),
         "cpu_ms_per_contact": {"all": round(sum(cpu_ms.values()), 2), **cpu_ms},
         "rss_mb": {k: round(max(memory[n] for n in ns)) for k, ns in by_kind.items() if k != "decoders"},
         "good": rows == queued == len(entries) and not received.wrong and not received.again,
     }
 
 
-def _percentiles(name: str, latency_s: Sequence[float]) -> dict[str, float]:
+def percentiles(name: str, latency_s: Sequence[float]) -> dict[str, float]:
+    """Return the percentiles 50 and 99 of latencies in milliseconds, as two fields that begin with `name`."""
     p50, p99 = np.percentile(1000 * np.array(latency_s or [float("nan")]), (50, 99))
     return {f"{name}_p50_ms": round(float(p50), 1), f"{name}_p99_ms": round(float(p99), 1)}
 
