@@ -1,0 +1,121 @@
+"""Redis: two servers with `appendfsync always`, and a forwarder between a stream of each.
+
+Redis has no transfer of streams of its own. The forwarder reads up to 512 entries, adds them with the same identifiers
+to the stream of the receiver, and deletes them at the sender when the receiver has answered. Redis answers after its
+`fsync`, one for all commands that it has read together. The receiver rejects an identifier that it has.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from research.peers.base import Peer, StartError, program, server
+from sonarpost.cli.demo.settings import free_ports
+
+BATCH = 512
+STREAM = b"records"
+
+
+class Connection:
+    """Client of one server."""
+
+    def __init__(self, port: int) -> None:
+        self._socket = socket.create_connection(("127.0.0.1", port))
+        self._file = self._socket.makefile("rb")
+
+    def request(self, *commands: Sequence[bytes]) -> list[Any]:
+        """Send commands together; return their answers, an integer, bytes, None or a list each.
+
+        Raises:
+            StartError: The server rejects a command.
+            ConnectionError: The connection has ended.
+        """
+        self._socket.sendall(
+            b"".join(
+                b"*%d\r\n%b" % (len(command), b"".join(b"$%d\r\n%b\r\n" % (len(word), word) for word in command))
+                for command in commands
+            )
+        )
+        return [self._answer() for _ in commands]
+
+    def _answer(self) -> object:
+        line = self._file.readline()
+        if not line:
+            raise ConnectionError("Redis closed the connection")
+        kind, text = line[:1], line[1:-2]
+        if kind == b"-":
+            raise StartError(text.decode())
+        if kind == b":":
+            return int(text)
+        if kind == b"$":
+            return None if text == b"-1" else self._file.read(int(text) + 2)[:-2]
+        if kind == b"*":
+            return [self._answer() for _ in range(int(text))]
+        return text
+
+    def close(self) -> None:
+        """End the connection; a request of another thread fails."""
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._file.close()
+        self._socket.close()
+
+
+class Redis(Peer):
+    """Streams with a forwarder."""
+
+    def __init__(self, sender_port: int, receiver_port: int, link_port: int) -> None:
+        self._sender_port, self._link_port = sender_port, link_port
+        self._sender, self._receiver = Connection(sender_port), Connection(receiver_port)
+        self._forwarder: threading.Thread | None = None
+
+    def fill(self, payloads: Sequence[bytes]) -> None:
+        """Empty both streams, then add the records to the sender's."""
+        if self._forwarder is not None:
+            self._forwarder.join()
+        for side in (self._sender, self._receiver):
+            side.request([b"DEL", STREAM])
+        for start in range(0, len(payloads), BATCH):
+            self._sender.request(*([b"XADD", STREAM, b"*", b"p", one] for one in payloads[start : start + BATCH]))
+
+    def connect(self) -> None:
+        """Start the forwarder."""
+        self._forwarder = threading.Thread(target=self._forward, daemon=True)
+        self._forwarder.start()
+
+    def stored(self) -> int:
+        """Return the length of the receiver's stream."""
+        return int(self._receiver.request([b"XLEN", STREAM])[0])
+
+    def _forward(self) -> None:
+        source, target = Connection(self._sender_port), Connection(self._link_port)
+        while entries := source.request([b"XRANGE", STREAM, b"-", b"+", b"COUNT", b"%d" % BATCH])[0]:
+            target.request(*([b"XADD", STREAM, number, *fields] for number, fields in entries))
+            source.request([b"XDEL", STREAM, *(number for number, _ in entries)])
+        source.close()
+        target.close()
+
+    def close(self) -> None:
+        """End the connections."""
+        self._sender.close()
+        self._receiver.close()
+
+
+@contextmanager
+def start(folder: Path, receiver_port: int, link_port: int) -> Iterator[Redis]:
+    """Start both servers; arguments and errors: `PEERS`."""
+    executable = program("redis-server", "apt-get install redis-server")
+    (sender_port,) = free_ports(1)
+    with ExitStack() as stack:
+        for name, port in (("sender", sender_port), ("receiver", receiver_port)):
+            (data := folder / name).mkdir(parents=True)
+            options = f"--bind 127.0.0.1 --port {port} --dir {data} --save  --appendonly yes --appendfsync always"
+            stack.enter_context(server([executable, *options.split(" ")], port, folder / f"{name}.log"))
+        peer = Redis(sender_port, receiver_port, link_port)
+        stack.callback(peer.close)
+        yield peer
