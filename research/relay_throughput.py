@@ -53,6 +53,7 @@ from sonarpost.delivery.protocol import CHUNK_BYTES
 from sonarpost.delivery.scheduler import WINDOW, WINDOW_BYTES
 from sonarpost.logs import configure_logging
 from sonarpost.messages import Decision, ImagePart, ReconstructedImage, Record, Relayed
+from sonarpost.runtime.process import relax_garbage_collection
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
@@ -96,6 +97,7 @@ def far_side(endpoint: str, folder: Path) -> None:
     router = zenoh.open(router_config([endpoint]))
     sink = Sink(platform("shore-1", endpoint, folder), ServiceConfig())
     sink.start()
+    relax_garbage_collection()
     session = zenoh.open(client_config([endpoint]))
 
     def answer(query: zenoh.Query) -> None:
@@ -177,6 +179,7 @@ def measure_relay(endpoint: str, folder: Path, key: str, payloads: Sequence[byte
     with relay.store.transaction() as tx:
         for payload in payloads:
             tx.accept(key, payload)
+    relax_garbage_collection()
     with logged_to(folder / "relay.log", level):
         started, used = time.perf_counter(), time.process_time()
         relay.start()

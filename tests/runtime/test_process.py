@@ -337,6 +337,23 @@ def test_damaged_store_is_refused_with_the_command_that_recovers_it(start_here, 
     assert f"sonarpost store salvage {store.path} --out NEW" in err
 
 
+def test_objects_of_the_start_are_not_searched_for_garbage_and_later_cycles_are_freed():
+    program = """if True:
+        import gc, weakref
+        from sonarpost.runtime.process import GARBAGE_THRESHOLD, relax_garbage_collection
+        class Cycle:
+            pass
+        relax_garbage_collection()
+        assert gc.get_freeze_count() > 10_000
+        one = Cycle()
+        one.itself, gone = one, weakref.ref(one)
+        del one
+        kept = [[] for _ in range(GARBAGE_THRESHOLD + 1)]
+        assert gone() is None
+    """
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
 def test_help_names_the_service(capsys):
     with pytest.raises(SystemExit, match="0"):
         main(RelayService, RelayConfig, ["--help"])
