@@ -49,8 +49,9 @@ from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.delivery.congestion import MAX_WINDOW_BYTES
 from sonarpost.delivery.protocol import CHUNK_BYTES
-from sonarpost.delivery.scheduler import WINDOW, WINDOW_BYTES
+from sonarpost.delivery.scheduler import WINDOW
 from sonarpost.logs import configure_logging
 from sonarpost.messages import Decision, ImagePart, ReconstructedImage, Record, Relayed
 from sonarpost.runtime.process import relax_garbage_collection
@@ -241,7 +242,7 @@ def main() -> int:
 def measure(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes]) -> dict[str, float]:
     """Measure one kind of record; the bare rate before and after the relay, because the load of the host varies."""
     size = len(payloads[0])
-    window = max(1, min(WINDOW, WINDOW_BYTES // size))
+    window = max(1, min(WINDOW, MAX_WINDOW_BYTES // size))
     sequential = measure_bare(endpoint, payloads[:SEQUENTIAL], 1)
     before = measure_bare(endpoint, payloads, window)
     relayed, cpu_us = measure_relay(endpoint, folder, key, payloads, "info")

@@ -88,7 +88,7 @@ QUEUES = {
     "common/sonarpost/cli/c2/watch.py": "MAX_WAITING of each vessel",
     "common/sonarpost/cli/deployment/modem_ping.py": "a command for a modem at this computer; it ends after its pings",
     "common/sonarpost/cli/record.py": "MAX_QUEUED_BYTES",
-    "common/sonarpost/delivery/outbox.py": "queries in flight, at most WINDOW_BYTES",
+    "common/sonarpost/delivery/outbox.py": "queries that have ended, at most WINDOW",
     "common/sonarpost/delivery/scheduler.py": "records of the store, at most `lookahead`",
     "common/sonarpost/modem/micromodem/driver.py": "packets to send; more fail with QUEUE_FULL",
     "common/sonarpost/modem/micromodem/supervisor.py": "commands of the configuration",

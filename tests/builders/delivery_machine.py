@@ -17,7 +17,7 @@ import zenoh
 
 from sonarpost import keys
 from sonarpost.delivery.inbox import Inbox
-from sonarpost.delivery.outbox import QueuePolicy, QueueSender, _NoReplyError
+from sonarpost.delivery.outbox import QueuePolicy, QueueSender
 from sonarpost.delivery.protocol import AckReply
 from sonarpost.delivery.records import Topic
 from sonarpost.delivery.store import Store
@@ -28,29 +28,15 @@ WAIT_LIMIT = 60
 """Rounds after which all records must be delivered when no fault occurs."""
 
 
-class Handler:
-    """Stands for the handler of a query: one reply, or an error after the time-out."""
-
-    def __init__(self):
-        self.reply = None
-        self.timed_out = False
-
-    def try_recv(self):
-        if self.timed_out:
-            raise zenoh.ZError("no reply")
-        if self.reply is None:
-            return None
-        return SimpleNamespace(ok=SimpleNamespace(payload=zenoh.ZBytes(self.reply)))
-
-
 @dataclass(eq=False)
 class SentQuery:
-    """A query in the network; it can arrive any number of times."""
+    """A query in the network; it can arrive any number of times. It ends once: with a reply, or by its time-out."""
 
     key: str
     content: bytes
     attached: bytes
-    handler: Handler = field(default_factory=Handler)
+    handler: zenoh.handlers.Callback = None
+    has_ended: bool = False
     replies: list[bytes] = field(default_factory=list)
 
     @property
@@ -75,6 +61,14 @@ class SentQuery:
         assert key == self.key
         self.replies.append(payload)
 
+    def end(self, reply=None):
+        """End the query at its sender, unless it has ended before; None for the time-out."""
+        if not self.has_ended:
+            self.has_ended = True
+            ok = None if reply is None else SimpleNamespace(payload=zenoh.ZBytes(reply))
+            self.handler.callback(SimpleNamespace(ok=ok))
+            self.handler.drop()
+
 
 class Network:
     """Stands for the session of a producer."""
@@ -83,10 +77,8 @@ class Network:
         self.sent = []
         self.published = []
 
-    def get(self, key, *, payload, attachment, **_):
-        query = SentQuery(key, payload, attachment)
-        self.sent.append(query)
-        return query.handler
+    def get(self, key, handler, *, payload, attachment, **_):
+        self.sent.append(SentQuery(key, payload, attachment, handler))
 
     def put(self, key, payload, *, attachment, **_):
         del key, payload
@@ -162,14 +154,14 @@ class Sending:
         return {bytes(row[0]) for row in self.store._query("SELECT payload FROM outbox")}
 
     def send(self):
-        self.sender._load()
-        self.sender._send_queries()
+        if self.sender._failure is None:
+            self.sender._load()
+            self.sender._send_queries()
 
     def use_replies(self):
-        try:
-            self.sender._process_replies()
-        except _NoReplyError as error:
-            self.sender._back_off(str(error))
+        self.sender._process_ended()
+        if self.sender._failure is not None and not self.sender._in_flight:
+            self.sender._back_off(self.sender._failure)
 
 
 class Delivery:
@@ -283,7 +275,7 @@ class Delivery:
     def deliver_everything(self):
         """Run without faults until all outboxes are empty."""
         for query in self.network.sent:
-            query.handler.timed_out = query.handler.reply is None
+            query.end()
         for _ in range(WAIT_LIMIT):
             for producer in self.producers:
                 producer.use_replies()
@@ -292,7 +284,7 @@ class Delivery:
                 producer.send()
                 for query in self.network.sent[before:]:
                     self.receive([query])
-                    query.handler.reply = query.replies[-1]
+                    query.end(query.replies[-1])
                     assert _status(query.replies[-1]) != "later"
             if not any(producer.queued() for producer in self.producers):
                 break

@@ -235,8 +235,8 @@ class Listener:
         return [c.seq for asked in self.asked for c in ([asked] if isinstance(asked, ReceivedChunk) else asked)]
 
 
-@pytest.mark.parametrize(("takes", "most"), [(0, 1), (1, 1), (5, 5), (2**60, MAX_BATCH_RECORDS)])
-def test_producer_sends_batches_of_the_announced_size(takes, most, producer, send, client):
+@pytest.mark.parametrize(("takes", "least", "most"), [(0, 1, 1), (1, 1, 1), (5, 5, 5), (2**60, 20, MAX_BATCH_RECORDS)])
+def test_producer_sends_batches_of_the_announced_size(takes, least, most, producer, send, client):
     def answer(asked):
         if isinstance(asked, ReceivedChunk):
             return AckReply("stored").pack(takes)
@@ -247,7 +247,9 @@ def test_producer_sends_batches_of_the_announced_size(takes, most, producer, sen
     eventually(lambda: producer.store.outbox_depth() == 0)
     assert isinstance(listener.asked[0], ReceivedChunk), "the consumer has not announced batches yet"
     assert listener.records == list(range(1, 301))
-    assert max(1 if isinstance(asked, ReceivedChunk) else len(asked) for asked in listener.asked) == most
+    largest = max(1 if isinstance(asked, ReceivedChunk) else len(asked) for asked in listener.asked)
+    # More than `least` if the window grows, which depends on the reply times.
+    assert least <= largest <= most
     assert all(isinstance(asked, ReceivedChunk) for asked in listener.asked) == (most == 1)
 
 

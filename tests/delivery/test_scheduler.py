@@ -4,17 +4,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sonarpost.delivery.congestion import MAX_WINDOW_BYTES
 from sonarpost.delivery.protocol import CHUNK_BYTES
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.scheduler import (
     CHUNK_S,
-    MAX_WINDOW_BYTES,
     MIN_CHUNK_BYTES,
     PROBE_WINDOW,
     QUERY_OVERHEAD_BYTES,
     URGENT_RESERVE,
     WINDOW,
-    WINDOW_BYTES,
     DeliveryScheduler,
     TokenBucket,
     chunk_bytes_for,
@@ -27,6 +26,7 @@ def item(seq, size=100, priority=6):
 
 def schedule(*items, bytes_per_s=None, responding=True):
     made = DeliveryScheduler(bytes_per_s, 0.0)
+    made.congestion.window_bytes = MAX_WINDOW_BYTES
     made.probing = not responding
     made.update(items)
     return made
@@ -56,7 +56,7 @@ class SlowLink:
             return True
         self.scheduler.query_sent(chunk, self.now_s)
         self.sent.append((self.now_s, chunk.transfer.item.seq, chunk.size))
-        self.scheduler.query_ended(chunk, self.now_s)
+        self.scheduler.query_ended(chunk, self.now_s, replied=True)
         if chunk.end == len(chunk.transfer.item.payload):
             self.scheduler.remove(chunk.transfer)
         else:
@@ -100,7 +100,7 @@ def test_urgent_records_are_charged_to_the_limit():
         scheduler.update([item(seq, 500, priority=1), item(1, 10_000)])
         chunk = ask(scheduler)
         assert chunk.transfer.item.seq == seq
-        scheduler.query_ended(chunk, 0.0)
+        scheduler.query_ended(chunk, 0.0, replied=True)
         scheduler.remove(chunk.transfer)
     chunk, wait_s = scheduler.next_chunk(0.0)
     assert chunk is None
@@ -132,7 +132,7 @@ def test_one_query_and_few_records_until_the_first_reply():
     assert scheduler.lookahead == PROBE_WINDOW
     first = ask(scheduler)
     assert scheduler.next_chunk(0.0) == (None, None)
-    scheduler.query_ended(first, 0.1)
+    scheduler.query_ended(first, 0.1, replied=True)
     scheduler.probing = False
     assert scheduler.lookahead == WINDOW
     assert ask(scheduler).transfer.item.seq == 2
@@ -147,33 +147,18 @@ def test_full_window_has_a_reserve_for_urgent_records():
     assert ask(scheduler).transfer.item.seq == 999
 
 
-def test_bytes_in_flight_follow_the_reply_time():
-    scheduler = schedule(*(item(n, 40 * CHUNK_BYTES) for n in range(1, 9)))
-
-    def in_flight(reply_after_s, rounds):
-        now_s, most = 0.0, 0
-        for _ in range(rounds):
-            chunks = []
-            while scheduler.next_chunk(now_s)[0] is not None:
-                chunks.append(ask(scheduler, now_s))
-            most = sum(chunk.size for chunk in chunks)
-            now_s += reply_after_s
-            for chunk in chunks:
-                scheduler.query_ended(chunk, now_s)
-        return most
-
-    assert in_flight(0.01, 1) == WINDOW_BYTES
-    assert in_flight(0.01, 4) > 4 * WINDOW_BYTES
-    assert in_flight(0.01, 3) <= MAX_WINDOW_BYTES
-    assert in_flight(2.0, 3) <= WINDOW_BYTES
-
-
-def test_bytes_in_flight_on_a_slow_link_fit_the_query_timeout():
-    scheduler = schedule(item(1, 60_000), bytes_per_s=1000)
-    for now_s in range(0, 40, 10):
-        while scheduler.next_chunk(now_s)[0] is not None:
-            ask(scheduler, now_s)
-    assert sum(size for size in [scheduler.active[1].sent]) <= 2 * 1000
+@given(st.lists(st.tuples(st.integers(0, 3000), st.booleans()), min_size=1, max_size=60), st.floats(4096, 40_000))
+def test_bytes_in_flight_fit_the_window_and_urgent_ones_a_window_of_their_own(records, window_bytes):
+    scheduler = schedule(*(item(n, size, 2 if urgent else 6) for n, (size, urgent) in enumerate(records, 1)))
+    scheduler.congestion.window_bytes = window_bytes
+    sent = {True: 0, False: 0}
+    while scheduler.next_chunk(0.0)[0] is not None:
+        chunk = ask(scheduler)
+        sent[chunk.transfer.urgent] += chunk.size
+    most = window_bytes + scheduler.chunk_bytes
+    assert max(sent.values()) <= most
+    left = [t.item.priority for t in scheduler.active.values() if t.has_unsent]
+    assert not left or sent[min(left) == 2] + sent[True] * (min(left) != 2) + scheduler.chunk_bytes / 2 > window_bytes
 
 
 def test_equal_replies_rewind_a_transfer_once():
@@ -194,9 +179,10 @@ def test_equal_replies_rewind_a_transfer_once():
 def test_restart_continues_at_the_confirmed_offset():
     scheduler = schedule(item(1, 3 * CHUNK_BYTES), item(2))
     chunks = [ask(scheduler) for _ in range(4)]
-    scheduler.query_ended(chunks[0], 0.0)
+    scheduler.query_ended(chunks[0], 0.0, replied=True)
     scheduler.confirm(chunks[0], CHUNK_BYTES)
-    scheduler.restart()
+    scheduler.restart(timed_out=False)
+    scheduler.congestion.window_bytes = MAX_WINDOW_BYTES
     scheduler.probing = False
     assert [(p.transfer.item.seq, p.start) for p in (ask(scheduler), ask(scheduler), ask(scheduler))] == [
         (1, CHUNK_BYTES),
@@ -258,7 +244,7 @@ def test_batches_keep_order_key_priority_and_chunk_size(records, takes, bytes_pe
             assert all(p.start == 0 and p.end == len(p.transfer.item.payload) for p in chunks)
             assert len({(p.transfer.item.key, p.transfer.item.priority) for p in chunks}) == 1
         scheduler.query_sent(chunk, now_s, *chunks[1:])
-        scheduler.query_ended(chunk, now_s)
+        scheduler.query_ended(chunk, now_s, replied=True)
         size = sum(p.size for p in chunks) + QUERY_OVERHEAD_BYTES
         if bytes_per_s is not None and not chunk.transfer.urgent:
             assert charged <= bytes_per_s * now_s + scheduler.chunk_bytes + QUERY_OVERHEAD_BYTES + 1e-3 * (charged + 1)
@@ -279,9 +265,9 @@ def test_restart_disables_batches_until_announced_again():
     scheduler.max_batch = 3
     first = ask(scheduler)
     assert len(scheduler.batch_with(first)) == 1, "the first record is already in flight"
-    scheduler.query_ended(first, 0.0)
+    scheduler.query_ended(first, 0.0, replied=True)
     chunk, _ = scheduler.next_chunk(0.0)
     assert [p.transfer.item.seq for p in scheduler.batch_with(chunk)] == [2, 3]
-    scheduler.restart()
+    scheduler.restart(timed_out=False)
     chunk, _ = scheduler.next_chunk(0.0)
     assert scheduler.batch_with(chunk) == [chunk]

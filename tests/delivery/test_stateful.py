@@ -119,7 +119,7 @@ class DeliveryFaults(RuleBasedStateMachine):
         if new:
             self.delivery.receive(new)
         for query in new:
-            query.handler.reply = query.replies[-1]
+            query.end(query.replies[-1])
         if lost:
             self.delivery.kill_producer(which)
         else:
@@ -154,15 +154,13 @@ class DeliveryFaults(RuleBasedStateMachine):
     @precondition(lambda self: self.sent)
     @rule(count=st.integers(1, 12))
     def reply_in_order(self, count):
-        open_queries = [q for q in self.sent if q.handler.reply is None and not q.handler.timed_out]
-        for query in [q for q in open_queries if q.replies][:count]:
-            query.handler.reply = query.replies[0]
+        for query in [q for q in self.sent if q.replies and not q.has_ended][:count]:
+            query.end(query.replies[0])
 
     @precondition(lambda self: self.sent)
     @rule(number=ANY)
     def lose_reply(self, number):
-        query = self.sent[number % len(self.sent)]
-        query.handler.timed_out = query.handler.reply is None
+        self.sent[number % len(self.sent)].end()
 
     # Consumer
 

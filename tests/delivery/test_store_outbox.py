@@ -89,7 +89,7 @@ def test_records_of_one_sender_displace_none_of_another_from_the_quarantine(stor
 
 def test_listeners_are_notified_of_commits_only(store):
     event = threading.Event()
-    store.add_outbox_listener(event)
+    store.add_outbox_listener(event.set)
     with pytest.raises(ZeroDivisionError):
         fail_within(store, lambda tx: (tx.send("k", "c", b"x", encoding="e"), tx.accept("k", b"x")))
     assert not event.is_set()
@@ -98,7 +98,7 @@ def test_listeners_are_notified_of_commits_only(store):
     assert event.is_set()
     assert not store.inbox_changed.is_set()
     event.clear()
-    store.remove_outbox_listener(event)
+    store.remove_outbox_listener(event.set)
     with store.transaction() as tx:
         tx.send("k", "c", b"x", encoding="e")
         tx.accept("k", b"x")

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import zenoh
 
 from sonarpost import keys
-from sonarpost.delivery import protocol
+from sonarpost.delivery import congestion, protocol
 from sonarpost.delivery.protocol import AckReply
 from sonarpost.delivery.records import OutboxItem, consumer_of
-from sonarpost.delivery.scheduler import MAX_WINDOW_BYTES, WINDOW, Chunk, DeliveryScheduler, RecordTransfer
+from sonarpost.delivery.scheduler import WINDOW, Chunk, DeliveryScheduler, RecordTransfer
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import DeliveryError, PayloadError
@@ -23,15 +23,12 @@ from sonarpost.logs import kv, log_context
 
 log = logging.getLogger(__name__)
 
-REPLY_TIMEOUT_S = 5.0
 BACK_OFF_S = (0.05, 0.1, 0.2, 0.5, 1.0)
 IDLE_S = 1.0
-POLL_S = (0.0005, 0.02)
-"""First and longest interval between checks for replies; they arrive in bursts, one for each commit."""
 REMOVE_AT = 512
 """Number of acknowledged records that are removed from the store at once."""
 REMOVE_AFTER_S = 0.2
-LOADED_BYTES = 2 * MAX_WINDOW_BYTES
+LOADED_BYTES = 2 * congestion.MAX_WINDOW_BYTES
 """Maximum size of the records in memory beyond the first 128."""
 PRIORITIES = {
     1: zenoh.Priority.REAL_TIME,
@@ -93,7 +90,7 @@ class Outbox:
         self._wake = threading.Event()
         self._senders: dict[str, QueueSender] = {}
         self._held: set[str] = set()
-        store.add_outbox_listener(self._wake)
+        store.add_outbox_listener(self._wake.set)
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
 
@@ -140,15 +137,34 @@ class Outbox:
         self._stop.set()
         self._wake.set()
         self._thread.join()
-        self._store.remove_outbox_listener(self._wake)
+        self._store.remove_outbox_listener(self._wake.set)
         for sender in self._senders.values():
             sender.close()
 
 
-@dataclass(frozen=True, slots=True)
 class _Query:
-    chunks: Sequence[Chunk]
-    replies: zenoh.handlers.Handler[zenoh.Reply]
+    """A query in flight; threads of Zenoh call `received` and `ended`.
+
+    Args:
+        chunks: What it sends.
+        on_end: Called once, with the reply or at the end without one.
+    """
+
+    def __init__(self, chunks: Sequence[Chunk], on_end: Callable[[_Query], None]) -> None:
+        self.chunks = chunks
+        self.reply: zenoh.Reply | None = None
+        self._on_end = on_end
+
+    def received(self, reply: zenoh.Reply) -> None:
+        """Use the first reply: of the consumer, or an error after the time-out."""
+        if self.reply is None:
+            self.reply = reply
+            self._on_end(self)
+
+    def ended(self) -> None:
+        """Report an end without a reply."""
+        if self.reply is None:
+            self._on_end(self)
 
 
 class _NoReplyError(Exception):
@@ -183,7 +199,10 @@ class QueueSender:
         self._on_acknowledged = on_acknowledged
         self._scheduler = DeliveryScheduler(policy.bytes_per_s, time.monotonic())
         self._published: set[int] = set()
-        self._in_flight: deque[_Query] = deque()
+        self._in_flight = 0
+        self._ended: deque[_Query] = deque()
+        self._failure: str | None = None
+        self._timed_out = False
         self._acknowledged: dict[int, OutboxItem] = {}
         self._first_acknowledged_s = 0.0
         self._done_up_to = 0
@@ -192,8 +211,8 @@ class QueueSender:
         self._batch_refused = False
         self._stop = threading.Event()
         self._wake = threading.Event()
-        self._wake.set()
-        store.add_outbox_listener(self._wake)
+        self._has_new = True
+        store.add_outbox_listener(self._on_new)
         self._thread = threading.Thread(target=self._run, name=f"outbox-{queue}", daemon=True)
         self._thread.start()
 
@@ -202,7 +221,15 @@ class QueueSender:
         self._stop.set()
         self._wake.set()
         self._thread.join(timeout=0.5)
-        self._store.remove_outbox_listener(self._wake)
+        self._store.remove_outbox_listener(self._on_new)
+
+    def _on_new(self) -> None:
+        self._has_new = True
+        self._wake.set()
+
+    def _on_end(self, query: _Query) -> None:
+        self._ended.append(query)
+        self._wake.set()
 
     def _run(self) -> None:
         while not self._stop.is_set():
@@ -211,36 +238,48 @@ class QueueSender:
             except Exception as error:
                 if not isinstance(error, (_NoReplyError, DeliveryError, zenoh.ZError)):
                     log.exception("Records not sent after an unexpected exception; sending them again")
-                self._back_off(str(error))
+                self._fail(str(error))
         try:
             self._remove_acknowledged()
         except DeliveryError as error:
             log.debug("Acknowledged records not removed; the next start sends them again", extra=kv(error=str(error)))
 
     def _step(self) -> None:
-        """Send the allowed queries and process the available replies; wait if there is nothing to do."""
-        self._load()
-        wait_s = self._send_queries()
-        if self._process_replies():
+        """Send the allowed queries and process the available replies; wait if there is nothing to do.
+
+        After a failure, wait until no query is in flight before anything is sent again: what a connection still holds
+        must not be sent a second time behind it.
+        """
+        self._wake.clear()
+        wait_s: float | None = None
+        if self._failure is None:
+            self._load()
+            wait_s = self._send_queries()
+        elif not self._in_flight:
+            self._back_off(self._failure)
+            return
+        if self._process_ended():
             return
         overdue = time.monotonic() - self._first_acknowledged_s > REMOVE_AFTER_S
         if self._acknowledged and (overdue or not self._in_flight):
             self._remove_acknowledged()
-        elif self._in_flight:
-            self._wait_for_reply(IDLE_S if wait_s is None else wait_s)
         else:
             self._wake.wait(IDLE_S if wait_s is None else wait_s)
+
+    def _fail(self, reason: str) -> None:
+        self.responding = False
+        self._failure = self._failure or reason
 
     # Load
 
     def _load(self) -> None:
         """Load the most urgent records if there are new ones or few remain."""
         scheduler = self._scheduler
-        if not self._wake.is_set() and len(scheduler.active) > scheduler.lookahead // 2:
+        if not self._has_new and len(scheduler.active) > scheduler.lookahead // 2:
             return
         if len(self._acknowledged) >= REMOVE_AT:
             self._remove_acknowledged()
-        self._wake.clear()
+        self._has_new = False
         numbers = self._store.queued_numbers(self._queue, scheduler.lookahead + len(self._acknowledged))
         unacknowledged = [seq for seq in numbers if seq not in self._acknowledged]
         known, loaded = self._items(unacknowledged[: scheduler.lookahead])
@@ -308,17 +347,21 @@ class QueueSender:
         else:
             payload = b"".join(item.payload for item in items)
             attachment = protocol.batch_attachment(items[0].origin, items, done_up_to)
-        replies = session.get(
+        query = _Query(chunks, self._on_end)
+        sent_s = time.monotonic()
+        session.get(
             keys.delivery_query(items[0].key, consumer_of(items[0].queue)),
-            timeout=REPLY_TIMEOUT_S,
+            # Without a thread of its own: it only stores the reply.
+            zenoh.handlers.Callback(query.received, query.ended, indirect=False),
+            timeout=self._scheduler.congestion.timeout_s,
             priority=PRIORITIES[items[0].priority],
             # Waits for the link: a dropped query would cost its whole time-out.
             congestion_control=zenoh.CongestionControl.BLOCK,
             payload=payload,
             attachment=attachment,
         )
-        self._scheduler.query_sent(chunks[0], time.monotonic(), *chunks[1:])
-        self._in_flight.append(_Query(chunks, replies))
+        self._in_flight += 1
+        self._scheduler.query_sent(chunks[0], sent_s, *chunks[1:])
 
     def _publish(self, session: zenoh.Session, item: OutboxItem) -> None:
         """Publish a copy for subscribers, which identify a repeated one by (origin, seq)."""
@@ -335,35 +378,27 @@ class QueueSender:
 
     # Replies
 
-    def _process_replies(self) -> bool:
-        """Process the available replies, oldest query first; return whether there was one."""
-        found = False
-        while self._in_flight:
-            query = self._in_flight[0]
+    def _process_ended(self) -> bool:
+        """Process the queries that have ended; return whether there was one."""
+        found = bool(self._ended)
+        while self._ended:
+            query = self._ended.popleft()
+            self._in_flight -= 1
+            reply = query.reply
+            replied = reply is not None and reply.ok is not None
+            self._scheduler.query_ended(query.chunks[0], time.monotonic(), replied=replied)
             try:
-                received = query.replies.try_recv()
-            except zenoh.ZError as error:
-                raise _NoReplyError("no reply") from error
-            if received is None:
-                break
-            self._in_flight.popleft()
-            self._scheduler.query_ended(query.chunks[0], time.monotonic())
-            self._process(query.chunks, received)
-            found = True
+                self._process(query.chunks, reply)
+            except _NoReplyError as error:
+                # The others can have replies.
+                self._fail(str(error))
         return found
 
-    def _wait_for_reply(self, timeout_s: float) -> None:
-        """Wait for the oldest query's reply, a new record, or the end of the bandwidth limit's wait."""
-        ends_s = time.monotonic() + timeout_s
-        poll_s = POLL_S[0]
-        while not self._wake.is_set() and not self._stop.is_set():
-            if self._process_replies() or time.monotonic() >= ends_s:
-                return
-            self._wake.wait(min(poll_s, max(ends_s - time.monotonic(), 0.0)))
-            poll_s = min(2 * poll_s, POLL_S[1])
-
-    def _process(self, chunks: Sequence[Chunk], received: zenoh.Reply) -> None:
+    def _process(self, chunks: Sequence[Chunk], received: zenoh.Reply | None) -> None:
+        if received is None:
+            raise _NoReplyError("no reply")
         if received.ok is None:
+            self._timed_out = True
             raise _NoReplyError("no reply before the time-out")
         replies = self._unpack(chunks, received.ok.payload.to_bytes())
         for chunk, reply in zip(chunks, replies, strict=True):
@@ -463,10 +498,10 @@ class QueueSender:
         self._store.clear_in_flight(self._queue, *numbers)
 
     def _back_off(self, reason: str) -> None:
-        """Discard the queries in flight and wait; all unconfirmed chunks are sent again."""
-        self.responding = False
-        self._in_flight.clear()
-        self._scheduler.restart()
+        """Wait; all unconfirmed chunks are sent again."""
+        self._scheduler.restart(timed_out=self._timed_out)
+        self._failure = None
+        self._timed_out = False
         for transfer in self._scheduler.active.values():
             if transfer.in_flight and transfer.received == 0:
                 # The consumer has confirmed no part of it: a newer edition may replace it again.

@@ -1,8 +1,8 @@
 """Order and timing of the chunks that are sent to one consumer. Pure: the time is an argument.
 
-The most urgent record is sent first, then the oldest. Urgent records (commands, decisions, advice) wait neither for the
-bandwidth limit nor for a full window, only for the chunk in progress. A bandwidth limit makes chunks smaller, so that
-this wait is short.
+The most urgent record is sent first, then the oldest. Congestion control limits the bytes in flight. Urgent records
+(commands, decisions, advice) have a window of their own and do not wait for the bandwidth limit, only for what is in
+flight. A slow link and a bandwidth limit make chunks smaller, so that this wait is short.
 """
 
 from __future__ import annotations
@@ -12,18 +12,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import islice
 
+from sonarpost.delivery.congestion import CongestionControl
 from sonarpost.delivery.protocol import BATCH_RECORD_OVERHEAD_BYTES, CHUNK_BYTES, MAX_BATCH_RECORDS
 from sonarpost.delivery.records import OutboxItem
 
 WINDOW = 128
 """Maximum number of queries in flight: twice what a consumer commits at once, so that it never waits for the next."""
-WINDOW_BYTES = 8 * CHUNK_BYTES
-"""Initial limit of the bytes in flight: 2 s on a link of 125 kB/s, out of the 5 s time-out of a query."""
-MAX_WINDOW_BYTES = 64 * CHUNK_BYTES
-"""Maximum bytes in flight on a fast link, so that the consumer has records to write at any time."""
-GROW_BELOW_S, SHRINK_ABOVE_S = 0.25, 1.0
-"""Reply times below the first limit increase the bytes in flight; times above the second halve them."""
-LOOKAHEAD = 512
+LOOKAHEAD = 2048
 """Number of records considered if the consumer accepts several in one query."""
 PROBE_WINDOW = 8
 """Number of records considered until the consumer has replied."""
@@ -64,7 +59,7 @@ class RecordTransfer:
 
     @property
     def urgent(self) -> bool:
-        """Whether it is exempt from bandwidth limit and window."""
+        """Whether it is exempt from the bandwidth limit and from the window of other records."""
         return self.item.priority <= URGENT_PRIORITY
 
     @property
@@ -147,28 +142,30 @@ class DeliveryScheduler:
         now_s: Start time, from the monotonic clock that all calls use.
 
     Attributes:
-        chunk_bytes: Maximum chunk size.
+        congestion: Window and time-out of the queries.
         active: Transfers by sequence number.
         probing: Whether the consumer has not replied yet; only one query is then in flight.
         max_batch: Number of records that the consumer accepts in one query.
     """
 
     def __init__(self, bytes_per_s: float | None, now_s: float) -> None:
-        self.chunk_bytes = chunk_bytes_for(bytes_per_s)
+        self.congestion = CongestionControl()
         self.active: dict[int, RecordTransfer] = {}
         self.probing = True
         self.max_batch = 0
         self._order: deque[RecordTransfer] = deque()
         self._order_stale = False
-        self._bytes_in_flight = 0
         self._queries: dict[Chunk, tuple[float, int]] = {}
+        self._bytes_in_flight = self._urgent_bytes_in_flight = 0
+        self._max_chunk_bytes = chunk_bytes_for(bytes_per_s)
         self._bucket: TokenBucket | None = None
-        self._window_bytes = WINDOW_BYTES
         if bytes_per_s is not None:
-            self._bucket = TokenBucket(bytes_per_s, self.chunk_bytes + QUERY_OVERHEAD_BYTES, now_s)
-            # All data in flight must get through a thin link before the time-out of a query.
-            self._window_bytes = int(min(WINDOW_BYTES, max(2 * bytes_per_s, 2 * self.chunk_bytes)))
-        self._initial_window_bytes = self._window_bytes
+            self._bucket = TokenBucket(bytes_per_s, self._max_chunk_bytes + QUERY_OVERHEAD_BYTES, now_s)
+
+    @property
+    def chunk_bytes(self) -> int:
+        """Maximum chunk size, and maximum payload of a query."""
+        return min(self._max_chunk_bytes, self.congestion.query_bytes)
 
     @property
     def lookahead(self) -> int:
@@ -222,10 +219,10 @@ class DeliveryScheduler:
         if self.probing:
             # One query at a time: a consumer that starts during a full window would receive the last records first.
             return in_flight == 0
-        if chunk.transfer.urgent:
-            return in_flight < WINDOW
-        fits = in_flight == 0 or self._bytes_in_flight + chunk.size <= self._window_bytes
-        return fits and in_flight < WINDOW - URGENT_RESERVE
+        sent_bytes = self._urgent_bytes_in_flight if chunk.transfer.urgent else self._bytes_in_flight
+        # Half of a query must fit: smaller ones would consist of headers.
+        fits = sent_bytes == 0 or sent_bytes + self.chunk_bytes / 2 <= self.congestion.window_bytes
+        return fits and in_flight < (WINDOW if chunk.transfer.urgent else WINDOW - URGENT_RESERVE)
 
     def batch_with(self, chunk: Chunk) -> list[Chunk]:
         """Return the chunks of the next query: `chunk`, and complete small records that follow it in order.
@@ -258,21 +255,21 @@ class DeliveryScheduler:
             sent.transfer.in_flight = True
             sent.transfer.sent = max(sent.end, 1)
         size += sum(sent.size for sent in more)
-        self._bytes_in_flight += size
+        self._count(chunk, size)
         self._queries[chunk] = (now_s, size)
         if self._bucket is not None:
             self._bucket.take(size + QUERY_OVERHEAD_BYTES + len(more) * BATCH_RECORD_OVERHEAD_BYTES, now_s)
 
-    def query_ended(self, chunk: Chunk, now_s: float) -> None:
-        """Record that a query has ended, with any result; `chunk` is the first one of the query."""
+    def query_ended(self, chunk: Chunk, now_s: float, *, replied: bool) -> None:
+        """Record that a query has ended, with a reply or without; `chunk` is the first one of the query."""
         sent_s, size = self._queries.pop(chunk)
-        self._bytes_in_flight -= size
-        if self._bucket is not None:
-            return
-        if now_s - sent_s < GROW_BELOW_S:
-            self._window_bytes = min(MAX_WINDOW_BYTES, self._window_bytes + size)
-        elif now_s - sent_s > SHRINK_ABOVE_S:
-            self._window_bytes = max(self.chunk_bytes, self._window_bytes // 2)
+        if replied:
+            self.congestion.replied(size, sent_s, now_s, self._bytes_in_flight)
+        self._count(chunk, -size)
+
+    def _count(self, chunk: Chunk, size_bytes: int) -> None:
+        self._bytes_in_flight += size_bytes
+        self._urgent_bytes_in_flight += size_bytes if chunk.transfer.urgent else 0
 
     def confirm(self, chunk: Chunk, next_offset: int) -> None:
         """Record how much of a record the consumer has; continue there if it did not accept the chunk."""
@@ -288,14 +285,21 @@ class DeliveryScheduler:
         """Remove a transfer that is complete, refused or superseded."""
         self.active.pop(transfer.item.seq, None)
 
-    def restart(self) -> None:
-        """Discard all queries in flight; send again what the consumer has not confirmed, one query at first."""
-        self._bytes_in_flight = 0
+    def restart(self, *, timed_out: bool) -> None:
+        """Send again what the consumer has not confirmed, one query at first. No query is in flight.
+
+        Args:
+            timed_out: Whether a query had no reply before its time-out; otherwise its connection was lost.
+        """
         self._queries.clear()
+        self._bytes_in_flight = self._urgent_bytes_in_flight = 0
         self._order_stale = True
         self.max_batch = 0
-        self._window_bytes = self._initial_window_bytes
         self.probing = True
+        if timed_out:
+            self.congestion.timed_out()
+        else:
+            self.congestion.interrupted()
         for transfer in self.active.values():
             transfer.attempt += 1
             transfer.sent = transfer.received

@@ -99,7 +99,7 @@ class Store:
         self._page_bytes = page_bytes
         self._lock = threading.RLock()
         self._reader_lock = threading.Lock()
-        self._outbox_listeners: list[threading.Event] = []
+        self._outbox_listeners: list[Callable[[], None]] = []
         self._in_flight: set[tuple[str, int]] = set()
         self._watermark = Watermark(path)
         self.lost: LostRecords | None = None
@@ -179,18 +179,18 @@ class Store:
                 raise DeliveryError(f"{self.path}: {_reason(error, self.path)}") from error
             self.states_discarded += tx.states_discarded
         if tx.wrote_outbox:
-            for event in tuple(self._outbox_listeners):
-                event.set()
+            for on_new in tuple(self._outbox_listeners):
+                on_new()
         if tx.wrote_inbox:
             self.inbox_changed.set()
 
-    def add_outbox_listener(self, event: threading.Event) -> None:
-        """Set `event` after each transaction that added a record to the outbox."""
-        self._outbox_listeners.append(event)
+    def add_outbox_listener(self, on_new: Callable[[], None]) -> None:
+        """Call `on_new` after each transaction that added a record to the outbox."""
+        self._outbox_listeners.append(on_new)
 
-    def remove_outbox_listener(self, event: threading.Event) -> None:
-        """Stop setting `event`."""
-        self._outbox_listeners.remove(event)
+    def remove_outbox_listener(self, on_new: Callable[[], None]) -> None:
+        """Stop calling `on_new`."""
+        self._outbox_listeners.remove(on_new)
 
     def _query(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
         """Query the writing connection, after the transaction in progress."""

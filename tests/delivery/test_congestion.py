@@ -1,0 +1,167 @@
+"""Congestion control on simulated links: use of the rate, waiting times, fairness, interruptions, time-outs."""
+
+import pytest
+from builders.link_simulation import Link, Sender, Simulation, records
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonarpost.delivery.congestion import (
+    MAX_TIMEOUT_S,
+    MAX_WINDOW_BYTES,
+    MIN_TIMEOUT_S,
+    START_BYTES,
+    CongestionControl,
+)
+
+RECORD_BYTES = 282
+"""A coded image of 200 bytes as the relay sends it."""
+MORE_THAN_ENOUGH = 6000
+RATES = st.floats(1000, 130_000)
+DELAYS_S = st.floats(0.001, 0.5)
+JITTER = st.floats(0, 0.15)
+"""Part of the delay."""
+
+
+def link(rate_bytes_per_s, delay_s, jitter=0.0):
+    return Link(rate_bytes_per_s, delay_s, jitter * delay_s)
+
+
+def reply_s(rate_bytes_per_s, delay_s, size_bytes=3000):
+    """Time of a query in an empty link."""
+    return 2 * delay_s + size_bytes / rate_bytes_per_s
+
+
+def carried(simulation, seconds):
+    """Part of the rate that the link carries in the next seconds."""
+    before, begins_s = simulation.link.carried_bytes, simulation.now_s
+    simulation.run(begins_s + seconds)
+    return (simulation.link.carried_bytes - before) / simulation.link.rate_bytes_per_s / seconds
+
+
+@settings(max_examples=60, deadline=None)
+@given(RATES, DELAYS_S, JITTER)
+def test_a_link_is_used_and_its_queue_stays_short(rate_bytes_per_s, delay_s, jitter):
+    sender = Sender(records(MORE_THAN_ENOUGH))
+    simulation = Simulation(link(rate_bytes_per_s, delay_s, jitter), sender)
+    simulation.run(15 * reply_s(rate_bytes_per_s, delay_s))
+    seconds = 20 * reply_s(rate_bytes_per_s, delay_s)
+    sender.add(records(int(rate_bytes_per_s * seconds / RECORD_BYTES), first=10**6))
+    assert carried(simulation, seconds) > 0.85
+    free_s = reply_s(rate_bytes_per_s, delay_s, sender.scheduler.chunk_bytes) * (1 + jitter)
+    assert simulation.link.queue_s(simulation.now_s) < 1.2 * free_s + 6000 / rate_bytes_per_s + 0.1
+    assert set(sender.queries.values()) == {1}, "nothing is sent again"
+
+
+@pytest.mark.parametrize("rate_bytes_per_s", [2000, 8000, 16_000, 32_000, 128_000])
+def test_headers_are_a_small_part_of_the_bytes(rate_bytes_per_s):
+    sender = Sender(records(rate_bytes_per_s // 10))
+    simulation = Simulation(link(rate_bytes_per_s, 0.3), sender).run()
+    assert sender.is_done
+    assert simulation.link.carried_bytes < 1.15 * 336 * len(sender.acknowledged_s)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(2000, 130_000), DELAYS_S, st.integers(0, 5))
+def test_a_decision_waits_at_most_two_round_trips(rate_bytes_per_s, delay_s, later):
+    sender = Sender(records(MORE_THAN_ENOUGH))
+    simulation = Simulation(link(rate_bytes_per_s, delay_s), sender)
+    round_trip_s = reply_s(rate_bytes_per_s, delay_s, sender.scheduler.chunk_bytes)
+    queued_s = (15 + later / 3) * round_trip_s
+    simulation.run(queued_s)
+    sender.add(records(1, 250, priority=2, first=10**6))
+    simulation.send(sender)
+    simulation.run(queued_s + 60)
+    assert sender.acknowledged_s[10**6] - queued_s < 2 * round_trip_s + 3000 / rate_bytes_per_s + 0.1
+
+
+def test_a_backlog_of_decisions_obeys_the_window():
+    sender = Sender(records(1000, 250, priority=2))
+    simulation = Simulation(link(8000, 0.3), sender)
+    assert carried(simulation, 20) > 0.8
+    assert simulation.link.queue_s(simulation.now_s) < 1.5
+
+
+@pytest.mark.parametrize("rate_bytes_per_s", [4000, 16_000, 64_000])
+@pytest.mark.parametrize("later_s", [0.0, 25.0])
+def test_two_sites_share_a_link(rate_bytes_per_s, later_s):
+    sites = [Sender(records(60_000)), Sender(records(60_000), begins_s=later_s)]
+    simulation = Simulation(link(rate_bytes_per_s, 0.3), *sites).run(260)
+    before = [len(site.acknowledged_s) for site in sites]
+    simulation.run(460)
+    first, second = (len(site.acknowledged_s) - count for site, count in zip(sites, before, strict=True))
+    assert 0.6 < first / second < 1.7
+    assert simulation.link.queue_s(simulation.now_s) < 3
+
+
+def test_an_interruption_keeps_what_was_learned():
+    sender = Sender(records(60_000))
+    simulation = Simulation(link(32_000, 0.3), sender).run(30)
+    learned_bytes = sender.scheduler.congestion.window_bytes
+    simulation.cut(link(32_000, 0.3))
+    assert sender.scheduler.congestion.window_bytes == START_BYTES
+    simulation.run(32.3)
+    assert sender.scheduler.congestion.window_bytes >= learned_bytes / 2
+    assert carried(simulation, 10) > 0.9
+
+
+def test_a_slower_link_after_an_interruption_is_not_flooded():
+    sender = Sender(records(60_000))
+    simulation = Simulation(link(128_000, 0.3), sender).run(30)
+    simulation.cut(link(2000, 0.3))
+    for end_s in range(31, 60):
+        simulation.run(end_s)
+        assert simulation.link.queue_s(simulation.now_s) < 5
+    assert carried(simulation, 30) > 0.85
+
+
+def test_a_rate_that_falls_causes_no_time_out():
+    sender = Sender(records(60_000))
+    simulation = Simulation(link(128_000, 0.3), sender).run(30)
+    simulation.link.rate_bytes_per_s = 16_000
+    for end_s in range(31, 90):
+        assert simulation.link.queue_s(simulation.now_s) < sender.scheduler.congestion.timeout_s
+        simulation.run(end_s)
+    assert simulation.link.queue_s(simulation.now_s) < 1.5
+    assert carried(simulation, 10) > 0.85
+
+
+def test_a_longer_path_without_an_interruption_is_found():
+    sender = Sender(records(200_000))
+    simulation = Simulation(link(64_000, 0.05), sender).run(30)
+    simulation.link.delay_s = 0.4
+    simulation.run(300)
+    assert carried(simulation, 20) > 0.85
+
+
+def test_time_outs_double_and_a_reply_ends_that():
+    control = CongestionControl()
+    timeouts_s = []
+    for _ in range(8):
+        timeouts_s.append(control.timeout_s)
+        control.timed_out()
+    assert timeouts_s == [min(MIN_TIMEOUT_S * 2**n, MAX_TIMEOUT_S) for n in range(8)]
+    control.replied(2000, 0.0, 1.5, 2000)
+    assert MIN_TIMEOUT_S + 1.5 < control.timeout_s < 2 * MIN_TIMEOUT_S + 12
+
+
+def test_a_window_that_is_not_used_does_not_grow():
+    control = CongestionControl()
+    for number in range(100):
+        control.replied(200, number, number + 0.01, 200)
+    assert control.window_bytes == START_BYTES
+
+
+@given(st.lists(st.tuples(st.sampled_from("rti"), st.floats(0, 100), st.integers(0, 10**6)), max_size=60))
+def test_window_and_time_out_stay_in_their_limits(events):
+    control = CongestionControl()
+    now_s = 0.0
+    for kind, seconds, size_bytes in events:
+        now_s += seconds
+        if kind == "r":
+            control.replied(size_bytes, now_s - seconds, now_s, size_bytes)
+        elif kind == "t":
+            control.timed_out()
+        else:
+            control.interrupted()
+        assert START_BYTES <= control.window_bytes <= MAX_WINDOW_BYTES
+        assert MIN_TIMEOUT_S <= control.timeout_s <= MAX_TIMEOUT_S
