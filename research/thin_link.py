@@ -2,7 +2,7 @@
 
     python -m research.thin_link [--images 60] [--seconds 60]
 
-Two routers with the configurations of `sonarpost pki router-config` are linked by TLS through a relay of TCP that
+Two routers with the configurations of `sonarpost pki router-config` are linked by TLS through a link that
 counts the bytes of each direction. The vessel's services (op_modem, decompressor, relay, console) publish their health
 at the default interval, and a subscriber at the shore's router receives it, as `sonarpost status` does. For each
 setting there are two periods of `--seconds`: without contacts, and with `--images` coded images of 200 bytes, which the
@@ -19,12 +19,9 @@ Headers of TCP and IP are not included. The exit status is 0 if c2 has acknowled
 from __future__ import annotations
 
 import argparse
-import contextlib
 import random
-import socket
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -34,6 +31,7 @@ from pathlib import Path, PurePosixPath
 
 import zenoh
 
+from research.common.link_emulator import LinkEmulator
 from research.fleet import Processes, coded_image, open_session
 from sonarpost import keys
 from sonarpost.bus import router
@@ -80,51 +78,6 @@ def print_row(name: str, cells: Sequence[str]) -> None:
     print(f"{name:24}" + "".join(f"{cell:>14}" for cell in cells), flush=True)
 
 
-class CountingLink:
-    """Relay of TCP connections that counts bytes.
-
-    Args:
-        port: Port to listen on.
-        target: Port to connect to.
-    """
-
-    def __init__(self, port: int, target: int) -> None:
-        self.sent = [0, 0]
-        self._target = target
-        self._sockets: list[socket.socket] = []
-        self._listener = socket.socket()
-        self._listener.bind(("127.0.0.1", port))
-        self._listener.listen()
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def _accept(self) -> None:
-        with contextlib.suppress(OSError):  # closed
-            while True:
-                vessel, _ = self._listener.accept()
-                try:
-                    shore = socket.create_connection(("127.0.0.1", self._target))
-                except ConnectionRefusedError:
-                    vessel.close()
-                    continue
-                self._sockets += [vessel, shore]
-                for direction, (source, sink) in enumerate([(vessel, shore), (shore, vessel)]):
-                    threading.Thread(target=self._pump, args=(direction, source, sink), daemon=True).start()
-
-    def _pump(self, direction: int, source: socket.socket, sink: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            while data := source.recv(65536):
-                self.sent[direction] += len(data)
-                sink.sendall(data)
-        for one in (source, sink):
-            with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        """Close all connections."""
-        for one in (self._listener, *self._sockets):
-            one.close()
-
-
 class HealthTimes:
     """Arrival times of the health reports of the vessel's services, by service."""
 
@@ -165,7 +118,7 @@ class Shore(Service[ServiceConfig]):
 class Sites:
     """The link, c2, the relay, sessions at the vessel's and the shore's router."""
 
-    link: CountingLink
+    link: LinkEmulator
     c2: Shore
     relay: RelayService
     vessel: zenoh.Session
@@ -175,7 +128,8 @@ class Sites:
 @contextmanager
 def linked_sites(folder: Path, setting: Setting) -> Iterator[Sites]:
     """Start routers and services."""
-    shore_tls, shore_local, vessel_local, link_port, modem = free_ports(5)
+    shore_tls, shore_local, vessel_local, modem = free_ports(4)
+    link = LinkEmulator(shore_tls)
     fleet = Fleet.init(folder / "pki", "thin")
     shore_files = PurePosixPath(fleet.issue(SHORE, "shore", ["localhost"]).folder)
     vessel_files = PurePosixPath(fleet.issue(VESSEL, "vessel").folder)
@@ -191,7 +145,7 @@ def linked_sites(folder: Path, setting: Setting) -> Iterator[Sites]:
         RouterOptions(
             VESSEL,
             local=[ends[VESSEL]],
-            connect=[f"tls/localhost:{link_port}"],
+            connect=[f"tls/localhost:{link.port}"],
             files=vessel_files,
             thin_link=setting.thin,
         ),
@@ -204,7 +158,6 @@ def linked_sites(folder: Path, setting: Setting) -> Iterator[Sites]:
         "[console]\nport = 0\n"
     )
     with ExitStack() as stack:
-        link = CountingLink(link_port, shore_tls)
         stack.callback(link.close)
         for options in all_options:
             path = folder / f"{options.platform}.json5"
@@ -248,9 +201,9 @@ def measure(folder: Path, setting: Setting, images: int, seconds: float) -> bool
         at_shore, at_vessel = HealthTimes(sites.shore), HealthTimes(sites.vessel)
         time.sleep(SETTLE_S)
         started_s = time.monotonic()
-        before = tuple(sites.link.sent)
+        before = tuple(sites.link.passed_bytes.values())
         time.sleep(seconds)
-        middle_s, middle = time.monotonic(), tuple(sites.link.sent)
+        middle_s, middle = time.monotonic(), tuple(sites.link.passed_bytes.values())
         for n in range(images):
             stream = random.Random(n).randbytes(STREAM_BYTES)  # a coded stream is not compressible either
             image = coded_image(VESSEL, 1, n, time.time(), stream)
@@ -259,7 +212,7 @@ def measure(folder: Path, setting: Setting, images: int, seconds: float) -> bool
         ends_s = time.monotonic() + START_TIMEOUT_S
         while sites.relay.store.inbox_depth() + sites.relay.store.outbox_depth() and time.monotonic() < ends_s:
             time.sleep(0.1)
-        ended_s, after = time.monotonic(), tuple(sites.link.sent)
+        ended_s, after = time.monotonic(), tuple(sites.link.passed_bytes.values())
         reports = [sum(map(len, times.arrivals.values())) for times in (at_shore, at_vessel)]
         gap_s = at_shore.longest_gap_s(started_s)
         accepted = len(sites.c2.images)

@@ -25,13 +25,13 @@ import tifffile
 
 from builders.chain import latest_versions, send_signal
 from builders.common import REPOSITORY, free_port
-from builders.faulty_link import FaultyLink
 from builders.history import History
 from builders.image_archive import ArchiveLog, name_of
 from builders.image_source import ImageSource, make_image
 from builders.numbered_snippet import number_of, numbered_snippet
 from builders.progress import wait_while_progressing
 from builders.small_disk import SmallDisk
+from research.common.link_emulator import LinkEmulator
 from sonarpost import keys
 from sonarpost.cli.demo.chain import ROUTERS, Chain
 from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
@@ -303,7 +303,7 @@ def chaos_chain(folder):
         ports = (free_port(), free_port(), free_port())
         history = History(folder / "history.jsonl")
         stack.callback(history.close)
-        link = FaultyLink(ports[2], on_fault=lambda fault: history.fault("link", fault))
+        link = LinkEmulator(ports[2], on_fault=lambda fault: history.fault("link", fault))
         stack.callback(link.close)
         settings = ChainSettings(
             folder=folder,

@@ -20,11 +20,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from builders.common import REPOSITORY, WAIT_S, free_port
-from builders.faulty_link import FaultyLink
 from builders.history import History
 from builders.image_archive import ArchiveLog, name_of, side_cars
 from builders.image_source import VESSEL, ImageSource
 from builders.progress import wait_while_progressing
+from research.common.link_emulator import LinkEmulator
 from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig
@@ -46,7 +46,7 @@ class Options:
         vessel_state, shore_state, shore_out: Folders, by default below the folder of the system.
         environment: Additional environment variables, by process.
         shore_prefix: Command that runs the processes of the shore, for example in another network namespace.
-        shore_host: Address of the shore's router; for another host there is no FaultyLink.
+        shore_host: Address of the shore's router; for another host there is no LinkEmulator.
     """
 
     link_bytes_per_s: float | None = None
@@ -89,10 +89,10 @@ class VesselAndShore:
     def __enter__(self):
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.options.shore_host == "127.0.0.1":
-            self.link = FaultyLink(
+            self.link = LinkEmulator(
                 self.ports["router-shore"],
-                self.options.link_bytes_per_s,
-                lambda fault: self.history.fault("link", fault),
+                rate_bytes_per_s=self.options.link_bytes_per_s,
+                on_fault=lambda fault: self.history.fault("link", fault),
             )
         self._write_config()
         for consumer in ("c2", "c2 index"):

@@ -4,8 +4,8 @@ import msgpack
 import pytest
 import zenoh
 from builders.common import eventually, free_port
-from builders.faulty_link import FaultyLink
 
+from research.common.link_emulator import LinkEmulator
 from sonarpost import keys, wire
 from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.bus.session import router_config
@@ -109,7 +109,7 @@ def test_advice_waits_for_an_unreachable_vessel(begin, relay, expert, console, o
 
 def test_advice_arrives_once_after_a_link_cut(begin, runner, platform, expert, out, tmp_path, router):
     """Two routers, linked through a connection that can be cut."""
-    link = FaultyLink(int(router.rpartition(":")[2]))
+    link = LinkEmulator(int(router.rpartition(":")[2]))
     vessel_endpoint = f"tcp/127.0.0.1:{free_port()}"
     vessel_router = zenoh.open(router_config([vessel_endpoint], [f"tcp/127.0.0.1:{link.port}"]))
     aboard = platform("vessel-1").model_copy(update={"router": (vessel_endpoint,)})

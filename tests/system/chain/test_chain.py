@@ -6,8 +6,8 @@ import time
 import pytest
 from builders.chain import latest_versions
 from builders.common import free_port
-from builders.faulty_link import FaultyLink
 
+from research.common.link_emulator import LinkEmulator
 from sonarpost.cli.demo.outcome import read_channel_log, read_images
 from sonarpost.cli.demo.settings import PLATFORM_OF
 
@@ -55,7 +55,7 @@ def test_images_cross_the_chain_and_every_service_stops_cleanly(start_chain):
 
 def test_killed_services_and_a_cut_connection_lose_and_duplicate_nothing(start_chain):
     ports = (free_port(), free_port(), free_port())
-    link = FaultyLink(ports[2])
+    link = LinkEmulator(ports[2])
     try:
         run = start_chain(link="v1", loss=0.3, router_ports=ports, shore_port_for_vessel=link.port)
         for service in PLATFORM_OF:
