@@ -6,7 +6,8 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
@@ -19,7 +20,7 @@ from sonarpost.archive.journal import Accepted, JournalEntry
 from sonarpost.bus.connectivity import declare_presence
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.records import InboxItem, OutboxItem, platform_of, queue_of
+from sonarpost.delivery.records import OutboxItem, platform_of, queue_of
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import DeliveryError, PayloadError, SonarpostError
 from sonarpost.logs import kv
@@ -84,6 +85,8 @@ class C2Service(Service[C2Config]):
         journal_folder = config.out_dir if address is None else platform.state_dir
         self._accepted = AcceptedRecords(self._archive, journal_folder, config.site)
         self._queries = QueryService(self._accepted, config.site, self.count)
+        # A shared database can be slow or absent.
+        self.max_at_once = 1 if address is None else 0
         self._retention = Retention(self._apply_retention, self.stopping)
         self._changed = threading.Event()
         self._changed_names: set[str] = set()
@@ -105,8 +108,6 @@ class C2Service(Service[C2Config]):
         # Of the records that are handled and not committed yet.
         self._to_publish: list[JournalEntry] = []
         self._uncommitted: dict[str, bytes] = {}
-        # Records are added to the archive and flushed by one thread at a time.
-        self._archiving = threading.Lock()
         self._stored_versions = 0
         self._backlog_names = BacklogNames(self.store)
         folder = platform.state_dir / CODEBOOKS
@@ -260,7 +261,8 @@ class C2Service(Service[C2Config]):
             OSError, DeliveryError: They cannot be written.
             ServiceStoppingError: The service stops; they are decoded again after the next start.
         """
-        with self._archiving:
+        # Records are added to the archive and flushed by one thread at a time.
+        with self.handling():
             written = [self._archive.store_image(image, image.last_frame_utc_s) for image in images]
             for entry in entries:
                 self._archive.handled(keys.shore_part(entry.vessel_id, self.config.site), entry.payload)
@@ -289,32 +291,37 @@ class C2Service(Service[C2Config]):
         self.count("images_undecodable")
         log.error("Image cannot be decoded", extra=kv(vessel=entry.vessel_id, reason=reason))
 
-    def _handle_batch(self, items: Sequence[InboxItem]) -> None:
-        with self._archiving:
-            super()._handle_batch(items)
+    @contextmanager
+    def handling(self, *, wait: bool = True) -> Iterator[bool]:
+        """Hold the lock under which records are handled, committed and archived; forget what was not committed."""
+        with super().handling(wait=wait) as is_held:
+            try:
+                yield is_held
+            finally:
+                if is_held:
+                    self._to_publish.clear()
+                    self._uncommitted.clear()
 
     def _store_decision(self, decision: Decision, effects: UnitOfWork) -> None:
         new = self._archive.store_decision(decision)
         effects.count("decisions_stored" if new else "decisions_repeated")
         self._to_publish.append(self._accepted.decision(decision))
 
-    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
-        """Commit after the files of all records are on the disk and published.
+    def before_commit(self) -> None:
+        """Write the files of all records to the disk and publish the records.
 
         Raises:
             OSError, DeliveryError: They cannot be written; all records are handled again.
         """
-        try:
-            self._publish_stored(self._to_publish, self._accepted.flush(self._to_publish))
-            superseded = super().commit_batch(handled)
-        finally:
-            self._to_publish.clear()
-            self._uncommitted.clear()
-        if any(effects.counts.get("images_accepted") for effects, _ in handled):
+        self._publish_stored(self._to_publish, self._accepted.flush(self._to_publish))
+
+    def after_commit(self, handled: Sequence[UnitOfWork], superseded: int) -> None:
+        """Wake the decoder and the retention for new images."""
+        super().after_commit(handled, superseded)
+        if any(effects.counts.get("images_accepted") for effects in handled):
             self.decoding.wake()
-        if any(effects.counts.get("images_stored") for effects, _ in handled):
+        if any(effects.counts.get("images_stored") for effects in handled):
             self._retention.wake()
-        return superseded
 
     # Records for vessels
 

@@ -18,7 +18,7 @@ from sonarpost.bus.connectivity import MonitoredSite, SiteMonitor
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig, TlsConfig
 from sonarpost.delivery.outbox import QueuePolicy
-from sonarpost.delivery.records import InboxItem, OutboxItem, Topic, consumer_of, queue_of
+from sonarpost.delivery.records import OutboxItem, Topic, consumer_of, queue_of
 from sonarpost.delivery.store import DiskReserve
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import MissingBaseError, PayloadError
@@ -107,6 +107,7 @@ class RelayService(Service[RelayConfig]):
 
     NAME = "relay"
     BATCH = 512
+    max_at_once = 32
 
     def __init__(self, platform: PlatformConfig, config: RelayConfig) -> None:
         super().__init__(platform, config)
@@ -116,7 +117,8 @@ class RelayService(Service[RelayConfig]):
             upstream.queue: keys.shore_part(platform.id, upstream.options.site) for upstream in upstreams
         }
         self._stored_versions = 0
-        self._queued: Counter[str] = Counter()  # records for the shore of the batch in progress, by type
+        # Records for the shore of the batch in progress and of the one that is committed, by type.
+        self._queued, self._committing = Counter[str](), Counter[str]()
         self._inboxes = {upstream.queue: keys.shore_inbox(platform.id, upstream.options.site) for upstream in upstreams}
         sites = [self._monitored(upstream) for upstream in upstreams]
         self._site_monitor = SiteMonitor(platform.id, sites, platform.tls)
@@ -303,12 +305,16 @@ class RelayService(Service[RelayConfig]):
                 if not tx.has_topic(queue, name.removeprefix(prefix)):
                     tx.delete_state(name)
 
-    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
-        """Commit, then apply the quota of each site's queue."""
-        queued, self._queued = self._queued, Counter()
-        superseded = super().commit_batch(handled)
-        if queued:
-            log_batch(log, "Records queued for the shore", [effects.payload for effects, _ in handled], **queued)
+    def before_commit(self) -> None:
+        """Begin to count the records of the next batch."""
+        self._committing, self._queued = self._queued, Counter()
+
+    def after_commit(self, handled: Sequence[UnitOfWork], superseded: int) -> None:
+        """Log the queued records, and apply the quota of each site's queue."""
+        super().after_commit(handled, superseded)
+        if self._committing:
+            payloads = [effects.payload for effects in handled]
+            log_batch(log, "Records queued for the shore", payloads, **self._committing)
         for satellite in self._satellites:
             satellite.committed()
         if superseded:
@@ -316,7 +322,6 @@ class RelayService(Service[RelayConfig]):
         for upstream in self._upstreams.values():
             if upstream.options.max_bytes is not None:
                 self._apply_quota(upstream, upstream.options.max_bytes)
-        return superseded
 
     def _apply_quota(self, upstream: Upstream, max_bytes: int) -> None:
         if self.store.queue_depth(upstream.queue).size_bytes <= max_bytes:

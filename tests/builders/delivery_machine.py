@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections import Counter
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
@@ -177,6 +178,7 @@ class Delivery:
         (folder / "consumer").mkdir()
         self.store = open_store(folder / "consumer" / "c.db")
         self.refused = []
+        self.handles_at_once = False
         self.inbox = self._new_inbox()
         self.handled = Counter()
         self.valid = {}
@@ -184,7 +186,22 @@ class Delivery:
         self.serial = 0
 
     def _new_inbox(self):
-        return SteppedInbox(None, self.store, CONSUMER, (), validate, self.refused.append)
+        accepting = self._accepting
+        return SteppedInbox(None, self.store, CONSUMER, (), validate, self.refused.append, accepting=accepting)
+
+    @contextmanager
+    def _accepting(self):
+        handled = []
+
+        def handle(key, payload):
+            if may_handle:
+                handled.append((key, payload))
+            return may_handle
+
+        with self.store.transaction() as tx:
+            may_handle = self.handles_at_once and tx.is_inbox_empty()
+            yield tx, handle
+        self.handled.update(handled)
 
     def _copy(self, store):
         self._copies += 1

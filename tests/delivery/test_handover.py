@@ -2,6 +2,7 @@
 
 import hashlib
 import shutil
+import threading
 from collections import Counter
 
 import msgpack
@@ -22,6 +23,7 @@ from sonarpost.delivery.protocol import (
     unpack_replies,
 )
 from sonarpost.delivery.records import OutboxItem, ReceivedChunk
+from sonarpost.delivery.watermark import read
 from sonarpost.errors import BadInputError, RejectedByDatabaseError, RetryLaterError
 from sonarpost.messages import Decision, Pixels, ReconstructedImage
 from sonarpost.runtime.service import Service
@@ -41,6 +43,8 @@ class Consumer(Service[ServiceConfig]):
         self.got = []
         self.fail_on = {}
         self.full = False
+        self.invalid_states = set()
+        self.threads = {}
 
     def consumed_keys(self):
         return {KEY: Decision}
@@ -55,6 +59,9 @@ class Consumer(Service[ServiceConfig]):
             if isinstance(error, OSError):
                 del self.fail_on[record.decision_id]
             raise error
+        if record.decision_id in self.invalid_states:
+            effects.put_state("name", object())
+        self.threads[record.decision_id] = threading.current_thread().name
         self.got.append(record.decision_id)
 
 
@@ -436,3 +443,50 @@ def test_unexpected_exceptions_do_not_stop_delivery(producer, send, consumer, mo
     eventually(lambda: producer.store.outbox_depth() == 0)
     assert producer.health().counters["acknowledgements_failed"] == 1
     assert min(failed.values()) >= 1
+
+
+@pytest.fixture
+def consumer_at_once(begin, monkeypatch):
+    monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.0)
+    monkeypatch.setattr(Consumer, "max_at_once", 2)
+    return begin()
+
+
+def test_first_records_are_handled_in_the_transaction_that_accepts_them(consumer_at_once, ask, runner, begin):
+    items = [item(n, decision(n)) for n in range(1, 5)]
+    for _ in range(2):
+        assert ask(items) == (AckReply("stored"),) * 4
+        eventually(lambda: consumer_at_once.got == ["d1", "d2", "d3", "d4"])
+    eventually(lambda: consumer_at_once.store.inbox_depth() == 0)
+    assert list(consumer_at_once.threads.values()) == ["inbox-consumer"] * 2 + ["work"] * 2
+    eventually(lambda: consumer_at_once.health().counters["records_handled"] == 4)
+    # All have a number, with which a later start finds that their commit was lost.
+    assert read(consumer_at_once.store.path).inbox.last == 4
+    runner.stop(consumer_at_once)
+    assert begin().store.lost is None
+
+
+def test_record_that_cannot_be_handled_when_it_is_accepted_waits_in_the_inbox(consumer_at_once, ask, refused):
+    consumer_at_once.fail_on = {"d1": OSError(28, "No space left on device"), "d3": BadInputError("here", "f", 1, "2")}
+    assert ask([item(1, decision(1)), item(2, decision(2))]) == (AckReply("stored"),) * 2
+    eventually(lambda: consumer_at_once.got == ["d1", "d2"])
+    assert set(consumer_at_once.threads.values()) == {"work"}
+    eventually(lambda: consumer_at_once.store.inbox_depth() == 0)
+    assert ask([item(3, decision(3))]).status == "stored"
+    eventually(lambda: [key for key, _ in refused(consumer_at_once)] == [KEY])
+    assert consumer_at_once.store.inbox_depth() == 0
+
+
+def test_record_whose_effects_cannot_be_written_is_accepted_once(consumer_at_once, ask):
+    consumer_at_once.invalid_states = {"d1"}
+    assert ask([item(1, decision(1))]).status == "stored"
+    eventually(lambda: consumer_at_once.health().state == "degraded")
+    # It waits, and no later record is handled before it is.
+    assert ask([item(2, decision(2))]).status == "stored"
+    eventually(lambda: "d2" in consumer_at_once.got)
+    assert set(consumer_at_once.threads.values()) <= {"inbox-consumer", "work"}
+    assert consumer_at_once.threads["d2"] == "work"
+    consumer_at_once.invalid_states.clear()
+    eventually(lambda: consumer_at_once.store.inbox_depth() == 0)
+    eventually(lambda: consumer_at_once.health().counters["records_handled"] == 2)
+    assert consumer_at_once.store.refused_count() == 0

@@ -168,6 +168,11 @@ class DeliveryFaults(RuleBasedStateMachine):
     def kill_consumer(self):
         self.delivery.kill_consumer()
 
+    @rule(at_once=st.booleans())
+    def handle_at_once(self, at_once):
+        """From then on, handle records in the transaction that accepts them, or only later."""
+        self.delivery.handles_at_once = at_once
+
     @rule(limit=st.integers(1, 5))
     def handle(self, limit):
         self.delivery.handle(limit)

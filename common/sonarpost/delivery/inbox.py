@@ -7,7 +7,7 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Collection, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 
 import zenoh
@@ -39,6 +39,10 @@ MAX_REASON = 200
 
 Replies = AckReply | list[AckReply]
 """Reply to a query; for a batch, one for each record."""
+Handle = Callable[[str, bytes], bool]
+"""Handles an accepted record, as key and payload, in the open transaction; False if it has to wait in the inbox."""
+Accepting = Callable[[], AbstractContextManager[tuple[Transaction, Handle]]]
+"""Opens a transaction that accepts records and can handle them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +53,10 @@ class _Message:
     payload: bytes
     attachment: bytes
     query: zenoh.Query | None
+
+
+def _wait(_key: str, _payload: bytes) -> bool:
+    return False
 
 
 class Inbox:
@@ -71,6 +79,7 @@ class Inbox:
         delivery_only_keys: Key expressions on which plain publications are ignored.
         before_commit: Called with the accepted records, as key and payload, before they are committed and acknowledged;
             raises DeliveryError to leave them with their senders.
+        accepting: Opens the transactions that accept records, which also handle them; by default none is handled.
 
     Attributes:
         storage_failing: Whether records cannot be stored at present, for example because of a full disk.
@@ -89,6 +98,7 @@ class Inbox:
         check_capacity: Callable[[str], None] = lambda _: None,
         delivery_only_keys: Collection[str] = (),
         before_commit: Callable[[Sequence[tuple[str, bytes]]], None] = lambda _: None,
+        accepting: Accepting | None = None,
     ) -> None:
         self._store = store
         self._key_suffix = "/handoff/" + consumer
@@ -97,6 +107,8 @@ class Inbox:
         self._expand = expand
         self._check_capacity = check_capacity
         self._before_commit = before_commit
+        self._accepting = accepting
+        self._handle: Handle = _wait
         self._accepted: list[tuple[str, bytes]] = []
         self._messages: queue.Queue[_Message] = queue.Queue(QUEUE_LIMIT)
         self._stop = threading.Event()
@@ -191,13 +203,8 @@ class Inbox:
 
     def _commit(self, messages: list[_Message]) -> list[Replies]:
         """Store several messages in one transaction, which share one write to the disk; after a failure in halves."""
-        self._no_capacity.clear()
-        self._accepted.clear()
         try:
-            with self._store.transaction() as tx:
-                replies = [self._store_message(tx, message) for message in messages]
-                if self._accepted:
-                    self._before_commit(self._accepted)
+            replies = self._commit_together(messages)
         except Exception as error:
             if not self.storage_failing:
                 log.exception("Records cannot be stored; senders keep them", extra=kv(error=str(error)))
@@ -218,7 +225,28 @@ class Inbox:
         self.storage_failing = False
         return replies
 
+    def _commit_together(self, messages: list[_Message]) -> list[Replies]:
+        if self._accepting is not None:
+            try:
+                with self._accepting() as (tx, self._handle):
+                    return self._store_messages(tx, messages)
+            except Exception as error:  # noqa: BLE001 - an error of the transaction is raised again below
+                # A record can be the cause: without handling it, it is accepted, and handled as others are.
+                log.debug("Records not handled when accepted", extra=kv(error=str(error)))
+            finally:
+                self._handle = _wait
+        with self._store.transaction() as tx:
+            return self._store_messages(tx, messages)
+
     # Store
+
+    def _store_messages(self, tx: Transaction, messages: list[_Message]) -> list[Replies]:
+        self._no_capacity.clear()
+        self._accepted.clear()
+        replies = [self._store_message(tx, message) for message in messages]
+        if self._accepted:
+            self._before_commit(self._accepted)
+        return replies
 
     def _store_message(self, tx: Transaction, message: _Message) -> Replies:
         if message.query is None:
@@ -297,7 +325,7 @@ class Inbox:
                 # An unexpected exception must neither block later records nor lose this one.
                 log.exception("Record quarantined after an unexpected exception", extra=kv(key=key))
                 return self._quarantine(tx, key, payload, f"{type(error).__name__}: {error}")
-        tx.accept(key, stored, chunk)
+        tx.accept(key, stored, chunk, is_handled=self._handle(key, stored))
         self._accepted.append((key, stored))
         return AckReply("stored")
 

@@ -173,8 +173,8 @@ class Store:
                     self._db.execute("BEGIN IMMEDIATE")
                     yield tx
                     tx.flush()
-                if tx.assigned or tx.wrote_inbox:
-                    self._watermark.committed(self._db, tx.assigned.items(), inbox=tx.wrote_inbox)
+                if tx.assigned or tx.numbered_inbox:
+                    self._watermark.committed(self._db, tx.assigned.items(), inbox=tx.numbered_inbox)
             except sqlite3.Error as error:
                 raise DeliveryError(f"{self.path}: {_reason(error, self.path)}") from error
             self.states_discarded += tx.states_discarded
@@ -446,7 +446,9 @@ class DiskReserve:
         return self._check() if self._reached else ""
 
     def _check(self) -> str:
-        free_bytes = self.free_bytes()
+        free_bytes = shutil.disk_usage(self._store.path.parent).free
+        if free_bytes < self._reserve_bytes:
+            free_bytes = self.free_bytes()
         self._reached = free_bytes < self._reserve_bytes
         if not self._reached:
             return ""

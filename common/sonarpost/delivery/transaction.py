@@ -112,7 +112,8 @@ class Transaction:
 
     Attributes:
         wrote_outbox: Whether a record was added to the outbox.
-        wrote_inbox: Whether a record was added to the inbox.
+        wrote_inbox: Whether a record was added to the inbox and has to be handled.
+        numbered_inbox: Whether a record was accepted, and handled or not.
         superseded: Number of queued records that newer editions replaced.
         states_discarded: Number of states that could not be read.
     """
@@ -128,7 +129,7 @@ class Transaction:
         self._in_flight = in_flight
         self._has_legacy_windows = has_legacy_windows
         self.wrote_outbox = False
-        self.wrote_inbox = False
+        self.wrote_inbox = self.numbered_inbox = False
         self.superseded = self.states_discarded = 0
         self._windows: dict[tuple[str, bytes], DuplicateWindow] = {}
         self._numbers: dict[str, tuple[int, bytes]] = {}
@@ -137,6 +138,7 @@ class Transaction:
         self._new_inbox: list[tuple[object, ...]] = []
         self._partial_records = PartialRecords(connection)
         self._handled: list[int] = []
+        self._handled_at_once = 0
 
     @property
     def assigned(self) -> dict[str, int]:
@@ -152,6 +154,12 @@ class Transaction:
         for first, last in runs(self._handled):
             self._db.execute("DELETE FROM inbox WHERE id BETWEEN ? AND ?", (first, last))
         self._handled.clear()
+        if self._handled_at_once:
+            # They have numbers as well, by which the watermark shows that their commit was lost.
+            sql = "UPDATE sqlite_sequence SET seq = seq + ? WHERE name = 'inbox'"
+            if self._db.execute(sql, (self._handled_at_once,)).rowcount == 0:
+                self._db.execute("INSERT INTO sqlite_sequence VALUES ('inbox', ?)", (self._handled_at_once,))
+            self._handled_at_once = 0
         for window in self._windows.values():
             window.write()
 
@@ -290,17 +298,26 @@ class Transaction:
 
     # Inbox
 
-    def accept(self, key: str, payload: bytes, chunk: ReceivedChunk | None = None) -> None:
+    def is_inbox_empty(self) -> bool:
+        """Return whether every record that was accepted before this transaction is handled."""
+        return self._db.execute("SELECT 1 FROM inbox LIMIT 1").fetchone() is None
+
+    def accept(self, key: str, payload: bytes, chunk: ReceivedChunk | None = None, *, is_handled: bool = False) -> None:
         """Add a record to the inbox.
 
         Args:
             key: Key expression of the record.
             payload: The complete record.
             chunk: The last chunk of the record, which identifies it; None for a plain publication.
+            is_handled: It is handled in this transaction: only its identity is stored.
         """
         origin, seq = (None, None) if chunk is None else (chunk.origin, chunk.seq)
         if chunk is not None:
             self._window(key, chunk.origin).add(chunk.seq, chunk.sha256, chunk.done_up_to)
+        self.numbered_inbox = True
+        if is_handled:
+            self._handled_at_once += 1
+            return
         self._new_inbox.append((key, payload, origin, seq, time.time()))
         self.wrote_inbox = True
 

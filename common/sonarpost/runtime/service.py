@@ -16,7 +16,8 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar, Final, Generic, TypeVar
@@ -26,7 +27,7 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.bus.session import lost_reason, open_with_retry
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.delivery.inbox import Inbox
+from sonarpost.delivery.inbox import Handle, Inbox
 from sonarpost.delivery.outbox import Outbox, QueuePolicy
 from sonarpost.delivery.records import InboxItem, OutboxItem
 from sonarpost.delivery.store import HANDLING_RESERVE_BYTES, DiskReserve, Store
@@ -81,6 +82,8 @@ class Service(ABC, Generic[C]):
         PUBLISH: Whether queued records are also published on their keys for subscribers.
         BATCH: Maximum number of records that are committed in one transaction. Above 1, a power cut can repeat the
             side effects of `handle` outside the `UnitOfWork` for a whole batch.
+        max_at_once: Maximum number of records that are handled in the transaction that accepts them, while no earlier
+            record waits; 0 if `handle` is slow or must not be called inside a transaction.
         BATCH_BYTES: Maximum size of the records of one batch; it bounds the write-ahead log.
         PAGE_BYTES: Page size of the store; small pages for a service whose transactions change few bytes.
     """
@@ -90,6 +93,7 @@ class Service(ABC, Generic[C]):
     BATCH: ClassVar[int] = 1
     BATCH_BYTES: ClassVar[int] = 2 * 1024 * 1024
     PAGE_BYTES: ClassVar[int] = 4096
+    max_at_once: int = 0
 
     def __init__(self, platform: PlatformConfig, config: C) -> None:
         self.platform = platform
@@ -113,6 +117,8 @@ class Service(ABC, Generic[C]):
         self._interval_logs: list[IntervalLog] = []
         self._refusal_logs: dict[str, IntervalLog] = {}
         self._failed_alone: dict[int, int] = {}
+        self._handling_lock = threading.Lock()
+        self._checked: tuple[bytes, Record | None] = (b"", None)
         self._heartbeat = Heartbeat.from_environment(os.environ, platform.state_dir, platform.health_interval_s)
         self._manager = ServiceManager.from_environment(os.environ, platform.health_interval_s)
 
@@ -265,6 +271,7 @@ class Service(ABC, Generic[C]):
                 check_capacity=self.check_capacity,
                 delivery_only_keys=self.delivery_only_keys(),
                 before_commit=self.before_accepting,
+                accepting=self._accepting if self.max_at_once else None,
             )
             self.start_thread(self._work, "work")
         self.on_start()
@@ -321,7 +328,9 @@ class Service(ABC, Generic[C]):
         raise BadInputError(key, "", key, "a key this service consumes: " + ", ".join(self.consumed_keys()))
 
     def _check_payload(self, key: str, payload: bytes) -> None:
-        self.validate(key, wire.decode(self._record_type(key), payload, key))
+        record = wire.decode(self._record_type(key), payload, key)
+        self.validate(key, record)
+        self._checked = payload, record
 
     def _refused(self, error: BadInputError) -> None:
         self.count("records_refused")
@@ -402,7 +411,49 @@ class Service(ABC, Generic[C]):
             raise failed[0][1]
         return bool(items)
 
+    @contextmanager
+    def handling(self, *, wait: bool = True) -> Iterator[bool]:
+        """Hold the lock under which records are handled and committed; yield False if it is not free and not `wait`."""
+        is_held = self._handling_lock.acquire(blocking=wait)
+        try:
+            yield is_held
+        finally:
+            if is_held:
+                self._handling_lock.release()
+
+    @contextmanager
+    def _accepting(self) -> Iterator[tuple[Transaction, Handle]]:
+        """Open a transaction that accepts records, and handles the first ones unless earlier ones wait."""
+        handled: list[UnitOfWork] = []
+        with self.handling(wait=False) as is_held:
+            with self.store.transaction() as tx:
+                limit = self.max_at_once if is_held and tx.is_inbox_empty() else 0
+
+                def handle(key: str, payload: bytes) -> bool:
+                    nonlocal limit
+                    if len(handled) >= limit:
+                        return False
+                    try:
+                        handled.append(self._call_handle(key, payload))
+                    except Exception as error:  # noqa: BLE001 - raised again when it is handled in its turn
+                        # Later records do not overtake it.
+                        log.debug("Record not handled when accepted", extra=kv(key=key, error=str(error)))
+                        limit = 0
+                    return bool(limit)
+
+                yield tx, handle
+                if handled:
+                    self.before_commit()
+                for effects in handled:
+                    effects.write(tx)
+            if handled:
+                self.after_commit(handled, tx.superseded)
+
     def _handle_batch(self, items: Sequence[InboxItem]) -> None:
+        with self.handling():
+            self._handle_locked(items)
+
+    def _handle_locked(self, items: Sequence[InboxItem]) -> None:
         if self.BATCH == 1:
             for item in items:
                 self._handle_item(item)
@@ -425,11 +476,9 @@ class Service(ABC, Generic[C]):
 
     def _effects_of(self, item: InboxItem) -> UnitOfWork | None:
         """Handle a record; return its effects, or None if it was quarantined."""
-        effects = UnitOfWork(item.payload)
         with log_context(item.payload):
             try:
-                record = wire.decode(self._record_type(item.key), item.payload, item.key)
-                self.handle(item.key, record, effects)
+                return self._call_handle(item.key, item.payload)
             except (OSError, DeliveryError, MemoryError, ServiceStoppingError):
                 raise
             except BadInputError as error:
@@ -442,6 +491,15 @@ class Service(ABC, Generic[C]):
                 self.count("records_failed")
                 self._quarantine_record(item, f"{type(error).__name__}: {error}")
                 return None
+
+    def _call_handle(self, key: str, payload: bytes) -> UnitOfWork:
+        effects = UnitOfWork(payload)
+        # The inbox has just decoded a record that is handled at once.
+        checked, record = self._checked
+        if record is None or checked is not payload:
+            record = wire.decode(self._record_type(key), payload, key)
+        with log_context(payload):
+            self.handle(key, record, effects)
         effects.count("records_handled")
         return effects
 
@@ -460,16 +518,32 @@ class Service(ABC, Generic[C]):
         Returns:
             Number of queued records that were replaced by newer editions.
         """
+        self.before_commit()
         with self.store.transaction() as tx:
             for effects, item in handled:
                 effects.write(tx)
                 if item is not None:
                     tx.remove_handled(item)
-        with self._counter_lock:
-            for effects, _ in handled:
-                for name, by in effects.counts.items():
-                    self._counters[name] += by
+        self.after_commit([effects for effects, _ in handled], tx.superseded)
         return tx.superseded
+
+    def before_commit(self) -> None:
+        """Do what has to precede the commit of handled records; by default nothing.
+
+        Raises:
+            OSError, DeliveryError: The records are handled again.
+        """
+
+    def after_commit(self, handled: Sequence[UnitOfWork], superseded: int) -> None:
+        """Count what was committed; a subclass extends it.
+
+        Args:
+            handled: The committed units of work.
+            superseded: Number of queued records that were replaced by newer editions.
+        """
+        with self._counter_lock:
+            for effects in handled:
+                self._counters.update(effects.counts)
 
     def publish(self, key: str, record: Record) -> bool:
         """Publish a record for subscribers, without durable delivery; return whether Zenoh has taken it."""
