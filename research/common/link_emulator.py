@@ -31,15 +31,15 @@ class SerialLine:
     order.
 
     Args:
-        rate_bytes_per_s: Above 0; None for no limit.
-        delay_s: Time of a byte on the line, 0 or more.
+        rate_bytes_per_s: Above 0; None for no limit. It can be changed.
+        delay_s: Time of a byte on the line, 0 or more. It can be changed.
         jitter_s: Largest additional delay, uniformly distributed from 0.
         seed: Of the jitter.
     """
 
     def __init__(self, rate_bytes_per_s: float | None, delay_s: float, jitter_s: float, seed: int) -> None:
-        self._s_per_byte = 0.0 if rate_bytes_per_s is None else 1 / rate_bytes_per_s
-        self._delay_s = delay_s
+        self.rate_bytes_per_s = rate_bytes_per_s
+        self.delay_s = delay_s
         self._jitter_s = jitter_s
         self._random = random.Random(seed)
         self.clear()
@@ -48,10 +48,15 @@ class SerialLine:
         """Discard the packets on the line."""
         self._free_at_s = self._last_arrival_s = float("-inf")
 
+    def queue_s(self, now_s: float) -> float:
+        """Return how long the packets on the line still occupy it."""
+        return max(0.0, self._free_at_s - now_s)
+
     def arrival_s(self, size_bytes: int, now_s: float) -> float:
         """Return the time of arrival of a packet that waits for the line from now on."""
-        self._free_at_s = max(now_s, self._free_at_s) + size_bytes * self._s_per_byte
-        arrival_s = self._free_at_s + self._delay_s + self._random.uniform(0.0, self._jitter_s)
+        duration_s = 0.0 if self.rate_bytes_per_s is None else size_bytes / self.rate_bytes_per_s
+        self._free_at_s = max(now_s, self._free_at_s) + duration_s
+        arrival_s = self._free_at_s + self.delay_s + self._random.uniform(0.0, self._jitter_s)
         self._last_arrival_s = max(self._last_arrival_s, arrival_s)
         return self._last_arrival_s
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import heapq
 import itertools
-import random
-from dataclasses import dataclass, field
 
+from research.common.link_emulator import SerialLine
 from sonarpost.delivery.protocol import BATCH_RECORD_OVERHEAD_BYTES
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.scheduler import DeliveryScheduler
@@ -20,41 +19,12 @@ QUERY_BYTES = 170
 REPLY_BYTES = 120
 
 
-@dataclass
 class Link:
-    """One link with two directions.
+    """A line in each direction."""
 
-    Attributes:
-        rate_bytes_per_s: Rate of each direction.
-        delay_s: Time of each direction, without transmission and jitter.
-        jitter_s: Maximum additional time.
-    """
-
-    rate_bytes_per_s: float
-    delay_s: float
-    jitter_s: float = 0.0
-    seed: int = 1
-    _free_s: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    _arrived_s: list[float] = field(default_factory=lambda: [0.0, 0.0])
-
-    def __post_init__(self):
-        self._draws = random.Random(self.seed)
+    def __init__(self, rate_bytes_per_s, delay_s, jitter_s=0.0):
+        self.up, self.down = (SerialLine(rate_bytes_per_s, delay_s, jitter_s, seed) for seed in (1, 2))
         self.carried_bytes = 0
-
-    def arrival_s(self, direction, size_bytes, now_s):
-        """Send data; return when it has arrived."""
-        begins_s = max(now_s, self._free_s[direction])
-        duration_s = size_bytes / self.rate_bytes_per_s
-        self._free_s[direction] = begins_s + duration_s
-        if direction == 0:
-            self.carried_bytes += size_bytes
-        arrives_s = self._free_s[direction] + self.delay_s + self._draws.uniform(0, self.jitter_s)
-        self._arrived_s[direction] = max(arrives_s, self._arrived_s[direction])
-        return self._arrived_s[direction]
-
-    def queue_s(self, now_s):
-        """Return how long the data that waits for the link occupies it."""
-        return max(0.0, self._free_s[0] - now_s)
 
 
 class Sender:
@@ -148,14 +118,16 @@ class Simulation:
                 seq = each.transfer.item.seq
                 sender.queries[seq] = sender.queries.get(seq, 0) + 1
             size = sum(each.size + BATCH_RECORD_OVERHEAD_BYTES for each in chunks) + QUERY_BYTES
-            arrives_s = self.link.arrival_s(0, size, self.now_s)
+            self.link.carried_bytes += size
+            arrives_s = self.link.up.arrival_s(size, self.now_s)
             # A commit in progress ends first.
             self._committed_s = max(arrives_s, self._committed_s) + self._commit_s
             self.at(self._committed_s, self._reply, sender, sender.epoch, chunks)
 
     def _reply(self, sender, epoch, chunks):
         if epoch == sender.epoch:
-            self.at(self.link.arrival_s(1, REPLY_BYTES + 8 * len(chunks), self.now_s), self._end, sender, epoch, chunks)
+            arrives_s = self.link.down.arrival_s(REPLY_BYTES + 8 * len(chunks), self.now_s)
+            self.at(arrives_s, self._end, sender, epoch, chunks)
 
     def _end(self, sender, epoch, chunks):
         if epoch != sender.epoch:

@@ -35,7 +35,7 @@ def carried(simulation, seconds):
     """Part of the rate that the link carries in the next seconds."""
     before, begins_s = simulation.link.carried_bytes, simulation.now_s
     simulation.run(begins_s + seconds)
-    return (simulation.link.carried_bytes - before) / simulation.link.rate_bytes_per_s / seconds
+    return (simulation.link.carried_bytes - before) / simulation.link.up.rate_bytes_per_s / seconds
 
 
 @settings(max_examples=60, deadline=None)
@@ -48,7 +48,7 @@ def test_a_link_is_used_and_its_queue_stays_short(rate_bytes_per_s, delay_s, jit
     sender.add(records(int(rate_bytes_per_s * seconds / RECORD_BYTES), first=10**6))
     assert carried(simulation, seconds) > 0.85
     free_s = reply_s(rate_bytes_per_s, delay_s, sender.scheduler.chunk_bytes) * (1 + jitter)
-    assert simulation.link.queue_s(simulation.now_s) < 1.2 * free_s + 6000 / rate_bytes_per_s + 0.1
+    assert simulation.link.up.queue_s(simulation.now_s) < 1.2 * free_s + 6000 / rate_bytes_per_s + 0.1
     assert set(sender.queries.values()) == {1}, "nothing is sent again"
 
 
@@ -78,7 +78,7 @@ def test_a_backlog_of_decisions_obeys_the_window():
     sender = Sender(records(1000, 250, priority=2))
     simulation = Simulation(link(8000, 0.3), sender)
     assert carried(simulation, 20) > 0.8
-    assert simulation.link.queue_s(simulation.now_s) < 1.5
+    assert simulation.link.up.queue_s(simulation.now_s) < 1.5
 
 
 @pytest.mark.parametrize("rate_bytes_per_s", [4000, 16_000, 64_000])
@@ -90,7 +90,7 @@ def test_two_sites_share_a_link(rate_bytes_per_s, later_s):
     simulation.run(460)
     first, second = (len(site.acknowledged_s) - count for site, count in zip(sites, before, strict=True))
     assert 0.6 < first / second < 1.7
-    assert simulation.link.queue_s(simulation.now_s) < 3
+    assert simulation.link.up.queue_s(simulation.now_s) < 3
 
 
 def test_an_interruption_keeps_what_was_learned():
@@ -110,25 +110,37 @@ def test_a_slower_link_after_an_interruption_is_not_flooded():
     simulation.cut(link(2000, 0.3))
     for end_s in range(31, 60):
         simulation.run(end_s)
-        assert simulation.link.queue_s(simulation.now_s) < 5
+        assert simulation.link.up.queue_s(simulation.now_s) < 5
     assert carried(simulation, 30) > 0.85
 
 
 def test_a_rate_that_falls_causes_no_time_out():
     sender = Sender(records(60_000))
     simulation = Simulation(link(128_000, 0.3), sender).run(30)
-    simulation.link.rate_bytes_per_s = 16_000
+    simulation.link.up.rate_bytes_per_s = 16_000
     for end_s in range(31, 90):
-        assert simulation.link.queue_s(simulation.now_s) < sender.scheduler.congestion.timeout_s
+        assert simulation.link.up.queue_s(simulation.now_s) < sender.scheduler.congestion.timeout_s
         simulation.run(end_s)
-    assert simulation.link.queue_s(simulation.now_s) < 1.5
+    assert simulation.link.up.queue_s(simulation.now_s) < 1.5
     assert carried(simulation, 10) > 0.85
+
+
+def test_a_slower_link_after_a_pause_is_not_flooded():
+    sender = Sender(records(4000))
+    simulation = Simulation(link(500_000, 0.02), sender).run(30)
+    assert sender.is_done
+    simulation.link.up.rate_bytes_per_s = 2000
+    sender.add(records(1000, first=10**6))
+    simulation.send(sender)
+    for end_s in range(31, 60):
+        simulation.run(end_s)
+        assert simulation.link.up.queue_s(simulation.now_s) < 5
 
 
 def test_a_longer_path_without_an_interruption_is_found():
     sender = Sender(records(200_000))
     simulation = Simulation(link(64_000, 0.05), sender).run(30)
-    simulation.link.delay_s = 0.4
+    simulation.link.up.delay_s = 0.4
     simulation.run(300)
     assert carried(simulation, 20) > 0.85
 
@@ -141,7 +153,7 @@ def test_time_outs_double_and_a_reply_ends_that():
         control.timed_out()
     assert timeouts_s == [min(MIN_TIMEOUT_S * 2**n, MAX_TIMEOUT_S) for n in range(8)]
     control.replied(2000, 0.0, 1.5, 2000)
-    assert MIN_TIMEOUT_S + 1.5 < control.timeout_s < 2 * MIN_TIMEOUT_S + 12
+    assert MIN_TIMEOUT_S + 1.5 < control.timeout_s < MIN_TIMEOUT_S + 15
 
 
 def test_a_window_that_is_not_used_does_not_grow():

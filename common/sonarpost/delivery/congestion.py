@@ -25,11 +25,13 @@ STEP_BYTES, GROWTH = 1024, 1 / 8
 """Growth of the window with each round trip: this number, and a part of the window. The number makes windows equal that
 share a link."""
 RESUME_FACTOR = 3
-"""Growth after an interruption, per byte acknowledged: the window is fourfold after each round trip."""
+"""Growth after an interruption or a pause, per byte acknowledged: the window is fourfold after each round trip."""
+PAUSE_S = 10.0
+"""Time without a reply after which the window is small again: the rate can have changed."""
 MEASURE_EVERY_S = 120.0
 """Interval at which the shortest reply time is measured again, with the first window: at multiples of it, so that all
 queues of a host do it at the same time and find an empty link."""
-MIN_TIMEOUT_S, MAX_TIMEOUT_S = 10.0, 300.0
+MIN_TIMEOUT_S, MAX_TIMEOUT_S = 30.0, 300.0
 TIMEOUT_FACTOR = 8
 """Longest reply times in a time-out: the rate of a radio link can fall by this factor."""
 FADE = 0.9
@@ -51,6 +53,7 @@ class CongestionControl:
         self._doubling = True
         self._is_first = True
         self._resume_bytes = 0.0
+        self._replied_s = math.inf
         self._period = math.inf
         self._measured_s = math.inf
         self._measuring_until_s = 0.0
@@ -68,6 +71,11 @@ class CongestionControl:
         """Time-out of the next query; much longer than a reply takes, because a broken connection ends a query."""
         return min((MIN_TIMEOUT_S + TIMEOUT_FACTOR * self._longest_s) * 2.0**self._timeouts, MAX_TIMEOUT_S)
 
+    def begins(self, now_s: float) -> None:
+        """Prepare for a query while no other is in flight."""
+        if now_s - self._replied_s > PAUSE_S:
+            self._restart(max(self._resume_bytes, self.window_bytes))
+
     def replied(self, size_bytes: int, sent_s: float, now_s: float, in_flight_bytes: int) -> None:
         """Use the reply to a query.
 
@@ -78,10 +86,12 @@ class CongestionControl:
             in_flight_bytes: Payload in flight before the reply, with the query's own.
         """
         reply_s = now_s - sent_s
+        self._replied_s = now_s
         self._timeouts = 0
         self._longest_s = max(reply_s, FADE * self._longest_s)
         if self._is_first and reply_s > 2 * self._free_s:
-            self._shortest_s = reply_s  # another path: nothing else was in flight
+            # Another path: nothing else was in flight.
+            self._shortest_s, self._resume_bytes = reply_s, 0.0
         self._is_first = False
         self._shortest_s = min(self._shortest_s, reply_s)
         self._round_s = min(self._round_s, reply_s)

@@ -204,6 +204,8 @@ class DeliveryScheduler:
         transfer = self._first_waiting()
         if transfer is None:
             return None, None
+        if not self._queries:
+            self.congestion.begins(now_s)
         end = min(transfer.sent + self.chunk_bytes, len(transfer.item.payload))
         chunk = Chunk(transfer, transfer.sent, end, transfer.attempt)
         if not self._fits_window(chunk):
