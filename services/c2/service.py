@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 import uuid
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -108,7 +109,7 @@ class C2Service(Service[C2Config]):
         # Of the records that are handled and not committed yet.
         self._to_publish: list[JournalEntry] = []
         self._uncommitted: dict[str, bytes] = {}
-        self._stored_versions = 0
+        self._stored_versions = Counter[str]()
         self._backlog_names = BacklogNames(self.store)
         folder = platform.state_dir / CODEBOOKS
         self.decoding = Decoding(
@@ -170,19 +171,27 @@ class C2Service(Service[C2Config]):
         if not image_parts.is_part(key):
             return payload
         prefix = f"{VERSIONS}{keys.part_vessel(key)}/"
-        name = image_parts.version_name(prefix, payload)
+        part = image_parts.head_of(payload)
+        name = prefix + part.subject
+        if part.version == 1:
+            tx.add_state(name, payload)  # a stored one is the same version or a later one
+            self._prune_versions(tx, prefix)
+            return payload
         known = image_parts.stored_version(tx.get_state(name), name)
-        if not image_parts.is_whole(payload):
+        if part.base:
             whole = image_parts.expand(wire.decode(ImagePart, payload, key), known, key)
             image_parts.coded_image(whole, keys.part_vessel(key), key)
             payload = wire.encode(whole)
-        if known is None or known.n < image_parts.version_of(payload):
+        if known is None or known.n < part.version:
             tx.put_state(name, payload)
-            self._stored_versions += 1
-            if self._stored_versions % image_parts.PRUNE_EVERY == 0:
-                for surplus in image_parts.surplus_names(self.store.state_names(prefix)):
-                    tx.delete_state(surplus)
+            self._prune_versions(tx, prefix)
         return payload
+
+    def _prune_versions(self, tx: Transaction, prefix: str) -> None:
+        self._stored_versions[prefix] += 1
+        if self._stored_versions[prefix] % image_parts.PRUNE_EVERY == 0:
+            for surplus in image_parts.surplus_names(tx.state_names(prefix)):
+                tx.delete_state(surplus)
 
     def before_accepting(self, records: Sequence[tuple[str, bytes]]) -> None:
         """Commit records to an archive that several c2 share, so that another one can handle them."""

@@ -116,7 +116,7 @@ class RelayService(Service[RelayConfig]):
         self._part_keys = {
             upstream.queue: keys.shore_part(platform.id, upstream.options.site) for upstream in upstreams
         }
-        self._stored_versions = 0
+        self._stored_versions = Counter[str]()
         # Records for the shore of the batch in progress and of the one that is committed, by type.
         self._queued, self._committing = Counter[str](), Counter[str]()
         self._inboxes = {upstream.queue: keys.shore_inbox(platform.id, upstream.options.site) for upstream in upstreams}
@@ -252,16 +252,17 @@ class RelayService(Service[RelayConfig]):
         whole = image_parts.whole_part(image)
         payload = wire.encode(whole)
         priority = PREVIEW_PRIORITY if image.version == 1 else DETAIL_PRIORITY
-        topic = topic_of(image) if self.config.supersede else None
+        topic = topic_of(image)
+        replaces = topic if self.config.supersede else None
         for queue, key in self._part_keys.items():
             known = None
             if image.version > 1:
-                name = image_parts.version_name(f"{VERSIONS}{queue}/", payload)
+                name = f"{VERSIONS}{queue}/{topic.name}"
                 known = image_parts.stored_version(self.store.get_state(name), name)
             sent = payload
             if known is not None:
                 sent = wire.encode(image_parts.difference(whole, known))
-            effects.send_payload(key, queue, sent, ImagePart, priority=priority, topic=topic)
+            effects.send_payload(key, queue, sent, ImagePart, priority=priority, topic=replaces)
             effects.count("image_differences", int(sent is not payload))
         effects.count("image_bytes_received", image.bytes_received)
         effects.count("coded_images_relayed")
@@ -274,10 +275,14 @@ class RelayService(Service[RelayConfig]):
             self._withdraw_short(item)
         if item.key != self._part_keys.get(item.queue):
             return False
-        prefix = f"{VERSIONS}{item.queue}/"
-        name = image_parts.version_name(prefix, item.payload)
-        known, whole = image_parts.stored_version(tx.get_state(name), name), item.payload
-        if not (is_whole := image_parts.is_whole(whole)):
+        part, whole = image_parts.head_of(item.payload), item.payload
+        name = f"{VERSIONS}{item.queue}/{part.subject}"
+        if part.version == 1 and reason is None:
+            tx.add_state(name, whole)  # a stored one is the same version or a later one
+            self._prune_versions(tx, item.queue)
+            return False
+        known = image_parts.stored_version(tx.get_state(name), name)
+        if part.base:
             try:
                 whole = wire.encode(image_parts.expand(wire.decode(ImagePart, whole, item.key), known, item.key))
             except MissingBaseError as error:
@@ -286,22 +291,23 @@ class RelayService(Service[RelayConfig]):
                 log.warning("Image version not stored: the base of its difference was deleted", extra=fields)
                 return False
         if reason is None:
-            if known is None or known.n < image_parts.version_of(whole):
+            if known is None or known.n < part.version:
                 tx.put_state(name, whole)
-                self._prune_versions(tx, item.queue, prefix)
+                self._prune_versions(tx, item.queue)
             return False
-        if is_whole:
+        if not part.base:
             return False
-        topic = Topic(name.removeprefix(prefix), image_parts.version_of(whole)) if self.config.supersede else None
+        topic = Topic(part.subject, part.version) if self.config.supersede else None
         tx.send(item.key, item.queue, whole, encoding=item.encoding, priority=item.priority, topic=topic)
         self.count("image_differences_refused")
         return True
 
-    def _prune_versions(self, tx: Transaction, queue: str, prefix: str) -> None:
+    def _prune_versions(self, tx: Transaction, queue: str) -> None:
         """Delete surplus versions, except those of images with a queued difference."""
-        self._stored_versions += 1
-        if self._stored_versions % image_parts.PRUNE_EVERY == 0:
-            for name in image_parts.surplus_names(self.store.state_names(prefix)):
+        self._stored_versions[queue] += 1
+        if self._stored_versions[queue] % image_parts.PRUNE_EVERY == 0:
+            prefix = f"{VERSIONS}{queue}/"
+            for name in image_parts.surplus_names(tx.state_names(prefix)):
                 if not tx.has_topic(queue, name.removeprefix(prefix)):
                     tx.delete_state(name)
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost import wire
-from sonarpost.archive.image_parts import coded_image, difference, expand, stream_of, version_name, whole_part
+from sonarpost.archive.image_parts import coded_image, difference, expand, head_of, stream_of, whole_part
 from sonarpost.errors import MissingBaseError, PayloadError
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.received_image import contact_of
@@ -143,5 +143,5 @@ def test_invalid_whole_image_is_refused(change):
 
 
 def test_versions_of_an_image_have_one_name():
-    names = {version_name("x/", wire.encode(whole_part(image(noise(200 + n), n)))) for n in (1, 2)}
-    assert names == {"x/uuv-1/000A/1764000000.123456"}
+    names = {head_of(wire.encode(whole_part(image(noise(200 + n), n)))).subject for n in (1, 2)}
+    assert names == {"uuv-1/000A/1764000000.123456"}

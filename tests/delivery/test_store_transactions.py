@@ -9,7 +9,7 @@ import threading
 import msgpack
 import pytest
 from builders.store_steps import fail_within, queued_items, record, send
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sonarpost.delivery.store import Store
@@ -177,6 +177,35 @@ def test_rollback_discards_collected_rows(store):
     with store.transaction() as tx:
         assert tx.send("k", "c", b"x", encoding="") == 1
         assert not tx.was_received("k", record(1, b"x"))
+
+
+STEPS = st.sampled_from(["add", "put", "delete", "get", "names"])
+STATES = st.lists(st.tuples(STEPS, st.sampled_from("abc")), max_size=60)
+
+
+@given(steps=STATES)
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_added_states_are_seen_by_every_later_step_of_the_transaction(store, steps):
+    with store.transaction() as tx:
+        for name in "abc":
+            tx.delete_state(name)
+        model: dict[str, bytes] = {}
+        for number, (step, name) in enumerate(steps):
+            value = b"%d" % number
+            if step == "add":
+                tx.add_state(name, value)
+                model.setdefault(name, value)
+            elif step == "put":
+                tx.put_state(name, value)
+                model[name] = value
+            elif step == "delete":
+                tx.delete_state(name)
+                model.pop(name, None)
+            elif step == "get":
+                assert tx.get_state(name) == model.get(name)
+            else:
+                assert tx.state_names(name) == ([name] if name in model else [])
+    assert store.states("") == model
 
 
 def test_state_that_cannot_be_read_is_quarantined_alone(store, open_store, caplog):

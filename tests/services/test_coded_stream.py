@@ -13,6 +13,7 @@ from builders.vessel_frames import CONTACT
 from sonarpost import keys, wire
 from sonarpost.archive.image_parts import stream_of
 from sonarpost.codec.registry import default_registry
+from sonarpost.delivery.records import OutboxItem
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
@@ -220,6 +221,19 @@ def test_invalid_parts_are_refused(runner, start_c2, refused):
     (_, first), (_, second) = refused(c2)
     assert "s: got '1 bytes', expected every byte of the stream that is not in m" in first
     assert "lat_deg: got 91.0" in second
+
+
+def test_relay_keeps_the_later_version_if_the_first_is_acknowledged_after_it(platform):
+    relay, queue, key = RelayService(platform(VESSEL), RelayConfig()), "c2", keys.shore_part(VESSEL)
+    payloads = [wire.encode(ImagePart(u="uuv-1", i="000A", n=n, t=1.0, p=b"\x04" * n)) for n in (1, 2)]
+    items = [OutboxItem(queue, n, key, "", 5, payload, b"") for n, payload in enumerate(payloads, start=1)]
+    found = []
+    for item in (items[0], items[1], items[0]):
+        with relay.store.transaction() as tx:
+            relay.on_acknowledged(tx, item, None)
+        found += relay.store.states("version/").values()
+    relay.store.close()
+    assert found == [payloads[0], payloads[1], payloads[1]]
 
 
 def test_site_keeps_a_limited_number_of_versions(runner, start_c2, platform, monkeypatch):

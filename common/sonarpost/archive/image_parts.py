@@ -12,7 +12,7 @@ import logging
 import zlib
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import msgpack
 import numpy as np
@@ -30,9 +30,10 @@ from sonarpost.messages import CodedImage, Contact, ImagePart
 log = logging.getLogger(__name__)
 
 MAX_VERSIONS: Final = 2048
-"""Images of one vessel (c2) or for one site (relay) whose last version is kept for differences; at most 128 MiB."""
-PRUNE_EVERY: Final = 256
-"""Number of stored versions after which surplus ones are deleted."""
+"""Images of one vessel (c2) or for one site (relay) whose last version is kept for differences; at most 192 MiB
+with the surplus ones."""
+PRUNE_EVERY: Final = 1024
+"""Number of stored versions after which surplus ones are deleted: their search reads all names."""
 MERGED_GAP_BYTES: Final = 5
 """Equal bytes between two pieces that are sent again, because a further piece would be as long."""
 
@@ -220,15 +221,24 @@ def codec_name(stream: bytes) -> str:
         return ""
 
 
-def version_name(prefix: str, payload: bytes) -> str:
-    """Return the name under which a store keeps the last version of an image.
+class PartHead(NamedTuple):
+    """What identifies a record `part`.
 
-    Args:
-        prefix: Prefix of the names of one vessel or one site.
-        payload: A valid encoded record `part` of the image.
+    Attributes:
+        subject: Name of the image on its vessel; a store keeps its last version under this name with a prefix.
+        version: Version of the image.
+        base: Version to which the record is the difference; 0 for a whole image.
     """
+
+    subject: str
+    version: int
+    base: int
+
+
+def head_of(payload: bytes) -> PartHead:
+    """Return what identifies a valid encoded record `part`."""
     fields = msgpack.unpackb(payload)
-    return prefix + subject(fields["u"], fields["i"], fields["t"])
+    return PartHead(subject(fields["u"], fields["i"], fields["t"]), fields["n"], fields.get("b", 0))
 
 
 def subject(vehicle_id: str, image_id: str, first_frame_utc_s: float) -> str:
@@ -241,18 +251,8 @@ def is_part(key: str) -> bool:
     return key.endswith("/part")
 
 
-def is_whole(payload: bytes) -> bool:
-    """Return whether a valid encoded record `part` is a whole image."""
-    return not msgpack.unpackb(payload).get("b", 0)
-
-
-def version_of(payload: bytes) -> int:
-    """Return the version in a valid encoded record `part`."""
-    return int(msgpack.unpackb(payload)["n"])
-
-
 def stored_version(value: bytes | None, name: str) -> ImagePart | None:
-    """Return the version that a store keeps under a name of `version_name`; None for none, or if it cannot be read."""
+    """Return the version that a store keeps under a name; None for none, or if it cannot be read."""
     try:
         return None if value is None else wire.decode(ImagePart, value, name)
     except PayloadError as error:
@@ -261,7 +261,7 @@ def stored_version(value: bytes | None, name: str) -> ImagePart | None:
 
 
 def surplus_names(names: Sequence[str]) -> Sequence[str]:
-    """Return those names of `version_name` that are beyond `MAX_VERSIONS`, the oldest images."""
+    """Return those names of stored versions that are beyond `MAX_VERSIONS`, the oldest images."""
     by_time = sorted(names, key=lambda name: float(name.rpartition("/")[2]))
     return by_time[: max(0, len(names) - MAX_VERSIONS)]
 

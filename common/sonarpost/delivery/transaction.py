@@ -137,6 +137,7 @@ class Transaction:
         self._new_topics: set[tuple[str, str]] = set()
         self._new_inbox: list[tuple[object, ...]] = []
         self._partial_records = PartialRecords(connection)
+        self._new_states: list[tuple[str, bytes]] = []
         self._handled: list[int] = []
         self._handled_at_once = 0
 
@@ -149,8 +150,9 @@ class Transaction:
         """Write the collected changes; `Store.transaction` calls it before the commit."""
         self._flush_outbox()
         if self._new_inbox:
-            _insert_rows(self._db, "inbox", _INBOX, self._new_inbox)
+            _insert_rows(self._db, "INTO inbox", _INBOX, self._new_inbox)
             self._new_inbox.clear()
+        self._flush_states()
         for first, last in runs(self._handled):
             self._db.execute("DELETE FROM inbox WHERE id BETWEEN ? AND ?", (first, last))
         self._handled.clear()
@@ -165,10 +167,15 @@ class Transaction:
 
     def _flush_outbox(self) -> None:
         if self._new_outbox:
-            _insert_rows(self._db, "outbox", _OUTBOX, self._new_outbox)
+            _insert_rows(self._db, "INTO outbox", _OUTBOX, self._new_outbox)
             self._write_numbers()
             self._new_outbox.clear()
             self._new_topics.clear()
+
+    def _flush_states(self) -> None:
+        if self._new_states:
+            _insert_rows(self._db, "OR IGNORE INTO state", "name, value", self._new_states)
+            self._new_states.clear()
 
     def _write_numbers(self) -> None:
         rows = [(queue, *number) for queue, number in self._numbers.items()]
@@ -399,40 +406,54 @@ class Transaction:
 
     def get_state(self, name: str) -> bytes | None:
         """Return the value under `name`, with the changes of this transaction; None if there is none."""
+        self._flush_states()
         found = self._db.execute("SELECT value FROM state WHERE name = ?", (name,)).fetchone()
         return None if found is None else bytes(found[0])
 
+    def state_names(self, prefix: str) -> list[str]:
+        """Return the names of all values that start with `prefix`, with the changes of this transaction."""
+        self._flush_states()
+        found = self._db.execute("SELECT name FROM state WHERE name >= ? AND name < ?", (prefix, prefix + "\U0010ffff"))
+        return [str(name) for (name,) in found]
+
+    def add_state(self, name: str, value: bytes) -> None:
+        """Store `value` under `name` if there is no value; `Store.get_state` finds it after the transaction."""
+        self._new_states.append((name, value))
+
     def put_state(self, name: str, value: bytes) -> None:
         """Store `value` under `name`."""
+        self._flush_states()
         self._db.execute(
             "INSERT INTO state VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET value = excluded.value", (name, value)
         )
 
     def delete_state(self, name: str) -> None:
         """Delete the value under `name`."""
+        self._flush_states()
         self._db.execute("DELETE FROM state WHERE name = ?", (name,))
 
     def discard_state(self, name: str, value: bytes, reason: str) -> None:
         """Move a value that cannot be read from `name` to the quarantine."""
         log.error("Stored state discarded: it cannot be read", extra=kv(state=name, reason=reason))
         self.quarantine("in", f"state {name}", value, reason)
+        self._flush_states()
         self._db.execute("DELETE FROM state WHERE name = ? AND value = ?", (name, value))
         self.states_discarded += 1
 
 
 @cache
-def _insert_statement(table: str, columns: str, values: int, rows: int) -> str:
+def _insert_statement(into: str, columns: str, values: int, rows: int) -> str:
     row = "(" + ", ".join("?" * values) + ")"
-    return f"INSERT INTO {table} ({columns}) VALUES {', '.join([row] * rows)}"  # noqa: S608 constants
+    return f"INSERT {into} ({columns}) VALUES {', '.join([row] * rows)}"  # noqa: S608 constants
 
 
-def _insert_rows(db: sqlite3.Connection, table: str, columns: str, rows: Sequence[tuple[object, ...]]) -> None:
+def _insert_rows(db: sqlite3.Connection, into: str, columns: str, rows: Sequence[tuple[object, ...]]) -> None:
     for first in range(0, len(rows), ROWS_PER_STATEMENT):
         part = rows[first : first + ROWS_PER_STATEMENT]
         if len(part) < ROWS_PER_STATEMENT:
-            db.executemany(_insert_statement(table, columns, len(part[0]), 1), part)
+            db.executemany(_insert_statement(into, columns, len(part[0]), 1), part)
         else:
-            statement = _insert_statement(table, columns, len(part[0]), len(part))
+            statement = _insert_statement(into, columns, len(part[0]), len(part))
             db.execute(statement, [value for row in part for value in row])
 
 
