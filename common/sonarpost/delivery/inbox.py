@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 
 import zenoh
+from zenoh.handlers import Callback
 
 from sonarpost import keys
 from sonarpost.delivery.protocol import MAX_BATCH_RECORDS, MAX_RECORD_BYTES, AckReply, pack_replies, parse_query
@@ -110,7 +111,7 @@ class Inbox:
         self._accepting = accepting
         self._handle: Handle = _wait
         self._accepted: list[tuple[str, bytes]] = []
-        self._messages: queue.Queue[_Message] = queue.Queue(QUEUE_LIMIT)
+        self._messages: queue.Queue[_Message | None] = queue.Queue(QUEUE_LIMIT)
         self._stop = threading.Event()
         self.storage_failing = False
         self._retained: list[_Message] = []
@@ -124,11 +125,12 @@ class Inbox:
         for key in key_expressions:
             self._declare(keys.delivery_query(key, consumer))
             if key not in delivery_only_keys:
-                self._subscribers.append(session.declare_subscriber(key, self._on_sample))
+                self._subscribers.append(session.declare_subscriber(key, Callback(self._on_sample, indirect=False)))
 
     def _declare(self, key: str) -> None:
         # Of several consumers of one name, a query goes to the nearest one that is complete, or to all if none is.
-        self._queryables[key] = self._session.declare_queryable(key, self._on_query, complete=self._is_preferred)
+        on_query = Callback(self._on_query, indirect=False)
+        self._queryables[key] = self._session.declare_queryable(key, on_query, complete=self._is_preferred)
 
     def set_preferred(self, *, is_preferred: bool) -> None:
         """Leave new queries to other consumers of the same name while there is one, or end that.
@@ -150,6 +152,8 @@ class Inbox:
         for subscriber in self._subscribers:
             subscriber.undeclare()
         self._stop.set()
+        with suppress(queue.Full):
+            self._messages.put_nowait(None)
         self._thread.join()
 
     # Receive
@@ -193,12 +197,14 @@ class Inbox:
             retained, self._retained = self._retained, []
             return retained
         messages: list[_Message] = []
+        message = self._messages.get()
         with suppress(queue.Empty):
-            messages.append(self._messages.get(timeout=0.2))
-            while (
-                len(messages) < COMMIT_MESSAGES and sum(len(m.attachment) for m in messages) < COMMIT_ATTACHMENT_BYTES
-            ):
-                messages.append(self._messages.get_nowait())
+            while message is not None:
+                messages.append(message)
+                size = sum(len(m.attachment) for m in messages)
+                if len(messages) >= COMMIT_MESSAGES or size >= COMMIT_ATTACHMENT_BYTES:
+                    break
+                message = self._messages.get_nowait()
         return messages
 
     def _commit(self, messages: list[_Message]) -> list[Replies]:

@@ -363,7 +363,7 @@ class Service(ABC, Generic[C]):
             failures = 0
             self.set_degraded("")
             if not found:
-                self.store.inbox_changed.wait(1.0)
+                self.store.inbox_changed.wait()
 
     def _handle_in_batches(self) -> bool:
         items = self.store.inbox_items(max(16, self.BATCH), max_bytes=self.BATCH_BYTES)
