@@ -334,7 +334,9 @@ def query_of(key, origin, records, settled, *, whole_bytes=0):
         size = max(whole_bytes, len(data))
         fields = {"v": 1, "seq": seq, "size": size, "sha256": digest, "offset": 0}
     else:
-        fields = {"v": 2, "records": [(seq, len(data), digest) for seq, data, digest in records]}
+        digests = b"".join(digest for _, _, digest in records)
+        fields = {"v": 3, "records": [(seq, len(data)) for seq, data, _ in records]}
+        fields["sha256"] = hashlib.sha256(digests).digest()
     attached = msgpack.packb(fields | {"origin": origin, "consumer": CONSUMER, "settled": settled})
     content = b"".join(data for _, data, _ in records)
     return SentQuery(keys.delivery_query(key, CONSUMER), content, attached)

@@ -7,6 +7,7 @@ an existing one would change. A record that gains a field needs a new sample, wi
 
 from __future__ import annotations
 
+import hashlib
 import json
 
 import msgpack
@@ -54,7 +55,8 @@ def delivery_samples() -> dict[str, dict[str, bytes]]:
 
 def batch_samples() -> dict[str, dict[str, bytes]]:
     """Return attachments and replies of queries with several records, by file and name."""
-    items = [OutboxItem("c2", seq, "k", "", 4, b"\x80" * size, bytes.fromhex("11" * 32)) for seq, size in BATCH]
+    records = [(seq, bytes([number]) * size) for number, (seq, size) in enumerate(BATCH)]
+    items = [OutboxItem("c2", seq, "k", "", 4, data, hashlib.sha256(data).digest()) for seq, data in records]
     replies = [
         AckReply("stored"),
         AckReply("refused", reason="k: v: got 2, expected 1"),
@@ -65,7 +67,10 @@ def batch_samples() -> dict[str, dict[str, bytes]]:
             "three-records": protocol.batch_attachment(bytes(range(16)), items),
             "after-dropped-ones": protocol.batch_attachment(bytes(range(16)), items, 6),
         },
-        "handoff-batch-reply": {"one-of-each": protocol.pack_replies(replies)},
+        "handoff-batch-reply": {
+            "one-of-each": protocol.pack_replies(replies),
+            "all-stored": protocol.pack_replies(replies[:1] * 3),
+        },
     }
 
 

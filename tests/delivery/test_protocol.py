@@ -14,6 +14,7 @@ from sonarpost.delivery.protocol import (
     AckReply,
     attachment,
     batch_attachment,
+    pack_replies,
     parse_query,
     unpack_replies,
 )
@@ -45,6 +46,7 @@ def test_packed_chunk_parses_unchanged():
 
 SINGLE = msgpack.unpackb(attachment(ORIGIN, item(5, b"data")))
 BATCH = msgpack.unpackb(batch_attachment(ORIGIN, [item(4, b"a"), item(9, b"b")]))
+DIGESTS = BATCH["sha256"]
 
 
 @pytest.mark.parametrize(
@@ -56,22 +58,24 @@ BATCH = msgpack.unpackb(batch_attachment(ORIGIN, [item(4, b"a"), item(9, b"b")])
         (SINGLE, {"sha256": "text"}, b"data", "sha256"),
         (SINGLE, {"offset": 10}, b"data", "payload"),
         (SINGLE, {"settled": 5}, b"data", "settled"),
-        (SINGLE, {"v": 2}, b"data", "records"),
-        (SINGLE, {"v": 3}, b"data", "v"),
-        (BATCH, {"v": 3}, b"ab", "v"),
+        (SINGLE, {"v": 3}, b"data", "records"),
+        (SINGLE, {"v": 2}, b"data", "v"),
+        (BATCH, {"v": 2}, b"ab", "v"),
+        (BATCH, {"sha256": b"short"}, b"ab", "sha256"),
+        (BATCH, {"sha256": SHA}, b"ab", "sha256"),
+        (BATCH, {}, b"ba", "sha256"),
         (BATCH, {"v": True}, b"ab", "v"),
         (BATCH, {"origin": b"short"}, b"ab", "origin"),
         (BATCH, {"settled": -1}, b"ab", "settled"),
         (BATCH, {"settled": 4}, b"ab", "settled"),
         (BATCH, {"records": []}, b"", "records"),
-        (BATCH, {"records": [[n, 0, SHA] for n in range(1, MAX_BATCH_RECORDS + 2)]}, b"", "records"),
-        (BATCH, {"records": [[4, 1, SHA], [4, 1, SHA]]}, b"ab", "records"),
-        (BATCH, {"records": [[4, 1, SHA], 5]}, b"ab", "records.1"),
-        (BATCH, {"records": [[4, 1, SHA], [5, 1]]}, b"ab", "records.1.2"),
-        (BATCH, {"records": [[0, 2, SHA]]}, b"ab", "records.0.0"),
-        (BATCH, {"records": [[1 << 63, 2, SHA]]}, b"ab", "records.0.0"),
-        (BATCH, {"records": [[4, CHUNK_BYTES + 1, SHA]]}, b"ab", "records.0.1"),
-        (BATCH, {"records": [[4, 2, b"short"]]}, b"ab", "records.0.2"),
+        (BATCH, {"records": [[n, 0] for n in range(1, MAX_BATCH_RECORDS + 2)]}, b"", "records"),
+        (BATCH, {"records": [[4, 1], [4, 1]], "sha256": DIGESTS}, b"ab", "records"),
+        (BATCH, {"records": [[4, 1], 5]}, b"ab", "records.1"),
+        (BATCH, {"records": [[4, 1], [5]]}, b"ab", "records.1.1"),
+        (BATCH, {"records": [[0, 2]]}, b"ab", "records.0.0"),
+        (BATCH, {"records": [[1 << 63, 2]]}, b"ab", "records.0.0"),
+        (BATCH, {"records": [[4, CHUNK_BYTES + 1]]}, b"ab", "records.0.1"),
         (BATCH, {}, b"a", "payload"),
         (BATCH, {}, b"abc", "payload"),
         (BATCH, {}, bytes(CHUNK_BYTES + 1), "payload"),
@@ -81,6 +85,12 @@ def test_query_error_names_the_field(fields, change, data, field):
     with pytest.raises(PayloadError, match="expected") as caught:
         parse_query(msgpack.packb(fields | change), data, WHERE)
     assert caught.value.field == field
+
+
+def test_a_short_reply_means_that_all_are_stored():
+    packed = pack_replies([AckReply("stored")] * 5)
+    assert len(packed) < 15
+    assert unpack_replies(packed, 5, WHERE) == (AckReply("stored"),) * 5
 
 
 @given(st.binary(max_size=80), st.binary(max_size=8))
@@ -103,7 +113,7 @@ def test_arbitrary_bytes_parse_or_raise_payload_error(attached, data):
 )
 def test_reply_error_names_the_field(replies, field):
     with pytest.raises(PayloadError, match="expected") as caught:
-        unpack_replies(msgpack.packb({"v": 2, "replies": replies}), 2, WHERE)
+        unpack_replies(msgpack.packb({"v": 3, "replies": replies}), 2, WHERE)
     assert caught.value.field == field
     single = msgpack.unpackb(AckReply("stored").pack())
     with pytest.raises(PayloadError, match="takes"):

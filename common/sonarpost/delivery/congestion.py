@@ -96,7 +96,7 @@ class CongestionControl:
         self._shortest_s = min(self._shortest_s, reply_s)
         self._round_s = min(self._round_s, reply_s)
         self._was_full = self._was_full or in_flight_bytes >= self.window_bytes / 2
-        if self._doubling and not self._measuring_until_s and self._was_full and reply_s <= 1.5 * self._free_s:
+        if self._doubling and not self._measuring_until_s and self._was_full and reply_s <= self._free_s:
             factor = RESUME_FACTOR if self.window_bytes < self._resume_bytes else 1
             self._set_window(self.window_bytes + factor * size_bytes)
         if sent_s >= self._round_began_s:

@@ -9,7 +9,7 @@ older version. `docs/specifications/zenoh.md` specifies the messages for other l
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -23,18 +23,18 @@ from sonarpost.errors import PayloadError
 CHUNK_BYTES = 32 * 1024
 MAX_RECORD_BYTES = 8 * 1024 * 1024
 SINGLE_VERSION = 1
-BATCH_VERSION = 2
+BATCH_VERSION = 3
 MAX_BATCH_RECORDS = 128
 """Maximum number of records in one query."""
-BATCH_RECORD_OVERHEAD_BYTES = 48
-"""Size of the entries of one more record in attachment and reply."""
+BATCH_RECORD_OVERHEAD_BYTES = 9
+"""Size of the entry of one more record in an attachment, with a number up to 2^32."""
 
 AckStatus = Literal["stored", "more", "refused", "later"]
 _Natural = Annotated[int, Field(ge=0, lt=1 << 63)]
 _Seq = Annotated[int, Field(ge=1, lt=1 << 63)]
 _Origin = Annotated[bytes, Field(min_length=16, max_length=16)]
 _Digest = Annotated[bytes, Field(min_length=32, max_length=32)]
-_BatchRecord = tuple[_Seq, Annotated[int, Field(ge=0, le=CHUNK_BYTES)], _Digest]
+_BatchRecord = tuple[_Seq, Annotated[int, Field(ge=0, le=CHUNK_BYTES)]]
 
 
 class _Fields(BaseModel):
@@ -54,11 +54,12 @@ class _Attachment(_Fields):
 
 
 class _BatchAttachment(_Fields):
-    """Attachment of a query with several records: (seq, size, sha256) of each."""
+    """Attachment of a query with several records: (seq, size) of each, and the digest of their digests."""
 
-    v: Annotated[int, Field(ge=2, le=2)]
+    v: Annotated[int, Field(ge=3, le=3)]
     origin: _Origin
     records: Annotated[tuple[_BatchRecord, ...], Field(min_length=1, max_length=MAX_BATCH_RECORDS)]
+    sha256: _Digest
     settled: _Natural = 0
 
 
@@ -73,7 +74,7 @@ class _Reply(_Fields):
 
 
 class _BatchReply(_Fields):
-    v: Annotated[int, Field(ge=2, le=2)]
+    v: Annotated[int, Field(ge=3, le=3)]
     replies: tuple[tuple[Literal["stored", "refused", "later"], str], ...]
 
 
@@ -170,7 +171,8 @@ def batch_attachment(origin: bytes, items: Sequence[OutboxItem], done_up_to: int
         "v": BATCH_VERSION,
         "origin": origin,
         "consumer": consumer_of(items[0].queue),
-        "records": [(item.seq, len(item.payload), item.sha256) for item in items],
+        "records": [(item.seq, len(item.payload)) for item in items],
+        "sha256": _digest_of(item.sha256 for item in items),
     }
     return _pack(fields | ({"settled": done_up_to} if done_up_to else {}))
 
@@ -198,11 +200,15 @@ def _parse_batch(batch: _BatchAttachment, data: bytes, where: str) -> tuple[Rece
         raise PayloadError(where, "payload", f"{len(data)} bytes", f"at most {CHUNK_BYTES} bytes")
     chunks = []
     start = 0
-    for seq, size, sha256 in batch.records:
-        chunks.append(ReceivedChunk(batch.origin, seq, size, sha256, 0, data[start : start + size], batch.settled))
+    for seq, size in batch.records:
+        record = data[start : start + size]
+        sha256 = hashlib.sha256(record).digest()
+        chunks.append(ReceivedChunk(batch.origin, seq, size, sha256, 0, record, batch.settled))
         start += size
     if start != len(data):
         raise PayloadError(where, "payload", f"{len(data)} bytes", f"{start} bytes, the sum of the records' sizes")
+    if _digest_of(chunk.sha256 for chunk in chunks) != batch.sha256:
+        raise PayloadError(where, "sha256", batch.sha256.hex(), "the digest of the records' digests")
     numbers = {chunk.seq for chunk in chunks}
     if len(numbers) < len(chunks):
         raise PayloadError(where, "records", sorted(chunk.seq for chunk in chunks), "each seq once")
@@ -212,8 +218,9 @@ def _parse_batch(batch: _BatchAttachment, data: bytes, where: str) -> tuple[Rece
 
 
 def pack_replies(replies: Sequence[AckReply]) -> bytes:
-    """Return the reply to a query of several records: one status for each, in the order of the query."""
-    return _pack({"v": BATCH_VERSION, "replies": [(reply.status, reply.reason) for reply in replies]})
+    """Return the reply to a query of several records: one status for each, in its order; none if all are stored."""
+    all_stored = all(reply.status == "stored" for reply in replies)
+    return _pack({"v": BATCH_VERSION, "replies": [] if all_stored else [(r.status, r.reason) for r in replies]})
 
 
 def unpack_replies(payload: bytes, count: int, where: str) -> tuple[AckReply, ...] | AckReply:
@@ -229,12 +236,18 @@ def unpack_replies(payload: bytes, count: int, where: str) -> tuple[AckReply, ..
     if not _is_batch(fields):
         return AckReply.unpack(payload, where)
     replies = wire.validated(_BatchReply, fields, where).replies
+    if not replies:
+        return (_STORED,) * count
     if len(replies) != count:
-        raise PayloadError(where, "replies", replies, f"an array of {count}")
+        raise PayloadError(where, "replies", replies, f"an array of {count}, or an empty one")
     return tuple(_STORED if status == "stored" else AckReply(status, reason=reason) for status, reason in replies)
 
 
 _STORED = AckReply("stored")
+
+
+def _digest_of(digests: Iterable[bytes]) -> bytes:
+    return hashlib.sha256(b"".join(digests)).digest()
 
 
 def _pack(fields: Mapping[str, object]) -> bytes:
