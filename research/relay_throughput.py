@@ -1,26 +1,28 @@
-"""`python -m research.relay_throughput`: throughput of the relay, compared with bare Zenoh queries and with the disk.
+"""`python -m research.relay_throughput`: throughput of the relay, compared with other software that stores on disk.
 
-    python -m research.relay_throughput [--decisions 20000] [--pictures 2000] [--dir DIR] [--profile]
+    python -m research.relay_throughput [--records 10000] [--rounds 5] [--peers NAME,…] [--dir DIR] [--profile]
 
-There are two processes: the far side with the router, and this one. For three kinds of records (a decision, a coded
-image of 200 bytes, and an image of 300 x 100 px as relays of earlier versions send it) these are measured:
+For decisions and for coded images of 200 bytes, records wait on the disk of a sender, and the rate is measured at which
+a receiver stores them: in records a second from the first arrival on, until the receiver has stored all. Each round
+measures all systems one after the other, because the load of the host varies; the ratios are medians of the ratios of
+a round. Of a coded image, the other systems transfer the bytes that the shore site receives. The systems:
 
-- sequential: acknowledged queries without storage, one at a time, through the router to a queryable that replies at
-  once;
-- pipelined: the same with as many queries in flight as the delivery protocol has, a record (or a chunk of 32 kB) each;
-- relay: a RelayService with the records in its inbox on disk. It moves each record to its outbox, delivers it to a c2
-  that commits it, and deletes it, until both tables are empty. It logs one line a record to a file, as on a vessel;
-  "unlogged" is the same with warnings only. The far side is a durable c2 that only stores records ("sink"), so that
-  the delivery is measured and not the writing of TIFF files. This process has no other load;
-- disk: the number of 4 kB writes a second that reach the disk, and the bytes a second with writes of 2 MB. The bound
-  follows from both: every record is committed three times (outbox, inbox of c2, deletion), up to 512 records with one
-  write, and its bytes are written four times (log and table on both sides).
+- sonarpost: a RelayService in this process with the records in its inbox. It moves each record to its outbox, and
+  delivers it through a router to a c2 in another process that only commits records ("sink"), so that the delivery is
+  measured and not the writing of TIFF files. A record counts when the relay has the acknowledgement of c2;
+- nats, rabbitmq, redis: two servers each of NATS, RabbitMQ and Redis, which this command starts (`research.peers`). A
+  peer that is not installed is skipped, with the reason;
+- zenoh: bare queries through the same router to a queryable that answers at once, with as many in flight as the
+  delivery protocol has, a record (or a chunk of 32 kB) each. Nothing is stored: this is the bound.
+
+"fsync_per_s" is the number of writes of 4 kB a second that reach the disk, "relay_cpu_us" the CPU time of a record in
+the relay's process.
 
 With `--profile`, only the relay's work for coded images is measured, in CPU time of its threads by area. The profiler
 makes calls of Python functions slower: the areas are to be compared with each other only.
 
-One JSON object a line. The exit status is 0 if the relay, with logging, reaches half of the pipelined rate or of the
-bound of the disk.
+One JSON object a line. The exit status is 0 if the ratios reach 4 times NATS and once RabbitMQ for decisions, and twice
+NATS for coded images; those of skipped peers do not count.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ import cProfile
 import json
 import logging
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -37,14 +40,18 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr
+from contextlib import ExitStack, contextmanager, redirect_stderr
+from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
 
 import zenoh
 
-from research.fleet import coded_image, noise_image
+from research.fleet import coded_image
+from research.peers import PEERS, AbsentError, Peer
+from research.peers.base import StartError
 from sonarpost import keys, wire
+from sonarpost.archive.image_parts import whole_part
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.cli.progress import ProgressDisplay
@@ -53,16 +60,15 @@ from sonarpost.delivery.congestion import MAX_WINDOW_BYTES
 from sonarpost.delivery.protocol import CHUNK_BYTES
 from sonarpost.delivery.scheduler import WINDOW
 from sonarpost.logs import configure_logging
-from sonarpost.messages import Decision, ImagePart, ReconstructedImage, Record, Relayed
+from sonarpost.messages import Decision, ImagePart, Record, Relayed
 from sonarpost.runtime.process import relax_garbage_collection
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
-GOAL = 0.5
-COMMITS, WRITES = 3, 4
-SEQUENTIAL = 2000
-BULK_BYTES = 2_000_000
+AIMS = {("decision", "nats"): 4.0, ("decision", "rabbitmq"): 1.0, ("coded image", "nats"): 2.0}
+"""Least ratio of the relay's rate to that of a peer."""
+FSYNC_S = 0.5
 VESSEL = "vessel-1"
 BARE_KEY = "bench/bare"
 AREAS = {
@@ -132,11 +138,6 @@ def decision(number: int) -> Decision:
     )
 
 
-def image(number: int) -> ReconstructedImage:
-    """Return an image of 300 x 100 px, 30 kB."""
-    return noise_image(VESSEL, "uuv-1", f"{number:04d}", number, float(number))
-
-
 @contextmanager
 def bare_session(endpoint: str) -> Iterator[zenoh.Session]:
     """Yield a client session that reaches the queryable."""
@@ -154,8 +155,9 @@ def query(session: zenoh.Session, chunk: bytes) -> zenoh.handlers.Handler[zenoh.
     return session.get(BARE_KEY, payload=chunk, timeout=5, congestion_control=zenoh.CongestionControl.BLOCK)
 
 
-def measure_bare(endpoint: str, payloads: Sequence[bytes], window: int) -> float:
-    """Return records a second of bare acknowledged queries, in chunks like the relay's, `window` in flight."""
+def measure_bare(endpoint: str, payloads: Sequence[bytes]) -> float:
+    """Return records a second of bare acknowledged queries, in chunks and as many in flight as the relay has."""
+    window = max(1, min(WINDOW, MAX_WINDOW_BYTES // len(payloads[0])))
     in_flight: deque[zenoh.handlers.Handler[zenoh.Reply]] = deque()
     with bare_session(endpoint) as session:
         started = time.perf_counter()
@@ -169,28 +171,71 @@ def measure_bare(endpoint: str, payloads: Sequence[bytes], window: int) -> float
         return len(payloads) / (time.perf_counter() - started)
 
 
-def measure_relay(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes], level: str) -> tuple[float, float]:
-    """Return records a second from the relay's inbox to the store of c2, and CPU time of each.
+@dataclass(frozen=True)
+class Records:
+    """Records of one kind.
 
-    A record counts when it is acknowledged and deleted.
+    Attributes:
+        key: Key under which the relay accepts them.
+        accepted: Encoded as the relay accepts them.
+        sent: Encoded as the site receives them: what the other systems transfer.
+    """
+
+    key: str
+    accepted: Sequence[bytes]
+    sent: Sequence[bytes]
+
+
+class Relay(Peer):
+    """A relay that delivers to the sink."""
+
+    def __init__(self, relay: RelayService, key: str) -> None:
+        self._relay, self._key = relay, key
+
+    def fill(self, payloads: Sequence[bytes]) -> None:
+        """Store records in the inbox of the relay."""
+        with self._relay.store.transaction() as tx:
+            for payload in payloads:
+                tx.accept(self._key, payload)
+
+    def connect(self) -> None:
+        """Start the relay."""
+        self._relay.start()
+
+    def stored(self) -> int:
+        """Return the number of records that c2 has acknowledged."""
+        return self._relay.acknowledged_count("c2")
+
+
+def measure_relay(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes]) -> tuple[float, float]:
+    """Return records a second from the relay's inbox to the store of c2, and CPU time of each.
 
     The CPU time, in microseconds, is that of this process, which runs the relay.
     """
     relay = RelayService(platform(VESSEL, endpoint, folder), RelayConfig())
-    with relay.store.transaction() as tx:
-        for payload in payloads:
-            tx.accept(key, payload)
+    peer = Relay(relay, key)
+    peer.fill(payloads)
     relax_garbage_collection()
-    with logged_to(folder / "relay.log", level):
-        started, used = time.perf_counter(), time.process_time()
-        relay.start()
+    with logged_to(folder / "relay.log", "info"):
+        used_s = time.process_time()
         try:
-            while relay.acknowledged_count("c2") < len(payloads) or relay.store.outbox_depth():
-                time.sleep(0.005)
-            seconds, used_s = time.perf_counter() - started, time.process_time() - used
+            per_s = drained_per_s(peer, len(payloads))
+            used_s = time.process_time() - used_s
         finally:
             relay.stop()
-    return len(payloads) / seconds, 1e6 * used_s / len(payloads)
+    return per_s, 1e6 * used_s / len(payloads)
+
+
+def drained_per_s(peer: Peer, count: int) -> float:
+    """Return records a second of a drain.
+
+    Raises:
+        StartError: Not all records have arrived.
+    """
+    drained = peer.drain(count)
+    if drained.records != count:
+        raise StartError(f"{type(peer).__name__}: {drained.records} of {count} records in {drained.seconds:.0f} s")
+    return drained.per_s
 
 
 @contextmanager
@@ -204,14 +249,14 @@ def logged_to(path: Path, level: str) -> Iterator[None]:
             logging.getLogger().handlers.clear()
 
 
-def measure_disk(folder: Path, size: int, seconds: float = 1.0) -> float:
-    """Return the number of sequential writes of `size` bytes a second that reach the disk."""
+def measure_fsyncs(folder: Path) -> float:
+    """Return the number of sequential writes of 4 kB a second that reach the disk."""
     path = folder / "fsync"
     count = 0
-    data = os.urandom(size)
+    data = os.urandom(4096)
     with path.open("wb", buffering=0) as file:
         started = time.perf_counter()
-        while time.perf_counter() - started < seconds:
+        while time.perf_counter() - started < FSYNC_S:
             file.seek(0)
             file.write(data)
             os.fsync(file.fileno())
@@ -221,52 +266,18 @@ def measure_disk(folder: Path, size: int, seconds: float = 1.0) -> float:
     return count / elapsed_s
 
 
-def main() -> int:
-    """Run; return 1 if a rate is below the goal."""
-    parser = argparse.ArgumentParser(description="relay throughput against bare acknowledged queries")
-    parser.add_argument(
-        "--decisions", type=int, default=20000, metavar="N", help="also the number of coded images; default: 20000"
-    )
-    parser.add_argument("--pictures", type=int, default=2000, metavar="N", help="default: 2000")
-    parser.add_argument("--dir", type=Path, metavar="DIR", help="folder for the stores (default: a temporary folder)")
-    parser.add_argument("--profile", action="store_true", help="only the CPU time of the relay for coded images")
-    parser.add_argument("--far-side", nargs=2, help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.far_side:
-        far_side(args.far_side[0], Path(args.far_side[1]))
-        return 0
-    with ProgressDisplay(step="relay_throughput"), tempfile.TemporaryDirectory(dir=args.dir) as name:
-        return compare(Path(name), args.decisions, args.pictures, is_profile=args.profile)
-
-
-def measure(endpoint: str, folder: Path, key: str, payloads: Sequence[bytes]) -> dict[str, float]:
-    """Measure one kind of record; the bare rate before and after the relay, because the load of the host varies."""
-    size = len(payloads[0])
-    window = max(1, min(WINDOW, MAX_WINDOW_BYTES // size))
-    sequential = measure_bare(endpoint, payloads[:SEQUENTIAL], 1)
-    before = measure_bare(endpoint, payloads, window)
-    relayed, cpu_us = measure_relay(endpoint, folder, key, payloads, "info")
-    unlogged, unlogged_cpu_us = measure_relay(endpoint, folder, key, payloads, "warning")
-    pipelined = (before + measure_bare(endpoint, payloads, window)) / 2
-    fsyncs, bulk = measure_disk(folder, 4096), measure_disk(folder, BULK_BYTES) * BULK_BYTES
-    bound = 1 / (COMMITS / (RelayService.BATCH * fsyncs) + WRITES * size / bulk)
+def measure(endpoint: str, folder: Path, records: Records, peers: Mapping[str, Peer]) -> dict[str, float]:
+    """Measure all systems once."""
+    rate, cpu_us = measure_relay(endpoint, folder, records.key, records.accepted)
+    rates = {"sonarpost": rate, "zenoh": measure_bare(endpoint, records.sent)}
+    for name, peer in peers.items():
+        peer.fill(records.sent)
+        rates[name] = drained_per_s(peer, len(records.sent))
     return {
-        "records": len(payloads),
-        "bytes": size,
-        "sequential_per_s": round(sequential),
-        "pipelined_per_s": round(pipelined),
-        "relay_per_s": round(relayed),
-        "unlogged_per_s": round(unlogged),
-        "of_sequential": round(relayed / sequential, 2),
-        "of_pipelined": round(relayed / pipelined, 3),
-        "unlogged_of_pipelined": round(unlogged / pipelined, 3),
+        **{f"{name}_per_s": round(found) for name, found in rates.items()},
+        **{f"of_{name}": round(rate / found, 2) for name, found in rates.items() if name != "sonarpost"},
         "relay_cpu_us": round(cpu_us),
-        "unlogged_cpu_us": round(unlogged_cpu_us),
-        "relay_mb_per_s": round(relayed * size / 1e6, 2),
-        "fsync_per_s": round(fsyncs),
-        "disk_mb_per_s": round(bulk / 1e6),
-        "disk_bound_per_s": round(bound),
-        "of_disk_bound": round(relayed / bound, 3),
+        "fsync_per_s": round(measure_fsyncs(folder)),
         "host_load": round(os.getloadavg()[0], 1),
     }
 
@@ -286,11 +297,12 @@ def profiled_threads() -> Iterator[list[cProfile.Profile]]:
         yield profiles
 
 
-def profile_relay(endpoint: str, folder: Path, count: int) -> dict[str, object]:
+def profile_relay(folder: Path, count: int) -> dict[str, object]:
     """Return the CPU time of each area of the relay for a coded image, in microseconds with the profiler."""
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
     payloads = [wire.encode(coded_image(VESSEL, 1, n, time.time())) for n in range(count)]
-    with profiled_threads() as profiles:
-        measure_relay(endpoint, folder, keys.image_coded(VESSEL), payloads, "info")
+    with running_far_side(endpoint, folder), profiled_threads() as profiles:
+        measure_relay(endpoint, folder, keys.image_coded(VESSEL), payloads)
     totals = dict.fromkeys((*AREAS, "all"), 0.0)
     for profile in profiles:
         profile.create_stats()
@@ -302,9 +314,9 @@ def profile_relay(endpoint: str, folder: Path, count: int) -> dict[str, object]:
     return {area: round(1e6 * seconds / count, 1) for area, seconds in totals.items()}
 
 
-def compare(folder: Path, decisions: int, images: int, *, is_profile: bool) -> int:
-    """Measure both kinds of records; return 1 if a rate is below the goal."""
-    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+@contextmanager
+def running_far_side(endpoint: str, folder: Path) -> Iterator[None]:
+    """Run the far side in a process of its own."""
     child = subprocess.Popen(
         [sys.executable, "-m", "research.relay_throughput", "--far-side", endpoint, str(folder)],
         stdin=subprocess.PIPE,
@@ -313,32 +325,72 @@ def compare(folder: Path, decisions: int, images: int, *, is_profile: bool) -> i
     )
     assert child.stdout is not None
     assert child.stdin is not None
-    passed = True
     try:
         if child.stdout.readline().strip() != "ready":
             sys.exit("relay_throughput: the far side did not start")
-        if is_profile:
-            print(json.dumps({"record": "stream", "cpu_us": profile_relay(endpoint, folder, decisions)}), flush=True)
-            return 0
-        kinds: list[tuple[str, str, list[bytes]]] = [
-            ("decision", keys.contact_decision(VESSEL), [wire.encode(decision(n)) for n in range(decisions)]),
-            (
-                "stream",
-                keys.image_coded(VESSEL),
-                [wire.encode(coded_image(VESSEL, 1, n, time.time())) for n in range(decisions)],
-            ),
-            ("picture", keys.image_reconstructed(VESSEL), [wire.encode(image(n)) for n in range(images)]),
-        ]
-        for name, key, payloads in kinds:
-            result = measure(endpoint, folder, key, payloads)
-            print(json.dumps({"record": name, **result}), flush=True)
-            passed = passed and result["relay_per_s"] >= GOAL * min(
-                result["pipelined_per_s"], result["disk_bound_per_s"]
-            )
+        yield
     finally:
         child.stdin.close()
         child.wait(timeout=10)
+
+
+def compare(folder: Path, count: int, rounds: int, names: Sequence[str]) -> int:
+    """Measure both kinds of records; return 1 if a ratio is below its aim."""
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    decisions = [wire.encode(decision(n)) for n in range(count)]
+    images = [coded_image(VESSEL, 1, n, time.time()) for n in range(count)]
+    kinds = {
+        "decision": Records(keys.contact_decision(VESSEL), decisions, decisions),
+        "coded image": Records(
+            keys.image_coded(VESSEL), [*map(wire.encode, images)], [wire.encode(whole_part(one)) for one in images]
+        ),
+    }
+    passed = True
+    with ExitStack() as stack:
+        peers: dict[str, Peer] = {}
+        for name in names:
+            (port,) = free_ports(1)
+            try:
+                peers[name] = stack.enter_context(PEERS[name](folder / name, port, port))
+            except AbsentError as error:
+                print(json.dumps({"skipped": name, "reason": str(error)}), flush=True)
+        stack.enter_context(running_far_side(endpoint, folder))
+        for kind, records in kinds.items():
+            found = []
+            for number in range(1, rounds + 1):
+                found.append(measure(endpoint, folder, records, peers))
+                print(json.dumps({"record": kind, "round": number, **found[-1]}), flush=True)
+            medians = {name: round(statistics.median(one[name] for one in found), 2) for name in found[0]}
+            size = round(statistics.mean(map(len, records.sent)))
+            print(json.dumps({"record": kind, "median_of": rounds, "bytes": size, **medians}), flush=True)
+            passed = passed and all(medians[f"of_{name}"] >= AIMS.get((kind, name), 0.0) for name in peers)
     return 0 if passed else 1
+
+
+def main() -> int:
+    """Run; return 1 if a ratio is below its aim."""
+    parser = argparse.ArgumentParser(description="relay throughput against software of others that stores on disk")
+    parser.add_argument("--records", type=int, default=10000, metavar="N", help="of each kind; default: 10000")
+    parser.add_argument("--rounds", type=int, default=5, metavar="N", help="default: 5")
+    parser.add_argument(
+        "--peers", default=",".join(PEERS), metavar="NAME,…", help="default: %(default)s; without any: --peers ''"
+    )
+    parser.add_argument("--dir", type=Path, metavar="DIR", help="folder for the stores (default: a temporary folder)")
+    parser.add_argument("--profile", action="store_true", help="only the CPU time of the relay for coded images")
+    parser.add_argument("--far-side", nargs=2, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.far_side:
+        far_side(args.far_side[0], Path(args.far_side[1]))
+        return 0
+    names = [name for name in args.peers.split(",") if name]
+    if unknown := set(names) - set(PEERS):
+        parser.error(f"--peers: got {', '.join(sorted(unknown))}, expected some of {', '.join(PEERS)}")
+    with ProgressDisplay(step="relay_throughput"), tempfile.TemporaryDirectory(dir=args.dir) as name:
+        folder = Path(name).resolve()
+        if args.profile:
+            print(json.dumps({"record": "coded image", "cpu_us": profile_relay(folder, args.records)}), flush=True)
+            return 0
+        return compare(folder, args.records, args.rounds, names)
 
 
 if __name__ == "__main__":
