@@ -8,6 +8,7 @@ out of range is an error with the key and the name of the field.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import TypeVar
 
 import msgpack
@@ -23,6 +24,7 @@ MAX_PAYLOAD_BYTES = 40 * 1024 * 1024
 ENCODING_PREFIX = "application/msgpack;schema=sonarpost."
 
 
+@cache
 def encoding_of(record_type: type[Record]) -> str:
     """Return the Zenoh encoding of a record type: application/msgpack;schema=sonarpost.contact.v1."""
     return f"{ENCODING_PREFIX}{record_type.TYPE}.v{record_type.VERSION}"
@@ -33,9 +35,13 @@ def encode(record: Record) -> bytes:
 
     Equal records give equal bytes on every platform. A sparse record omits fields with their default value.
     """
-    fields = {"type": record.TYPE, "v": record.VERSION, **record.model_dump(exclude_defaults=record.SPARSE)}
-    packed: bytes = msgpack.packb(fields, use_bin_type=True)
+    packed: bytes = msgpack.packb(map_of(record), use_bin_type=True)
     return packed
+
+
+def map_of(record: Record) -> dict[str, object]:
+    """Return the map of a record's payload, which `unpack_map` reads from it."""
+    return {"type": record.TYPE, "v": record.VERSION, **record.model_dump(exclude_defaults=record.SPARSE)}
 
 
 def unpack_map(payload: bytes, where: str) -> dict[str, object]:

@@ -27,6 +27,7 @@ from sonarpost.errors import DeliveryError, PayloadError, SonarpostError
 from sonarpost.logs import kv
 from sonarpost.messages import (
     Advice,
+    CodedImage,
     Command,
     Decision,
     ImagePart,
@@ -144,23 +145,22 @@ class C2Service(Service[C2Config]):
 
     # Records of vessels
 
-    def validate(self, key: str, record: Record) -> None:
-        """Refuse records that cannot be handled later, so that their senders are informed."""
+    def validate(self, key: str, record: Record) -> Record | None:
+        """Refuse records that cannot be handled later, so that their senders are informed; return a coded image."""
         if isinstance(record, Relayed):
             if key != keys.shore_inbox(record.vessel_id, self.config.site):
                 # Access control restricts a vessel to its own key, so the key proves the vessel.
                 raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
             self._unpack(record)
-            return
+            return None
         if isinstance(record, ImagePart):
-            if record.b == 0:
-                image_parts.coded_image(record, keys.part_vessel(key), key)
-            return
+            return image_parts.coded_image(record, keys.part_vessel(key), key) if record.b == 0 else None
         assert isinstance(record, (Advice, Command))
         vessel = keys.tasking_vessel(key)
         if isinstance(record, Advice) and record.vessel_id != vessel:
             raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
         self._is_known(vessel, key, record)
+        return None
 
     def expand(self, tx: Transaction, key: str, payload: bytes) -> bytes:
         """Return the whole image of a difference; store it, because the vessel sends later differences to it.
@@ -206,7 +206,7 @@ class C2Service(Service[C2Config]):
         except Exception:
             self._archive.discard(key, effects.payload)
             raise
-        if not isinstance(record, ImagePart):
+        if not isinstance(record, (ImagePart, CodedImage)):
             self._archive.handled(key, effects.payload)
 
     def _handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
@@ -218,8 +218,10 @@ class C2Service(Service[C2Config]):
                 self._publish_status(inner, effects)
             else:
                 self._store_decision(inner, effects)
+        elif isinstance(record, CodedImage):
+            self._accept_image(record, effects)
         elif isinstance(record, ImagePart):
-            self._accept_image(keys.part_vessel(key), key, record, effects)
+            self._accept_image(image_parts.coded_image(record, keys.part_vessel(key), key), effects)
         else:
             assert isinstance(record, (Advice, Command))
             self._send_to_vessel(keys.tasking_vessel(key), key, record, effects)
@@ -229,8 +231,7 @@ class C2Service(Service[C2Config]):
         key = keys.shore_status(status.vessel_id, self.config.site)
         self.publish(key, status)
         if self.config.json_mirror:
-            fields = wire.unpack_map(wire.encode(status), key)
-            self.publish_payload(keys.json_mirror(key), json_payload(fields, "none"), ENCODING)
+            self.publish_payload(keys.json_mirror(key), json_payload(wire.map_of(status), "none"), ENCODING)
         effects.count("statuses_published")
 
     def _unpack(self, envelope: Relayed) -> ReconstructedImage | Decision | ReceivedStatus:
@@ -255,9 +256,9 @@ class C2Service(Service[C2Config]):
             effects.count("images_conflicting")
         self._to_publish.append(self._accepted.image(image, written.tiff.stem))
 
-    def _accept_image(self, vessel: str, key: str, part: ImagePart, effects: UnitOfWork) -> None:
+    def _accept_image(self, image: CodedImage, effects: UnitOfWork) -> None:
         """Add a coded image to the backlog of the decoder, and publish it in coded form."""
-        image = image_parts.coded_image(part, vessel, key)
+        vessel = image.vessel_id
         entry = AcceptedImage(self._backlog_names.next(vessel), vessel, effects.payload)
         effects.put_state(entry.name, entry.pack())
         effects.count("images_accepted")
@@ -558,7 +559,7 @@ class C2Service(Service[C2Config]):
             ServiceStoppingError: The session was closed: the records are published after the next start.
         """
         for entry, accepted in zip(entries, numbers, strict=True):
-            fields = accepted_fields(wire.unpack_map(wire.encode(entry.record), entry.key), accepted)
+            fields = accepted_fields(wire.map_of(entry.record), accepted)
             encoding = wire.encoding_of(type(entry.record))
             if not self.publish_payload(entry.key, payload_of(fields), encoding) and self.stopping.is_set():
                 raise ServiceStoppingError

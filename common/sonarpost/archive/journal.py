@@ -18,9 +18,9 @@ import time
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgpack
 
@@ -83,8 +83,7 @@ class JournalEntry:
     name: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class JournalRecord:
+class JournalRecord(NamedTuple):
     """Columns of a record in a journal, in the order of the table, without its number.
 
     Attributes:
@@ -112,11 +111,12 @@ class JournalRecord:
     def of(cls, entry: JournalEntry, accepted_utc_s: float) -> JournalRecord:
         """Return the columns of a record that is accepted at this time."""
         contact = entry.contact
+        payload = wire.encode(entry.record)
         return cls(
             entry.key,
-            hashlib.sha256(wire.encode(entry.record)).digest()[:DIGEST_BYTES],
+            hashlib.sha256(payload).digest()[:DIGEST_BYTES],
             wire.encoding_of(type(entry.record)),
-            zlib.compress(_without_pixels(entry)),
+            zlib.compress(_without_pixels(entry, payload)),
             accepted_utc_s,
             entry.vessel_id,
             entry.vehicle_id,
@@ -129,7 +129,7 @@ class JournalRecord:
         )
 
 
-COLUMNS: Final = ", ".join(each.name for each in fields(JournalRecord))
+COLUMNS: Final = ", ".join(JournalRecord._fields)
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,9 +290,8 @@ class Journal:
             known = db.execute(same_files, (entry.key, entry.vessel_id, entry.name)).fetchone()
         if known is not None:
             return entry.key, Accepted(self.archive, int(known[0]), float(known[1]))
-        row = astuple(values)
-        marks = ", ".join("?" * len(row))
-        seq = db.execute(f"INSERT INTO record ({COLUMNS}) VALUES ({marks})", row).lastrowid  # noqa: S608 literals
+        marks = ", ".join("?" * len(values))
+        seq = db.execute(f"INSERT INTO record ({COLUMNS}) VALUES ({marks})", values).lastrowid  # noqa: S608 literals
         assert seq is not None
         if isinstance(entry.record, Decision):
             self._review(db, entry)
@@ -412,9 +411,8 @@ def conditions(keys: Sequence[str], criteria: Criteria) -> tuple[list[str], list
     return where, values
 
 
-def _without_pixels(entry: JournalEntry) -> bytes:
+def _without_pixels(entry: JournalEntry, payload: bytes) -> bytes:
     """Return the payload of a record, without the pixels that its files hold."""
-    payload = wire.encode(entry.record)
     if not entry.name:
         return payload
     fields = wire.unpack_map(payload, entry.key)

@@ -11,7 +11,6 @@ import json
 import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict
 from itertools import count
 from typing import Final
 
@@ -226,7 +225,7 @@ def _insert(sql: Sql, records: Sequence[tuple[int, JournalRecord]]) -> None:
     rows = []
     for seq, record in records:
         contents = {"digest": f"\\x{record.digest.hex()}", "payload": f"\\x{record.payload.hex()}"}
-        rows.append({"seq": seq} | asdict(record) | contents)
+        rows.append({"seq": seq} | record._asdict() | contents)
     sql.rows(
         f"INSERT INTO record (seq, {COLUMNS}) SELECT seq, {COLUMNS}"  # noqa: S608 literals
         # Without the schema, `record` is a pseudo-type.

@@ -55,6 +55,8 @@ FAILURES_ALONE: Final = limit(
     3, "failures", "blame", "all services", "sender", "failures alone while others are handled", "it is quarantined"
 )
 MAX_DETAIL = 2000
+MAX_CHECKED, MAX_CHECKED_BYTES = 2048, 4096
+"""Maximum number and size of accepted records that are kept in memory to save the decoding in `handle`."""
 TYPES_KEPT = 1000
 """Maximum number of keys in the cache of record types."""
 MAX_REFUSAL_LOGS = 64
@@ -118,7 +120,7 @@ class Service(ABC, Generic[C]):
         self._refusal_logs: dict[str, IntervalLog] = {}
         self._failed_alone: dict[int, int] = {}
         self._handling_lock = threading.Lock()
-        self._checked: tuple[bytes, Record | None] = (b"", None)
+        self._checked: dict[tuple[str, bytes], Record] = {}  # accepted records that are not handled yet
         self._heartbeat = Heartbeat.from_environment(os.environ, platform.state_dir, platform.health_interval_s)
         self._manager = ServiceManager.from_environment(os.environ, platform.health_interval_s)
 
@@ -145,10 +147,13 @@ class Service(ABC, Generic[C]):
             ServiceStoppingError: The service is stopping; the record is handled after the next start.
         """
 
-    def validate(self, key: str, record: Record) -> None:
+    def validate(self, key: str, record: Record) -> Record | None:
         """Check a record before it is accepted; the default accepts every record.
 
         Called inside a store transaction: it must not wait for a lock whose holder opens another one.
+
+        Returns:
+            What `handle` receives in place of the record, unless it reads it from the store; None for the record.
 
         Raises:
             BadInputError: The record is refused; its sender quarantines it.
@@ -329,8 +334,9 @@ class Service(ABC, Generic[C]):
 
     def _check_payload(self, key: str, payload: bytes) -> None:
         record = wire.decode(self._record_type(key), payload, key)
-        self.validate(key, record)
-        self._checked = payload, record
+        record = self.validate(key, record) or record
+        if len(self._checked) < MAX_CHECKED and len(payload) <= MAX_CHECKED_BYTES:
+            self._checked[key, payload] = record
 
     def _refused(self, error: BadInputError) -> None:
         self.count("records_refused")
@@ -363,6 +369,7 @@ class Service(ABC, Generic[C]):
             failures = 0
             self.set_degraded("")
             if not found:
+                self._checked.clear()  # of records that were not accepted
                 self.store.inbox_changed.wait()
 
     def _handle_in_batches(self) -> bool:
@@ -494,9 +501,8 @@ class Service(ABC, Generic[C]):
 
     def _call_handle(self, key: str, payload: bytes) -> UnitOfWork:
         effects = UnitOfWork(payload)
-        # The inbox has just decoded a record that is handled at once.
-        checked, record = self._checked
-        if record is None or checked is not payload:
+        record = self._checked.pop((key, payload), None)
+        if record is None:
             record = wire.decode(self._record_type(key), payload, key)
         with log_context(payload):
             self.handle(key, record, effects)
