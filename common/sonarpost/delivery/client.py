@@ -14,7 +14,6 @@ from sonarpost.delivery.records import OutboxItem
 from sonarpost.errors import DeliveryError, PayloadError
 from sonarpost.messages import Record
 
-ATTEMPT_S = 2.0
 PAUSE_S = 0.2
 
 
@@ -53,7 +52,8 @@ def deliver(
     ends_s = time.monotonic() + timeout_s
     offset, reason = 0, "no reply"
     while True:
-        reply = _query(session, item, queue_origin, offset)
+        # A broken connection ends a query at once: one that is in transit is not sent a second time behind itself.
+        reply = _query(session, item, queue_origin, offset, max(ends_s - time.monotonic(), PAUSE_S))
         if reply is not None and reply.status == "stored":
             return
         if reply is not None and reply.status == "refused":
@@ -71,13 +71,15 @@ def deliver(
         time.sleep(PAUSE_S)
 
 
-def _query(session: zenoh.Session, item: OutboxItem, origin: bytes, offset: int) -> AckReply | None:
+def _query(
+    session: zenoh.Session, item: OutboxItem, origin: bytes, offset: int, timeout_s: float
+) -> AckReply | None:
     replies = session.get(
         keys.delivery_query(item.key, item.queue),
         payload=item.payload[offset : offset + CHUNK_BYTES],
         attachment=attachment(origin, item, offset),
         congestion_control=zenoh.CongestionControl.BLOCK,
-        timeout=ATTEMPT_S,
+        timeout=timeout_s,
     )
     for received in replies:
         if received.ok is not None:

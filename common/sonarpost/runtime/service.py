@@ -353,8 +353,10 @@ class Service(ABC, Generic[C]):
 
     def _work(self) -> None:
         failures = 0
-        while not self.stopping.is_set():
+        while True:
             self.store.inbox_changed.clear()
+            if self.stopping.is_set():  # `stop` sets both, this one first
+                return
             try:
                 found = self._handle_in_batches() if failures < ALONE_AFTER else self._handle_each_alone(failures)
             except ServiceStoppingError:
