@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Protocol
 
 from sonarpost import keys
@@ -16,7 +18,6 @@ from sonarpost.archive.shore_files import (
     decision_path,
     decision_text,
     delete_image_files,
-    files_digest,
     image_row,
     index_missing_files,
     remove_temporary_files,
@@ -118,7 +119,8 @@ class Archive:
         self._lock = threading.RLock()
         self._files = AtomicFiles()
         self._images: list[tuple[str, ReconstructedImage, float]] = []
-        self._decisions: list[Decision] = []
+        self._decisions: dict[Path, tuple[Decision, bytes, bool]] = {}
+        """Content of the file of each, and whether it is new."""
 
     def index(self) -> ShoreIndex:
         """Return the open index, completed from the files."""
@@ -155,16 +157,14 @@ class Archive:
         """
         index = self.index()
         path = decision_path(self._out_dir, decision.vessel_id, decision.decision_id)
-        path.parent.mkdir(parents=True, exist_ok=True)
         text = decision_text(decision)
         with self._lock:
-            stored = self._files.text_of(path) or (path.read_bytes() if path.is_file() else None)
+            added = self._decisions.get(path)
+            stored = added[1] if added else path.read_bytes() if path.is_file() else None
             if stored is not None and stored != text:
                 raise decision_conflict(decision, str(path))
-            if stored is None:
-                self._files.add(path, text, last=True)
-            if stored is None or not index.has_decision(decision.vessel_id, decision.decision_id):
-                self._decisions.append(decision)
+            if stored is None or not (added or index.has_decision(decision.vessel_id, decision.decision_id)):
+                self._decisions[path] = (decision, text, stored is None)
         log.info("Decision stored", extra=kv(vessel=decision.vessel_id, verdict=decision.verdict))
         return stored is None
 
@@ -176,15 +176,21 @@ class Archive:
         """
         with self._lock:
             images, self._images = self._images, []
-            decisions, self._decisions = self._decisions, []
+            decisions, self._decisions = self._decisions, {}
             files, self._files = self._files, AtomicFiles()
-            files.commit()
+            try:
+                for path, (_, text, is_new) in decisions.items():
+                    if is_new:
+                        path.parent.mkdir(parents=True, exist_ok=True)
+                        files.add(path, text, last=True)
+                files.commit()
+            finally:
+                files.drop_from(0)
             rows: list[ImageRow | DecisionRow] = [
                 image_row(self._out_dir, name, image, at, time.time()) for name, image, at in images
             ]
-            for decision in decisions:
-                path = decision_path(self._out_dir, decision.vessel_id, decision.decision_id)
-                rows.append(DecisionRow.of(decision, time.time(), files_digest([path])))
+            for decision, text, _ in decisions.values():
+                rows.append(DecisionRow.of(decision, time.time(), hashlib.sha256(text).hexdigest()))
             if rows:
                 self.index().put(rows)
 

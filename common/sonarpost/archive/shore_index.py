@@ -11,7 +11,7 @@ import sqlite3
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -263,7 +263,7 @@ class ShoreIndex:
         """
         with self._writing() as db:
             for row in rows:
-                values = astuple(row)
+                values = tuple(getattr(row, each.name) for each in fields(row))
                 marks = ", ".join("?" * len(values))
                 db.execute(f"INSERT OR REPLACE INTO {_TABLES[type(row)]} VALUES ({marks})", values)  # noqa: S608
 
