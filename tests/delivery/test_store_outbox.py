@@ -104,3 +104,14 @@ def test_listeners_are_notified_of_commits_only(store):
         tx.accept("k", b"x")
     assert not event.is_set()
     assert store.inbox_changed.is_set()
+
+
+def test_listener_of_a_queue_replaces_the_general_one(store):
+    called = []
+    store.add_outbox_listener(lambda: called.append("general"))
+    store.add_outbox_listener(lambda: called.append("c2"), "c2")
+    for queues in (["c2"], ["relay"], ["c2", "relay"]):
+        with store.transaction() as tx:
+            for queue in queues:
+                tx.send("k", queue, b"x", encoding="e")
+    assert called == ["c2", "general", "c2", "general"]

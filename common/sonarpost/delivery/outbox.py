@@ -212,7 +212,7 @@ class QueueSender:
         self._stop = threading.Event()
         self._wake = threading.Event()
         self._has_new = True
-        store.add_outbox_listener(self._on_new)
+        store.add_outbox_listener(self._on_new, queue)
         self._thread = threading.Thread(target=self._run, name=f"outbox-{queue}", daemon=True)
         self._thread.start()
 
@@ -221,7 +221,7 @@ class QueueSender:
         self._stop.set()
         self._wake.set()
         self._thread.join(timeout=0.5)
-        self._store.remove_outbox_listener(self._on_new)
+        self._store.remove_outbox_listener(self._on_new, self._queue)
 
     def _on_new(self) -> None:
         self._has_new = True

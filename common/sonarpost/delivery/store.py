@@ -99,7 +99,7 @@ class Store:
         self._page_bytes = page_bytes
         self._lock = threading.RLock()
         self._reader_lock = threading.Lock()
-        self._outbox_listeners: list[Callable[[], None]] = []
+        self._outbox_listeners: list[tuple[str, Callable[[], None]]] = []
         self._in_flight: set[tuple[str, int]] = set()
         self._watermark = Watermark(path)
         self.lost: LostRecords | None = None
@@ -179,18 +179,21 @@ class Store:
                 raise DeliveryError(f"{self.path}: {_reason(error, self.path)}") from error
             self.states_discarded += tx.states_discarded
         if tx.wrote_outbox:
-            for on_new in tuple(self._outbox_listeners):
-                on_new()
+            listeners = tuple(self._outbox_listeners)
+            for queue in tx.assigned:
+                own = [on_new for name, on_new in listeners if name == queue]
+                for on_new in own or [on_new for name, on_new in listeners if not name]:
+                    on_new()
         if tx.wrote_inbox:
             self.inbox_changed.set()
 
-    def add_outbox_listener(self, on_new: Callable[[], None]) -> None:
-        """Call `on_new` after each transaction that added a record to the outbox."""
-        self._outbox_listeners.append(on_new)
+    def add_outbox_listener(self, on_new: Callable[[], None], queue: str = "") -> None:
+        """Call `on_new` after each transaction that added a record to `queue`; by default to one without a listener."""
+        self._outbox_listeners.append((queue, on_new))
 
-    def remove_outbox_listener(self, on_new: Callable[[], None]) -> None:
+    def remove_outbox_listener(self, on_new: Callable[[], None], queue: str = "") -> None:
         """Stop calling `on_new`."""
-        self._outbox_listeners.remove(on_new)
+        self._outbox_listeners.remove((queue, on_new))
 
     def _query(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
         """Query the writing connection, after the transaction in progress."""
