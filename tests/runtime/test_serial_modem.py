@@ -17,9 +17,10 @@ from sonarpost.simulation.channel.emulator import ChannelEmulator
 
 
 @pytest.fixture
-def channel(tmp_path):
+def channel(tmp_path, request):
     modems = (ModemSite(address=1), ModemSite(address=3, east_m=150.0))
-    emulator = ChannelEmulator(EmulatorConfig(modem=modems, pty_dir=tmp_path / "modems", time_scale=150.0))
+    time_scale = getattr(request, "param", 150.0)
+    emulator = ChannelEmulator(EmulatorConfig(modem=modems, pty_dir=tmp_path / "modems", time_scale=time_scale))
     emulator.start()
     yield emulator
     emulator.stop()
@@ -97,6 +98,7 @@ def test_a_modem_that_does_not_reply_is_named():
         SerialModem("loop://", address=1, ready_timeout_s=0.3).open()
 
 
+@pytest.mark.parametrize("channel", [0.01], indirect=True)  # the packet lasts longer than the test
 def test_close_ends_send_and_receive_in_other_threads(ports):
     modem = SerialModem(ports[3], address=3)
     modem.open()
