@@ -2,7 +2,8 @@
 
 Redis has no transfer of streams of its own. The forwarder reads up to 512 entries, adds them with the same identifiers
 to the stream of the receiver, and deletes them at the sender when the receiver has answered. Redis answers after its
-`fsync`, one for all commands that it has read together. The receiver rejects an identifier that it has.
+`fsync`, one for all commands that it has read together. The forwarder connects again after the loss of a connection,
+and sends the same entries; the receiver rejects an identifier that is not larger than its last one.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from research.peers.base import Peer, StartError, program, server
 from sonarpost.cli.demo.settings import free_ports
 
 BATCH = 512
+RECONNECT_S = 1.0
 STREAM = b"records"
 
 
@@ -29,11 +31,11 @@ class Connection:
         self._file = self._socket.makefile("rb")
 
     def request(self, *commands: Sequence[bytes]) -> list[Any]:
-        """Send commands together; return their answers, an integer, bytes, None or a list each.
+        """Send commands together; return their answers: an integer, bytes, None or a list each.
 
         Raises:
-            StartError: The server rejects a command.
-            ConnectionError: The connection has ended.
+            StartError: The server rejects a command, other than an identifier that it has.
+            OSError: The connection has ended.
         """
         self._socket.sendall(
             b"".join(
@@ -48,7 +50,7 @@ class Connection:
         if not line:
             raise ConnectionError("Redis closed the connection")
         kind, text = line[:1], line[1:-2]
-        if kind == b"-":
+        if kind == b"-" and b"ID specified in XADD is equal or smaller" not in text:
             raise StartError(text.decode())
         if kind == b":":
             return int(text)
@@ -59,9 +61,7 @@ class Connection:
         return text
 
     def close(self) -> None:
-        """End the connection; a request of another thread fails."""
-        with suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
+        """End the connection."""
         self._file.close()
         self._socket.close()
 
@@ -73,11 +73,11 @@ class Redis(Peer):
         self._sender_port, self._link_port = sender_port, link_port
         self._sender, self._receiver = Connection(sender_port), Connection(receiver_port)
         self._forwarder: threading.Thread | None = None
+        self._is_stopped = threading.Event()
 
     def fill(self, payloads: Sequence[bytes]) -> None:
         """Empty both streams, then add the records to the sender's."""
-        if self._forwarder is not None:
-            self._forwarder.join()
+        self._stop_forwarder()
         for side in (self._sender, self._receiver):
             side.request([b"DEL", STREAM])
         for start in range(0, len(payloads), BATCH):
@@ -85,23 +85,40 @@ class Redis(Peer):
 
     def connect(self) -> None:
         """Start the forwarder."""
-        self._forwarder = threading.Thread(target=self._forward, daemon=True)
+        self._is_stopped.clear()
+        self._forwarder = threading.Thread(target=self._run, daemon=True)
         self._forwarder.start()
 
     def stored(self) -> int:
         """Return the length of the receiver's stream."""
         return int(self._receiver.request([b"XLEN", STREAM])[0])
 
+    def _run(self) -> None:
+        while not self._is_stopped.is_set():
+            try:
+                self._forward()
+            except OSError:
+                self._is_stopped.wait(RECONNECT_S)
+            else:
+                return
+
     def _forward(self) -> None:
-        source, target = Connection(self._sender_port), Connection(self._link_port)
-        while entries := source.request([b"XRANGE", STREAM, b"-", b"+", b"COUNT", b"%d" % BATCH])[0]:
-            target.request(*([b"XADD", STREAM, number, *fields] for number, fields in entries))
-            source.request([b"XDEL", STREAM, *(number for number, _ in entries)])
-        source.close()
-        target.close()
+        """Move all records of the sender."""
+        with closing(Connection(self._link_port)) as target, closing(Connection(self._sender_port)) as source:
+            while entries := source.request([b"XRANGE", STREAM, b"-", b"+", b"COUNT", b"%d" % BATCH])[0]:
+                target.request(*([b"XADD", STREAM, number, *fields] for number, fields in entries))
+                if self._is_stopped.is_set():
+                    return
+                source.request([b"XDEL", STREAM, *(number for number, _ in entries)])
+
+    def _stop_forwarder(self) -> None:
+        self._is_stopped.set()
+        if self._forwarder is not None:
+            self._forwarder.join()
 
     def close(self) -> None:
-        """End the connections."""
+        """End the forwarder and the connections."""
+        self._is_stopped.set()
         self._sender.close()
         self._receiver.close()
 

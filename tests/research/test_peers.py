@@ -4,34 +4,55 @@ import re
 import shutil
 import sys
 import time
+from contextlib import closing, contextmanager
 
 import pytest
-from builders.common import free_port
+from builders.common import eventually, free_port
 
+from research.common.link_emulator import LinkEmulator
 from research.peers import PEERS, AbsentError, Peer
 from research.peers.base import StartError, program, server
 
 COUNT = 600
 
 
-@pytest.fixture(params=PEERS)
-def peer(request, tmp_path):
-    """Both servers of a peer."""
+@contextmanager
+def linked(name, folder):
+    """A link, and both servers of a peer, whose sender uses it."""
     port = free_port()
-    try:
-        with PEERS[request.param](tmp_path / request.param, port, port) as started:
-            yield started
-    except AbsentError as error:
-        pytest.skip(str(error))
+    with closing(LinkEmulator(port)) as link:
+        try:
+            with PEERS[name](folder / name, port, link.port) as peer:
+                yield link, peer
+        except AbsentError as error:
+            pytest.skip(str(error))
 
 
-def test_the_receiver_stores_every_record_once(peer):
-    for count in (COUNT, COUNT + 1):
-        peer.fill([b"%0200d" % number for number in range(count)])
-        drained = peer.drain(count)
-        assert drained.records == count
-        assert min(drained.seconds, drained.per_s) > 0
-    assert peer.stored() == COUNT + 1
+def records(count):
+    return [b"%0200d" % number for number in range(count)]
+
+
+@pytest.mark.parametrize("name", PEERS)
+def test_the_receiver_stores_every_record_once(name, tmp_path):
+    with linked(name, tmp_path) as (link, peer):
+        for count in (COUNT, COUNT + 1):
+            peer.fill(records(count))
+            drained = peer.drain(count)
+            assert drained.records == count
+            assert min(drained.seconds, drained.per_s) > 0
+        assert peer.stored() == COUNT + 1
+        assert link.attempts > 0
+
+
+def test_the_forwarder_of_redis_connects_again(tmp_path):
+    with linked("redis", tmp_path) as (link, peer):
+        peer.fill(records(COUNT))
+        link.cut()
+        peer.connect()
+        eventually(lambda: link.attempts > 1)
+        assert peer.stored() == 0
+        link.mend()
+        eventually(lambda: peer.stored() == COUNT)
 
 
 class Counted(Peer):
