@@ -7,8 +7,8 @@ of a docstring is a row of the generated table of keys.
 
 from __future__ import annotations
 
+import functools
 import re
-from functools import lru_cache
 
 from sonarpost.errors import BadInputError
 
@@ -263,7 +263,7 @@ def shore_part_all(site: str = SHORE) -> str:
     return _of(site, "inbox/*/part")
 
 
-@lru_cache(1024)
+@functools.lru_cache(1024)
 def part_vessel(key: str) -> str:
     """Return the vessel that a key made by `shore_part` names.
 
