@@ -16,7 +16,7 @@ sum. The parts:
 One JSON object a line:
 
 - `seconds`: from the start to the acknowledgement of the last record (peers: until the receiver has stored it);
-- `arriving_s`: from the first arrival to the last one;
+- `arriving_s`: from the first arrival to the last one (peers: as `seconds`);
 - `wire_bytes`: what the link has carried to the shore, and back, TCP and IP not included;
 - `bytes_a_record`: of both directions;
 - `wire_of_payload`: bytes to the shore, divided by the payload;
@@ -74,8 +74,7 @@ def peer_drain(system: str, link: Link, payloads: Sequence[bytes], timeout_s: fl
         before = passed(links)
         found = peer.drain(len(payloads), timeout_s)
         wire_bytes = [after - earlier for after, earlier in zip(passed(links), before, strict=True)]
-    arriving_s = found.records / found.per_s if found.records else 0.0
-    return Drain(found.records, found.seconds, arriving_s, found.records, wire_bytes)
+    return Drain(found.records, found.seconds, found.seconds, found.records, wire_bytes)
 
 
 def images_of(count: int) -> list[CodedImage]:
