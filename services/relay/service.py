@@ -245,7 +245,8 @@ class RelayService(Service[RelayConfig]):
             effects.send_payload(inbox, queue, payload, Relayed, priority=priority, topic=topic)
         effects.count(f"{record.TYPE}s_relayed")
         self._queued[record.TYPE] += 1
-        log.debug("Record queued for the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
+        if log.isEnabledFor(logging.DEBUG):
+            log.debug("Record queued for the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
 
     def _queue_image(self, image: CodedImage, effects: UnitOfWork) -> None:
         """Queue for each site the difference to the version that it has acknowledged last, or the whole image."""
@@ -267,7 +268,8 @@ class RelayService(Service[RelayConfig]):
         effects.count("image_bytes_received", image.bytes_received)
         effects.count("coded_images_relayed")
         self._queued[image.TYPE] += 1
-        log.debug("Image queued for the shore", extra=kv(version=image.version, bytes=len(payload)))
+        if log.isEnabledFor(logging.DEBUG):
+            log.debug("Image queued for the shore", extra=kv(version=image.version, bytes=len(payload)))
 
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> bool:
         """Store which version of an image a site has; send the whole image if the site has refused a difference."""

@@ -7,9 +7,10 @@ import logging
 import sqlite3
 import time
 import uuid
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from functools import cache
+from itertools import chain
 from typing import Final
 
 from sonarpost import wire
@@ -53,7 +54,7 @@ class UnitOfWork:
 
     def __init__(self, payload: bytes = b"") -> None:
         self.payload = payload
-        self.counts: Counter[str] = Counter()
+        self.counts: defaultdict[str, int] = defaultdict(int)
         self._writes: list[Callable[[Transaction], object]] = []
 
     def send(self, key: str, queue: str, record: Record, *, priority: int = 4, topic: Topic | None = None) -> None:
@@ -454,7 +455,7 @@ def _insert_rows(db: sqlite3.Connection, into: str, columns: str, rows: Sequence
             db.executemany(_insert_statement(into, columns, len(part[0]), 1), part)
         else:
             statement = _insert_statement(into, columns, len(part[0]), len(part))
-            db.execute(statement, [value for row in part for value in row])
+            db.execute(statement, tuple(chain.from_iterable(part)))
 
 
 def runs(numbers: Iterable[int]) -> Iterator[tuple[int, int]]:

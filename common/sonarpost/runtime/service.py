@@ -551,7 +551,8 @@ class Service(ABC, Generic[C]):
         """
         with self._counter_lock:
             for effects in handled:
-                self._counters.update(effects.counts)
+                for name, by in effects.counts.items():
+                    self._counters[name] += by
 
     def publish(self, key: str, record: Record) -> bool:
         """Publish a record for subscribers, without durable delivery; return whether Zenoh has taken it."""
