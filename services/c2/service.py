@@ -306,7 +306,8 @@ class C2Service(Service[C2Config]):
         """Hold the lock under which records are handled, committed and archived; forget what was not committed."""
         with super().handling(wait=wait) as is_held:
             try:
-                yield is_held
+                # To open a large archive takes long: until then, records are accepted without it.
+                yield is_held and (wait or self._accepted.is_open)
             finally:
                 if is_held:
                     self._to_publish.clear()

@@ -71,9 +71,7 @@ def deliver(
         time.sleep(PAUSE_S)
 
 
-def _query(
-    session: zenoh.Session, item: OutboxItem, origin: bytes, offset: int, timeout_s: float
-) -> AckReply | None:
+def _query(session: zenoh.Session, item: OutboxItem, origin: bytes, offset: int, timeout_s: float) -> AckReply | None:
     replies = session.get(
         keys.delivery_query(item.key, item.queue),
         payload=item.payload[offset : offset + CHUNK_BYTES],
