@@ -20,11 +20,32 @@ REPLY_BYTES = 120
 
 
 class Link:
-    """A line in each direction."""
+    """A line in each direction, or several in series with routers between, each of which receives a query as a whole.
 
-    def __init__(self, rate_bytes_per_s, delay_s, jitter_s=0.0):
-        self.up, self.down = (SerialLine(rate_bytes_per_s, delay_s, jitter_s, seed) for seed in (1, 2))
+    Args:
+        rate_bytes_per_s: Rate of each line.
+        delay_s: Time of each direction, without transmission and jitter.
+        jitter_s: Maximum additional time of a line.
+        hops: Number of lines.
+    """
+
+    def __init__(self, rate_bytes_per_s, delay_s, jitter_s=0.0, hops=1):
+        self.lines = [
+            [SerialLine(rate_bytes_per_s, delay_s / hops, jitter_s, 2 * hop + way) for hop in range(hops)]
+            for way in (0, 1)
+        ]
         self.carried_bytes = 0
+
+    @property
+    def up(self):
+        return self.lines[0][0]
+
+    def arrival_s(self, direction, size_bytes, now_s):
+        """Send data; return when it arrives."""
+        self.carried_bytes += size_bytes * (direction == 0)
+        for line in self.lines[direction]:
+            now_s = line.arrival_s(size_bytes, now_s)
+        return now_s
 
 
 class Sender:
@@ -35,9 +56,10 @@ class Sender:
         queries: Number of queries for each record.
     """
 
-    def __init__(self, records=(), bytes_per_s=None, begins_s=0.0):
+    def __init__(self, records=(), bytes_per_s=None, begins_s=0.0, max_batch=128):
         self.scheduler = DeliveryScheduler(bytes_per_s, begins_s)
         self.begins_s = begins_s
+        self.max_batch = max_batch
         self._not_loaded = []
         self.acknowledged_s = {}
         self.queries = {}
@@ -118,15 +140,14 @@ class Simulation:
                 seq = each.transfer.item.seq
                 sender.queries[seq] = sender.queries.get(seq, 0) + 1
             size = sum(each.size + BATCH_RECORD_OVERHEAD_BYTES for each in chunks) + QUERY_BYTES
-            self.link.carried_bytes += size
-            arrives_s = self.link.up.arrival_s(size, self.now_s)
+            arrives_s = self.link.arrival_s(0, size, self.now_s)
             # A commit in progress ends first.
             self._committed_s = max(arrives_s, self._committed_s) + self._commit_s
             self.at(self._committed_s, self._reply, sender, sender.epoch, chunks)
 
     def _reply(self, sender, epoch, chunks):
         if epoch == sender.epoch:
-            arrives_s = self.link.down.arrival_s(REPLY_BYTES + 8 * len(chunks), self.now_s)
+            arrives_s = self.link.arrival_s(1, REPLY_BYTES, self.now_s)
             self.at(arrives_s, self._end, sender, epoch, chunks)
 
     def _end(self, sender, epoch, chunks):
@@ -135,7 +156,7 @@ class Simulation:
         scheduler = sender.scheduler
         scheduler.query_ended(chunks[0], self.now_s, replied=True)
         scheduler.probing = False
-        scheduler.max_batch = 128
+        scheduler.max_batch = sender.max_batch
         for chunk in chunks:
             item = chunk.transfer.item
             if chunk.end < len(item.payload):

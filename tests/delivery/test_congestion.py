@@ -9,6 +9,7 @@ from sonarpost.delivery.congestion import (
     MAX_TIMEOUT_S,
     MAX_WINDOW_BYTES,
     MIN_TIMEOUT_S,
+    QUEUE_S,
     START_BYTES,
     CongestionControl,
 )
@@ -71,7 +72,21 @@ def test_a_decision_waits_at_most_two_round_trips(rate_bytes_per_s, delay_s, lat
     sender.add(records(1, 250, priority=2, first=10**6))
     simulation.send(sender)
     simulation.run(queued_s + 60)
-    assert sender.acknowledged_s[10**6] - queued_s < 2 * round_trip_s + 3000 / rate_bytes_per_s + 0.1
+    assert sender.acknowledged_s[10**6] - queued_s < 2 * round_trip_s + 3000 / rate_bytes_per_s + 3 * QUEUE_S
+
+
+@pytest.mark.parametrize("hops", [1, 2, 3])
+@pytest.mark.parametrize("rate_bytes_per_s", [2000, 8000, 32_000, 128_000])
+def test_routers_that_forward_whole_queries_do_not_look_like_a_queue(rate_bytes_per_s, hops):
+    sender = Sender(records(int(rate_bytes_per_s * 80 / RECORD_BYTES)))
+    simulation = Simulation(Link(rate_bytes_per_s, 0.3, hops=hops), sender).run(20)
+    assert carried(simulation, 40) > 0.85
+
+
+def test_a_consumer_of_single_records_gets_a_window():
+    sender = Sender(records(60_000), max_batch=0)
+    simulation = Simulation(link(32_000, 0.3), sender).run(20)
+    assert carried(simulation, 20) > 0.85
 
 
 def test_a_backlog_of_decisions_obeys_the_window():

@@ -15,8 +15,9 @@ START_BYTES = 2048
 """Window before the first reply."""
 MIN_QUERY_BYTES = 2048
 """Size of a query on a slow link. A smaller one would consist of headers; a larger one delays urgent records."""
-QUERIES = 3
-"""Number of queries in a window, as far as their size allows."""
+QUERIES = 8
+"""Number of queries in a window, as far as their size allows. Routers forward whole queries: each hop adds the time of
+one to a reply time."""
 MAX_WINDOW_BYTES = 64 * CHUNK_BYTES
 QUEUE_FACTOR, QUEUE_S = 1.25, 0.05
 """Reply times up to the shortest one times the factor, and by these seconds more, show no queue: a consumer commits
@@ -28,7 +29,7 @@ RESUME_FACTOR = 3
 """Growth after an interruption or a pause, per byte acknowledged: the window is fourfold after each round trip."""
 PAUSE_S = 10.0
 """Time without a reply after which the window is small again: the rate can have changed."""
-MEASURE_EVERY_S = 120.0
+MEASURE_EVERY_S = 240.0
 """Interval at which the shortest reply time is measured again, with the first window: at multiples of it, so that all
 queues of a host do it at the same time and find an empty link."""
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 30.0, 300.0
@@ -48,6 +49,7 @@ class CongestionControl:
     def __init__(self) -> None:
         self.window_bytes = float(START_BYTES)
         self._shortest_s = math.inf
+        self._measured_bytes = 0
         self._longest_s = 0.0
         self._timeouts = 0
         self._doubling = True
@@ -89,9 +91,13 @@ class CongestionControl:
         self._replied_s = now_s
         self._timeouts = 0
         self._longest_s = max(reply_s, FADE * self._longest_s)
+        if size_bytes < self._measured_bytes / 2:
+            return  # a small query is faster
         if self._is_first and reply_s > 2 * self._free_s:
             # Another path: nothing else was in flight.
-            self._shortest_s, self._resume_bytes = reply_s, 0.0
+            self._shortest_s, self._measured_bytes, self._resume_bytes = reply_s, size_bytes, 0.0
+        elif size_bytes == in_flight_bytes and size_bytes > 2 * self._measured_bytes:
+            self._shortest_s, self._measured_bytes = reply_s, size_bytes
         self._is_first = False
         self._shortest_s = min(self._shortest_s, reply_s)
         self._round_s = min(self._round_s, reply_s)
@@ -120,6 +126,7 @@ class CongestionControl:
         self.window_bytes = START_BYTES
         self._resume_bytes = resume_bytes
         self._measuring_until_s = 0.0
+        self._measured_bytes = 0
         self._doubling = self._is_first = True
         self._begin_round(-math.inf)
 
@@ -136,9 +143,10 @@ class CongestionControl:
                 self._shortest_s = self._measured_s
                 self._set_window(self._resume_bytes)
                 self._measuring_until_s = self._resume_bytes = 0.0
-        elif self._was_full and now_s // MEASURE_EVERY_S > self._period:
+        elif self._was_full and not self._doubling and now_s // MEASURE_EVERY_S > self._period:
             self._resume_bytes = self.window_bytes
             self.window_bytes = START_BYTES
+            self._measured_bytes = 0
             self._measured_s = math.inf
             self._measuring_until_s = now_s + 2 * self._longest_s
         else:
