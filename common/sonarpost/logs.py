@@ -114,9 +114,11 @@ def log_batch(logger: logging.Logger, message: str, payloads: Sequence[bytes], /
             `last`, each with vehicle and image.
         **counts: Further fields, for example the number of records of each type.
     """
-    names = [context_of_payload(payload) for payload in (payloads[0], payloads[-1])]
-    ends = {end: "/".join([*found.values()][:2]) for end, found in zip(("first", "last"), names, strict=True)}
-    logger.info(message, extra=kv(**(ends if len(payloads) > 1 else names[0]), **counts))
+    names = context_of_payload(payloads[0])
+    if len(payloads) > 1:
+        ends = zip(("first", "last"), (names, context_of_payload(payloads[-1])), strict=True)
+        names = {end: "/".join([*found.values()][:2]) for end, found in ends}
+    logger.info(message, extra=kv(**names, **counts))
 
 
 def fields_of(record: logging.LogRecord) -> dict[str, object]:

@@ -211,7 +211,7 @@ class QueueSender:
         self._batch_refused = False
         self._stop = threading.Event()
         self._wake = threading.Event()
-        self._has_new = True
+        self._has_new, self._has_all = True, False
         store.add_outbox_listener(self._on_new, queue)
         self._thread = threading.Thread(target=self._run, name=f"outbox-{queue}", daemon=True)
         self._thread.start()
@@ -273,16 +273,18 @@ class QueueSender:
     # Load
 
     def _load(self) -> None:
-        """Load the most urgent records if there are new ones or few remain."""
+        """Load the most urgent records if there are new ones, or few remain and the store has more."""
         scheduler = self._scheduler
-        if not self._has_new and len(scheduler.active) > scheduler.lookahead // 2:
+        if not self._has_new and (self._has_all or len(scheduler.active) > scheduler.lookahead // 2):
             return
         if len(self._acknowledged) >= REMOVE_AT:
             self._remove_acknowledged()
-        self._has_new = False
-        numbers = self._store.queued_numbers(self._queue, scheduler.lookahead + len(self._acknowledged))
+        self._has_new = self._has_all = False  # both stay so if the store cannot be read
+        limit = scheduler.lookahead + len(self._acknowledged)
+        numbers = self._store.queued_numbers(self._queue, limit)
         unacknowledged = [seq for seq in numbers if seq not in self._acknowledged]
         known, loaded = self._items(unacknowledged[: scheduler.lookahead])
+        self._has_all = len(numbers) < limit and len(known) + len(loaded) == len(unacknowledged)
         scheduler.update([*known, *loaded])
         self._done_up_to = self._store.done_up_to(self._queue)
         session = self._session()
