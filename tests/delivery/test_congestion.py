@@ -99,10 +99,10 @@ def test_a_backlog_of_decisions_obeys_the_window():
 @pytest.mark.parametrize("rate_bytes_per_s", [4000, 16_000, 64_000])
 @pytest.mark.parametrize("later_s", [0.0, 25.0])
 def test_two_sites_share_a_link(rate_bytes_per_s, later_s):
-    sites = [Sender(records(60_000)), Sender(records(60_000), begins_s=later_s)]
-    simulation = Simulation(link(rate_bytes_per_s, 0.3), *sites).run(260)
+    sites = [Sender(records(100_000)), Sender(records(100_000), begins_s=later_s)]
+    simulation = Simulation(link(rate_bytes_per_s, 0.3), *sites).run(420)
     before = [len(site.acknowledged_s) for site in sites]
-    simulation.run(460)
+    simulation.run(620)
     first, second = (len(site.acknowledged_s) - count for site, count in zip(sites, before, strict=True))
     assert 0.6 < first / second < 1.7
     assert simulation.link.up.queue_s(simulation.now_s) < 3
@@ -114,7 +114,7 @@ def test_an_interruption_keeps_what_was_learned():
     learned_bytes = sender.scheduler.congestion.window_bytes
     simulation.cut(link(32_000, 0.3))
     assert sender.scheduler.congestion.window_bytes == START_BYTES
-    simulation.run(32.3)
+    simulation.run(33.5)
     assert sender.scheduler.congestion.window_bytes >= learned_bytes / 2
     assert carried(simulation, 10) > 0.9
 

@@ -36,7 +36,7 @@ MIN_TIMEOUT_S, MAX_TIMEOUT_S = 30.0, 300.0
 TIMEOUT_FACTOR = 8
 """Longest reply times in a time-out: the rate of a radio link can fall by this factor."""
 FADE = 0.9
-"""Factor by which the longest reply time is forgotten with each reply."""
+"""Factor by which the longest reply time and the usual size of a query are forgotten with each reply."""
 
 
 class CongestionControl:
@@ -49,7 +49,7 @@ class CongestionControl:
     def __init__(self) -> None:
         self.window_bytes = float(START_BYTES)
         self._shortest_s = math.inf
-        self._measured_bytes = 0
+        self._usual_bytes = 0.0
         self._longest_s = 0.0
         self._timeouts = 0
         self._doubling = True
@@ -91,13 +91,15 @@ class CongestionControl:
         self._replied_s = now_s
         self._timeouts = 0
         self._longest_s = max(reply_s, FADE * self._longest_s)
-        if size_bytes < self._measured_bytes / 2:
-            return  # a small query is faster
-        if self._is_first and reply_s > 2 * self._free_s:
-            # Another path: nothing else was in flight.
-            self._shortest_s, self._measured_bytes, self._resume_bytes = reply_s, size_bytes, 0.0
-        elif size_bytes == in_flight_bytes and size_bytes > 2 * self._measured_bytes:
-            self._shortest_s, self._measured_bytes = reply_s, size_bytes
+        usual_bytes = self._usual_bytes
+        self._usual_bytes = max(size_bytes, FADE * usual_bytes)
+        if size_bytes < min(usual_bytes, self.query_bytes) / 2:
+            return  # it is faster than others
+        is_slower = self._is_first and reply_s > 2 * self._free_s
+        if is_slower:
+            self._resume_bytes = 0.0  # another path
+        if is_slower or (size_bytes == in_flight_bytes and size_bytes > 2 * usual_bytes):
+            self._shortest_s = reply_s  # nothing else was in flight
         self._is_first = False
         self._shortest_s = min(self._shortest_s, reply_s)
         self._round_s = min(self._round_s, reply_s)
@@ -126,7 +128,6 @@ class CongestionControl:
         self.window_bytes = START_BYTES
         self._resume_bytes = resume_bytes
         self._measuring_until_s = 0.0
-        self._measured_bytes = 0
         self._doubling = self._is_first = True
         self._begin_round(-math.inf)
 
@@ -146,7 +147,6 @@ class CongestionControl:
         elif self._was_full and not self._doubling and now_s // MEASURE_EVERY_S > self._period:
             self._resume_bytes = self.window_bytes
             self.window_bytes = START_BYTES
-            self._measured_bytes = 0
             self._measured_s = math.inf
             self._measuring_until_s = now_s + 2 * self._longest_s
         else:
