@@ -150,6 +150,8 @@ def test_the_radio_goes_first_and_its_image_replaces_the_preview(
     eventually(
         lambda: not relay.store.state_names("short/shore/item/"), what="withdrawal of what the radio has delivered"
     )
+    # The part of the image withdraws its preview as well: the whole can follow later.
+    eventually(lambda: relay.store.outbox_depth() == 0, what="delivery by radio")
     assert gateway.messages == 0
     # The preview of a stored image changes nothing; a preview that came first is replaced.
     runner.stop(relay)
