@@ -199,7 +199,7 @@ class QueueSender:
         self._on_acknowledged = on_acknowledged
         self._scheduler = DeliveryScheduler(policy.bytes_per_s, time.monotonic())
         self._published: set[int] = set()
-        self._in_flight = 0
+        self._in_flight: set[_Query] = set()
         self._ended: deque[_Query] = deque()
         self._failure: str | None = None
         self._timed_out = False
@@ -362,7 +362,7 @@ class QueueSender:
             payload=payload,
             attachment=attachment,
         )
-        self._in_flight += 1
+        self._in_flight.add(query)
         self._scheduler.query_sent(chunks[0], sent_s, *chunks[1:])
 
     def _publish(self, session: zenoh.Session, item: OutboxItem) -> None:
@@ -385,7 +385,9 @@ class QueueSender:
         found = bool(self._ended)
         while self._ended:
             query = self._ended.popleft()
-            self._in_flight -= 1
+            if query not in self._in_flight:
+                continue  # it could not be sent
+            self._in_flight.remove(query)
             reply = query.reply
             replied = reply is not None and reply.ok is not None
             self._scheduler.query_ended(query.chunks[0], time.monotonic(), replied=replied)

@@ -1,0 +1,99 @@
+"""The sender of a queue, step by step over a network in memory: failures while queries are in flight."""
+
+import pytest
+import zenoh
+from builders.delivery_machine import Network, SteppedSender
+
+from sonarpost.delivery import outbox
+from sonarpost.delivery.outbox import QueuePolicy
+from sonarpost.delivery.protocol import MAX_BATCH_RECORDS, AckReply
+
+STORED = AckReply("stored").pack()
+
+
+class FailingNetwork(Network):
+    """Raises as a closed session does, which also ends the query."""
+
+    is_closed = False
+
+    def get(self, key, handler, **options):
+        if self.is_closed:
+            handler.drop()
+            raise zenoh.ZError("session closed")
+        super().get(key, handler, **options)
+
+
+@pytest.fixture
+def network():
+    return FailingNetwork()
+
+
+@pytest.fixture
+def sender(store, network, monkeypatch):
+    monkeypatch.setattr(outbox, "IDLE_S", 0.0)
+    monkeypatch.setattr(outbox, "BACK_OFF_S", (0.0,))
+    return SteppedSender(network, store, "c", QueuePolicy(), None)
+
+
+def queue(store, count, size_bytes=1000):
+    with store.transaction() as tx:
+        for number in range(count):
+            tx.send("k", "c", bytes([number]) * size_bytes, encoding="e")
+
+
+def step(sender, times=4):
+    for _ in range(times):
+        sender._step()
+
+
+def connect(sender, network):
+    """Deliver the first record, after which several queries are in flight."""
+    step(sender)
+    network.sent[0].end(STORED)
+    sender._scheduler.congestion.window_bytes = 4096
+    step(sender)
+
+
+def test_a_record_whose_query_cannot_be_sent_is_sent_later(sender, store, network):
+    queue(store, 1)
+    network.is_closed = True
+    with pytest.raises(zenoh.ZError):
+        sender._step()
+    sender._fail("session closed")
+    network.is_closed = False
+    step(sender)
+    assert len(network.sent) == 1
+    network.sent[0].end(STORED)
+    step(sender)
+    assert store.outbox_depth() == 0
+
+
+@pytest.mark.parametrize("late_reply", [STORED, None])
+def test_nothing_is_sent_again_while_another_query_is_in_flight(sender, store, network, late_reply):
+    queue(store, 4)
+    connect(sender, network)
+    assert len(network.sent) == 4
+    network.sent[1].end()
+    step(sender)
+    assert not sender.responding
+    assert len(network.sent) == 4, "two queries are in flight"
+    network.sent[3].end(STORED)
+    step(sender)
+    assert len(network.sent) == 4
+    network.sent[2].end(late_reply)
+    step(sender)
+    assert len(network.sent) == 5, "one query tests the connection"
+    assert network.sent[4].content == network.sent[1].content
+    network.sent[4].end(STORED)
+    step(sender)
+    assert [query.content[0] for query in network.sent[5:]] == ([2] if late_reply is None else [])
+
+
+def test_replies_count_in_any_order(sender, store, network):
+    queue(store, 4)
+    connect(sender, network)
+    for query in reversed(network.sent[1:]):
+        query.end(AckReply("stored").pack(MAX_BATCH_RECORDS))
+    step(sender)
+    assert store.outbox_depth() == 0
+    assert sender.acknowledged_count == 4
