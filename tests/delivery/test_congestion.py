@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from sonarpost.delivery.congestion import (
     MAX_TIMEOUT_S,
     MAX_WINDOW_BYTES,
+    MIN_QUERY_BYTES,
     MIN_TIMEOUT_S,
     QUEUE_S,
     START_BYTES,
@@ -175,7 +176,7 @@ def test_a_window_that_is_not_used_does_not_grow():
     control = CongestionControl()
     for number in range(100):
         control.replied(200, number, number + 0.01, 200)
-    assert control.window_bytes == START_BYTES
+    assert control.window_bytes == 2 * MIN_QUERY_BYTES
 
 
 @given(st.lists(st.tuples(st.sampled_from("rti"), st.floats(0, 100), st.integers(0, 10**6)), max_size=60))

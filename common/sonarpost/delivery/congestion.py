@@ -98,12 +98,12 @@ class CongestionControl:
         is_slower = self._is_first and reply_s > 2 * self._free_s
         if is_slower:
             self._resume_bytes = 0.0  # another path
-        if is_slower or (size_bytes == in_flight_bytes and size_bytes > 2 * usual_bytes):
-            self._shortest_s = reply_s  # nothing else was in flight
-        self._is_first = False
+        if is_slower or (in_flight_bytes <= 2 * size_bytes and size_bytes > 2 * usual_bytes):
+            self._shortest_s = reply_s  # nothing was in flight before it
         self._shortest_s = min(self._shortest_s, reply_s)
         self._round_s = min(self._round_s, reply_s)
-        self._was_full = self._was_full or in_flight_bytes >= self.window_bytes / 2
+        self._was_full = self._was_full or self._is_first or in_flight_bytes >= self.window_bytes / 2
+        self._is_first = False
         if self._doubling and not self._measuring_until_s and self._was_full and reply_s <= self._free_s:
             factor = RESUME_FACTOR if self.window_bytes < self._resume_bytes else 1
             self._set_window(self.window_bytes + factor * size_bytes)
