@@ -359,6 +359,8 @@ class QueueSender:
             priority=PRIORITIES[items[0].priority],
             # Waits for the link: a dropped query would cost its whole time-out.
             congestion_control=zenoh.CongestionControl.BLOCK,
+            # The first reply counts: of several consumers of one name, one may not reply at all.
+            consolidation=zenoh.ConsolidationMode.NONE,
             payload=payload,
             attachment=attachment,
         )
