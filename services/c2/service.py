@@ -394,8 +394,10 @@ class C2Service(Service[C2Config]):
 
     def _publish_states(self) -> None:
         """Publish and index changed states after their commit; after a start all states once."""
+        # Outside the lock: a transaction, for which the store waits, can wait for it in `_mark_changed`.
+        names = self.store.state_names(tasking.PREFIX)
         with self._changed_lock:
-            self._changed_names.update(self.store.state_names(tasking.PREFIX))
+            self._changed_names.update(names)
         while not self.stopping.is_set():
             self._changed.clear()
             try:
