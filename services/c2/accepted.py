@@ -57,11 +57,6 @@ class AcceptedRecords:
         self._journal: Journal | SharedJournal | None = None
         self._lock = threading.Lock()
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the journal, and with it the archive, has been opened."""
-        return self._journal is not None
-
     def journal(self) -> Journal | SharedJournal:
         """Return the open journal, completed from the stored records.
 

@@ -87,8 +87,6 @@ class C2Service(Service[C2Config]):
         journal_folder = config.out_dir if address is None else platform.state_dir
         self._accepted = AcceptedRecords(self._archive, journal_folder, config.site)
         self._queries = QueryService(self._accepted, config.site, self.count)
-        # A shared database can be slow or absent.
-        self.max_at_once = 1 if address is None else 0
         self._retention = Retention(self._apply_retention, self.stopping)
         self._changed = threading.Event()
         self._changed_names: set[str] = set()
@@ -189,7 +187,7 @@ class C2Service(Service[C2Config]):
 
     def _prune_versions(self, tx: Transaction, prefix: str) -> None:
         self._stored_versions[prefix] += 1
-        if self._stored_versions[prefix] % image_parts.PRUNE_EVERY == 0:
+        if (self._stored_versions[prefix] - 1) % image_parts.PRUNE_EVERY == 0:
             for surplus in image_parts.surplus_names(tx.state_names(prefix)):
                 tx.delete_state(surplus)
 
@@ -306,8 +304,7 @@ class C2Service(Service[C2Config]):
         """Hold the lock under which records are handled, committed and archived; forget what was not committed."""
         with super().handling(wait=wait) as is_held:
             try:
-                # To open a large archive takes long: until then, records are accepted without it.
-                yield is_held and (wait or self._accepted.is_open)
+                yield is_held
             finally:
                 if is_held:
                     self._to_publish.clear()

@@ -49,6 +49,7 @@ DECISION_PRIORITY = 2
 STATUS_PRIORITY = 3
 PREVIEW_PRIORITY = 5
 DETAIL_PRIORITY = 6
+LOGGED_COUNTS = ("coded_images_relayed", "reconstructed_images_relayed", "decisions_relayed")
 VERSIONS = "version/"
 """Prefix of the states with the last version of an image that a site has acknowledged."""
 
@@ -107,7 +108,7 @@ class RelayService(Service[RelayConfig]):
 
     NAME = "relay"
     BATCH = 512
-    max_at_once = 32
+    MAX_AT_ONCE = 32
 
     def __init__(self, platform: PlatformConfig, config: RelayConfig) -> None:
         super().__init__(platform, config)
@@ -117,8 +118,6 @@ class RelayService(Service[RelayConfig]):
             upstream.queue: keys.shore_part(platform.id, upstream.options.site) for upstream in upstreams
         }
         self._stored_versions = Counter[str]()
-        # Records for the shore of the batch in progress and of the one that is committed, by type.
-        self._queued, self._committing = Counter[str](), Counter[str]()
         self._inboxes = {upstream.queue: keys.shore_inbox(platform.id, upstream.options.site) for upstream in upstreams}
         sites = [self._monitored(upstream) for upstream in upstreams]
         self._site_monitor = SiteMonitor(platform.id, sites, platform.tls)
@@ -244,7 +243,6 @@ class RelayService(Service[RelayConfig]):
         for queue, inbox in self._inboxes.items():
             effects.send_payload(inbox, queue, payload, Relayed, priority=priority, topic=topic)
         effects.count(f"{record.TYPE}s_relayed")
-        self._queued[record.TYPE] += 1
         if log.isEnabledFor(logging.DEBUG):
             log.debug("Record queued for the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
 
@@ -267,7 +265,6 @@ class RelayService(Service[RelayConfig]):
             effects.count("image_differences", int(sent is not payload))
         effects.count("image_bytes_received", image.bytes_received)
         effects.count("coded_images_relayed")
-        self._queued[image.TYPE] += 1
         if log.isEnabledFor(logging.DEBUG):
             log.debug("Image queued for the shore", extra=kv(version=image.version, bytes=len(payload)))
 
@@ -307,22 +304,19 @@ class RelayService(Service[RelayConfig]):
     def _prune_versions(self, tx: Transaction, queue: str) -> None:
         """Delete surplus versions, except those of images with a queued difference."""
         self._stored_versions[queue] += 1
-        if self._stored_versions[queue] % image_parts.PRUNE_EVERY == 0:
+        if (self._stored_versions[queue] - 1) % image_parts.PRUNE_EVERY == 0:
             prefix = f"{VERSIONS}{queue}/"
             for name in image_parts.surplus_names(tx.state_names(prefix)):
                 if not tx.has_topic(queue, name.removeprefix(prefix)):
                     tx.delete_state(name)
 
-    def before_commit(self) -> None:
-        """Begin to count the records of the next batch."""
-        self._committing, self._queued = self._queued, Counter()
-
     def after_commit(self, handled: Sequence[UnitOfWork], superseded: int) -> None:
         """Log the queued records, and apply the quota of each site's queue."""
         super().after_commit(handled, superseded)
-        if self._committing:
+        counts = {name: sum(effects.counts.get(name, 0) for effects in handled) for name in LOGGED_COUNTS}
+        if any(counts.values()):
             payloads = [effects.payload for effects in handled]
-            log_batch(log, "Records queued for the shore", payloads, **self._committing)
+            log_batch(log, "Records queued for the shore", payloads, **{name: n for name, n in counts.items() if n})
         for satellite in self._satellites:
             satellite.committed()
         if superseded:

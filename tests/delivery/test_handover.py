@@ -2,6 +2,7 @@
 
 import hashlib
 import shutil
+import sqlite3
 import threading
 from collections import Counter
 
@@ -449,7 +450,7 @@ def test_unexpected_exceptions_do_not_stop_delivery(producer, send, consumer, mo
 @pytest.fixture
 def consumer_at_once(begin, monkeypatch):
     monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.0)
-    monkeypatch.setattr(Consumer, "max_at_once", 2)
+    monkeypatch.setattr(Consumer, "MAX_AT_ONCE", 2)
     return begin()
 
 
@@ -491,3 +492,31 @@ def test_record_whose_effects_cannot_be_written_is_accepted_once(consumer_at_onc
     eventually(lambda: consumer_at_once.store.inbox_depth() == 0)
     eventually(lambda: consumer_at_once.health().counters["records_handled"] == 2)
     assert consumer_at_once.store.refused_count() == 0
+
+
+def test_failure_after_the_commit_repeats_no_publication(consumer_at_once, client, monkeypatch):
+    def fail(*_):
+        raise RetryLaterError("quota not applied")
+
+    monkeypatch.setattr(consumer_at_once, "after_commit", fail)
+    publish_once(client, KEY, decision(1))
+    eventually(lambda: consumer_at_once.got == ["d1"])
+    monkeypatch.undo()
+    publish_once(client, KEY, decision(2))
+    eventually(lambda: "d2" in consumer_at_once.got)
+    assert consumer_at_once.got == ["d1", "d2"]
+
+
+def test_error_of_the_database_quarantines_no_record(begin, ask, monkeypatch):
+    consumer = begin()
+    fails = [True]
+
+    def expand(tx, key, payload):
+        if fails.pop() if fails else False:
+            raise sqlite3.OperationalError("database or disk is full")
+        return payload
+
+    monkeypatch.setattr(consumer._inbox, "_expand", expand)
+    assert ask([item(1, decision(1))]).status == "later"
+    assert ask([item(1, decision(1))]).status == "stored"
+    assert consumer.store.refused_count() == 0

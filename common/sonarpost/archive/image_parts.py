@@ -33,7 +33,7 @@ MAX_VERSIONS: Final = 2048
 """Images of one vessel (c2) or for one site (relay) whose last version is kept for differences; at most 192 MiB
 with the surplus ones."""
 PRUNE_EVERY: Final = 1024
-"""Number of stored versions after which surplus ones are deleted: their search reads all names."""
+"""Number of stored versions after which surplus ones are deleted, and after a start: their search reads all names."""
 MERGED_GAP_BYTES: Final = 5
 """Equal bytes between two pieces that are sent again, because a further piece would be as long."""
 

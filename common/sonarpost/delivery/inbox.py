@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import queue
+import sqlite3
 import threading
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, suppress
@@ -318,7 +319,7 @@ class Inbox:
             try:
                 self._validate(key, payload)
                 stored = self._expand(tx, key, payload)
-            except DeliveryError:
+            except (DeliveryError, sqlite3.Error):
                 raise
             except MissingBaseError as error:
                 # Not an error of the producer: it sends the whole record, and nothing has to be kept.

@@ -84,8 +84,9 @@ class Service(ABC, Generic[C]):
         PUBLISH: Whether queued records are also published on their keys for subscribers.
         BATCH: Maximum number of records that are committed in one transaction. Above 1, a power cut can repeat the
             side effects of `handle` outside the `UnitOfWork` for a whole batch.
-        max_at_once: Maximum number of records that are handled in the transaction that accepts them, while no earlier
-            record waits; 0 if `handle` is slow or must not be called inside a transaction.
+        MAX_AT_ONCE: Maximum number of records that are handled in the transaction that accepts them, while no earlier
+            record waits; 0 if `handle` is slow, opens a transaction, or has effects outside the `UnitOfWork`, which
+            stay if the transaction fails.
         BATCH_BYTES: Maximum size of the records of one batch; it bounds the write-ahead log.
         PAGE_BYTES: Page size of the store; small pages for a service whose transactions change few bytes.
     """
@@ -95,7 +96,7 @@ class Service(ABC, Generic[C]):
     BATCH: ClassVar[int] = 1
     BATCH_BYTES: ClassVar[int] = 2 * 1024 * 1024
     PAGE_BYTES: ClassVar[int] = 4096
-    max_at_once: int = 0
+    MAX_AT_ONCE: ClassVar[int] = 0
 
     def __init__(self, platform: PlatformConfig, config: C) -> None:
         self.platform = platform
@@ -276,7 +277,7 @@ class Service(ABC, Generic[C]):
                 check_capacity=self.check_capacity,
                 delivery_only_keys=self.delivery_only_keys(),
                 before_commit=self.before_accepting,
-                accepting=self._accepting if self.max_at_once else None,
+                accepting=self._accepting if self.MAX_AT_ONCE else None,
             )
             self.start_thread(self._work, "work")
         self.on_start()
@@ -436,7 +437,7 @@ class Service(ABC, Generic[C]):
         handled: list[UnitOfWork] = []
         with self.handling(wait=False) as is_held:
             with self.store.transaction() as tx:
-                limit = self.max_at_once if is_held and tx.is_inbox_empty() else 0
+                limit = self.MAX_AT_ONCE if is_held and tx.is_inbox_empty() else 0
 
                 def handle(key: str, payload: bytes) -> bool:
                     nonlocal limit
@@ -444,6 +445,8 @@ class Service(ABC, Generic[C]):
                         return False
                     try:
                         handled.append(self._call_handle(key, payload))
+                    except (DeliveryError, sqlite3.Error):
+                        raise  # the transaction can have ended
                     except Exception as error:  # noqa: BLE001 - raised again when it is handled in its turn
                         # Later records do not overtake it.
                         log.debug("Record not handled when accepted", extra=kv(key=key, error=str(error)))
@@ -455,8 +458,14 @@ class Service(ABC, Generic[C]):
                     self.before_commit()
                 for effects in handled:
                     effects.write(tx)
+            if is_held and not tx.wrote_inbox:
+                self._checked.clear()  # of records that were not accepted
             if handled:
-                self.after_commit(handled, tx.superseded)
+                try:
+                    self.after_commit(handled, tx.superseded)
+                except Exception:
+                    # The records are accepted and handled: the inbox must not repeat them.
+                    log.exception("Work after the commit of handled records failed")
 
     def _handle_batch(self, items: Sequence[InboxItem]) -> None:
         with self.handling():

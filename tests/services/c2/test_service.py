@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import threading
 
 import msgpack
 import numpy as np
@@ -15,7 +14,6 @@ from builders.shore import relayed
 from sonarpost import keys, wire
 from sonarpost.files import AtomicFiles
 from sonarpost.messages import Contact, Pixels, ReceivedStatus, Relayed
-from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.sonar.image_files import read_image
@@ -89,26 +87,6 @@ def test_decision_is_stored_and_published(begin, relay, out, watch):
     assert json.loads(kept.read_text()) == decision_record(
         "d1", remark="Stein oder Mine? \u2014 prüfen", confidence=0.75
     ).model_dump(mode="json")
-
-
-def test_decision_is_handled_when_it_is_accepted_once_the_archive_is_open(begin, relay, out, watch, monkeypatch):
-    threads = []
-    store = Archive.store_decision
-
-    def store_decision(archive, decision):
-        threads.append(threading.current_thread().name)
-        if decision.decision_id == "d3" and threads[-1] == "inbox-c2":
-            raise OSError(28, "No space left on device")
-        return store(archive, decision)
-
-    monkeypatch.setattr(Archive, "store_decision", store_decision)
-    seen = watch(keys.shore_decision("vessel-1"))
-    service = begin()
-    for number in range(1, 5):
-        send(relay, decision_record(f"d{number}"))
-        eventually(lambda: len(seen) == number and service.store.inbox_depth() == 0)  # noqa: B023
-    assert threads == ["work", "inbox-c2", "inbox-c2", "work", "inbox-c2"]
-    assert len(list((out / "vessel-1" / "decisions").iterdir())) == 4
 
 
 def test_repeated_record_changes_no_file_and_is_published_again(begin, relay, image, out, watch):

@@ -54,7 +54,7 @@ def test_a_batch_is_one_line_and_each_record_has_its_own_at_level_debug(platform
         lines = [line for line in capsys.readouterr().err.splitlines() if "queued for the shore" in line]
         assert [line.split()[1] for line in lines] == (["DEBUG"] * 2 if level == "debug" else []) + ["INFO"]
         assert "Records queued for the shore first=uuv-1/" in lines[-1]
-        assert lines[-1].endswith(" decision=2")
+        assert lines[-1].endswith(" decisions_relayed=2")
 
 
 def test_records_wait_for_the_shore_and_decisions_are_first(begin, runner, c2, source, image):
