@@ -78,7 +78,14 @@ class Shore:
 
     def replies(self, selector):
         """Return the replies of one page and the page."""
-        found = list(self.client.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=WAIT_S))
+        found = []
+
+        def is_answered():
+            # A router drops replies of c2 that wait for 50 ms, and it may not know the queryable yet.
+            found[:] = self.client.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=WAIT_S)
+            return bool(found)
+
+        eventually(is_answered, what=f"replies to {selector}")
         errors = [reply.err.payload.to_string() for reply in found if reply.err is not None]
         assert errors == []
         samples = [reply.ok for reply in found]
