@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from sonarpost.delivery.congestion import (
     MAX_TIMEOUT_S,
     MAX_WINDOW_BYTES,
+    MEASURE_EVERY_S,
     MIN_QUERY_BYTES,
     MIN_TIMEOUT_S,
     QUEUE_S,
@@ -153,6 +154,46 @@ def test_a_slower_link_after_a_pause_is_not_flooded():
         assert simulation.link.up.queue_s(simulation.now_s) < 5
 
 
+@pytest.mark.parametrize(("rate_bytes_per_s", "stall_s"), [(32_000, 60), (128_000, 100)])
+def test_a_stall_at_the_time_of_a_measurement_ends_with_it(rate_bytes_per_s, stall_s):
+    sender = Sender(records(rate_bytes_per_s * 2))
+    simulation = Simulation(link(rate_bytes_per_s, 0.3), sender).run(MEASURE_EVERY_S - stall_s / 2)
+    simulation.link.up.arrival_s(rate_bytes_per_s * stall_s, simulation.now_s)
+    simulation.run(MEASURE_EVERY_S + stall_s / 2 + 20)
+    assert carried(simulation, 20) > 0.8
+    assert set(sender.queries.values()) == {1}
+
+
+@pytest.mark.parametrize(("before_s", "after_s"), [(0.15, 0.3), (0.05, 0.12)])
+def test_a_longer_path_after_an_interruption_is_found(before_s, after_s):
+    sender = Sender(records(200_000))
+    simulation = Simulation(link(128_000, before_s), sender).run(242)
+    simulation.cut(link(128_000, after_s))
+    simulation.run(262)
+    assert carried(simulation, 20) > 0.85
+
+
+def test_measurements_begin_at_multiples_of_utc():
+    control = CongestionControl(clock_offset_s=100.0)
+    control.replied(4000, 0.0, 0.1, 10**7)
+    small_at_s = []
+    for now_s in range(1, 2 * int(MEASURE_EVERY_S)):
+        control.replied(4000, now_s - 1, now_s, 10**7)
+        if control.window_bytes == START_BYTES:
+            small_at_s.append(now_s)
+    assert small_at_s[0] == MEASURE_EVERY_S - 100
+    assert MEASURE_EVERY_S < max(small_at_s) < 2 * MEASURE_EVERY_S - 90
+
+
+def test_hosts_that_share_a_link_measure_at_the_same_time_by_their_synchronised_clocks():
+    starts_s = [0.0, 61.0, 127.0, 190.0]
+    hosts = [Sender(records(60_000), begins_s=start_s) for start_s in starts_s]
+    simulation = Simulation(link(32_000, 0.3), *hosts)
+    for end_s in range(600, 1500, 100):
+        simulation.run(end_s)
+        assert simulation.link.up.queue_s(simulation.now_s) < 1.5
+
+
 def test_a_longer_path_without_an_interruption_is_found():
     sender = Sender(records(200_000))
     simulation = Simulation(link(64_000, 0.05), sender).run(30)
@@ -179,17 +220,19 @@ def test_a_window_that_is_not_used_does_not_grow():
     assert control.window_bytes == 2 * MIN_QUERY_BYTES
 
 
-@given(st.lists(st.tuples(st.sampled_from("rti"), st.floats(0, 100), st.integers(0, 10**6)), max_size=60))
+@given(st.lists(st.tuples(st.sampled_from("rtib"), st.floats(0, 100), st.integers(0, 10**6)), max_size=60))
 def test_window_and_time_out_stay_in_their_limits(events):
     control = CongestionControl()
     now_s = 0.0
     for kind, seconds, size_bytes in events:
         now_s += seconds
         if kind == "r":
-            control.replied(size_bytes, now_s - seconds, now_s, size_bytes)
+            control.replied(size_bytes, now_s - seconds, now_s, 3 * size_bytes)
         elif kind == "t":
             control.timed_out()
-        else:
+        elif kind == "i":
             control.interrupted()
+        else:
+            control.begins(now_s)
         assert START_BYTES <= control.window_bytes <= MAX_WINDOW_BYTES
         assert MIN_TIMEOUT_S <= control.timeout_s <= MAX_TIMEOUT_S

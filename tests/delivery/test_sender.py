@@ -7,6 +7,7 @@ from builders.delivery_machine import Network, SteppedSender
 from sonarpost.delivery import outbox
 from sonarpost.delivery.outbox import QueuePolicy
 from sonarpost.delivery.protocol import MAX_BATCH_RECORDS, AckReply
+from sonarpost.errors import DeliveryError
 
 STORED = AckReply("stored").pack()
 
@@ -38,7 +39,7 @@ def sender(store, network, monkeypatch):
 def queue(store, count, size_bytes=1000):
     with store.transaction() as tx:
         for number in range(count):
-            tx.send("k", "c", bytes([number]) * size_bytes, encoding="e")
+            tx.send("k", "c", bytes([number % 256]) * size_bytes, encoding="e")
 
 
 def step(sender, times=4):
@@ -97,3 +98,44 @@ def test_replies_count_in_any_order(sender, store, network):
     step(sender)
     assert store.outbox_depth() == 0
     assert sender.acknowledged_count == 4
+
+
+def test_a_removal_that_fails_is_not_repeated_before_all_queries_have_ended(sender, store, network, monkeypatch):
+    queue(store, 4)
+    connect(sender, network)
+    removals = []
+
+    def fail():
+        removals.append(1)
+        raise DeliveryError("disk full")
+
+    monkeypatch.setattr(sender, "_remove_acknowledged", fail)
+    monkeypatch.setattr(outbox, "REMOVE_AFTER_S", -1.0)
+    network.sent[1].end(STORED)
+    sender._step()
+    with pytest.raises(DeliveryError):
+        sender._step()
+    sender._fail("disk full")
+    step(sender, 20)
+    assert len(removals) == 1
+
+
+def test_an_urgent_record_is_loaded_although_the_store_could_not_be_read_once(sender, store, network, monkeypatch):
+    queue(store, 2000, size_bytes=1)
+    connect(sender, network)
+    with store.transaction() as tx:
+        tx.send("k", "c", b"urgent", encoding="e", priority=1)
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "queued_numbers", lambda *_: fail_to_read())
+        with pytest.raises(DeliveryError):
+            sender._step()
+        sender._fail("disk I/O error")
+    for query in network.sent[1:]:
+        query.end(STORED)
+    before = len(network.sent)
+    step(sender)
+    assert network.sent[before].content == b"urgent"
+
+
+def fail_to_read():
+    raise DeliveryError("disk I/O error")

@@ -77,6 +77,7 @@ def _query(session: zenoh.Session, item: OutboxItem, origin: bytes, offset: int,
         payload=item.payload[offset : offset + CHUNK_BYTES],
         attachment=attachment(origin, item, offset),
         congestion_control=zenoh.CongestionControl.BLOCK,
+        consolidation=zenoh.ConsolidationMode.NONE,
         timeout=timeout_s,
     )
     for received in replies:

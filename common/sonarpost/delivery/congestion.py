@@ -30,8 +30,8 @@ RESUME_FACTOR = 3
 PAUSE_S = 10.0
 """Time without a reply after which the window is small again: the rate can have changed."""
 MEASURE_EVERY_S = 240.0
-"""Interval at which the shortest reply time is measured again, with the first window: at multiples of it, so that all
-queues of a host do it at the same time and find an empty link."""
+"""Interval at which the shortest reply time is measured again, with the first window: at multiples of it in UTC, so
+that all queues that share a link do it at the same time and find an empty link."""
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 30.0, 300.0
 TIMEOUT_FACTOR = 8
 """Longest reply times in a time-out: the rate of a radio link can fall by this factor."""
@@ -42,11 +42,15 @@ FADE = 0.9
 class CongestionControl:
     """Window and time-out of the queries to one consumer.
 
+    Args:
+        clock_offset_s: What is added to the times of all calls for times that other hosts share, as UTC.
+
     Attributes:
         window_bytes: Payload that may be in flight.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, clock_offset_s: float = 0.0) -> None:
+        self._clock_offset_s = clock_offset_s
         self.window_bytes = float(START_BYTES)
         self._shortest_s = math.inf
         self._usual_bytes = 0.0
@@ -58,7 +62,7 @@ class CongestionControl:
         self._replied_s = math.inf
         self._period = math.inf
         self._measured_s = math.inf
-        self._measuring_until_s = 0.0
+        self._measuring_since_s = 0.0
         self._round_began_s = -math.inf
         self._round_s = math.inf
         self._was_full = False
@@ -95,7 +99,7 @@ class CongestionControl:
         self._usual_bytes = max(size_bytes, FADE * usual_bytes)
         if size_bytes < min(usual_bytes, self.query_bytes) / 2:
             return  # it is faster than others
-        is_slower = self._is_first and reply_s > 2 * self._free_s
+        is_slower = self._is_first and reply_s > self._free_s
         if is_slower:
             self._resume_bytes = 0.0  # another path
         if is_slower or (in_flight_bytes <= 2 * size_bytes and size_bytes > 2 * usual_bytes):
@@ -104,7 +108,7 @@ class CongestionControl:
         self._round_s = min(self._round_s, reply_s)
         self._was_full = self._was_full or self._is_first or in_flight_bytes >= self.window_bytes / 2
         self._is_first = False
-        if self._doubling and not self._measuring_until_s and self._was_full and reply_s <= self._free_s:
+        if self._doubling and not self._measuring_since_s and self._was_full and reply_s <= self._free_s:
             factor = RESUME_FACTOR if self.window_bytes < self._resume_bytes else 1
             self._set_window(self.window_bytes + factor * size_bytes)
         if sent_s >= self._round_began_s:
@@ -127,7 +131,7 @@ class CongestionControl:
     def _restart(self, resume_bytes: float) -> None:
         self.window_bytes = START_BYTES
         self._resume_bytes = resume_bytes
-        self._measuring_until_s = 0.0
+        self._measuring_since_s = 0.0
         self._doubling = self._is_first = True
         self._begin_round(-math.inf)
 
@@ -138,17 +142,18 @@ class CongestionControl:
 
     def _end_round(self, now_s: float) -> None:
         """Adapt the window once for each round trip, by the shortest reply time in it."""
-        if self._measuring_until_s:
+        period = (now_s + self._clock_offset_s) // MEASURE_EVERY_S
+        if self._measuring_since_s:
             self._measured_s = min(self._measured_s, self._round_s)
-            if now_s >= self._measuring_until_s:
+            if now_s - self._measuring_since_s >= 2 * self._longest_s:
                 self._shortest_s = self._measured_s
                 self._set_window(self._resume_bytes)
-                self._measuring_until_s = self._resume_bytes = 0.0
-        elif self._was_full and not self._doubling and now_s // MEASURE_EVERY_S > self._period:
+                self._measuring_since_s = self._resume_bytes = 0.0
+        elif self._was_full and not self._doubling and period > self._period:
             self._resume_bytes = self.window_bytes
             self.window_bytes = START_BYTES
             self._measured_s = math.inf
-            self._measuring_until_s = now_s + 2 * self._longest_s
+            self._measuring_since_s = now_s
         else:
             free = 1.0 if self._round_s <= self._free_s else self._free_s / self._round_s
             if free < 1.0:
@@ -156,7 +161,7 @@ class CongestionControl:
             adapted = (free + GROWTH) * self.window_bytes + STEP_BYTES
             if not self._doubling and (self._was_full or adapted < self.window_bytes):
                 self._set_window(adapted)
-        self._period = now_s // MEASURE_EVERY_S
+        self._period = period
         self._begin_round(now_s)
 
     def _set_window(self, window_bytes: float) -> None:

@@ -197,7 +197,8 @@ class QueueSender:
         self._queue = queue
         self._policy = policy
         self._on_acknowledged = on_acknowledged
-        self._scheduler = DeliveryScheduler(policy.bytes_per_s, time.monotonic())
+        now_s = time.monotonic()
+        self._scheduler = DeliveryScheduler(policy.bytes_per_s, now_s, time.time() - now_s)
         self._published: set[int] = set()
         self._in_flight: set[_Query] = set()
         self._ended: deque[_Query] = deque()
@@ -251,6 +252,8 @@ class QueueSender:
         must not be sent a second time behind it.
         """
         self._wake.clear()
+        if self._stop.is_set():
+            return
         wait_s: float | None = None
         if self._failure is None:
             self._load()
@@ -261,7 +264,7 @@ class QueueSender:
         if self._process_ended():
             return
         overdue = time.monotonic() - self._first_acknowledged_s > REMOVE_AFTER_S
-        if self._acknowledged and (overdue or not self._in_flight):
+        if self._acknowledged and self._failure is None and (overdue or not self._in_flight):
             self._remove_acknowledged()
         else:
             self._wake.wait(IDLE_S if wait_s is None else wait_s)
@@ -508,6 +511,7 @@ class QueueSender:
         self._scheduler.restart(timed_out=self._timed_out)
         self._failure = None
         self._timed_out = False
+        self._has_new = True  # the failure can have been that of the store
         for transfer in self._scheduler.active.values():
             if transfer.in_flight and transfer.received == 0:
                 # The consumer has confirmed no part of it: a newer edition may replace it again.

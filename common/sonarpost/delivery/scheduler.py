@@ -140,6 +140,7 @@ class DeliveryScheduler:
     Args:
         bytes_per_s: Bandwidth limit, None for none.
         now_s: Start time, from the monotonic clock that all calls use.
+        clock_offset_s: UTC minus this clock.
 
     Attributes:
         congestion: Window and time-out of the queries.
@@ -148,8 +149,8 @@ class DeliveryScheduler:
         max_batch: Number of records that the consumer accepts in one query.
     """
 
-    def __init__(self, bytes_per_s: float | None, now_s: float) -> None:
-        self.congestion = CongestionControl()
+    def __init__(self, bytes_per_s: float | None, now_s: float, clock_offset_s: float = 0.0) -> None:
+        self.congestion = CongestionControl(clock_offset_s)
         self.active: dict[int, RecordTransfer] = {}
         self.probing = True
         self.max_batch = 0
