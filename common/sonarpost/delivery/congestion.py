@@ -33,6 +33,7 @@ MEASURE_EVERY_S = 240.0
 """Interval at which the shortest reply time is measured again, with the first window: at multiples of it in UTC, so
 that all queues that share a link do it at the same time and find an empty link."""
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 30.0, 300.0
+MAX_DOUBLINGS = 10
 TIMEOUT_FACTOR = 8
 """Longest reply times in a time-out: the rate of a radio link can fall by this factor."""
 FADE = 0.9
@@ -116,7 +117,7 @@ class CongestionControl:
 
     def timed_out(self) -> None:
         """Use that a query had no reply: double the time-out and begin with a small window."""
-        self._timeouts += 1
+        self._timeouts = min(self._timeouts + 1, MAX_DOUBLINGS)
         self._restart(0.0)
 
     def interrupted(self) -> None:
