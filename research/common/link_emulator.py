@@ -210,7 +210,7 @@ class LinkEmulator:
         }
         self._target_port = target_port
         self._on_fault = on_fault
-        self._refusing = False
+        self._refusing = self._is_closing = False
         self._ends: list[_End] = []
         self._listener = _new_socket()
         self._listener.bind((HOST, 0))
@@ -256,13 +256,14 @@ class LinkEmulator:
         """Reset every connection and close the port; a second call has no effect."""
         if self._thread.is_alive():
             self._refusing = True
-            self._in_loop(self._reset_all)
-            self._loop.call_soon_threadsafe(self._accepting.cancel)
+            self._is_closing = True
+            with contextlib.suppress(OSError), socket.create_connection((HOST, self.port), CONNECT_TIMEOUT_S):
+                pass  # ends the wait for a connection: if it were cancelled, an accepted socket could stay open
             self._thread.join()
 
     def _run(self) -> None:
-        with contextlib.suppress(asyncio.CancelledError):
-            self._loop.run_until_complete(self._accepting)
+        self._loop.run_until_complete(self._accepting)
+        self._reset_all()
         self._loop.run_until_complete(asyncio.sleep(0))  # closes the sockets of ended connections
         self._listener.close()
         self._loop.close()
@@ -289,6 +290,9 @@ class LinkEmulator:
     async def _accept(self) -> None:
         while True:
             near, _ = await self._loop.sock_accept(self._listener)
+            if self._is_closing:
+                near.close()
+                return
             self.attempts += 1
             up, down = (_End(direction) for direction in self._directions.values())
             up.other, down.other = down, up
@@ -296,12 +300,10 @@ class LinkEmulator:
             far = _new_socket()
             try:
                 await self._reach_target(far, up)
-            except BaseException as error:
+            except OSError:
                 for one in (near, far):
                     _reset_on_close(one)
                     one.close()
-                if not isinstance(error, OSError):
-                    raise
             else:
                 await self._forward(up, near)
                 await self._forward(down, far)

@@ -402,6 +402,7 @@ def test_differing_verdicts_are_both_kept(served):
     bo.press("Enter")
     assert len(served.decisions("0000")) == 2
     button.click()
+    eventually(lambda: len(served.decisions("0000")) == 3, what="the settling decision")
     bo.wait(".now .badge.not_mine_like")
     latest, *earlier = served.decisions("0000")
     assert len(earlier) == 2
