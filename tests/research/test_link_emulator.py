@@ -1,6 +1,7 @@
 """The link emulator: no data is early, senders wait for the buffer, and faults do what they say."""
 
 import contextlib
+import gc
 import socket
 import threading
 import time
@@ -248,3 +249,24 @@ def test_close_is_repeatable_and_frees_the_port(ends):
     link.close()
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", link.port))
+
+
+def test_close_while_clients_connect_leaves_no_socket_open(ends):
+    """An open socket that is collected is an error in tests."""
+    stopped = threading.Event()
+
+    def dial(port):
+        while not stopped.is_set():
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=10):
+                pass
+
+    for _ in range(10):
+        link = ends.link_with()
+        dialling = threading.Thread(target=dial, args=(link.port,))
+        stopped.clear()
+        dialling.start()
+        ends.server.accept()[0].close()
+        link.close()
+        stopped.set()
+        dialling.join()
+    gc.collect()
