@@ -304,10 +304,10 @@ class ModemPair:
     def port(self, modem):
         return str(self.folder / f"modem-{modem}")
 
-    def start(self, *, time_scale=150.0, **channel):
+    def start(self, *, time_scale=150.0, echo=None, **channel):
         modems = (ModemSite(address=1), ModemSite(address=3, east_m=150.0))
         config = EmulatorConfig(modem=modems, **channel, pty_dir=self.folder, time_scale=time_scale)
-        self._channel = ChannelEmulator(config)
+        self._channel = ChannelEmulator(config, echo)
         self._channel.start()
         return self._channel
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import json
+import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zenoh
-from builders.common import eventually
+from builders.common import WAIT_S, eventually
 from builders.services import ModemPair, ServiceRunner, modem_pair, runner
 
 from sonarpost import keys, wire
@@ -43,6 +46,20 @@ RECORD_SHARES = """() => {
 }"""
 
 
+class HoldAfterFirstPacket(io.StringIO):
+    """Output of the channel's log that holds the channel once the vessel has a packet, until `go_on`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.go_on = threading.Event()
+
+    def write(self, text: str) -> int:
+        line = json.loads(text)
+        if line["event"] == "packet" and line["heard"] and line["receiver_modem"] == ModemPair.VESSEL:
+            self.go_on.wait(WAIT_S)
+        return len(text)
+
+
 def encoded() -> EncodedImage:
     """The image of a simulated object in 512 bytes."""
     simulated = simulate_survey(SurveySpec(seed=4, pings=200, samples=512, targets=1, clutter=0))
@@ -66,7 +83,8 @@ def encoded() -> EncodedImage:
 def test_contact_is_received_measured_and_decided(
     client: zenoh.Session, platform: Any, runner: ServiceRunner, modem_pair: ModemPair, tmp_path: Path, visit: Any
 ) -> None:
-    modem_pair.start(time_scale=TIME_SCALE)
+    channel_log = HoldAfterFirstPacket()
+    modem_pair.start(time_scale=TIME_SCALE, echo=channel_log)
     at_shore: list[Decision] = []
     client.declare_subscriber(
         keys.shore_decision("vessel-1"),
@@ -104,6 +122,8 @@ def test_contact_is_received_measured_and_decided(
     # The contact appears before its image is complete, and is updated until then.
     operator.wait('.row[data-id*=".0007"]')
     operator.wait_for_contact("0007")
+    operator.wait(".row .share >> text=/^preview /")
+    channel_log.go_on.set()
     operator.wait(".row .share >> text=/^sent /")
     shares = operator.page.evaluate("window.shares")
     assert len(shares) > 1, shares
