@@ -61,7 +61,7 @@ from sonarpost.delivery.protocol import CHUNK_BYTES
 from sonarpost.delivery.scheduler import WINDOW
 from sonarpost.logs import configure_logging
 from sonarpost.messages import Decision, ImagePart, Record, Relayed
-from sonarpost.runtime.process import relax_garbage_collection
+from sonarpost.runtime.process import tune_interpreter
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
@@ -104,7 +104,7 @@ def far_side(endpoint: str, folder: Path) -> None:
     router = zenoh.open(router_config([endpoint]))
     sink = Sink(platform("shore-1", endpoint, folder), ServiceConfig())
     sink.start()
-    relax_garbage_collection()
+    tune_interpreter()
     session = zenoh.open(client_config([endpoint]))
 
     def answer(query: zenoh.Query) -> None:
@@ -215,7 +215,7 @@ def measure_relay(endpoint: str, folder: Path, key: str, payloads: Sequence[byte
     relay = RelayService(platform(VESSEL, endpoint, folder), RelayConfig())
     peer = Relay(relay, key)
     peer.fill(payloads)
-    relax_garbage_collection()
+    tune_interpreter()
     with logged_to(folder / "relay.log", "info"):
         used_s = time.process_time()
         try:

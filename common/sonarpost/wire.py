@@ -91,10 +91,11 @@ def validated(model: type[M], fields: Mapping[str, object], where: str) -> M:
         PayloadError: A field is missing or invalid.
     """
     try:
-        return model.model_validate(fields)
+        record: M = model.__pydantic_validator__.validate_python(fields)
     except ValidationError as error:
         field, value, expected = first_error(error)
         raise PayloadError(where, field or str(getattr(model, "TYPE", "")), value, expected) from error
+    return record
 
 
 def first_error(error: ValidationError) -> tuple[str, object, str]:

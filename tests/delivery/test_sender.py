@@ -7,6 +7,7 @@ from builders.delivery_machine import Network, SteppedSender
 from sonarpost.delivery import outbox
 from sonarpost.delivery.outbox import QueuePolicy
 from sonarpost.delivery.protocol import MAX_BATCH_RECORDS, AckReply
+from sonarpost.delivery.records import Topic
 from sonarpost.errors import DeliveryError
 
 STORED = AckReply("stored").pack()
@@ -139,3 +140,25 @@ def test_an_urgent_record_is_loaded_although_the_store_could_not_be_read_once(se
 
 def fail_to_read():
     raise DeliveryError("disk I/O error")
+
+
+def test_a_new_record_is_loaded_at_once_only_if_its_place_is_among_those_in_memory(sender, store, network, monkeypatch):
+    with store.transaction() as tx:
+        for number in range(500):
+            tx.send("k", "c", bytes(1000), encoding="e", topic=Topic(f"image-{number}", 1))
+    connect(sender, network)
+    read = []
+    queued_numbers = store.queued_numbers
+    monkeypatch.setattr(store, "queued_numbers", lambda *args: read.append(1) or queued_numbers(*args))
+
+    def loaded_after(payload, *, topic, priority=4):
+        read.clear()
+        with store.transaction() as tx:
+            tx.send("k", "c", payload, encoding="e", priority=priority, topic=topic)
+        step(sender)
+        return len(read), any(one.item.payload == payload for one in sender._scheduler.active.values())
+
+    assert loaded_after(b"last", topic=Topic("image-500", 1)) == (0, False)
+    assert loaded_after(b"edition of the last", topic=Topic("image-499", 2)) == (0, False)
+    assert loaded_after(b"edition of an early one", topic=Topic("image-100", 2)) == (1, True)
+    assert loaded_after(b"urgent", topic=None, priority=1) == (1, True)

@@ -340,10 +340,10 @@ def test_damaged_store_is_refused_with_the_command_that_recovers_it(start_here, 
 def test_objects_of_the_start_are_not_searched_for_garbage_and_later_cycles_are_freed():
     program = """if True:
         import gc, weakref
-        from sonarpost.runtime.process import GARBAGE_THRESHOLD, relax_garbage_collection
+        from sonarpost.runtime.process import GARBAGE_THRESHOLD, tune_interpreter
         class Cycle:
             pass
-        relax_garbage_collection()
+        tune_interpreter()
         assert gc.get_freeze_count() > 10_000
         one = Cycle()
         one.itself, gone = one, weakref.ref(one)

@@ -14,7 +14,7 @@ import zenoh
 from sonarpost import keys
 from sonarpost.delivery import congestion, protocol
 from sonarpost.delivery.protocol import AckReply
-from sonarpost.delivery.records import OutboxItem, consumer_of
+from sonarpost.delivery.records import OutboxItem, Place, consumer_of
 from sonarpost.delivery.scheduler import WINDOW, Chunk, DeliveryScheduler, RecordTransfer
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 
 BACK_OFF_S = (0.05, 0.1, 0.2, 0.5, 1.0)
 IDLE_S = 1.0
+FIRST_PLACE: Place = (0, 0)
+"""Before all records."""
 REMOVE_AT = 512
 """Number of acknowledged records that are removed from the store at once."""
 REMOVE_AFTER_S = 0.2
@@ -90,9 +92,12 @@ class Outbox:
         self._wake = threading.Event()
         self._senders: dict[str, QueueSender] = {}
         self._held: set[str] = set()
-        store.add_outbox_listener(self._wake.set)
+        store.add_outbox_listener(self._on_new)
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
+
+    def _on_new(self, _place: Place) -> None:
+        self._wake.set()
 
     def _run(self) -> None:
         """Start a sender for each queue when it first holds a record."""
@@ -137,7 +142,7 @@ class Outbox:
         self._stop.set()
         self._wake.set()
         self._thread.join()
-        self._store.remove_outbox_listener(self._wake.set)
+        self._store.remove_outbox_listener(self._on_new)
         for sender in self._senders.values():
             sender.close()
 
@@ -212,7 +217,8 @@ class QueueSender:
         self._batch_refused = False
         self._stop = threading.Event()
         self._wake = threading.Event()
-        self._has_new, self._has_all = True, False
+        self._new_places: deque[Place] = deque([FIRST_PLACE])
+        self._last_place, self._has_all = FIRST_PLACE, False
         store.add_outbox_listener(self._on_new, queue)
         self._thread = threading.Thread(target=self._run, name=f"outbox-{queue}", daemon=True)
         self._thread.start()
@@ -224,8 +230,8 @@ class QueueSender:
         self._thread.join(timeout=0.5)
         self._store.remove_outbox_listener(self._on_new, self._queue)
 
-    def _on_new(self) -> None:
-        self._has_new = True
+    def _on_new(self, place: Place) -> None:
+        self._new_places.append(place)
         self._wake.set()
 
     def _on_end(self, query: _Query) -> None:
@@ -276,18 +282,23 @@ class QueueSender:
     # Load
 
     def _load(self) -> None:
-        """Load the most urgent records if there are new ones, or few remain and the store has more."""
+        """Load the most urgent records if new ones belong to them, or if few remain and the store has more."""
         scheduler = self._scheduler
-        if not self._has_new and (self._has_all or len(scheduler.active) > scheduler.lookahead // 2):
+        are_enough = self._has_all or len(scheduler.active) > scheduler.lookahead // 2
+        while are_enough and self._new_places:
+            are_enough = not self._has_all and self._new_places.popleft() > self._last_place
+        if are_enough:
             return
+        self._new_places.clear()
         if len(self._acknowledged) >= REMOVE_AT:
             self._remove_acknowledged()
-        self._has_new = self._has_all = False  # both stay so if the store cannot be read
+        self._has_all = False  # it stays so if the store cannot be read
         limit = scheduler.lookahead + len(self._acknowledged)
         numbers = self._store.queued_numbers(self._queue, limit)
         unacknowledged = [seq for seq in numbers if seq not in self._acknowledged]
         known, loaded = self._items(unacknowledged[: scheduler.lookahead])
         self._has_all = len(numbers) < limit and len(known) + len(loaded) == len(unacknowledged)
+        self._last_place = max((items[-1].place for items in (known, loaded) if items), default=FIRST_PLACE)
         scheduler.update([*known, *loaded])
         self._done_up_to = self._store.done_up_to(self._queue)
         session = self._session()
@@ -300,11 +311,15 @@ class QueueSender:
         active = self._scheduler.active
         known: list[OutboxItem] = []
         loaded: list[OutboxItem] = []
+        size_bytes = 0
         for first in range(0, len(numbers), WINDOW):
             part = numbers[first : first + WINDOW]
-            known += [active[seq].item for seq in part if seq in active]
-            loaded += self._store.queued_items(self._queue, [seq for seq in part if seq not in active])
-            if sum(len(item.payload) for items in (known, loaded) for item in items) > LOADED_BYTES:
+            kept = [active[seq].item for seq in part if seq in active]
+            new = self._store.queued_items(self._queue, [seq for seq in part if seq not in active])
+            known += kept
+            loaded += new
+            size_bytes += sum(len(item.payload) for item in (*kept, *new))
+            if size_bytes > LOADED_BYTES:
                 break
         return known, loaded
 
@@ -511,7 +526,7 @@ class QueueSender:
         self._scheduler.restart(timed_out=self._timed_out)
         self._failure = None
         self._timed_out = False
-        self._has_new = True  # the failure can have been that of the store
+        self._new_places.append(FIRST_PLACE)  # the failure can have been that of the store
         for transfer in self._scheduler.active.values():
             if transfer.in_flight and transfer.received == 0:
                 # The consumer has confirmed no part of it: a newer edition may replace it again.

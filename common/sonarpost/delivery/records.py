@@ -26,6 +26,10 @@ def platform_of(queue: str) -> str:
     return queue.partition(SITE_SEPARATOR)[2]
 
 
+Place = tuple[int, int]
+"""Priority and position of a queued record; the lowest is sent first."""
+
+
 @dataclass(frozen=True, slots=True)
 class Topic:
     """Subject and edition of a record: in a queue, a newer edition replaces older ones that are not in flight."""
@@ -34,7 +38,7 @@ class Topic:
     edition: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class OutboxItem:
     """A queued record that its consumer has not acknowledged yet.
 
@@ -60,6 +64,11 @@ class OutboxItem:
     position: int = field(default=0, compare=False)
     origin: bytes = field(default=b"", compare=False)
 
+    @property
+    def place(self) -> Place:
+        """Its place in the queue; of two records of one place, the older one is sent first."""
+        return (self.priority, self.position)
+
 
 @dataclass(frozen=True, slots=True)
 class ReceivedChunk:
@@ -84,7 +93,7 @@ class ReceivedChunk:
     done_up_to: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class InboxItem:
     """A record that was accepted and not yet handled."""
 

@@ -73,7 +73,7 @@ class RecordTransfer:
         return self.sent < len(self.item.payload) or self.sent == 0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Chunk:
     """Bytes `start` to `end` of a record, sent with one query."""
 

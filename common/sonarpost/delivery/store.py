@@ -23,7 +23,7 @@ from typing import IO, Any, TypeVar
 import msgpack
 
 from sonarpost.delivery import schema
-from sonarpost.delivery.records import InboxItem, OutboxItem, QuarantinedRecord
+from sonarpost.delivery.records import InboxItem, OutboxItem, Place, QuarantinedRecord
 from sonarpost.delivery.transaction import MAX_QUARANTINED_BYTES, Transaction, runs
 from sonarpost.delivery.watermark import SUFFIX as SIDE_CAR_SUFFIX
 from sonarpost.delivery.watermark import LostRecords, Watermark, clear_lost_records, lost_records
@@ -99,7 +99,7 @@ class Store:
         self._page_bytes = page_bytes
         self._lock = threading.RLock()
         self._reader_lock = threading.Lock()
-        self._outbox_listeners: list[tuple[str, Callable[[], None]]] = []
+        self._outbox_listeners: list[tuple[str, Callable[[Place], object]]] = []
         self._in_flight: set[tuple[str, int]] = set()
         self._watermark = Watermark(path)
         self.lost: LostRecords | None = None
@@ -178,20 +178,22 @@ class Store:
             except sqlite3.Error as error:
                 raise DeliveryError(f"{self.path}: {_reason(error, self.path)}") from error
             self.states_discarded += tx.states_discarded
-        if tx.wrote_outbox:
-            listeners = tuple(self._outbox_listeners)
-            for queue in tx.assigned:
-                own = [on_new for name, on_new in listeners if name == queue]
-                for on_new in own or [on_new for name, on_new in listeners if not name]:
-                    on_new()
+        listeners = tuple(self._outbox_listeners)
+        for queue, place in tx.first_places.items():
+            own = [on_new for name, on_new in listeners if name == queue]
+            for on_new in own or [on_new for name, on_new in listeners if not name]:
+                on_new(place)
         if tx.wrote_inbox:
             self.inbox_changed.set()
 
-    def add_outbox_listener(self, on_new: Callable[[], None], queue: str = "") -> None:
-        """Call `on_new` after each transaction that added a record to `queue`; by default to one without a listener."""
+    def add_outbox_listener(self, on_new: Callable[[Place], object], queue: str = "") -> None:
+        """Call `on_new` after each transaction that added a record to `queue`; by default to one without a listener.
+
+        Its argument is the place of the first new record.
+        """
         self._outbox_listeners.append((queue, on_new))
 
-    def remove_outbox_listener(self, on_new: Callable[[], None], queue: str = "") -> None:
+    def remove_outbox_listener(self, on_new: Callable[[Place], object], queue: str = "") -> None:
         """Stop calling `on_new`."""
         self._outbox_listeners.remove((queue, on_new))
 

@@ -17,7 +17,7 @@ from sonarpost import wire
 from sonarpost.archive.retention import Stored, select_for_removal, vehicle_source
 from sonarpost.delivery.duplicate_window import DuplicateWindow
 from sonarpost.delivery.partial_records import PartialRecords
-from sonarpost.delivery.records import InboxItem, OutboxItem, ReceivedChunk, Topic
+from sonarpost.delivery.records import InboxItem, OutboxItem, Place, ReceivedChunk, Topic
 from sonarpost.keys import writer_of
 from sonarpost.limits import limit
 from sonarpost.logs import kv
@@ -112,9 +112,9 @@ class Transaction:
     statement depends on them, or at the end by `flush`.
 
     Attributes:
-        wrote_outbox: Whether a record was added to the outbox.
         wrote_inbox: Whether a record was added to the inbox and has to be handled.
         numbered_inbox: Whether a record was accepted, and handled or not.
+        first_places: Place of the first new record of each queue.
         superseded: Number of queued records that newer editions replaced.
         states_discarded: Number of states that could not be read.
     """
@@ -129,13 +129,13 @@ class Transaction:
         self._db = connection
         self._in_flight = in_flight
         self._has_legacy_windows = has_legacy_windows
-        self.wrote_outbox = False
         self.wrote_inbox = self.numbered_inbox = False
         self.superseded = self.states_discarded = 0
         self._windows: dict[tuple[str, bytes], DuplicateWindow] = {}
         self._numbers: dict[str, tuple[int, bytes]] = {}
         self._new_outbox: list[tuple[object, ...]] = []
         self._new_topics: set[tuple[str, str]] = set()
+        self.first_places: dict[str, Place] = {}
         self._new_inbox: list[tuple[object, ...]] = []
         self._partial_records = PartialRecords(connection)
         self._new_states: list[tuple[str, bytes]] = []
@@ -209,14 +209,15 @@ class Transaction:
             position, priority = self._supersede(queue, [row for row in editions if row[1] < edition], priority)
         seq, origin = self._last_number(queue)
         seq += 1
+        place = (priority, position or seq)
         self._numbers[queue] = (seq, origin)
+        self.first_places[queue] = min(place, self.first_places.get(queue, place))
         digest = hashlib.sha256(payload).digest()
         self._new_outbox.append(
             (queue, seq, key, encoding, priority, payload, digest, time.time(), name, edition, position or seq, origin)
         )
         if name:
             self._new_topics.add((queue, name))
-        self.wrote_outbox = True
         return seq
 
     def _last_number(self, queue: str) -> tuple[int, bytes]:

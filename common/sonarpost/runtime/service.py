@@ -444,7 +444,8 @@ class Service(ABC, Generic[C]):
                     if len(handled) >= limit:
                         return False
                     try:
-                        handled.append(self._call_handle(key, payload))
+                        with log_context(payload):
+                            handled.append(self._call_handle(key, payload))
                     except (DeliveryError, sqlite3.Error):
                         raise  # the transaction can have ended
                     except Exception as error:  # noqa: BLE001 - raised again when it is handled in its turn
@@ -515,8 +516,7 @@ class Service(ABC, Generic[C]):
         record = self._checked.pop((key, payload), None)
         if record is None:
             record = wire.decode(self._record_type(key), payload, key)
-        with log_context(payload):
-            self.handle(key, record, effects)
+        self.handle(key, record, effects)
         effects.count("records_handled")
         return effects
 
