@@ -104,7 +104,6 @@ class Store:
         self._watermark = Watermark(path)
         self.lost: LostRecords | None = None
         self.states_discarded = 0
-        self._has_legacy_windows = False
         self.inbox_changed = threading.Event()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -132,7 +131,6 @@ class Store:
             self._db.execute(f"PRAGMA cache_size={-CACHE_KB}")
             self._require_sound()
             version, self.origin = schema.prepare(self._db, self._page_bytes)
-            self._has_legacy_windows = schema.has_legacy_windows(self._db)
             self._reader = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
             on_error.callback(self._reader.close)
             self._reader.execute("PRAGMA query_only=ON")
@@ -166,7 +164,7 @@ class Store:
             DeliveryError: The database reported an error, for example a full disk; nothing was written.
         """
         with self._lock:
-            tx = Transaction(self._db, self._in_flight, has_legacy_windows=self._has_legacy_windows)
+            tx = Transaction(self._db, self._in_flight)
             try:
                 # The connection commits at the end of its block, and rolls back after an exception.
                 with self._db:

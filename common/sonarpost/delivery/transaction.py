@@ -119,16 +119,9 @@ class Transaction:
         states_discarded: Number of states that could not be read.
     """
 
-    def __init__(
-        self,
-        connection: sqlite3.Connection,
-        in_flight: Set[tuple[str, int]] = frozenset(),
-        *,
-        has_legacy_windows: bool = False,
-    ) -> None:
+    def __init__(self, connection: sqlite3.Connection, in_flight: Set[tuple[str, int]] = frozenset()) -> None:
         self._db = connection
         self._in_flight = in_flight
-        self._has_legacy_windows = has_legacy_windows
         self.wrote_inbox = self.numbered_inbox = False
         self.superseded = self.states_discarded = 0
         self._windows: dict[tuple[str, bytes], DuplicateWindow] = {}
@@ -367,9 +360,7 @@ class Transaction:
 
     def was_received(self, key: str, chunk: ReceivedChunk) -> bool:
         """Return whether the record of a chunk was accepted before: same key, origin, number and digest."""
-        if self._window(key, chunk.origin).contains(chunk.seq, chunk.sha256):
-            return True
-        return self._has_legacy_windows and self._was_received_before_migration(chunk)
+        return self._window(key, chunk.origin).contains(chunk.seq, chunk.sha256)
 
     def accepted_number(self, key: str, chunk: ReceivedChunk) -> tuple[int, bytes]:
         """Return what shows a producer that its store is older than its last delivery.
@@ -387,14 +378,6 @@ class Transaction:
         if window is None:
             window = self._windows[key, origin] = DuplicateWindow(self._db, key, origin)
         return window
-
-    def _was_received_before_migration(self, chunk: ReceivedChunk) -> bool:
-        found = self._db.execute(
-            "SELECT EXISTS (SELECT 1 FROM seen_upto WHERE origin = ? AND seq >= ?)"
-            " OR EXISTS (SELECT 1 FROM seen WHERE origin = ? AND seq = ?)",
-            (chunk.origin, chunk.seq, chunk.origin, chunk.seq),
-        ).fetchone()
-        return bool(found[0])
 
     def add_chunk(self, key: str, chunk: ReceivedChunk) -> bytes | int:
         """Add a chunk of a record; return the complete record, or the next offset to send."""
