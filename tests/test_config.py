@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import tomllib
 from enum import StrEnum
 from pathlib import Path
@@ -351,35 +350,6 @@ def test_line_of_every_key_of_the_example_files(name):
         for key in keys:
             line = text.splitlines()[lines[table, key] - 1]
             assert line.startswith(f"{key} =")
-
-
-@pytest.mark.parametrize(
-    ("table", "old", "new"), [(t, o, n) for t, keys in config.RENAMED_KEYS.items() for o, n in keys.items()]
-)
-def test_renamed_key_is_rejected_with_its_new_name(tmp_path, table, old, new):
-    model = service_config(table)
-    new_table, _, key = new.rpartition(".")
-    assert key in service_config(new_table or table).model_fields
-    assert old not in model.model_fields
-    path = tmp_path / "platform.toml"
-    path.write_text(f'[platform]\nid = "uuv-1"\n[{table}]\n{old} = 1\n')
-    with pytest.raises(ConfigError, match=rf"platform.toml:4: {table}.{old}: .* expected its new name, {new}$"):
-        config.load(path, table, model, {})
-    path.write_text('[platform]\nid = "uuv-1"\n')
-    variable = f"SONARPOST_{table.upper()}__{old.upper()}"
-    with pytest.raises(ConfigError, match=rf"environment: {variable}: .* expected its new name, {new}$"):
-        config.load(path, table, model, {variable: "1"})
-
-
-def service_config(name):
-    """Return the model of a service's table."""
-    module = importlib.import_module(f"sonarpost.services.{name}.config")
-    (found,) = [
-        kind
-        for kind in vars(module).values()
-        if isinstance(kind, type) and issubclass(kind, ServiceConfig) and kind.__module__ == module.__name__
-    ]
-    return found
 
 
 class Nothing(ServiceConfig):

@@ -45,47 +45,6 @@ TABLES = ("platform", "modem", *SERVICES)
 # Inline tables of which environment variables can override single keys: SONARPOST_PLATFORM__TLS__KEY.
 NESTED_TABLES = {("platform", "tls")}
 
-# Keys of version 0.1 with their present names, `table.key` for a key that moved to another table. Old names are errors.
-RENAMED_KEYS: Mapping[str, Mapping[str, str]] = {
-    "atd_stub": {
-        "max_on_the_way": "max_in_flight",
-        "needs_done": "require_done_marker",
-        "seam_pings": "join_overlap_pings",
-        "seam_wait_s": "join_timeout_s",
-    },
-    "compressor": {"catalogue": "codebook", "keep_pictures": "cache_images"},
-    "uuv_modem": {
-        "frame_s": "tdma_cycle_s",
-        "frames_per_picture": "frames_per_image",
-        "gather_s": "group_delay_s",
-        "listen_every_s": "tx_burst_s",
-        "listen_s": "rx_window_s",
-        "mean_wait_s": "mean_backoff_s",
-        "medium": "mac",
-        "more_rates": "allowed_rates",
-        "picture_share": "image_airtime_share",
-        "quiet_s": "holdoff_s",
-    },
-    "op_modem": {
-        "frame_s": "tdma_cycle_s",
-        "medium": "mac",
-        "order_lifetime_s": "command_lifetime_s",
-        "patience_s": "max_defer_s",
-        "quiet_s": "holdoff_s",
-        "report_frames": "feedback_interval_frames",
-        "report_s": "feedback_interval_s",
-    },
-    "decompressor": {
-        "catalogues": "codebooks",
-        "links": "op_modem.wire_formats",
-        "pairing_timeout_s": "op_modem.pairing_timeout_s",
-        "picture_consumers": "image_consumers",
-        "vehicles": "op_modem.vehicles",
-        "wire_formats": "op_modem.wire_formats",
-    },
-    "console": {"behind_proxy": "trusted_proxies", "session_most_s": "session_max_s", "side": "role"},
-}
-
 
 class ServiceConfig(BaseModel):
     """Base class of all configuration tables; unknown keys are errors."""
@@ -261,13 +220,10 @@ class ConfigFile:
         if not isinstance(written, dict):
             return None  # in `errors` already
         overrides = self._overrides.get(name, {})
-        merged, renamed = _merged(name, written, overrides), self._renamed(name, written, overrides)
-        self.errors += renamed.values()
-        for key in renamed:
-            merged.pop(key, None)
+        merged = _merged(name, written, overrides)
         try:
             # As JSON, whose types fit pydantic's strict mode: no "5" for 5, no true for 1.
-            table = model.model_validate_json(to_json(merged), strict=True)
+            return model.model_validate_json(to_json(merged), strict=True)
         except ConfigError as error:  # in a file that the table names
             self.errors.append(error)
             return None
@@ -283,8 +239,7 @@ class ConfigFile:
                     self.errors.append(_override_error(name, by_environment, value, expected))
                 else:
                     self.errors.append(self.error((name, *names), value, expected))
-            return None
-        return None if renamed else table
+        return None
 
     def _add_override(self, name: str, text: str) -> None:
         if not text or not name.startswith(ENVIRONMENT_PREFIX) or "__" not in name:
@@ -295,19 +250,6 @@ class ConfigFile:
         else:
             expected = "SONARPOST_{platform or a service's name}__{KEY}"
             self.errors.append(ConfigError("environment", name, text, expected))
-
-    def _renamed(
-        self, table: str, written: Mapping[str, object], overrides: Mapping[str, object]
-    ) -> dict[str, ConfigError]:
-        """Return an error for each key that has its name of version 0.1; the error names the present one."""
-        found: dict[str, ConfigError] = {}
-        for old, new in RENAMED_KEYS.get(table, {}).items():
-            value, expected = "the key's name of version 0.1", f"its new name, {new}"
-            if old in written:
-                found[old] = self.error((table, old), value, expected)
-            elif old in overrides:
-                found[old] = _override_error(table, old, value, expected)
-        return found
 
 
 def _override_error(table: str, key: str, value: object, expected: str) -> ConfigError:

@@ -430,7 +430,6 @@ def _walk(command: Command) -> Iterator[Command]:
     yield command
     for action in command.parser._actions:
         if isinstance(action, argparse._SubParsersAction):
-            # Names without a help line are refused names of version 0.1.
             for choice in action._choices_actions:
                 below = action.choices[choice.dest]
                 yield from _walk(

@@ -178,18 +178,6 @@ def test_export_writes_all_formats_and_marks_images_as_exported(capsys, out, tmp
     assert exported == {"AAAA": True, "BBBB": True, "CCCC": False}
 
 
-def test_former_spellings_of_archive_and_out_are_accepted(capsys, out, tmp_path):
-    assert main(["c2", "get", "uuv-1/AAAA", "--out-dir", str(out), "--to", str(tmp_path / "here")]) == 0
-    assert len(list((tmp_path / "here").iterdir())) == 3
-    assert main(["c2", "export", "--out-dir", str(out), "--kml", str(tmp_path / "contacts.xml")]) == 0
-    assert "<kml" in (tmp_path / "contacts.xml").read_text()
-    with pytest.raises(SystemExit):
-        main(["c2", "export", "--help"])
-    printed = capsys.readouterr().out
-    assert "--archive" in printed
-    assert "--out-dir" not in printed
-
-
 def test_export_to_a_file_of_unknown_format_is_an_error(capsys, out, tmp_path):
     assert main(["c2", "export", "--archive", str(out), "--out", str(tmp_path / "contacts.shp")]) == 2
     expected = "expected a name that ends in .geojson, .kml, .kmz, .csv, .gpkg, .cot.xml, .tak.zip, .caris.txt,"
@@ -257,14 +245,14 @@ def test_comment_is_stored_by_c2_when_the_command_ends(capsys, c2, router, tmp_p
     assert "an identifier that no other record for this vessel has" in capsys.readouterr().err
 
 
-def test_commands_are_sent_before_a_comment_and_expand_has_a_former_name(capsys, c2, router):
-    send = [["comment"], *(["command", "--kind", kind] for kind in ("refine", "expand", "wider"))]
+def test_commands_are_sent_before_a_comment(capsys, c2, router):
+    send = [["comment"], *(["command", "--kind", kind] for kind in ("refine", "expand"))]
     for action, *options in send:
         assert main(["c2", action, "uuv-1/AAAA", "--vessel", "vessel-1", "--router", router, *options]) == 0
-    eventually(lambda: c2.gauges()["waiting_for_vessels"] == 4)
+    eventually(lambda: c2.gauges()["waiting_for_vessels"] == 3)
     assert [item.key for item in queued_items(c2.store, "relay@vessel-1", 9)] == [
         keys.command("vessel-1", "refine"),
-        *[keys.command("vessel-1", "wider")] * 2,
+        keys.command("vessel-1", "wider"),
         keys.advice("vessel-1"),
     ]
 
@@ -340,14 +328,6 @@ def test_time_forms():
 
 def test_control_characters_are_not_printed():
     assert printable("a\x1b[2Jb\n\u202ec") == "a?[2Jb??c"
-
-
-def test_former_action_name_is_refused_with_the_new_name(capsys):
-    for old, new in (("task", "command"), ("advise", "comment")):
-        assert main(["c2", old, "uuv-1/AAAA", "--vessel", "vessel-1", "--kind", "refine"]) == 2
-        assert capsys.readouterr().err == f"sonarpost: c2: got '{old}', expected `sonarpost c2 {new}`, its new name\n"
-        assert main(["c2", old]) == 2
-        capsys.readouterr()
 
 
 # The folder without --archive

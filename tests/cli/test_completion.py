@@ -33,7 +33,6 @@ def test_bash_completes_commands_actions_options_and_values(tmp_path, capsys):
     assert completed(text, tmp_path, "simulate", "a.xtf", "--seabed", "rip") == ["ripples"]
     assert completed(text, tmp_path, "run", "comp") == ["compressor"]
     assert completed(text, tmp_path, "encode", "photo.p") == []
-    assert "task" not in completed(text, tmp_path, "c2", ""), "a refused former name"
 
 
 def test_bash_loads_the_script_and_registers_it(tmp_path, capsys):

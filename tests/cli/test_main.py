@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import os
 import shlex
@@ -11,7 +10,7 @@ import sys
 
 import pytest
 
-from sonarpost.cli.main import COMMANDS, LOG_LEVEL_VARIABLE, RENAMED_COMMANDS, exit_status, main, parser
+from sonarpost.cli.main import COMMANDS, LOG_LEVEL_VARIABLE, exit_status, main, parser
 from sonarpost.cli.parsing.commands import EXAMPLES, EXTRAS
 from sonarpost.cli.parsing.parser import actions_of, all_parsers
 
@@ -156,17 +155,6 @@ def test_another_missing_module_is_a_defect():
 
     with pytest.raises(ModuleNotFoundError):
         exit_status(run)
-
-
-def test_a_renamed_command_names_its_new_name_which_exists(capsys):
-    for command, new in RENAMED_COMMANDS.items():
-        assert main([*command.split(), "--json"]) == 2
-        printed = capsys.readouterr()
-        assert printed.out == ""
-        [line] = printed.err.splitlines()
-        assert line.endswith(new)
-        if new.startswith("python -m "):
-            assert importlib.util.find_spec(new.split()[2]) is not None
 
 
 @pytest.mark.parametrize(

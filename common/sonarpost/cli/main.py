@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from sonarpost import __version__
-from sonarpost.cli.parsing.commands import COMMANDS, EXTRAS, RENAMED_COMMANDS
+from sonarpost.cli.parsing.commands import COMMANDS, EXTRAS
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.errors import SonarpostError
 from sonarpost.stop_signals import exit_process
@@ -61,10 +61,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[:1] == ["help"]:
         given = [*words[1:], "--help"]
         words = words[1:]
-    new_name = RENAMED_COMMANDS.get(" ".join(words[:2])) or RENAMED_COMMANDS.get(" ".join(words[:1]))
-    if new_name is not None:
-        print(f"sonarpost: {' '.join(words[:2])}: this command is now: {new_name}", file=sys.stderr)
-        return EXIT_ERROR
     command = words[0] if words else ""
 
     def run() -> int:

@@ -52,7 +52,6 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument("--preset", choices=list(PRESETS), help="set of channel parameters (default: still)")
     parser.add_argument("--channel", type=Path, metavar="FILE", help="TOML file with parameters; overrides the preset")
-    parser.add_argument("--water", dest="renamed_water", help=argparse.SUPPRESS)
     for name, metavar, text in (
         ("loss", "P", "probability that a frame is lost (default: 0)"),
         ("packet-loss", "P", "probability that a packet is lost (default: 0)"),
@@ -126,8 +125,6 @@ def _config(parsed: argparse.Namespace) -> EmulatorConfig:
     Raises:
         ConfigError: A value is out of range.
     """
-    if parsed.renamed_water is not None:
-        raise ConfigError("command line", "--water", parsed.renamed_water, "its new name, --channel")
     if not 1 <= parsed.modems <= MAX_MODEMS:
         raise ConfigError("command line", "--modems", parsed.modems, f"1..{MAX_MODEMS}")
     options = {

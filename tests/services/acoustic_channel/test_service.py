@@ -387,7 +387,6 @@ def test_command_with_tcp_ports_continues_when_its_output_is_closed(arguments):
     [
         ("--modems 0", "--modems"),
         ("--set colour=blue", "colour"),
-        ("--water sea.toml", "--water.*--channel"),
         ("--transponder A=far", "--transponder"),
         ("--transponder E=1", "transponder.0.letter"),
         ("--loss 1.5", "frame_loss"),

@@ -39,7 +39,6 @@ from sonarpost.files import write_atomically
 DEMO_IMAGES = Path("demo-out/shore/images")
 SHORE_CONFIG = Path("/etc/sonarpost/shore.toml")
 PIPED_WIDTH = 160
-FORMER_OPTIONS = ("geojson", "kml", "kmz", "csv")
 EXIT_INCOMPLETE = 1
 
 _AGO = re.compile(r"(\d+(?:\.\d+)?)([smhd])")
@@ -95,7 +94,6 @@ def add_actions(actions: Subparsers) -> None:
     get.add_argument("--vessel", metavar="NAME", help="vessel, if two vessels have an image of this name")
     get.add_argument("--version", type=int, metavar="N", help="version (default: the newest)")
     get.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="destination (default: current folder)")
-    get.add_argument("--to", dest="out", type=Path, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     _add_archive(get)
     get.set_defaults(run=run_get)
 
@@ -111,8 +109,6 @@ def add_actions(actions: Subparsers) -> None:
         metavar="FILE",
         help="file to write, named *." + ", *.".join(FORMATS) + "; can be repeated",
     )
-    for name in FORMER_OPTIONS:
-        export.add_argument(f"--{name}", type=Path, help=argparse.SUPPRESS)  # former spellings of --out
     export.add_argument("--cot", metavar="URL", help="send events to tcp://host:port, tls://… or udp://…")
     add_tls_options(export, "--cot tls://…")
     export.add_argument(
@@ -129,7 +125,6 @@ def _add_archive(parser: argparse.ArgumentParser) -> None:
         help=f"folder of c2, or address of its database, postgresql://USER@HOST/NAME (default: {DEMO_IMAGES} if there"
         f" is one, else that of {SHORE_CONFIG}, else out)",
     )
-    where.add_argument("--out-dir", dest="archive", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     where.add_argument(
         "--config", type=Path, metavar="FILE", help="TOML file of the shore site; its database or out_dir is used"
     )
@@ -381,7 +376,7 @@ def _export_files(parsed: argparse.Namespace) -> list[tuple[str, Path]]:
         if name is None:
             raise ConfigError("c2 export", "--out", str(path), "a name that ends in ." + ", .".join(FORMATS))
         files.append((name, path))
-    return files + [(name, path) for name in FORMER_OPTIONS if (path := getattr(parsed, name)) is not None]
+    return files
 
 
 def _mark_exported(place: ArchivePlace, contacts: Sequence[ExportContact]) -> None:

@@ -28,10 +28,8 @@ KINDS = {
     "revisit": "revisit",
     "region": "region",
     "prioritise": "prioritise",
-    "wider": "wider",
 }
-"""Kind on the command line (`wider` is the former name of `expand`) -> kind in the record."""
-RENAMED_ACTIONS = {"task": "command", "advise": "comment"}
+"""Kind on the command line -> kind in the record."""
 
 
 def add_actions(actions: Subparsers) -> None:
@@ -68,11 +66,6 @@ def add_actions(actions: Subparsers) -> None:
     comment.add_argument("--class", dest="mlo_class", metavar="TEXT", help="class of mine-like object")
     comment.add_argument("--remark", default="", metavar="TEXT", help="free text")
     comment.set_defaults(run=run_comment)
-    for name in RENAMED_ACTIONS:
-        # No argument can start with this prefix: every former option is accepted, and the action is refused.
-        renamed = actions.add_parser(name, prefix_chars="\0", add_help=False)
-        renamed.add_argument("arguments", nargs="*", help="ignored")
-        renamed.set_defaults(run=refuse_renamed, action=name)
 
 
 def _add_common_options(parser: argparse.ArgumentParser) -> None:
@@ -83,15 +76,6 @@ def _add_common_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--timeout", type=float, default=10.0, metavar="S", help="time limit to reach c2 (default: 10)")
     add_site_option(parser)
     add_router_options(parser)
-
-
-def refuse_renamed(parsed: argparse.Namespace) -> int:
-    """Refuse the former name of an action.
-
-    Raises:
-        ConfigError: Always; the text contains the new name.
-    """
-    raise ConfigError("c2", "", parsed.action, f"`sonarpost c2 {RENAMED_ACTIONS[parsed.action]}`, its new name")
 
 
 def run_comment(parsed: argparse.Namespace) -> int:

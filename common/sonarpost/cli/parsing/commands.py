@@ -1,4 +1,4 @@
-"""Tables of the commands: modules, summaries, former names, examples, extras."""
+"""Tables of the commands: modules, summaries, examples, extras."""
 
 from __future__ import annotations
 
@@ -35,22 +35,6 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "completion": ("cli.parsing.completion", "print the completion script of a shell"),
 }
 """Name -> module and summary. Only the module of the given command is imported: all of them together take seconds."""
-
-RENAMED_COMMANDS: Final[Mapping[str, str]] = {
-    "catalogue": "sonarpost codebook",
-    "survey-panel": "python -m research.user_study",
-    "codebook nominal": "python -m research.default_codebooks",
-    "bench": "python -m research.codecs (research/README.md lists the others)",
-    "bench codecs": "python -m research.codecs",
-    "bench link": "python -m research.link",
-    "bench detect": "python -m research.detection",
-    "bench recognition": "python -m research.recognition",
-    "bench paper": "python -m research.paper",
-    "bench sea-trial": "python -m research.sea_trial",
-    "bench mission": "python -m research.mission",
-    "bench busy": "python -m research.utilisation",
-}
-"""Commands of version 0.1 that have another name now."""
 
 EXTRAS: Final[Mapping[str, str]] = {
     "starlette": "console",

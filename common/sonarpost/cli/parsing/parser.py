@@ -84,8 +84,8 @@ def all_parsers(parser: argparse.ArgumentParser) -> Mapping[str, argparse.Argume
 
 
 def actions_of(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
-    """Return the parsers of a command's actions by name, without refused former names, which have no help."""
+    """Return the parsers of a command's actions by name."""
     for group in parser._actions:  # noqa: SLF001 argparse has no public way to list them
         if isinstance(group, argparse._SubParsersAction):  # noqa: SLF001
-            return {each.dest: group.choices[each.dest] for each in group._choices_actions}  # noqa: SLF001
+            return dict(group.choices)
     return {}
