@@ -17,12 +17,16 @@ written to disk:
   relay is `research.recording_relay`, which records this time;
 - `shown_*_ms`: until a subscriber at the shore site receives the decoded image from c2, after c2 has written its files.
 
-With `--accept N`, routers, relays and c2 hand over N contacts of 200 coded bytes as fast as they can, and before that,
-in the same way, N / 20 decoded images as vessels of earlier versions send them. Half of the contacts come from each of
-two vessels. A contact counts when the relay has removed it after the acknowledgement of c2, which has it on its disk.
-The decoders of
-c2 work behind the acceptance, with lower priority, on the same cores; the object states how many images they have
-stored when the last contact is accepted.
+With `--accept N`, c2 accepts N contacts of 200 coded bytes from the relays of two vessels, half from each, as fast as
+all processes can. A contact counts when c2 has committed it to its disk; the time starts with the first one. The
+decoders of c2 work behind the acceptance, with lower priority, on the same cores; the object states how many images
+they have stored when the last contact is accepted. There are three runs:
+
+- N / 20 decoded images as vessels of earlier versions send them. The relays start with the records in their inboxes:
+  their start and the preparation of the records for c2 are a part of the time (`senders_prepared` false);
+- N coded images in the same way;
+- N coded images that the relays have prepared and queued for c2 before c2 starts (`senders_prepared` true): the rate of
+  c2 and of the delivery to it, with less of the work of the vessels, which have their own processors.
 
 Each run prints one JSON object, including the load average of the host (mean of samples of the one-minute average) and
 the CPU usage of all processes of the host and of this benchmark. The exit status is 0 if every image was acknowledged
@@ -330,7 +334,7 @@ class Processes:
 
 @contextmanager
 def fleet(
-    folder: Path, vessels: Sequence[str], *, start_relays: bool = True
+    folder: Path, vessels: Sequence[str], *, start_relays: bool = True, start_c2: bool = True
 ) -> Iterator[tuple[Processes, dict[str, str], str]]:
     """Start routers, relays and c2; yield the processes, the endpoint of each vessel, and that of the shore site."""
     ports = free_ports(len(vessels) + 1)
@@ -343,7 +347,8 @@ def fleet(
     )
     try:
         processes.start("router-shore", "-m", "sonarpost.bus.router", "--listen", shore)
-        processes.start("c2", "-m", "sonarpost.services.c2", "--config", str(folder / "shore.toml"))
+        if start_c2:
+            run_c2(processes, folder)
         for vessel, endpoint in endpoints.items():
             file = folder / f"{vessel}.toml"
             file.write_text(
@@ -355,6 +360,11 @@ def fleet(
         yield processes, endpoints, shore
     finally:
         processes.stop()
+
+
+def run_c2(processes: Processes, folder: Path) -> None:
+    """Start c2 with the configuration that `fleet` has written."""
+    processes.start("c2", "-m", "sonarpost.services.c2", "--config", str(folder / "shore.toml"))
 
 
 def open_session(endpoint: str) -> zenoh.Session:
@@ -426,8 +436,15 @@ def run(
     }
 
 
-def accept(folder: Path, count: int, *, is_coded: bool) -> dict[str, object]:
-    """Hand over prepared contacts of two vessels as fast as relays and c2 can; return the figures."""
+def accept(folder: Path, count: int, *, is_coded: bool, is_prepared: bool) -> dict[str, object]:
+    """Hand over contacts of two vessels as fast as relays and c2 can; return the figures.
+
+    Args:
+        folder: Folder for stores and files.
+        count: Number of contacts.
+        is_coded: Send coded images, not decoded ones.
+        is_prepared: The relays queue all contacts for c2 before c2 starts.
+    """
     names = ["vessel-1", "vessel-2"]
     now_utc_s = time.time()
     for vehicle, name in enumerate(names, start=1):
@@ -444,18 +461,25 @@ def accept(folder: Path, count: int, *, is_coded: bool) -> dict[str, object]:
             for record in records:
                 tx.accept(key, wire.encode(record))
         store.close()
-    with fleet(folder, names, start_relays=False) as (processes, _, shore):
+    with fleet(folder, names, start_relays=False, start_c2=not is_prepared) as (processes, _, shore):
         session = open_session(shore)
-        wait_until_ready(session, [])
-        c2_db = folder / "shore" / "c2.db"
-        before = {name: processes.cpu_s(name) for name in ("c2", "router-shore")}
+        before = dict[str, float]()
+        if not is_prepared:
+            wait_until_ready(session, [])
+            before = {name: processes.cpu_s(name) for name in ("c2", "router-shore")}
         for name in names:
             processes.start(f"relay-{name}", "-m", "sonarpost.services.relay", "--config", str(folder / f"{name}.toml"))
+        if is_prepared:
+            wait_until_queued([folder / name / "relay.db" for name in names])
+            run_c2(processes, folder)
+        c2_db = folder / "shore" / "c2.db"
         samples: list[tuple[float, int]] = []
         deadline_s = time.monotonic() + ACCEPT_TIMEOUT_S
         while (not samples or samples[-1][1] < count) and time.monotonic() < deadline_s:
             accepted = accepted_records(c2_db)
             if accepted:
+                if is_prepared and not samples:
+                    before = {name: processes.cpu_s(name) for name in processes.running}
                 samples.append((time.monotonic(), accepted))
             time.sleep(0.02)
         used = {name: processes.cpu_s(name) - before.get(name, 0.0) for name in processes.running}
@@ -465,6 +489,7 @@ def accept(folder: Path, count: int, *, is_coded: bool) -> dict[str, object]:
     accepted = samples[-1][1] - samples[0][1]
     return {
         "record": "part" if is_coded else "reconstructed_image",
+        "senders_prepared": is_prepared,
         "contacts": samples[-1][1],
         "accepted_per_s": round(accepted / seconds),
         "stored_when_all_accepted": stored,
@@ -479,9 +504,25 @@ def accept(folder: Path, count: int, *, is_coded: bool) -> dict[str, object]:
 
 def accepted_records(store: Path) -> int:
     """Return the number of records that were ever committed to an inbox, from SQLite's autoincrement counter."""
+    try:
+        return read_int(store, "SELECT COALESCE(MAX(seq), 0) FROM sqlite_sequence WHERE name = 'inbox'")
+    except sqlite3.OperationalError:
+        return 0  # the service is creating it
+
+
+def wait_until_queued(stores: Sequence[Path]) -> None:
+    """Wait until relays have queued all records of their inboxes for the shore site."""
+    deadline_s = time.monotonic() + ACCEPT_TIMEOUT_S
+    while any(read_int(store, "SELECT EXISTS (SELECT 1 FROM inbox)") for store in stores):
+        if time.monotonic() > deadline_s:
+            sys.exit("fleet: the relays have not queued their records")
+        time.sleep(0.2)
+
+
+def read_int(store: Path, sql: str) -> int:
+    """Return the single number of a query of a store that another process uses."""
     with closing(sqlite3.connect(f"file:{store}?mode=ro", uri=True)) as db:
-        row = db.execute("SELECT seq FROM sqlite_sequence WHERE name = 'inbox'").fetchone()
-    return 0 if row is None else int(row[0])
+        return int(db.execute(sql).fetchone()[0])
 
 
 def images_at_shore(out_dir: Path) -> int:
@@ -565,9 +606,10 @@ def main() -> int:
         run_load(endpoint, Path(folder), vessel, own_vehicles, float(seconds), float(every), is_coded=kind == "coded")
         return 0
     passed = True
-    for is_coded in (False, True) if args.accept else ():
+    for is_coded, is_prepared in ((False, False), (True, False), (True, True)) if args.accept else ():
+        count = args.accept if is_coded else args.accept // 20
         with ProgressDisplay(step="acceptance"), tempfile.TemporaryDirectory(dir=args.dir) as name:
-            result = accept(Path(name), args.accept if is_coded else args.accept // 20, is_coded=is_coded)
+            result = accept(Path(name), count, is_coded=is_coded, is_prepared=is_prepared)
         print(json.dumps(result), flush=True)
         passed = passed and bool(result["good"])
     if args.accept:
