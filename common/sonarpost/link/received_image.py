@@ -86,11 +86,10 @@ def _contact_fields(summary: ContactSummary, vehicle_id: str, image_id: str) -> 
 def contact_record(contact: Contact, height_px: int | None, width_px: int | None, image_id: str) -> bytes:
     """Return the contact record of 25 bytes if it represents exactly this contact and size, otherwise no bytes."""
     try:
-        packed = summary_of(contact, height_px, width_px).pack()
-        summary = ContactSummary.unpack(packed)
+        summary = summary_of(contact, height_px, width_px)
     except FrameError:
         return b""
     has_size = (summary.height_px, summary.width_px) == (height_px, width_px)
     # Dictionaries are compared: making and comparing a second `Contact` takes twice as long.
     fields = _UNKNOWN_FIELDS | _contact_fields(summary, contact.vehicle_id, image_id)
-    return packed if has_size and fields == vars(contact) else b""
+    return summary.pack_exact() if has_size and fields == vars(contact) else b""

@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
-from typing import Final, NamedTuple, get_args
+import sys
+from dataclasses import dataclass, fields
+from operator import attrgetter
+from typing import Any, Final, get_args
 
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX
 from sonarpost.errors import FrameError
@@ -52,19 +54,41 @@ _CLASSES: Final[tuple[AtdClass | None, ...]] = (None, *get_args(AtdClass))
 """Classes by their code of 2 bits."""
 _PROBABILITY_STEPS: Final = 20  # 0.05
 _PROBABILITIES: Final = tuple(
-    (mine_like, other_object)
+    (mine_like / _PROBABILITY_STEPS, other_object / _PROBABILITY_STEPS)
     for mine_like in range(_PROBABILITY_STEPS + 1)
     for other_object in range(_PROBABILITY_STEPS + 1 - mine_like)
 )
-"""The 231 pairs of p_mine_like and p_other_object in steps, by their code."""
+"""The 231 pairs of p_mine_like and p_other_object, by their code."""
 _PROBABILITY_CODES: Final = {pair: code for code, pair in enumerate(_PROBABILITIES)}
-_CLASS_BITS, _PROBABILITY_BITS, _SIDE_BITS, _LAT_BITS, _LON_BITS = 2, 8, 9, 29, 30
-_CLASSIFIED_BITS: Final = (1, _CLASS_BITS, _PROBABILITY_BITS, _SIDE_BITS, _SIDE_BITS, _LAT_BITS, _LON_BITS)
+_LAT_BITS, _LON_BITS = 29, 30
+_LAT_SHIFT, _WIDTH_SHIFT, _HEIGHT_SHIFT, _PROBABILITY_SHIFT, _CLASS_SHIFT = 30, 59, 68, 77, 85
+
+_SIDES: Final = (None, *Side)
+_LARGEST: Final = sys.float_info.max
+_LIMITS: Final = (
+    ("height_px", MIN_SIDE_PX, MAX_SIDE_PX),
+    ("width_px", MIN_SIDE_PX, MAX_SIDE_PX),
+    ("lat_deg", -90, 90),
+    ("lon_deg", -180, 180),
+    ("time_utc_s", 0, _UNKNOWN_U32 - 1),
+    ("confidence", 0, 2),
+    ("heading_deg", -_LARGEST, _LARGEST),
+    ("altitude_m", -_LARGEST, _LARGEST),
+    ("depth_m", -_LARGEST, _LARGEST),
+    ("ground_range_m", 0, _LARGEST),
+    ("pixel_along_m", 0, _LARGEST),
+    ("pixel_across_m", 0, _LARGEST),
+    ("position_sigma_m", 0, _LARGEST),
+    ("p_mine_like", 0, 1),
+    ("p_other_object", 0, 1),
+)
+"""Lowest and highest value of each number."""
+_numbers_of = attrgetter(*(name for name, _, _ in _LIMITS))
 
 
 def atd_class_of(name: str | None) -> AtdClass | None:
     """Return the class of this name if the record can carry it, else None."""
-    return next((known for known in _CLASSES if known is not None and known == name), None)
+    return _CLASSES[_CLASSES.index(name)] if name in _CLASSES else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,18 +141,13 @@ class ContactSummary:
     def __post_init__(self) -> None:
         _check_together("height_px and width_px", self.height_px, self.width_px)
         _check_together("lat_deg and lon_deg", self.lat_deg, self.lon_deg)
-        _check_within("height_px", self.height_px, MIN_SIDE_PX, MAX_SIDE_PX)
-        _check_within("width_px", self.width_px, MIN_SIDE_PX, MAX_SIDE_PX)
-        _check_within("lat_deg", self.lat_deg, -90, 90)
-        _check_within("lon_deg", self.lon_deg, -180, 180)
-        _check_within("time_utc_s", self.time_utc_s, 0, _UNKNOWN_U32 - 1)
-        _check_within("confidence", self.confidence, 0, 2)
-        for name in ("heading_deg", "altitude_m", "depth_m"):
-            _check_within(name, getattr(self, name), -math.inf, math.inf)
-        for name in ("ground_range_m", "pixel_along_m", "pixel_across_m", "position_sigma_m"):
-            _check_within(name, getattr(self, name), 0, math.inf)
+        _check_together("p_mine_like and p_other_object", self.p_mine_like, self.p_other_object)
+        for (name, low, high), value in zip(_LIMITS, _numbers_of(self), strict=True):
+            if value is not None and not low <= value <= high:
+                limits = "" if low == -_LARGEST else f", {low} to {high}"
+                raise FrameError(_WHERE, name, value, f"a finite number{limits}")
         # Any other value would be sent as port: the contact would lie on the wrong side of the track.
-        if self.side not in (None, Side.PORT, Side.STARBOARD):
+        if self.side not in _SIDES:
             raise FrameError(_WHERE, "side", self.side, "port, starboard or None")
         if self.ground_range_m is not None and self.side is None:
             raise FrameError(_WHERE, "side", None, "port or starboard with a ground_range_m")
@@ -136,9 +155,6 @@ class ContactSummary:
             raise FrameError(_WHERE, "lat_deg", None, "a position with a position_sigma_m")
         if self.atd_class not in _CLASSES:
             raise FrameError(_WHERE, "atd_class", self.atd_class, f"{', '.join(get_args(AtdClass))} or None")
-        _check_together("p_mine_like and p_other_object", self.p_mine_like, self.p_other_object)
-        _check_within("p_mine_like", self.p_mine_like, 0, 1)
-        _check_within("p_other_object", self.p_other_object, 0, 1)
         total = (self.p_mine_like or 0.0) + (self.p_other_object or 0.0)
         if total > 1 + PROBABILITY_TOLERANCE:
             raise FrameError(_WHERE, "p_mine_like + p_other_object", total, "at most 1")
@@ -161,18 +177,15 @@ class ContactSummary:
         )
 
     def _classified_head(self) -> bytes:
-        codes = (
-            1,
-            _CLASSES.index(self.atd_class),
-            _probability_code(self.p_mine_like, self.p_other_object),
-            0 if self.height_px is None else self.height_px - 1,
-            0 if self.width_px is None else self.width_px - 1,
-            _degree_code(self.lat_deg, _LAT_BITS),
-            _degree_code(self.lon_deg, _LON_BITS),
+        packed = (
+            1 << 8 * _HEAD_BYTES - 1
+            | _CLASSES.index(self.atd_class) << _CLASS_SHIFT
+            | _probability_code(self.p_mine_like, self.p_other_object) << _PROBABILITY_SHIFT
+            | (0 if self.height_px is None else self.height_px - 1) << _HEIGHT_SHIFT
+            | (0 if self.width_px is None else self.width_px - 1) << _WIDTH_SHIFT
+            | _degree_code(self.lat_deg, _LAT_BITS) << _LAT_SHIFT
+            | _degree_code(self.lon_deg, _LON_BITS)
         )
-        packed = 0
-        for code, bits in zip(codes, _CLASSIFIED_BITS, strict=True):
-            packed = packed << bits | code
         return packed.to_bytes(_HEAD_BYTES, "big")
 
     def _tail(self) -> bytes:
@@ -188,6 +201,11 @@ class ContactSummary:
             _sigma_code(self.position_sigma_m),
         )
 
+    def pack_exact(self) -> bytes:
+        """Return the 25 bytes if `unpack` returns an equal contact, otherwise no bytes."""
+        packed = self.pack()
+        return packed if _unpack(packed, _WHERE) == _values_of(self) else b""
+
     @classmethod
     def unpack(cls, data: bytes, where: str = _WHERE) -> ContactSummary:
         """Parse exactly 25 bytes.
@@ -197,35 +215,14 @@ class ContactSummary:
         """
         if len(data) != RECORD_SIZE:
             raise FrameError(where, "length", len(data), f"{RECORD_SIZE} bytes")
-        is_classified = bool(data[0] & _CLASSIFIED_BIT)
-        head = _unpack_classified(data[:_HEAD_BYTES], where) if is_classified else _unpack_plain(data[:_HEAD_BYTES])
-        time, confidence, heading, altitude, depth, side_range, along, across, sigma = _TAIL.unpack(data[_HEAD_BYTES:])
-        side, ground_range_m = _side_range_value(side_range)
-        return cls(
-            height_px=head.height_px,
-            width_px=head.width_px,
-            lat_deg=head.lat_deg,
-            lon_deg=head.lon_deg,
-            atd_class=head.atd_class,
-            p_mine_like=head.p_mine_like,
-            p_other_object=head.p_other_object,
-            time_utc_s=None if time == _UNKNOWN_U32 else float(time),
-            confidence=None if confidence == _UNKNOWN_U8 else confidence / _CONFIDENCE_STEPS,
-            heading_deg=None if heading == _UNKNOWN_U8 else heading * 360 / _HEADING_STEPS,
-            altitude_m=None if altitude == _UNKNOWN_U8 else altitude / _ALTITUDE_STEPS,
-            depth_m=None if depth == _UNKNOWN_U16 else depth / _DEPTH_STEPS,
-            side=side,
-            ground_range_m=ground_range_m,
-            pixel_along_m=_pixel_value(along),
-            pixel_across_m=_pixel_value(across),
-            position_sigma_m=None
-            if sigma == _UNKNOWN_U8
-            else _SIGMA_MIN_M * math.exp2(sigma / _SIGMA_STEPS_PER_OCTAVE),
-        )
+        return cls(*_unpack(data, where))
 
     def rounded(self) -> ContactSummary:
         """Return the record as the receiver reads it: rounded to the steps of its fields."""
         return ContactSummary.unpack(self.pack())
+
+
+_values_of = attrgetter(*(field.name for field in fields(ContactSummary)))
 
 
 def summary_of(
@@ -268,50 +265,56 @@ def summary_of(
     )
 
 
-class _Head(NamedTuple):
-    """Values of the first 11 bytes of a record."""
-
-    height_px: int | None
-    width_px: int | None
-    lat_deg: float | None
-    lon_deg: float | None
-    atd_class: AtdClass | None = None
-    p_mine_like: float | None = None
-    p_other_object: float | None = None
-
-
-def _unpack_plain(data: bytes) -> _Head:
-    size, lat, lon = _PLAIN_HEAD.unpack(data)
-    size_code = int.from_bytes(size, "big")
-    return _Head(
-        height_px=(size_code >> 12) or None,
-        width_px=(size_code & 0xFFF) or None,
-        lat_deg=None if lat == _NO_FIX else lat / _DEGREE_STEPS,
-        lon_deg=None if lon == _NO_FIX else lon / _DEGREE_STEPS,
+def _unpack(data: bytes, where: str) -> tuple[Any, ...]:
+    """Return the values of the fields of `ContactSummary`, in their order."""
+    is_classified = bool(data[0] & _CLASSIFIED_BIT)
+    *size_and_fix, classes = _unpack_classified(data, where) if is_classified else _unpack_plain(data)
+    time, confidence, heading, altitude, depth, side_range, along, across, sigma = _TAIL.unpack_from(data, _HEAD_BYTES)
+    return (
+        *size_and_fix,
+        None if time == _UNKNOWN_U32 else float(time),
+        None if confidence == _UNKNOWN_U8 else confidence / _CONFIDENCE_STEPS,
+        None if heading == _UNKNOWN_U8 else heading * 360 / _HEADING_STEPS,
+        None if altitude == _UNKNOWN_U8 else altitude / _ALTITUDE_STEPS,
+        None if depth == _UNKNOWN_U16 else depth / _DEPTH_STEPS,
+        *_side_range_value(side_range),
+        _pixel_value(along),
+        _pixel_value(across),
+        None if sigma == _UNKNOWN_U8 else _SIGMA_MIN_M * math.exp2(sigma / _SIGMA_STEPS_PER_OCTAVE),
+        *classes,
     )
 
 
-def _unpack_classified(data: bytes, where: str) -> _Head:
-    packed = int.from_bytes(data, "big")
-    codes = []
-    for bits in reversed(_CLASSIFIED_BITS):
-        codes.append(packed & (1 << bits) - 1)
-        packed >>= bits
-    lon, lat, width, height, probabilities, class_code, _ = codes
+def _unpack_plain(data: bytes) -> tuple[Any, ...]:
+    """Return height, width, latitude, longitude; class and probabilities, which are unknown."""
+    size, lat, lon = _PLAIN_HEAD.unpack_from(data)
+    size_code = int.from_bytes(size, "big")
+    return (
+        (size_code >> 12) or None,
+        (size_code & 0xFFF) or None,
+        None if lat == _NO_FIX else lat / _DEGREE_STEPS,
+        None if lon == _NO_FIX else lon / _DEGREE_STEPS,
+        (None, None, None),
+    )
+
+
+def _unpack_classified(data: bytes, where: str) -> tuple[Any, ...]:
+    """Return height, width, latitude, longitude; class and probabilities."""
+    packed = int.from_bytes(data[:_HEAD_BYTES], "big")
+    class_code = packed >> _CLASS_SHIFT & 3
+    probabilities = packed >> _PROBABILITY_SHIFT & 0xFF
     if len(_PROBABILITIES) <= probabilities < _UNKNOWN_U8:
         raise FrameError(where, "probabilities", probabilities, f"a code below {len(_PROBABILITIES)}, or 255")
     if class_code == 0 and probabilities == _UNKNOWN_U8:
         raise FrameError(where, "class", class_code, "a class or probabilities in the classified layout")
-    known = probabilities != _UNKNOWN_U8
-    mine_like, other_object = _PROBABILITIES[probabilities] if known else (0, 0)
-    return _Head(
-        height_px=height + 1 if height else None,
-        width_px=width + 1 if width else None,
-        lat_deg=_degree_value(lat, _LAT_BITS),
-        lon_deg=_degree_value(lon, _LON_BITS),
-        atd_class=_CLASSES[class_code],
-        p_mine_like=mine_like / _PROBABILITY_STEPS if known else None,
-        p_other_object=other_object / _PROBABILITY_STEPS if known else None,
+    height, width = packed >> _HEIGHT_SHIFT & 0x1FF, packed >> _WIDTH_SHIFT & 0x1FF
+    pair = (None, None) if probabilities == _UNKNOWN_U8 else _PROBABILITIES[probabilities]
+    return (
+        height + 1 if height else None,
+        width + 1 if width else None,
+        _degree_value(packed >> _LAT_SHIFT, _LAT_BITS),
+        _degree_value(packed, _LON_BITS),
+        (_CLASSES[class_code], *pair),
     )
 
 
@@ -320,19 +323,13 @@ def _check_together(names: str, first: object, second: object) -> None:
         raise FrameError(_WHERE, names, (first, second), "both or neither")
 
 
-def _check_within(name: str, value: float | None, low: float, high: float) -> None:
-    if value is not None and not (math.isfinite(value) and low <= value <= high):
-        limits = "a finite number" if low == -math.inf else f"a finite number, {low} to {high}"
-        raise FrameError(_WHERE, name, value, limits)
-
-
 def _probability_code(p_mine_like: float | None, p_other_object: float | None) -> int:
     if p_mine_like is None or p_other_object is None:
         return _UNKNOWN_U8
     mine_like = round(p_mine_like * _PROBABILITY_STEPS)
     # The sum can exceed 1 by a rounding error.
     other_object = min(round(p_other_object * _PROBABILITY_STEPS), _PROBABILITY_STEPS - mine_like)
-    return _PROBABILITY_CODES[mine_like, other_object]
+    return _PROBABILITY_CODES[mine_like / _PROBABILITY_STEPS, other_object / _PROBABILITY_STEPS]
 
 
 def _degree_code(degrees: float | None, bits: int) -> int:
@@ -342,9 +339,10 @@ def _degree_code(degrees: float | None, bits: int) -> int:
 
 
 def _degree_value(code: int, bits: int) -> float | None:
-    if code == 1 << bits - 1:
-        return None
-    return (code - (1 << bits) if code >> bits - 1 else code) / _CLASSIFIED_DEGREE_STEPS
+    """Return the latitude or longitude of a code in the lowest bits of a number."""
+    sign = 1 << bits - 1
+    code &= 2 * sign - 1
+    return None if code == sign else ((code ^ sign) - sign) / _CLASSIFIED_DEGREE_STEPS
 
 
 def _linear_code(value: float | None, steps_per_unit: int, last: int, unknown: int) -> int:
