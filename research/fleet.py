@@ -68,8 +68,7 @@ from sonarpost.codec.registry import default_registry
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.store import Store
 from sonarpost.link.downlink.messages import image_of_number
-from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.received_image import contact_of
+from sonarpost.link.frames.contact_record import ContactSummary, contact_of
 from sonarpost.messages import CodedImage, Pixels, ReconstructedImage, Record
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.stop_signals import EXIT_WITH_PARENT

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from sonarpost import wire
 from sonarpost.archive.image_parts import coded_image, difference, expand, head_of, stream_of, whole_part
 from sonarpost.errors import MissingBaseError, PayloadError
-from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.received_image import contact_of
+from sonarpost.link.frames.contact_record import ContactSummary, contact_of
 from sonarpost.messages import CodedImage, ImagePart
 
 SUMMARY = ContactSummary.unpack(ACOUSTIC_CONTACT)
@@ -68,6 +67,15 @@ def test_every_image_arrives_unchanged(sent):
     halves = tuple(half for half in ("top", "bottom") if half in sent.missing_halves)
     expected = {"stream": bytes(zeroed), "missing_halves": halves, "codec": arrived.codec}
     assert arrived == sent.model_copy(update=expected)
+
+
+@pytest.mark.parametrize("names", [{"vehicle_id": "uuv-2"}, {"contact_id": "uuv-2/000A"}], ids=str)
+def test_contact_with_names_of_another_image_arrives_unchanged(names):
+    """Its contact record would be exact, but a site reads the vehicle and the image from the record around it."""
+    sent = image(noise(200), contact=contact_of(SUMMARY, "uuv-1", "000A").model_copy(update=names))
+    assert coded_image(decoded(whole_part(sent)), sent.vessel_id, "key") == sent
+    sent = image(noise(200), vehicle_id="uuv-2")
+    assert coded_image(decoded(whole_part(sent)), sent.vessel_id, "key") == sent
 
 
 @given(data=st.data(), length=st.integers(3, 900), more=st.integers(0, 900))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
@@ -22,8 +22,7 @@ from pydantic import ValidationError
 from sonarpost import wire
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError, FrameError, MissingBaseError, PayloadError
-from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary
-from sonarpost.link.received_image import contact_of, contact_record
+from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary, contact_of, exact_record
 from sonarpost.logs import kv
 from sonarpost.messages import CodedImage, Contact, ImagePart
 
@@ -269,13 +268,12 @@ def _pack_contact(image: CodedImage) -> bytes:
     contact = image.contact
     if contact is None:
         return b""
-    record = contact_record(contact, image.height_px, image.width_px, image.image_id)
-    if record:
+    usual = _usual_names(image.vehicle_id, image.image_id)
+    has_usual_names = usual.items() <= vars(contact).items()
+    if has_usual_names and (record := exact_record(contact, image.height_px, image.width_px)):
         return record
-    fields = {name: value for name, value in contact.model_dump().items() if value is not None}
-    for name, usual in (("vehicle_id", image.vehicle_id), ("contact_id", f"{image.vehicle_id}/{image.image_id}")):
-        if fields[name] == usual:
-            del fields[name]
+    present = {name: value for name, value in contact.model_dump().items() if value is not None}
+    fields = {name: value for name, value in present.items() if usual.get(name) != value}
     packed: bytes = msgpack.packb(fields)
     return packed
 
@@ -289,9 +287,12 @@ def _unpack_contact(part: ImagePart, where: str) -> tuple[Contact | None, int | 
             return contact_of(summary, part.u, part.i), summary.height_px, summary.width_px
     except (FrameError, ValidationError) as error:
         raise PayloadError(where, "c", part.c, f"a contact record: {error}") from error
-    usual: Mapping[str, object] = {"vehicle_id": part.u, "contact_id": f"{part.u}/{part.i}"}
-    fields = {**usual, **wire.unpack_map(part.c, f"{where}: c")}
+    fields = _usual_names(part.u, part.i) | wire.unpack_map(part.c, f"{where}: c")
     return wire.validated(Contact, fields, f"{where}: c"), part.h, part.w
+
+
+def _usual_names(vehicle_id: str, image_id: str) -> dict[str, object]:
+    return {"vehicle_id": vehicle_id, "contact_id": f"{vehicle_id}/{image_id}"}
 
 
 def _mask(length: int, missing: Sequence[tuple[int, int]]) -> npt.NDArray[np.bool_]:

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
-
-from sonarpost.errors import FrameError
-from sonarpost.link.frames.contact_record import ContactSummary, summary_of
+from sonarpost.link.frames.contact_record import contact_of
 from sonarpost.link.receiver import ImageUpdate
-from sonarpost.messages import Contact, ReceivedImage
-
-_UNKNOWN_FIELDS: Final = {name: field.default for name, field in Contact.model_fields.items()}
+from sonarpost.messages import ReceivedImage
 
 
 def received_image(
@@ -50,46 +45,3 @@ def received_image(
         last_frame_utc_s=update.last_frame_s,
         authenticated=authenticated,
     )
-
-
-def contact_of(summary: ContactSummary, vehicle_id: str, image_id: str) -> Contact:
-    """Return the contact that a contact record describes.
-
-    Raises:
-        ValidationError: A value does not fit the record.
-    """
-    return Contact(**_contact_fields(summary, vehicle_id, image_id))
-
-
-def _contact_fields(summary: ContactSummary, vehicle_id: str, image_id: str) -> dict[str, Any]:
-    return {
-        "contact_id": f"{vehicle_id}/{image_id}",
-        "vehicle_id": vehicle_id,
-        "channel": summary.side.value if summary.side else None,
-        "time_utc_s": summary.time_utc_s,
-        "lat_deg": summary.lat_deg,
-        "lon_deg": summary.lon_deg,
-        "position_sigma_m": summary.position_sigma_m,
-        "depth_m": summary.depth_m,
-        "altitude_m": summary.altitude_m,
-        "heading_deg": summary.heading_deg,
-        "ground_range_m": summary.ground_range_m,
-        "atd_class": summary.atd_class,
-        "atd_confidence": summary.confidence,
-        "pixel_along_m": summary.pixel_along_m,
-        "pixel_across_m": summary.pixel_across_m,
-        "p_mine_like": summary.p_mine_like,
-        "p_other_object": summary.p_other_object,
-    }
-
-
-def contact_record(contact: Contact, height_px: int | None, width_px: int | None, image_id: str) -> bytes:
-    """Return the contact record of 25 bytes if it represents exactly this contact and size, otherwise no bytes."""
-    try:
-        summary = summary_of(contact, height_px, width_px)
-    except FrameError:
-        return b""
-    has_size = (summary.height_px, summary.width_px) == (height_px, width_px)
-    # Dictionaries are compared: making and comparing a second `Contact` takes twice as long.
-    fields = _UNKNOWN_FIELDS | _contact_fields(summary, contact.vehicle_id, image_id)
-    return summary.pack_exact() if has_size and fields == vars(contact) else b""

@@ -8,11 +8,20 @@ import struct
 from typing import Any
 
 import pytest
+from builders.record_strategies import STRATEGIES
 from hypothesis import example, given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from sonarpost.errors import FrameError
-from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary, atd_class_of, summary_of
+from sonarpost.link.frames.contact_record import (
+    RECORD_SIZE,
+    ContactSummary,
+    atd_class_of,
+    contact_of,
+    exact_record,
+    summary_of,
+)
 from sonarpost.messages import Contact
 from sonarpost.sonar.survey import Side
 
@@ -287,3 +296,32 @@ def test_other_length_is_rejected(length: int) -> None:
 def test_time_that_the_record_cannot_hold_is_unknown(time_utc_s: float, expected: float | None) -> None:
     summary = summary_of(Contact(contact_id="c", vehicle_id="uuv-1", time_utc_s=time_utc_s), None, None)
     assert ContactSummary.unpack(summary.pack()).time_utc_s == expected
+
+
+SOME_SIDES = st.none() | st.integers(1, 600)
+
+
+@given(contacts(), st.sampled_from(sorted(Contact.model_fields.keys() - {"vehicle_id"})), SOME_SIDES, st.data())
+def test_exact_record_is_read_as_the_same_contact_or_is_empty(
+    sent: ContactSummary, changed: str, side_px: int | None, data: st.DataObject
+) -> None:
+    """A contact as it was received has an exact record; one with a change has it only if the change is read as well."""
+    received = sent.rounded()
+    contact = contact_of(received, "uuv-1", "000A")
+    assert exact_record(contact, received.height_px, received.width_px) == received.pack()
+    size = data.draw(st.sampled_from([(received.height_px, received.width_px), (side_px, 80), (80, side_px)]))
+    drawn: Contact = data.draw(STRATEGIES[Contact])
+    try:
+        contact = Contact.model_validate(contact.model_dump() | {changed: getattr(drawn, changed)})
+    except ValidationError:
+        contact = drawn
+    packed = exact_record(contact, *size)
+    try:
+        read = summary_of(contact, *size).rounded()
+    except FrameError:
+        assert packed == b""
+        return
+    identifiers = {"contact_id": contact.contact_id, "vehicle_id": contact.vehicle_id}
+    is_exact = contact_of(read, "uuv-1", "000A").model_copy(update=identifiers) == contact
+    is_exact &= (read.height_px, read.width_px) == size
+    assert packed == (read.pack() if is_exact else b"")

@@ -166,45 +166,7 @@ class ContactSummary:
 
     def pack(self) -> bytes:
         """Return the 25 bytes."""
-        return (self._classified_head() if self.is_classified else self._plain_head()) + self._tail()
-
-    def _plain_head(self) -> bytes:
-        size = 0 if self.height_px is None or self.width_px is None else (self.height_px << 12) | self.width_px
-        return _PLAIN_HEAD.pack(
-            size.to_bytes(3, "big"),
-            _NO_FIX if self.lat_deg is None else round(self.lat_deg * _DEGREE_STEPS),
-            _NO_FIX if self.lon_deg is None else round(self.lon_deg * _DEGREE_STEPS),
-        )
-
-    def _classified_head(self) -> bytes:
-        packed = (
-            1 << 8 * _HEAD_BYTES - 1
-            | _CLASSES.index(self.atd_class) << _CLASS_SHIFT
-            | _probability_code(self.p_mine_like, self.p_other_object) << _PROBABILITY_SHIFT
-            | (0 if self.height_px is None else self.height_px - 1) << _HEIGHT_SHIFT
-            | (0 if self.width_px is None else self.width_px - 1) << _WIDTH_SHIFT
-            | _degree_code(self.lat_deg, _LAT_BITS) << _LAT_SHIFT
-            | _degree_code(self.lon_deg, _LON_BITS)
-        )
-        return packed.to_bytes(_HEAD_BYTES, "big")
-
-    def _tail(self) -> bytes:
-        return _TAIL.pack(
-            _UNKNOWN_U32 if self.time_utc_s is None else round(self.time_utc_s),
-            _linear_code(self.confidence, _CONFIDENCE_STEPS, _LAST_U8, _UNKNOWN_U8),
-            _heading_code(self.heading_deg),
-            _linear_code(self.altitude_m, _ALTITUDE_STEPS, _LAST_U8, _UNKNOWN_U8),
-            _linear_code(self.depth_m, _DEPTH_STEPS, _UNKNOWN_U16 - 1, _UNKNOWN_U16),
-            _side_range_code(self.side, self.ground_range_m),
-            _pixel_code(self.pixel_along_m),
-            _pixel_code(self.pixel_across_m),
-            _sigma_code(self.position_sigma_m),
-        )
-
-    def pack_exact(self) -> bytes:
-        """Return the 25 bytes if `unpack` returns an equal contact, otherwise no bytes."""
-        packed = self.pack()
-        return packed if _unpack(packed, _WHERE) == _values_of(self) else b""
+        return _pack(*_values_of(self))
 
     @classmethod
     def unpack(cls, data: bytes, where: str = _WHERE) -> ContactSummary:
@@ -223,6 +185,13 @@ class ContactSummary:
 
 
 _values_of = attrgetter(*(field.name for field in fields(ContactSummary)))
+_CONTACT_NAMES: Final = {"confidence": "atd_confidence", "side": "channel"}
+_CARRIED_FIELDS: Final = tuple(_CONTACT_NAMES.get(field.name, field.name) for field in fields(ContactSummary)[2:])
+"""Fields of `Contact` that the record carries, in the order of the fields of `ContactSummary` after the size."""
+_carried = attrgetter(*_CARRIED_FIELDS)
+_OTHER_FIELDS: Final = sorted(Contact.model_fields.keys() - {"contact_id", "vehicle_id", *_CARRIED_FIELDS})
+_others = attrgetter(*_OTHER_FIELDS)
+_NO_OTHERS: Final = (None,) * len(_OTHER_FIELDS)
 
 
 def summary_of(
@@ -241,27 +210,106 @@ def summary_of(
     Raises:
         FrameError: A side of the image is out of range.
     """
+    return ContactSummary(*_summary_values(contact, height_px, width_px, contact_class=contact_class))
+
+
+def exact_record(contact: Contact, height_px: int | None, width_px: int | None) -> bytes:
+    """Return the record of 25 bytes if a receiver reads exactly this size and contact from it, otherwise no bytes.
+
+    The identifiers of the contact are not compared.
+    """
+    for side in (height_px, width_px):
+        if side is not None and not MIN_SIDE_PX <= side <= MAX_SIDE_PX:
+            return b""
+    if _others(contact) != _NO_OTHERS:
+        return b""
+    packed = _pack(*_summary_values(contact, height_px, width_px))
+    return packed if _unpack(packed, _WHERE) == (height_px, width_px, *_carried(contact)) else b""
+
+
+def contact_of(summary: ContactSummary, vehicle_id: str, image_id: str) -> Contact:
+    """Return the contact that a contact record describes.
+
+    Raises:
+        ValidationError: A value does not fit the record.
+    """
+    values = dict(zip(_CARRIED_FIELDS, _values_of(summary)[2:], strict=True))
+    return Contact(contact_id=f"{vehicle_id}/{image_id}", vehicle_id=vehicle_id, **values)
+
+
+def _summary_values(
+    contact: Contact, height_px: int | None, width_px: int | None, *, contact_class: bool = True
+) -> tuple[Any, ...]:
     has_size = height_px is not None and width_px is not None
     time_utc_s = contact.time_utc_s
     has_fix = contact.lat_deg is not None and contact.lon_deg is not None
-    return ContactSummary(
-        height_px=height_px if has_size else None,
-        width_px=width_px if has_size else None,
-        lat_deg=contact.lat_deg if has_fix else None,
-        lon_deg=contact.lon_deg if has_fix else None,
-        time_utc_s=time_utc_s if time_utc_s is not None and time_utc_s <= _UNKNOWN_U32 - 1 else None,
-        confidence=contact.atd_confidence,
-        heading_deg=contact.heading_deg,
-        altitude_m=contact.altitude_m,
-        depth_m=contact.depth_m,
-        side=Side(contact.channel) if contact.channel else None,
-        ground_range_m=contact.ground_range_m if contact.channel else None,
-        pixel_along_m=contact.pixel_along_m,
-        pixel_across_m=contact.pixel_across_m,
-        position_sigma_m=contact.position_sigma_m if has_fix else None,
-        atd_class=atd_class_of(contact.atd_class) if contact_class else None,
-        p_mine_like=contact.p_mine_like if contact_class else None,
-        p_other_object=contact.p_other_object if contact_class else None,
+    return (
+        height_px if has_size else None,
+        width_px if has_size else None,
+        contact.lat_deg if has_fix else None,
+        contact.lon_deg if has_fix else None,
+        time_utc_s if time_utc_s is not None and time_utc_s <= _UNKNOWN_U32 - 1 else None,
+        contact.atd_confidence,
+        contact.heading_deg,
+        contact.altitude_m,
+        contact.depth_m,
+        Side(contact.channel) if contact.channel else None,
+        contact.ground_range_m if contact.channel else None,
+        contact.pixel_along_m,
+        contact.pixel_across_m,
+        contact.position_sigma_m if has_fix else None,
+        atd_class_of(contact.atd_class) if contact_class else None,
+        contact.p_mine_like if contact_class else None,
+        contact.p_other_object if contact_class else None,
+    )
+
+
+def _pack(
+    height_px: int | None,
+    width_px: int | None,
+    lat_deg: float | None,
+    lon_deg: float | None,
+    time_utc_s: float | None,
+    confidence: float | None,
+    heading_deg: float | None,
+    altitude_m: float | None,
+    depth_m: float | None,
+    side: Side | None,
+    ground_range_m: float | None,
+    pixel_along_m: float | None,
+    pixel_across_m: float | None,
+    position_sigma_m: float | None,
+    atd_class: AtdClass | None,
+    p_mine_like: float | None,
+    p_other_object: float | None,
+) -> bytes:
+    """Return the 25 bytes for the values of the fields of `ContactSummary`, in their order."""
+    if atd_class is not None or p_mine_like is not None:
+        head = (
+            1 << 8 * _HEAD_BYTES - 1
+            | _CLASSES.index(atd_class) << _CLASS_SHIFT
+            | _probability_code(p_mine_like, p_other_object) << _PROBABILITY_SHIFT
+            | (0 if height_px is None else height_px - 1) << _HEIGHT_SHIFT
+            | (0 if width_px is None else width_px - 1) << _WIDTH_SHIFT
+            | _degree_code(lat_deg, _LAT_BITS) << _LAT_SHIFT
+            | _degree_code(lon_deg, _LON_BITS)
+        ).to_bytes(_HEAD_BYTES, "big")
+    else:
+        head = _PLAIN_HEAD.pack(
+            (0 if height_px is None or width_px is None else height_px << 12 | width_px).to_bytes(3, "big"),
+            _NO_FIX if lat_deg is None else round(lat_deg * _DEGREE_STEPS),
+            _NO_FIX if lon_deg is None else round(lon_deg * _DEGREE_STEPS),
+        )
+    return head + _TAIL.pack(
+        _UNKNOWN_U32 if time_utc_s is None else round(time_utc_s),
+        _linear_code(confidence, _CONFIDENCE_STEPS, _LAST_U8, _UNKNOWN_U8),
+        _heading_code(heading_deg),
+        _linear_code(altitude_m, _ALTITUDE_STEPS, _LAST_U8, _UNKNOWN_U8),
+        _linear_code(depth_m, _DEPTH_STEPS, _UNKNOWN_U16 - 1, _UNKNOWN_U16),
+        _side_range_code(side, ground_range_m),
+        _pixel_code(pixel_along_m),
+        _pixel_code(pixel_across_m),
+        _sigma_code(position_sigma_m),
     )
 
 
