@@ -188,8 +188,8 @@ class C2Service(Service[C2Config]):
     def _prune_versions(self, tx: Transaction, prefix: str) -> None:
         self._stored_versions[prefix] += 1
         if (self._stored_versions[prefix] - 1) % image_parts.PRUNE_EVERY == 0:
-            for surplus in image_parts.surplus_names(tx.state_names(prefix)):
-                tx.delete_state(surplus)
+            surplus = image_parts.surplus_names(tx.state_names(prefix))
+            tx.delete_states(prefix, (name.removeprefix(prefix) for name in surplus))
 
     def before_accepting(self, records: Sequence[tuple[str, bytes]]) -> None:
         """Commit records to an archive that several c2 share, so that another one can handle them."""

@@ -306,9 +306,8 @@ class RelayService(Service[RelayConfig]):
         self._stored_versions[queue] += 1
         if (self._stored_versions[queue] - 1) % image_parts.PRUNE_EVERY == 0:
             prefix = f"{VERSIONS}{queue}/"
-            for name in image_parts.surplus_names(tx.state_names(prefix)):
-                if not tx.has_topic(queue, name.removeprefix(prefix)):
-                    tx.delete_state(name)
+            surplus = image_parts.surplus_names(tx.state_names(prefix))
+            tx.delete_states(prefix, (name.removeprefix(prefix) for name in surplus), queue)
 
     def after_commit(self, handled: Sequence[UnitOfWork], superseded: int) -> None:
         """Log the queued records, and apply the quota of each site's queue."""

@@ -231,10 +231,6 @@ class Transaction:
         self._numbers[queue] = (seq, uuid.uuid4().bytes)
         self._write_numbers()
 
-    def has_topic(self, queue: str, topic: str) -> bool:
-        """Return whether a queue holds a record of a topic."""
-        return bool(self._editions(queue, topic))
-
     def _editions(self, queue: str, topic: str) -> list[tuple[int, int, int, int]]:
         """Return (seq, edition, position, priority) of a topic's records in a queue."""
         if (queue, topic) in self._new_topics:
@@ -416,6 +412,16 @@ class Transaction:
         """Delete the value under `name`."""
         self._flush_states()
         self._db.execute("DELETE FROM state WHERE name = ?", (name,))
+
+    def delete_states(self, prefix: str, names: Iterable[str], queue: str = "") -> None:
+        """Delete the values under `prefix` and each name, except where the name is a topic of a record in `queue`."""
+        self._flush_states()
+        self._flush_outbox()
+        self._db.executemany(
+            "DELETE FROM state WHERE name = ? AND NOT EXISTS"
+            " (SELECT 1 FROM outbox WHERE consumer = ? AND topic = ? AND topic <> '')",
+            [(prefix + name, queue, name) for name in names],
+        )
 
     def discard_state(self, name: str, value: bytes, reason: str) -> None:
         """Move a value that cannot be read from `name` to the quarantine."""
