@@ -13,7 +13,7 @@ from builders.vessel_frames import CONTACT
 from sonarpost import keys, wire
 from sonarpost.archive.image_parts import stream_of
 from sonarpost.codec.registry import default_registry
-from sonarpost.delivery.records import OutboxItem
+from sonarpost.delivery.records import OutboxItem, Topic
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
@@ -234,6 +234,20 @@ def test_relay_keeps_the_later_version_if_the_first_is_acknowledged_after_it(pla
         found += relay.store.states("version/").values()
     relay.store.close()
     assert found == [payloads[0], payloads[1], payloads[1]]
+
+
+def test_relay_deletes_surplus_versions_except_those_with_a_queued_record(platform, monkeypatch):
+    monkeypatch.setattr("sonarpost.archive.image_parts.MAX_VERSIONS", 1)
+    monkeypatch.setattr("sonarpost.archive.image_parts.PRUNE_EVERY", 1)
+    relay, queue, key = RelayService(platform(VESSEL), RelayConfig()), "c2", keys.shore_part(VESSEL)
+    parts = [ImagePart(u="uuv-1", i=image_of_number(n), n=1, t=float(n), p=b"\x04\x30") for n in range(1, 5)]
+    with relay.store.transaction() as tx:
+        tx.send(key, queue, b"", encoding="", topic=Topic("uuv-1/0002/2.0", 2))
+        for part in parts:
+            relay.on_acknowledged(tx, OutboxItem(queue, part.n, key, "", 5, wire.encode(part), b""), None)
+    names = relay.store.state_names("version/")
+    relay.store.close()
+    assert names == ("version/c2/uuv-1/0002/2.0", "version/c2/uuv-1/0004/4.0")
 
 
 def test_accepted_image_is_decoded_once_or_again_if_it_is_read_from_the_store(platform, tmp_path, monkeypatch):
