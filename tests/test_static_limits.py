@@ -121,7 +121,6 @@ ALLOCATIONS = {
     "common/sonarpost/link/coding/byte_ranges.py": "MAX_PARTIAL_BYTES; pieces end at MAX_STREAM_BYTES",
     "common/sonarpost/link/coding/channel_capacity.py: received_distribution": "frames of a plan",
     "common/sonarpost/link/frames/paper/receiver.py: PendingImage.add_half": "16 bits, MAX_CANDIDATES times",
-    "common/sonarpost/link/migration.py: _packed_stream": "state of an earlier version; lengths of 16 bits",
     "common/sonarpost/messages/image.py: ReconstructedImage.missing": "pixels of the record",
     "common/sonarpost/sonar/geometry.py: _moving_average": "at most half the fixes",
     "common/sonarpost/sonar/maps/geotiff.py: _pack": SENT,

@@ -22,9 +22,7 @@ from sonarpost.logs import kv
 from sonarpost.messages import ReceivedImage, ReconstructedImage, Record
 from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, UnitOfWork
-from sonarpost.security.acoustic_key import link_key
 from sonarpost.services.decompressor.config import DecompressorConfig
-from sonarpost.services.decompressor.migration import migrate_store
 
 log = logging.getLogger(__name__)
 
@@ -50,11 +48,6 @@ class DecompressorService(Service[DecompressorConfig]):
         super().__init__(platform, config)
         self._retention = Retention(self._apply_retention, self.stopping)
         self._copy_origin, self._copies = uuid.uuid4().bytes, 0
-
-    def start(self) -> bool:
-        """Convert the frames and the receiver state that version 0.1 left in the store, then start."""
-        migrate_store(self.store, self.platform.id, lambda: link_key(self.platform))
-        return super().start()
 
     def on_start(self) -> None:
         """Start the retention, and reply to queries for codebooks."""

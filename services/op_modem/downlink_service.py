@@ -38,8 +38,6 @@ from sonarpost.services.op_modem.vessel_endpoint import VesselLink
 
 log = logging.getLogger(__name__)
 
-_STATE_0_1 = "station"
-"""The whole state in one value, as version 0.1 saved it."""
 _PARTS = "station/"
 _COUNTER_LIMIT = "seal-limit/"
 _AUTHENTICATED_SINCE = "authenticated-since"
@@ -102,8 +100,7 @@ class DownlinkService(ModemService[OpModemConfig]):
                 return 0.0
             names = self.store.state_names(_PARTS)
             was_on = any(name.startswith(_PARTS + "authentication/") for name in names)
-            is_new = not names and self.store.get_state(_STATE_0_1) is None
-            since_s = 0.0 if was_on or is_new else time.time()
+            since_s = 0.0 if was_on or not names else time.time()
             for name in names if since_s else ():
                 if name.removeprefix(_PARTS).startswith(_UNFINISHED_BLOCKS):
                     tx.delete_state(name)
@@ -169,8 +166,6 @@ class DownlinkService(ModemService[OpModemConfig]):
             parts = self.store.states(_PARTS)
             self._saved_parts = SavedParts(parts)
             errors = self._link.restore(parts)
-            if not parts:
-                self.store.read_state(_STATE_0_1, self._link.restore_old, None)
             if errors:
                 with self.store.transaction() as tx:
                     for name, reason in errors.items():
@@ -181,7 +176,6 @@ class DownlinkService(ModemService[OpModemConfig]):
         """Add the changed parts of the endpoint's state to a unit of work."""
         parts = self._link.parts()
         effects.put_states(_PARTS, self._saved_parts.changes(parts))
-        effects.delete_state(_STATE_0_1)
         self._saved_parts.commit(parts)
 
     # Transmission

@@ -42,8 +42,6 @@ log = logging.getLogger(__name__)
 
 _PACKETS = "packets"
 _PARTIAL_PACKET = "arriving"
-_QUEUE_0_1 = "decompressor"
-"""Queue in which version 0.1 kept received frames."""
 TICK_S = 0.1
 SAVE_RETRY_S = 1.0
 MAX_UNSAVED = limit(
@@ -84,11 +82,6 @@ class OpModemService(DownlinkService):
             self.config.status_interval_s, [int(address) for address in self.config.vehicles]
         )
         self._limit_log = self.interval_log(log, logging.WARNING, "Image limit reached")
-
-    def start(self) -> bool:
-        """Process the frames that version 0.1 left in the outbox, then start."""
-        self._process_queued_frames()
-        return super().start()
 
     def on_start(self) -> None:
         """Process the unfinished packet of a killed process, then open the port."""
@@ -404,38 +397,6 @@ class OpModemService(DownlinkService):
         super()._handle_item(item)
         for message in self._merged_messages if not self.config.message_consumers else ():
             self.publish(keys.message_received(self.platform.id), message)
-
-    # Migration
-
-    def _process_queued_frames(self) -> None:
-        """Process the frames that version 0.1 queued for the decompressor.
-
-        The v1 receiver has already processed those addressed to this vessel, but its images were not sent. They are
-        sent again from its state.
-        """
-        key = keys.acoustic_rx(self.platform.id)
-        numbers = self.store.queued_numbers(_QUEUE_0_1, 2**31)
-        items = [item for item in self.store.queued_items(_QUEUE_0_1, numbers) if item.key == key]
-        if not items:
-            return
-        effects = UnitOfWork()
-        frames: list[AcousticFrame] = []
-        for item in items:
-            try:
-                frames.append(wire.decode(AcousticFrame, item.payload, item.key))
-            except PayloadError as error:
-                effects.quarantine(item.key, item.payload, str(error))
-        with self._link_step() as link:
-            if frames:
-                self._send_images(link.endpoint.v1.repeat_updates(min(frame.time_utc_s for frame in frames)), effects)
-            for frame in frames:
-                self._send_images(self._accept(link, frame).images, effects)
-            self._save_state(effects)
-            with self.store.transaction() as tx:
-                effects.write(tx)
-                tx.remove_acknowledged(_QUEUE_0_1, [item.seq for item in items])
-            self._is_committed = True
-        log.info("Frames of version 0.1 processed", extra=kv(frames=len(items)))
 
 
 def _text(error: ValidationError | FrameError) -> str:

@@ -7,7 +7,6 @@ from typing import Final
 
 from sonarpost.codec.region import RegionBox
 from sonarpost.errors import FrameError, PayloadError
-from sonarpost.link import migration
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.merging import FrameMerger
 from sonarpost.link.downlink import messages as dl
@@ -16,7 +15,7 @@ from sonarpost.link.downlink.vessel_endpoint import VesselEndpoint
 from sonarpost.link.frames.v1.frame import segments_room
 from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
-from sonarpost.link.state import Parts, below, prefixed, unpack_plain
+from sonarpost.link.state import Parts, below, prefixed
 from sonarpost.messages import Command, CommandKind, Decision, DownlinkState, ReceivedImage
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.image_limiter import ImageLimiter
@@ -148,20 +147,6 @@ class VesselLink:
             skipped = self._merger.restore(below(_MERGING, parts))
             errors |= {_MERGING + name: error for name, error in skipped.items()}
         return errors
-
-    def restore_old(self, saved: bytes) -> None:
-        """Replace the state by that of version 0.1.
-
-        Raises:
-            FrameError: Not a state of version 0.1.
-        """
-        state = unpack_plain(dict, saved, "op_modem state")
-        if not isinstance(state.get("link"), dict):
-            raise FrameError("op_modem state", "link", saved[:20], "a map")
-        parts = prefixed(_LINK, migration.endpoint_parts(state["link"]))
-        if isinstance(state.get("seal"), dict):
-            parts |= prefixed(_AUTHENTICATION, migration.authentication_parts(state["seal"]))
-        self.restore(parts)
 
 
 _NUMBER_MESSAGES: Final[Mapping[CommandKind, type[dl.ResendMessage | dl.ExpandMessage | dl.OriginalMessage]]] = {

@@ -44,7 +44,6 @@ MAX_UNSAVED: Final = limit(
     1000, "frames", "shares", "acoustic link", "all modems", "frames without a disk", "further ones are dropped"
 )
 SAVE_AGAIN_S: Final = 0.5
-_ARRIVAL_0_1: Final = "arrival/"
 _MAX_WAIT_S: Final = 0.2
 _MIN_WAIT_S: Final = 0.005
 _STATE_INTERVAL_S: Final = 0.2
@@ -70,7 +69,6 @@ class UuvModemService(ModemService[UuvModemConfig]):
         config.check_with(platform)
         super().__init__(platform, config)
         try:
-            self._migrate()
             rejection_log = self.interval_log(log, logging.WARNING, "Frame rejected")
             self._endpoint = VehicleEndpoint(platform, self.config, self.store, self.key, rejection_log)
         except BaseException:
@@ -92,20 +90,6 @@ class UuvModemService(ModemService[UuvModemConfig]):
         self._link_error = ""
         self._published_at_s: float | None = None
         self._published_images = (0, 0)
-
-    def _migrate(self) -> None:
-        """Return records to the inbox that version 0.1 stored between the inbox and the queue.
-
-        An image that version 0.1 was sending in the `paper` format is sent again from its beginning.
-        """
-        with self.store.transaction() as tx:
-            arrived = self.store.states(_ARRIVAL_0_1) if self.config.link == "v1" else {}
-            for name, payload in arrived.items():
-                is_message = wire.unpack_map(payload, name).get("type") == OutgoingMessage.TYPE
-                own_key = keys.message_outgoing if is_message else keys.image_encoded
-                tx.accept(own_key(self.platform.id), payload)
-                tx.delete_state(_ARRIVAL_0_1 + name)
-            tx.delete_state("progress")
 
     def on_start(self) -> None:
         """Open the port and start the link's thread."""

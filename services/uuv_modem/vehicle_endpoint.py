@@ -16,7 +16,6 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.errors import BadInputError, FrameError
-from sonarpost.link import migration
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import AcousticKey, Direction
 from sonarpost.link.downlink.messages import (
@@ -143,15 +142,14 @@ class VehicleEndpoint:
         self._reset()
         saved = self._store.states(self._prefix)
         self._saved = SavedParts(saved)
-        parts, skipped = migration.vehicle_parts(saved)
-        errors: dict[str, BadInputError] = dict(skipped)
-        errors |= prefixed(_QUEUE, self.queue.restore(below(_QUEUE, parts)))
-        errors |= prefixed(_RECEIVER, self._receiver.restore(below(_RECEIVER, parts)))
+        errors: dict[str, BadInputError] = {}
+        errors |= prefixed(_QUEUE, self.queue.restore(below(_QUEUE, saved)))
+        errors |= prefixed(_RECEIVER, self._receiver.restore(below(_RECEIVER, saved)))
         if self.authenticator is not None:
-            errors |= prefixed(_AUTHENTICATION, self.authenticator.restore(below(_AUTHENTICATION, parts)))
-        if _COMMANDS in parts:
+            errors |= prefixed(_AUTHENTICATION, self.authenticator.restore(below(_AUTHENTICATION, saved)))
+        if _COMMANDS in saved:
             try:
-                self._commands.restore(unpack_plain(dict, parts[_COMMANDS], "uuv_modem state"))
+                self._commands.restore(unpack_plain(dict, saved[_COMMANDS], "uuv_modem state"))
             except BadInputError as error:
                 errors[_COMMANDS] = error
         for name, reason in errors.items():

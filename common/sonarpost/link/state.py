@@ -27,7 +27,7 @@ import numpy as np
 from sonarpost.errors import BadInputError, FrameError
 
 FORMAT_VERSION: Final = 2
-"""Version of all parts. Version 1 was the state of sonarpost 0.1, see `sonarpost.link.migration`."""
+"""Version of all parts; parts of another version are not read."""
 
 Parts = Mapping[str, bytes]
 Errors = Mapping[str, FrameError]

@@ -293,14 +293,6 @@ def test_overheard_vehicle_gets_no_feedback_and_its_messages_are_ignored():
     assert link.due_address(3600.0) == UUV
 
 
-def test_updates_of_recent_images_are_repeated_as_the_next_version():
-    link = VesselEndpoint(CommandTracker(30.0))
-    updates = [update for at, frame in enumerate(lost_image_frames()) for update in link.accept(UUV, frame, at).images]
-    assert link.v1.repeat_updates(updates[-1].last_frame_s + 1.0) == []
-    [again] = link.v1.repeat_updates(updates[-1].last_frame_s)
-    assert again == replace(updates[-1], version=updates[-1].version + 1)
-
-
 def test_messages_are_returned_once_and_invalid_ones_rejected():
     link = VesselEndpoint(CommandTracker(30.0))
     sender = V1Sender(SenderConfig(channels=(LossChannel(0.3),)))

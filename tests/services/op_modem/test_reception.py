@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
@@ -10,14 +9,13 @@ from dataclasses import replace
 import msgpack
 import numpy as np
 import pytest
-from builders.common import GOLDEN_FOLDER, eventually
+from builders.common import eventually
 from builders.vessel_frames import CONTACT, packet, preview_frame, received
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost import keys, wire
 from sonarpost.delivery.store import Store
-from sonarpost.link import migration
 from sonarpost.link.coding.channel_capacity import LossChannel
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.downlink.messages import image_of_number
@@ -26,14 +24,11 @@ from sonarpost.link.frames.paper.frame import ContactFrame
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.receiver import ImageUpdate
-from sonarpost.link.state import below
 from sonarpost.messages import AcousticFrame
 from sonarpost.modem.interface import FrameDecoded
 from sonarpost.modem.micromodem import LinkStatistics, nmea
 from sonarpost.services.op_modem import service as op_modem
-from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.packets import quality_of
-from sonarpost.services.op_modem.service import OpModemService
 
 VESSEL = "vessel-1"
 RX = keys.acoustic_rx(VESSEL)
@@ -305,7 +300,7 @@ def test_image_of_the_paper_format_waits_for_its_other_frames(begin):
     assert (gauges["images_waiting"], gauges["images_incomplete"], gauges["outbox"]) == (1.0, 1.0, 0.0)
 
 
-# Kills and migration
+# Kills
 
 
 @pytest.fixture
@@ -373,49 +368,3 @@ def test_unfinished_packet_is_published_after_a_kill_without_statistics(begin, k
     ]
     service.on_modem_event(packet(b"after"))
     eventually(lambda: [f.packet for f in observed()] == [1, 1, 2])
-
-
-def old_store(service, *, state=None, frames=()):
-    """Fill the store of a service that is not started as version 0.1 did."""
-    with service.store.transaction() as tx:
-        if state is not None:
-            tx.put_state("station", state)
-        for data, time_utc_s in frames:
-            record = AcousticFrame(
-                direction="rx", platform_id=VESSEL, time_utc_s=time_utc_s, source=3, destination=1, rate=1, packet=1,
-                frame_number=1, frame_count=1, data=data,
-            )  # fmt: skip
-            tx.send(RX, "decompressor", wire.encode(record), encoding=wire.encoding_of(AcousticFrame))
-
-
-@pytest.fixture
-def unstarted(platform, modem_pair):
-    config = OpModemConfig(port=modem_pair.port(modem_pair.VESSEL), vehicles={"3": "uuv-1"})
-    return OpModemService(platform(VESSEL), config)
-
-
-def test_frames_that_version_0_1_queued_are_processed(unstarted, runner, decompressor):
-    old_store(unstarted, frames=[(preview_frame(number), 1e9 + number) for number in range(1, 4)])
-    service = runner.start(unstarted)
-    eventually(lambda: numbers(decompressor) == [(1, 1), (2, 1), (3, 1)])
-    assert [image.first_frame_utc_s for image in decompressor.received] == [1e9 + number for number in range(1, 4)]
-    eventually(lambda: service.health().gauges["outbox"] == 0)
-
-
-def test_images_of_queued_frames_that_version_0_1_had_processed_are_sent_again(unstarted, runner, decompressor):
-    case = json.loads((GOLDEN_FOLDER / "link-state-0.1" / "endpoint.json").read_text(encoding="utf-8"))
-    state = msgpack.unpackb(bytes.fromhex(case["state"]), strict_map_key=False)
-    receiver = V1Receiver()
-    receiver.restore(below("v1/", migration.endpoint_parts(bytes.fromhex(case["state"]))))
-    images = sorted(receiver.repeat_updates(0.0), key=lambda image: image.last_frame_s)
-    assert len(images) >= 3
-    since_s = images[1].last_frame_s
-    resent = [image for image in images if image.last_frame_s >= since_s]
-    assert 0 < len(resent) < len(images)
-    old_store(unstarted, state=msgpack.packb({"link": state}), frames=[(b"already processed", since_s)])
-    service = runner.start(unstarted)
-    eventually(lambda: len(decompressor.received) == len(resent))
-    content = lambda images: {(image.image_id, image.version, image.stream) for image in images}  # noqa: E731
-    assert content(decompressor.received) == content(resent)
-    eventually(lambda: service.health().counters.get("commands_expired") == 4, what="the end of its open commands")
-    assert service.store.get_state("station") is None

@@ -1,14 +1,13 @@
-"""State of uuv_modem: failed commits, state of version 0.1, and a change of the wire format."""
+"""State of uuv_modem: failed commits, and a change of the wire format."""
 
 from __future__ import annotations
 
 from itertools import groupby
 from operator import itemgetter
 
-import msgpack
 import pytest
 from builders.common import eventually
-from builders.records import encoded_image, outgoing_message
+from builders.records import encoded_image
 
 from sonarpost import keys, wire
 from sonarpost.errors import RetryLaterError
@@ -123,19 +122,6 @@ def test_events_that_wait_for_the_link_are_limited_but_the_end_of_a_packet_is_ke
     waiting = [stopped._events.get_nowait() for _ in range(stopped._events.qsize())]
     assert [type(event) for event in waiting] == 3 * [FrameReceived] + [PacketFailed]
     stopped.store.close()
-
-
-def test_records_that_version_0_1_held_before_its_queue_are_queued(start_service, runner, queue_states, queued):
-    service = start_service()
-    runner.stop(service)
-    records = [encoded_image(1), outgoing_message("m"), encoded_image(2)]
-    progress = msgpack.packb({"image_id": "0001", "rate": 1, "of": 2, "done": 1})
-    arrived = {f"arrival/{number:016d}": wire.encode(record) for number, record in enumerate(records, start=1)}
-    fill(service, progress=progress, **arrived)
-    again = start_service()
-    eventually(lambda: queued() == ["0001", "0002"])
-    eventually(lambda: (queue_states()[-1].messages_waiting, queue_states()[-1].images_accepted) == (1, 2))
-    assert again.store.state_names("arrival/") == again.store.state_names("progress") == ()
 
 
 def test_images_of_the_paper_queue_are_sent_with_v1_after_a_change_of_the_format(

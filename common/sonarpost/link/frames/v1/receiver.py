@@ -556,13 +556,6 @@ class V1Receiver:
         if peer is not None and number in peer.images:
             peer.images[number].stopped = True
 
-    def repeat_updates(self, since_s: float) -> list[ImageUpdate]:
-        """Return the content of all images that received a frame at `since_s` or later, as their next version."""
-        images = [i for peer in self._sources.values() for i in peer.images.values() if i.last_frame_s >= since_s]
-        for image in images:
-            image.reported = (-1, False)
-        return [update for image in images if (update := image.next_update()) is not None]
-
     def mini_feedback(self, source: int) -> int | None:
         """Return 13 bits for a mini-packet: the oldest incomplete block. None if all are complete."""
         peer = self._sources.get(source)
