@@ -26,8 +26,6 @@ class UuvModemConfig(ModemServiceConfig):
         link: Wire format: "v1", or "paper" for the paper's.
         rate: Number of the rate, see the driver; of the Micro-Modem, the paper uses 4 in a tank and 1 at sea. The
             default is that of the Micro-Modem; other drivers have their own.
-        contact_class: Whether contact records carry the class of the contact and its probabilities. Vessels of versions
-            without them reject such records: false sends every record in the layout that those read.
         retry_s: Wait before a packet that the modem could not send is sent again.
         allowed_rates: v1: further rates that are used when they are faster at the measured loss.
         expected_loss: v1: share of frames lost, until feedback has measured it.
@@ -53,7 +51,7 @@ class UuvModemConfig(ModemServiceConfig):
             decision for `unsure` queues the rest again.
         queue_interval_s: Maximum time between two publications of the queue state.
         status_period_s: v1: time between two statuses of the vehicle (position, depth, images waiting, free disk space)
-            that are sent to the vessel, 0 for none. Vessels of versions without them reject such messages.
+            that are sent to the vessel, 0 for none.
         refine_consumers: v1: services that receive the commands refine, resend, expand, original and region.
         revisit_consumers: v1: services that receive the command revisit.
         decision_consumers: v1: services that receive operators' decisions.
@@ -66,7 +64,6 @@ class UuvModemConfig(ModemServiceConfig):
     destination: Address = 1
     link: Literal["v1", "paper"] = "v1"
     rate: RateNumber = 1
-    contact_class: bool = True
     retry_s: Annotated[float, Field(gt=0, le=600)] = 2.0
     allowed_rates: tuple[RateNumber, ...] = ()
     expected_loss: Annotated[float, Field(ge=0, le=0.95)] = 0.2

@@ -202,7 +202,7 @@ class VehicleEndpoint:
             BadInputError: Names the invalid field.
         """
         if isinstance(record, EncodedImage):
-            self._check_image(self._image_to_send(record))
+            self._check_image(image_to_send(record))
 
     def _check_image(self, image: ImageToSend) -> None:
         if not self._is_v1:
@@ -236,7 +236,7 @@ class VehicleEndpoint:
             )
         else:
             is_new = self.queue.image_id_of(number_of_image(record.image_id)) is None
-            self.queue.add_image(self._image_to_send(record), now)
+            self.queue.add_image(image_to_send(record), now)
             self.images_accepted += is_new
         self.changed = True
 
@@ -258,9 +258,6 @@ class VehicleEndpoint:
             once=True,
         )
         self.changed = True
-
-    def _image_to_send(self, record: EncodedImage) -> ImageToSend:
-        return image_to_send(record, contact_class=self._config.contact_class)
 
     # Frames received
 
@@ -430,7 +427,7 @@ class VehicleEndpoint:
             )
 
 
-def image_to_send(record: EncodedImage, *, contact_class: bool = True) -> ImageToSend:
-    """Return an encoded image as the transmit queue takes it; `contact_class` as for `summary_of`."""
-    contact = summary_of(record.contact, record.height_px, record.width_px, contact_class=contact_class)
+def image_to_send(record: EncodedImage) -> ImageToSend:
+    """Return an encoded image as the transmit queue takes it."""
+    contact = summary_of(record.contact, record.height_px, record.width_px)
     return ImageToSend(record.image_id, record.contact.contact_id, contact, record.stream)

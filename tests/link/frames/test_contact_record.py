@@ -117,7 +117,7 @@ def test_values_round_trip_within_half_a_step(sent: ContactSummary) -> None:
 
 @given(contacts())
 def test_only_the_classified_layout_begins_with_a_set_bit(sent: ContactSummary) -> None:
-    """Versions without the classified layout read the first 12 bits as the height of the image, at most 512 px."""
+    """In the plain layout the first 12 bits are the height of the image, at most 512 px."""
     packed = sent.pack()
     first_12_bits = int.from_bytes(packed[:2], "big") >> 4
     assert (first_12_bits > 512) == sent.is_classified == (sent.atd_class is not None or sent.p_mine_like is not None)

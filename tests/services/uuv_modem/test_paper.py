@@ -197,15 +197,14 @@ def test_invalid_images_are_refused_to_their_sender(link, start_service, compres
         assert expected in reason
 
 
-@pytest.mark.parametrize("contact_class", [True, False])
-def test_class_of_contacts_is_sent_unless_switched_off(contact_class, received, start_service, compressor, encoded):
-    start_service(contact_class=contact_class)
+def test_class_of_contacts_is_sent(received, start_service, compressor, encoded):
+    start_service()
     changes = {"atd_class": "structure", "p_mine_like": 0.05, "p_other_object": 0.9}
     compressor.send(IN, "uuv_modem", encoded(contact=CONTACT.model_copy(update=changes)))
     eventually(lambda: any(frame.data[:1] == b"C" for frame in received))
     frame = parse_frame(next(frame.data for frame in received if frame.data[:1] == b"C"))
-    expected = ("structure", 0.05, 0.9) if contact_class else (None, None, None)
-    assert (frame.contact.atd_class, frame.contact.p_mine_like, frame.contact.p_other_object) == expected
+    sent = (frame.contact.atd_class, frame.contact.p_mine_like, frame.contact.p_other_object)
+    assert sent == ("structure", 0.05, 0.9)
 
 
 def test_unsupported_port_is_an_error_before_the_store_is_opened(platform):
@@ -243,7 +242,8 @@ def test_every_valid_contact_has_a_contact_record(contact, height_px, width_px, 
     if probabilities is not None:
         changes = {"p_mine_like": probabilities, "p_other_object": 1 - probabilities}
         contact = contact.model_copy(update=changes)
-    plain = ContactSummary.unpack(summary_of(contact, height_px, width_px, contact_class=False).pack())
+    unclassified = contact.model_copy(update=dict.fromkeys(("atd_class", "p_mine_like", "p_other_object")))
+    plain = ContactSummary.unpack(summary_of(unclassified, height_px, width_px).pack())
     assert not plain.is_classified
     record = ContactSummary.unpack(summary_of(contact, height_px, width_px).pack())
     assert (record.height_px, record.width_px) == (height_px, width_px)

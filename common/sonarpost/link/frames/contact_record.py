@@ -3,9 +3,9 @@
 With a frame type, an image identifier and a checksum it fills the 32 bytes of a rate-0 frame. Every value that can be
 unknown has a code for it. A value that its field cannot hold is sent as unknown, never as the nearest possible one.
 
-There are two layouts of the first 11 bytes. A record without class and probabilities has the plain layout, which all
-versions read. In the classified layout the first bit is 1: earlier versions read an image height of at least 2048 px
-there, and reject it. docs/specifications/acoustic-paper.md specifies every bit.
+There are two layouts of the first 11 bytes. A record without class and probabilities has the plain layout. In the
+classified layout the first bit is 1, and positions have coarser steps. docs/specifications/acoustic-paper.md specifies
+every bit.
 """
 
 from __future__ import annotations
@@ -194,9 +194,7 @@ _others = attrgetter(*_OTHER_FIELDS)
 _NO_OTHERS: Final = (None,) * len(_OTHER_FIELDS)
 
 
-def summary_of(
-    contact: Contact, height_px: int | None, width_px: int | None, *, contact_class: bool = True
-) -> ContactSummary:
+def summary_of(contact: Contact, height_px: int | None, width_px: int | None) -> ContactSummary:
     """Return the contact record that is transmitted with an image of this size.
 
     Values that the record cannot hold are sent as unknown: a wrong clock on the vehicle does not lose the image.
@@ -205,12 +203,11 @@ def summary_of(
         contact: The contact.
         height_px: Rows of the image, 16..512; None if not known.
         width_px: Columns of the image, 16..512; None if not known.
-        contact_class: Whether the record carries class and probabilities.
 
     Raises:
         FrameError: A side of the image is out of range.
     """
-    return ContactSummary(*_summary_values(contact, height_px, width_px, contact_class=contact_class))
+    return ContactSummary(*_summary_values(contact, height_px, width_px))
 
 
 def exact_record(contact: Contact, height_px: int | None, width_px: int | None) -> bytes:
@@ -237,9 +234,7 @@ def contact_of(summary: ContactSummary, vehicle_id: str, image_id: str) -> Conta
     return Contact(contact_id=f"{vehicle_id}/{image_id}", vehicle_id=vehicle_id, **values)
 
 
-def _summary_values(
-    contact: Contact, height_px: int | None, width_px: int | None, *, contact_class: bool = True
-) -> tuple[Any, ...]:
+def _summary_values(contact: Contact, height_px: int | None, width_px: int | None) -> tuple[Any, ...]:
     has_size = height_px is not None and width_px is not None
     time_utc_s = contact.time_utc_s
     has_fix = contact.lat_deg is not None and contact.lon_deg is not None
@@ -258,9 +253,9 @@ def _summary_values(
         contact.pixel_along_m,
         contact.pixel_across_m,
         contact.position_sigma_m if has_fix else None,
-        atd_class_of(contact.atd_class) if contact_class else None,
-        contact.p_mine_like if contact_class else None,
-        contact.p_other_object if contact_class else None,
+        atd_class_of(contact.atd_class),
+        contact.p_mine_like,
+        contact.p_other_object,
     )
 
 
