@@ -17,7 +17,7 @@ import msgpack
 import numpy as np
 
 from sonarpost import keys
-from sonarpost.archive.journal import FILE_NAME, Accepted, Journal, JournalEntry, JournalRecord, JournalRow
+from sonarpost.archive.journal import Accepted, Journal, JournalEntry, JournalRecord, JournalRow
 from sonarpost.archive.shared_journal import SharedJournal
 from sonarpost.archive.shore_database import ShoreDatabase
 from sonarpost.archive.shore_files import decision_path
@@ -45,8 +45,7 @@ class AcceptedRecords:
 
     Args:
         archive: The archive.
-        folder: Folder of the journal and the files. If several c2 share the archive: folder in which an earlier version
-            of this c2 has had a journal of its own.
+        folder: Folder of the journal and the files; not used if several c2 share the archive.
         site: Name of the site in keys.
     """
 
@@ -71,7 +70,10 @@ class AcceptedRecords:
 
     def _open(self) -> Journal:
         index = self._archive.index() if isinstance(self._archive, Archive) else None
-        journal = self._own_journal()
+        try:
+            journal = Journal(self._folder)
+        except StoredFileError as error:
+            raise OSError(str(error)) from error
         try:
             added = 0 if index is None else self._complete(journal, index)
         except BaseException:
@@ -80,12 +82,6 @@ class AcceptedRecords:
         if added:
             log.info("Journal completed from the files", extra=kv(file=journal.path, records=added))
         return journal
-
-    def _own_journal(self) -> Journal:
-        try:
-            return Journal(self._folder)
-        except StoredFileError as error:
-            raise OSError(str(error)) from error
 
     def image(self, image: ReconstructedImage, name: str) -> JournalEntry:
         """Return the entry of an image; `name` is that of its files without suffix."""
@@ -184,7 +180,7 @@ class AcceptedRecords:
                 self._journal.close()
             self._journal = None
 
-    # Records that are stored and have no number, for example those of an earlier version
+    # Records that are stored and have no number
 
     def _complete(self, journal: Journal, index: ShoreIndex) -> int:
         """Make journal and index agree; return the number of added records."""
@@ -231,14 +227,6 @@ class AcceptedRecords:
         assert isinstance(self._archive, SharedArchive)
         database = self._archive.index()
         database.prepare()
-        if (self._folder / FILE_NAME).is_file():
-            own = self._own_journal()
-            try:
-                added = database.adopt_journal(own)
-            finally:
-                own.close()
-            own.path.replace(own.path.with_name(f"{FILE_NAME}.imported"))
-            log.info("Journal of an earlier version imported", extra=kv(file=own.path, records=added))
         images = database.images_without_number()
         decisions = database.decisions_without_number(keys.shore_decision_all(self._site))
         added = 0

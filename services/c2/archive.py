@@ -25,7 +25,7 @@ from sonarpost.archive.shore_files import (
     verify_files,
 )
 from sonarpost.archive.shore_index import DEFECTS, DecisionRow, ImageRow, ShoreIndex, TaskingRow, Verified
-from sonarpost.errors import PayloadError
+from sonarpost.errors import PayloadError, StoredFileError
 from sonarpost.files import AtomicFiles
 from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage, TaskingKind
@@ -44,7 +44,7 @@ class Storage(Protocol):
     """
 
     def open(self) -> None:
-        """Create or migrate the archive at the start of c2, if it can be reached."""
+        """Create the archive at the start of c2, if it can be reached."""
 
     def index(self) -> RecordReader:
         """Return what reads the stored records."""
@@ -123,10 +123,17 @@ class Archive:
         """Content of the file of each, and whether it is new."""
 
     def index(self) -> ShoreIndex:
-        """Return the open index, completed from the files."""
+        """Return the open index, completed from the files.
+
+        Raises:
+            OSError: It cannot be written, or is of another version.
+        """
         with self._lock:
             if self._index is None:
-                index = ShoreIndex(self._out_dir)
+                try:
+                    index = ShoreIndex(self._out_dir)
+                except StoredFileError as error:
+                    raise OSError(str(error)) from error
                 try:
                     remove_temporary_files(self._out_dir)
                     added = index_missing_files(self._out_dir, index)

@@ -84,8 +84,7 @@ class C2Service(Service[C2Config]):
         super().__init__(platform, config)
         address = config.database_address()
         self._archive: Storage = Archive(config) if address is None else SharedArchive(config, address, self._owner())
-        journal_folder = config.out_dir if address is None else platform.state_dir
-        self._accepted = AcceptedRecords(self._archive, journal_folder, config.site)
+        self._accepted = AcceptedRecords(self._archive, config.out_dir, config.site)
         self._queries = QueryService(self._accepted, config.site, self.count)
         self._retention = Retention(self._apply_retention, self.stopping)
         self._changed = threading.Event()

@@ -62,11 +62,11 @@ class SharedArchive:
         self._take_over_records = TAKE_OVER_RECORDS
 
     def open(self) -> None:
-        """Create or migrate the schema; a server that is not reached is logged, and tried again later.
+        """Create the schema; a server that is not reached is logged, and tried again later.
 
         Raises:
             ConfigError: The database belongs to another site, or the driver is missing.
-            StoredFileError: The schema has a later version.
+            StoredFileError: The schema has another version.
         """
         try:
             self._database.prepare()

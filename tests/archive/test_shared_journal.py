@@ -1,4 +1,4 @@
-"""Journal in PostgreSQL: order of the numbers, searches as in SQLite, journals and databases of an earlier version."""
+"""Journal in PostgreSQL: order of the numbers, searches as in SQLite, journals of single c2, other versions."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -10,11 +10,11 @@ from builders import shore
 from builders.records import decision_record
 
 from sonarpost.archive import journal as sqlite_journal
-from sonarpost.archive import shore_schema
 from sonarpost.archive.journal import Area, Criteria, Journal, JournalEntry, JournalRecord
 from sonarpost.archive.postgresql import Database, DatabaseAddress
 from sonarpost.archive.shore_database import ShoreDatabase, StoredImage
 from sonarpost.archive.shore_files import row_of_image
+from sonarpost.errors import StoredFileError
 from sonarpost.messages import Contact, Decision
 
 IMAGES, DECISIONS = "sonarpost/v1/shore/contact/vessel-1/image", "sonarpost/v1/shore/contact/vessel-1/decision"
@@ -188,7 +188,7 @@ def test_removed_image_is_removed_from_the_journal(archive):
     assert archive.journal().position()[1] == 3
 
 
-# Journals and databases of an earlier version
+# Journals of single c2, records without a number, other versions
 
 
 @pytest.fixture
@@ -216,19 +216,18 @@ def test_first_journal_keeps_its_numbers_and_later_ones_follow(archive, own):
     second.close()
 
 
-def test_database_of_version_1_is_migrated_and_its_records_have_no_number(database, archive, monkeypatch):
-    with monkeypatch.context() as earlier:
-        earlier.setattr(shore_schema, "VERSION", 1)
-        earlier.setattr(shore_schema, "_MIGRATIONS", shore_schema._MIGRATIONS[:1])
-        ShoreDatabase(database).prepare()
-    with database.transaction() as sql:
-        assert sql.number("SELECT version FROM sonarpost.archive") == 1
-    # A command reads it and does not migrate it.
-    reader = ShoreDatabase(database, writable=False)
-    assert reader.images() == []
+def test_images_without_a_number_are_found(archive):
     archive.write([stored(image("0001"), "a")])
-    with database.transaction() as sql:
-        assert sql.number("SELECT version FROM sonarpost.archive") == 2
     assert [row.name for row in archive.images_without_number()] == ["a"]
     archive.write([], numbered=columns(entry(image("0001"), "a")))
     assert archive.images_without_number() == []
+
+
+@pytest.mark.parametrize("version", [1, 3])
+def test_database_of_another_version_is_refused(database, version):
+    ShoreDatabase(database).prepare()
+    with database.transaction() as sql:
+        sql.rows("UPDATE sonarpost.archive SET version = :version", version=version)
+    for writable in (True, False):
+        with pytest.raises(StoredFileError, match=f"version: got {version}, expected 2"):
+            ShoreDatabase(database, writable=writable).prepare()

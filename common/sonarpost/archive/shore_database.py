@@ -56,14 +56,14 @@ class AcceptedRecord:
 class ShoreDatabase:
     """Archive of one site in PostgreSQL, for several threads.
 
-    The schema is created or migrated by the first transaction. Every method raises DatabaseUnavailableError if the
+    The schema is created by the first transaction. Every method raises DatabaseUnavailableError if the
     server is not reached, and can be called again.
 
     Args:
         database: Connections to the database.
         owner: Identity of this c2; empty for a command.
         site: Name of the site, stored at the first use and compared afterwards; empty for any.
-        writable: Whether to create or migrate the schema.
+        writable: Whether to create the schema.
     """
 
     def __init__(self, database: Database, *, owner: str = "", site: str = "", writable: bool = True) -> None:
@@ -74,7 +74,7 @@ class ShoreDatabase:
         self._is_prepared = False
 
     def prepare(self) -> None:
-        """Create or migrate the schema, or check its version.
+        """Create the schema, or check its version.
 
         Raises:
             DatabaseUnavailableError: The server is not reached, or PostGIS is missing.
@@ -86,7 +86,7 @@ class ShoreDatabase:
         where = str(self.database.address)
         with self.database.transaction() as sql:
             if self._writable:
-                shore_schema.migrate(sql, where)
+                shore_schema.create(sql, where)
             else:
                 shore_schema.check_version(sql, where)
             if self._site:
@@ -557,7 +557,7 @@ def _try_lock(sql: Sql, lock: int) -> bool:
 def _compare(row: ImageRow | DecisionRow, found: set[str]) -> Verified:
     expected = set(row.files_sha256.split())
     fault: Fault = "" if found == expected else ("missing" if len(found) < len(expected) else "changed")
-    return Verified(row, row.files_sha256, fault)
+    return Verified(row, fault)
 
 
 def _bytes(value: object) -> bytes:

@@ -52,10 +52,7 @@ def decision_text(decision: Decision) -> bytes:
 
 
 def verify_files(out_dir: Path, row: ImageRow | DecisionRow) -> Verified:
-    """Compare the files of a row with the index: existence and digests.
-
-    A row without digests (of an earlier version) gets those of the present files.
-    """
+    """Compare the files of a row with the index: existence and digests."""
     if isinstance(row, ImageRow):
         paths = image_paths(out_dir, row)
     else:
@@ -63,13 +60,11 @@ def verify_files(out_dir: Path, row: ImageRow | DecisionRow) -> Verified:
     try:
         found = files_digest(paths)
     except FileNotFoundError:
-        return Verified(row, row.files_sha256, "missing")
+        return Verified(row, "missing")
     except OSError as error:
         log.debug("Stored file cannot be read", extra=kv(file=paths[0], error=str(error)))
-        return Verified(row, row.files_sha256, "unreadable")
-    if found == (row.files_sha256 or found):
-        return Verified(row, found, "")
-    return Verified(row, row.files_sha256, "changed")
+        return Verified(row, "unreadable")
+    return Verified(row, "" if found == row.files_sha256 else "changed")
 
 
 def decision_file_name(decision_id: str) -> str:

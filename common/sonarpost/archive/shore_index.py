@@ -52,25 +52,6 @@ CREATE INDEX IF NOT EXISTS picture_conflict ON picture (conflict) WHERE conflict
 CREATE INDEX IF NOT EXISTS decision_verified ON decision (verified_utc_s);
 CREATE INDEX IF NOT EXISTS decision_fault ON decision (fault) WHERE fault <> '';
 """
-_MIGRATE_FROM_VERSION_1 = """
-ALTER TABLE picture ADD COLUMN conflict INTEGER NOT NULL DEFAULT 0;
-ALTER TABLE picture ADD COLUMN files_sha256 TEXT NOT NULL DEFAULT '';
-ALTER TABLE picture ADD COLUMN verified_utc_s REAL;
-ALTER TABLE picture ADD COLUMN fault TEXT NOT NULL DEFAULT '';
-ALTER TABLE decision ADD COLUMN files_sha256 TEXT NOT NULL DEFAULT '';
-ALTER TABLE decision ADD COLUMN verified_utc_s REAL;
-ALTER TABLE decision ADD COLUMN fault TEXT NOT NULL DEFAULT '';
-"""
-_MIGRATE_FROM_VERSION_2 = "ALTER TABLE picture ADD COLUMN despeckle_strength REAL;"
-_MIGRATE_FROM_VERSION_3 = """
-ALTER TABLE picture ADD COLUMN p_mine_like REAL;
-ALTER TABLE picture ADD COLUMN p_other_object REAL;
-"""
-_MIGRATIONS = {
-    1: _MIGRATE_FROM_VERSION_1 + _MIGRATE_FROM_VERSION_2 + _MIGRATE_FROM_VERSION_3,
-    2: _MIGRATE_FROM_VERSION_2 + _MIGRATE_FROM_VERSION_3,
-    3: _MIGRATE_FROM_VERSION_3,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,12 +66,11 @@ class ImageRow:
         exported_utc_s: When it was last exported; None for never.
         removed_utc_s: When retention deleted its files; None while they exist.
         conflict: Whether another image has the plain file name, see `image_files`.
-        files_sha256: SHA-256 digests of its files in the order of `shore_files.SUFFIXES`, separated by spaces; empty
-            before the first verification of an image of an earlier version.
+        files_sha256: SHA-256 digests of its files in the order of `shore_files.SUFFIXES`, separated by spaces.
         verified_utc_s: When its files were last compared with the index; None for never.
         fault: `missing`, `changed` or `unreadable` if the last comparison failed, else empty.
-        despeckle_strength: As in `ReconstructedImage`; None in an index of an earlier version.
-        p_mine_like: As in `Contact`; None in an index of an earlier version.
+        despeckle_strength: As in `ReconstructedImage`.
+        p_mine_like: As in `Contact`.
         p_other_object: As `p_mine_like`.
     """
 
@@ -145,7 +125,7 @@ class DecisionRow:
     fault: str = ""
 
     @classmethod
-    def of(cls, decision: Decision, accepted_utc_s: float, files_sha256: str = "") -> DecisionRow:
+    def of(cls, decision: Decision, accepted_utc_s: float, files_sha256: str) -> DecisionRow:
         """Return the row of a record."""
         values = decision.model_dump(exclude={"accepted_utc_s"})
         named = {f.name: values[f.name] for f in fields(cls) if f.name in values}
@@ -183,12 +163,10 @@ class Verified:
 
     Attributes:
         row: The row as it was compared.
-        files_sha256: Digests of the files, as in `ImageRow`.
         fault: What differs, empty if nothing does.
     """
 
     row: ImageRow | DecisionRow
-    files_sha256: str
     fault: Fault
 
 
@@ -227,17 +205,15 @@ class ShoreIndex:
 
     def _open(self, *, writable: bool) -> None:
         version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
-        # Columns that an earlier version does not have get their default values.
-        if version not in (*_MIGRATIONS, INDEX_VERSION) and not (writable and version == 0):
+        if version != INDEX_VERSION and not (writable and version == 0):
             self._db.close()
             raise StoredFileError(str(self.path), "user_version", version, str(INDEX_VERSION))
         if writable:
             self._db.execute("PRAGMA journal_mode=WAL")
             # Rows that a power cut deletes are restored from the files at the next start.
             self._db.execute("PRAGMA synchronous=NORMAL")
-            migration = _MIGRATIONS.get(version, "")
             end = f"PRAGMA user_version = {INDEX_VERSION}; COMMIT;"
-            self._db.executescript(f"BEGIN IMMEDIATE; {migration} {_SCHEMA} {_INDEXES} {end}")
+            self._db.executescript(f"BEGIN IMMEDIATE; {_SCHEMA} {_INDEXES} {end}")
 
     def close(self) -> None:
         """Close the file."""
@@ -337,9 +313,9 @@ class ShoreIndex:
             for result in results:
                 table, name = _TABLES[type(result.row)], _NAMES[type(result.row)]
                 key = (result.row.vessel_id, getattr(result.row, name))
-                sql = f"UPDATE {table} SET files_sha256 = ?, verified_utc_s = ?, fault = ?"  # noqa: S608 literals
+                sql = f"UPDATE {table} SET verified_utc_s = ?, fault = ?"  # noqa: S608 literals
                 sql += f" WHERE vessel_id = ? AND {name} = ?"
-                db.execute(sql, (result.files_sha256, at_utc_s, result.fault, *key))
+                db.execute(sql, (at_utc_s, result.fault, *key))
 
     def defect_counts(self) -> dict[str, int]:
         """Return the numbers of missing, changed, unreadable and conflicting images and decisions.

@@ -1,4 +1,4 @@
-"""Tables of the archive of a shore site in PostgreSQL: creation, migration, name of the site."""
+"""Tables of the archive of a shore site in PostgreSQL: creation, version, name of the site."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ VERSION: Final = 2
 _LOCK: Final = 0x736F6E61725F01
 _ARCHIVE: Final = """
 CREATE TABLE archive (version integer NOT NULL, site text);
-INSERT INTO archive VALUES (0, NULL);
 CREATE TABLE image (
     vessel_id text NOT NULL, name text NOT NULL, vehicle_id text NOT NULL, image_id text NOT NULL,
     version bigint NOT NULL, first_frame_utc_s float8 NOT NULL, last_frame_utc_s float8 NOT NULL,
@@ -49,12 +48,10 @@ CREATE TABLE accepted (
 CREATE INDEX accepted_age ON accepted (accepted_at);
 CREATE TABLE member (owner text PRIMARY KEY, seen_at timestamptz NOT NULL);
 """
-_MIGRATIONS: Final = (_ARCHIVE, shared_journal.SCHEMA)
-"""Statements from version 0 to 1, from 1 to 2, and so on."""
 
 
-def migrate(sql: Sql, where: str) -> None:
-    """Create the tables or migrate them from an earlier version.
+def create(sql: Sql, where: str) -> None:
+    """Create the tables unless they exist.
 
     Args:
         sql: Transaction; other c2 wait for its end before they do the same.
@@ -62,31 +59,28 @@ def migrate(sql: Sql, where: str) -> None:
 
     Raises:
         DatabaseUnavailableError: PostGIS is missing.
-        StoredFileError: The tables have a later version.
+        StoredFileError: The tables have another version.
     """
     sql.rows("SELECT pg_advisory_xact_lock(:lock)", lock=_LOCK)
-    version = _stored_version(sql)
-    if version > VERSION:
-        raise StoredFileError(where, "version", version, str(VERSION))
-    if version == VERSION:
+    if _stored_version(sql) != 0:
+        check_version(sql, where)
         return
-    if version == 0:
-        # Needs a superuser, unless an administrator has created it.
-        sql.rows("CREATE EXTENSION IF NOT EXISTS postgis")
-        sql.rows("CREATE SCHEMA IF NOT EXISTS sonarpost")
-    for statements in _MIGRATIONS[version:]:
-        sql.rows(statements)
-    sql.rows("UPDATE archive SET version = :version", version=VERSION)
+    # Needs a superuser, unless an administrator has created it.
+    sql.rows("CREATE EXTENSION IF NOT EXISTS postgis")
+    sql.rows("CREATE SCHEMA IF NOT EXISTS sonarpost")
+    sql.rows(_ARCHIVE)
+    sql.rows(shared_journal.SCHEMA)
+    sql.rows("INSERT INTO archive VALUES (:version, NULL)", version=VERSION)
 
 
 def check_version(sql: Sql, where: str) -> None:
-    """Check that a command can read the tables; an earlier version has fewer of them.
+    """Check the version of the tables.
 
     Raises:
-        StoredFileError: There are no tables, or they have a later version.
+        StoredFileError: There are no tables, or they have another version.
     """
     version = _stored_version(sql)
-    if not 0 < version <= VERSION:
+    if version != VERSION:
         raise StoredFileError(where, "version", version, str(VERSION))
 
 

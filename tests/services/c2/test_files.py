@@ -1,4 +1,4 @@
-"""Archive of files of c2: comparison with the index, retention, and indexes of earlier versions."""
+"""Archive of files of c2: comparison with the index, retention, version of the index."""
 
 import logging
 import os
@@ -21,7 +21,6 @@ from sonarpost.archive.shore_index import FILE_NAME, DecisionRow, ImageRow, Shor
 from sonarpost.cli.main import main
 from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import load_contacts
-from sonarpost.messages import Contact
 from sonarpost.services.c2 import archive as c2_archive
 
 DAY_S = 86400.0
@@ -161,7 +160,7 @@ def test_vessel_that_floods_displaces_no_image_of_another():
 
 
 def test_images_with_a_decision_are_removed_last():
-    decision = DecisionRow.of(decision_record(vehicle_id="uuv-1", image_id="BBBB"), 5.0)
+    decision = DecisionRow.of(decision_record(vehicle_id="uuv-1", image_id="BBBB"), 5.0, "")
     rows = [row("a", 1), row("b", 2, image_id="BBBB"), row("c", 3, exported_utc_s=9.0)]
     assert [r.name for r in select_images(rows, [decision], 10.0, None, 100)] == ["c", "a"]
     assert [r.name for r in select_images(rows, [decision], 10.0, None, 0)] == ["c", "a", "b"]
@@ -242,7 +241,33 @@ def test_service_removes_counts_and_logs(begin, relay, out, caplog):
 # Index
 
 
-def test_index_of_another_version_or_other_file_is_rejected(tmp_path):
+@pytest.mark.parametrize("version", [3, 5])
+def test_index_of_another_version_is_rejected_and_unchanged(version, filled, out):
+    filled.close()
+    with closing(sqlite3.connect(out / FILE_NAME)) as db:
+        db.execute(f"PRAGMA user_version = {version}")
+    before = (out / FILE_NAME).read_bytes()
+    for writable in (True, False):
+        with pytest.raises(StoredFileError, match=rf"index\.db: user_version: got {version}, expected 4"):
+            ShoreIndex(out, writable=writable)
+    assert (out / FILE_NAME).read_bytes() == before
+
+
+def test_records_wait_while_the_index_is_of_another_version(filled, begin, relay, out):
+    filled.close()
+    with closing(sqlite3.connect(out / FILE_NAME)) as db:
+        db.execute("PRAGMA user_version = 3")
+    service = begin()
+    relay.send(INBOX, "c2", relayed(image("000A")))
+    eventually(lambda: "user_version: got 3, expected 4" in service.health().detail, what="the reason in the health")
+    assert service.health().state == "degraded"
+    with closing(sqlite3.connect(out / FILE_NAME)) as db:
+        db.execute("PRAGMA user_version = 4")
+    eventually(lambda: service.health().counters.get("images_stored") == 1)
+    assert service.health().gauges["refused"] == 0
+
+
+def test_other_file_is_not_an_index(tmp_path):
     with pytest.raises(StoredFileError, match="no such file"):
         ShoreIndex(tmp_path, writable=False)
     (tmp_path / FILE_NAME).write_bytes(b"no database" * 100)
@@ -261,85 +286,3 @@ def test_image_is_found_by_name_and_newest_version():
     twice = [*rows, row("h", first_frame_utc_s=9.0)]
     with pytest.raises(StoredFileError, match="one image, with --vessel or by the name of its files"):
         find_image(twice, "uuv-1/AAAA", None, None)
-
-
-VERSION_1 = """
-CREATE TABLE picture (
-    vessel_id TEXT NOT NULL, name TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
-    version INTEGER NOT NULL, first_frame_utc_s REAL NOT NULL, last_frame_utc_s REAL NOT NULL,
-    relayed_utc_s REAL, accepted_utc_s REAL NOT NULL, complete INTEGER NOT NULL, missing_fraction REAL NOT NULL,
-    height_px INTEGER NOT NULL, width_px INTEGER NOT NULL, codec TEXT NOT NULL, lat_deg REAL, lon_deg REAL,
-    atd_class TEXT, atd_confidence REAL, size_bytes INTEGER NOT NULL, exported_utc_s REAL, removed_utc_s REAL,
-    PRIMARY KEY (vessel_id, name)) WITHOUT ROWID;
-CREATE TABLE decision (
-    vessel_id TEXT NOT NULL, decision_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
-    image_version INTEGER NOT NULL, verdict TEXT NOT NULL, confidence REAL, mlo_class TEXT, remark TEXT NOT NULL,
-    operator TEXT NOT NULL, decided_utc_s REAL NOT NULL, accepted_utc_s REAL NOT NULL,
-    PRIMARY KEY (vessel_id, decision_id)) WITHOUT ROWID;
-CREATE TABLE tasking (
-    vessel_id TEXT NOT NULL, kind TEXT NOT NULL, record_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT,
-    summary TEXT NOT NULL, author TEXT NOT NULL, issued_utc_s REAL NOT NULL, state TEXT NOT NULL, reason TEXT NOT NULL,
-    changed_utc_s REAL NOT NULL, PRIMARY KEY (vessel_id, kind, record_id)) WITHOUT ROWID;
-PRAGMA user_version = 1;
-"""
-
-
-@pytest.fixture
-def version_1(filled, out):
-    """Turn the index into one of version 1; return its rows with the defaults of the new columns."""
-    rows = filled.index().images()
-    filled.close()
-    path = out / FILE_NAME
-    with closing(sqlite3.connect(path)) as db:
-        old = {t: [r[1] for r in db.execute(f"PRAGMA table_info({t})")] for t in ("picture", "decision")}
-        data = {t: db.execute(f"SELECT * FROM {t}").fetchall() for t in old}
-    path.unlink()
-    new = {"conflict", "files_sha256", "verified_utc_s", "fault", "despeckle_strength", "p_mine_like", "p_other_object"}
-    with closing(sqlite3.connect(path)) as db, db:
-        db.executescript(VERSION_1)
-        for table, columns in old.items():
-            kept = [n for n, column in enumerate(columns) if column not in new]
-            marks = ", ".join("?" * len(kept))
-            db.executemany(f"INSERT INTO {table} VALUES ({marks})", [[r[n] for n in kept] for r in data[table]])
-    return [replace(row, files_sha256="") for row in rows]
-
-
-def test_index_of_version_1_is_read_without_a_migration(version_1, out):
-    before = (out / FILE_NAME).read_bytes()
-    with closing(ShoreIndex(out, writable=False)) as index:
-        assert index.images() == version_1
-        assert len(index.decisions()) == 1
-    assert (out / FILE_NAME).read_bytes() == before
-
-
-def test_index_of_version_1_is_migrated_and_gets_digests(version_1, open_files, out):
-    migrated = open_files()
-    assert migrated.index().images() == version_1
-    assert migrated.verify(1e9, DAY_S) == 11
-    assert migrated.defect_counts() == {"missing": 0, "changed": 0, "unreadable": 0, "conflicting": 0}
-    tiff = image_paths(out, version_1[1])[1]
-    tiff.write_bytes(tiff.read_bytes()[:-1] + b"\xff")
-    migrated.verify(1e9 + 2 * DAY_S, DAY_S)
-    assert migrated.defect_counts()["changed"] == 1
-
-
-@pytest.mark.parametrize("version", [2, 3])
-def test_index_of_a_later_version_gains_its_columns(version, open_files, filled, out):
-    before = filled.index().images()
-    filled.close()
-    with closing(sqlite3.connect(out / FILE_NAME)) as db, db:
-        for column in ("p_mine_like", "p_other_object", *["despeckle_strength"] * (version < 3)):
-            db.execute(f"ALTER TABLE picture DROP COLUMN {column}")
-        db.execute(f"PRAGMA user_version = {version}")
-    with closing(ShoreIndex(out, writable=False)) as index:
-        assert index.images() == before
-    migrated = open_files()
-    assert migrated.index().images() == before
-    contact = Contact(
-        contact_id="uuv-1/000A", vehicle_id="uuv-1", atd_class="structure", p_mine_like=0.05, p_other_object=0.9
-    )
-    migrated.store_image(image("000A", despeckle_strength=0.5, contact=contact), 5.0)
-    migrated.flush()
-    [added] = [row for row in migrated.index().images() if row.image_id == "000A"]
-    assert (added.despeckle_strength, added.atd_class) == (0.5, "structure")
-    assert (added.p_mine_like, added.p_other_object) == (0.05, 0.9)

@@ -13,12 +13,12 @@ from builders.records import command_record, decision_record
 from builders.shore import CONTACTS, identity, image, relayed
 
 from sonarpost import keys, wire
-from sonarpost.archive.journal import FILE_NAME, Criteria, Journal
+from sonarpost.archive.journal import Criteria
 from sonarpost.archive.shore_database import ShoreDatabase
 from sonarpost.codec.registry import default_registry
 from sonarpost.delivery.client import deliver
 from sonarpost.errors import ConfigError, PayloadError
-from sonarpost.messages import Command, ImagePart, ReconstructedImage
+from sonarpost.messages import Command, ImagePart
 from sonarpost.services.c2.accepted import AcceptedRecords
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
@@ -418,41 +418,17 @@ def test_query_goes_to_the_c2_that_reaches_the_database(begin, client):
         assert end["type"] == "page"
 
 
-def test_journals_of_an_earlier_version_are_imported_and_the_archive_is_numbered(begin, runner, reading):
-    def stored_before(host):
-        """Store records without numbers, as an earlier version has done; return them with their names."""
-        number = 1 if host.platform.id == "shore-1" else 2
-        records = (image(f"{number:04d}"), decision_record(f"d{number}"))
-        name = host._archive.store_image(records[0], 5.0).tiff.stem
-        host._archive.store_decision(records[1])
-        host._archive.flush()
-        return [(records[0], name), (records[1], "")]
-
-    cursors = []
-    hosts = [begin("shore-1"), begin("shore-2")]
-    for host in hosts:
-        stored = stored_before(host)
+def test_records_without_a_number_are_numbered_at_the_start(begin, runner, reading):
+    """`sonarpost c2 migrate` copies the records of a folder without a journal in this way."""
+    host = begin("shore-1")
+    host._archive.store_image(image("0001"), 5.0)
+    host._archive.store_decision(decision_record("d1"))
+    host._archive.flush()
+    runner.stop(host)
+    for _ in range(2):
+        host = begin("shore-1")
+        assert sorted(reading().wait_for(2)) == ["0001", "d1"]
         runner.stop(host)
-        if host.platform.id == "shore-1":
-            journal = Journal(host.platform.state_dir)
-            names = AcceptedRecords(host._archive, host.platform.state_dir, "shore")
-            for record, name in stored:
-                is_image = isinstance(record, ReconstructedImage)
-                journal.append([names.image(record, name) if is_image else names.decision(record)], 7.0)
-            cursors.append(f"{journal.archive}.1")
-            journal.close()
-    # shore-2 does not return, and with it its journal: its records are numbered from the database.
-    again = begin("shore-1")
-    reader = reading()
-    assert sorted(reader.wait_for(4)) == ["0001", "0002", "d1", "d2"]
-    assert reader.identities()[:2] == ["0001", "d1"]
-    # A cursor of the journal that was imported first stays valid.
-    assert sorted(reading(cursors[0]).wait_for(3)) == ["0002", "d1", "d2"]
-    assert not (again.platform.state_dir / FILE_NAME).exists()
-    assert (again.platform.state_dir / f"{FILE_NAME}.imported").exists()
-    runner.stop(again)
-    begin("shore-1")
-    assert sorted(reading().wait_for(4)) == ["0001", "0002", "d1", "d2"]
 
 
 def test_image_that_retention_of_another_c2_has_removed_is_no_longer_sent(begin, client):

@@ -147,10 +147,10 @@ class Migration:
                 continue
             contents = tuple((suffix, files[f"{row.name}{suffix}"]) for suffix in SUFFIXES)
             digests = " ".join(sha256(data).hexdigest() for _, data in contents)
-            if digests != (row.files_sha256 or digests):
+            if digests != row.files_sha256:
                 self.problems.append(f"{row.vessel_id}/{row.name}: the files differ from the index")
                 continue
-            yield StoredImage(replace(row, files_sha256=digests, verified_utc_s=None, fault=""), contents)
+            yield StoredImage(replace(row, verified_utc_s=None, fault=""), contents)
 
     def _place(self, image: StoredImage) -> tuple[StoredImage, bool]:
         """Return an image with the name that it has in the database, and whether it is there."""
@@ -172,12 +172,12 @@ class Migration:
                 self.problems.append(f"{path}: {error.strerror or error}")
                 continue
             digest = sha256(content).hexdigest()
-            if digest != (row.files_sha256 or digest):
+            if digest != row.files_sha256:
                 self.problems.append(f"{path}: the file differs from the index")
                 continue
             found = self._database.find_decision(row.vessel_id, row.decision_id)
             if found is None:
-                new.append((replace(row, files_sha256=digest, verified_utc_s=None, fault=""), content))
+                new.append((replace(row, verified_utc_s=None, fault=""), content))
             elif found != digest:
                 self.problems.append(f"{path}: the database has another decision with this identifier")
             else:
