@@ -40,6 +40,7 @@ TIME_STEPS: Final = 1 << 22
 """Units of `d` a second."""
 
 _COMPLETE, _AUTHENTICATED, _UNAUTHENTICATED, _TOP, _BOTTOM = 1, 2, 4, 8, 16
+_HALVES: Final = {0: (), _TOP: ("top",), _BOTTOM: ("bottom",), _TOP | _BOTTOM: ("top", "bottom")}
 
 
 def whole_part(image: CodedImage) -> ImagePart:
@@ -147,6 +148,8 @@ def expand(part: ImagePart, base: ImagePart | None, where: str) -> ImagePart:
 
 def stream_of(part: ImagePart) -> bytes:
     """Return the stream of a whole image, with zeros in the missing ranges."""
+    if not part.s and part.z is None:
+        return part.p
     stream = bytearray(length_of(part))
     for first, content in pieces_of(part):
         stream[first : first + len(content)] = content
@@ -172,16 +175,15 @@ def coded_image(part: ImagePart, vessel_id: str, where: str) -> CodedImage:
     Raises:
         PayloadError: The contact is invalid, a byte of the stream is neither present nor missing, or one is both.
     """
-    length = length_of(part)
-    if part.m or len(part.p) != length:
-        pieces = np.zeros(length, dtype=np.bool_)
+    stream = stream_of(part)
+    received = len(part.p) + sum([len(content) for _, content in part.s])
+    if part.m or received != len(stream):
+        pieces = np.zeros(len(stream), dtype=np.bool_)
         for first, content in pieces_of(part):
             pieces[first : first + len(content)] = True
-        if not np.array_equal(pieces, _mask(length, part.m)):
+        if not np.array_equal(pieces, _mask(len(stream), part.m)):
             raise PayloadError(where, "s", f"{int(pieces.sum())} bytes", "every byte of the stream that is not in m")
     contact, height_px, width_px = _unpack_contact(part, where)
-    stream = stream_of(part)
-    received = sum(len(content) for _, content in pieces_of(part))
     authenticated = True if part.g & _AUTHENTICATED else False if part.g & _UNAUTHENTICATED else None
     fields: dict[str, object] = {
         "vessel_id": vessel_id,
@@ -193,7 +195,7 @@ def coded_image(part: ImagePart, vessel_id: str, where: str) -> CodedImage:
         "width_px": width_px,
         "stream": stream,
         "missing": part.m,
-        "missing_halves": tuple(half for half, bit in (("top", _TOP), ("bottom", _BOTTOM)) if part.g & bit),
+        "missing_halves": _HALVES[part.g & (_TOP | _BOTTOM)],
         "complete": bool(part.g & _COMPLETE),
         "bytes_received": received if part.y is None else part.y,
         "bytes_total": len(stream) if part.e is None else part.e,

@@ -15,7 +15,14 @@ import zenoh
 from zenoh.handlers import Callback
 
 from sonarpost import keys
-from sonarpost.delivery.protocol import MAX_BATCH_RECORDS, MAX_RECORD_BYTES, AckReply, pack_replies, parse_query
+from sonarpost.delivery.protocol import (
+    MAX_BATCH_RECORDS,
+    MAX_RECORD_BYTES,
+    STORED,
+    AckReply,
+    pack_replies,
+    parse_query,
+)
 from sonarpost.delivery.records import ReceivedChunk
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction
@@ -266,7 +273,7 @@ class Inbox:
             return self._refused(error)
         if isinstance(received, ReceivedChunk):
             return self._store_chunk(tx, message.key, received)
-        return [self._store_chunk(tx, message.key, chunk) for chunk in received]
+        return [self._store_once(tx, message.key, chunk) for chunk in received]
 
     def _store_publication(self, tx: Transaction, message: _Message) -> AckReply:
         try:
@@ -279,10 +286,12 @@ class Inbox:
 
     def _store_chunk(self, tx: Transaction, key: str, chunk: ReceivedChunk) -> AckReply:
         highest, sha256 = tx.accepted_number(key, chunk)
-        reply = AckReply("stored") if tx.was_received(key, chunk) else self._store_new_chunk(tx, key, chunk)
+        reply = self._store_once(tx, key, chunk)
         return replace(reply, highest=highest, highest_sha256=sha256) if chunk.offset == 0 else reply
 
-    def _store_new_chunk(self, tx: Transaction, key: str, chunk: ReceivedChunk) -> AckReply:
+    def _store_once(self, tx: Transaction, key: str, chunk: ReceivedChunk) -> AckReply:
+        if tx.was_received(key, chunk):
+            return STORED
         try:
             self._require_capacity(key)
         except RetryLaterError as error:
@@ -334,7 +343,7 @@ class Inbox:
                 return self._quarantine(tx, key, payload, f"{type(error).__name__}: {error}")
         tx.accept(key, stored, chunk, is_handled=self._handle(key, stored))
         self._accepted.append((key, stored))
-        return AckReply("stored")
+        return STORED
 
     def _quarantine(self, tx: Transaction, key: str, payload: bytes, reason: str) -> AckReply:
         tx.quarantine("in", key, payload, reason)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import msgpack
 from pydantic import BaseModel, ConfigDict, Field
@@ -127,6 +127,9 @@ class AckReply:
         return cls(reply.status, reply.next, reply.reason, reply.takes, reply.highest, reply.digest)
 
 
+STORED: Final = AckReply("stored")
+
+
 def watcher_origin(origin: bytes) -> bytes:
     """Return the identity of a queue for watchers, 16 bytes.
 
@@ -237,13 +240,10 @@ def unpack_replies(payload: bytes, count: int, where: str) -> tuple[AckReply, ..
         return AckReply.unpack(payload, where)
     replies = wire.validated(_BatchReply, fields, where).replies
     if not replies:
-        return (_STORED,) * count
+        return (STORED,) * count
     if len(replies) != count:
         raise PayloadError(where, "replies", replies, f"an array of {count}, or an empty one")
-    return tuple(_STORED if status == "stored" else AckReply(status, reason=reason) for status, reason in replies)
-
-
-_STORED = AckReply("stored")
+    return tuple(STORED if status == "stored" else AckReply(status, reason=reason) for status, reason in replies)
 
 
 def _digest_of(digests: Iterable[bytes]) -> bytes:

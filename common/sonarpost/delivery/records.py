@@ -70,7 +70,7 @@ class OutboxItem:
         return (self.priority, self.position)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ReceivedChunk:
     """A chunk of a record, as one delivery query carries it.
 
