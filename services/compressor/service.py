@@ -12,7 +12,7 @@ from sonarpost import keys, wire
 from sonarpost.codec.interface import Codec
 from sonarpost.codec.jit import use_code_folder
 from sonarpost.codec.region import RegionBox
-from sonarpost.codec.registry import CodecResources, default_registry, present_name
+from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.config import PlatformConfig
 from sonarpost.link.frames.paper.frame import format_image_id
@@ -238,7 +238,7 @@ class CompressorService(Service[CompressorConfig]):
         The configuration may have changed since: model and strength of despeckling are those of the stream. None for
         an image of another codec than the configured one, or of a model or codebook that this installation lacks.
         """
-        if present_name(image.codec) != self._codec.name:
+        if image.codec != self._codec.name:
             return None
         codec = default_registry().create_for_stream(image.stream, CodecResources(self._tiles))
         return codec if codec.model_hash == image.model else None

@@ -66,7 +66,6 @@ def test_options_select_model_codebook_and_packing(codebook: Path) -> None:
         ("emb", {"model": "texture"}, "standard or structure"),
         ("vq", {"packing": "13bit"}, "14bit"),
         ("zip", {}, "one of"),
-        ("emb-structure", {}, 'model = "structure"'),
     ],
 )
 def test_errors_name_the_valid_options(name: str, options: dict[str, str], match: str) -> None:

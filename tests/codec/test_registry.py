@@ -16,7 +16,6 @@ from sonarpost.codec.registry import (
     CodecResources,
     CodecSpec,
     load_plugins,
-    present_name,
 )
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.codec.vq.tiles import TileDatabase
@@ -109,18 +108,8 @@ def test_error_names_an_invalid_plugin(registry: CodecRegistry, name: str, value
     assert name in caught.value.where
 
 
-def test_error_for_a_retired_name_names_codec_and_model(registry: CodecRegistry) -> None:
-    with pytest.raises(ConfigError) as caught:
-        registry.create("emb-structure")
-    assert caught.value.value == "emb-structure"
-    assert 'codec = "emb", model = "structure"' in caught.value.expected
-    assert present_name("emb-structure") == "emb"
-    assert present_name("vq") == "vq"
-
-
 def test_prefixes_of_embedded_codecs_are_images(registry: CodecRegistry) -> None:
     assert {name for name in registry.names() if registry.is_embedded(name)} == {"emb", "spiht"}
-    assert registry.is_embedded("emb-structure")  # in records of version 0.1
     assert not registry.is_embedded("nothing")
     image = np.random.default_rng(1).integers(0, 256, (32, 40), dtype=np.uint8)
     for name in ("emb", "spiht"):

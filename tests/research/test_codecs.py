@@ -403,8 +403,6 @@ def test_models_of_emb_are_measured_under_their_own_names_and_with_its_strength(
     ]
     everything, _ = measuring.create_codecs(registry, None, all_packings=False)
     assert [one.name for one in everything if one.codec.name == "emb"] == ["emb", "emb:structure"]
-    with pytest.raises(SonarpostError, match='model = "structure"'):
-        measuring.create_codecs(registry, ["emb-structure"])
     assert command.new_parser().parse_args([]).strength == DEFAULT_STRENGTH
     for options, strength in (({}, DEFAULT_STRENGTH), ({"strength": 0.0}, 0)):
         ((tested,), _) = measuring.create_codecs(default_registry(), ["emb"], **options)

@@ -15,7 +15,7 @@ from sonarpost.cli.shared import Subparsers, add_fit_option, in_new_folder, prin
 from sonarpost.codec import Codec, StreamHeader, codec_names, decode_image, get_codec
 from sonarpost.codec.api import CodecOptions
 from sonarpost.codec.fitting import fit_image
-from sonarpost.codec.registry import RETIRED_NAMES, CodecResources, default_registry
+from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.codec.vq.tiles import TileDatabase
@@ -110,7 +110,7 @@ def run_encode(args: argparse.Namespace) -> int:
 
 def run_decode(args: argparse.Namespace) -> int:
     """Decode; return 0, or 1 if any file of the folder could not be decoded."""
-    suffixes = (*(f".{name}" for name in (*codec_names(), *RETIRED_NAMES)), TEXT_SUFFIX)
+    suffixes = (*(f".{name}" for name in codec_names()), TEXT_SUFFIX)
     # Opened before the loop: an unreadable codebook is one error, not one for each file.
     tiles = open_codebook(args.codebook).tiles if args.codebook is not None else None
 

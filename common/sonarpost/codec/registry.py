@@ -9,11 +9,10 @@ emb (one for each kind of model, with and without despeckling). 0x80 and above a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import Final
 
 from sonarpost.codec import emb
 from sonarpost.codec.baselines.huffman import HuffmanCodec
@@ -27,10 +26,6 @@ from sonarpost.errors import ConfigError, StreamError
 
 ENTRY_POINT_GROUP = "sonarpost.codecs"
 CODEBOOK_TAG_BYTES = 2
-RETIRED_NAMES: Final[Mapping[str, tuple[str, str]]] = {
-    "emb-structure": (emb.NAME, 'codec = "emb", model = "structure" (on command lines: --codec emb --model structure)')
-}
-"""Codec names of earlier releases: the present name, and how to select the codec. Stored records may contain them."""
 
 
 @dataclass(frozen=True)
@@ -139,11 +134,6 @@ BUILTINS = (
 )
 
 
-def present_name(name: str) -> str:
-    """Return the present name of a codec whose name is in a record, which an earlier release may have written."""
-    return RETIRED_NAMES.get(name, (name, ""))[0]
-
-
 class CodecRegistry:
     """Codecs by name and by codec id. Both are unique."""
 
@@ -183,17 +173,14 @@ class CodecRegistry:
 
     def is_embedded(self, name: str) -> bool:
         """Return whether the streams of a codec can be truncated and extended; False for an unknown name."""
-        name = present_name(name)
         return name in self._by_name and self._by_name[name].is_embedded
 
     def spec(self, name: str) -> CodecSpec:
         """Return the entry of a codec.
 
         Raises:
-            ConfigError: No codec has this name. The message lists the names, or how to select a retired codec.
+            ConfigError: No codec has this name. The message lists the names.
         """
-        if name in RETIRED_NAMES and name not in self._by_name:
-            raise ConfigError("codec registry", "name", name, RETIRED_NAMES[name][1])
         if name not in self._by_name:
             raise ConfigError("codec registry", "name", name, "one of " + ", ".join(self.names()) + _requirement(name))
         return self._by_name[name]

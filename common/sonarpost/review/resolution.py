@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from sonarpost.codec.registry import present_name
+from sonarpost.codec import emb
 from sonarpost.messages import ReconstructedImage
 
 FULL_WIDTH: Final = 2.0 * math.sqrt(2.0 * math.log(2.0))
@@ -49,7 +49,7 @@ def detail_px(codec: str, bytes_received: int, pixels: int) -> float | None:
         bytes_received: Bytes of the stream from which the image is decoded.
         pixels: Number of pixels of the image.
     """
-    if present_name(codec) != "emb" or bytes_received <= 0 or pixels <= 0:
+    if codec != emb.NAME or bytes_received <= 0 or pixels <= 0:
         return None
     return _emb_detail_px(bytes_received / pixels)
 
@@ -72,7 +72,7 @@ def blur_px(codec: str, bytes_received: int, pixels: int) -> float:
     """
     if codec in CODEBOOK_CODECS:
         return 0.0
-    share = 1.0 if present_name(codec) == "emb" else _OTHER_CODECS
+    share = 1.0 if codec == emb.NAME else _OTHER_CODECS
     return _emb_detail_px(share * max(1, bytes_received) / max(1, pixels))
 
 

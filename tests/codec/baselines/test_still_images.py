@@ -248,23 +248,12 @@ def test_small_avif_budgets_are_met() -> None:
 
 
 @WITH_AVIF
-def test_complete_avif_files_of_earlier_releases_decode_the_same() -> None:
-    codec = StillImageCodec(AVIF)
-    for name in golden_names(AVIF):
-        stream = bytes.fromhex((GOLDEN / f"{name}.hex").read_text())
-        header = StreamHeader.unpack(stream)
-        short = stream[: header.size] + avif_body(body(stream), (header.height_px, header.width_px))
-        assert len(stream) - len(short) == 271
-        assert np.array_equal(codec.decode(short).image, codec.decode(stream).image)
-
-
-@WITH_AVIF
-def test_avif_file_with_other_boxes_is_rejected() -> None:
+def test_avif_file_with_other_boxes_and_a_body_that_is_a_file_are_rejected() -> None:
     with pytest.raises(ConfigError, match="libavif"):
         avif_body(avif_of(noise(20, 20), 30), (20, 21))
     header = StreamHeader(0x06, 0, 80, 80).pack()
-    with pytest.raises(StreamError, match="size"):
-        StillImageCodec(AVIF).decode(header + avif_of(noise(80, 64), 30))
+    with pytest.raises(StreamError, match="units"):
+        StillImageCodec(AVIF).decode(header + avif_of(noise(80, 80), 30))
 
 
 @WITH_AVIF

@@ -9,9 +9,6 @@ import numpy as np
 import pytest
 from builders.common import eventually
 
-from sonarpost import wire
-from sonarpost.messages import EncodedImage
-
 
 def test_the_same_image_is_sent_again_while_it_is_in_the_cache(
     start_service, encoded, send_command, answer, snippet, caplog
@@ -65,22 +62,6 @@ def test_an_image_of_another_codec_is_sent_unchanged(start_service, restart, enc
     repeated = answer("refine", image.image_id)
     assert repeated.codec == "emb"
     assert repeated.stream.startswith(image.stream)
-
-
-def test_cached_image_of_a_retired_codec_name_is_refined(start_service, encoded, change_cached, answer, snippet):
-    service = start_service(codec="emb", model="structure", budget_bytes=120, despeckle_strength=0.0)
-    [image] = encoded(snippet("c1", 64, 64))
-    assert (image.codec, image.stream[0]) == ("emb", 0x21)
-
-    def renamed(entry):
-        old = wire.decode(EncodedImage, entry[0], "kept").model_copy(update={"codec": "emb-structure"})
-        return [wire.encode(old), *entry[1:]]
-
-    change_cached(service, renamed)
-    longer = answer("refine", image.image_id)
-    assert longer.stream.startswith(image.stream)
-    assert len(longer.stream) >= 1.9 * len(image.stream)
-    assert longer.codec == "emb"
 
 
 def test_region_is_an_image_of_its_own_with_all_bytes(start_service, encoded, answer, snippet, emb):

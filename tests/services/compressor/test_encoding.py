@@ -140,7 +140,6 @@ def test_the_configured_packing_is_used(start_service, encoded, snippet):
         ({"codebook": "/nowhere/own.tiles"}, CodebookError, "/nowhere/own.tiles"),
         ({"codebook": "nominal-11"}, CodebookError, "nominal-11"),
         ({"codec": "jpeg-of-the-future"}, ConfigError, "one of"),
-        ({"codec": "emb-structure"}, ConfigError, 'codec = "emb", model = "structure"'),
         ({"codec": "emb", "model": "texture"}, ConfigError, "standard or structure"),
     ],
 )

@@ -10,7 +10,7 @@ The body omits everything that follows from the image size:
 * `webp`: the VP8 key frame without start code and size (RFC 6386, section 9.1). 27 bytes less than the file.
 * `avif`: the AV1 sequence header and frame (AV1 specification, section 5.5). libavif writes 269 bytes of boxes before
   the first byte of AV1 (ISO/IEC 14496-12 and 23008-12, AVIF 1.1), then a temporal delimiter of 2 bytes. Only two
-  lengths, the size and the level vary. A body that is a complete file, as sent by earlier releases, is decoded too.
+  lengths, the size and the level vary.
 
 Libraries allocate memory for the size in the data, so the decoder first compares that size with the stream header. No
 format decodes a truncated body.
@@ -162,7 +162,8 @@ def _decode(image_format: StillImageFormat, body: bytes, shape: tuple[int, ...])
         case StillImageFormat.WEBP:
             file = webp_file(body, shape)
         case StillImageFormat.AVIF:
-            file = _avif_file_of_body(body, shape)
+            check_av1_frame(body, shape)
+            file = avif_file(body, shape)
         case StillImageFormat.JPEGXL:
             importlib.import_module("pillow_jxl")
             _check_size(image_format, jpegxl_size(body), shape)
@@ -247,22 +248,6 @@ def avif_file(frame: bytes, shape: tuple[int, ...]) -> bytes:
 def _box(name: bytes, *parts: bytes) -> bytes:
     content = b"".join(parts)
     return (8 + len(content)).to_bytes(4, "big") + name + content
-
-
-def _avif_file_of_body(body: bytes, shape: tuple[int, ...]) -> bytes:
-    """Return the AVIF file of a body, which can be a complete file.
-
-    Raises:
-        StreamError: The body is neither a file nor a frame, or it has another size.
-    """
-    frame = body
-    if body[4:8] == b"ftyp":
-        try:
-            frame = avif_body(body, shape)
-        except ConfigError as error:
-            raise StreamError("avif body", "file or its size", body[:32], f"a grey still of {shape}") from error
-    check_av1_frame(frame, shape)
-    return avif_file(frame, shape)
 
 
 def check_av1_frame(frame: bytes, shape: tuple[int, ...]) -> None:
