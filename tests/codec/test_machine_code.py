@@ -46,7 +46,7 @@ for case in ("80x80 at 64 B", "17x33 at 40 B"):
     c.decode(bytes.fromhex(golden[case]["stream"]))
 for seed in range(2):
     c.encode(np.random.default_rng(seed).integers(0, 256, (80, 80), dtype=np.uint8), "vq")
-""".replace("GOLDEN", str(GOLDEN_FOLDER / "emb" / "streams_second.json"))
+""".replace("GOLDEN", str(GOLDEN_FOLDER / "emb" / "streams.json"))
 
 
 def run(cache: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -9,7 +9,7 @@ import pytest
 from research.training.emb.trials import contact_contexts, learned_lifting, tile_predictors
 from research.training.emb.trials.contact_contexts import BUDGETS, EXTRAS, Contact
 from sonarpost.codec.emb import contexts, transform
-from sonarpost.codec.emb.model import shipped_models
+from sonarpost.codec.emb.model import shipped_model
 from sonarpost.codec.emb.transform import HL, LL, layout_of
 
 
@@ -23,7 +23,7 @@ def scene(seed: int = 1) -> npt.NDArray[np.uint8]:
 
 def bits_of_decisions(rows: npt.NDArray[np.int16]) -> float:
     """Return the code length of listed decisions by the shipped networks, without learning."""
-    model, total = shipped_models()[0], 0.0
+    model, total = shipped_model(), 0.0
     for net in range(2):
         own = rows[rows[:, -1] == net]
         x = own[:, : contexts.FEATURES].astype(np.int64)

@@ -19,7 +19,7 @@ from sonarpost.codec.baselines.huffman import HuffmanCodec
 from sonarpost.codec.baselines.jpeg2000 import Jpeg2000Codec
 from sonarpost.codec.baselines.spiht import SpihtCodec
 from sonarpost.codec.baselines.still_images import StillImageCodec, StillImageFormat
-from sonarpost.codec.interface import Codec, StreamHeader, model_tag, tag_length
+from sonarpost.codec.interface import Codec, StreamHeader, tag_length
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import ConfigError, StreamError
@@ -38,7 +38,6 @@ class CodecResources:
         model: Name of the model of emb; None: the default model.
         strength: Strength of despeckling of emb, 0..1; None: the default strength.
         codec_id: Codec id of the stream to decode; None for encoding.
-        model_tag: Model tag of the stream to decode; None for encoding.
     """
 
     tiles: TileDatabase | None = None
@@ -46,7 +45,6 @@ class CodecResources:
     model: str | None = None
     strength: float | None = None
     codec_id: int | None = None
-    model_tag: int | None = None
 
 
 @dataclass(frozen=True)
@@ -83,17 +81,13 @@ def _create_vq(resources: CodecResources) -> Codec:
 
 
 def _create_emb(resources: CodecResources) -> Codec:
-    # Imported lazily: these modules load numba.
+    # Imported lazily: it loads numba.
     from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415
-    from sonarpost.codec.emb.model import shipped_models  # noqa: PLC0415
 
     for despeckled, codec_ids in ((False, emb.CODEC_IDS), (True, emb.DESPECKLED_CODEC_IDS)):
         for name, codec_id in codec_ids.items():
             if codec_id == resources.codec_id:
-                models = shipped_models(name, despeckled=despeckled)
-                # For an unknown tag, the current model: its `decode` raises the error.
-                known = (one for one in models if model_tag(codec_id, one.identity) == resources.model_tag)
-                return EmbCodec(next(known, models[0]), emb.DEFAULT_STRENGTH if despeckled else 0.0)
+                return EmbCodec(name, emb.DEFAULT_STRENGTH if despeckled else 0.0)
     strength = emb.DEFAULT_STRENGTH if resources.strength is None else resources.strength
     return EmbCodec(resources.model or emb.DEFAULT_MODEL, strength)
 
@@ -215,8 +209,7 @@ class CodecRegistry:
         """
         header = StreamHeader.unpack(stream)
         resources = resources or CodecResources()
-        resources = replace(resources, codec_id=header.codec_id, model_tag=header.model_tag)
-        return self.spec_for_id(header.codec_id).create(resources)
+        return self.spec_for_id(header.codec_id).create(replace(resources, codec_id=header.codec_id))
 
 
 def _requirement(name_or_id: str | int) -> str:

@@ -1,7 +1,7 @@
 """Train the enhancer of the decoder on decoded images, and write its weights.
 
     python -m research.training.emb.enhancer --pool /tmp/emb/pool.npz \
-        --model /tmp/emb/contexts.model --out common/sonarpost/codec/emb/data/emb.model --steps 12000
+        --model /tmp/emb/contexts.model --out /tmp/emb/emb.model --steps 12000
 
 Loss: squared error relative to that before enhancement, minus the weighted multi-scale structural similarity.
 """

@@ -1,6 +1,6 @@
 """Train the context networks and write the model file.
 
-    python -m research.training.emb.train --pool /tmp/emb/pool.npz --out common/sonarpost/codec/emb/data/emb.model
+    python -m research.training.emb.train --pool /tmp/emb/pool.npz --out /tmp/emb/contexts.model
 
 Requires jax and optax (CPU), which are not dependencies of the package.
 """

@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 from sonarpost.codec.emb import MODEL_FILES, transform
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.decode import read_body
-from sonarpost.codec.emb.model import parse, shipped_models
+from sonarpost.codec.emb.model import parse, shipped_model
 from sonarpost.codec.emb.transform import layout_of
-from sonarpost.codec.interface import StreamHeader, model_tag
+from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.registry import default_registry
 from sonarpost.errors import StreamError
 
 CODEC = EmbCodec()
@@ -130,37 +129,18 @@ def test_unknown_models_and_small_budgets_are_rejected_and_no_bytes_give_no_pixe
 
 
 def test_invalid_model_files_are_rejected() -> None:
-    for name, model in zip(MODEL_FILES["standard"], shipped_models(), strict=True):
-        raw = files("sonarpost.codec.emb").joinpath("data", name).read_bytes()
-        assert parse(raw).identity == hashlib.sha256(raw).hexdigest() == model.identity
+    for name, file in MODEL_FILES.items():
+        raw = files("sonarpost.codec.emb").joinpath("data", file).read_bytes()
+        assert parse(raw).identity == hashlib.sha256(raw).hexdigest() == shipped_model(name).identity
         with pytest.raises(StreamError, match="magic"):
             parse(b"x" + raw)
         with pytest.raises(StreamError, match="length"):
             parse(raw[:-1])
-    assert CODEC.model_hash == shipped_models()[0].identity
-    tags = [model_tag(CODEC.codec_id, model.identity) for model in shipped_models()]
-    assert len(set(tags)) == len(tags)
-
-
-def test_streams_of_an_earlier_model_are_decoded_and_extended() -> None:
-    """Vehicle and vessel may have different releases."""
-    old = EmbCodec(shipped_models()[-1])
-    image = contact()
-    stream = old.encode(image, 64)
-    assert stream[:1] == CODEC.encode(image, 64)[:1]
-    assert stream[1] != CODEC.encode(image, 64)[1]
-    assert np.array_equal(CODEC.decode(stream).image, old.decode(stream).image)
-    assert np.array_equal(CODEC.decode_before_enhancer(stream).plane, old.decode_before_enhancer(stream).plane)
-    longer = CODEC.extend(stream, image, 160)
-    assert longer == old.extend(stream, image, 160)
-    assert len(longer) > 150
-    assert longer.startswith(stream[:-1])
-    found = default_registry().create_for_stream(stream)
-    assert found.model_hash == old.model_hash != CODEC.model_hash
+    assert CODEC.model_hash == shipped_model().identity
 
 
 def test_accumulators_do_not_overflow() -> None:
-    for model in shipped_models():
+    for model in map(shipped_model, MODEL_FILES):
         first = 290 * np.abs(model.w1.astype(np.int64)).sum(1) + np.abs(model.b1)
         second = 4095 * np.abs(model.w2.astype(np.int64)).sum(1) + np.abs(model.b2)
         sign = 96 * np.abs(model.sign_w1.astype(np.int64)).sum(1) + np.abs(model.sign_b1)

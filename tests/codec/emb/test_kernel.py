@@ -11,9 +11,9 @@ from sonarpost.codec.emb import contexts, kernel
 from sonarpost.codec.emb import transform as t
 from sonarpost.codec.emb.bitplanes import reconstructed_coefficients
 from sonarpost.codec.emb.coder import CoefficientState
-from sonarpost.codec.emb.model import shipped_models
+from sonarpost.codec.emb.model import shipped_model
 
-MODEL = shipped_models()[0]
+MODEL = shipped_model()
 
 
 def plain_logit(features: list[int], net: int, last: list[int]) -> tuple[int, list[int]]:

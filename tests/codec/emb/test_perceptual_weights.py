@@ -14,14 +14,14 @@ from research.common.quality import ms_ssim
 from sonarpost.codec.emb import perceptual_weights, transform
 from sonarpost.codec.emb.codec import EmbCodec, structural_similarity
 from sonarpost.codec.emb.coder import UNIT_SCALE, CoefficientState
-from sonarpost.codec.emb.model import shipped_models
+from sonarpost.codec.emb.model import shipped_model
 from sonarpost.codec.emb.side_info import RegionOfInterest
 from sonarpost.codec.emb.transform import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, layout_of
 from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.registry import CodecResources, default_registry
 
 STANDARD, STRUCTURE = EmbCodec(), EmbCodec("structure")
-WEIGHTS = shipped_models("structure")[0].perceptual
+WEIGHTS = shipped_model("structure").perceptual
 assert WEIGHTS is not None
 
 
@@ -171,7 +171,7 @@ def test_each_model_has_its_codec_ids() -> None:
     for model, strength, codec_id in each:
         codec = registry.create("emb", CodecResources(model=model, strength=strength))
         assert (codec.name, codec.codec_id) == ("emb", codec_id)
-        assert codec.model_hash == shipped_models(model, despeckled=strength > 0)[0].identity
+        assert codec.model_hash == shipped_model(model, despeckled=strength > 0).identity
         stream = codec.encode(image, 64)
         assert stream[0] == codec_id
         reader = registry.create_for_stream(stream)

@@ -6,8 +6,8 @@ NAME: Final = "emb"
 DEFAULT_MODEL: Final = "standard"
 DEFAULT_STRENGTH: Final = 1.0
 """Strength of despeckling, 0 to 1, unless an option sets it."""
-MODEL_FILES: Final = {"standard": ("emb-2.model", "emb.model"), "structure": ("emb-structure.model",)}
-"""Model files by model name. The first file encodes; the others decode streams of earlier releases."""
+MODEL_FILES: Final = {"standard": "emb-2.model", "structure": "emb-structure.model"}
+"""Model file by model name."""
 CODEC_IDS: Final = {"standard": 0x20, "structure": 0x21}
 """Codec id in the stream header, by model name."""
 DESPECKLED_CODEC_IDS: Final = {"standard": 0x22, "structure": 0x23}

@@ -39,7 +39,7 @@ from sonarpost.codec.emb.decode import (
 )
 from sonarpost.codec.emb.despeckle import STRENGTH_STEPS, check_strength, despeckled
 from sonarpost.codec.emb.kernel import I64
-from sonarpost.codec.emb.model import Model, shipped_models
+from sonarpost.codec.emb.model import Model, shipped_model
 from sonarpost.codec.emb.rate_distortion_opt import TargetCoefficients, target_coefficients
 from sonarpost.codec.emb.side_info import MEAN_STEP, RegionOfInterest, SideInfo, code_side_info, region_weights
 from sonarpost.codec.emb.transform import layout_of
@@ -288,7 +288,7 @@ class EmbCodec:
     def network(self) -> Model:
         """The model that encodes."""
         if isinstance(self.model, str):
-            return shipped_models(self.model, despeckled=self.strength > 0)[0]
+            return shipped_model(self.model, despeckled=self.strength > 0)
         return replace(self.model, sends_strength=self.strength > 0)
 
     @property
@@ -418,9 +418,9 @@ def _model_of(stream: bytes, own: Model) -> tuple[Model, StreamHeader]:
         known = (*CODEC_IDS.values(), *DESPECKLED_CODEC_IDS.values())
         expected = " or ".join(f"{codec_id:#04x}" for codec_id in known)
         raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", f"{expected} ({NAME})")
-    models = shipped_models(name, despeckled=despeckled_stream)
+    models = [shipped_model(name, despeckled=despeckled_stream)]
     if header.codec_id == _codec_id_of(own):
-        models = (own, *models)
+        models.insert(0, own)
     for model in models:
         if header.model_tag == model_tag(header.codec_id, model.identity):
             return model, header

@@ -1,8 +1,7 @@
 """The trained models of `emb`: integer weights of the networks, reconstruction points and tables.
 
 A model file is a magic word for its format, then the arrays of that format in order, little-endian (`FORMATS`). Its
-SHA-256 is the identity of the model. `training/emb` makes model files. Models of earlier releases stay in the package,
-so that their streams always decode; the weights that their networks do not have are zero.
+SHA-256 is the identity of the model. `training/emb` makes model files.
 """
 
 from __future__ import annotations
@@ -32,30 +31,29 @@ CONTRASTS: Final = 128
 """Entries of the table of perceptual scales by contrast, in eighths of octaves."""
 
 
-def _network_arrays(features: int, sign_features: int, sign_hidden: int) -> Arrays:
-    """Return name, shape and type of each array, in the order of the file."""
-    sides = [4, *[CHANNELS] * (len(DILATIONS) - 1), 4]
-    return (
-        ("w1", (2, features, k.HIDDEN_1), "<i2"),
-        ("b1", (2, k.HIDDEN_1), "<i4"),
-        ("w2", (2, k.HIDDEN_1, k.HIDDEN_2), "<i2"),
-        ("b2", (2, k.HIDDEN_2), "<i4"),
-        ("w3", (2, k.HIDDEN_2), "<i2"),
-        ("b3", (2,), "<i4"),
-        ("sign_w1", (4, sign_features, sign_hidden), "<i2"),
-        ("sign_b1", (4, sign_hidden), "<i4"),
-        ("sign_w2", (4, sign_hidden), "<i2"),
-        ("probabilities", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
-        ("costs", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
-        ("centres", (4, k.CENTRE_COLUMNS), "<i2"),
-        ("mean_tree", (64,), "<u2"),
-        ("image_weights", (IMAGE_FEATURES, CHANNELS), "<i4"),
-        *(
-            (f"{kind}{i}", shape, number)
-            for i, (inputs, outputs) in enumerate(pairwise(sides))
-            for kind, shape, number in (("taps", (9, inputs, outputs), "<i2"), ("bias", (outputs,), "<i4"))
-        ),
-    )
+_LAYER_SIDES: Final = (4, *(CHANNELS,) * (len(DILATIONS) - 1), 4)
+"""Channels between the layers of the enhancer."""
+_NETWORK_ARRAYS: Final[Arrays] = (
+    ("w1", (2, contexts.FEATURES, k.HIDDEN_1), "<i2"),
+    ("b1", (2, k.HIDDEN_1), "<i4"),
+    ("w2", (2, k.HIDDEN_1, k.HIDDEN_2), "<i2"),
+    ("b2", (2, k.HIDDEN_2), "<i4"),
+    ("w3", (2, k.HIDDEN_2), "<i2"),
+    ("b3", (2,), "<i4"),
+    ("sign_w1", (4, contexts.SIGN_FEATURES, k.SIGN_HIDDEN), "<i2"),
+    ("sign_b1", (4, k.SIGN_HIDDEN), "<i4"),
+    ("sign_w2", (4, k.SIGN_HIDDEN), "<i2"),
+    ("probabilities", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
+    ("costs", (2 * k.LOGIT_LIMIT + 1,), "<u2"),
+    ("centres", (4, k.CENTRE_COLUMNS), "<i2"),
+    ("mean_tree", (64,), "<u2"),
+    ("image_weights", (IMAGE_FEATURES, CHANNELS), "<i4"),
+    *(
+        (f"{kind}{i}", shape, number)
+        for i, (inputs, outputs) in enumerate(pairwise(_LAYER_SIDES))
+        for kind, shape, number in (("taps", (9, inputs, outputs), "<i2"), ("bias", (outputs,), "<i4"))
+    ),
+)
 
 
 class ModelFormat(NamedTuple):
@@ -69,12 +67,9 @@ _PERCEPTUAL_ARRAYS: Final[Arrays] = (
     ("perceptual_levels", (SCALE_LEVELS,), "<i2"),
     ("perceptual_contrast", (CONTRASTS,), "<i2"),
 )
-FORMAT_1: Final = ModelFormat(b"SPEMB1\n", _network_arrays(50, 11, 8))
-FORMAT_2: Final = ModelFormat(b"SPEMB2\n", _network_arrays(contexts.FEATURES, contexts.SIGN_FEATURES, k.SIGN_HIDDEN))
+FORMAT_2: Final = ModelFormat(b"SPEMB2\n", _NETWORK_ARRAYS)
 FORMAT_3: Final = ModelFormat(b"SPEMB3\n", FORMAT_2.arrays + _PERCEPTUAL_ARRAYS)
-FORMATS: Final = (FORMAT_1, FORMAT_2, FORMAT_3)
-_FORMAT_1_BAND_FEATURES: Final = 40
-"""Index of the first band feature in format 1."""
+FORMATS: Final = (FORMAT_2, FORMAT_3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +131,7 @@ def read_arrays(raw: bytes, where: str = "emb model") -> dict[str, I32]:
             break
     else:
         expected = " or ".join(repr(one.magic) for one in FORMATS)
-        raise StreamError(where, "magic", raw[: len(FORMAT_1.magic)], expected)
+        raise StreamError(where, "magic", raw[: len(FORMAT_2.magic)], expected)
     position = len(model_format.magic)
     sizes = [int(np.prod(shape)) * np.dtype(kind).itemsize for _, shape, kind in model_format.arrays]
     if len(raw) != position + sum(sizes):
@@ -155,18 +150,7 @@ def model_of(arrays: dict[str, I32], identity: str = "") -> Model:
     if "perceptual_levels" in arrays:
         perceptual = PerceptualWeights(arrays["perceptual_levels"], arrays["perceptual_contrast"])
     own = {name: array for name, array in arrays.items() if not name.startswith(("taps", "bias", "perceptual_"))}
-    own["w1"] = _with_zero_rows(own["w1"], _FORMAT_1_BAND_FEATURES, contexts.FEATURES)
-    own["sign_w1"] = _with_zero_rows(own["sign_w1"], own["sign_w1"].shape[1], contexts.SIGN_FEATURES)
-    for name in ("sign_w1", "sign_b1", "sign_w2"):
-        missing = k.SIGN_HIDDEN - own[name].shape[-1]
-        own[name] = np.pad(own[name], [(0, 0)] * (own[name].ndim - 1) + [(0, missing)])
     return Model(identity=identity, layers=layers, perceptual=perceptual, sends_strength=False, **own)
-
-
-def _with_zero_rows(weights: I32, at: int, rows: int) -> I32:
-    """Insert zero weights for missing features, so that the second axis has `rows` entries."""
-    missing = np.zeros((weights.shape[0], rows - weights.shape[1], weights.shape[2]), np.int32)
-    return np.concatenate([weights[:, :at], missing, weights[:, at:]], axis=1)
 
 
 def parse(raw: bytes, where: str = "emb model") -> Model:
@@ -179,18 +163,18 @@ def parse(raw: bytes, where: str = "emb model") -> Model:
 
 
 @cache
-def shipped_models(name: str = DEFAULT_MODEL, *, despeckled: bool = False) -> tuple[Model, ...]:
-    """Return the shipped models of a name: the current one, then those of earlier releases.
+def shipped_model(name: str = DEFAULT_MODEL, *, despeckled: bool = False) -> Model:
+    """Return the shipped model of a name.
 
     Args:
         name: A name in `MODEL_FILES`.
-        despeckled: Whether their streams have the strength of despeckling.
+        despeckled: Whether its streams have the strength of despeckling.
 
     Raises:
         ConfigError: No model has this name.
     """
     if name not in MODEL_FILES:
         raise ConfigError("codec emb", "model", name, " or ".join(MODEL_FILES))
-    data = files("sonarpost.codec.emb").joinpath("data")
-    models = (parse(data.joinpath(file).read_bytes(), file) for file in MODEL_FILES[name])
-    return tuple(replace(model, sends_strength=despeckled) for model in models)
+    file = MODEL_FILES[name]
+    raw = files("sonarpost.codec.emb").joinpath("data", file).read_bytes()
+    return replace(parse(raw, file), sends_strength=despeckled)

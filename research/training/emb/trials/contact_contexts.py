@@ -26,7 +26,7 @@ from research.training.emb.examples import random_side_info
 from sonarpost.codec.emb import contexts, kernel, transform
 from sonarpost.codec.emb.bitplanes import code_planes
 from sonarpost.codec.emb.coder import Coder, CoefficientState
-from sonarpost.codec.emb.model import shipped_models
+from sonarpost.codec.emb.model import shipped_model
 from sonarpost.codec.emb.rate_distortion_opt import target_coefficients
 from sonarpost.codec.emb.side_info import MEAN_STEP, region_weights
 from sonarpost.codec.emb.transform import HEIGHT, LL, OFFSET, ORIENT, STRIDE, WIDTH, layout_of
@@ -147,7 +147,7 @@ def decisions_of(contact: Contact, size: int, rng: np.random.Generator) -> tuple
     Returns:
         Rows of contexts, extra features, bit, network; rows of sign contexts, extra features, bit, orientation.
     """
-    model, layout = shipped_models()[0], layout_of(*contact.pixels.shape)
+    model, layout = shipped_model(), layout_of(*contact.pixels.shape)
     mean = min((int(contact.pixels.astype(np.int64).sum()) // contact.pixels.size + MEAN_STEP // 2) // MEAN_STEP, 63)
     plane = (contact.pixels.astype(np.int64) - mean * MEAN_STEP) * transform.UNIT
     target = target_coefficients(plane, layout, region_weights(layout, None), size, None)
@@ -225,7 +225,7 @@ def measure(
         logits = [function(p, part[:, :width].astype(np.float32)) * (1 - 2 * part[:, -2]) for part in parts]
         return sum(float(jnp.logaddexp(0, part).sum()) for part in logits) / float(np.log(2))
 
-    model, bits = shipped_models()[0], {name: np.zeros((2, 2)) for name in held_out}
+    model, bits = shipped_model(), {name: np.zeros((2, 2)) for name in held_out}
     plans = [(0, net, "w1 b1 w2 b2 w3 b3", steps // (1 + 2 * net)) for net in range(2)]
     plans += [(1, orient, "sign_w1 sign_b1 sign_w2", steps // 6) for orient in range(4)]
     for has_extras, extra in enumerate((0, EXTRAS)):
