@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from sonarpost import wire
 from sonarpost.archive.image_parts import coded_image, difference, expand, head_of, stream_of, whole_part
 from sonarpost.errors import MissingBaseError, PayloadError
-from sonarpost.link.frames.contact_record import ContactSummary, contact_of
-from sonarpost.messages import CodedImage, ImagePart
+from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary, contact_of
+from sonarpost.messages import CodedImage, Contact, ImagePart
 
 SUMMARY = ContactSummary.unpack(ACOUSTIC_CONTACT)
 
@@ -76,6 +76,26 @@ def test_contact_with_names_of_another_image_arrives_unchanged(names):
     assert coded_image(decoded(whole_part(sent)), sent.vessel_id, "key") == sent
     sent = image(noise(200), vehicle_id="uuv-2")
     assert coded_image(decoded(whole_part(sent)), sent.vessel_id, "key") == sent
+
+
+@pytest.mark.parametrize("size", [{}, {"height_px": None, "width_px": None}], ids=["size", "no-size"])
+def test_contact_with_a_map_as_long_as_a_contact_record_arrives_unchanged(size):
+    contact = Contact(contact_id="uuv-1/000A", vehicle_id="uuv-1", sonar_id="14 characters.")
+    assert len(msgpack.packb({"sonar_id": contact.sonar_id})) == RECORD_SIZE
+    sent = image(noise(200), contact=contact, **size)
+    assert coded_image(decoded(whole_part(sent)), sent.vessel_id, "key") == sent
+
+
+def test_image_whose_contact_is_too_long_is_refused():
+    contact = Contact(
+        contact_id="c",
+        vehicle_id="uuv-1",
+        sonar_id="\U0001f6a2" * 2000,
+        line_name="\U0001f6a2" * 2000,
+        position_note="\U0001f6a2" * 2000,
+    )
+    with pytest.raises(PayloadError, match="part: c: "):
+        whole_part(image(noise(200), contact=contact))
 
 
 @given(data=st.data(), length=st.integers(3, 900), more=st.integers(0, 900))

@@ -138,7 +138,7 @@ class ReceivedImage(Record):
     @classmethod
     def _fit_the_stream(cls, missing: tuple[tuple[int, int], ...], info: ValidationInfo) -> tuple[tuple[int, int], ...]:
         stream = info.data.get("stream")
-        if isinstance(stream, bytes):
+        if missing and isinstance(stream, bytes):
             bounds = [bound for first_and_stop in missing for bound in first_and_stop]
             if bounds != sorted(set(bounds)) or (bounds and bounds[-1] > len(stream)):
                 raise ValueError(f"ascending, separate ranges within the {len(stream)} bytes of the stream")
@@ -182,7 +182,8 @@ class ImagePart(Record):
         l: Arrival of the last frame, if `d` cannot represent it exactly. None: `d` does.
         c: The contact: the 25 bytes of the contact record of the acoustic link, which include height and width; if
             they cannot represent it, a msgpack map of the fields of `contact` that are not nil, without `contact_id`
-            and `vehicle_id` if these are `u`/`i` and `u`. Empty: no contact, or that of version `b`.
+            and `vehicle_id` if these are `u`/`i` and `u` and the map does not have 25 bytes then. Empty: no contact,
+            or that of version `b`.
         h: Rows (`height_px`), if `c` is not a contact record of 25 bytes.
         w: Columns (`width_px`), as `h`.
         z: Length of the stream. None: the end of its last piece.

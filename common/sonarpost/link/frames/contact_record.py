@@ -14,7 +14,7 @@ import math
 import struct
 import sys
 from dataclasses import dataclass, fields
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import Any, Final, get_args
 
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX
@@ -188,9 +188,9 @@ _values_of = attrgetter(*(field.name for field in fields(ContactSummary)))
 _CONTACT_NAMES: Final = {"confidence": "atd_confidence", "side": "channel"}
 _CARRIED_FIELDS: Final = tuple(_CONTACT_NAMES.get(field.name, field.name) for field in fields(ContactSummary)[2:])
 """Fields of `Contact` that the record carries, in the order of the fields of `ContactSummary` after the size."""
-_carried = attrgetter(*_CARRIED_FIELDS)
+_carried = itemgetter(*_CARRIED_FIELDS)
 _OTHER_FIELDS: Final = sorted(Contact.model_fields.keys() - {"contact_id", "vehicle_id", *_CARRIED_FIELDS})
-_others = attrgetter(*_OTHER_FIELDS)
+_others = itemgetter(*_OTHER_FIELDS)
 _NO_OTHERS: Final = (None,) * len(_OTHER_FIELDS)
 
 
@@ -218,10 +218,10 @@ def exact_record(contact: Contact, height_px: int | None, width_px: int | None) 
     for side in (height_px, width_px):
         if side is not None and not MIN_SIDE_PX <= side <= MAX_SIDE_PX:
             return b""
-    if _others(contact) != _NO_OTHERS:
+    if _others(vars(contact)) != _NO_OTHERS:
         return b""
     packed = _pack(*_summary_values(contact, height_px, width_px))
-    return packed if _unpack(packed, _WHERE) == (height_px, width_px, *_carried(contact)) else b""
+    return packed if _unpack(packed, _WHERE) == (height_px, width_px, *_carried(vars(contact))) else b""
 
 
 def contact_of(summary: ContactSummary, vehicle_id: str, image_id: str) -> Contact:
