@@ -22,7 +22,7 @@ from pydantic import ValidationError
 from sonarpost import wire
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError, FrameError, MissingBaseError, PayloadError
-from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary, contact_of, exact_record
+from sonarpost.link.frames.contact_record import RECORD_SIZE, contact_and_size, exact_record
 from sonarpost.logs import kv
 from sonarpost.messages import CodedImage, Contact, ImagePart
 
@@ -291,8 +291,7 @@ def _unpack_contact(part: ImagePart, where: str) -> tuple[Contact | None, int | 
         return None, part.h, part.w
     try:
         if len(part.c) == RECORD_SIZE and part.h is None and part.w is None:
-            summary = ContactSummary.unpack(part.c, where)
-            return contact_of(summary, part.u, part.i), summary.height_px, summary.width_px
+            return contact_and_size(part.c, part.u, part.i, where)
     except (FrameError, ValidationError) as error:
         raise PayloadError(where, "c", part.c, f"a contact record: {error}") from error
     fields = _usual_names(part.u, part.i) | wire.unpack_map(part.c, f"{where}: c")

@@ -18,6 +18,7 @@ from sonarpost.link.frames.contact_record import (
     RECORD_SIZE,
     ContactSummary,
     atd_class_of,
+    contact_and_size,
     contact_of,
     exact_record,
     summary_of,
@@ -142,6 +143,27 @@ def test_any_record_that_parses_packs_to_the_same_bytes(data: bytes, first: int)
             continue
         assert contact.is_classified == (candidate[0] >= 128)
         assert contact.pack() == candidate
+
+
+@given(
+    st.sampled_from([b"\0\0\0", b"\x02\x00\x50", b"\x02\x00\x00", b"\x00\xf0\x50", b"\x02\x02\x01"])
+    | st.binary(min_size=3, max_size=3),
+    st.sampled_from([(-(2**31), -(2**31)), (1, 2), (-(2**31), 2), (900_000_001, 2), (1, -1_800_000_001)]),
+    st.binary(min_size=14, max_size=14),
+    st.booleans(),
+)
+def test_contact_and_size_are_those_of_a_summary_or_both_are_rejected(
+    size: bytes, fix: tuple[int, int], tail: bytes, has_sigma: bool
+) -> None:
+    data = struct.pack(">3sii14s", size, *fix, tail if has_sigma else tail[:13] + b"\xff")
+    try:
+        summary = ContactSummary.unpack(data)
+        expected = contact_of(summary, "uuv-1", "000A"), summary.height_px, summary.width_px
+    except (FrameError, ValidationError):
+        with pytest.raises((FrameError, ValidationError)):
+            contact_and_size(data, "uuv-1", "000A")
+        return
+    assert contact_and_size(data, "uuv-1", "000A") == expected
 
 
 def test_all_codes_of_class_and_probabilities_round_trip_or_are_rejected() -> None:

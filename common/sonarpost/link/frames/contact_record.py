@@ -66,8 +66,6 @@ _LAT_SHIFT, _WIDTH_SHIFT, _HEIGHT_SHIFT, _PROBABILITY_SHIFT, _CLASS_SHIFT = 30, 
 _SIDES: Final = (None, *Side)
 _LARGEST: Final = sys.float_info.max
 _LIMITS: Final = (
-    ("height_px", MIN_SIDE_PX, MAX_SIDE_PX),
-    ("width_px", MIN_SIDE_PX, MAX_SIDE_PX),
     ("lat_deg", -90, 90),
     ("lon_deg", -180, 180),
     ("time_utc_s", 0, _UNKNOWN_U32 - 1),
@@ -139,8 +137,7 @@ class ContactSummary:
     p_other_object: float | None = None
 
     def __post_init__(self) -> None:
-        _check_together("height_px and width_px", self.height_px, self.width_px)
-        _check_together("lat_deg and lon_deg", self.lat_deg, self.lon_deg)
+        _check_size_and_fix(self.height_px, self.width_px, self.lat_deg, self.lon_deg, self.position_sigma_m)
         _check_together("p_mine_like and p_other_object", self.p_mine_like, self.p_other_object)
         for (name, low, high), value in zip(_LIMITS, _numbers_of(self), strict=True):
             if value is not None and not low <= value <= high:
@@ -151,8 +148,6 @@ class ContactSummary:
             raise FrameError(_WHERE, "side", self.side, "port, starboard or None")
         if self.ground_range_m is not None and self.side is None:
             raise FrameError(_WHERE, "side", None, "port or starboard with a ground_range_m")
-        if self.position_sigma_m is not None and self.lat_deg is None:
-            raise FrameError(_WHERE, "lat_deg", None, "a position with a position_sigma_m")
         if self.atd_class not in _CLASSES:
             raise FrameError(_WHERE, "atd_class", self.atd_class, f"{', '.join(get_args(AtdClass))} or None")
         total = (self.p_mine_like or 0.0) + (self.p_other_object or 0.0)
@@ -175,8 +170,6 @@ class ContactSummary:
         Raises:
             FrameError: Another length, an invalid code, or values that contradict each other.
         """
-        if len(data) != RECORD_SIZE:
-            raise FrameError(where, "length", len(data), f"{RECORD_SIZE} bytes")
         return cls(*_unpack(data, where))
 
     def rounded(self) -> ContactSummary:
@@ -185,6 +178,7 @@ class ContactSummary:
 
 
 _values_of = attrgetter(*(field.name for field in fields(ContactSummary)))
+_SIGMA_INDEX: Final = [field.name for field in fields(ContactSummary)].index("position_sigma_m")
 _CONTACT_NAMES: Final = {"confidence": "atd_confidence", "side": "channel"}
 _CARRIED_FIELDS: Final = tuple(_CONTACT_NAMES.get(field.name, field.name) for field in fields(ContactSummary)[2:])
 """Fields of `Contact` that the record carries, in the order of the fields of `ContactSummary` after the size."""
@@ -230,8 +224,27 @@ def contact_of(summary: ContactSummary, vehicle_id: str, image_id: str) -> Conta
     Raises:
         ValidationError: A value does not fit the record.
     """
-    values = dict(zip(_CARRIED_FIELDS, _values_of(summary)[2:], strict=True))
-    return Contact(contact_id=f"{vehicle_id}/{image_id}", vehicle_id=vehicle_id, **values)
+    return _contact(_values_of(summary), vehicle_id, image_id)
+
+
+def contact_and_size(
+    data: bytes, vehicle_id: str, image_id: str, where: str = _WHERE
+) -> tuple[Contact, int | None, int | None]:
+    """Return the contact that a record of 25 bytes describes, and height and width of its image.
+
+    Raises:
+        FrameError: As for `ContactSummary.unpack`.
+        ValidationError: A value does not fit the record.
+    """
+    height_px, width_px, lat_deg, lon_deg, *_ = values = _unpack(data, where)
+    # The other values of every code are within their limits; `Contact` checks the position.
+    _check_size_and_fix(height_px, width_px, lat_deg, lon_deg, values[_SIGMA_INDEX])
+    return _contact(values, vehicle_id, image_id), height_px, width_px
+
+
+def _contact(values: tuple[Any, ...], vehicle_id: str, image_id: str) -> Contact:
+    carried = dict(zip(_CARRIED_FIELDS, values[2:], strict=True))
+    return Contact.model_validate({"contact_id": f"{vehicle_id}/{image_id}", "vehicle_id": vehicle_id, **carried})
 
 
 def _summary_values(contact: Contact, height_px: int | None, width_px: int | None) -> tuple[Any, ...]:
@@ -310,6 +323,8 @@ def _pack(
 
 def _unpack(data: bytes, where: str) -> tuple[Any, ...]:
     """Return the values of the fields of `ContactSummary`, in their order."""
+    if len(data) != RECORD_SIZE:
+        raise FrameError(where, "length", len(data), f"{RECORD_SIZE} bytes")
     is_classified = bool(data[0] & _CLASSIFIED_BIT)
     *size_and_fix, classes = _unpack_classified(data, where) if is_classified else _unpack_plain(data)
     time, confidence, heading, altitude, depth, side_range, along, across, sigma = _TAIL.unpack_from(data, _HEAD_BYTES)
@@ -364,6 +379,22 @@ def _unpack_classified(data: bytes, where: str) -> tuple[Any, ...]:
 def _check_together(names: str, first: object, second: object) -> None:
     if (first is None) != (second is None):
         raise FrameError(_WHERE, names, (first, second), "both or neither")
+
+
+def _check_size_and_fix(
+    height_px: int | None,
+    width_px: int | None,
+    lat_deg: float | None,
+    lon_deg: float | None,
+    position_sigma_m: float | None,
+) -> None:
+    _check_together("height_px and width_px", height_px, width_px)
+    _check_together("lat_deg and lon_deg", lat_deg, lon_deg)
+    for name, side in (("height_px", height_px), ("width_px", width_px)):
+        if side is not None and not MIN_SIDE_PX <= side <= MAX_SIDE_PX:
+            raise FrameError(_WHERE, name, side, f"a finite number, {MIN_SIDE_PX} to {MAX_SIDE_PX}")
+    if position_sigma_m is not None and lat_deg is None:
+        raise FrameError(_WHERE, "lat_deg", None, "a position with a position_sigma_m")
 
 
 def _probability_code(p_mine_like: float | None, p_other_object: float | None) -> int:
