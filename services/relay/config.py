@@ -80,8 +80,7 @@ class RelayConfig(ServiceConfig):
     Attributes:
         upstreams: Ways to sites, each with its own queue; empty means the single site `shore`.
         supersede: A newer version of an image replaces queued older ones whose transfer has not started.
-        forward_status: Send the latest status of each vehicle to every site by radio. Sites of version 0.2 or earlier
-            refuse it.
+        forward_status: Send the latest status of each vehicle to every site by radio.
         disk_reserve_bytes: Free space below which images are not accepted; decisions still are.
         advice_consumers: Services on the vessel that receive advice; without any, advice is refused.
         command_consumers: Services on the vessel that receive commands; without any, commands are refused.

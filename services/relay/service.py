@@ -64,7 +64,7 @@ class Upstream:
 
     def __init__(self, options: UpstreamOptions, tls: TlsConfig | None) -> None:
         self.options = options
-        # The queue of the default site has the name that it had before several sites were supported.
+        # The queue of the default site has no site in its name.
         self.queue = CONSUMER if options.site == keys.SHORE else queue_of(CONSUMER, options.site)
         self._tls = tls
         self._session: zenoh.Session | None = None
