@@ -38,6 +38,8 @@ MAX_SEARCH_S: Final = 5.0
 _STEPS: Final = 10_000
 """Instructions of SQLite between two checks of that time."""
 DIGEST_BYTES: Final = 16
+COMPRESSION_WINDOW_BITS: Final = 12
+"""4 KiB: to clear the largest window takes longer than to compress a record."""
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS journal (archive TEXT NOT NULL);
@@ -116,7 +118,7 @@ class JournalRecord(NamedTuple):
             entry.key,
             hashlib.sha256(payload).digest()[:DIGEST_BYTES],
             wire.encoding_of(type(entry.record)),
-            zlib.compress(_without_pixels(entry, payload)),
+            zlib.compress(_without_pixels(entry, payload), wbits=COMPRESSION_WINDOW_BITS),
             accepted_utc_s,
             entry.vessel_id,
             entry.vehicle_id,
@@ -294,16 +296,17 @@ class Journal:
         seq = db.execute(f"INSERT INTO record ({COLUMNS}) VALUES ({marks})", values).lastrowid  # noqa: S608 literals
         assert seq is not None
         if isinstance(entry.record, Decision):
-            self._review(db, entry)
+            self._review(db, entry, seq, entry.record)
         return entry.key, Accepted(self.archive, seq, utc_s)
 
-    def _review(self, db: sqlite3.Connection, entry: JournalEntry) -> None:
+    def _review(self, db: sqlite3.Connection, entry: JournalEntry, seq: int, decision: Decision) -> None:
         image = (entry.vessel_id, entry.vehicle_id, entry.image_id)
         rows = db.execute(
-            "SELECT payload FROM record WHERE key = ? AND vessel_id = ? AND vehicle_id = ? AND image_id = ?",
-            (entry.key, *image),
+            "SELECT payload FROM record"
+            " WHERE key = ? AND vessel_id = ? AND vehicle_id = ? AND image_id = ? AND seq <> ?",
+            (entry.key, *image, seq),
         )
-        state = review_state([row[0] for row in rows], str(self.path))
+        state = review_state([row[0] for row in rows], str(self.path), decision)
         db.execute("INSERT OR REPLACE INTO review VALUES (?, ?, ?, ?)", (*image, state))
 
     def known_keys(self) -> list[str]:
@@ -372,9 +375,9 @@ def journal_row(accepted: Accepted, key: str, encoding: str, payload: bytes, ves
     return JournalRow(accepted, key, encoding, wire.unpack_map(zlib.decompress(payload), key), vessel_id, name)
 
 
-def review_state(payloads: Iterable[bytes], where: str) -> ReviewState:
-    """Return the result of all decisions on an image, from their compressed payloads; `where` names the journal."""
-    decisions = [wire.decode(Decision, zlib.decompress(payload), where) for payload in payloads]
+def review_state(payloads: Iterable[bytes], where: str, *more: Decision) -> ReviewState:
+    """Return the result of all decisions on an image: compressed payloads of the journal `where`, and `more`."""
+    decisions = [*more, *(wire.decode(Decision, zlib.decompress(payload), where) for payload in payloads)]
     return review_result(sorted(decisions, key=lambda d: (d.decided_utc_s, d.decision_id))).state
 
 
