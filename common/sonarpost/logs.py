@@ -263,6 +263,7 @@ def configure_logging(service: str, level: str = "info", log_format: LogFormat =
     handler.setFormatter(JsonFormatter(service) if log_format == "json" else TextFormatter(service))
     # Not part of a line, and a tenth of its cost.
     logging.logThreads = logging.logProcesses = logging.logMultiprocessing = False
+    logging._srcfile = None  # noqa: SLF001  documented for this purpose
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level.upper())

@@ -1,4 +1,4 @@
-"""Samples of every record type: the golden vectors of `tests/golden/zenoh`."""
+"""Samples of every record type: the golden vectors of `tests/golden/zenoh`, older ones included."""
 
 from __future__ import annotations
 

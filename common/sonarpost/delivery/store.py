@@ -320,6 +320,8 @@ class Store:
         """
         if max_bytes is not None:
             sizes = self._read("SELECT LENGTH(payload) FROM inbox ORDER BY id LIMIT ?", (limit,))
+            if not sizes:
+                return ()
             totals = accumulate(size for (size,) in sizes)
             limit = max(1, sum(total <= max_bytes for total in totals))
         found = self._read("SELECT id, key, payload FROM inbox ORDER BY id LIMIT ?", (limit,))
@@ -423,6 +425,7 @@ class DiskReserve:
 
     def __init__(self, store: Store, reserve_bytes: int, consequence: str) -> None:
         self._store = store
+        self._folder = store.path.parent
         self._reserve_bytes = reserve_bytes
         self._consequence = consequence
         self._reached = False
@@ -433,7 +436,7 @@ class DiskReserve:
         Raises:
             DeliveryError: The store cannot be read.
         """
-        return shutil.disk_usage(self._store.path.parent).free + self._store.reusable_bytes()
+        return shutil.disk_usage(self._folder).free + self._store.reusable_bytes()
 
     def require(self) -> None:
         """Check the free space.
@@ -449,14 +452,14 @@ class DiskReserve:
         return self._check() if self._reached else ""
 
     def _check(self) -> str:
-        free_bytes = shutil.disk_usage(self._store.path.parent).free
+        free_bytes = shutil.disk_usage(self._folder).free
         if free_bytes < self._reserve_bytes:
             free_bytes = self.free_bytes()
         self._reached = free_bytes < self._reserve_bytes
         if not self._reached:
             return ""
-        folder = self._store.path.parent
-        return f"{folder}: {free_bytes} bytes free, below the reserve of {self._reserve_bytes}: {self._consequence}"
+        reserve = f"the reserve of {self._reserve_bytes}"
+        return f"{self._folder}: {free_bytes} bytes free, below {reserve}: {self._consequence}"
 
 
 def _files_of(path: Path) -> list[Path]:

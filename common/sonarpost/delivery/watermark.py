@@ -32,6 +32,7 @@ VERSION = 1
 FILE_BYTES = 4096
 """Initial size: later writes in place then need no new disk space."""
 MAX_FILE_BYTES = 1 << 24
+_encode = json.JSONEncoder(separators=(",", ":")).encode
 LOST = "lost_records"
 """Name of the report in the store's table `meta`."""
 
@@ -287,7 +288,7 @@ class Watermark:
             return
         queues = {queue: [n.last, n.first_open] for queue, n in self._queues.items()}
         content = {"v": VERSION, "inbox": [self._inbox.last, self._inbox.first_open], "queues": queues}
-        text = json.dumps(content, separators=(",", ":")).encode()
+        text = _encode(content).encode()
         try:
             os.pwrite(self._descriptor, b"%b\n%b\n" % (text, _checksum(text)), 0)
         except OSError as error:

@@ -109,7 +109,8 @@ class ReceivedImage(Record):
         conflicts: Frames that contradict others of this image.
         first_frame_utc_s: Arrival of the first frame, by the vessel's clock.
         last_frame_utc_s: Arrival of the last frame that contributed.
-        authenticated: Whether all acoustic frames that contributed were authenticated with a key. None: not known.
+        authenticated: Whether all acoustic frames that contributed were authenticated with a key. None: not known, in
+            records of earlier versions.
     """
 
     TYPE: ClassVar[str] = "received_image"
@@ -302,9 +303,10 @@ class ReconstructedImage(Record):
         first_frame_utc_s: Arrival of the first frame, by the vessel's clock.
         last_frame_utc_s: Arrival of the last frame.
         notes: Remarks for the operator about this image.
-        authenticated: Whether all acoustic frames that contributed were authenticated with a key. None: not known.
+        authenticated: Whether all acoustic frames that contributed were authenticated with a key. None: not known, in
+            records of earlier versions.
         despeckle_strength: Strength with which the vehicle removed speckle before coding, 0 for none. None: not known,
-            as with codecs without despeckling.
+            with codecs without despeckling and in records of earlier versions.
     """
 
     TYPE: ClassVar[str] = "reconstructed_image"
