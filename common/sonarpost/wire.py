@@ -77,10 +77,10 @@ def decode(record_type: type[R], payload: bytes, where: str) -> R:
     fields = unpack_map(payload, where)
     if fields.get("type") != record_type.TYPE:
         raise PayloadError(where, "type", fields.get("type"), repr(record_type.TYPE))
-    version, versions = fields.get("v"), range(record_type.OLDEST, record_type.VERSION + 1)
+    version = fields.get("v")
     # In Python 1.0 and true equal 1; other languages distinguish them.
-    if type(version) is not int or version not in versions:
-        raise PayloadError(where, "v", version, " or ".join(map(str, versions)))
+    if type(version) is not int or version != record_type.VERSION:
+        raise PayloadError(where, "v", version, str(record_type.VERSION))
     return validated(record_type, fields, where)
 
 

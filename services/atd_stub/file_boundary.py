@@ -132,18 +132,16 @@ def pack(stored: StoredEnd) -> bytes:
 
 
 def unpack(packed: bytes) -> StoredEnd:
-    """Return what `pack` was called with, of this format or of format 1.
+    """Return what `pack` was called with.
 
     Raises:
         ValueError: It has another format, or is damaged.
     """
     try:
         fields = msgpack.unpackb(packed)
-        version = fields["format"]
-        if version not in (1, FORMAT):
-            raise ValueError(f"file end: format: got {version}, expected 1 or {FORMAT}")
-        end = _end_of_format_1(fields) if version == 1 else _end(fields)
-        return StoredEnd(end, float(fields["until_utc_s"]))
+        if fields["format"] != FORMAT:
+            raise ValueError(f"file end: format: got {fields['format']}, expected {FORMAT}")
+        return StoredEnd(_end(fields), float(fields["until_utc_s"]))
     except (KeyError, IndexError, TypeError, msgpack.UnpackException) as error:
         raise ValueError(f"file end: content: got {type(error).__name__}: {error}, expected a file end") from error
 
@@ -159,31 +157,6 @@ def _end(fields: Mapping[str, Any]) -> SurveyEnd:
         open_row=fields["open_row"],
         reported=tuple(map(_place, fields["reported"])),
         held=tuple(StreamContact(origins[place.row], place, content) for place, content in held),
-    )
-
-
-def _end_of_format_1(fields: Mapping[str, Any]) -> SurveyEnd:
-    """Return the end of a recording of format 1.
-
-    It has one list of detections, with the snippet of a held one, without the extent of highlight and shadow. Rows in
-    their file are not known: they are counted from its first stored ping. Half of the pings, or those from the first
-    held contact on, are undecided.
-    """
-    files = [FileOrigin(*each) for each in fields["files"]]
-    numbers = fields["file_of"]
-    origins = tuple(PingOrigin(files[number], row - numbers.index(number)) for row, number in enumerate(numbers))
-    places = [
-        (DetectionPlace(Side(side), row, first_row, end_row, slant_m, slant_m, slant_m, along_m), held)
-        for side, row, first_row, end_row, slant_m, along_m, held in fields["looks"]
-    ]
-    middle = len(origins) - len(origins) // 2
-    return StreamEnd(
-        sonar_id=fields["sonar_id"],
-        pings=tuple(_unpacked_ping(each) for each in fields["pings"]),
-        origins=origins,
-        open_row=min([middle, *(max(place.row, 0) for place, held in places if held is not None)]),
-        reported=tuple(place for place, held in places if held is None),
-        held=tuple(StreamContact(origins[place.row], place, held) for place, held in places if held is not None),
     )
 
 
@@ -228,9 +201,8 @@ def _unpacked_ping(packed: list[Any]) -> Ping:
         ChannelPing(Side(side), np.frombuffer(data, dtype=np.dtype(kind)), slant_range_m, frequency_hz, scale)
         for side, kind, data, slant_range_m, frequency_hz, scale in channels
     )
-    # Format 1 has no coordinates in metres; what follows them is left out where it is unknown.
     count = len(_NAVIGATION)
+    grid_m, *position = navigation[count:]
     values = dict(zip(_NAVIGATION, navigation[:count], strict=True))
-    values |= dict(zip(_POSITION, navigation[count + 1 :], strict=False))
-    grid_m = navigation[count] if len(navigation) > count else None
+    values |= dict(zip(_POSITION, position, strict=False))  # left out where all are unknown
     return Ping(number, time_utc_s, unpacked, **values, grid_m=None if grid_m is None else (grid_m[0], grid_m[1]))

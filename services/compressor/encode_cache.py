@@ -83,11 +83,11 @@ def _index(packed: bytes) -> list[str]:
 
 
 def _entry(packed: bytes) -> CachedImage:
-    image, snippet, *ids = msgpack.unpackb(packed)
+    image, snippet, expanded_id, original_id = msgpack.unpackb(packed)
     # A damaged record is discarded with its entry.
     wire.decode(EncodedImage, image, "cached image")
     wire.decode(Snippet, snippet, "cached snippet")
-    return CachedImage(image, snippet, *map(str, ids))
+    return CachedImage(image, snippet, str(expanded_id), str(original_id))
 
 
 def entry_location(image_id: str) -> str:

@@ -1,4 +1,4 @@
-"""Samples of every record type: the golden vectors of `tests/golden/zenoh`, older ones included."""
+"""Samples of every record type: the golden vectors of `tests/golden/zenoh`."""
 
 from __future__ import annotations
 

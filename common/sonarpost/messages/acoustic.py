@@ -41,7 +41,7 @@ class AcousticFrame(Record):
         frame_count: Frames of the packet. None if the modem did not report it.
         data: Content of the frame, padding included.
         quality: Measurements of the packet. None if there are none.
-        airtime_s: Nominal duration of the packet. None if the rate is not known, and in version 1.
+        airtime_s: Nominal duration of the packet. None if the rate is not known.
     """
 
     TYPE: ClassVar[str] = "acoustic_frame"

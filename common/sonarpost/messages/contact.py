@@ -122,8 +122,7 @@ class Contact(Record):
         pixel_along_m: Size of a pixel of the image, along-track.
         pixel_across_m: Size of a pixel of the image, across-track.
         p_mine_like: Probability that the contact is a mine-like object, together with `p_other_object`; their sum is
-            at most 1. None: not classified, and in records of earlier versions. The acoustic link rounds both to
-            multiples of 0.05.
+            at most 1. None: not classified. The acoustic link rounds both to multiples of 0.05.
         p_other_object: Probability that it is another object on the seabed. The rest is the probability that there is
             seabed alone.
     """

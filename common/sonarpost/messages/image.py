@@ -109,8 +109,7 @@ class ReceivedImage(Record):
         conflicts: Frames that contradict others of this image.
         first_frame_utc_s: Arrival of the first frame, by the vessel's clock.
         last_frame_utc_s: Arrival of the last frame that contributed.
-        authenticated: Whether all acoustic frames that contributed were authenticated with a key. None: not known, in
-            records of earlier versions.
+        authenticated: Whether all acoustic frames that contributed were authenticated with a key. None: not known.
     """
 
     TYPE: ClassVar[str] = "received_image"
@@ -303,10 +302,9 @@ class ReconstructedImage(Record):
         first_frame_utc_s: Arrival of the first frame, by the vessel's clock.
         last_frame_utc_s: Arrival of the last frame.
         notes: Remarks for the operator about this image.
-        authenticated: Whether all acoustic frames that contributed were authenticated with a key. None: not known, in
-            records of earlier versions.
+        authenticated: Whether all acoustic frames that contributed were authenticated with a key. None: not known.
         despeckle_strength: Strength with which the vehicle removed speckle before coding, 0 for none. None: not known,
-            with codecs without despeckling and in records of earlier versions.
+            as with codecs without despeckling.
     """
 
     TYPE: ClassVar[str] = "reconstructed_image"

@@ -47,7 +47,5 @@ class Record(BaseModel):
 
     TYPE: ClassVar[str] = ""
     VERSION: ClassVar[int] = 1
-    OLDEST: ClassVar[int] = 1
-    """Oldest schema version that decodes: a valid record of it is a valid record of `VERSION`."""
     # Whether the wire omits fields with their default value; for records of thin links.
     SPARSE: ClassVar[bool] = False

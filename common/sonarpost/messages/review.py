@@ -59,7 +59,7 @@ class Decision(Record):
         operator: Name of the operator.
         decided_utc_s: Time of the decision.
         withdraws: Decision on the same image that this record takes back; it repeats the verdict before that one,
-            `unsure` if there was none. None if the record is a decision, and in records of earlier versions.
+            `unsure` if there was none. None if the record is a decision.
         overrules: Decisions of other operators on the same image that this one replaces.
     """
 

@@ -24,7 +24,7 @@ from sonarpost.detection.settings import DetectorTuning
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamEnd
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import StoredEnd, pack, unpack
-from sonarpost.services.atd_stub.survey_detection import detect_in_survey, snippets_of
+from sonarpost.services.atd_stub.survey_detection import detect_in_survey
 from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Side
@@ -142,7 +142,8 @@ def test_a_file_end_is_restored_from_the_store(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda fields: fields | {"format": 3}, "format: got 3, expected 1 or 2"),
+        (lambda fields: fields | {"format": 3}, "format: got 3, expected 2"),
+        (lambda fields: fields | {"format": 1}, "format: got 1, expected 2"),
         (lambda fields: {"format": 2}, "content: got KeyError"),
         (lambda fields: fields | {"origins": [[7, 0]]}, "content: got IndexError"),
         (lambda fields: fields | {"held": [[1]]}, "got"),
@@ -158,56 +159,27 @@ def test_an_unreadable_file_end_is_one_error(change, message):
 FIRST, SECOND = FileOrigin("0a" * 32, "line-0.xtf", "line-0"), FileOrigin("1b" * 32, "line-1.xtf", "line-1")
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_a_stored_file_end_is_read_and_one_of_format_2_written_unchanged(version):
-    packed = bytes.fromhex((GOLDEN / f"seam-format-{version}.hex").read_text())
+def test_a_stored_file_end_is_read_and_written_unchanged():
+    packed = bytes.fromhex((GOLDEN / "seam-format-2.hex").read_text())
     stored = unpack(packed)
-    ground_m = {1: ((12.5, 12.5), (11.25, 11.25)), 2: ((12.0, 14.25), (11.0, 13.5))}[version]
-    first_pings = {1: (0, 1), 2: (98, 99)}[version]
-    held = DetectionPlace(Side.STARBOARD, 1, 0, 3, 12.5, *ground_m[0], 0.125)
+    held = DetectionPlace(Side.STARBOARD, 1, 0, 3, 12.5, 12.0, 14.25, 0.125)
     assert stored.hold_until_utc_s == 1.0e9 + 30.0
     assert replace(stored.end, pings=()) == StreamEnd(
         sonar_id="made",
         pings=(),
-        origins=(*(PingOrigin(FIRST, number) for number in first_pings), PingOrigin(SECOND, 0)),
+        origins=(PingOrigin(FIRST, 98), PingOrigin(FIRST, 99), PingOrigin(SECOND, 0)),
         open_row=1,
-        reported=(DetectionPlace(Side.PORT, -2, -5, 1, 11.25, *ground_m[1], 0.2),),
-        held=(StreamContact(PingOrigin(FIRST, first_pings[1]), held, b"\x81a snippet's payload"),),
+        reported=(DetectionPlace(Side.PORT, -2, -5, 1, 11.25, 11.0, 13.5, 0.2),),
+        held=(StreamContact(PingOrigin(FIRST, 99), held, b"\x81a snippet's payload"),),
     )
     pings = stored.end.pings
     assert [ping.number for ping in pings] == [98, 99, 100]
-    assert [ping.grid_m for ping in pings] == [None, None, (500_000.25, 6_651_000.5) if version == 2 else None]
+    assert [ping.grid_m for ping in pings] == [None, None, (500_000.25, 6_651_000.5)]
     assert (pings[0].pitch_deg, pings[0].roll_deg, pings[1].lat_deg) == (0.5, -0.25, None)
     starboard = pings[2].channel(Side.STARBOARD)
     assert (starboard.frequency_hz, starboard.scale, starboard.samples.dtype) == (600e3, 0.5, np.uint16)
     np.testing.assert_array_equal(starboard.samples, [7, 8, 65535])
-    if version == 2:
-        assert pack(stored) == packed
-    else:
-        assert replace(unpack(pack(stored)).end, pings=()) == replace(stored.end, pings=())
-
-
-def test_a_file_after_an_upgrade_continues_a_file_end_of_format_1(tmp_path):
-    """The file end of the earlier version holds a contact; the continuation file gives it once."""
-    first, second = split(tmp_path, survey_of(240, Box(120)), (0, 119), (119, 240))
-    before = detect_in_survey(first, "0" * 64, "uuv-1", HOLDING)
-    [end] = before.ends.values()
-    fields = msgpack.unpackb(pack(StoredEnd(end, 130.0)))
-    places = [(place, content) for place, content in fields.pop("held")]
-    old = fields | {
-        "format": 1,
-        "file_of": [number for number, _ in fields.pop("origins")],
-        "pings": [ping[:-1] for ping in fields["pings"]],
-        "looks": [[*place[:5], place[7], held] for place, held in places]
-        + [[*place[:5], place[7], None] for place in fields.pop("reported")],
-    }
-    migrated = unpack(msgpack.packb(old)).end
-    result = detect_in_survey(second, "1" * 64, "uuv-1", HOLDING, {"made": migrated})
-    assert before.held
-    assert result.joined
-    held = [snippet for end in result.ends.values() for snippet in snippets_of(end.held)]
-    assert len(near([*result.snippets, *held], 120)) == 1
-    assert result.replaced == tuple(s.contact.contact_id for s in before.held)
+    assert pack(stored) == packed
 
 
 # The service

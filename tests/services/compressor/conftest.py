@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from itertools import count
 
-import msgpack
 import pytest
 from builders.common import eventually
 from builders.records import command_record
@@ -109,19 +108,6 @@ def command_over_the_link(runner, modem):
         return modem.received[before]
 
     return send
-
-
-@pytest.fixture
-def change_cached(modem):
-    """Change the cache entry of the first image in the service's store."""
-
-    def change(service, new_entry):
-        name = f"kept/{modem.received[0].image_id}"
-        entry = new_entry(msgpack.unpackb(service.store.get_state(name)))
-        with service.store.transaction() as tx:
-            tx.put_state(name, msgpack.packb(entry))
-
-    return change
 
 
 @pytest.fixture(scope="session")

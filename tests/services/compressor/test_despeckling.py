@@ -136,15 +136,3 @@ def test_images_of_another_strength_are_resent_and_refined(
     assert strength_of(longer) == before
     assert (longer.codec, longer.model) == (first.codec, first.model)
     assert service.health().counters["images_refined"] == 1
-
-
-def test_a_cache_entry_without_an_original_id_is_read(start_service, encoded, change_cached, answer, snippet):
-    service = start_service(**EMB)
-    [image] = encoded(snippet("c1", 64, 64))
-
-    def without_the_last(entry):
-        assert len(entry) == 4
-        return entry[:3]
-
-    change_cached(service, without_the_last)
-    assert strength_of(answer("original", image.image_id)) == 0.0

@@ -111,10 +111,3 @@ def test_pixel_sizes_above_the_range_of_the_record_are_unknown(expandable_snippe
     expanded = expand(expandable_snippet("c1", pixel_along_m=60.0, pixel_across_m=None))
     assert (expanded.contact.pixel_along_m, expanded.contact.pixel_across_m) == (None, None)
     assert expanded.wide is None
-
-
-def test_a_cache_entry_without_an_expanded_id_is_sent(start_service, encoded, change_cached, answer, snippet):
-    service = start_service()
-    [image] = encoded(snippet("c1"))
-    change_cached(service, lambda entry: entry[:2])
-    assert answer("resend", image.image_id) == image
