@@ -159,27 +159,32 @@ class C2Service(Service[C2Config]):
         self._is_known(vessel, key, record)
         return None
 
-    def expand(self, tx: Transaction, key: str, payload: bytes) -> bytes:
+    def expand(self, tx: Transaction, key: str, payload: bytes, record: Record) -> bytes:
         """Return the whole image of a difference; store it, because the vessel sends later differences to it.
 
         Raises:
             MissingBaseError: The version to which it is the difference is not known.
         """
-        if not image_parts.is_part(key):
+        if isinstance(record, CodedImage):
+            vehicle, image, first_frame_utc_s = record.vehicle_id, record.image_id, record.first_frame_utc_s
+            version = record.version
+        elif isinstance(record, ImagePart):
+            vehicle, image, first_frame_utc_s, version = record.u, record.i, record.t, record.n
+        else:
             return payload
-        prefix = f"{VERSIONS}{keys.part_vessel(key)}/"
-        part = image_parts.head_of(payload)
-        name = prefix + part.subject
-        if part.version == 1:
+        vessel = keys.part_vessel(key)
+        prefix = f"{VERSIONS}{vessel}/"
+        name = prefix + image_parts.subject(vehicle, image, first_frame_utc_s)
+        if version == 1:
             tx.add_state(name, payload)  # a stored one is the same version or a later one
             self._prune_versions(tx, prefix)
             return payload
         known = image_parts.stored_version(tx.get_state(name), name)
-        if part.base:
-            whole = image_parts.expand(wire.decode(ImagePart, payload, key), known, key)
-            image_parts.coded_image(whole, keys.part_vessel(key), key)
+        if isinstance(record, ImagePart):
+            whole = image_parts.expand(record, known, key)
+            image_parts.coded_image(whole, vessel, key)
             payload = wire.encode(whole)
-        if known is None or known.n < part.version:
+        if known is None or known.n < version:
             tx.put_state(name, payload)
             self._prune_versions(tx, prefix)
         return payload

@@ -511,7 +511,7 @@ def test_error_of_the_database_quarantines_no_record(begin, ask, monkeypatch):
     consumer = begin()
     fails = [True]
 
-    def expand(tx, key, payload):
+    def expand(tx, key, payload, record):
         if fails.pop() if fails else False:
             raise sqlite3.OperationalError("database or disk is full")
         return payload

@@ -251,11 +251,6 @@ def subject(vehicle_id: str, image_id: str, first_frame_utc_s: float) -> str:
     return f"{vehicle_id}/{image_id}/{float(first_frame_utc_s)!r}"
 
 
-def is_part(key: str) -> bool:
-    """Return whether a key of an inbox is that of coded images."""
-    return key.endswith("/part")
-
-
 def stored_version(value: bytes | None, name: str) -> ImagePart | None:
     """Return the version that a store keeps under a name; None for none, or if it cannot be read."""
     try:

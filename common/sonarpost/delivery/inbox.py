@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import zenoh
 from zenoh.handlers import Callback
@@ -37,6 +38,8 @@ from sonarpost.errors import (
 from sonarpost.logs import kv, log_context
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 COMMIT_MESSAGES = 64
 COMMIT_ATTACHMENT_BYTES = 65_536
@@ -68,7 +71,7 @@ def _wait(_key: str, _payload: bytes) -> bool:
     return False
 
 
-class Inbox:
+class Inbox(Generic[T]):
     """Receives the records of one consumer: delivery queries, and plain publications of third-party programs.
 
     A publication with an attachment is a copy for subscribers and is ignored; its record arrives by query. One without
@@ -80,10 +83,12 @@ class Inbox:
         store: Store for the accepted records.
         consumer: Name of the consumer.
         key_expressions: Keys of the records.
-        validate: Called with (key, payload) before a record is stored; raises BadInputError to refuse it.
+        validate: Called with (key, payload) before a record is stored; returns the decoded record, or raises
+            BadInputError to refuse it.
         on_refused: Called with each error that caused a record to be refused.
-        expand: Called with a valid record in the transaction that accepts it; returns the payload to store in its
-            place. Raises MissingBaseError to refuse a difference, which its producer then sends as a whole.
+        expand: Called with (transaction, key, payload, record) in the transaction that accepts a valid record; returns
+            the payload to store in its place. Raises MissingBaseError to refuse a difference, which its producer then
+            sends as a whole.
         check_capacity: Called with the key before a record is stored; raises RetryLaterError if there is no space.
         delivery_only_keys: Key expressions on which plain publications are ignored.
         before_commit: Called with the accepted records, as key and payload, before they are committed and acknowledged;
@@ -100,10 +105,10 @@ class Inbox:
         store: Store,
         consumer: str,
         key_expressions: tuple[str, ...],
-        validate: Callable[[str, bytes], None],
+        validate: Callable[[str, bytes], T],
         on_refused: Callable[[BadInputError], None],
         *,
-        expand: Callable[[Transaction, str, bytes], bytes] = lambda _tx, _key, payload: payload,
+        expand: Callable[[Transaction, str, bytes, T], bytes] = lambda _tx, _key, payload, _record: payload,
         check_capacity: Callable[[str], None] = lambda _: None,
         delivery_only_keys: Collection[str] = (),
         before_commit: Callable[[Sequence[tuple[str, bytes]]], None] = lambda _: None,
@@ -326,8 +331,8 @@ class Inbox:
     def _store_record(self, tx: Transaction, key: str, payload: bytes, chunk: ReceivedChunk | None) -> AckReply:
         with log_context(payload):
             try:
-                self._validate(key, payload)
-                stored = self._expand(tx, key, payload)
+                record = self._validate(key, payload)
+                stored = self._expand(tx, key, payload, record)
             except (DeliveryError, sqlite3.Error):
                 raise
             except MissingBaseError as error:

@@ -113,7 +113,7 @@ class Service(ABC, Generic[C]):
         self._record_type = lru_cache(TYPES_KEPT)(self._find_record_type)
         self._degraded = self._router_failure = ""
         self._session: zenoh.Session | None = None
-        self._inbox: Inbox | None = None
+        self._inbox: Inbox[Record] | None = None
         self._outbox: Outbox | None = None
         self._token: zenoh.LivelinessToken | None = None
         self._threads: list[threading.Thread] = []
@@ -191,8 +191,14 @@ class Service(ABC, Generic[C]):
         """Return the settings with which an outbox queue is sent."""
         return QueuePolicy(publish=self.PUBLISH)
 
-    def expand(self, tx: Transaction, key: str, payload: bytes) -> bytes:
+    def expand(self, tx: Transaction, key: str, payload: bytes, record: Record) -> bytes:
         """Return the payload to store for a valid record, in the transaction that accepts it; by default its own.
+
+        Args:
+            tx: The open transaction.
+            key: Key of the record.
+            payload: Its payload.
+            record: The decoded record, or what `validate` has returned in its place.
 
         Raises:
             MissingBaseError: The record is a difference to a version that is not known; its producer sends the whole.
@@ -333,11 +339,12 @@ class Service(ABC, Generic[C]):
                 return record_type
         raise BadInputError(key, "", key, "a key this service consumes: " + ", ".join(self.consumed_keys()))
 
-    def _check_payload(self, key: str, payload: bytes) -> None:
+    def _check_payload(self, key: str, payload: bytes) -> Record:
         record = wire.decode(self._record_type(key), payload, key)
         record = self.validate(key, record) or record
         if len(self._checked) < MAX_CHECKED and len(payload) <= MAX_CHECKED_BYTES:
             self._checked[key, payload] = record
+        return record
 
     def _refused(self, error: BadInputError) -> None:
         self.count("records_refused")
