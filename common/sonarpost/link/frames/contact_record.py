@@ -13,14 +13,17 @@ from __future__ import annotations
 import math
 import struct
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from operator import attrgetter, itemgetter
-from typing import Any, Final, get_args
+from typing import Any, Final, TypeVar, get_args
 
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX
 from sonarpost.errors import FrameError
 from sonarpost.messages import PROBABILITY_TOLERANCE, AtdClass, Contact
 from sonarpost.sonar.survey import Side
+
+T = TypeVar("T")
 
 RECORD_SIZE = 25
 
@@ -59,9 +62,27 @@ _PROBABILITIES: Final = tuple(
     for other_object in range(_PROBABILITY_STEPS + 1 - mine_like)
 )
 """The 231 pairs of p_mine_like and p_other_object, by their code."""
-_PROBABILITY_CODES: Final = {pair: code for code, pair in enumerate(_PROBABILITIES)}
 _LAT_BITS, _LON_BITS = 29, 30
 _LAT_SHIFT, _WIDTH_SHIFT, _HEIGHT_SHIFT, _PROBABILITY_SHIFT, _CLASS_SHIFT = 30, 59, 68, 77, 85
+
+# Values by their code of one byte; the last code means unknown.
+_CONFIDENCES: Final = (*(code / _CONFIDENCE_STEPS for code in range(_UNKNOWN_U8)), None)
+_HEADINGS_DEG: Final = (*(code * 360 / _HEADING_STEPS for code in range(_UNKNOWN_U8)), None)
+_ALTITUDES_M: Final = (*(code / _ALTITUDE_STEPS for code in range(_UNKNOWN_U8)), None)
+_PIXELS_M: Final = (*(_PIXEL_MIN_M * math.exp2(code / _PIXEL_STEPS_PER_OCTAVE) for code in range(_UNKNOWN_U8)), None)
+_SIGMAS_M: Final = (*(_SIGMA_MIN_M * math.exp2(code / _SIGMA_STEPS_PER_OCTAVE) for code in range(_UNKNOWN_U8)), None)
+
+
+def _codes(values: Sequence[object]) -> dict[object, int]:
+    return {value: code for code, value in enumerate(values)}
+
+
+_CLASS_CODES, _PROBABILITY_CODES = _codes(_CLASSES), _codes(_PROBABILITIES) | {(None, None): _UNKNOWN_U8}
+_CONFIDENCE_CODES, _HEADING_CODES, _ALTITUDE_CODES = map(_codes, (_CONFIDENCES, _HEADINGS_DEG, _ALTITUDES_M))
+_PIXEL_CODES, _SIGMA_CODES = map(_codes, (_PIXELS_M, _SIGMAS_M))
+_DEGREE_CODES: Final = range(-180 * _DEGREE_STEPS, 180 * _DEGREE_STEPS + 1)
+_TIME_CODES, _DEPTH_CODES, _RANGE_CODES = range(_UNKNOWN_U32), range(_UNKNOWN_U16), range(_LAST_RANGE + 1)
+_SIDE_CODES: Final = {"port": 0, "starboard": _STARBOARD_BIT}
 
 _SIDES: Final = (None, *Side)
 _LARGEST: Final = sys.float_info.max
@@ -161,7 +182,26 @@ class ContactSummary:
 
     def pack(self) -> bytes:
         """Return the 25 bytes."""
-        return _pack(*_values_of(self))
+        steps = _CLASSIFIED_DEGREE_STEPS if self.is_classified else _DEGREE_STEPS
+        head = _head(
+            self.height_px,
+            self.width_px,
+            None if self.lat_deg is None else round(self.lat_deg * steps),
+            None if self.lon_deg is None else round(self.lon_deg * steps),
+            _CLASS_CODES[self.atd_class],
+            _probability_code(self.p_mine_like, self.p_other_object),
+        )
+        return head + _TAIL.pack(
+            _UNKNOWN_U32 if self.time_utc_s is None else round(self.time_utc_s),
+            _linear_code(self.confidence, _CONFIDENCE_STEPS, _LAST_U8, _UNKNOWN_U8),
+            _heading_code(self.heading_deg),
+            _linear_code(self.altitude_m, _ALTITUDE_STEPS, _LAST_U8, _UNKNOWN_U8),
+            _linear_code(self.depth_m, _DEPTH_STEPS, _UNKNOWN_U16 - 1, _UNKNOWN_U16),
+            _side_range_code(self.side, self.ground_range_m),
+            _pixel_code(self.pixel_along_m),
+            _pixel_code(self.pixel_across_m),
+            _sigma_code(self.position_sigma_m),
+        )
 
     @classmethod
     def unpack(cls, data: bytes, where: str = _WHERE) -> ContactSummary:
@@ -182,7 +222,6 @@ _SIGMA_INDEX: Final = [field.name for field in fields(ContactSummary)].index("po
 _CONTACT_NAMES: Final = {"confidence": "atd_confidence", "side": "channel"}
 _CARRIED_FIELDS: Final = tuple(_CONTACT_NAMES.get(field.name, field.name) for field in fields(ContactSummary)[2:])
 """Fields of `Contact` that the record carries, in the order of the fields of `ContactSummary` after the size."""
-_carried = itemgetter(*_CARRIED_FIELDS)
 _OTHER_FIELDS: Final = sorted(Contact.model_fields.keys() - {"contact_id", "vehicle_id", *_CARRIED_FIELDS})
 _others = itemgetter(*_OTHER_FIELDS)
 _NO_OTHERS: Final = (None,) * len(_OTHER_FIELDS)
@@ -201,7 +240,28 @@ def summary_of(contact: Contact, height_px: int | None, width_px: int | None) ->
     Raises:
         FrameError: A side of the image is out of range.
     """
-    return ContactSummary(*_summary_values(contact, height_px, width_px))
+    has_size = height_px is not None and width_px is not None
+    time_utc_s = contact.time_utc_s
+    has_fix = contact.lat_deg is not None and contact.lon_deg is not None
+    return ContactSummary(
+        height_px=height_px if has_size else None,
+        width_px=width_px if has_size else None,
+        lat_deg=contact.lat_deg if has_fix else None,
+        lon_deg=contact.lon_deg if has_fix else None,
+        time_utc_s=time_utc_s if time_utc_s is not None and time_utc_s <= _UNKNOWN_U32 - 1 else None,
+        confidence=contact.atd_confidence,
+        heading_deg=contact.heading_deg,
+        altitude_m=contact.altitude_m,
+        depth_m=contact.depth_m,
+        side=Side(contact.channel) if contact.channel else None,
+        ground_range_m=contact.ground_range_m if contact.channel else None,
+        pixel_along_m=contact.pixel_along_m,
+        pixel_across_m=contact.pixel_across_m,
+        position_sigma_m=contact.position_sigma_m if has_fix else None,
+        atd_class=atd_class_of(contact.atd_class),
+        p_mine_like=contact.p_mine_like,
+        p_other_object=contact.p_other_object,
+    )
 
 
 def exact_record(contact: Contact, height_px: int | None, width_px: int | None) -> bytes:
@@ -209,13 +269,34 @@ def exact_record(contact: Contact, height_px: int | None, width_px: int | None) 
 
     The identifiers of the contact are not compared.
     """
-    for side in (height_px, width_px):
-        if side is not None and not MIN_SIDE_PX <= side <= MAX_SIDE_PX:
-            return b""
-    if _others(vars(contact)) != _NO_OTHERS:
+    side, ground_range_m = contact.channel, contact.ground_range_m
+    if _others(vars(contact)) != _NO_OTHERS or (side is None and ground_range_m is not None):
         return b""
-    packed = _pack(*_summary_values(contact, height_px, width_px))
-    return packed if _unpack(packed, _WHERE) == (height_px, width_px, *_carried(vars(contact))) else b""
+    steps = _DEGREE_STEPS if contact.atd_class is None and contact.p_mine_like is None else _CLASSIFIED_DEGREE_STEPS
+    try:
+        _check_size_and_fix(height_px, width_px, contact.lat_deg, contact.lon_deg, contact.position_sigma_m)
+        head = _head(
+            height_px,
+            width_px,
+            _exact_code(contact.lat_deg, steps, _DEGREE_CODES, None),
+            _exact_code(contact.lon_deg, steps, _DEGREE_CODES, None),
+            _CLASS_CODES[contact.atd_class],
+            _PROBABILITY_CODES[contact.p_mine_like, contact.p_other_object],
+        )
+        range_code = _exact_code(ground_range_m, _RANGE_STEPS, _RANGE_CODES, _RANGE_UNKNOWN)
+        return head + _TAIL.pack(
+            _exact_code(contact.time_utc_s, 1, _TIME_CODES, _UNKNOWN_U32),
+            _CONFIDENCE_CODES[contact.atd_confidence],
+            _HEADING_CODES[contact.heading_deg],
+            _ALTITUDE_CODES[contact.altitude_m],
+            _exact_code(contact.depth_m, _DEPTH_STEPS, _DEPTH_CODES, _UNKNOWN_U16),
+            _SIDE_UNKNOWN if side is None else _SIDE_CODES[side] | range_code,
+            _PIXEL_CODES[contact.pixel_along_m],
+            _PIXEL_CODES[contact.pixel_across_m],
+            _SIGMA_CODES[contact.position_sigma_m],
+        )
+    except (FrameError, KeyError):
+        return b""
 
 
 def contact_of(summary: ContactSummary, vehicle_id: str, image_id: str) -> Contact:
@@ -247,78 +328,29 @@ def _contact(values: tuple[Any, ...], vehicle_id: str, image_id: str) -> Contact
     return Contact.model_validate({"contact_id": f"{vehicle_id}/{image_id}", "vehicle_id": vehicle_id, **carried})
 
 
-def _summary_values(contact: Contact, height_px: int | None, width_px: int | None) -> tuple[Any, ...]:
-    has_size = height_px is not None and width_px is not None
-    time_utc_s = contact.time_utc_s
-    has_fix = contact.lat_deg is not None and contact.lon_deg is not None
-    return (
-        height_px if has_size else None,
-        width_px if has_size else None,
-        contact.lat_deg if has_fix else None,
-        contact.lon_deg if has_fix else None,
-        time_utc_s if time_utc_s is not None and time_utc_s <= _UNKNOWN_U32 - 1 else None,
-        contact.atd_confidence,
-        contact.heading_deg,
-        contact.altitude_m,
-        contact.depth_m,
-        Side(contact.channel) if contact.channel else None,
-        contact.ground_range_m if contact.channel else None,
-        contact.pixel_along_m,
-        contact.pixel_across_m,
-        contact.position_sigma_m if has_fix else None,
-        atd_class_of(contact.atd_class),
-        contact.p_mine_like,
-        contact.p_other_object,
-    )
-
-
-def _pack(
+def _head(
     height_px: int | None,
     width_px: int | None,
-    lat_deg: float | None,
-    lon_deg: float | None,
-    time_utc_s: float | None,
-    confidence: float | None,
-    heading_deg: float | None,
-    altitude_m: float | None,
-    depth_m: float | None,
-    side: Side | None,
-    ground_range_m: float | None,
-    pixel_along_m: float | None,
-    pixel_across_m: float | None,
-    position_sigma_m: float | None,
-    atd_class: AtdClass | None,
-    p_mine_like: float | None,
-    p_other_object: float | None,
+    lat_code: int | None,
+    lon_code: int | None,
+    class_code: int,
+    probability_code: int,
 ) -> bytes:
-    """Return the 25 bytes for the values of the fields of `ContactSummary`, in their order."""
-    if atd_class is not None or p_mine_like is not None:
-        head = (
-            1 << 8 * _HEAD_BYTES - 1
-            | _CLASSES.index(atd_class) << _CLASS_SHIFT
-            | _probability_code(p_mine_like, p_other_object) << _PROBABILITY_SHIFT
-            | (0 if height_px is None else height_px - 1) << _HEIGHT_SHIFT
-            | (0 if width_px is None else width_px - 1) << _WIDTH_SHIFT
-            | _degree_code(lat_deg, _LAT_BITS) << _LAT_SHIFT
-            | _degree_code(lon_deg, _LON_BITS)
-        ).to_bytes(_HEAD_BYTES, "big")
-    else:
-        head = _PLAIN_HEAD.pack(
-            (0 if height_px is None or width_px is None else height_px << 12 | width_px).to_bytes(3, "big"),
-            _NO_FIX if lat_deg is None else round(lat_deg * _DEGREE_STEPS),
-            _NO_FIX if lon_deg is None else round(lon_deg * _DEGREE_STEPS),
-        )
-    return head + _TAIL.pack(
-        _UNKNOWN_U32 if time_utc_s is None else round(time_utc_s),
-        _linear_code(confidence, _CONFIDENCE_STEPS, _LAST_U8, _UNKNOWN_U8),
-        _heading_code(heading_deg),
-        _linear_code(altitude_m, _ALTITUDE_STEPS, _LAST_U8, _UNKNOWN_U8),
-        _linear_code(depth_m, _DEPTH_STEPS, _UNKNOWN_U16 - 1, _UNKNOWN_U16),
-        _side_range_code(side, ground_range_m),
-        _pixel_code(pixel_along_m),
-        _pixel_code(pixel_across_m),
-        _sigma_code(position_sigma_m),
+    """Return the first 11 bytes; the codes of the position have the steps of the layout."""
+    if class_code == 0 and probability_code == _UNKNOWN_U8:
+        size = 0 if height_px is None or width_px is None else height_px << 12 | width_px
+        fix = (_NO_FIX if code is None else code for code in (lat_code, lon_code))
+        return _PLAIN_HEAD.pack(size.to_bytes(3, "big"), *fix)
+    packed = (
+        1 << 8 * _HEAD_BYTES - 1
+        | class_code << _CLASS_SHIFT
+        | probability_code << _PROBABILITY_SHIFT
+        | (0 if height_px is None else height_px - 1) << _HEIGHT_SHIFT
+        | (0 if width_px is None else width_px - 1) << _WIDTH_SHIFT
+        | _field_of(lat_code, _LAT_BITS) << _LAT_SHIFT
+        | _field_of(lon_code, _LON_BITS)
     )
+    return packed.to_bytes(_HEAD_BYTES, "big")
 
 
 def _unpack(data: bytes, where: str) -> tuple[Any, ...]:
@@ -331,14 +363,14 @@ def _unpack(data: bytes, where: str) -> tuple[Any, ...]:
     return (
         *size_and_fix,
         None if time == _UNKNOWN_U32 else float(time),
-        None if confidence == _UNKNOWN_U8 else confidence / _CONFIDENCE_STEPS,
-        None if heading == _UNKNOWN_U8 else heading * 360 / _HEADING_STEPS,
-        None if altitude == _UNKNOWN_U8 else altitude / _ALTITUDE_STEPS,
+        _CONFIDENCES[confidence],
+        _HEADINGS_DEG[heading],
+        _ALTITUDES_M[altitude],
         None if depth == _UNKNOWN_U16 else depth / _DEPTH_STEPS,
         *_side_range_value(side_range),
-        _pixel_value(along),
-        _pixel_value(across),
-        None if sigma == _UNKNOWN_U8 else _SIGMA_MIN_M * math.exp2(sigma / _SIGMA_STEPS_PER_OCTAVE),
+        _PIXELS_M[along],
+        _PIXELS_M[across],
+        _SIGMAS_M[sigma],
         *classes,
     )
 
@@ -406,10 +438,9 @@ def _probability_code(p_mine_like: float | None, p_other_object: float | None) -
     return _PROBABILITY_CODES[mine_like / _PROBABILITY_STEPS, other_object / _PROBABILITY_STEPS]
 
 
-def _degree_code(degrees: float | None, bits: int) -> int:
-    """Return the two's complement of a latitude or longitude; the lowest value means unknown."""
-    code = -(1 << bits - 1) if degrees is None else round(degrees * _CLASSIFIED_DEGREE_STEPS)
-    return code & (1 << bits) - 1
+def _field_of(code: int | None, bits: int) -> int:
+    """Return the two's complement of the code of a latitude or longitude; the lowest value means unknown."""
+    return (-(1 << bits - 1) if code is None else code) & (1 << bits) - 1
 
 
 def _degree_value(code: int, bits: int) -> float | None:
@@ -427,6 +458,20 @@ def _linear_code(value: float | None, steps_per_unit: int, last: int, unknown: i
         return unknown
     code = round(scaled)
     return code if 0 <= code <= last else unknown
+
+
+def _exact_code(value: float | None, steps_per_unit: int, codes: range, unknown: T) -> int | T:
+    """Return the code that represents a value exactly.
+
+    Raises:
+        KeyError: There is none.
+    """
+    if value is None:
+        return unknown
+    code = round(value * steps_per_unit)
+    if code not in codes or code / steps_per_unit != value:
+        raise KeyError(value)
+    return code
 
 
 def _heading_code(heading_deg: float | None) -> int:
@@ -457,10 +502,6 @@ def _pixel_code(size_m: float | None) -> int:
         return _UNKNOWN_U8
     code = round(_PIXEL_STEPS_PER_OCTAVE * (math.log2(size_m) - math.log2(_PIXEL_MIN_M)))
     return code if 0 <= code <= _LAST_U8 else _UNKNOWN_U8
-
-
-def _pixel_value(code: int) -> float | None:
-    return None if code == _UNKNOWN_U8 else _PIXEL_MIN_M * math.exp2(code / _PIXEL_STEPS_PER_OCTAVE)
 
 
 def _sigma_code(sigma_m: float | None) -> int:
