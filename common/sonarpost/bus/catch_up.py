@@ -136,7 +136,7 @@ class CatchUpSubscriber:
 
         Raises:
             QueryRefusedError: c2 does not accept the key or the cursor, for example after its archive was replaced.
-            BadInputError: A record has no number, because the c2 is of an earlier version, or one of another archive.
+            BadInputError: A record has no number, or one of another archive.
         """
         query_at_s = time.monotonic()
         while not self._closed:
