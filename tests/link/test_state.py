@@ -122,6 +122,7 @@ def test_error_of_a_nested_value_names_the_field(change: dict[str, object]) -> N
         (msgpack.packb([]), "format version"),
         (msgpack.packb([True, *plain()]), "format version"),
         (msgpack.packb([FORMAT_VERSION + 1, *plain()]), "format version"),
+        (msgpack.packb([FORMAT_VERSION - 1, *plain()]), "format version: got 1, expected 2"),
         (msgpack.packb([FORMAT_VERSION, *plain(), 1]), "at most 7"),
     ],
 )
