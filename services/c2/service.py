@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 
 from sonarpost import keys, wire
 from sonarpost.archive import image_parts
@@ -63,6 +63,16 @@ VERSIONS = "version/"
 """Prefix of the states with the last accepted version of an image, to which vessels send differences."""
 CODEBOOKS = "codebooks"
 """Folder of state_dir with the codebooks of vessels."""
+
+
+@lru_cache(1024)
+def _relayed_types(vessel: str) -> Mapping[str, type[ReconstructedImage] | type[Decision] | type[ReceivedStatus]]:
+    """Return the types of the records in envelopes of a vessel, by their keys."""
+    return {
+        keys.image_reconstructed(vessel): ReconstructedImage,
+        keys.contact_decision(vessel): Decision,
+        keys.acoustic_status(vessel): ReceivedStatus,
+    }
 
 
 class C2Service(Service[C2Config]):
@@ -238,11 +248,7 @@ class C2Service(Service[C2Config]):
 
     def _unpack(self, envelope: Relayed) -> ReconstructedImage | Decision | ReceivedStatus:
         vessel = envelope.vessel_id
-        known: Mapping[str, type[ReconstructedImage] | type[Decision] | type[ReceivedStatus]] = {
-            keys.image_reconstructed(vessel): ReconstructedImage,
-            keys.contact_decision(vessel): Decision,
-            keys.acoustic_status(vessel): ReceivedStatus,
-        }
+        known = _relayed_types(vessel)
         record_type = known.get(envelope.key)
         if record_type is None:
             raise PayloadError(keys.shore_inbox(vessel, self.config.site), "key", envelope.key, " or ".join(known))
