@@ -138,9 +138,9 @@ def test_killed_process_continues_without_loss(vessel, start_service, compressor
     killed = tmp_path / "killed"
     killed.mkdir()
     path = service.store.path
+    received_before = len(vessel.frames)
     with closing(sqlite3.connect(path)) as source, closing(sqlite3.connect(killed / path.name)) as copy:
         source.backup(copy)
-    received_before = len(vessel.frames)
     runner.stop(service)
     time_of_stop = len(vessel.frames)
     again = start_service(service.platform.model_copy(update={"state_dir": killed}))
