@@ -1,14 +1,12 @@
 """`python -m research.fleet`: many vehicles over several vessels into one shore site, on one host.
 
-    python -m research.fleet [--vehicles 100] [--vessels 4] [--seconds 600] [--every 10] [--grow 10,30] [--pixels]
+    python -m research.fleet [--vehicles 100] [--vessels 4] [--seconds 600] [--every 10] [--grow 10,30]
     python -m research.fleet --accept 20000 [--dir DIR]
 
 Real processes, each with its own store: a router and a relay for each vessel, the router of the shore site, and c2,
 which writes the files of every image. Vehicles, acoustic channel and decompressor are replaced by one load process a
 vessel: it queues a coded image of 300 x 100 px and 200 bytes for the relay in its durable outbox, for each of its
-vehicles once every `--every` seconds at a random phase. With `--pixels`, a run with decoded images of 30 kB, as vessels
-of earlier versions send them, precedes each run, and the ratios of both are printed: compare runs only so, because
-other work on the host changes all figures.
+vehicles once every `--every` seconds at a random phase. Other work on the host changes all figures.
 
 All processes run on this host and share one clock. Both latencies of an image start when it is queued, before it is
 written to disk:
@@ -20,11 +18,10 @@ written to disk:
 With `--accept N`, c2 accepts N contacts of 200 coded bytes from the relays of two vessels, half from each, as fast as
 all processes can. A contact counts when c2 has committed it to its disk; the time starts with the first one. The
 decoders of c2 work behind the acceptance, with lower priority, on the same cores; the object states how many images
-they have stored when the last contact is accepted. There are three runs:
+they have stored when the last contact is accepted. There are two runs:
 
-- N / 20 decoded images as vessels of earlier versions send them. The relays start with the records in their inboxes:
-  their start and the preparation of the records for c2 are a part of the time (`senders_prepared` false);
-- N coded images in the same way;
+- The relays start with the records in their inboxes: their start and the preparation of the records for c2 are a part
+  of the time (`senders_prepared` false);
 - N coded images that the relays have prepared and queued for c2 before c2 starts (`senders_prepared` true): the rate of
   c2 and of the delivery to it, with less of the work of the vessels, which have their own processors.
 
@@ -47,7 +44,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -69,7 +66,7 @@ from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.store import Store
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.frames.contact_record import ContactSummary, contact_of
-from sonarpost.messages import CodedImage, Pixels, ReconstructedImage, Record
+from sonarpost.messages import CodedImage, ReconstructedImage, Record
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.stop_signals import EXIT_WITH_PARENT
 
@@ -83,7 +80,7 @@ SHAPE = (100, 300)
 
 
 class Load(Service[ServiceConfig]):
-    """Load of one vessel: an outbox with reconstructed images."""
+    """Load of one vessel: an outbox with coded images."""
 
     NAME = "load"
     PUBLISH = False
@@ -91,33 +88,6 @@ class Load(Service[ServiceConfig]):
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """No records are consumed."""
         raise NotImplementedError
-
-
-def noise_image(
-    vessel_id: str, vehicle_id: str, image_id: str, seed: int | Sequence[int], first_frame_utc_s: float
-) -> ReconstructedImage:
-    """Return a completely received image of noise, which is not compressible; the same seed gives the same pixels."""
-    pixels = Pixels.from_array(np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8))
-    return ReconstructedImage(
-        vessel_id=vessel_id,
-        vehicle_id=vehicle_id,
-        image_id=image_id,
-        version=1,
-        contact=None,
-        codec="vq",
-        model="",
-        picture=pixels,
-        picture_sha256=pixels.sha256,
-        complete=True,
-        missing_fraction=0.0,
-        missing_mask=b"",
-        missing_halves=(),
-        bytes_received=232,
-        bytes_total=232,
-        frames_received=6,
-        first_frame_utc_s=first_frame_utc_s,
-        last_frame_utc_s=first_frame_utc_s,
-    )
 
 
 @cache
@@ -173,11 +143,6 @@ def coded_image(vessel: str, vehicle: int, number: int, now_utc_s: float, stream
     )
 
 
-def new_image(vessel: str, vehicle: int, number: int, now_utc_s: float) -> ReconstructedImage:
-    """Return an image of noise, 30 kB, different for every vehicle and number."""
-    return noise_image(vessel, f"uuv-{vehicle}", f"{number:04X}", [vehicle, number], now_utc_s)
-
-
 def run_load(
     endpoint: str,
     folder: Path,
@@ -185,13 +150,10 @@ def run_load(
     vehicles: Sequence[int],
     seconds: float,
     every_s: float,
-    *,
-    is_coded: bool,
 ) -> None:
     """Queue images for a time, then wait until the relay has accepted them; print their number."""
-    key = keys.image_coded(vessel) if is_coded else keys.image_reconstructed(vessel)
-    make: Callable[[str, int, int, float], Record] = coded_image if is_coded else new_image
-    make(vessel, vehicles[0], 0, 0.0)  # prepares the streams before the time starts
+    key = keys.image_coded(vessel)
+    coded_image(vessel, vehicles[0], 0, 0.0)  # prepares the streams before the time starts
     platform = PlatformConfig(id=vessel, router=(endpoint,), state_dir=folder / vessel, health_interval_s=60.0)
     load = Load(platform, ServiceConfig())
     load.start()
@@ -201,7 +163,7 @@ def run_load(
     for at_s, vehicle, number in due:
         load.stopping.wait(max(0.0, started_s + at_s - time.monotonic()))
         effects = UnitOfWork()
-        effects.send(key, "relay", make(vessel, vehicle, number, time.time()), priority=5)
+        effects.send(key, "relay", coded_image(vessel, vehicle, number, time.time()), priority=5)
         load.commit(effects)
     ends_s = time.monotonic() + DRAIN_TIMEOUT_S
     while load.store.outbox_depth() and time.monotonic() < ends_s:
@@ -391,9 +353,7 @@ def wait_until_ready(session: zenoh.Session, vessels: Sequence[str]) -> None:
         alive = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
 
-def run(
-    folder: Path, vehicles: int, vessels: int, seconds: float, every_s: float, *, is_coded: bool
-) -> dict[str, object]:
+def run(folder: Path, vehicles: int, vessels: int, seconds: float, every_s: float) -> dict[str, object]:
     """Run once; return the figures."""
     names = [f"vessel-{n + 1}" for n in range(vessels)]
     received = ReceivedImages()
@@ -408,8 +368,7 @@ def run(
         for n, name in enumerate(names):
             own_vehicles = ",".join(str(v) for v in range(n, vehicles, vessels))
             options = (endpoints[name], str(folder / "load"), name, own_vehicles, str(seconds), str(every_s))
-            kind = "coded" if is_coded else "pixels"
-            processes.start(f"load-{name}", "-m", "research.fleet", "--load", *options, kind)
+            processes.start(f"load-{name}", "-m", "research.fleet", "--load", *options)
         queued = 0
         for name in names:
             output, _ = processes.running[f"load-{name}"].communicate(timeout=seconds + DRAIN_TIMEOUT_S + 60)
@@ -426,7 +385,6 @@ def run(
         session.close()
     entries = [entry for name in names for entry in acknowledged(folder / name)]
     return {
-        "record": "part" if is_coded else "reconstructed_image",
         "vehicles": vehicles,
         "vessels": vessels,
         "bytes_mean": round(sum(entry["bytes"] for entry in entries) / len(entries)),
@@ -435,13 +393,12 @@ def run(
     }
 
 
-def accept(folder: Path, count: int, *, is_coded: bool, is_prepared: bool) -> dict[str, object]:
+def accept(folder: Path, count: int, *, is_prepared: bool) -> dict[str, object]:
     """Hand over contacts of two vessels as fast as relays and c2 can; return the figures.
 
     Args:
         folder: Folder for stores and files.
         count: Number of contacts.
-        is_coded: Send coded images, not decoded ones.
         is_prepared: The relays queue all contacts for c2 before c2 starts.
     """
     names = ["vessel-1", "vessel-2"]
@@ -449,16 +406,10 @@ def accept(folder: Path, count: int, *, is_coded: bool, is_prepared: bool) -> di
     for vehicle, name in enumerate(names, start=1):
         (folder / name).mkdir(parents=True)
         store = Store(folder / name / "relay.db")
-        records: Iterator[Record]
-        if is_coded:
-            key = keys.image_coded(name)
-            records = (coded_image(name, vehicle, number, now_utc_s + number * 1e-3) for number in range(count // 2))
-        else:
-            key = keys.image_reconstructed(name)
-            records = (new_image(name, vehicle, number, now_utc_s + number) for number in range(count // 2))
         with store.transaction() as tx:
-            for record in records:
-                tx.accept(key, wire.encode(record))
+            for number in range(count // 2):
+                record = coded_image(name, vehicle, number, now_utc_s + number * 1e-3)
+                tx.accept(keys.image_coded(name), wire.encode(record))
         store.close()
     with fleet(folder, names, start_relays=False, start_c2=not is_prepared) as (processes, _, shore):
         session = open_session(shore)
@@ -487,7 +438,6 @@ def accept(folder: Path, count: int, *, is_coded: bool, is_prepared: bool) -> di
     seconds = samples[-1][0] - samples[0][0]
     accepted = samples[-1][1] - samples[0][1]
     return {
-        "record": "part" if is_coded else "reconstructed_image",
         "senders_prepared": is_prepared,
         "contacts": samples[-1][1],
         "accepted_per_s": round(accepted / seconds),
@@ -577,15 +527,6 @@ def percentiles(name: str, latency_s: Sequence[float]) -> dict[str, float]:
     return {f"{name}_p50_ms": round(float(p50), 1), f"{name}_p99_ms": round(float(p99), 1)}
 
 
-def ratios(coded: Mapping[str, Any], pixels: Mapping[str, Any]) -> dict[str, float]:
-    """Return figures of a run with coded images, divided by those of the run with pixels before it."""
-    names = ("bytes_mean", "acknowledged_p50_ms", "acknowledged_p99_ms", "shown_p50_ms", "shown_p99_ms")
-    found = {name: round(coded[name] / pixels[name], 3) for name in names}
-    kinds = coded["cpu_ms_per_contact"].keys()
-    cpu = {kind: (coded["cpu_ms_per_contact"][kind], pixels["cpu_ms_per_contact"][kind]) for kind in kinds}
-    return found | {f"cpu_{kind}": round(one / other, 3) for kind, (one, other) in cpu.items() if other}
-
-
 def main() -> int:
     """Run; return 1 if an image is missing or wrong."""
     parser = argparse.ArgumentParser(description="many vehicles over several vessels into one shore site")
@@ -595,34 +536,27 @@ def main() -> int:
     parser.add_argument("--every", type=float, default=10.0, metavar="S", help="interval of a vehicle; default: 10 s")
     parser.add_argument("--grow", metavar="N,N", help="several runs with these numbers of vehicles")
     parser.add_argument("--dir", type=Path, metavar="DIR", help="folder for stores and files (default: temporary)")
-    parser.add_argument("--pixels", action="store_true", help="before each run, one with decoded images of 30 kB")
-    parser.add_argument("--load", nargs=7, help=argparse.SUPPRESS)
+    parser.add_argument("--load", nargs=6, help=argparse.SUPPRESS)
     parser.add_argument("--accept", type=int, metavar="N", help="measure the acceptance of N contacts instead")
     args = parser.parse_args()
     if args.load:
-        endpoint, folder, vessel, vehicles, seconds, every, kind = args.load
+        endpoint, folder, vessel, vehicles, seconds, every = args.load
         own_vehicles = [int(v) for v in vehicles.split(",")]
-        run_load(endpoint, Path(folder), vessel, own_vehicles, float(seconds), float(every), is_coded=kind == "coded")
+        run_load(endpoint, Path(folder), vessel, own_vehicles, float(seconds), float(every))
         return 0
     passed = True
-    for is_coded, is_prepared in ((False, False), (True, False), (True, True)) if args.accept else ():
-        count = args.accept if is_coded else args.accept // 20
+    for is_prepared in (False, True) if args.accept else ():
         with ProgressDisplay(step="acceptance"), tempfile.TemporaryDirectory(dir=args.dir) as name:
-            result = accept(Path(name), count, is_coded=is_coded, is_prepared=is_prepared)
+            result = accept(Path(name), args.accept, is_prepared=is_prepared)
         print(json.dumps(result), flush=True)
         passed = passed and bool(result["good"])
     if args.accept:
         return 0 if passed else 1
     for count in [int(n) for n in args.grow.split(",")] if args.grow else [args.vehicles]:
-        results = []
-        for is_coded in (False, True) if args.pixels else (True,):
-            with ProgressDisplay(step=f"fleet of {count}"), tempfile.TemporaryDirectory(dir=args.dir) as name:
-                result = run(Path(name), count, args.vessels, args.seconds, args.every, is_coded=is_coded)
-            print(json.dumps(result), flush=True)
-            passed = passed and bool(result["good"])
-            results.append(result)
-        if args.pixels:
-            print(json.dumps({"coded_to_pixels": ratios(results[1], results[0])}), flush=True)
+        with ProgressDisplay(step=f"fleet of {count}"), tempfile.TemporaryDirectory(dir=args.dir) as name:
+            result = run(Path(name), count, args.vessels, args.seconds, args.every)
+        print(json.dumps(result), flush=True)
+        passed = passed and bool(result["good"])
     return 0 if passed else 1
 
 

@@ -19,7 +19,7 @@ from sonarpost.archive.image_parts import TIME_STEPS
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
-from sonarpost.messages import ImagePart, ReconstructedImage
+from sonarpost.messages import ImagePart
 from sonarpost.runtime.process import main
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
@@ -50,22 +50,17 @@ class RecordingRelay(RelayService):
 
 
 def _image_fields(item: OutboxItem) -> dict[str, Any] | None:
-    """Return what identifies an image, from its coded record or from its pixels in an envelope; None for another."""
+    """Return what identifies a coded image; None for another record."""
     fields: dict[str, Any] = dict(wire.unpack_map(item.payload, item.key))
-    if fields["type"] == ImagePart.TYPE:
-        queued_utc_s = fields.get("l") or fields["t"] + fields.get("d", 0) / TIME_STEPS
-        return {
-            "vehicle_id": fields["u"],
-            "image_id": fields["i"],
-            "version": fields["n"],
-            "queued_utc_s": queued_utc_s,
-        }
-    if "payload" in fields:
-        fields = dict(wire.unpack_map(fields["payload"], item.key))
-    if fields["type"] != ReconstructedImage.TYPE:
+    if fields["type"] != ImagePart.TYPE:
         return None
-    names = ("vehicle_id", "image_id", "version")
-    return {**{name: fields[name] for name in names}, "queued_utc_s": fields["last_frame_utc_s"]}
+    queued_utc_s = fields.get("l") or fields["t"] + fields.get("d", 0) / TIME_STEPS
+    return {
+        "vehicle_id": fields["u"],
+        "image_id": fields["i"],
+        "version": fields["n"],
+        "queued_utc_s": queued_utc_s,
+    }
 
 
 def acknowledged(state_dir: Path) -> Iterator[dict[str, Any]]:

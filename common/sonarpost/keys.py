@@ -176,9 +176,7 @@ def message_outgoing(vehicle: str) -> str:
 def image_reconstructed(vessel: str) -> str:
     """A decoded image (the paper's imgToDecompress on the operator's side).
 
-    The relay accepts those that a decompressor of an earlier version has queued for it.
-
-    Record: reconstructed_image. From: decompressor. To: relay, console. Delivery: durable, priority 5.
+    Record: reconstructed_image. From: decompressor. To: console. Delivery: durable, priority 5.
     """
     return _of(vessel, "image/reconstructed")
 

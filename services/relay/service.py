@@ -30,7 +30,6 @@ from sonarpost.messages import (
     Decision,
     ImagePart,
     ReceivedStatus,
-    ReconstructedImage,
     Record,
     Relayed,
 )
@@ -49,7 +48,7 @@ DECISION_PRIORITY = 2
 STATUS_PRIORITY = 3
 PREVIEW_PRIORITY = 5
 DETAIL_PRIORITY = 6
-LOGGED_COUNTS = ("coded_images_relayed", "reconstructed_images_relayed", "decisions_relayed")
+LOGGED_COUNTS = ("coded_images_relayed", "decisions_relayed")
 VERSIONS = "version/"
 """Prefix of the states with the last version of an image that a site has acknowledged."""
 
@@ -137,16 +136,12 @@ class RelayService(Service[RelayConfig]):
         return MonitoredSite(options.site, lambda: self.session, self.platform.upstream)
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """Images, decisions and statuses of this vessel, advice and commands for it.
-
-        Decoded images are those that an earlier version of the decompressor has queued.
-        """
+        """Images, decisions and statuses of this vessel, advice and commands for it."""
         vessel = self.platform.id
         statuses: dict[str, type[Record]] = {keys.acoustic_status(vessel): ReceivedStatus}
         return {
             **(statuses if self.config.forward_status else {}),
             keys.image_coded(vessel): CodedImage,
-            keys.image_reconstructed(vessel): ReconstructedImage,
             keys.contact_decision(vessel): Decision,
             keys.advice(vessel): Advice,
             keys.command_all(vessel): Command,
@@ -159,7 +154,7 @@ class RelayService(Service[RelayConfig]):
     def check_capacity(self, key: str) -> None:
         """Reject images below `disk_reserve_bytes`; other records are small and are accepted for longer."""
         super().check_capacity(key)
-        if key in (keys.image_coded(self.platform.id), keys.image_reconstructed(self.platform.id)):
+        if key == keys.image_coded(self.platform.id):
             self._image_reserve.require()
 
     def validate(self, key: str, record: Record) -> None:
@@ -170,7 +165,7 @@ class RelayService(Service[RelayConfig]):
                 raise PayloadError(key, "kind", record.kind, "the kind in the key")
             self._require(self.config.command_consumers, key, "command_consumers")
             return
-        assert isinstance(record, (CodedImage, ReconstructedImage, Decision, Advice, ReceivedStatus))
+        assert isinstance(record, (CodedImage, Decision, Advice, ReceivedStatus))
         if record.vessel_id != vessel:
             raise PayloadError(record.TYPE, "vessel_id", record.vessel_id, vessel)
         if isinstance(record, Advice):
@@ -196,10 +191,9 @@ class RelayService(Service[RelayConfig]):
             self._queue_short(record, effects)
             self._queue_image(record, effects)
         else:
-            assert isinstance(record, (ReconstructedImage, Decision))
-            if isinstance(record, Decision):
-                self._queue_short(record, effects)
-            self._queue_for_sites(key, record, effects)
+            assert isinstance(record, Decision)
+            self._queue_short(record, effects)
+            self._queue_decision(key, effects)
 
     def _queue_short(self, record: CodedImage | Decision, effects: UnitOfWork) -> None:
         for satellite in self._satellites:
@@ -231,20 +225,14 @@ class RelayService(Service[RelayConfig]):
             effects.send_payload(inbox, queue, payload, Relayed, priority=STATUS_PRIORITY, topic=topic)
         effects.count("statuses_relayed")
 
-    def _queue_for_sites(self, key: str, record: ReconstructedImage | Decision, effects: UnitOfWork) -> None:
-        vessel = self.platform.id
-        envelope = Relayed(vessel_id=vessel, key=key, payload=effects.payload, relayed_utc_s=time.time())
+    def _queue_decision(self, key: str, effects: UnitOfWork) -> None:
+        envelope = Relayed(vessel_id=self.platform.id, key=key, payload=effects.payload, relayed_utc_s=time.time())
         payload = wire.encode(envelope)
-        if isinstance(record, Decision):
-            priority, topic = DECISION_PRIORITY, None
-        else:
-            priority = PREVIEW_PRIORITY if record.version == 1 else DETAIL_PRIORITY
-            topic = topic_of(record) if self.config.supersede else None
         for queue, inbox in self._inboxes.items():
-            effects.send_payload(inbox, queue, payload, Relayed, priority=priority, topic=topic)
-        effects.count(f"{record.TYPE}s_relayed")
+            effects.send_payload(inbox, queue, payload, Relayed, priority=DECISION_PRIORITY)
+        effects.count("decisions_relayed")
         if log.isEnabledFor(logging.DEBUG):
-            log.debug("Record queued for the shore", extra=kv(record=record.TYPE, sites=len(self._upstreams)))
+            log.debug("Record queued for the shore", extra=kv(record=Decision.TYPE, sites=len(self._upstreams)))
 
     def _queue_image(self, image: CodedImage, effects: UnitOfWork) -> None:
         """Queue for each site the difference to the version that it has acknowledged last, or the whole image."""
@@ -402,7 +390,7 @@ def _is_site_queue(queue: str) -> bool:
     return consumer_of(queue) == CONSUMER
 
 
-def topic_of(image: CodedImage | ReconstructedImage) -> Topic:
+def topic_of(image: CodedImage) -> Topic:
     """Return the topic of an image's versions; the time distinguishes images after a restart of the identifiers."""
     name = image_parts.subject(image.vehicle_id, image.image_id, image.first_frame_utc_s)
     return Topic(name, image.version)

@@ -27,7 +27,7 @@ from builders.chain import latest_versions, send_signal
 from builders.common import REPOSITORY, free_port
 from builders.history import History
 from builders.image_archive import ArchiveLog, name_of
-from builders.image_source import ImageSource, make_image
+from builders.image_source import ImageSource, make_image, picture_sha256
 from builders.numbered_snippet import number_of, numbered_snippet
 from builders.progress import wait_while_progressing
 from builders.small_disk import SmallDisk
@@ -46,7 +46,7 @@ CLOCK_STEPS_S = (-7200.0, -3600.0, -30.0, 30.0, 3600.0, 7200.0)
 """The difference of two is less than the time for which op_modem keeps a contact: see its limits."""
 SOURCE_VEHICLE = "uuv-9"
 SNIPPET_KEY = "snippet"
-IMAGE_KEY = keys.image_reconstructed(VESSEL)
+IMAGE_KEY = keys.image_coded(VESSEL)
 SNIPPET_INTERVAL_S = 4.0
 IMAGE_INTERVAL_S = 1.0
 STUCK_S = 120.0
@@ -173,7 +173,7 @@ class ChaosChain:
 
     def _log(self, operation, image):
         assert operation in ("queued", "acknowledged")
-        self.history.add(operation, "source", name_of(image), key=IMAGE_KEY, sha256=image.picture_sha256)
+        self.history.add(operation, "source", name_of(image), key=IMAGE_KEY, sha256=picture_sha256(image))
 
     # Faults
 

@@ -14,7 +14,7 @@ import tifffile
 from PIL import Image
 
 from builders.history import History
-from sonarpost.messages import ReconstructedImage
+from sonarpost.messages import CodedImage, ReconstructedImage
 
 
 def record_name(vehicle_id: str, image_id: str, version: int, first_frame_utc_s: float) -> str:
@@ -22,7 +22,7 @@ def record_name(vehicle_id: str, image_id: str, version: int, first_frame_utc_s:
     return f"{vehicle_id}/{image_id}/v{version}/{first_frame_utc_s:.3f}"
 
 
-def name_of(image: ReconstructedImage) -> str:
+def name_of(image: CodedImage | ReconstructedImage) -> str:
     """Return the identity of an image record."""
     return record_name(image.vehicle_id, image.image_id, image.version, image.first_frame_utc_s)
 

@@ -1,28 +1,68 @@
-"""Outbox of a test that sends images to the relay, and images for it."""
+"""Outbox of a test that sends coded images to the relay, and images for it."""
+
+from functools import cache, lru_cache
 
 import numpy as np
 
-from builders.records import reconstructed_image
 from sonarpost import keys, wire
+from sonarpost.codec.registry import default_registry
 from sonarpost.config import ServiceConfig
-from sonarpost.messages import Pixels, ReconstructedImage
+from sonarpost.messages import CodedImage, Pixels
 from sonarpost.runtime.service import Service, UnitOfWork
 
 VESSEL = "vessel-1"
+MAX_STREAM_BYTES = 60_000
+
+
+@cache
+def _spiht():
+    return default_registry().create("spiht")
+
+
+@cache
+def _stream_start(shape):
+    """Return the header and the first bytes of the body; any bytes can follow."""
+    return _spiht().encode(np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8), 9)
 
 
 def make_image(number, shape=(24, 32), mission=0, version=1):
-    """Return an image of noise, unique for number, mission and version."""
+    """Return a coded image of about one byte for each pixel, unique for number, mission and version."""
     rng = np.random.default_rng([mission, number, version])
-    pixels = Pixels.from_array(rng.integers(0, 256, shape, dtype=np.uint8))
-    return reconstructed_image(
-        pixels,
+    start = _stream_start(shape)
+    stream = start + rng.bytes(min(shape[0] * shape[1], MAX_STREAM_BYTES) - len(start))
+    at_s = 1.0e9 + 86400.0 * mission + number
+    return CodedImage(
+        vessel_id=VESSEL,
         vehicle_id=f"uuv-{number % 3 + 1}",
         image_id=f"{number:04d}",
         version=version,
-        first_frame_utc_s=1.0e9 + 86400.0 * mission + number,
-        last_frame_utc_s=1.0e9 + 86400.0 * mission + number,
+        contact=None,
+        height_px=shape[0],
+        width_px=shape[1],
+        stream=stream,
+        missing=(),
+        missing_halves=(),
+        complete=True,
+        bytes_received=len(stream),
+        bytes_total=len(stream),
+        frames_received=1,
+        conflicts=0,
+        first_frame_utc_s=at_s,
+        last_frame_utc_s=at_s,
+        authenticated=True,
+        codec="spiht",
+        model="",
     )
+
+
+def picture_sha256(image):
+    """Return the digest of the pixels of a coded image."""
+    return _picture_sha256(image.stream)
+
+
+@lru_cache(maxsize=1024)
+def _picture_sha256(stream):
+    return Pixels.from_array(_spiht().decode(stream).image).sha256
 
 
 class ImageSource(Service[ServiceConfig]):
@@ -40,7 +80,7 @@ class ImageSource(Service[ServiceConfig]):
 
     def on_acknowledged(self, tx, item, reason):
         if reason is None:
-            self._on_stored(wire.decode(ReconstructedImage, item.payload, item.key))
+            self._on_stored(wire.decode(CodedImage, item.payload, item.key))
 
     def handle(self, key, record, effects):
         raise AssertionError("the source consumes nothing")
@@ -49,5 +89,5 @@ class ImageSource(Service[ServiceConfig]):
         """Queue images for the relay."""
         effects = UnitOfWork()
         for image in images:
-            effects.send(keys.image_reconstructed(VESSEL), "relay", image, priority=5)
+            effects.send(keys.image_coded(VESSEL), "relay", image, priority=5)
         self.commit(effects)

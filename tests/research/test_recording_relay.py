@@ -6,7 +6,6 @@ import hashlib
 
 import pytest
 
-from research.fleet import noise_image
 from research.recording_relay import FILE_NAME, RecordingRelay, acknowledged
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
@@ -39,15 +38,14 @@ def acknowledge(relay: RecordingRelay, *items: OutboxItem) -> None:
             relay.on_acknowledged(tx, item, None)
 
 
-def test_coded_and_decoded_images_are_recorded_with_their_size_and_time(relay, tmp_path) -> None:
+def test_images_are_recorded_with_their_size_and_time(relay, tmp_path) -> None:
     part = ImagePart(u="uuv-1", i="0001", n=2, t=QUEUED_UTC_S - 2.0, d=2 << 22, p=bytes(40))
-    pixels = noise_image("vessel-1", "uuv-2", "0002", 1, QUEUED_UTC_S)
-    coded = item_of(1, keys.shore_part("vessel-1"), part)
-    decoded = item_of(2, keys.shore_inbox("vessel-1"), envelope_of(pixels, keys.image_reconstructed("vessel-1")))
-    acknowledge(relay, coded, decoded)
+    exact = ImagePart(u="uuv-2", i="0002", n=1, t=QUEUED_UTC_S - 2.0, l=QUEUED_UTC_S, p=bytes(40))
+    items = [item_of(seq, keys.shore_part("vessel-1"), record) for seq, record in enumerate((part, exact), start=1)]
+    acknowledge(relay, *items)
     first, second = acknowledged(tmp_path)
-    assert (first["image_id"], first["version"], first["bytes"]) == ("0001", 2, len(coded.payload))
-    assert (second["image_id"], second["version"], second["bytes"]) == ("0002", 1, len(decoded.payload))
+    assert (first["image_id"], first["version"], first["bytes"]) == ("0001", 2, len(items[0].payload))
+    assert (second["image_id"], second["version"], second["bytes"]) == ("0002", 1, len(items[1].payload))
     assert first["queued_utc_s"] == second["queued_utc_s"] == QUEUED_UTC_S
     assert not first["refused"]
 

@@ -11,7 +11,7 @@ import msgpack
 import pytest
 from builders.common import WAIT_S, eventually
 from builders.message_gateway import MessageGatewayEmulator
-from builders.records import decision_record, reconstructed_image
+from builders.records import decision_record
 from builders.short_messages import decision, with_crc
 from builders.short_messages import received as received_image
 from pydantic import ValidationError
@@ -23,7 +23,7 @@ from sonarpost.bearers.short_message import ShortMessage, pack_decision, split
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.delivery.store import Store
 from sonarpost.errors import ConfigError, DatabaseUnavailableError, DeliveryError
-from sonarpost.messages import CodedImage, Pixels
+from sonarpost.messages import CodedImage
 from sonarpost.services.c2.config import C2Config, ShortMessageOptions
 from sonarpost.services.c2.service import C2Service
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
@@ -138,34 +138,33 @@ def test_all_records_arrive_once_over_losses_and_restarts_of_both_ends(
 def test_the_radio_goes_first_and_its_image_replaces_the_preview(
     runner, source, begin_c2, begin_relay, tmp_path, gateway, texture
 ):
+    stream = default_registry().create("emb", CodecResources()).encode(texture(80, 140))
+    fields = {"stream": stream, "bytes_received": len(stream), "bytes_total": len(stream)}
+    first, second = (received(n).model_copy(update=fields) for n in (1, 2))
     c2 = begin_c2()
     relay = begin_relay(UpstreamOptions(), after_s=3600.0)
-    picture = Pixels.from_array(texture(80, 140))
-    whole = reconstructed_image(picture, image_id="0001", first_frame_utc_s=received(1).first_frame_utc_s)
-    source.send(CODED, "relay", received(1))
+    source.send(CODED, "relay", first)
     source.send(DECISIONS, "relay", decision_record())
-    source.send(keys.image_reconstructed("vessel-1"), "relay", whole)
-    relayed = ("coded_images_relayed", "decisions_relayed", "reconstructed_images_relayed")
+    relayed = ("coded_images_relayed", "decisions_relayed")
     eventually(lambda: all(relay.health().counters.get(name) == 1 for name in relayed))
     eventually(
         lambda: not relay.store.state_names("short/shore/item/"), what="withdrawal of what the radio has delivered"
     )
-    # The part of the image withdraws its preview as well: the whole can follow later.
     eventually(lambda: relay.store.outbox_depth() == 0, what="delivery by radio")
+    eventually(lambda: len(side_cars(tmp_path)) == 1, what="the image at the shore")
     assert gateway.messages == 0
     # The preview of a stored image changes nothing; a preview that came first is replaced.
     runner.stop(relay)
     relay = begin_relay()
-    source.send(CODED, "relay", received(1), received(2))
+    source.send(CODED, "relay", first, second)
     eventually(lambda: len(side_cars(tmp_path)) == 2 and not waits(relay))
     assert side_cars(tmp_path)["0001"]["notes"] == []
     assert side_cars(tmp_path)["0002"]["notes"][0] == PREVIEW_NOTE
-    later = whole.model_copy(update={"image_id": "0002", "first_frame_utc_s": received(2).first_frame_utc_s})
     runner.stop(relay)
-    begin_relay(UpstreamOptions())
-    source.send(keys.image_reconstructed("vessel-1"), "relay", later)
+    begin_relay(UpstreamOptions(), after_s=3600.0)
+    source.send(CODED, "relay", second)
     eventually(lambda: side_cars(tmp_path)["0002"]["notes"] == [])
-    assert len(list((tmp_path / "out" / "vessel-1").glob(f"{image_file_name(later)}*"))) == 3
+    assert len(list((tmp_path / "out" / "vessel-1").glob(f"{image_file_name(second)}*"))) == 3
     eventually(lambda: len(c2._archive.index().images()) == 2)
     assert c2.gauges()["records_conflicting"] == 0
 

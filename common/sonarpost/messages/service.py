@@ -15,7 +15,7 @@ class Relayed(Record):
     Attributes:
         vessel_id: Must be the vessel of the inner key and record.
         key: Key of the inner record: this vessel's `contact/decision` or `acoustic/status`, or `image/reconstructed`
-            from relays of earlier versions.
+            for a preview from short messages and for a replayed recording.
         payload: The inner record, unchanged, with its `type` and `v`.
         relayed_utc_s: When the relay accepted it.
     """

@@ -3,7 +3,7 @@
 import pytest
 
 from sonarpost import keys
-from sonarpost.messages import Relayed
+from sonarpost.messages import ImagePart, Relayed
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
@@ -24,7 +24,9 @@ def c2(runner):
     """Starts the consumer of a site."""
 
     def start(site="shore", platform_id="shore-1"):
-        return runner.peer(platform_id, "c2", {keys.shore_inbox_all(site): Relayed})
+        return runner.peer(
+            platform_id, "c2", {keys.shore_inbox_all(site): Relayed, keys.shore_part_all(site): ImagePart}
+        )
 
     return start
 

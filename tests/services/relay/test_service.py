@@ -1,42 +1,49 @@
 """relay: records of the vessel in envelopes, urgent ones first, stored until the shore has acknowledged them."""
 
 import msgpack
-import pytest
 import zenoh
 from builders.common import eventually
+from builders.image_source import make_image
 from builders.record_samples import SAMPLES
-from builders.records import decision_record, reconstructed_image
+from builders.records import decision_record
 
 from sonarpost import keys, logs, wire
-from sonarpost.messages import Pixels
+from sonarpost.archive.image_parts import whole_part
+from sonarpost.messages import ImagePart
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
-IMAGES, DECISIONS = keys.image_reconstructed("vessel-1"), keys.contact_decision("vessel-1")
+IMAGES, DECISIONS = keys.image_coded("vessel-1"), keys.contact_decision("vessel-1")
 INBOX = keys.shore_inbox("vessel-1")
 
 
-@pytest.fixture
-def image(texture):
-    def make(image_id="AAAA", vessel="vessel-1"):
-        return reconstructed_image(Pixels.from_array(texture()), vessel_id=vessel, image_id=image_id)
-
-    return make
+def image(image_id="AAAA", vessel="vessel-1"):
+    changes = {"vessel_id": vessel, "vehicle_id": "uuv-1", "image_id": image_id}
+    return make_image(1, (80, 140)).model_copy(update=changes)
 
 
-def test_records_are_relayed_unchanged_in_an_envelope(begin, c2, source, image, watch, check_monitoring):
+def identity(record):
+    """Identifier of a received image or decision; the type of another record."""
+    if isinstance(record, ImagePart):
+        return record.i
+    fields = msgpack.unpackb(record.payload)
+    return fields.get("decision_id", fields["type"])
+
+
+def test_decision_is_relayed_unchanged_in_an_envelope_and_an_image_as_part(begin, c2, source, watch, check_monitoring):
     seen, shore, service = watch(INBOX), c2(), begin()
-    records = {IMAGES: image(), DECISIONS: decision_record()}
-    for key, record in records.items():
-        source.send(key, "relay", record)
+    source.send(DECISIONS, "relay", decision_record())
+    eventually(lambda: len(shore.received) == 1)
+    source.send(IMAGES, "relay", image())
     eventually(lambda: len(shore.received) == 2)
-    for envelope in shore.received:
-        assert envelope.vessel_id == "vessel-1"
-        assert envelope.payload == wire.encode(records[envelope.key])
-        assert envelope.relayed_utc_s >= service.started_utc_s
+    envelope, part = shore.received
+    assert (envelope.vessel_id, envelope.key) == ("vessel-1", DECISIONS)
+    assert envelope.payload == wire.encode(decision_record())
+    assert envelope.relayed_utc_s >= service.started_utc_s
+    assert part == whole_part(image())
     eventually(lambda: service.health().gauges["waiting_for_shore"] == 0.0)
     counters = service.health().counters
-    assert (counters["reconstructed_images_relayed"], counters["decisions_relayed"]) == (1, 1)
+    assert (counters["coded_images_relayed"], counters["decisions_relayed"]) == (1, 1)
     check_monitoring(service)
     assert seen == [], "envelopes are not published"
 
@@ -57,7 +64,7 @@ def test_a_batch_is_one_line_and_each_record_has_its_own_at_level_debug(platform
         assert lines[-1].endswith(" decisions_relayed=2")
 
 
-def test_records_wait_for_the_shore_and_decisions_are_first(begin, runner, c2, source, image):
+def test_records_wait_for_the_shore_and_decisions_are_first(begin, runner, c2, source):
     service = begin()
     source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(3)))
     eventually(lambda: service.health().gauges["waiting_for_shore"] == 3.0)
@@ -67,11 +74,10 @@ def test_records_wait_for_the_shore_and_decisions_are_first(begin, runner, c2, s
     shore = c2()
     begin()
     eventually(lambda: len(shore.received) == 5)
-    inner = [msgpack.unpackb(e.payload) for e in shore.received]
-    assert [m.get("decision_id", m["image_id"]) for m in inner] == ["d1", "d2", "0000", "0001", "0002"]
+    assert [identity(record) for record in shore.received] == ["d1", "d2", "0000", "0001", "0002"]
 
 
-def test_record_of_another_vessel_is_refused_to_its_sender_and_logged(begin, c2, source, image, refused, capsys):
+def test_record_of_another_vessel_is_refused_to_its_sender_and_logged(begin, c2, source, refused, capsys):
     logs.configure_logging("relay")
     shore, service = c2(), begin()
     source.send(IMAGES, "relay", image("00A7", vessel="vessel-2"))
@@ -98,7 +104,7 @@ def test_invalid_records_are_refused_and_the_next_one_relayed(begin, c2, source,
     assert service.health().state == "ok"
 
 
-def test_record_is_relayed_once_after_a_stop_before_sending(begin, runner, c2, platform, image):
+def test_record_is_relayed_once_after_a_stop_before_sending(begin, runner, c2, platform):
     idle = RelayService(platform("vessel-1"), RelayConfig())
     with idle.store.transaction() as tx:
         tx.accept(IMAGES, wire.encode(image()))
@@ -108,10 +114,10 @@ def test_record_is_relayed_once_after_a_stop_before_sending(begin, runner, c2, p
     runner.stop(service)
     shore, again = c2(), begin()
     eventually(lambda: again.health().gauges["waiting_for_shore"] == 0.0)
-    assert [e.key for e in shore.received] == [IMAGES]
+    assert [identity(record) for record in shore.received] == ["AAAA"]
 
 
-def test_sender_keeps_the_record_while_the_disk_is_full(begin, c2, source, image):
+def test_sender_keeps_the_record_while_the_disk_is_full(begin, c2, source):
     shore, service = c2(), begin()
     service.store._db.execute("PRAGMA max_page_count=1")
     source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(6)))
@@ -122,9 +128,7 @@ def test_sender_keeps_the_record_while_the_disk_is_full(begin, c2, source, image
     eventually(lambda: service.health().state == "ok")
 
 
-def test_latest_status_of_each_vehicle_waits_for_the_shore_and_precedes_images(
-    begin, runner, c2, source, image, client
-):
+def test_latest_status_of_each_vehicle_waits_for_the_shore_and_precedes_images(begin, runner, c2, source, client):
     service = begin()
     source.send(IMAGES, "relay", image("AAAA"))
     key, first = keys.acoustic_status("vessel-1"), SAMPLES["received-status"]
@@ -152,10 +156,10 @@ def test_latest_status_of_each_vehicle_waits_for_the_shore_and_precedes_images(
     shore = c2()
     begin()
     eventually(lambda: len(shore.received) == 3)
-    inner = [msgpack.unpackb(e.payload) for e in shore.received]
-    assert [m["type"] for m in inner] == ["received_status", "received_status", "reconstructed_image"]
+    assert [identity(record) for record in shore.received] == ["received_status", "received_status", "AAAA"]
+    inner = [msgpack.unpackb(envelope.payload) for envelope in shore.received[:2]]
     last_s = 1476262830.5 + published - 1
-    assert {m["vehicle_id"]: m["received_utc_s"] for m in inner[:2]} == {"uuv-0": last_s - 1, "uuv-1": last_s}
+    assert {m["vehicle_id"]: m["received_utc_s"] for m in inner} == {"uuv-0": last_s - 1, "uuv-1": last_s}
 
 
 def test_statuses_are_not_relayed_if_configured(begin):

@@ -6,27 +6,29 @@ import msgpack
 import pytest
 import zenoh
 from builders.common import eventually, free_port
-from builders.records import decision_record, reconstructed_image
+from builders.image_source import make_image
+from builders.records import decision_record
 from pydantic import ValidationError
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
-from sonarpost.messages import Pixels
+from sonarpost.messages import ImagePart
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
 from sonarpost.services.relay.service import topic_of
 
-IMAGES, DECISIONS = keys.image_reconstructed("vessel-1"), keys.contact_decision("vessel-1")
+IMAGES, DECISIONS = keys.image_coded("vessel-1"), keys.contact_decision("vessel-1")
 
 
 def image(image_id="AAAA", version=1, height_px=40, **changes):
-    picture = Pixels(height_px=height_px, width_px=100, bits=8, data=bytes([version]) * height_px * 100)
-    return reconstructed_image(picture, image_id=image_id, version=version, **changes)
+    return make_image(1, (height_px, 100), version=version).model_copy(update={"image_id": image_id, **changes})
 
 
 def names(site):
     """Received records: identifiers of decisions, identifier and version of images."""
-    inner = [msgpack.unpackb(envelope.payload) for envelope in site.received]
-    return [m.get("decision_id") or f"{m['image_id']}v{m['version']}" for m in inner]
+    return [
+        f"{record.i}v{record.n}" if isinstance(record, ImagePart) else msgpack.unpackb(record.payload)["decision_id"]
+        for record in site.received
+    ]
 
 
 def test_every_site_receives_everything_and_an_unreachable_one_delays_none(begin, runner, c2, source):
@@ -110,9 +112,9 @@ def test_newer_version_replaces_unsent_ones(begin, c2, source, runner):
     eventually(lambda: service.gauges()["waiting_for_shore"] == 1)
     for version in (1, 2, 3):
         source.send(IMAGES, "relay", image("AAAA", version))
-        eventually(lambda version=version: service.health().counters.get("reconstructed_images_relayed") == version)
+        eventually(lambda version=version: service.health().counters.get("coded_images_relayed") == version)
     source.send(IMAGES, "relay", image("BBBB", 1))
-    eventually(lambda: service.health().counters.get("reconstructed_images_relayed") == 4)
+    eventually(lambda: service.health().counters.get("coded_images_relayed") == 4)
     assert service.gauges()["waiting_for_shore"] == 3
     assert service.health().counters["records_superseded"] == 2
     runner.stop(service)

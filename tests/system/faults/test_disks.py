@@ -9,6 +9,7 @@ from builders.small_disk import SmallDisk
 
 COUNT = 200
 LARGE = (150, 300)
+ALL_VERSIONS = "supersede = false\n"
 
 MakeDisk = Callable[[int], SmallDisk]
 
@@ -26,12 +27,17 @@ def disk(tmp_path):
         yield make
 
 
+def versions_of_images():
+    """Return 12 MB in four versions of each image; relay and c2 keep the last one of each."""
+    return [make_image(n % (COUNT // 4), (200, 300), version=1 + n // (COUNT // 4)) for n in range(COUNT)]
+
+
 def test_unreachable_vessel_fills_its_disk_to_the_reserve_and_recovers(disk, start_system):
-    small = disk(32_000)
-    system = start_system(relay="disk_reserve_bytes = 12_000_000\n", vessel_state=small.folder / "state")
+    small = disk(20_000)
+    system = start_system(relay=f"disk_reserve_bytes = 12_000_000\n{ALL_VERSIONS}", vessel_state=small.folder / "state")
     system.watch_health()
     system.link.cut()
-    system.send([make_image(n, (200, 600)) for n in range(COUNT)])  # 24 MB
+    system.send(versions_of_images())
     system.wait_for_state("relay", "degraded", "below the reserve")
     assert small.free_bytes > 4_000_000, "space remains for small records and for handling"
     assert system.source.store.outbox_depth() > 0
@@ -59,13 +65,15 @@ def test_sender_keeps_images_while_the_vessel_disk_is_full(disk, start_system):
 
 
 def test_images_stay_in_the_store_while_the_shore_image_disk_is_full(disk, start_system):
-    small = disk(1_500)
+    small = disk(4_000)
     system = start_system(shore_out=small.folder / "out")
     system.watch_health()
-    system.send([make_image(n, (60, 80)) for n in range(COUNT)])  # 4 MB of files
+    system.send([make_image(n, (60, 80)) for n in range(COUNT)])  # 4 MB of files, 1 MB in the journal
     system.wait_for_state("c2", "degraded", "No space left|disk is full")
     system.wait_until(lambda: system.depths("relay")["outbox"] == 0, "c2 has accepted all")
-    assert 0 < system.shore_image_count() < COUNT
+    system.history.fault("disk", "full")
+    system.wait_until(lambda: system.shore_image_count() > 0, "first images at the shore")
+    assert system.shore_image_count() < COUNT
     small.grow(64_000)
     system.assert_all_delivered_once()
     system.wait_for_state("c2", "ok")
@@ -92,9 +100,9 @@ def test_shore_with_unwritable_images_fills_its_store_to_the_reserve_and_recover
     small = disk(24_000)
     blocked = small.folder.parent / "out"
     blocked.write_text("a file in place of the folder")
-    system = start_system(shore_state=small.folder / "state", shore_out=blocked)
+    system = start_system(relay=ALL_VERSIONS, shore_state=small.folder / "state", shore_out=blocked)
     system.watch_health()
-    system.send([make_image(n, (200, 600)) for n in range(COUNT)])  # 24 MB
+    system.send(versions_of_images())
     system.wait_until(lambda: small.free_bytes < 9_000_000, "c2 has filled its disk to the reserve")
     system.history.fault("disk", "c2 refuses records below the reserve")
     system.wait_for_state("c2", "degraded")
