@@ -74,7 +74,7 @@ BARE_KEY = "bench/bare"
 AREAS = {
     "decode": ("sonarpost/wire.py", "decode"),
     "build_part": ("archive/image_parts.py", "whole_part"),
-    "build_part_contact": ("link/received_image.py", "contact_record"),
+    "build_part_contact": ("link/frames/contact_record.py", "exact_record"),
     "encode": ("sonarpost/wire.py", "encode"),
     "log_line": ("logging/__init__.py", "info"),
     "commit_queued": ("runtime/service.py", "commit_batch"),
