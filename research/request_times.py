@@ -50,7 +50,7 @@ class RequestSpec:
     """Parameters of a run.
 
     Attributes:
-        kind: "wider", which is answered with an image of its own, or "refine".
+        kind: "expand", which is answered with an image of its own, or "refine".
         loss: Share of frames lost in each direction.
         contact_every_s: Mean time between contacts; 0 for one contact at the start and none later.
         seed: Seed of all random draws.
@@ -58,7 +58,7 @@ class RequestSpec:
         vessel: Options of `[op_modem]`.
     """
 
-    kind: str = "wider"
+    kind: str = "expand"
     loss: float = LOST_FRAMES
     contact_every_s: float = 0.0
     seed: int = 1
@@ -205,7 +205,7 @@ class RequestRun:
                 effects = self._vehicle.take_changes()
             if effects.counts["commands_received"]:
                 self._note(now, "command received")
-                if self._spec.kind == "wider":
+                if self._spec.kind == "expand":
                     self._due.append((now + _CODING_S, self._answer, _STREAM_BYTES))
 
     # The stations
@@ -271,7 +271,7 @@ def run(args: argparse.Namespace) -> int:
     """Run requests and print the times to the answer."""
     if args.log is None:
         print(f"{'request':8} {'contacts':>8} {'median s':>8} {'90 %':>7} {'longest':>7} {'air s':>7}")
-    for kind in ("wider", "refine"):
+    for kind in ("expand", "refine"):
         for every_s in (0.0, 120.0):
             if args.log is not None:
                 found = run_request(RequestSpec(kind, args.loss, every_s, args.log))

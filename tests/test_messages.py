@@ -265,7 +265,7 @@ def test_error_names_the_digest_of_another_image():
     [
         ("refine", {}, "image_id"),
         ("resend", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
-        ("wider", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
+        ("expand", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
         ("original", {"lat_deg": 1.0, "lon_deg": 1.0}, "image_id"),
         ("region", {"image_id": "0001", "stream_bytes": 192}, "box"),
         ("region", {"image_id": "0001", "box": (4, 0, 4, 32), "stream_bytes": 192}, "box"),

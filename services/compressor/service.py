@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 IMAGE_IDS = MAX_NUMBER
 """Image identifiers are the image numbers of the v1 link, 1 to this."""
-_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "wider", "original", "region")
+_KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "expand", "original", "region")
 _CONSUMER = "uuv_modem"
 _NEXT_IMAGE = "next_image"
 _COMMAND_PRIORITY = 3
@@ -142,7 +142,7 @@ class CompressorService(Service[CompressorConfig]):
         if cached is None:
             effects.count("commands_unknown_image")
             log.warning("Image of command not in cache", extra=kv(image_id=image_id, kind=command.kind))
-        elif command.kind == "wider":
+        elif command.kind == "expand":
             self._expand(image_id, cached, effects)
         elif command.kind == "original":
             self._send_original(image_id, cached, effects)

@@ -151,7 +151,7 @@ class VesselLink:
 
 _NUMBER_MESSAGES: Final[Mapping[CommandKind, type[dl.ResendMessage | dl.ExpandMessage | dl.OriginalMessage]]] = {
     "resend": dl.ResendMessage,
-    "wider": dl.ExpandMessage,
+    "expand": dl.ExpandMessage,
     "original": dl.OriginalMessage,
 }
 """Messages that have only the number of the contact."""

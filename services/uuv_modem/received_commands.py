@@ -37,7 +37,7 @@ _KINDS: Final[dict[type, CommandKind]] = {
     RefineMessage: "refine",
     ResendMessage: "resend",
     RevisitMessage: "revisit",
-    ExpandMessage: "wider",
+    ExpandMessage: "expand",
     OriginalMessage: "original",
     RegionMessage: "region",
     PrioritiseMessage: "prioritise",

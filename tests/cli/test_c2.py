@@ -252,7 +252,7 @@ def test_commands_are_sent_before_a_comment(capsys, c2, router):
     eventually(lambda: c2.gauges()["waiting_for_vessels"] == 3)
     assert [item.key for item in queued_items(c2.store, "relay@vessel-1", 9)] == [
         keys.command("vessel-1", "refine"),
-        keys.command("vessel-1", "wider"),
+        keys.command("vessel-1", "expand"),
         keys.advice("vessel-1"),
     ]
 

@@ -13,11 +13,11 @@ from sonarpost.review.costs import LinkRecord, expected_arrival, request_cost
 
 @pytest.mark.parametrize("contact_every_s", [0.0, 120.0])
 def test_answers_arrive_within_the_estimate_at_30_percent_loss(contact_every_s):
-    runs = [run_request(RequestSpec("wider", LOST_FRAMES, contact_every_s, seed)) for seed in range(10)]
+    runs = [run_request(RequestSpec("expand", LOST_FRAMES, contact_every_s, seed)) for seed in range(10)]
     times_s = [one.arrived_s - one.asked_s for one in runs if one.arrived_s is not None]
     assert len(times_s) == 10
     cost = request_cost(
-        "wider",
+        "expand",
         downlink_rate=RATES[0],
         uplink_rate=RATES[1],
         bytes_received=0,

@@ -12,7 +12,7 @@ HEADER = 5
 
 def arrival(link: LinkRecord, loss: float | None = None, bytes_total: int = 131):
     cost = request_cost(
-        "wider",
+        "expand",
         downlink_rate=RATES[0],
         uplink_rate=RATES[1],
         bytes_received=0,

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
-from sonarpost.review.image_matching import _convolve_valid, place_in_wider
+from sonarpost.review.image_matching import _convolve_valid, place_in_expanded
 
 
 def seabed(seed=0):
@@ -20,24 +20,24 @@ def reduced(image):
 
 
 @pytest.mark.parametrize("place", [(20, 35), (0, 0), (40, 70), (4, 58)])
-def test_image_is_found_in_the_wider_image(place):
+def test_image_is_found_in_the_expanded_image(place):
     scene = seabed()
     row, column = 2 * place[0], 2 * place[1]
     image = scene[row : row + 80, column : column + 140]
-    assert place_in_wider(image, reduced(scene)) == place
+    assert place_in_expanded(image, reduced(scene)) == place
 
 
 def test_image_of_other_seabed_is_not_found():
-    assert place_in_wider(seabed(1)[:80, :140], reduced(seabed(2))) is None
+    assert place_in_expanded(seabed(1)[:80, :140], reduced(seabed(2))) is None
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (400, 400)])
 def test_images_that_do_not_fit_are_not_found(shape):
-    assert place_in_wider(np.zeros(shape, np.uint8), reduced(seabed())) is None
+    assert place_in_expanded(np.zeros(shape, np.uint8), reduced(seabed())) is None
 
 
 def test_image_without_contrast_is_not_found():
-    assert place_in_wider(np.full((80, 140), 7, np.uint8), reduced(seabed())) is None
+    assert place_in_expanded(np.full((80, 140), 7, np.uint8), reduced(seabed())) is None
 
 
 @pytest.mark.parametrize(("scene", "kernel"), [((80, 140), (17, 33)), ((31, 31), (31, 31)), ((64, 50), (1, 7))])

@@ -178,7 +178,7 @@ class Snippet(Record):
         picture: The pixels, nadir to the left if `channel` is known. The compressor accepts sides of 16 to 512 px.
         source: Name of the file in which the contact was detected.
         wide: More seabed around the same centre, in pixels of twice the size along and across, sides of 16 to 512 px.
-            It stays on the vehicle until a command of kind `wider` requests it. None if there is none.
+            It stays on the vehicle until a command of kind `expand` requests it. None if there is none.
     """
 
     TYPE: ClassVar[str] = "snippet"

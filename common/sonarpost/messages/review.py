@@ -35,7 +35,7 @@ MIN_REGION_BYTES: Final = 24
 _IMAGE_OF_COMMAND: Final = {
     "refine": "the image to refine",
     "resend": "the image to resend",
-    "wider": "the image to show more around",
+    "expand": "the image to show more around",
     "original": "the image to send without despeckling",
     "region": "the image with the region",
     "prioritise": "the image to move in the queue",
@@ -85,7 +85,7 @@ class Command(Record):
 
     Attributes:
         command_id: Unique; a repeated command is recognised by it.
-        kind: refine: more detail. resend: the same again. wider: more seabed around the contact, as an image of its
+        kind: refine: more detail. resend: the same again. expand: more seabed around the contact, as an image of its
             own. original: the contact without despeckling, as an image of its own. region: a part of the image, as an
             image of its own. prioritise: send the rest of the image before or after all others. revisit: survey a
             position again.

@@ -11,7 +11,7 @@ from typing import Final
 
 from sonarpost.modem.interface import RateInfo
 
-NEW_IMAGE_KINDS: Final = ("wider", "original")
+NEW_IMAGE_KINDS: Final = ("expand", "original")
 """Kinds of requests that are answered with an image of its own."""
 
 
@@ -80,7 +80,7 @@ def request_cost(
 ) -> RequestCost:
     """Estimate the cost of a request.
 
-    `refine` doubles the length of the stream, and `resend` completes the present stream. `wider` (expand) and
+    `refine` doubles the length of the stream, and `resend` completes the present stream. `expand` and
     `original` request a new image. A `revisit` costs only its request packet, because its result is a new contact. Lost
     frames are sent again, so that the uplink takes 1 / (1 - loss) times as long.
 

@@ -16,23 +16,23 @@ MIN_CORRELATION: Final = 0.4
 Grey = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 
-def place_in_wider(image: Grey, wider: Grey) -> tuple[int, int] | None:
-    """Return (row, column) of the upper left corner of an image in the wider image, None if it is not found.
+def place_in_expanded(image: Grey, expanded: Grey) -> tuple[int, int] | None:
+    """Return (row, column) of the upper left corner of an image in the expanded image, None if it is not found.
 
     Both windows are shifted at the borders of a recording, so that their centres can differ. The place is the maximum
     of the normalised cross-correlation.
 
     Args:
         image: Shape (height_px, width_px).
-        wider: Any shape of at least half of these sides, with pixels of twice the size.
+        expanded: Any shape of at least half of these sides, with pixels of twice the size.
     """
     rows, columns = image.shape[0] // EXPAND_FACTOR, image.shape[1] // EXPAND_FACTOR
-    if rows < 1 or columns < 1 or rows > wider.shape[0] or columns > wider.shape[1]:
+    if rows < 1 or columns < 1 or rows > expanded.shape[0] or columns > expanded.shape[1]:
         return None
     cut = image[: rows * EXPAND_FACTOR, : columns * EXPAND_FACTOR].astype(np.float64)
     template = cut.reshape(rows, EXPAND_FACTOR, columns, EXPAND_FACTOR).mean(axis=(1, 3))
     template -= template.mean()
-    scene = wider.astype(np.float64)
+    scene = expanded.astype(np.float64)
     scene -= scene.mean()
     window = np.ones_like(template)
     sums = _convolve_valid(scene, window)

@@ -35,7 +35,7 @@ RECORD_TYPES: Final[dict[Table, type[Decision] | type[Command] | type[Advice]]] 
 }
 
 DATABASE_NAME: Final = "console-review.db"
-SCHEMA_VERSION: Final = 3
+SCHEMA_VERSION: Final = 4
 
 CONTRADICTORY: Final = (
     "COALESCE(MAX(g.review = 'disputed') OR (MAX(g.review = 'mine_like') AND MAX(g.review = 'not_mine_like')), 0)"

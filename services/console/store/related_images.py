@@ -15,10 +15,10 @@ from sonarpost.codec.region import RegionBox
 from sonarpost.limits import limit
 from sonarpost.messages import Command, Contact, ReconstructedImage
 from sonarpost.modem.interface import RateInfo
-from sonarpost.review.image_matching import EXPAND_FACTOR, place_in_wider
+from sonarpost.review.image_matching import EXPAND_FACTOR, place_in_expanded
 from sonarpost.services.console.store.serialisers import Json, decode_image, versions_json
 
-Relation = Literal["wider", "original", "region"]
+Relation = Literal["expand", "original", "region"]
 """Kind of the request that the image answers."""
 
 SIZE_TOLERANCE: Final = 0.06
@@ -43,7 +43,7 @@ def relation_of(image: ReconstructedImage, parent: ReconstructedImage) -> Relati
     if ratios is None:
         return None
     if all(abs(ratio / EXPAND_FACTOR - 1.0) <= SIZE_TOLERANCE for ratio in ratios):
-        return "wider"
+        return "expand"
     is_same_size = all(abs(ratio - 1.0) <= SIZE_TOLERANCE for ratio in ratios)
     if is_same_size and parent.despeckle_strength and image.despeckle_strength == 0.0:
         return "original"
@@ -116,11 +116,11 @@ def related_images_json(db: sqlite3.Connection, contact_id: str, rates: Mapping[
     found: list[Json] = []
     for row in rows:
         box: Sequence[int] | None = None
-        if row["relation"] == "wider":
+        if row["relation"] == "expand":
             newest = db.execute(
                 "SELECT * FROM version WHERE contact_id = ? ORDER BY version DESC LIMIT 1", (row["id"],)
             )
-            box = _box_in_wider(db, contact_id, decode_image(newest.fetchone()))
+            box = _box_in_expanded(db, contact_id, decode_image(newest.fetchone()))
         elif row["relation"] == "region":
             box = _box_of_region(db, contact_id, row["id"])
         images = versions_json(db, row["id"], rates)
@@ -141,14 +141,18 @@ def _box_of_region(db: sqlite3.Connection, contact_id: str, region_id: str) -> S
     return RegionBox(*command.box).pixels(row["height_px"], row["width_px"])
 
 
-def _box_in_wider(db: sqlite3.Connection, contact_id: str, wider: ReconstructedImage) -> Sequence[int] | None:
-    """Return the box of a contact's image in the wider image, as that of a region; None if it is not found."""
+def _box_in_expanded(db: sqlite3.Connection, contact_id: str, expanded: ReconstructedImage) -> Sequence[int] | None:
+    """Return the box of a contact's image in the expanded image, as that of a region; None if it is not found."""
     newest = db.execute(
         "SELECT v.* FROM version v JOIN contact c ON c.id = v.contact_id AND c.version = v.version WHERE c.id = ?",
         (contact_id,),
     ).fetchone()
     image = decode_image(newest)
-    place = place_in_wider(image.picture.to_array(), wider.picture.to_array()) if image.codec and wider.codec else None
+    place = (
+        place_in_expanded(image.picture.to_array(), expanded.picture.to_array())
+        if image.codec and expanded.codec
+        else None
+    )
     if place is None:
         return None
     height, width = (size // EXPAND_FACTOR for size in (image.picture.height_px, image.picture.width_px))

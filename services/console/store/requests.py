@@ -33,7 +33,7 @@ MAX_WAITING: Final = limit(
 REQUEST_KINDS: Final[tuple[CommandKind, ...]] = (
     "refine",
     "region",
-    "wider",
+    "expand",
     "original",
     "resend",
     "prioritise",

@@ -253,7 +253,7 @@ class TrainingSimulator:
         if command.kind in NEW_IMAGE_KINDS and requested not in self._requested:
             new_id = self._new_image_id()
             simulated = cached.simulated
-            new = simulated.expanded(new_id) if command.kind == "wider" else simulated.unfiltered(new_id)
+            new = simulated.expanded(new_id) if command.kind == "expand" else simulated.unfiltered(new_id)
             if new is not None:
                 self._requested[requested] = new_id
                 self._transfers.append(_Transfer(new, now_utc_s))

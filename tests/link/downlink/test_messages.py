@@ -27,7 +27,7 @@ SAMPLES: dict[str, dl.Content] = {
     "confirmation": dl.ConfirmationMessage(
         ((1, dl.CommandOutcome.ACCEPTED), (2**32 - 1, dl.CommandOutcome.UNKNOWN_IMAGE))
     ),
-    "wider": dl.ExpandMessage(0x0A0B0C0D, 1_790_000_004, 7),
+    "expand": dl.ExpandMessage(0x0A0B0C0D, 1_790_000_004, 7),
     "original": dl.OriginalMessage(0x0A0B0C0E, 1_790_000_005, 7),
     "region": dl.RegionMessage(0x0A0B0C0F, 1_790_000_006, 7, RegionBox(4, 8, 20, 32), 192),
     "region-corner": dl.RegionMessage(1, 0, 65535, RegionBox(31, 31, 32, 32), 65535),

@@ -113,7 +113,7 @@ def test_an_expanded_image_is_despeckled_and_its_original_can_be_requested(start
     wide = snippet("wide", 64, 64, seed=9).picture
     contact = Contact(contact_id="c1", vehicle_id="uuv-1", pixel_along_m=0.05, pixel_across_m=0.1)
     [first] = encoded(Snippet(contact=contact, picture=snippet("c1", 64, 64).picture, wide=wide))
-    expanded = answer("wider", first.image_id)
+    expanded = answer("expand", first.image_id)
     original = answer("original", expanded.image_id)
     assert original.original_sha256 == expanded.original_sha256 == wide.sha256
     assert original.contact == expanded.contact

@@ -1,4 +1,4 @@
-"""compressor: the expand command (kind "wider") sends more seabed around a contact as an image of its own."""
+"""compressor: the expand command (kind "expand") sends more seabed around a contact as an image of its own."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_expand_sends_more_seabed_as_an_image_of_its_own(start_service, encoded,
     service = start_service()
     sent = expandable_snippet("c1")
     [first] = encoded(sent)
-    expanded = answer("wider", first.image_id)
+    expanded = answer("expand", first.image_id)
     assert int(expanded.image_id, 36) == int(first.image_id, 36) + 1
     assert expanded.contact == sent.contact.model_copy(update={"pixel_along_m": 0.1, "pixel_across_m": 0.2})
     assert expanded.stream == vq.encode(sent.wide.to_array())
@@ -54,7 +54,7 @@ def test_expand_of_a_detection_shows_twice_the_ground(start_service, encoded, co
     origin = FileOrigin("ab" * 32, "line-7.xtf", "line-7")
     start_service(codec="emb", budget_bytes=4000)
     [first] = encoded(snippet_of(survey, detection, origin, "uuv-1", AtdStubConfig()))
-    expanded = command_over_the_link("wider", first.image_id)
+    expanded = command_over_the_link("expand", first.image_id)
     near, around = (emb.decode(image.stream).image.astype(float) for image in (first, expanded))
     assert around.shape == near.shape == (80, 140)
     assert expanded.contact.pixel_along_m == 2 * first.contact.pixel_along_m
@@ -73,20 +73,20 @@ def test_expand_of_a_detection_shows_twice_the_ground(start_service, encoded, co
 def test_a_repeated_expand_command_sends_the_same_image(start_service, restart, encoded, answer, expandable_snippet):
     service = start_service()
     first, _ = encoded(expandable_snippet("c1"), expandable_snippet("c2", seed=2))
-    expanded = answer("wider", first.image_id)
+    expanded = answer("expand", first.image_id)
     answer("refine", first.image_id)  # replaces the cache entry
     service = restart(service)
-    assert answer("wider", first.image_id) == expanded
+    assert answer("expand", first.image_id) == expanded
     assert "images_encoded" not in service.health().counters
 
 
 def test_an_expanded_image_that_left_the_cache_is_encoded_again(start_service, encoded, answer, expandable_snippet):
     start_service(codec="emb", budget_bytes=120, cache_images=2)
     [first] = encoded(expandable_snippet("c1"))
-    expanded = answer("wider", first.image_id)
+    expanded = answer("expand", first.image_id)
     answer("refine", first.image_id)  # now the expanded image is the oldest entry
     [other] = encoded(expandable_snippet("c2", seed=2))
-    again = answer("wider", first.image_id)
+    again = answer("expand", first.image_id)
     assert again.stream == expanded.stream
     assert again.image_id not in {first.image_id, expanded.image_id, other.image_id}
 
@@ -97,12 +97,12 @@ def test_expand_without_an_expanded_image_is_counted(
     service = start_service()
     plain, first = encoded(snippet("plain"), expandable_snippet("c1"))
     counters = lambda: service.health().counters  # noqa: E731
-    send_command("wider", plain.image_id)
+    send_command("expand", plain.image_id)
     eventually(lambda: counters().get("commands_without_expanded_image") == 1)
-    send_command("wider", "ZZZZ")
+    send_command("expand", "ZZZZ")
     eventually(lambda: counters().get("commands_unknown_image") == 1)
-    expanded = answer("wider", first.image_id)
-    send_command("wider", expanded.image_id)  # an expanded image cannot be expanded again
+    expanded = answer("expand", first.image_id)
+    send_command("expand", expanded.image_id)  # an expanded image cannot be expanded again
     eventually(lambda: counters().get("commands_without_expanded_image") == 2)
     assert answer("resend", expanded.image_id) == expanded
 

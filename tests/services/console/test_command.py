@@ -195,7 +195,7 @@ def test_training_continues_after_a_restart_with_the_same_seed(console):
         start(3, seed=2)
 
 
-@pytest.mark.parametrize("kind", ["wider", "original"])
+@pytest.mark.parametrize("kind", ["expand", "original"])
 def test_training_sends_a_new_image_once(kind, console):
     simulator = TrainingSimulator(console.state, contacts=1, interval_s=0.01)
     simulator.load_backlog(1)
@@ -216,10 +216,10 @@ def test_training_sends_a_new_image_once(kind, console):
     [related] = detail["related"]
     assert (related["relation"], related["image_id"]) == (kind, "ZZZZ")
     known, new = (console.state.image(contact_id, 1) for contact_id in (contact["id"], related["id"]))
-    scale = 2 if kind == "wider" else 1
+    scale = 2 if kind == "expand" else 1
     assert new.contact.pixel_along_m == scale * known.contact.pixel_along_m
     assert new.contact.pixel_across_m == scale * known.contact.pixel_across_m
-    assert (known.despeckle_strength, new.despeckle_strength) == (1.0, 1.0 if kind == "wider" else 0.0)
+    assert (known.despeckle_strength, new.despeckle_strength) == (1.0, 1.0 if kind == "expand" else 0.0)
     version = related["versions"][-1]
     assert (version["complete"], version["stage"]) == (True, "sent")
     [request] = detail["requests"]

@@ -143,9 +143,9 @@ def test_undo_is_audited_with_the_image_on_the_screen(console, clock):
     assert second != decision["sha256"]
     # The digest of another version is refused.
     assert anna.undo(ID, decision["decision_id"], sha256=decision["sha256"]).json()["error"]["field"] == "sha256"
-    assert anna.undo(ID, decision["decision_id"], layer="wider").status_code == 201
+    assert anna.undo(ID, decision["decision_id"], layer="expand").status_code == 201
     entry = anna.contact(ID)["audit"][-1]
-    assert [entry[name] for name in ("action", "version", "sha256", "layer")] == ["undo", 2, second, "wider"]
+    assert [entry[name] for name in ("action", "version", "sha256", "layer")] == ["undo", 2, second, "expand"]
 
 
 def test_only_own_decisions_can_be_undone(console, clock):
@@ -245,7 +245,7 @@ def test_observer_has_no_decision_to_undo_or_acknowledge(console, clock):
 def test_image_response_has_the_digest_that_a_decision_states(console, clock):
     anna = console.browser("anna")
     path = f"/api/contacts/{ID}/versions/1/picture.png"
-    for layer in ("raw", "wider"):
+    for layer in ("raw", "expand"):
         digest = anna.get(path, layer=layer).headers["X-Image-SHA256"]
         assert digest == anna.contact(ID)["versions"][0]["sha256"]
     assert anna.decide(ID, sha256=digest).status_code == 201

@@ -116,7 +116,7 @@ def test_stored_measurement_is_in_the_audit(anna):
 
 def test_missing_pixels_other_layers_and_unknown_sizes_are_not_measurable(anna, make_console):
     for changes, field in (
-        ({"layer": "wider"}, "layer"),
+        ({"layer": "expand"}, "layer"),
         ({"kind": "length", "to": [38.0, 50.0]}, "line"),
         ({"to": [10.0, 10.0]}, "to"),
         ({"to": [10.0, 60.5]}, "to"),

@@ -21,11 +21,11 @@ def store(console, version=1, received=200, *, complete=True, total=0):
 
 def related(kind, version=1, *, complete=True, received=300, **fields):
     """The image that answers a request about contact 00A7."""
-    scale = 2.02 if kind == "wider" else 1.0  # the link transmits pixel sizes in steps of 2.5 %
+    scale = 2.02 if kind == "expand" else 1.0  # the link transmits pixel sizes in steps of 2.5 %
     sizes = {"pixel_along_m": 0.1 * scale, "pixel_across_m": 0.05 * scale, **fields}
     times = {"first_utc_s": FIRST_UTC_S + 60, "time_utc_s": FIRST_UTC_S - 100}
     record = partial_record("00A9", version, received, complete=complete, **times, **sizes)
-    return record.model_copy(update={"despeckle_strength": 1.0 if kind == "wider" else 0.0})
+    return record.model_copy(update={"despeckle_strength": 1.0 if kind == "expand" else 0.0})
 
 
 def ask(console, kind="refine", contact_id=ID, status=201, **body):
@@ -86,7 +86,7 @@ def test_revisit_request_is_answered_by_a_later_look_of_the_vehicle(console):
     assert requests_of(console)[0]["result"]["id"].endswith(".00B2")
 
 
-@pytest.mark.parametrize("kind", ["wider", "original"])
+@pytest.mark.parametrize("kind", ["expand", "original"])
 def test_answer_to_a_request_is_a_layer_of_its_contact(kind, console):
     store(console)
     ask(console, kind)
@@ -109,7 +109,7 @@ def test_answer_to_a_request_is_a_layer_of_its_contact(kind, console):
 
 
 def test_layer_that_arrives_before_its_contact_is_linked(console):
-    console.state.store_image(related("wider"))
+    console.state.store_image(related("expand"))
     assert console.state.counts().total == 1
     store(console)
     listed = console.browser("watch").get("/api/contacts").json()
@@ -118,7 +118,7 @@ def test_layer_that_arrives_before_its_contact_is_linked(console):
 
 def test_other_detections_and_equal_images_stay_contacts(make_console):
     changes = ({"position": (56.0001, -5.0)}, {"altitude_m": 5.5}, {"pixel_across_m": 0.05}, {"vehicle": "uuv-2"})
-    others = [related("wider", **change) for change in changes]
+    others = [related("expand", **change) for change in changes]
     # A vehicle that has lost its state can send a contact twice: nothing shows that a request was answered.
     for other in (*others, related("original").model_copy(update={"despeckle_strength": 1.0})):
         console = make_console()
@@ -128,7 +128,7 @@ def test_other_detections_and_equal_images_stay_contacts(make_console):
 
 
 def test_image_with_a_decision_stays_a_contact(console):
-    console.state.store_image(related("wider"))
+    console.state.store_image(related("expand"))
     [row] = console.browser("watch").get("/api/contacts").json()["items"]
     assert console.browser("anna").decide(row["id"]).status_code == 201
     store(console)
@@ -185,7 +185,7 @@ def test_expected_time_follows_the_repetitions_and_durations_of_earlier_requests
     clock.advance(8 * before["median_s"])
     store(console, 2, 400)
     store(console, 3, 800)
-    after = costs(console)["wider"]
+    after = costs(console)["expand"]
     assert (after["packets_sent"], after["packets_lost"], after["past_requests"]) == (3, 2, 1)
     assert after["loss_up"] is None
     # 8^(1/3): one ratio of 8 and two of 1.
@@ -193,7 +193,7 @@ def test_expected_time_follows_the_repetitions_and_durations_of_earlier_requests
     cost = RequestCost(3.2, 2 * 6.1, after["bytes"], after["bytes"])
     unscaled = expected_arrival(cost, rate, FRAME_HEADER_BYTES, LinkRecord(None, 3, 2))
     assert after["median_s"] == pytest.approx(2 * unscaled.median_s)
-    assert ask(console, "wider")["expected_utc_s"] == pytest.approx(clock.now_utc_s + after["median_s"])
+    assert ask(console, "expand")["expected_utc_s"] == pytest.approx(clock.now_utc_s + after["median_s"])
 
 
 def test_gain_is_the_smallest_detail_before_and_after(make_console):
@@ -203,7 +203,7 @@ def test_gain_is_the_smallest_detail_before_and_after(make_console):
     sharp_to_m = console.browser("anna").contact(ID)["versions"][-1]["sharp_to_m"]
     for kind in ("refine", "region"):
         assert found[kind]["detail_m"] == sharp_to_m > found[kind]["new_detail_m"]
-    assert found["wider"]["new_detail_m"] is None
+    assert found["expand"]["new_detail_m"] is None
     assert found["region"]["bytes"] == 192
 
 

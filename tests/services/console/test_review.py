@@ -231,9 +231,9 @@ def test_request_costs_and_no_repeated_request(make_console):
     assert costs["refine"]["airtime_s"] == pytest.approx(3.2 + 3 * 6.1)
     assert costs["revisit"]["airtime_s"] == pytest.approx(3.2)
     # A new image of 200 bytes: 4 frames, two packets.
-    assert costs["wider"]["bytes"] == 200
-    assert costs["wider"]["airtime_s"] == pytest.approx(3.2 + 2 * 6.1)
-    assert {**costs["original"], "kind": "wider"} == costs["wider"]
+    assert costs["expand"]["bytes"] == 200
+    assert costs["expand"]["airtime_s"] == pytest.approx(3.2 + 2 * 6.1)
+    assert {**costs["original"], "kind": "expand"} == costs["expand"]
     path = f"/api/contacts/{ID}/requests"
     asked = anna.post(path, {"kind": "resend", "airtime_s": 9.3})
     assert (asked.status_code, asked.json()["state"]) == (201, "waiting")
@@ -242,7 +242,7 @@ def test_request_costs_and_no_repeated_request(make_console):
     [request] = anna.contact(ID)["requests"]
     assert (request["state"], request["reason"]) == ("refused", "no transmitter")
     assert anna.post(path, {"kind": "resend"}).status_code == 201
-    assert anna.post(path, {"kind": "wider"}).status_code == 201
+    assert anna.post(path, {"kind": "expand"}).status_code == 201
     assert anna.post(path, {"kind": "original"}).status_code == 201
     assert anna.post(path, {"kind": "original"}).status_code == 400
     assert anna.post(path, {"kind": "larger"}).status_code == 400
@@ -255,20 +255,20 @@ def test_costs_of_new_images_are_those_of_the_first_version_and_unknown_without_
         longer = {"bytes_received": 400, "bytes_total": 400, "despeckle_strength": 1.0}
         console.state.store_image(image_record(version=2).model_copy(update=longer))
         costs = {cost["kind"]: cost for cost in console.browser("anna").contact(ID)["costs"]}
-        assert [costs[kind]["bytes"] for kind in ("refine", "wider", "original")] == [400, 200, 200]
+        assert [costs[kind]["bytes"] for kind in ("refine", "expand", "original")] == [400, 200, 200]
         assert [costs["refine"][name] is None for name in ("airtime_s", "median_s", "most_s")] == [rate is None] * 3
 
 
 @pytest.mark.parametrize(
     ("changes", "possible"),
     [
-        ({}, {"refine", "revisit", "wider"}),
-        ({"position": None}, {"refine", "wider"}),
-        ({"position": None, "codec": "vq"}, {"wider"}),
-        ({"missing_rows": 10, "codec": "vq"}, {"resend", "prioritise", "revisit", "wider"}),
-        ({"missing_rows": 10}, {"refine", "resend", "prioritise", "revisit", "wider"}),
-        ({"despeckle_strength": 0.0}, {"refine", "revisit", "wider"}),
-        ({"despeckle_strength": 0.0625}, {"refine", "revisit", "wider", "original"}),
+        ({}, {"refine", "revisit", "expand"}),
+        ({"position": None}, {"refine", "expand"}),
+        ({"position": None, "codec": "vq"}, {"expand"}),
+        ({"missing_rows": 10, "codec": "vq"}, {"resend", "prioritise", "revisit", "expand"}),
+        ({"missing_rows": 10}, {"refine", "resend", "prioritise", "revisit", "expand"}),
+        ({"despeckle_strength": 0.0}, {"refine", "revisit", "expand"}),
+        ({"despeckle_strength": 0.0625}, {"refine", "revisit", "expand", "original"}),
     ],
 )
 def test_impossible_requests_are_rejected(console, changes, possible):

@@ -141,7 +141,7 @@ def test_commands_are_sent_and_confirmed(authenticated, modem_pair, begin, conso
         "c-1": command(),
         "c-2": command("resend", "c-2"),
         "c-3": command("revisit", "c-3"),
-        "c-4": command("wider", "c-4"),
+        "c-4": command("expand", "c-4"),
         "c-5": command("original", "c-5"),
         "c-6": command("region", "c-6", box=(4, 8, 20, 32), stream_bytes=192),
         "c-7": command("prioritise", "c-7", place="last"),

@@ -201,7 +201,7 @@ COMMANDS = [
     (dl.RefineMessage(1, 1000, 2, 400), "refine", "0002"),
     (dl.ResendMessage(2, 1001, 3), "resend", "0003"),
     (dl.RevisitMessage(3, 1002, 56.5, -5.25), "revisit", None),
-    (dl.ExpandMessage(5, 1004, 4), "wider", "0004"),
+    (dl.ExpandMessage(5, 1004, 4), "expand", "0004"),
     (dl.OriginalMessage(6, 1005, 5), "original", "0005"),
     (dl.RegionMessage(7, 1006, 6, RegionBox(4, 8, 20, 32), 192), "region", "0006"),
 ]
@@ -227,7 +227,7 @@ def test_commands_become_one_record_each_and_are_confirmed_each_time(vessel, sta
     assert {(c.kind, c.image_id) for c in compressor.received} == {
         ("refine", "0002"),
         ("resend", "0003"),
-        ("wider", "0004"),
+        ("expand", "0004"),
         ("original", "0005"),
         ("region", "0006"),
     }

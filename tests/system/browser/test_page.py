@@ -105,12 +105,12 @@ def test_complete_review_with_the_keyboard(serve):
     # A request: first its cost, then the command.
     visit.press("r")
     visit.wait("[data-request]:focus")
-    assert "cost unknown" in visit.text("[data-request=wider]")
-    visit.page.locator("[data-request=wider]").focus()
+    assert "cost unknown" in visit.text("[data-request=expand]")
+    visit.page.locator("[data-request=expand]").focus()
     visit.press("Enter")
     visit.wait("dialog >> text=The cost is not known")
     visit.press("Enter")
-    visit.wait('details[data-name="requests"] >> text=Wider view')
+    visit.wait('details[data-name="requests"] >> text=Expanded view')
     # The other views, and back.
     visit.press("n", "p")
     visit.until(MAP_DRAWN)

@@ -21,7 +21,7 @@ def sent_record(version, received):
     return partial_record("00A7", version, received, complete=True)
 
 
-def wider_record():
+def expanded_record():
     fields = {"first_utc_s": FIRST_UTC_S + 60, "time_utc_s": FIRST_UTC_S - 100}
     return partial_record("00A9", 1, 300, complete=True, pixel_along_m=0.2, pixel_across_m=0.1, **fields)
 
@@ -158,7 +158,7 @@ def test_request_of_unknown_cost_is_confirmed_and_a_phone_has_a_menu(served):
     assert served.contact()["requests"] == []
     visit.resize(390, 844)
     visit.page.locator(".request-menu").click()
-    visit.page.locator("dialog [data-request=wider]").wait_for()
+    visit.page.locator("dialog [data-request=expand]").wait_for()
     visit.page.locator("dialog [data-request=refine]").click()
     visit.wait("dialog >> text=The cost is not known")
     visit.page.locator('dialog [data-action="send"]').click()
@@ -176,39 +176,39 @@ def test_observer_sees_the_preview_and_no_request_buttons(served):
 
 
 @pytest.mark.firefox
-def test_wider_view_is_a_layer_of_its_contact(v1_page):
+def test_expanded_view_is_a_layer_of_its_contact(v1_page):
     served, visit = v1_page
-    visit.page.locator('[data-request="wider"]').click()
+    visit.page.locator('[data-request="expand"]').click()
     visit.wait(".request-states >> text=ordered")
-    served.state.store_image(wider_record())
-    visit.wait(".request-states >> text=arrived: wider view (+300")
+    served.state.store_image(expanded_record())
+    visit.wait(".request-states >> text=arrived: expanded view (+300")
     assert visit.page.locator(".row").count() == 1
-    assert visit.page.locator('[data-tool="layer-wider"]').count() == 1
-    visit.press("-")  # zooming out of the whole image continues into the wider image
-    shows_layer(visit, "wider")
+    assert visit.page.locator('[data-tool="layer-expand"]').count() == 1
+    visit.press("-")  # zooming out of the whole image continues into the expanded image
+    shows_layer(visit, "expand")
     assert visit.pixels() > 1000
     assert visit.page.locator('[data-tool="measure"]').get_attribute("aria-disabled") == "true"
     visit.page.locator('[data-tool="layer-raw"]').click()
     shows_layer(visit, "raw")
     visit.page.locator(".stage canvas").first.hover()
     visit.page.mouse.wheel(0, 100)
-    visit.wait(SELECTED.format("wider"))
+    visit.wait(SELECTED.format("expand"))
 
 
 @pytest.mark.firefox
-def test_wider_view_surrounds_the_image_at_its_place(serve):
-    """The wider image is darker than the contact's image here, so that the latter can be told apart inside it."""
+def test_expanded_view_surrounds_the_image_at_its_place(serve):
+    """The expanded image is darker than the contact's image here, so that the latter can be told apart inside it."""
     blocks = np.random.default_rng(3).integers(100, 250, (20, 30))
     own = np.kron(blocks, np.ones((2, 2))).astype(np.uint8)
     surroundings = np.full((40, 60), 20, np.uint8)
     surroundings[6:26, 20:50] = blocks // 5
     served = serve(assumed_rate=1)
     served.state.store_image(with_pixels(sent_record(1, 131), own))
-    served.state.store_image(with_pixels(wider_record(), surroundings))
+    served.state.store_image(with_pixels(expanded_record(), surroundings))
     visit = served.visit(viewport=LARGE)
     visit.wait_for_contact("00A7")
     visit.press("-")
-    shows_layer(visit, "wider")
+    shows_layer(visit, "expand")
     # The view covers twice the lengths of the contact's image: 40 x 60 px of 0.1 x 0.05 m.
     across_m, along_m = json.loads(visit.page.locator(".stage canvas").first.get_attribute("data-extent"))
     assert (across_m, along_m) == pytest.approx((6.0, 8.0))

@@ -65,8 +65,8 @@ def test_expand_command_sends_an_image_of_twice_the_ground(start_chain):
     run.until_idle()
     before = set(shore)
     first = next(image for image in shore.values() if image.complete)
-    send_command(run, "wider", first.image_id)
-    run.until(lambda: any(i not in before and shore[i].complete for i in list(shore)), "the wider image received")
+    send_command(run, "expand", first.image_id)
+    run.until(lambda: any(i not in before and shore[i].complete for i in list(shore)), "the expanded image received")
     (wide_id,) = set(shore) - before
     near, wide = run.watcher.encoded[first.image_id].contact, run.watcher.encoded[wide_id].contact
     assert wide.contact_id == near.contact_id

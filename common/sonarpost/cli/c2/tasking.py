@@ -16,20 +16,10 @@ from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.shared import Subparsers, add_router_options, add_site_option, router_of
 from sonarpost.delivery.client import deliver
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.messages import Advice, Command, QueuePlace, Record, Verdict
+from sonarpost.messages import Advice, Command, CommandKind, QueuePlace, Record, Verdict
 from sonarpost.wire import first_error
 
 CONSUMER = "c2"
-KINDS = {
-    "refine": "refine",
-    "resend": "resend",
-    "expand": "wider",
-    "original": "original",
-    "revisit": "revisit",
-    "region": "region",
-    "prioritise": "prioritise",
-}
-"""Kind on the command line -> kind in the record."""
 
 
 def add_actions(actions: Subparsers) -> None:
@@ -41,7 +31,7 @@ def add_actions(actions: Subparsers) -> None:
     command.add_argument(
         "--kind",
         required=True,
-        choices=KINDS,
+        choices=get_args(CommandKind),
         metavar="KIND",
         help="refine (more detail), resend (lost parts), expand (more seabed around the contact), original (the image"
         " without despeckling), region (a part of the image), prioritise (move it in the transmit queue) or revisit",
@@ -104,7 +94,7 @@ def run_command(parsed: argparse.Namespace) -> int:
     vehicle, image = _vehicle_and_image(parsed)
     fields = {
         "command_id": parsed.id or f"c-{uuid.uuid4().hex}",
-        "kind": KINDS[parsed.kind],
+        "kind": parsed.kind,
         "vehicle_id": vehicle,
         "image_id": image,
         "lat_deg": parsed.lat,

@@ -153,8 +153,8 @@ export class ContactView {
   async showLayer(name) {
     const layer = this.layers.find((one) => one.name === name);
     if (!layer) return;
-    // The wider image shows other seabed: the viewport of one image does not fit the other.
-    if (name === "wider" || this.layer === "wider") Object.assign(this.views[0].viewport, defaultViewport());
+    // The expanded image shows other seabed: the viewport of one image does not fit the other.
+    if (name === "expand" || this.layer === "expand") Object.assign(this.views[0].viewport, defaultViewport());
     if (layer.reason && this.measurement.active) this.measurement.stop();
     await this.#select({ layer: name });
   }
@@ -301,7 +301,7 @@ export class ContactView {
 
   zoom(factor) {
     if (continuesOut(this, factor)) {
-      this.showLayer("wider");
+      this.showLayer("expand");
       return;
     }
     this.views[0].zoom(factor);

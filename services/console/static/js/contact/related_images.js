@@ -2,7 +2,7 @@
 
 import { t } from "../texts.js";
 
-const EXPANDED_PIXEL = 2; // ratio of the pixel sizes of the wider image and of the contact's image
+const EXPANDED_PIXEL = 2; // ratio of the pixel sizes of the expanded image and of the contact's image
 const OUTLINE_COLOUR = "#52e0ff";
 
 const withPicture = (one) => one.versions.some((version) => version.codec);
@@ -25,7 +25,7 @@ export function relatedVersion(/** @type {ContactDetail} */ detail, layer) {
 }
 
 /**
- * How a layer is composed of several images: regions on the contact's image, or this image on the wider one.
+ * How a layer is composed of several images: regions on the contact's image, or this image on the expanded one.
  *
  * Returns `{layer, base, factor, parts, mark, box}`: `base` is drawn in pixels of 1 / `factor` of its size, and `parts`, `{version, box}`,
  * at their places in these pixels: [first row, first column, last row + 1, last column + 1]. `mark` and `box` are those of the contact.
@@ -35,12 +35,12 @@ export function compositionOf(detail, shown, layer) {
   const placed = relatedOf(detail, layer).filter((one) => one.box);
   if (!placed.length || !shown?.codec || shown.height_px !== detail.contact.height_px || shown.width_px !== detail.contact.width_px) return null;
   if (layer === "region") return { layer, base: shown, factor: 1, parts: placed.map((one) => ({ version: newestOf(one), box: one.box })), mark: shown.mark, box: shown.box };
-  const wider = placed.at(-1);
-  const part = wider.box.map((value) => value * EXPANDED_PIXEL);
+  const expanded = placed.at(-1);
+  const part = expanded.box.map((value) => value * EXPANDED_PIXEL);
   const [row, column] = part;
   const { mark, box } = shown;
   return {
-    layer, base: newestOf(wider), factor: EXPANDED_PIXEL, parts: [{ version: shown, box: part }],
+    layer, base: newestOf(expanded), factor: EXPANDED_PIXEL, parts: [{ version: shown, box: part }],
     mark: mark && { ...mark, row: mark.row + row, column: mark.column + column, columns: mark.columns.map((one) => one + column) },
     box: box && { rows: box.rows.map((one) => one + row), columns: box.columns.map((one) => one + column) },
   };
@@ -77,8 +77,8 @@ export function outlinesOf(composition) {
   });
 }
 
-/** Whether zooming out from the whole image continues into the wider image. */
+/** Whether zooming out from the whole image continues into the expanded image. */
 export function continuesOut(view, factor) {
   return factor < 1 && !view.zoomed && !view.measurement.active && relatedVersion(view.detail, view.layer) === null
-    && relatedVersion(view.detail, "wider") !== null;
+    && relatedVersion(view.detail, "expand") !== null;
 }

@@ -26,7 +26,7 @@ export function startPointer(view) {
       event.preventDefault();
       const factor = event.deltaY < 0 ? 1.25 : 0.8;
       if (continuesOut(view, factor)) {
-        view.showLayer("wider");
+        view.showLayer("expand");
         return;
       }
       image.zoom(factor, ...at(event));

@@ -19,7 +19,7 @@ export function isPending(/** @type {VehicleRequest} */ request, now_s) {
 function resultText(/** @type {VehicleRequest} */ request) {
   const { result } = request;
   const name = request.kind === "revisit" ? result.id.split(".").filter((_, index) => index === 2 || index === 4).join("/")
-    : ["wider", "original", "region"].includes(request.kind) ? t(`layer.${request.kind}`) : t("request_state.version", { version: result.version });
+    : ["expand", "original", "region"].includes(request.kind) ? t(`layer.${request.kind}`) : t("request_state.version", { version: result.version });
   const elapsed = duration(request.arrived_utc_s - request.asked_utc_s);
   return t("request_state.arrived", { name, bytes: bytes(result.bytes), elapsed });
 }
