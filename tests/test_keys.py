@@ -59,7 +59,7 @@ EXPECTED = {
     "sonarpost/v1/uuv-1/health/atd_stub": keys.health("uuv-1", "atd_stub"),
     "sonarpost/v1/uuv-1/health/*": keys.health_all("uuv-1"),
     "sonarpost/v1/uuv-1/alive/atd_stub": keys.alive("uuv-1", "atd_stub"),
-    "sonarpost/v1/shore/inbox/*/handoff/c2": keys.delivery_query(keys.shore_inbox_all(), "c2"),
+    "sonarpost/v1/shore/inbox/*/delivery/c2": keys.delivery_query(keys.shore_inbox_all(), "c2"),
 }
 
 # The name of each parameter of each function in the module that makes a key, with valid names for the others.

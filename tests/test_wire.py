@@ -53,13 +53,13 @@ def test_golden_bytes_decode_and_are_encoded_again(record_type):
 
 def test_golden_delivery_messages_parse_and_encode_unchanged():
     made = delivery_samples()
-    for name, vector in vectors("handoff-reply").items():
+    for name, vector in vectors("delivery-reply").items():
         payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
         reply = AckReply.unpack(payload, KEY)
         assert (reply.status, reply.next_offset, reply.reason) == (fields["status"], fields["next"], fields["reason"])
         assert reply.max_batch == fields.get("takes", 0)
-        assert made["handoff-reply"][name] == payload == reply.pack(reply.max_batch)
-    for name, vector in vectors("handoff-attachment").items():
+        assert made["delivery-reply"][name] == payload == reply.pack(reply.max_batch)
+    for name, vector in vectors("delivery-attachment").items():
         payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
         size = min(32768, fields["size"] - fields["offset"])
         chunk = parse_query(payload, bytes(size), KEY)
@@ -69,7 +69,7 @@ def test_golden_delivery_messages_parse_and_encode_unchanged():
             "sha256": fields["sha256"],
         }
         assert (chunk.seq, chunk.size, chunk.offset) == (fields["seq"], fields["size"], fields["offset"])
-        assert made["handoff-attachment"][name] == payload
+        assert made["delivery-attachment"][name] == payload
         item = OutboxItem(fields["consumer"], chunk.seq, "k", "", 4, bytes(chunk.size), chunk.sha256)
         assert chunk.done_up_to == fields.get("settled", 0)
         assert attachment(chunk.origin, item, chunk.offset, chunk.done_up_to) == payload
@@ -79,7 +79,7 @@ def test_golden_batch_messages_parse_and_encode_unchanged():
     made = batch_samples()
     sizes = [size for _, size in BATCH]
     data = b"".join(bytes([number]) * size for number, size in enumerate(sizes))
-    for name, vector in vectors("handoff-batch-attachment").items():
+    for name, vector in vectors("delivery-batch-attachment").items():
         payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
         chunks = parse_query(payload, data, KEY)
         assert isinstance(chunks, tuple)
@@ -87,13 +87,13 @@ def test_golden_batch_messages_parse_and_encode_unchanged():
         assert [c.data for c in chunks] == [bytes([number]) * size for number, size in enumerate(sizes)]
         assert {c.done_up_to for c in chunks} == {fields.get("settled", 0)}
         assert {c.origin.hex() for c in chunks} == {fields["origin"]["$hex"]}
-        assert made["handoff-batch-attachment"][name] == payload
-    for name, vector in vectors("handoff-batch-reply").items():
+        assert made["delivery-batch-attachment"][name] == payload
+    for name, vector in vectors("delivery-batch-reply").items():
         payload, fields = bytes.fromhex(vector["hex"]), vector["fields"]
         replies = unpack_replies(payload, 3, KEY)
         assert isinstance(replies, tuple)
         assert [[reply.status, reply.reason] for reply in replies] == (fields["replies"] or 3 * [["stored", ""]])
-        assert made["handoff-batch-reply"][name] == payload == pack_replies(replies)
+        assert made["delivery-batch-reply"][name] == payload == pack_replies(replies)
 
 
 # Round trips

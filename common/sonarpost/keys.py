@@ -459,12 +459,12 @@ def service_of(key: str) -> tuple[str, str]:
 
 def delivery_query(key: str, consumer: str) -> str:
     """Delivery queries for records of `key` to the named consumer."""
-    return f"{key}/handoff/{_name('consumer', consumer)}"
+    return f"{key}/delivery/{_name('consumer', consumer)}"
 
 
 def delivery_query_any(key: str) -> str:
     """Delivery queries for records of `key` to every consumer."""
-    return f"{key}/handoff/*"
+    return f"{key}/delivery/*"
 
 
 def writer_of(key: str) -> str:

@@ -9,7 +9,7 @@ from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.messages import Snippet
 
-_PREFIX = "pool:"
+_PREFIX = "pending/"
 _MAX_CONFIDENCE = 2.0
 _STEPS = 1_000_000
 _PICK_RANK = -1

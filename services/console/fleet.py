@@ -234,7 +234,7 @@ def fleet_json(
                 "heading_deg": position and position[3],
                 "measured_range": ranges.get(name),
                 "status": status_json(statuses[name]) if name in statuses else None,
-                "open_orders": open_requests.get(name, 0),
+                "open_requests": open_requests.get(name, 0),
             }
         )
     links = chain_links(

@@ -38,8 +38,8 @@ from sonarpost.services.op_modem.vessel_endpoint import VesselLink
 
 log = logging.getLogger(__name__)
 
-_PARTS = "station/"
-_COUNTER_LIMIT = "seal-limit/"
+_PARTS = "vehicle/"
+_COUNTER_LIMIT = "counter-limit/"
 _AUTHENTICATED_SINCE = "authenticated-since"
 _UNFINISHED_BLOCKS = ("link/v1/block", "link/v1/rival")
 

@@ -55,8 +55,8 @@ _STATUS_PRIORITY: Final = 5
 _MAX_IMAGES_PUBLISHED: Final = 500
 
 # Names of the saved parts, below the name of the wire format.
-_QUEUE, _RECEIVER, _COMMANDS, _AUTHENTICATION = "queue/", "receiver/", "orders", "authentication/"
-_COUNTER_LIMIT: Final = "v1-seal-limit/"
+_QUEUE, _RECEIVER, _COMMANDS, _AUTHENTICATION = "queue/", "receiver/", "commands", "authentication/"
+_COUNTER_LIMIT: Final = "counter-limit/"
 _IMAGES_ACCEPTED: Final = "images_accepted"
 _PAPER: Final = "paper/"
 

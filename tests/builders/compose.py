@@ -139,7 +139,7 @@ class Project:
         script = (
             "import sqlite3; db = sqlite3.connect('file:/var/lib/sonarpost/state/atd_stub.db?mode=ro', uri=True); "
             "count = lambda kind: db.execute('SELECT COUNT(*) FROM state WHERE name LIKE ?', (kind,)).fetchone()[0]; "
-            "print(count('file:%'), count('pool:%') + db.execute('SELECT COUNT(*) FROM outbox').fetchone()[0])"
+            "print(count('file:%'), count('pending/%') + db.execute('SELECT COUNT(*) FROM outbox').fetchone()[0])"
         )
         files, owed = self.inside("atd_stub", script).split()
         return int(files) if owed == "0" else 0

@@ -37,12 +37,12 @@ def delivery_samples() -> dict[str, dict[str, bytes]]:
     item = OutboxItem("c2", 7, "k", "", 4, b"\x80", bytes.fromhex("11" * 32))
     large = OutboxItem("relay", 2**40, "k", "", 4, b"\x00" * 100_000, bytes.fromhex("22" * 32))
     return {
-        "handoff-attachment": {
+        "delivery-attachment": {
             "first-piece": attachment(bytes(range(16)), item),
             "second-piece": attachment(bytes(range(16)), large, 32768),
             "after-dropped-ones": attachment(bytes(range(16)), item, 0, 5),
         },
-        "handoff-reply": {
+        "delivery-reply": {
             "stored": AckReply("stored").pack(),
             "more": AckReply("more", next_offset=65536).pack(),
             "refused": AckReply("refused", reason="k: v: got 2, expected 1").pack(),
@@ -63,11 +63,11 @@ def batch_samples() -> dict[str, dict[str, bytes]]:
         AckReply("later", reason="full"),
     ]
     return {
-        "handoff-batch-attachment": {
+        "delivery-batch-attachment": {
             "three-records": protocol.batch_attachment(bytes(range(16)), items),
             "after-dropped-ones": protocol.batch_attachment(bytes(range(16)), items, 6),
         },
-        "handoff-batch-reply": {
+        "delivery-batch-reply": {
             "one-of-each": protocol.pack_replies(replies),
             "all-stored": protocol.pack_replies(replies[:1] * 3),
         },

@@ -21,7 +21,7 @@ from sonarpost.delivery.protocol import (
 from sonarpost.delivery.records import OutboxItem, ReceivedChunk
 from sonarpost.errors import PayloadError
 
-WHERE = "k/handoff/consumer"
+WHERE = "k/delivery/consumer"
 ORIGIN = b"o" * 16
 SHA = bytes(32)
 

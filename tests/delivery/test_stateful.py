@@ -244,7 +244,7 @@ class DeliveryFaults(RuleBasedStateMachine):
         seen = self.sent[number % len(self.sent)]
         fields = msgpack.unpackb(seen.attached)
         seq, digest = (fields["seq"], fields["sha256"]) if fields["v"] == 1 else fields["records"][0][::2]
-        key = seen.key.removesuffix("/handoff/relay")
+        key = seen.key.removesuffix("/delivery/relay")
         windows, _, inbox = self.delivery.consumer_state_of_producers()
         self.delivery.receive([query_of(key, fields["origin"], [(seq, f"{key} valid own".encode(), digest)], 0)])
         after = self.delivery.consumer_state_of_producers()

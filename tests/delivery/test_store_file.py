@@ -48,13 +48,13 @@ def test_other_file_is_rejected_and_unchanged(tmp_path):
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize("version", [b"2", b"4"])
+@pytest.mark.parametrize("version", [b"3", b"5"])
 def test_store_of_another_version_is_rejected_and_unchanged(version, open_store, tmp_path):
     path = tmp_path / "s.db"
     with closing(sqlite3.connect(path)) as db, db:
         db.execute("CREATE TABLE meta (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID")
         db.execute("INSERT INTO meta VALUES ('version', ?)", (version,))
-    with pytest.raises(DeliveryError, match=f"s.db: store version {version!r}, expected 3"):
+    with pytest.raises(DeliveryError, match=f"s.db: store version {version!r}, expected 4"):
         open_store(page_bytes=512)
     with closing(sqlite3.connect(path)) as db:
         assert db.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall() == [("meta",)]

@@ -142,7 +142,7 @@ def test_vessel_replies_on_its_own_keys_only(world, shore_session, received):
         own = keys.delivery_query(keys.advice("vessel-1"), "relay")
         eventually(lambda: answers(shore_session, own) == [b"mine"], what="the reply on its own key")
         assert answers(shore_session, keys.delivery_query(keys.advice("vessel-2"), "relay")) == []
-    world.shore.wait_for_denial("vessel-1", "Queryable", "vessel-2/advice/handoff/relay")
+    world.shore.wait_for_denial("vessel-1", "Queryable", "vessel-2/advice/delivery/relay")
 
 
 def test_vessel_receives_its_own_prefix_only(world, shore_session):

@@ -115,7 +115,7 @@ class Inbox(Generic[T]):
         accepting: Accepting | None = None,
     ) -> None:
         self._store = store
-        self._key_suffix = "/handoff/" + consumer
+        self._key_suffix = "/delivery/" + consumer
         self._validate = validate
         self._on_refused = on_refused
         self._expand = expand

@@ -1,6 +1,6 @@
 """Messages of the delivery protocol between a producer and a consumer.
 
-The producer queries the consumer at `{key}/handoff/{consumer}`. The payload of the query is one chunk of a record (at
+The producer queries the consumer at `{key}/delivery/{consumer}`. The payload of the query is one chunk of a record (at
 most 32 KiB) or several small records; its attachment identifies them. The consumer replies after it has committed. A
 consumer that accepts several records in a query announces it in its replies (`takes`), so that either side can run an
 older version. `docs/specifications/zenoh.md` specifies the messages for other languages.

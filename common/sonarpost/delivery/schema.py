@@ -10,7 +10,7 @@ from sonarpost.logs import kv
 
 log = logging.getLogger(__name__)
 
-VERSION = 3
+VERSION = 4
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;

@@ -148,11 +148,9 @@ def _box_in_expanded(db: sqlite3.Connection, contact_id: str, expanded: Reconstr
         (contact_id,),
     ).fetchone()
     image = decode_image(newest)
-    place = (
-        place_in_expanded(image.picture.to_array(), expanded.picture.to_array())
-        if image.codec and expanded.codec
-        else None
-    )
+    if not image.codec or not expanded.codec:
+        return None
+    place = place_in_expanded(image.picture.to_array(), expanded.picture.to_array())
     if place is None:
         return None
     height, width = (size // EXPAND_FACTOR for size in (image.picture.height_px, image.picture.width_px))

@@ -320,25 +320,6 @@ def test_a_release_that_cannot_be_stored_is_tried_again(
     eventually(lambda: service.health().state == "ok")
 
 
-def test_a_store_of_version_0_1_is_continued(start_service, platform, put_images, modem, gauge, request):
-    settings = platform("uuv-1")
-    settings.state_dir.mkdir(parents=True)
-    store = Store(settings.state_dir / "atd_stub.db")
-    with store.transaction() as tx:
-        for number, (name, confidence) in enumerate((("low", 0.5), ("high", 1.9)), start=1):
-            rank = round((2.0 - confidence) * 1e6)
-            tx.put_state(f"pool:{rank:08d}:{number:015d}", wire.encode(snippet(name, confidence)))
-        tx.put_state("released", b"1")
-    store.close()
-    compressor = request.getfixturevalue("compressor")
-    service = start_service(max_in_flight=8)
-    assert gauge(service, "contacts_waiting") == 2
-    put_images([1.0])
-    eventually(lambda: gauge(service, "contacts_waiting") == 3)
-    publish_until(modem, lambda: len(compressor.received) == 3)
-    assert [s.contact.contact_id for s in compressor.received] == ["high", "p000", "low"]
-
-
 def test_a_process_that_is_killed_repeatedly_sends_each_contact_once(router, tmp_path, compressor, put_images, modem):
     images, kills = 24, 2
     put_images([round(random.Random(n).uniform(0, 2), 3) for n in range(images)])

@@ -144,7 +144,7 @@ def test_delivery_program_waits_for_its_consumer(run, router, client, platform, 
     (tmp_path / "record").write_bytes(hex_block("decision"))
     asked = []
     silent = client.declare_queryable(
-        f"{DecisionConsumer.key}/handoff/relay", lambda q: asked.append(q.payload.to_bytes())
+        f"{DecisionConsumer.key}/delivery/relay", lambda q: asked.append(q.payload.to_bytes())
     )
     program = run("deliver", router, DecisionConsumer.key, "relay", str(tmp_path / "record"))
     eventually(lambda: hex_block("decision") in asked, what="an attempt without a reply")
@@ -230,7 +230,7 @@ def test_consumer_ignores_publications_with_an_attachment(client, platform):
 def test_service_answers_the_example_query_with_the_example_reply(client, platform):
     consumer = DecisionConsumer(platform("vessel-1"))
     consumer.start()
-    selector = "sonarpost/v1/vessel-1/contact/decision/handoff/relay"
+    selector = "sonarpost/v1/vessel-1/contact/decision/delivery/relay"
 
     def ask(payload, attached):
         replies = client.get(selector, payload=payload, attachment=attached, timeout=WAIT_S)

@@ -104,7 +104,7 @@ class VehicleCard {
         fact(t("fleet.position"), one.lat_deg === null ? DASH : position(one.lat_deg, one.lon_deg), " ", positionTime(one, limit_s)),
         statusFact(one.status),
         one.queue ? fact(t("fleet.send_queue"), queueText(one.queue), " ", withAge("", one.queue.time_utc_s, limit_s)) : null,
-        fact(t("fleet.requests"), number(one.open_orders))),
+        fact(t("fleet.requests"), number(one.open_requests))),
       h("h4", { text: t("fleet.seabed") }), seabedFacts(one.seabed));
   }
 }
