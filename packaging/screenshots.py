@@ -17,7 +17,7 @@ from urllib.parse import quote, urlsplit
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from sonarpost.messages import Advice
+from sonarpost.messages import Comment
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import ContactFilter
@@ -136,8 +136,8 @@ def decision(scene: Scene) -> None:
     """Night theme, large: a delivered decision and a comment from the shore site, two versions side by side."""
     contact_id = scene.contact(complete=True, index=0)
     row = scene.state.contact_detail(contact_id)["contact"]
-    advice = Advice(
-        advice_id="advice-1",
+    comment = Comment(
+        comment_id="comment-1",
         vessel_id=VESSEL,
         vehicle_id=row["vehicle_id"],
         image_id=row["image_id"],
@@ -147,9 +147,9 @@ def decision(scene: Scene) -> None:
         mlo_class="manta",
         remark="same outline as last week's",
         author="eva",
-        advised_utc_s=scene.state.clock() - 40.0,
+        commented_utc_s=scene.state.clock() - 40.0,
     )
-    scene.state.store_advice(advice)
+    scene.state.store_comment(comment)
     with scene.page(LARGE, "night", contact_id) as page:
         page.click('[data-confidence="0.9"]')
         press(page, "w")

@@ -227,13 +227,13 @@ def command_all(platform: str) -> str:
     return _of(platform, "command/*")
 
 
-def advice(vessel: str) -> str:
+def comment(vessel: str) -> str:
     """An expert's comment from the shore site.
 
-    Record: advice. From: c2. To: relay. Delivery: durable, priority 2, not published.
-    Record: advice. From: relay. To: console, the configured consumers. Delivery: durable, priority 2.
+    Record: comment. From: c2. To: relay. Delivery: durable, priority 2, not published.
+    Record: comment. From: relay. To: console, the configured consumers. Delivery: durable, priority 2.
     """
-    return _of(vessel, "advice")
+    return _of(vessel, "comment")
 
 
 def shore_inbox(vessel: str, site: str = SHORE) -> str:
@@ -353,17 +353,17 @@ def json_mirror(key: str) -> str:
     return "/".join([*parts[:3], "json", *parts[3:]])
 
 
-def tasking_advice(vessel: str, site: str = SHORE) -> str:
+def tasking_comment(vessel: str, site: str = SHORE) -> str:
     """An expert's comment for one vessel.
 
-    Record: advice. From: console, `sonarpost c2 comment`. To: c2. Delivery: durable, priority 2.
+    Record: comment. From: console, `sonarpost c2 comment`. To: c2. Delivery: durable, priority 2.
     """
-    return _of(site, f"tasking/{_name('vessel', vessel)}/advice")
+    return _of(site, f"tasking/{_name('vessel', vessel)}/comment")
 
 
-def tasking_advice_all(site: str = SHORE) -> str:
+def tasking_comment_all(site: str = SHORE) -> str:
     """Comments for every vessel."""
-    return _of(site, "tasking/*/advice")
+    return _of(site, "tasking/*/comment")
 
 
 def tasking_command(vessel: str, site: str = SHORE) -> str:
@@ -380,7 +380,7 @@ def tasking_command_all(site: str = SHORE) -> str:
 
 
 def tasking_vessel(key: str) -> str:
-    """Return the vessel that a key made by `tasking_advice` or `tasking_command` names.
+    """Return the vessel that a key made by `tasking_comment` or `tasking_command` names.
 
     Raises:
         BadInputError: It is another key.

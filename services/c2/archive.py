@@ -72,7 +72,7 @@ class Storage(Protocol):
         """Return a record for a vessel that another c2 has claimed; see `ShoreDatabase.foreign_tasking`."""
 
     def store_tasking(self, rows: Sequence[TaskingRow]) -> None:
-        """Index advice and commands with their states."""
+        """Index comments and commands with their states."""
 
     def accept(self, records: Sequence[tuple[str, bytes]]) -> None:
         """Store records, as key and payload, before they are acknowledged."""
@@ -202,7 +202,7 @@ class Archive:
                 self.index().put(rows)
 
     def store_tasking(self, rows: Sequence[TaskingRow]) -> None:
-        """Index advice and commands with their states."""
+        """Index comments and commands with their states."""
         self.index().put(rows)
 
     # A single c2: its own store has what it has accepted and not handled.

@@ -1,4 +1,4 @@
-"""Shore side of the relay: stores and publishes the records of vessels, and sends advice and commands to vessels."""
+"""Shore side of the relay: stores and publishes the records of vessels, and sends comments and commands to vessels."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import DeliveryError, PayloadError, SonarpostError
 from sonarpost.logs import kv
 from sonarpost.messages import (
-    Advice,
     CodedImage,
     Command,
+    Comment,
     Decision,
     ImagePart,
     ReceivedStatus,
@@ -52,7 +52,7 @@ from sonarpost.services.c2.tasking import Tasking
 log = logging.getLogger(__name__)
 
 COMMAND_PRIORITY = 1
-ADVICE_PRIORITY = 2
+COMMENT_PRIORITY = 2
 CONSUMER = "relay"
 VERIFICATION_INTERVAL_S = 60.0
 RETRY_S = 1.0
@@ -76,7 +76,7 @@ def _relayed_types(vessel: str) -> Mapping[str, type[ReconstructedImage] | type[
 
 
 class C2Service(Service[C2Config]):
-    """Stores and publishes relayed records, and sends advice and commands to vessels.
+    """Stores and publishes relayed records, and sends comments and commands to vessels.
 
     A record is acknowledged to the vessel when it is committed to this service's store, and published to subscribers
     when its files are written. Coded images are decoded by other processes, while further records are
@@ -85,7 +85,7 @@ class C2Service(Service[C2Config]):
 
     NAME = "c2"
     BATCH = 32
-    # The relay of the vessel publishes advice and commands; a copy from here would only load the radio link.
+    # The relay of the vessel publishes comments and commands; a copy from here would only load the radio link.
     PUBLISH = False
 
     def __init__(self, platform: PlatformConfig, config: C2Config) -> None:
@@ -141,12 +141,12 @@ class C2Service(Service[C2Config]):
         return known
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """Relayed records of all vessels, and advice and commands for them."""
+        """Relayed records of all vessels, and comments and commands for them."""
         site = self.config.site
         return {
             keys.shore_inbox_all(site): Relayed,
             keys.shore_part_all(site): ImagePart,
-            keys.tasking_advice_all(site): Advice,
+            keys.tasking_comment_all(site): Comment,
             keys.tasking_command_all(site): Command,
         }
 
@@ -162,9 +162,9 @@ class C2Service(Service[C2Config]):
             return None
         if isinstance(record, ImagePart):
             return image_parts.coded_image(record, keys.part_vessel(key), key) if record.b == 0 else None
-        assert isinstance(record, (Advice, Command))
+        assert isinstance(record, (Comment, Command))
         vessel = keys.tasking_vessel(key)
-        if isinstance(record, Advice) and record.vessel_id != vessel:
+        if isinstance(record, Comment) and record.vessel_id != vessel:
             raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
         self._is_known(vessel, key, record)
         return None
@@ -210,7 +210,7 @@ class C2Service(Service[C2Config]):
         self._archive.accept(records)
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """Store the record of a vessel, or queue advice and commands for one."""
+        """Store the record of a vessel, or queue comments and commands for one."""
         try:
             self._handle(key, record, effects)
         except (OSError, DeliveryError, MemoryError, ServiceStoppingError):
@@ -235,7 +235,7 @@ class C2Service(Service[C2Config]):
         elif isinstance(record, ImagePart):
             self._accept_image(image_parts.coded_image(record, keys.part_vessel(key), key), effects)
         else:
-            assert isinstance(record, (Advice, Command))
+            assert isinstance(record, (Comment, Command))
             self._send_to_vessel(keys.tasking_vessel(key), key, record, effects)
 
     def _publish_status(self, status: ReceivedStatus, effects: UnitOfWork) -> None:
@@ -343,7 +343,7 @@ class C2Service(Service[C2Config]):
 
     # Records for vessels
 
-    def _is_known(self, vessel: str, key: str, record: Advice | Command) -> bool:
+    def _is_known(self, vessel: str, key: str, record: Comment | Command) -> bool:
         """Return whether a record was accepted before.
 
         Raises:
@@ -357,13 +357,13 @@ class C2Service(Service[C2Config]):
         kind, record_id = tasking.kind_and_id(record)
         return self._is_foreign(vessel, key, record, self._archive.foreign_tasking(vessel, kind, record_id))
 
-    def _is_foreign(self, vessel: str, key: str, record: Advice | Command, payload: bytes | None) -> bool:
+    def _is_foreign(self, vessel: str, key: str, record: Comment | Command, payload: bytes | None) -> bool:
         """Return whether another c2 has a record; see `_is_known` for errors."""
         if payload:
             tasking.reject_conflict(Tasking(vessel, tasking.kind_and_id(record)[0], payload), record, key)
         return payload is not None
 
-    def _send_to_vessel(self, vessel: str, key: str, record: Advice | Command, effects: UnitOfWork) -> None:
+    def _send_to_vessel(self, vessel: str, key: str, record: Comment | Command, effects: UnitOfWork) -> None:
         if self._is_known(vessel, key, record):
             effects.count("tasking_repeated")
             return
@@ -374,7 +374,7 @@ class C2Service(Service[C2Config]):
         if self._is_foreign(vessel, key, record, self._archive.claim_tasking(item.row(), payload)):
             effects.count("tasking_repeated")
             return
-        priority = ADVICE_PRIORITY if isinstance(record, Advice) else COMMAND_PRIORITY
+        priority = COMMENT_PRIORITY if isinstance(record, Comment) else COMMAND_PRIORITY
         # One queue for each vessel: an unreachable vessel does not delay the others.
         effects.send_payload(item.key, queue_of(CONSUMER, vessel), payload, type(record), priority=priority)
         packed = item.pack()

@@ -188,7 +188,7 @@ class SharedArchive:
         return self._database.foreign_tasking(vessel_id, kind, record_id)
 
     def store_tasking(self, rows: Sequence[TaskingRow]) -> None:
-        """Write the states of advice and commands."""
+        """Write the states of comments and commands."""
         self._database.put_tasking(rows)
 
     # Accepted records

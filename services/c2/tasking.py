@@ -1,4 +1,4 @@
-"""Delivery state of advice and commands for vessels; stored with the delivery itself, published afterwards."""
+"""Delivery state of comments and commands for vessels; stored with the delivery itself, published afterwards."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sonarpost import keys, wire
 from sonarpost.archive.shore_index import TaskingRow
 from sonarpost.errors import PayloadError
 from sonarpost.link.state import unpack_value
-from sonarpost.messages import Advice, Command, DeliveryState, TaskingKind, TaskingState
+from sonarpost.messages import Command, Comment, DeliveryState, TaskingKind, TaskingState
 
 PREFIX = "tasking/"
 _WHERE: Final = "tasking state"
@@ -19,7 +19,7 @@ _WHERE: Final = "tasking state"
 
 @dataclass(frozen=True, slots=True)
 class Tasking:
-    """Advice or a command for a vessel, with its delivery state."""
+    """A comment or a command for a vessel, with its delivery state."""
 
     vessel_id: str
     kind: TaskingKind
@@ -29,10 +29,10 @@ class Tasking:
     changed_utc_s: float = 0.0
 
     @property
-    def record(self) -> Advice | Command:
+    def record(self) -> Comment | Command:
         """The record itself."""
-        if self.kind == "advice":
-            return wire.decode(Advice, self.payload, keys.advice(self.vessel_id))
+        if self.kind == "comment":
+            return wire.decode(Comment, self.payload, keys.comment(self.vessel_id))
         return wire.decode(Command, self.payload, keys.command_all(self.vessel_id))
 
     @property
@@ -49,8 +49,8 @@ class Tasking:
     def key(self) -> str:
         """Key on which the vessel's relay receives it."""
         record = self.record
-        if isinstance(record, Advice):
-            return keys.advice(self.vessel_id)
+        if isinstance(record, Comment):
+            return keys.comment(self.vessel_id)
         return keys.command(self.vessel_id, record.kind)
 
     def pack(self) -> bytes:
@@ -89,8 +89,8 @@ class Tasking:
     def row(self) -> TaskingRow:
         """Return the row of the index."""
         record = self.record
-        if isinstance(record, Advice):
-            summary, author, issued_utc_s = _advice_summary(record), record.author, record.advised_utc_s
+        if isinstance(record, Comment):
+            summary, author, issued_utc_s = _comment_summary(record), record.author, record.commented_utc_s
         else:
             summary, author, issued_utc_s = _command_summary(record), record.issued_by, record.issued_utc_s
         return TaskingRow(
@@ -115,16 +115,16 @@ def state_name(vessel: str, kind: TaskingKind, record_id: str) -> str:
 
 def of_payload(vessel: str, key: str, payload: bytes) -> Tasking:
     """Return the tasking of a record that is queued for a vessel's relay."""
-    kind: TaskingKind = "advice" if key == keys.advice(vessel) else "command"
+    kind: TaskingKind = "comment" if key == keys.comment(vessel) else "command"
     return Tasking(vessel, kind, payload)
 
 
-def kind_and_id(record: Advice | Command) -> tuple[TaskingKind, str]:
+def kind_and_id(record: Comment | Command) -> tuple[TaskingKind, str]:
     """Return kind and identifier of a record."""
-    return ("advice", record.advice_id) if isinstance(record, Advice) else ("command", record.command_id)
+    return ("comment", record.comment_id) if isinstance(record, Comment) else ("command", record.command_id)
 
 
-def reject_conflict(known: Tasking, record: Advice | Command, key: str) -> None:
+def reject_conflict(known: Tasking, record: Comment | Command, key: str) -> None:
     """Reject a record with the identifier of a different one.
 
     Raises:
@@ -135,8 +135,8 @@ def reject_conflict(known: Tasking, record: Advice | Command, key: str) -> None:
         raise PayloadError(key, f"{kind}_id", record_id, "an identifier that no other record for this vessel has")
 
 
-def _advice_summary(advice: Advice) -> str:
-    parts = [f"v{advice.image_version}", advice.verdict or "", advice.mlo_class or "", advice.remark]
+def _comment_summary(comment: Comment) -> str:
+    parts = [f"v{comment.image_version}", comment.verdict or "", comment.mlo_class or "", comment.remark]
     return " ".join(part for part in parts if part)
 
 

@@ -56,7 +56,7 @@ interface Contact {
   contradictory: boolean;
   decided_on: { version: number; bytes: number | null } | null;
   newer_detail: boolean;
-  advised: boolean;
+  commented: boolean;
   delivery: Delivery | null;
   open_requests: number;
   authenticated: boolean | null;
@@ -150,7 +150,7 @@ interface ContactDetail {
   related: any[];
   decisions: Decision[];
   standing: string[];
-  advice: any[];
+  comments: any[];
   requests: VehicleRequest[];
   measurements: any[];
   size: Record<string, any>;

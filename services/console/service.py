@@ -22,7 +22,7 @@ from sonarpost.export.contacts import SideCar, read_stored_records
 from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import (
     AcousticFrame,
-    Advice,
+    Comment,
     Decision,
     DownlinkState,
     Health,
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 COMMAND_PRIORITY = 1
-ADVICE_PRIORITY = 2
+COMMENT_PRIORITY = 2
 DECISION_PRIORITY = 2
 C2 = "c2"
 OP_MODEM = "op_modem"
@@ -121,13 +121,13 @@ class ConsoleService(Service[ConsoleConfig]):
         """On a vessel: its images and comments. At a shore site: images and decisions published by c2."""
         if self._on_vessel:
             vessel = self.platform.id
-            return {keys.image_reconstructed(vessel): ReconstructedImage, keys.advice(vessel): Advice}
+            return {keys.image_reconstructed(vessel): ReconstructedImage, keys.comment(vessel): Comment}
         site = self.config.site
         return {keys.shore_image_all(site): ReconstructedImage, keys.shore_decision_all(site): Decision}
 
     def validate(self, key: str, record: Record) -> None:
         """Refuse a record of another vessel."""
-        if self._on_vessel and isinstance(record, (ReconstructedImage, Advice)):
+        if self._on_vessel and isinstance(record, (ReconstructedImage, Comment)):
             if record.vessel_id != self.platform.id:
                 raise PayloadError(key, "vessel_id", record.vessel_id, self.platform.id)
         elif isinstance(record, (ReconstructedImage, Decision)):
@@ -146,9 +146,9 @@ class ConsoleService(Service[ConsoleConfig]):
         elif isinstance(record, Decision):
             effects.count("decisions_taken" if self.state.store_decision(record) else "decisions_repeated")
         else:
-            assert isinstance(record, Advice)
-            self.state.store_advice(record)
-            effects.count("advice_taken")
+            assert isinstance(record, Comment)
+            self.state.store_comment(record)
+            effects.count("comments_taken")
 
     def _apply_retention(self, now_utc_s: float) -> None:
         removed = self.state.remove_images(now_utc_s)
@@ -194,9 +194,9 @@ class ConsoleService(Service[ConsoleConfig]):
                     continue
                 effects.send(keys.contact_decision(vessel), consumer, record, priority=DECISION_PRIORITY)
             effects.count("decisions_made")
-        elif isinstance(record, Advice):
-            effects.send(keys.tasking_advice(vessel, site), C2, record, priority=ADVICE_PRIORITY)
-            effects.count("advice_given")
+        elif isinstance(record, Comment):
+            effects.send(keys.tasking_comment(vessel, site), C2, record, priority=COMMENT_PRIORITY)
+            effects.count("comments_given")
         elif self._on_vessel:
             for consumer in self.config.command_consumers:
                 effects.send(keys.command(vessel, record.kind), consumer, record, priority=COMMAND_PRIORITY)

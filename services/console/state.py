@@ -8,8 +8,8 @@ from dataclasses import asdict
 from types import MappingProxyType
 
 from sonarpost.messages import (
-    Advice,
     CommandKind,
+    Comment,
     Decision,
     DownlinkState,
     ReceivedStatus,
@@ -133,10 +133,10 @@ class ConsoleState:
         with self.database.transaction() as db:
             return decisions.store_received_decision(db, record, self.clock(), at_shore=at_shore)
 
-    def store_advice(self, record: Advice) -> None:
+    def store_comment(self, record: Comment) -> None:
         """Store a comment from the shore site."""
         with self.database.transaction() as db:
-            requests.store_received_advice(db, record)
+            requests.store_received_comment(db, record)
 
     def store_status(self, record: ReceivedStatus) -> None:
         """Store the status of a vehicle. The pages show it with the next fleet event."""
@@ -164,7 +164,7 @@ class ConsoleState:
                 state = "asked" if reason is None else "refused"
                 requests.update_request_state(db, record_id, state, reason or "", None, now)
             elif reason is not None:
-                requests.refuse_advice(db, record_id, reason)
+                requests.refuse_comment(db, record_id, reason)
 
     def mark_delivered_to_shore(self, before_utc_s: float) -> None:
         """Mark decisions that the relay stored before a time as delivered to shore."""
@@ -383,12 +383,12 @@ class ConsoleState:
             )
         return self._record_json("request", command_id)
 
-    def add_advice(self, contact_id: str, record: Advice, actor: Actor) -> Json:
+    def add_comment(self, contact_id: str, record: Comment, actor: Actor) -> Json:
         """Store a comment to send; return it."""
         self.image(contact_id, record.image_version)
         with self.database.transaction() as db:
-            requests.add_advice(db, contact_id, record, actor)
-        return self._record_json("advice", record.advice_id)
+            requests.add_comment(db, contact_id, record, actor)
+        return self._record_json("comment", record.comment_id)
 
     def measure(self, contact_id: str, line: Line, actor: Actor, *, keep: bool) -> Json:
         """Measure a line on an image, and optionally store the measurement.

@@ -82,7 +82,7 @@ class RelayConfig(ServiceConfig):
         supersede: A newer version of an image replaces queued older ones whose transfer has not started.
         forward_status: Send the latest status of each vehicle to every site by radio.
         disk_reserve_bytes: Free space below which images are not accepted; decisions still are.
-        advice_consumers: Services on the vessel that receive advice; without any, advice is refused.
+        comment_consumers: Services on the vessel that receive comments; without any, comments are refused.
         command_consumers: Services on the vessel that receive commands; without any, commands are refused.
         drop_removed_upstreams: Drop the records queued for sites that are no longer configured.
     """
@@ -91,7 +91,7 @@ class RelayConfig(ServiceConfig):
     supersede: bool = True
     forward_status: bool = True
     disk_reserve_bytes: Annotated[int, Field(ge=0)] = 67_108_864
-    advice_consumers: tuple[ConsumerName, ...] = ()
+    comment_consumers: tuple[ConsumerName, ...] = ()
     command_consumers: tuple[ConsumerName, ...] = ()
     drop_removed_upstreams: bool = False
 
@@ -103,7 +103,7 @@ class RelayConfig(ServiceConfig):
                 raise ValueError(f"each site once by {bearer}, not {times} times {site}")
         return upstreams
 
-    @field_validator("advice_consumers", "command_consumers")
+    @field_validator("comment_consumers", "command_consumers")
     @classmethod
     def _not_the_relay(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         if "relay" in names or "c2" in names:

@@ -24,9 +24,9 @@ from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import MissingBaseError, PayloadError
 from sonarpost.logs import kv, log_batch
 from sonarpost.messages import (
-    Advice,
     CodedImage,
     Command,
+    Comment,
     Decision,
     ImagePart,
     ReceivedStatus,
@@ -40,10 +40,10 @@ from sonarpost.services.relay.satellite import SatelliteUpstream
 log = logging.getLogger(__name__)
 
 CONSUMER = "c2"
-# Advice and commands keep the priority with which they arrived. Decisions are small and urgent. The first version of
+# Comments and commands keep the priority with which they arrived. Decisions are small and urgent. The first version of
 # every image precedes more detail of any image.
 COMMAND_PRIORITY = 1
-ADVICE_PRIORITY = 2
+COMMENT_PRIORITY = 2
 DECISION_PRIORITY = 2
 STATUS_PRIORITY = 3
 PREVIEW_PRIORITY = 5
@@ -136,20 +136,20 @@ class RelayService(Service[RelayConfig]):
         return MonitoredSite(options.site, lambda: self.session, self.platform.upstream)
 
     def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """Images, decisions and statuses of this vessel, advice and commands for it."""
+        """Images, decisions and statuses of this vessel, comments and commands for it."""
         vessel = self.platform.id
         statuses: dict[str, type[Record]] = {keys.acoustic_status(vessel): ReceivedStatus}
         return {
             **(statuses if self.config.forward_status else {}),
             keys.image_coded(vessel): CodedImage,
             keys.contact_decision(vessel): Decision,
-            keys.advice(vessel): Advice,
+            keys.comment(vessel): Comment,
             keys.command_all(vessel): Command,
         }
 
     def delivery_only_keys(self) -> Collection[str]:
         """Plain publications on these keys are for the consumers on the vessel."""
-        return (keys.advice(self.platform.id), keys.command_all(self.platform.id))
+        return (keys.comment(self.platform.id), keys.command_all(self.platform.id))
 
     def check_capacity(self, key: str) -> None:
         """Reject images below `disk_reserve_bytes`; other records are small and are accepted for longer."""
@@ -165,11 +165,11 @@ class RelayService(Service[RelayConfig]):
                 raise PayloadError(key, "kind", record.kind, "the kind in the key")
             self._require(self.config.command_consumers, key, "command_consumers")
             return
-        assert isinstance(record, (CodedImage, Decision, Advice, ReceivedStatus))
+        assert isinstance(record, (CodedImage, Decision, Comment, ReceivedStatus))
         if record.vessel_id != vessel:
             raise PayloadError(record.TYPE, "vessel_id", record.vessel_id, vessel)
-        if isinstance(record, Advice):
-            self._require(self.config.advice_consumers, key, "advice_consumers")
+        if isinstance(record, Comment):
+            self._require(self.config.comment_consumers, key, "comment_consumers")
 
     def _require(self, consumers: Sequence[str], key: str, option: str) -> None:
         if not consumers:
@@ -177,10 +177,10 @@ class RelayService(Service[RelayConfig]):
 
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Queue the record for every site, or for every configured consumer on the vessel."""
-        if isinstance(record, Advice):
-            for consumer in self.config.advice_consumers:
-                effects.send_payload(key, consumer, effects.payload, Advice, priority=ADVICE_PRIORITY)
-            effects.count("advice_taken")
+        if isinstance(record, Comment):
+            for consumer in self.config.comment_consumers:
+                effects.send_payload(key, consumer, effects.payload, Comment, priority=COMMENT_PRIORITY)
+            effects.count("comments_taken")
         elif isinstance(record, Command):
             for consumer in self.config.command_consumers:
                 effects.send_payload(key, consumer, effects.payload, Command, priority=COMMAND_PRIORITY)
@@ -327,7 +327,7 @@ class RelayService(Service[RelayConfig]):
     def queue_policy(self, queue: str) -> QueuePolicy:
         """Return the settings of the queue of a site or of a consumer on the vessel."""
         if not _is_site_queue(queue):
-            return QueuePolicy(held=queue not in {*self.config.advice_consumers, *self.config.command_consumers})
+            return QueuePolicy(held=queue not in {*self.config.comment_consumers, *self.config.command_consumers})
         upstream = self._upstreams.get(queue)
         return QueuePolicy(held=True) if upstream is None else upstream.queue_policy()
 

@@ -223,11 +223,11 @@ def test_images_without_a_number_are_found(archive):
     assert archive.images_without_number() == []
 
 
-@pytest.mark.parametrize("version", [1, 3])
+@pytest.mark.parametrize("version", [2, 4])
 def test_database_of_another_version_is_refused(database, version):
     ShoreDatabase(database).prepare()
     with database.transaction() as sql:
         sql.rows("UPDATE sonarpost.archive SET version = :version", version=version)
     for writable in (True, False):
-        with pytest.raises(StoredFileError, match=f"version: got {version}, expected 2"):
+        with pytest.raises(StoredFileError, match=f"version: got {version}, expected 3"):
             ShoreDatabase(database, writable=writable).prepare()

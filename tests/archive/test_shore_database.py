@@ -60,7 +60,7 @@ def test_schema_of_a_later_version_is_refused(archive, database):
     archive.prepare()
     with database.transaction() as sql:
         sql.rows("UPDATE archive SET version = 99")
-    with pytest.raises(StoredFileError, match="version: got 99, expected 2"):
+    with pytest.raises(StoredFileError, match="version: got 99, expected 3"):
         ShoreDatabase(database).prepare()
     with pytest.raises(DatabaseUnavailableError, match="version: got 99"):
         ShoreDatabase(database).images()

@@ -28,7 +28,7 @@ from sonarpost import keys, wire
 from sonarpost.config import TlsConfig
 from sonarpost.messages import (
     AcousticFrame,
-    Advice,
+    Comment,
     Contact,
     DownlinkState,
     Health,
@@ -178,11 +178,11 @@ def downlink_state(kind: str, record_id: str, state: str, now_utc_s: float, **ch
     return DownlinkState.model_validate(fields | times | changes)
 
 
-def advice_record(image_id: str = "00A7", **changes: Any) -> Advice:
+def comment_record(image_id: str = "00A7", **changes: Any) -> Comment:
     """A comment of eva on the first version of an image."""
     names = {"vessel_id": VESSEL, "vehicle_id": "uuv-1", "image_id": image_id, "image_version": 1}
-    fields = {"advice_id": "a-1", "author": "eva", "advised_utc_s": FIRST_UTC_S + 50, "remark": "look again"}
-    return Advice.model_validate(names | fields | changes)
+    fields = {"comment_id": "a-1", "author": "eva", "commented_utc_s": FIRST_UTC_S + 50, "remark": "look again"}
+    return Comment.model_validate(names | fields | changes)
 
 
 def health_record(

@@ -203,20 +203,20 @@ def false_deliveries(site: Site) -> Iterator[None]:
 
 @contextmanager
 def tasking_of_user(site: Site) -> Iterator[None]:
-    """Junk and valid advice from a console for all vessels."""
+    """Junk and valid comments from a console for all vessels."""
     random, sender = Random(6), site.sender("console-1")
-    advice = {
-        "type": "advice",
+    comment = {
+        "type": "comment",
         "v": 1,
-        "advice_id": "a",
+        "comment_id": "a",
         "vessel_id": HOSTILE,
         "vehicle_id": "uuv-1",
         "image_id": "AAAA",
     }
-    advice |= {"image_version": 1, "verdict": "unsure", "author": "ben", "advised_utc_s": 2.0}
-    for key in (keys.tasking_advice(HOSTILE), keys.tasking_command(HOSTILE)):
+    comment |= {"image_version": 1, "verdict": "unsure", "author": "ben", "commented_utc_s": 2.0}
+    for key in (keys.tasking_comment(HOSTILE), keys.tasking_command(HOSTILE)):
         sender.send(key, "c2", [random.randbytes(100) for _ in range(50)])
-        sender.send(key, "c2", [msgpack.packb(advice | {"advice_id": f"{n}"}) for n in range(300)])
+        sender.send(key, "c2", [msgpack.packb(comment | {"comment_id": f"{n}"}) for n in range(300)])
     yield
 
 
@@ -497,7 +497,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(("zenoh:*/{vessel}/acoustic/image",), "vehicle", "flood", "tests/services/op_modem/test_image_limiter.py"),
     Row(
-        ("zenoh:*/{vessel}/advice", "zenoh:*/{vessel}/contact/decision", "zenoh:*/{vessel}/image/*"),
+        ("zenoh:*/{vessel}/comment", "zenoh:*/{vessel}/contact/decision", "zenoh:*/{vessel}/image/*"),
         "every certificate",
         "junk",
         "tests/security/test_delivery_matrix.py",

@@ -24,7 +24,7 @@ from sonarpost.cli.main import main
 from sonarpost.cli.shared import printable
 from sonarpost.errors import ConfigError
 from sonarpost.export.formats import FORMATS
-from sonarpost.messages import Advice, Contact, Pixels, TaskingState
+from sonarpost.messages import Comment, Contact, Pixels, TaskingState
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
@@ -235,9 +235,9 @@ def test_comment_is_stored_by_c2_when_the_command_ends(capsys, c2, router, tmp_p
     assert "comment a-1 for vessel-1 accepted" in capsys.readouterr().out
     eventually(lambda: c2.gauges()["waiting_for_vessels"] == 1)
     [item] = queued_items(c2.store, "relay@vessel-1", 9)
-    advice = wire.decode(Advice, item.payload, item.key)
-    assert item.key == keys.advice("vessel-1")
-    assert (advice.image_id, advice.image_version, advice.verdict, advice.author) == ("AAAA", 2, "mine_like", "ann")
+    comment = wire.decode(Comment, item.payload, item.key)
+    assert item.key == keys.comment("vessel-1")
+    assert (comment.image_id, comment.image_version, comment.verdict, comment.author) == ("AAAA", 2, "mine_like", "ann")
     listing = ["c2", "ls", "--tasking", "--json", "--archive", str(tmp_path / "live")]
     eventually(lambda: main(listing) == 0 and '"state": "waiting"' in capsys.readouterr().out)
     # Another record with the same identifier is rejected.
@@ -253,7 +253,7 @@ def test_commands_are_sent_before_a_comment(capsys, c2, router):
     assert [item.key for item in queued_items(c2.store, "relay@vessel-1", 9)] == [
         keys.command("vessel-1", "refine"),
         keys.command("vessel-1", "expand"),
-        keys.advice("vessel-1"),
+        keys.comment("vessel-1"),
     ]
 
 
@@ -298,7 +298,7 @@ def test_watch_prints_lines_across_router_restarts_until_ctrl_c():
             eventually(lambda: any("expected" in line for line in errors))
             publish(image(), keys.shore_image("vessel-1"))
             publish(decision(remark="two\nlines \x1b[31m"), keys.shore_decision("vessel-1"))
-            state = {"kind": "advice", "record_id": "a", "state": "refused", "reason": "no", "changed_utc_s": 1}
+            state = {"kind": "comment", "record_id": "a", "state": "refused", "reason": "no", "changed_utc_s": 1}
             publish(TaskingState(vessel_id="vessel-1", **state), keys.tasking_state("vessel-1"))
             eventually(lambda: len(printed) == 3)
             assert "vessel-1  image     uuv-1/AAAA v1  30 × 20 px, complete, at 56.40000 -5.60000" in "".join(printed)

@@ -158,7 +158,7 @@ def test_replay_for_watchers_is_not_handled_by_services(platform, router, tmp_pa
     """A publication without attachment is accepted by the consumer of its key; a replayed one has an attachment."""
     path = tmp_path / "a.mcap"
     recording = McapRecording(path)
-    key = keys.tasking_advice("vessel-1")
+    key = keys.tasking_comment("vessel-1")
     recording.write(key, "application/msgpack", b"\x80", 1)
     recording.close()
     service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "live"))

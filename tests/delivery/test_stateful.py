@@ -28,7 +28,7 @@ DECISION = "sonarpost/v1/vessel-1/contact/decision"
 IMAGE = "sonarpost/v1/vessel-1/image/reconstructed"
 OTHER_IMAGE = "sonarpost/v1/vessel-2/image/reconstructed"
 PRODUCER_KEYS = ((DECISION, IMAGE), (IMAGE, OTHER_IMAGE))
-HOSTILE_KEYS = ("sonarpost/v1/other/tasking/a/advice", "sonarpost/v1/other/tasking/b/advice", "sonarpost/v1/other/x")
+HOSTILE_KEYS = ("sonarpost/v1/other/tasking/a/comment", "sonarpost/v1/other/tasking/b/comment", "sonarpost/v1/other/x")
 MAX_RESTORES = 2
 SMALL_LIMITS = {
     (outbox, "BACK_OFF_S"): (0.0,),

@@ -138,7 +138,7 @@ def test_many_names_below_one_prefix_count_as_one_writer(store, monkeypatch):
     first, second = chunks(bytes(100), 60)
     assert add(store, first) == 60
     for number in range(30):
-        key = f"sonarpost/v1/shore/tasking/name-{number}/advice"
+        key = f"sonarpost/v1/shore/tasking/name-{number}/comment"
         assert add(store, chunks(b"0123456789", 1, origin=bytes([number]) * 16)[0], key) == 1
     assert partials(store) == 6
     assert add(store, second) == bytes(100)

@@ -108,14 +108,14 @@ def test_least_recently_used_window_of_a_writer_is_deleted(store, monkeypatch):
     vessel_key = "sonarpost/v1/shore/inbox/vessel-1"
     receive(store, vessel_key, record(1, b"image"))
     for number in range(8):
-        key = f"sonarpost/v1/shore/tasking/vessel-{number}/advice"
-        receive(store, key, record(1, b"advice", bytes([number]) * 16))
+        key = f"sonarpost/v1/shore/tasking/vessel-{number}/comment"
+        receive(store, key, record(1, b"comment", bytes([number]) * 16))
     assert len(store._query("SELECT 1 FROM received_window")) == 4
     assert len(store._query("SELECT 1 FROM received")) == 4
     with store.transaction() as tx:
         assert tx.was_received(vessel_key, record(1, b"image"))
-        assert tx.was_received(key, record(1, b"advice", bytes([7]) * 16))
-        assert not tx.was_received("sonarpost/v1/shore/tasking/vessel-0/advice", record(1, b"advice", bytes(16)))
+        assert tx.was_received(key, record(1, b"comment", bytes([7]) * 16))
+        assert not tx.was_received("sonarpost/v1/shore/tasking/vessel-0/comment", record(1, b"comment", bytes(16)))
 
 
 @pytest.mark.parametrize(("max_bytes", "count"), [(None, 4), (0, 1), (10, 1), (29, 2), (30, 3), (1000, 4)])

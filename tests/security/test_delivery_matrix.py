@@ -27,12 +27,12 @@ VESSEL, VEHICLE = "vessel-1", "uuv-1"
 RECORDS = 60
 CERTIFICATES = ("uuv-1", "vessel-1", "vessel-2", "shore-1", "console-1", "observer-1")
 UPLINK = (keys.shore_inbox(VESSEL),)
-TASKING = (keys.tasking_advice(VESSEL), keys.tasking_command(VESSEL))
+TASKING = (keys.tasking_comment(VESSEL), keys.tasking_command(VESSEL))
 ON_VESSEL = (
     keys.image_reconstructed(VESSEL),
     keys.contact_decision(VESSEL),
     keys.command(VESSEL, "resend"),
-    keys.advice(VESSEL),
+    keys.comment(VESSEL),
     keys.acoustic_image(VESSEL),
     keys.message_received(VESSEL),
     keys.vessel_frames(VESSEL, "vessel-2"),
@@ -52,7 +52,7 @@ ALLOWED = {
     ("vessel-2", "shore"): {keys.shore_inbox("vessel-2")},
     ("console-1", "shore"): set(TASKING),
     ("console-1", "vessel"): {keys.contact_decision(VESSEL), keys.command(VESSEL, "resend")},
-    ("shore-1", "vessel"): {keys.advice(VESSEL), keys.command(VESSEL, "resend")},
+    ("shore-1", "vessel"): {keys.comment(VESSEL), keys.command(VESSEL, "resend")},
 }
 # A vehicle on deck publishes below its own prefix, and a vessel below its own.
 ALLOWED_PUBLICATIONS = ALLOWED | {

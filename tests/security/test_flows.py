@@ -15,7 +15,7 @@ from builders.records import decision_record
 from sonarpost import keys, wire
 from sonarpost.bus.connectivity import ConnectivityState, diagnose_no_reply, probe_endpoint, query_presence
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.messages import Advice, Command, Record
+from sonarpost.messages import Command, Comment, Record
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.security.router_config import RouterOptions
 from sonarpost.services.c2.config import C2Config
@@ -41,7 +41,7 @@ class Producer(Service[ServiceConfig]):
 
 
 class Console(Service[ServiceConfig]):
-    """Consumes advice and commands on the vessel."""
+    """Consumes comments and commands on the vessel."""
 
     NAME = "console"
 
@@ -50,7 +50,7 @@ class Console(Service[ServiceConfig]):
         self.got: list[Record] = []
 
     def consumed_keys(self):
-        return {keys.advice(self.platform.id): Advice, keys.command_all(self.platform.id): Command}
+        return {keys.comment(self.platform.id): Comment, keys.command_all(self.platform.id): Command}
 
     def handle(self, key, record, effects):
         self.got.append(record)
@@ -74,7 +74,7 @@ def start_service(tmp_path):
         service.stop()
 
 
-def test_records_advice_and_commands_pass_the_routers(own_world, start_service, tmp_path):
+def test_records_comment_and_commands_pass_the_routers(own_world, start_service, tmp_path):
     world = own_world
     got: list[str] = []
     c2 = start_service(C2Service, "shore-1", world.shore_local, C2Config(out_dir=tmp_path / "out"))
@@ -82,7 +82,7 @@ def test_records_advice_and_commands_pass_the_routers(own_world, start_service, 
         RelayService,
         "vessel-1",
         world.vessel_local,
-        RelayConfig(advice_consumers=("console",), command_consumers=("console",)),
+        RelayConfig(comment_consumers=("console",), command_consumers=("console",)),
         upstream=(world.shore_tls,),
         tls=world.tls("vessel-1"),
     )
@@ -94,10 +94,10 @@ def test_records_advice_and_commands_pass_the_routers(own_world, start_service, 
     operator.send(keys.contact_decision("vessel-1"), "relay", decision_record("d-1"))
     eventually(lambda: c2.health().counters.get("decisions_stored") == 1, what="the decision at the shore")
 
-    fields = {"vehicle_id": "uuv-1", "image_id": "AAAA", "image_version": 1, "author": "expert", "advised_utc_s": 2.0}
-    advice = Advice(advice_id="a-1", vessel_id="vessel-1", verdict="unsure", **fields)
-    expert.send(keys.tasking_advice("vessel-1"), "c2", advice)
-    eventually(lambda: advice in console.got, what="the advice at the vessel")
+    fields = {"vehicle_id": "uuv-1", "image_id": "AAAA", "image_version": 1, "author": "expert", "commented_utc_s": 2.0}
+    comment = Comment(comment_id="a-1", vessel_id="vessel-1", verdict="unsure", **fields)
+    expert.send(keys.tasking_comment("vessel-1"), "c2", comment)
+    eventually(lambda: comment in console.got, what="the comment at the vessel")
 
     # Subscribers at the shore see the vessel's health and liveliness; the relay reports the shore as reached.
     eventually(lambda: keys.health("vessel-1", "relay") in got, what="the relay's health at the shore")

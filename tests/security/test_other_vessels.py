@@ -27,7 +27,7 @@ DENIED = (
     keys.message_received(LEAD),
     keys.command(LEAD, "resend"),
     keys.contact_decision(LEAD),
-    keys.advice(LEAD),
+    keys.comment(LEAD),
 )
 
 

@@ -10,7 +10,7 @@ from builders.records import decision_record
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
-from sonarpost.messages import Advice, Relayed
+from sonarpost.messages import Comment, Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 
@@ -42,13 +42,13 @@ def received(session, selector):
 
 
 def test_only_readers_of_the_shore_may_query(world, c2, shore_session):
-    fields = {"vehicle_id": "uuv-1", "image_id": "AAAA", "image_version": 1, "author": "expert", "advised_utc_s": 2.0}
-    advice = Advice(advice_id="a-1", vessel_id="vessel-1", verdict="unsure", **fields)
+    fields = {"vehicle_id": "uuv-1", "image_id": "AAAA", "image_version": 1, "author": "expert", "commented_utc_s": 2.0}
+    comment = Comment(comment_id="a-1", vessel_id="vessel-1", verdict="unsure", **fields)
     decision = decision_record("d1")
     key = keys.contact_decision("vessel-1")
     envelope = Relayed(vessel_id="vessel-1", key=key, payload=wire.encode(decision), relayed_utc_s=1.0)
     shore_session.put(keys.shore_inbox("vessel-1"), wire.encode(envelope))
-    shore_session.put(keys.tasking_advice("vessel-1"), wire.encode(advice))
+    shore_session.put(keys.tasking_comment("vessel-1"), wire.encode(comment))
     for selector in (CONTACTS, STATES):
         eventually(lambda selector=selector: len(received(shore_session, selector)) == 2, what=selector)
 

@@ -137,28 +137,34 @@ def test_vessel_replies_on_its_own_keys_only(world, shore_session, received):
     with world.open("vessel-1") as rogue:
         for vessel in ("vessel-1", "vessel-2"):
             rogue.declare_queryable(
-                keys.delivery_query(keys.advice(vessel), "relay"), lambda query: query.reply(query.key_expr, b"mine")
+                keys.delivery_query(keys.comment(vessel), "relay"), lambda query: query.reply(query.key_expr, b"mine")
             )
-        own = keys.delivery_query(keys.advice("vessel-1"), "relay")
+        own = keys.delivery_query(keys.comment("vessel-1"), "relay")
         eventually(lambda: answers(shore_session, own) == [b"mine"], what="the reply on its own key")
-        assert answers(shore_session, keys.delivery_query(keys.advice("vessel-2"), "relay")) == []
-    world.shore.wait_for_denial("vessel-1", "Queryable", "vessel-2/advice/delivery/relay")
+        assert answers(shore_session, keys.delivery_query(keys.comment("vessel-2"), "relay")) == []
+    world.shore.wait_for_denial("vessel-1", "Queryable", "vessel-2/comment/delivery/relay")
 
 
 def test_vessel_receives_its_own_prefix_only(world, shore_session):
     got: list[str] = []
     with world.open("vessel-1") as rogue:
-        for key in ("sonarpost/v1/vessel-2/**", "sonarpost/v1/shore/**", "sonarpost/**", "**", keys.advice("vessel-1")):
+        for key in (
+            "sonarpost/v1/vessel-2/**",
+            "sonarpost/v1/shore/**",
+            "sonarpost/**",
+            "**",
+            keys.comment("vessel-1"),
+        ):
             rogue.declare_subscriber(key, lambda sample: got.append(str(sample.key_expr)))
 
         def put_and_got():
             shore_session.put("sonarpost/v1/vessel-2/acoustic/rx", b"secret")
             shore_session.put(keys.shore_image("vessel-2"), b"secret")
-            shore_session.put(keys.advice("vessel-1"), b"own")
-            return keys.advice("vessel-1") in got
+            shore_session.put(keys.comment("vessel-1"), b"own")
+            return keys.comment("vessel-1") in got
 
         eventually(put_and_got, what="its own key")
-    assert set(got) == {keys.advice("vessel-1")}
+    assert set(got) == {keys.comment("vessel-1")}
     world.shore.wait_for_denial("vessel-1", "Subscriber", "sonarpost/v1/vessel-2/**")
 
 
@@ -203,9 +209,9 @@ def test_observer_reads_everything_and_writes_nothing(world, shore_session, rece
             return key in got
 
         eventually(put_and_seen, what="the image")
-        watcher.put(keys.advice("vessel-1"), b"false")
+        watcher.put(keys.comment("vessel-1"), b"false")
         assert answers(watcher, keys.delivery_query(INBOX_1, "c2")) == []
-    world.shore.wait_for_denial("observer-1", "Put", keys.advice("vessel-1"))
+    world.shore.wait_for_denial("observer-1", "Put", keys.comment("vessel-1"))
 
 
 def test_payload_above_8_mib_is_refused(world, received):

@@ -84,7 +84,7 @@ def test_reports_of_each_service_are_thinned_for_the_shore_only(vessel, shore):
         (keys.shore_part(VESSEL), "c2", True),
         (keys.shore_inbox(VESSEL), "c2", True),
         (keys.command(VESSEL, "resend"), "relay", False),
-        (keys.advice(VESSEL), "relay", False),
+        (keys.comment(VESSEL), "relay", False),
     ],
 )
 def test_records_and_acknowledgements_are_not_thinned(vessel, shore, tmp_path, key, consumer, at_shore):

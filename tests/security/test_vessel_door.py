@@ -1,4 +1,4 @@
-"""Rights at a vessel's router: a compromised shore can send advice and commands only; consoles."""
+"""Rights at a vessel's router: a compromised shore can send comments and commands only; consoles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sonarpost.security.tls_files import check_tls_files
 
 VESSEL = "vessel-1"
 DECISION = keys.delivery_query(keys.contact_decision(VESSEL), "relay")
-ADVICE = keys.delivery_query(keys.advice(VESSEL), "relay")
+COMMENT = keys.delivery_query(keys.comment(VESSEL), "relay")
 COMMAND = keys.delivery_query(keys.command(VESSEL, "resend"), "relay")
 IMAGE = keys.delivery_query(keys.image_reconstructed(VESSEL), "relay")
 
@@ -31,7 +31,7 @@ def relay(vessel_session):
 
     for key in (
         keys.contact_decision(VESSEL),
-        keys.advice(VESSEL),
+        keys.comment(VESSEL),
         keys.command_all(VESSEL),
         keys.image_reconstructed(VESSEL),
     ):
@@ -44,16 +44,16 @@ def answered(session, key):
     return [reply.ok.payload.to_bytes() for reply in session.get(key, timeout=30) if reply.ok] == [b"stored"]
 
 
-def test_shore_sends_advice_and_commands_only(world, relay):
+def test_shore_sends_comment_and_commands_only(world, relay):
     with world.open("shore-1", endpoint=world.vessel_tls) as shore:
-        eventually(lambda: answered(shore, ADVICE), what="advice")
+        eventually(lambda: answered(shore, COMMENT), what="comment")
         assert answered(shore, COMMAND)
         assert not answered(shore, DECISION)
         assert not answered(shore, IMAGE)
         shore.put(keys.image_reconstructed(VESSEL), b"false")
         shore.put(keys.contact_decision(VESSEL), b"false")
-        shore.put(keys.advice(VESSEL), b"true")
-        eventually(lambda: f"put {keys.advice(VESSEL)}" in relay, what="the advice as a publication")
+        shore.put(keys.comment(VESSEL), b"true")
+        eventually(lambda: f"put {keys.comment(VESSEL)}" in relay, what="the comment as a publication")
     assert not {DECISION, IMAGE} & set(relay)
     assert f"put {keys.image_reconstructed(VESSEL)}" not in relay
     assert f"put {keys.contact_decision(VESSEL)}" not in relay
@@ -61,36 +61,36 @@ def test_shore_sends_advice_and_commands_only(world, relay):
     world.vessel.wait_for_denial("shore-1", "Put", keys.image_reconstructed(VESSEL))
 
 
-def test_vessel_console_sends_decisions_and_commands_and_receives_advice(world, relay, vessel_session):
-    taken = keys.delivery_query(keys.advice(VESSEL), "console")
+def test_vessel_console_sends_decisions_and_commands_and_receives_comment(world, relay, vessel_session):
+    taken = keys.delivery_query(keys.comment(VESSEL), "console")
     with world.open("console-1", endpoint=world.vessel_tls) as console:
         eventually(lambda: answered(console, DECISION), what="the decision")
         assert answered(console, COMMAND)
         assert not answered(console, IMAGE)
         console.declare_queryable(taken, lambda query: query.reply(query.key_expr, b"stored"))
-        eventually(lambda: answered(vessel_session, taken), what="advice for the console")
+        eventually(lambda: answered(vessel_session, taken), what="comments for the console")
     assert IMAGE not in relay
     world.vessel.wait_for_denial("console-1", "Query", IMAGE)
 
 
-def test_shore_console_sends_advice_and_no_image(world, shore_session):
-    advice = keys.delivery_query(keys.tasking_advice(VESSEL), "c2")
+def test_shore_console_sends_comment_and_no_image(world, shore_session):
+    comment = keys.delivery_query(keys.tasking_comment(VESSEL), "c2")
 
     def answer(query):
         with query:
             query.reply(query.key_expr, b"stored")
 
-    shore_session.declare_queryable(keys.delivery_query(keys.tasking_advice_all(), "c2"), answer)
+    shore_session.declare_queryable(keys.delivery_query(keys.tasking_comment_all(), "c2"), answer)
     shore_session.declare_queryable(keys.delivery_query(keys.shore_inbox_all(), "c2"), answer)
     with world.open("console-1") as console:
-        eventually(lambda: answered(console, advice), what="the advice")
+        eventually(lambda: answered(console, comment), what="the comment")
         assert not answered(console, keys.delivery_query(keys.shore_inbox(VESSEL), "c2"))
 
 
 def test_other_vessels_and_vehicles_are_denied(world, relay):
     for name in ("vessel-2", "uuv-1"):
         with world.open(name, endpoint=world.vessel_tls) as stranger:
-            assert not any(answered(stranger, key) for key in (ADVICE, COMMAND, DECISION, IMAGE))
+            assert not any(answered(stranger, key) for key in (COMMENT, COMMAND, DECISION, IMAGE))
         world.vessel.wait_for("Peer denied by access control", f"peer={name}")
     assert relay == []
 

@@ -31,7 +31,7 @@ from sonarpost.messages import Contact, Decision, Record
 from sonarpost.review.decisions import ReviewState, review_result
 
 FILE_NAME: Final = "journal.db"
-VERSION: Final = 1
+VERSION: Final = 2
 BUSY_S: Final = 10.0
 MAX_SEARCH_S: Final = 5.0
 """A search that takes more processor time is ended with an error."""

@@ -34,7 +34,7 @@ class RecordReader(Protocol):
         """Return all decisions, oldest first."""
 
     def tasking(self) -> list[TaskingRow]:
-        """Return all advice and commands, oldest first."""
+        """Return all comments and commands, oldest first."""
 
     def mark(self, column: Mark, images: Iterable[ImageRow], at_utc_s: float) -> None:
         """Mark images as exported or removed."""

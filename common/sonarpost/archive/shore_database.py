@@ -388,7 +388,7 @@ class ShoreDatabase:
     # Tasking
 
     def claim_tasking(self, row: TaskingRow, payload: bytes) -> bytes | None:
-        """Claim advice or a command for this c2, which alone sends it; return the record of another c2 that has it.
+        """Claim a comment or a command for this c2, which alone sends it; return the record of another c2 that has it.
 
         Returns:
             None if this c2 has claimed the record, now or before. Otherwise the record that another c2 has under this
@@ -406,7 +406,7 @@ class ShoreDatabase:
         return self.foreign_tasking(row.vessel_id, row.kind, row.record_id)
 
     def foreign_tasking(self, vessel_id: str, kind: str, record_id: str) -> bytes | None:
-        """Return advice or a command that another c2 has claimed; empty if only its row is known, None for none."""
+        """Return a comment or a command that another c2 has claimed; empty if only its row is known, None for none."""
         with self._transaction() as sql:
             found = sql.rows(
                 "SELECT payload FROM tasking WHERE vessel_id = :vessel AND kind = :kind AND record_id = :record"
@@ -419,7 +419,7 @@ class ShoreDatabase:
         return _bytes(found[0][0]) if found else None
 
     def put_tasking(self, rows: Sequence[TaskingRow]) -> None:
-        """Write the states of advice and commands; an older state does not replace a newer one."""
+        """Write the states of comments and commands; an older state does not replace a newer one."""
         names = ", ".join(_names(TaskingRow))
         with self._transaction() as sql:
             sql.rows(
@@ -434,7 +434,7 @@ class ShoreDatabase:
             )
 
     def tasking(self) -> list[TaskingRow]:
-        """Return all advice and commands, oldest first."""
+        """Return all comments and commands, oldest first."""
         return self._rows(TaskingRow, "ORDER BY issued_utc_s, vessel_id, kind, record_id")
 
     # Accepted records

@@ -20,7 +20,7 @@ from sonarpost.files import make_private
 from sonarpost.messages import Decision, DeliveryState, TaskingKind
 
 FILE_NAME = "index.db"
-INDEX_VERSION = 4
+INDEX_VERSION = 5
 BUSY_S = 10.0
 
 _SCHEMA = """
@@ -134,7 +134,7 @@ class DecisionRow:
 
 @dataclass(frozen=True, slots=True)
 class TaskingRow:
-    """Advice or a command with its delivery state."""
+    """A comment or a command with its delivery state."""
 
     vessel_id: str
     kind: TaskingKind
@@ -269,7 +269,7 @@ class ShoreIndex:
         return self._rows(DecisionRow, "ORDER BY decided_utc_s, vessel_id, decision_id")
 
     def tasking(self) -> list[TaskingRow]:
-        """Return all advice and commands, oldest first."""
+        """Return all comments and commands, oldest first."""
         return self._rows(TaskingRow, "ORDER BY issued_utc_s, vessel_id, kind, record_id")
 
     def has_image(self, vessel_id: str, name: str) -> bool:

@@ -8,7 +8,7 @@ from sonarpost.archive import shared_journal
 from sonarpost.archive.postgresql import Sql
 from sonarpost.errors import ConfigError, StoredFileError
 
-VERSION: Final = 2
+VERSION: Final = 3
 _LOCK: Final = 0x736F6E61725F01
 _ARCHIVE: Final = """
 CREATE TABLE archive (version integer NOT NULL, site text);

@@ -63,8 +63,8 @@ def fit_image(image: SnippetPixels, fit: Fit, where: str, option: str = "--fit {
             factor = MIN_SIDE_PX / min(rows, columns)
         height, width = max(1, round(rows * factor)), max(1, round(columns * factor))
     if min(height, width) < MIN_SIDE_PX or max(height, width) > MAX_SIDE_PX:
-        advice = f"; {option.format('resize')} enlarges small images" if fit == "crop" else ""
-        raise StreamError(where, "size", f"{size}, after {fit} {width} × {height} px", limits + advice)
+        hint = f"; {option.format('resize')} enlarges small images" if fit == "crop" else ""
+        raise StreamError(where, "size", f"{size}, after {fit} {width} × {height} px", limits + hint)
     if fit == "crop":
         top, left = (rows - height) // 2, (columns - width) // 2
         centre = image[top : top + height, left : left + width]

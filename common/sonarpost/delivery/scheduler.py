@@ -1,7 +1,7 @@
 """Order and timing of the chunks that are sent to one consumer. Pure: the time is an argument.
 
 The most urgent record is sent first, then the oldest. Congestion control limits the bytes in flight. Urgent records
-(commands, decisions, advice) have a window of their own and do not wait for the bandwidth limit, only for what is in
+(commands, decisions, comments) have a window of their own and do not wait for the bandwidth limit, only for what is in
 flight. A slow link and a bandwidth limit make chunks smaller, so that this wait is short.
 """
 

@@ -60,7 +60,7 @@ from sonarpost.messages.record import (
     Time,
     Verdict,
 )
-from sonarpost.messages.review import MAX_OVERRULED, MIN_REGION_BYTES, Advice, Command, Decision, TaskingState
+from sonarpost.messages.review import MAX_OVERRULED, MIN_REGION_BYTES, Command, Comment, Decision, TaskingState
 from sonarpost.messages.service import Health, Relayed
 from sonarpost.messages.vehicle import ReceivedStatus, VehicleRange, VehicleStatus
 
@@ -72,7 +72,6 @@ __all__ = [
     "PROBABILITY_TOLERANCE",
     "AcousticFrame",
     "Address",
-    "Advice",
     "AtdClass",
     "BoxEnd",
     "BoxStart",
@@ -80,6 +79,7 @@ __all__ = [
     "CodedImage",
     "Command",
     "CommandKind",
+    "Comment",
     "Contact",
     "Count",
     "Crc32",

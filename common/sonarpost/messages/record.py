@@ -32,7 +32,7 @@ CommandKind = Literal["refine", "resend", "revisit", "expand", "original", "regi
 QueuePlace = Literal["first", "last"]
 BoxStart = Annotated[int, Field(ge=0, le=31)]
 BoxEnd = Annotated[int, Field(ge=1, le=32)]
-TaskingKind = Literal["advice", "command"]
+TaskingKind = Literal["comment", "command"]
 AtdClass = Literal["mine-like", "clutter", "structure"]
 DeliveryState = Literal["waiting", "delivered", "refused"]
 DownlinkKind = Literal["refine", "resend", "revisit", "decision", "expand", "original", "region", "prioritise"]

@@ -1,4 +1,4 @@
-"""Records of the review: decisions, commands, advice."""
+"""Records of the review: decisions, commands, comments."""
 
 from __future__ import annotations
 
@@ -155,11 +155,11 @@ class Command(Record):
         return place
 
 
-class Advice(Record):
+class Comment(Record):
     """An expert's comment from the shore site on one image, for the operator on the vessel.
 
     Attributes:
-        advice_id: Unique; repeated advice is recognised by it.
+        comment_id: Unique; a repeated comment is recognised by it.
         vessel_id: Vessel of the operator; must be the vessel of the key.
         vehicle_id: Vehicle of the image.
         image_id: Identifier of the image.
@@ -169,12 +169,12 @@ class Advice(Record):
         mlo_class: Class of mine-like object. None if not classified.
         remark: Free text.
         author: Name of the expert.
-        advised_utc_s: Time of the advice.
+        commented_utc_s: Time of the comment.
     """
 
-    TYPE: ClassVar[str] = "advice"
+    TYPE: ClassVar[str] = "comment"
 
-    advice_id: RecordId
+    comment_id: RecordId
     vessel_id: PlatformId
     vehicle_id: PlatformId
     image_id: ImageId
@@ -184,16 +184,16 @@ class Advice(Record):
     mlo_class: Annotated[str, Field(max_length=60)] | None = None
     remark: Text = ""
     author: Annotated[str, Field(min_length=1, max_length=120)]
-    advised_utc_s: Time
+    commented_utc_s: Time
 
 
 class TaskingState(Record):
-    """Progress of advice or a command from the shore site to a vessel. c2 publishes it at every change.
+    """Progress of a comment or a command from the shore site to a vessel. c2 publishes it at every change.
 
     Attributes:
         vessel_id: Vessel that it is for.
         kind: Which record.
-        record_id: Its `advice_id` or `command_id`.
+        record_id: Its `comment_id` or `command_id`.
         state: waiting: stored by c2. delivered: stored by the vessel's relay. refused: the relay does not accept it.
         reason: With `refused`: the relay's reason.
         changed_utc_s: Time of this change.

@@ -287,7 +287,7 @@ def _rules_at_shore(entry: CertificateEntry | PreparedName, sites: Sequence[str]
             # A vehicle on deck, linked for a transfer or a test: it publishes below its own prefix.
             return [("ingress", ("put", "liveliness_token"), own), ("egress", INTEREST, (keys.ANY,))]
         case "console":
-            taskings = [(keys.tasking_advice_all(site), keys.tasking_command_all(site)) for site in sites]
+            taskings = [(keys.tasking_comment_all(site), keys.tasking_command_all(site)) for site in sites]
             sent = tuple(keys.below(key) for pair in taskings for key in pair)
             return [*_reading(), *_sending(sent), *_querying(_accepted(sites))]
         case "observer":
@@ -302,12 +302,12 @@ def _rules_at_shore(entry: CertificateEntry | PreparedName, sites: Sequence[str]
 def _rules_at_vessel(entry: CertificateEntry | PreparedName, vessel: str, sites: Sequence[str]) -> list[Rule]:
     """Return the rights of a certificate at the router of a vessel.
 
-    The shore can send advice and commands, and request codebooks. It can neither send images or decisions as if they
+    The shore can send comments and commands, and request codebooks. It can neither send images or decisions as if they
     came from the vessel nor read the vessel's internal records.
     """
     match entry.role:
         case "shore":
-            downward = (keys.below(keys.advice(vessel)), keys.below(keys.command_all(vessel)))
+            downward = (keys.below(keys.comment(vessel)), keys.below(keys.command_all(vessel)))
             inboxes = tuple(keys.below(keys.shore_inbox(vessel, site)) for site in sites)
             return [
                 ("ingress", INTEREST, (keys.ANY,)),
@@ -321,9 +321,9 @@ def _rules_at_vessel(entry: CertificateEntry | PreparedName, vessel: str, sites:
                 ("egress", ("reply", "declare_queryable"), (keys.codebook_all(vessel),)),
             ]
         case "console":
-            # A console on the vessel sends decisions and commands, and receives advice.
+            # A console on the vessel sends decisions and commands, and receives comments.
             sent = (keys.below(keys.contact_decision(vessel)), keys.below(keys.command_all(vessel)))
-            received = (keys.delivery_query_any(keys.advice(vessel)),)
+            received = (keys.delivery_query_any(keys.comment(vessel)),)
             return [
                 *_reading(),
                 *_sending(sent),

@@ -47,7 +47,7 @@ def contact_detail_json(
         "related": related_images_json(db, contact_id, rates),
         "decisions": list_records(db, "decision", contact_id),
         "standing": standing_decisions(db, contact_id),
-        "advice": list_records(db, "advice", contact_id),
+        "comments": list_records(db, "comment", contact_id),
         "requests": list_records(db, "request", contact_id),
         "measurements": measured,
         "size": summary(measured),

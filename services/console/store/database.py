@@ -17,21 +17,21 @@ from typing import Final, Literal
 
 from sonarpost.errors import DeliveryError
 from sonarpost.files import make_private
-from sonarpost.messages import Advice, Command, Decision
+from sonarpost.messages import Command, Comment, Decision
 
 Role = Literal["observer", "operator", "expert"]
 Side = Literal["vessel", "shore"]
-Permission = Literal["decide", "measure", "request", "advise"]
-Table = Literal["decision", "request", "advice"]
+Permission = Literal["decide", "measure", "request", "comment"]
+Table = Literal["decision", "request", "comment"]
 """Tables of the records that this console sends; their columns `payload` and `sent` hold what the outbox receives."""
 
 ROLES: Final[tuple[Role, ...]] = ("observer", "operator", "expert")
-PERMISSIONS: Final[tuple[Permission, ...]] = ("decide", "measure", "request", "advise")
-ID_COLUMN: Final[dict[Table, str]] = {"decision": "decision_id", "request": "command_id", "advice": "advice_id"}
-RECORD_TYPES: Final[dict[Table, type[Decision] | type[Command] | type[Advice]]] = {
+PERMISSIONS: Final[tuple[Permission, ...]] = ("decide", "measure", "request", "comment")
+ID_COLUMN: Final[dict[Table, str]] = {"decision": "decision_id", "request": "command_id", "comment": "comment_id"}
+RECORD_TYPES: Final[dict[Table, type[Decision] | type[Command] | type[Comment]]] = {
     "decision": Decision,
     "request": Command,
-    "advice": Advice,
+    "comment": Comment,
 }
 
 DATABASE_NAME: Final = "console-review.db"
@@ -57,7 +57,7 @@ CREATE TABLE IF NOT EXISTS contact (
     first_s INTEGER NOT NULL, name TEXT NOT NULL, revision INTEGER NOT NULL DEFAULT 0,
     version INTEGER NOT NULL, review TEXT NOT NULL DEFAULT 'unreviewed', mlo_class TEXT, confidence REAL,
     decided_by TEXT, decided_utc_s REAL,
-    effective TEXT, last_decision TEXT, remark TEXT NOT NULL DEFAULT '', advised INTEGER NOT NULL DEFAULT 0,
+    effective TEXT, last_decision TEXT, remark TEXT NOT NULL DEFAULT '', commented INTEGER NOT NULL DEFAULT 0,
     atd_class TEXT, atd_confidence REAL, lat_deg REAL, lon_deg REAL, position_sigma_m REAL, range_m REAL,
     vehicle_lat_deg REAL, vehicle_lon_deg REAL, seen_utc_s REAL, first_frame_utc_s REAL NOT NULL,
     last_frame_utc_s REAL NOT NULL, arrived_utc_s REAL NOT NULL, updated_utc_s REAL NOT NULL,
@@ -112,15 +112,15 @@ CREATE TABLE IF NOT EXISTS request (
     late_utc_s REAL, arrived_utc_s REAL, result_contact TEXT, result_version INTEGER, result_bytes INTEGER);
 CREATE INDEX IF NOT EXISTS request_contact ON request (contact_id, seq);
 CREATE INDEX IF NOT EXISTS request_unsent ON request (seq) WHERE sent = 0;
-CREATE TABLE IF NOT EXISTS advice (
-    seq INTEGER PRIMARY KEY AUTOINCREMENT, advice_id TEXT NOT NULL UNIQUE, contact_id TEXT NOT NULL DEFAULT '',
+CREATE TABLE IF NOT EXISTS comment (
+    seq INTEGER PRIMARY KEY AUTOINCREMENT, comment_id TEXT NOT NULL UNIQUE, contact_id TEXT NOT NULL DEFAULT '',
     vessel_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL, version INTEGER NOT NULL,
     verdict TEXT, confidence REAL, mlo_class TEXT, remark TEXT NOT NULL, author TEXT NOT NULL,
-    advised_utc_s REAL NOT NULL, state TEXT, reason TEXT NOT NULL DEFAULT '', payload BLOB NOT NULL,
+    commented_utc_s REAL NOT NULL, state TEXT, reason TEXT NOT NULL DEFAULT '', payload BLOB NOT NULL,
     sent INTEGER NOT NULL);
-CREATE INDEX IF NOT EXISTS advice_contact ON advice (contact_id, seq);
-CREATE INDEX IF NOT EXISTS advice_waiting ON advice (vessel_id, vehicle_id, image_id) WHERE contact_id = '';
-CREATE INDEX IF NOT EXISTS advice_unsent ON advice (seq) WHERE sent = 0;
+CREATE INDEX IF NOT EXISTS comment_contact ON comment (contact_id, seq);
+CREATE INDEX IF NOT EXISTS comment_waiting ON comment (vessel_id, vehicle_id, image_id) WHERE contact_id = '';
+CREATE INDEX IF NOT EXISTS comment_unsent ON comment (seq) WHERE sent = 0;
 CREATE TABLE IF NOT EXISTS measurement (
     id INTEGER PRIMARY KEY AUTOINCREMENT, contact_id TEXT NOT NULL, utc_s REAL NOT NULL, body TEXT NOT NULL,
     withdrawn_by TEXT, withdrawn_utc_s REAL);
@@ -170,8 +170,8 @@ CREATE TEMP TRIGGER decision_2 AFTER UPDATE ON decision WHEN old.sent IS new.sen
 CREATE TEMP TRIGGER request_1 AFTER INSERT ON request BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
 CREATE TEMP TRIGGER request_2 AFTER UPDATE ON request WHEN old.sent IS new.sent
     BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
-CREATE TEMP TRIGGER advice_1 AFTER INSERT ON advice BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
-CREATE TEMP TRIGGER advice_2 AFTER UPDATE ON advice WHEN old.sent IS new.sent
+CREATE TEMP TRIGGER comment_1 AFTER INSERT ON comment BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
+CREATE TEMP TRIGGER comment_2 AFTER UPDATE ON comment WHEN old.sent IS new.sent
     BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
 CREATE TEMP TRIGGER measurement_1 AFTER INSERT ON measurement
     BEGIN INSERT INTO changed VALUES (new.contact_id, 0); END;
@@ -311,7 +311,7 @@ class Actor:
         Decisions are made on the vessel, which can send them to the vehicle at once. Experts at the shore site comment
         and send requests.
         """
-        if permission == "advise":
+        if permission == "comment":
             return side == "shore" and self.role == "expert"
         if permission == "decide":
             return side == "vessel" and self.role != "observer"

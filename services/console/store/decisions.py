@@ -263,7 +263,7 @@ def attach_waiting_records(db: sqlite3.Connection, contact_id: str, now_utc_s: f
     """Assign decisions and comments that arrived before their image to the new contact."""
     row = db.execute("SELECT vessel_id, vehicle_id, image_id FROM contact WHERE id = ?", (contact_id,)).fetchone()
     attached = 0
-    for table in ("decision", "advice"):
+    for table in ("decision", "comment"):
         attached += db.execute(
             f"UPDATE {table} SET contact_id = ? WHERE contact_id = ''"  # noqa: S608  constants only
             " AND vessel_id = ? AND vehicle_id = ? AND image_id = ?",
@@ -271,7 +271,7 @@ def attach_waiting_records(db: sqlite3.Connection, contact_id: str, now_utc_s: f
         ).rowcount
     if attached:
         db.execute(
-            "UPDATE contact SET advised = EXISTS (SELECT 1 FROM advice WHERE contact_id = ?) WHERE id = ?",
+            "UPDATE contact SET commented = EXISTS (SELECT 1 FROM comment WHERE contact_id = ?) WHERE id = ?",
             (contact_id, contact_id),
         )
         _update_contact(db, contact_id, now_utc_s)

@@ -13,7 +13,7 @@ from sonarpost import wire
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError
 from sonarpost.limits import limit
-from sonarpost.messages import Advice, Command, CommandKind, Decision, DownlinkState, TaskingState
+from sonarpost.messages import Command, CommandKind, Comment, Decision, DownlinkState, TaskingState
 from sonarpost.review.costs import NEW_IMAGE_KINDS, RequestEstimate
 from sonarpost.services.console.store.contacts import find_contact, find_contact_of_image
 from sonarpost.services.console.store.database import (
@@ -233,52 +233,52 @@ def apply_tasking_state(db: sqlite3.Connection, state: TaskingState) -> None:
     if state.kind == "command":
         update_request_state(db, state.record_id, state.state, state.reason, None, state.changed_utc_s)
         return
-    row = find_record(db, "advice", state.record_id)
+    row = find_record(db, "comment", state.record_id)
     if row is None or row["state"] in (None, "delivered", "refused") or row["state"] == state.state:
         return
     db.execute(
-        "UPDATE advice SET state = ?, reason = ? WHERE advice_id = ?", (state.state, state.reason, state.record_id)
+        "UPDATE comment SET state = ?, reason = ? WHERE comment_id = ?", (state.state, state.reason, state.record_id)
     )
 
 
-def refuse_advice(db: sqlite3.Connection, advice_id: str, reason: str) -> None:
+def refuse_comment(db: sqlite3.Connection, comment_id: str, reason: str) -> None:
     """Mark a comment as refused by c2."""
     db.execute(
-        "UPDATE advice SET state = 'refused', reason = ? WHERE advice_id = ? AND state = 'waiting'",
-        (reason, advice_id),
+        "UPDATE comment SET state = 'refused', reason = ? WHERE comment_id = ? AND state = 'waiting'",
+        (reason, comment_id),
     )
 
 
-def add_advice(db: sqlite3.Connection, contact_id: str, record: Advice, actor: Actor) -> None:
+def add_comment(db: sqlite3.Connection, contact_id: str, record: Comment, actor: Actor) -> None:
     """Store a comment of this console."""
-    _insert_advice(db, contact_id, record, "waiting")
-    detail = record.model_dump(include={"advice_id", "verdict", "confidence", "mlo_class", "remark"})
+    _insert_comment(db, contact_id, record, "waiting")
+    detail = record.model_dump(include={"comment_id", "verdict", "confidence", "mlo_class", "remark"})
     displayed = DisplayedImage(record.image_version)
-    add_audit_entry(db, contact_id, actor, "advise", record.advised_utc_s, displayed, detail)
+    add_audit_entry(db, contact_id, actor, "comment", record.commented_utc_s, displayed, detail)
 
 
-def store_received_advice(db: sqlite3.Connection, record: Advice) -> None:
+def store_received_comment(db: sqlite3.Connection, record: Comment) -> None:
     """Store a comment from the shore site. A comment without its image is kept until the image arrives.
 
     Raises:
         BadInputError: Too many comments wait for their images.
     """
-    if find_record(db, "advice", record.advice_id) is not None:
+    if find_record(db, "comment", record.comment_id) is not None:
         return
-    contact_id = find_contact_of_image(db, record.vessel_id, record.vehicle_id, record.image_id, record.advised_utc_s)
+    contact_id = find_contact_of_image(db, record.vessel_id, record.vehicle_id, record.image_id, record.commented_utc_s)
     if contact_id is None:
         check_waiting(db, record)
-    _insert_advice(db, contact_id or "", record, None)
+    _insert_comment(db, contact_id or "", record, None)
 
 
-def check_waiting(db: sqlite3.Connection, record: Decision | Advice) -> None:
+def check_waiting(db: sqlite3.Connection, record: Decision | Comment) -> None:
     """Raise `BadInputError` if too many decisions or comments of a vessel wait for their images."""
     count = f"SELECT COUNT(*) FROM {record.TYPE} WHERE contact_id = '' AND vessel_id = ?"  # noqa: S608  constants only
     if db.execute(count, (record.vessel_id,)).fetchone()[0] >= MAX_WAITING:
         raise BadInputError(record.TYPE, "image_id", record.image_id, f"an image; {MAX_WAITING} others have none yet")
 
 
-def _insert_advice(db: sqlite3.Connection, contact_id: str, record: Advice, state: str | None) -> None:
+def _insert_comment(db: sqlite3.Connection, contact_id: str, record: Comment, state: str | None) -> None:
     values: Json = {
         **record.model_dump(exclude={"image_version"}),
         "contact_id": contact_id,
@@ -287,5 +287,5 @@ def _insert_advice(db: sqlite3.Connection, contact_id: str, record: Advice, stat
         "payload": wire.encode(record),
         "sent": int(state is None),
     }
-    insert_row(db, "advice", values)
-    db.execute("UPDATE contact SET advised = 1 WHERE id = ?", (contact_id,))
+    insert_row(db, "comment", values)
+    db.execute("UPDATE contact SET commented = 1 WHERE id = ?", (contact_id,))

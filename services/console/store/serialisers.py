@@ -62,7 +62,7 @@ _REQUEST_COLUMNS: Final = (
     "command_id kind user asked_utc_s airtime_s state times_sent reason changed_utc_s bytes_wanted probable_utc_s"
     " expected_utc_s late_utc_s arrived_utc_s"
 )
-_ADVICE_COLUMNS: Final = "advice_id version verdict confidence mlo_class remark author advised_utc_s"
+_COMMENT_COLUMNS: Final = "comment_id version verdict confidence mlo_class remark author commented_utc_s"
 _AUDIT_COLUMNS: Final = "seq utc_s user role address action version sha256 layer"
 _VERSION_FIELDS: Final = (
     "version codec model complete missing_fraction bytes_received bytes_total first_frame_utc_s authenticated"
@@ -94,7 +94,7 @@ def contact_json(row: sqlite3.Row) -> Json:
         "contradictory": bool(row["contradictory"]),
         "decided_on": None if decided_on is None else {"version": decided_on, "bytes": bytes_decided},
         "newer_detail": bool(row["newer_detail"]),
-        "advised": bool(row["advised"]),
+        "commented": bool(row["commented"]),
         "delivery": None if row["d_shore"] is None else _select(row, _DELIVERY_COLUMNS, "d_"),
         "open_requests": row["asking"],
         "authenticated": None if row["authenticated"] is None else bool(row["authenticated"]),
@@ -122,16 +122,16 @@ def request_json(row: sqlite3.Row) -> Json:
     return {**_select(row, _REQUEST_COLUMNS), "result": result}
 
 
-def advice_json(row: sqlite3.Row) -> Json:
+def comment_json(row: sqlite3.Row) -> Json:
     """Return a comment."""
     delivery = None if row["state"] is None else {"state": row["state"], "reason": row["reason"]}
-    return {**_select(row, _ADVICE_COLUMNS), "delivery": delivery}
+    return {**_select(row, _COMMENT_COLUMNS), "delivery": delivery}
 
 
 RECORD_JSON: Final[Mapping[Table, Callable[[sqlite3.Row], Json]]] = {
     "decision": decision_json,
     "request": request_json,
-    "advice": advice_json,
+    "comment": comment_json,
 }
 
 

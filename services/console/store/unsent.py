@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from sonarpost import wire
 from sonarpost.errors import BadInputError
 from sonarpost.logs import IntervalLog
-from sonarpost.messages import Advice, Command, Decision
+from sonarpost.messages import Command, Comment, Decision
 from sonarpost.services.console.store.database import ID_COLUMN, RECORD_TYPES, Table
 
 _unreadable_log = IntervalLog(logging.getLogger(__name__), logging.ERROR, "Stored record not readable, not sent")
@@ -26,7 +26,7 @@ class UnsentRecord:
     table: Table
     record_id: str
     vessel_id: str
-    record: Decision | Command | Advice
+    record: Decision | Command | Comment
     to_vehicle: bool = True
 
 

@@ -15,8 +15,8 @@ from sonarpost.errors import ConfigError
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.messages import (
     AcousticFrame,
-    Advice,
     Command,
+    Comment,
     Decision,
     DownlinkState,
     DownlinkStep,
@@ -221,7 +221,7 @@ class TrainingSimulator:
         record = transfer.simulated.record(VESSEL, transfer.next_version, transfer.first_frame_utc_s, now_utc_s)
         self._state.store_image(record, transfer.simulated.truth)
         if self._packet % COMMENT_INTERVAL_PACKETS == COMMENT_INTERVAL_PACKETS - 2:
-            self._state.store_advice(self._comment(record))
+            self._state.store_comment(self._comment(record))
         transfer.next_version += 1
         if transfer.next_version == len(transfer.simulated.versions):
             self._transfers.remove(transfer)
@@ -280,12 +280,12 @@ class TrainingSimulator:
         elif decision.image_id in self._stopped:
             self._transfers.append(self._stopped.pop(decision.image_id))
 
-    def _comment(self, record: ReconstructedImage) -> Advice:
+    def _comment(self, record: ReconstructedImage) -> Comment:
         """Return a comment of a simulated expert at the shore site."""
         confidence = record.contact.atd_confidence if record.contact else None
         is_likely = confidence is not None and confidence > 1.1
-        return Advice(
-            advice_id=f"training-{record.image_id}-{record.version}",
+        return Comment(
+            comment_id=f"training-{record.image_id}-{record.version}",
             vessel_id=VESSEL,
             vehicle_id=record.vehicle_id,
             image_id=record.image_id,
@@ -296,7 +296,7 @@ class TrainingSimulator:
             if is_likely
             else "Simulated: wait for more of the image.",
             author="shore",
-            advised_utc_s=record.last_frame_utc_s,
+            commented_utc_s=record.last_frame_utc_s,
         )
 
     def _receive_frame(self, vehicle: str, now_utc_s: float) -> None:

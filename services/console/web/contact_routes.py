@@ -14,10 +14,10 @@ from starlette.routing import Route
 
 from sonarpost.messages import (
     MIN_REGION_BYTES,
-    Advice,
     BoxEnd,
     BoxStart,
     CommandKind,
+    Comment,
     ReconstructedImage,
     Verdict,
 )
@@ -37,7 +37,7 @@ Layer = Literal["raw", Relation]
 _Point = tuple[Annotated[float, Field(ge=0, le=4096)], Annotated[float, Field(ge=0, le=4096)]]
 
 
-class AdviceBody(RequestBody):
+class CommentBody(RequestBody):
     """Fields of a comment, and of a decision."""
 
     version: Version
@@ -89,7 +89,7 @@ class ContactRoutes:
             write(contact + "/measure", self._measure, "measure"),
             write(contact + "/measure/{measurement:number}/withdraw", self._withdraw_measurement, "measure"),
             write(contact + "/requests", self._add_request, "request"),
-            write(contact + "/advice", self._add_advice, "advise"),
+            write(contact + "/comment", self._add_comment, "comment"),
         ]
 
     # Images
@@ -130,20 +130,20 @@ class ContactRoutes:
         found = self._state.add_request(contact_id(call), body.kind, body.airtime_s, call.actor, arguments)
         return JSONResponse(found, 201)
 
-    def _add_advice(self, call: Call) -> Response:
-        body = call.parse_body(AdviceBody)
+    def _add_comment(self, call: Call) -> Response:
+        body = call.parse_body(CommentBody)
         image = self._state.image(contact_id(call), body.version)
-        record = Advice(
+        record = Comment(
             **body.model_dump(exclude={"version"}),
-            advice_id=f"a-{uuid.uuid4().hex}",
+            comment_id=f"a-{uuid.uuid4().hex}",
             vessel_id=image.vessel_id,
             vehicle_id=image.vehicle_id,
             image_id=image.image_id,
             image_version=body.version,
             author=call.actor.user,
-            advised_utc_s=self._state.clock(),
+            commented_utc_s=self._state.clock(),
         )
-        return JSONResponse(self._state.add_advice(contact_id(call), record, call.actor), 201)
+        return JSONResponse(self._state.add_comment(contact_id(call), record, call.actor), 201)
 
 
 def contact_id(call: Call) -> str:

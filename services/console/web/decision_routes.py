@@ -13,12 +13,12 @@ from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.database import DisplayedImage
 from sonarpost.services.console.store.decisions import DecisionInput
 from sonarpost.services.console.web.access import AccessControl, Call, RequestBody
-from sonarpost.services.console.web.contact_routes import AdviceBody, Layer, Version, contact_id
+from sonarpost.services.console.web.contact_routes import CommentBody, Layer, Version, contact_id
 
 _Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
-class _DecisionBody(AdviceBody):
+class _DecisionBody(CommentBody):
     verdict: Verdict
     revision: Annotated[int, Field(ge=0)]
     sha256: _Digest

@@ -95,7 +95,7 @@ def _sheet(given: ReportContact, now_utc_s: float, *, training: bool) -> str:
         f"<div class='columns'>{_figure(given)}<dl>{_facts_html(_facts(given))}</dl></div>"
         f"{_table('Measurements', detail['measurements'], _MEASUREMENT_COLUMNS)}"
         f"{_table('Decisions', detail['decisions'], _DECISION_COLUMNS)}"
-        f"{_table('Comments', detail['advice'], _COMMENT_COLUMNS)}"
+        f"{_table('Comments', detail['comments'], _COMMENT_COLUMNS)}"
         f"{_table('Audit, latest entries', audit[: -MAX_AUDIT_ROWS - 1 : -1], _AUDIT_COLUMNS)}"
         f"<footer><p>{html.escape(_integrity_text(given))}</p></footer></article>"
     )
@@ -266,7 +266,7 @@ _DECISION_COLUMNS: Final = {
     "class": "mlo_class",
     "remark": "remark",
 }
-_COMMENT_COLUMNS: Final = {**_DECISION_COLUMNS, "time": "advised_utc_s", "operator": "author"}
+_COMMENT_COLUMNS: Final = {**_DECISION_COLUMNS, "time": "commented_utc_s", "operator": "author"}
 _AUDIT_COLUMNS: Final = {
     "time": "utc_s",
     "user": "user",

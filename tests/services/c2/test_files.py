@@ -241,14 +241,14 @@ def test_service_removes_counts_and_logs(begin, relay, out, caplog):
 # Index
 
 
-@pytest.mark.parametrize("version", [3, 5])
+@pytest.mark.parametrize("version", [4, 6])
 def test_index_of_another_version_is_rejected_and_unchanged(version, filled, out):
     filled.close()
     with closing(sqlite3.connect(out / FILE_NAME)) as db:
         db.execute(f"PRAGMA user_version = {version}")
     before = (out / FILE_NAME).read_bytes()
     for writable in (True, False):
-        with pytest.raises(StoredFileError, match=rf"index\.db: user_version: got {version}, expected 4"):
+        with pytest.raises(StoredFileError, match=rf"index\.db: user_version: got {version}, expected 5"):
             ShoreIndex(out, writable=writable)
     assert (out / FILE_NAME).read_bytes() == before
 
@@ -256,13 +256,13 @@ def test_index_of_another_version_is_rejected_and_unchanged(version, filled, out
 def test_records_wait_while_the_index_is_of_another_version(filled, begin, relay, out):
     filled.close()
     with closing(sqlite3.connect(out / FILE_NAME)) as db:
-        db.execute("PRAGMA user_version = 3")
+        db.execute("PRAGMA user_version = 4")
     service = begin()
     relay.send(INBOX, "c2", relayed(image("000A")))
-    eventually(lambda: "user_version: got 3, expected 4" in service.health().detail, what="the reason in the health")
+    eventually(lambda: "user_version: got 4, expected 5" in service.health().detail, what="the reason in the health")
     assert service.health().state == "degraded"
     with closing(sqlite3.connect(out / FILE_NAME)) as db:
-        db.execute("PRAGMA user_version = 4")
+        db.execute("PRAGMA user_version = 5")
     eventually(lambda: service.health().counters.get("images_stored") == 1)
     assert service.health().gauges["refused"] == 0
 

@@ -19,7 +19,7 @@ from sonarpost import keys, wire
 from sonarpost.archive.journal import Journal
 from sonarpost.bus.catch_up import CatchUpSubscriber
 from sonarpost.errors import QueryRefusedError
-from sonarpost.messages import Advice, Contact, Decision, Pixels, ReconstructedImage
+from sonarpost.messages import Comment, Contact, Decision, Pixels, ReconstructedImage
 from sonarpost.services.c2 import queries
 from sonarpost.services.c2.accepted import AcceptedRecords
 
@@ -245,12 +245,12 @@ def test_invalid_query_gets_one_error(shore):
 
 
 def test_tasking_states_are_all_in_order_or_the_latest(shore, runner):
-    fields = {"vehicle_id": "uuv-1", "image_id": "0001", "image_version": 1, "author": "expert", "advised_utc_s": 2.0}
-    advice = Advice(advice_id="a-1", vessel_id="vessel-1", **fields, verdict="unsure")
-    shore.put(keys.tasking_advice("vessel-1"), advice)
+    fields = {"vehicle_id": "uuv-1", "image_id": "0001", "image_version": 1, "author": "expert", "commented_utc_s": 2.0}
+    comment = Comment(comment_id="a-1", vessel_id="vessel-1", **fields, verdict="unsure")
+    shore.put(keys.tasking_comment("vessel-1"), comment)
     selector = keys.tasking_state_all()
     eventually(lambda: shore.names(selector) == ["tasking_state"])
-    runner.peer("vessel-1", "relay", {keys.advice("vessel-1"): Advice})
+    runner.peer("vessel-1", "relay", {keys.comment("vessel-1"): Comment})
     eventually(lambda: len(shore.names(selector)) == 2)
 
     def states(parameters):

@@ -1,4 +1,4 @@
-"""Advice and commands from the shore to the vessel: delivered exactly once, with their state shown at the shore."""
+"""Comments and commands from the shore to the vessel: delivered exactly once, with their state shown at the shore."""
 
 import msgpack
 import pytest
@@ -10,17 +10,17 @@ from sonarpost import keys, wire
 from sonarpost.archive.shore_index import ShoreIndex
 from sonarpost.bus.session import router_config
 from sonarpost.errors import StoredFileError
-from sonarpost.messages import Advice, Command, TaskingState
+from sonarpost.messages import Command, Comment, TaskingState
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
-ADVICE, COMMAND = keys.tasking_advice("vessel-1"), keys.tasking_command("vessel-1")
+COMMENT, COMMAND = keys.tasking_comment("vessel-1"), keys.tasking_command("vessel-1")
 
 
 @pytest.fixture
 def relay(runner, platform):
-    def make(advice=("console",), commands=("op_modem",)):
-        config = RelayConfig(advice_consumers=advice, command_consumers=commands)
+    def make(comment=("console",), commands=("op_modem",)):
+        config = RelayConfig(comment_consumers=comment, command_consumers=commands)
         return runner.start(RelayService(platform("vessel-1"), config))
 
     return make
@@ -33,7 +33,7 @@ def expert(runner):
 
 @pytest.fixture
 def console(runner):
-    return lambda: runner.peer("vessel-1", "console", {keys.advice("vessel-1"): Advice})
+    return lambda: runner.peer("vessel-1", "console", {keys.comment("vessel-1"): Comment})
 
 
 @pytest.fixture
@@ -41,9 +41,9 @@ def op_modem(runner):
     return lambda: runner.peer("vessel-1", "op_modem", {keys.command_all("vessel-1"): Command})
 
 
-def advice(advice_id="a1", vessel="vessel-1", **changes):
+def comment(comment_id="a1", vessel="vessel-1", **changes):
     fields = {
-        "advice_id": advice_id,
+        "comment_id": comment_id,
         "vessel_id": vessel,
         "vehicle_id": "uuv-1",
         "image_id": "AAAA",
@@ -51,9 +51,9 @@ def advice(advice_id="a1", vessel="vessel-1", **changes):
         "verdict": "mine_like",
         "remark": "look again",
         "author": "expert",
-        "advised_utc_s": 5.0,
+        "commented_utc_s": 5.0,
     }
-    return Advice(**(fields | changes))
+    return Comment(**(fields | changes))
 
 
 def command(command_id="c1", kind="refine"):
@@ -74,16 +74,16 @@ def states(out):
         index.close()
 
 
-def test_advice_and_command_reach_their_consumers_on_the_vessel(begin, relay, expert, console, op_modem, out, watch):
+def test_comment_and_command_reach_their_consumers_on_the_vessel(begin, relay, expert, console, op_modem, out, watch):
     shown, aboard = watch(keys.tasking_state("vessel-1")), watch("sonarpost/v1/vessel-1/**")
     service = begin()
     relay()
     screen, modem = console(), op_modem()
-    expert.send(ADVICE, "c2", advice())
+    expert.send(COMMENT, "c2", comment())
     expert.send(COMMAND, "c2", command())
-    eventually(lambda: screen.received == [advice()] and modem.received == [command()])
+    eventually(lambda: screen.received == [comment()] and modem.received == [command()])
     eventually(lambda: set(states(out).values()) == {"delivered"})
-    assert set(states(out)) == {("vessel-1", "advice", "a1"), ("vessel-1", "command", "c1")}
+    assert set(states(out)) == {("vessel-1", "comment", "a1"), ("vessel-1", "command", "c1")}
     eventually(lambda: len(shown) >= 2)
     told = [msgpack.unpackb(sample.payload.to_bytes()) for sample in shown]
     assert {(t["type"], t["state"]) for t in told} <= {(TaskingState.TYPE, s) for s in ("waiting", "delivered")}
@@ -92,9 +92,9 @@ def test_advice_and_command_reach_their_consumers_on_the_vessel(begin, relay, ex
     assert service.health().counters["tasking_accepted"] == 2
 
 
-def test_advice_waits_for_an_unreachable_vessel(begin, relay, expert, console, out, runner):
+def test_comment_waits_for_an_unreachable_vessel(begin, relay, expert, console, out, runner):
     service = begin()
-    expert.send(ADVICE, "c2", advice("a1"), advice("a2"))
+    expert.send(COMMENT, "c2", comment("a1"), comment("a2"))
     eventually(lambda: service.gauges()["waiting_for_vessels"] == 2)
     eventually(lambda: list(states(out).values()) == ["waiting"] * 2)
     runner.stop(service)
@@ -102,12 +102,12 @@ def test_advice_waits_for_an_unreachable_vessel(begin, relay, expert, console, o
     assert service.gauges()["waiting_for_vessels"] == 2
     screen = console()
     relay(commands=())
-    eventually(lambda: [a.advice_id for a in screen.received] == ["a1", "a2"])
+    eventually(lambda: [a.comment_id for a in screen.received] == ["a1", "a2"])
     eventually(lambda: list(states(out).values()) == ["delivered"] * 2)
     assert service.gauges()["waiting_for_vessels"] == 0
 
 
-def test_advice_arrives_once_after_a_link_cut(begin, runner, platform, expert, out, tmp_path, router):
+def test_comment_arrives_once_after_a_link_cut(begin, runner, platform, expert, out, tmp_path, router):
     """Two routers, linked through a connection that can be cut."""
     link = LinkEmulator(int(router.rpartition(":")[2]))
     vessel_endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -116,19 +116,19 @@ def test_advice_arrives_once_after_a_link_cut(begin, runner, platform, expert, o
     screen_type = type("Console", (type(expert),), {"NAME": "console"})
     try:
         service = begin()
-        runner.start(RelayService(aboard, RelayConfig(advice_consumers=("console",))))
-        screen = runner.start(screen_type(aboard, {keys.advice("vessel-1"): Advice}))
-        expert.send(ADVICE, "c2", advice("before"))
-        eventually(lambda: [a.advice_id for a in screen.received] == ["before"])
-        eventually(lambda: states(out).get(("vessel-1", "advice", "before")) == "delivered")
+        runner.start(RelayService(aboard, RelayConfig(comment_consumers=("console",))))
+        screen = runner.start(screen_type(aboard, {keys.comment("vessel-1"): Comment}))
+        expert.send(COMMENT, "c2", comment("before"))
+        eventually(lambda: [a.comment_id for a in screen.received] == ["before"])
+        eventually(lambda: states(out).get(("vessel-1", "comment", "before")) == "delivered")
         link.cut()
-        expert.send(ADVICE, "c2", advice("later"))
-        eventually(lambda: states(out).get(("vessel-1", "advice", "later")) == "waiting")
+        expert.send(COMMENT, "c2", comment("later"))
+        eventually(lambda: states(out).get(("vessel-1", "comment", "later")) == "waiting")
         eventually(lambda: not service.is_responding("relay@vessel-1"))
-        assert [a.advice_id for a in screen.received] == ["before"]
+        assert [a.comment_id for a in screen.received] == ["before"]
         link.mend()
-        eventually(lambda: [a.advice_id for a in screen.received] == ["before", "later"])
-        eventually(lambda: states(out).get(("vessel-1", "advice", "later")) == "delivered")
+        eventually(lambda: [a.comment_id for a in screen.received] == ["before", "later"])
+        eventually(lambda: states(out).get(("vessel-1", "comment", "later")) == "delivered")
     finally:
         runner.stop_all()
         vessel_router.close()
@@ -139,42 +139,42 @@ def test_unreachable_vessel_does_not_delay_others(begin, relay, expert, console,
     begin()
     relay()
     screen = console()
-    expert.send(keys.tasking_advice("vessel-9"), "c2", advice("far", vessel="vessel-9"))
-    eventually(lambda: states(out) == {("vessel-9", "advice", "far"): "waiting"})
-    expert.send(ADVICE, "c2", advice("near"))
-    eventually(lambda: [a.advice_id for a in screen.received] == ["near"])
-    eventually(lambda: states(out)["vessel-1", "advice", "near"] == "delivered")
-    assert states(out)["vessel-9", "advice", "far"] == "waiting"
+    expert.send(keys.tasking_comment("vessel-9"), "c2", comment("far", vessel="vessel-9"))
+    eventually(lambda: states(out) == {("vessel-9", "comment", "far"): "waiting"})
+    expert.send(COMMENT, "c2", comment("near"))
+    eventually(lambda: [a.comment_id for a in screen.received] == ["near"])
+    eventually(lambda: states(out)["vessel-1", "comment", "near"] == "delivered")
+    assert states(out)["vessel-9", "comment", "far"] == "waiting"
 
 
 def test_record_without_a_consumer_is_refused_with_a_state_at_the_shore(begin, relay, expert, out, refused):
     service = begin()
-    relay(advice=(), commands=())
-    expert.send(ADVICE, "c2", advice())
+    relay(comment=(), commands=())
+    expert.send(COMMENT, "c2", comment())
     expert.send(COMMAND, "c2", command())
     eventually(lambda: list(states(out).values()) == ["refused"] * 2)
     reasons = [reason for _, reason in refused(service)]
-    assert any("a name in [relay] advice_consumers" in reason for reason in reasons)
+    assert any("a name in [relay] comment_consumers" in reason for reason in reasons)
     index = ShoreIndex(out, writable=False)
     assert all("no consumer on vessel-1" in row.reason for row in index.tasking())
     index.close()
 
 
-def test_repeated_advice_is_accepted_once_and_a_conflicting_one_refused(begin, relay, expert, console, refused):
+def test_repeated_comment_is_accepted_once_and_a_conflicting_one_refused(begin, relay, expert, console, refused):
     service = begin()
     relay()
     screen = console()
-    expert.send(ADVICE, "c2", advice(), advice())
+    expert.send(COMMENT, "c2", comment(), comment())
     eventually(lambda: service.health().counters.get("tasking_repeated") == 1)
-    expert.send(ADVICE, "c2", advice(remark="something else"), advice("a2"))
-    eventually(lambda: [a.advice_id for a in screen.received] == ["a1", "a2"])
+    expert.send(COMMENT, "c2", comment(remark="something else"), comment("a2"))
+    eventually(lambda: [a.comment_id for a in screen.received] == ["a1", "a2"])
     eventually(lambda: len(refused(expert)) == 1)
-    assert "advice_id: got 'a1', expected an identifier that no other record" in refused(expert)[0][1]
+    assert "comment_id: got 'a1', expected an identifier that no other record" in refused(expert)[0][1]
 
 
 @pytest.mark.parametrize(
     ("key", "record", "field"),
-    [(ADVICE, advice(vessel="vessel-2"), "vessel_id"), (ADVICE, command(), "type"), (COMMAND, advice(), "type")],
+    [(COMMENT, comment(vessel="vessel-2"), "vessel_id"), (COMMENT, command(), "type"), (COMMAND, comment(), "type")],
 )
 def test_record_for_another_vessel_than_the_key_is_refused(key, record, field, begin, expert, refused):
     service = begin()
@@ -184,10 +184,10 @@ def test_record_for_another_vessel_than_the_key_is_refused(key, record, field, b
     assert service.gauges()["waiting_for_vessels"] == 0
 
 
-def test_relay_refuses_advice_of_another_vessel_and_command_of_another_kind(relay, runner, refused):
+def test_relay_refuses_comment_of_another_vessel_and_command_of_another_kind(relay, runner, refused):
     relay()
     other = runner.peer("shore-9", "c2")
-    other.send(keys.advice("vessel-1"), "relay", advice(vessel="vessel-2"))
+    other.send(keys.comment("vessel-1"), "relay", comment(vessel="vessel-2"))
     other.send(keys.command("vessel-1", "resend"), "relay", command(kind="refine"))
     eventually(lambda: len(refused(other)) == 2)
     reasons = " ".join(reason for _, reason in refused(other))
@@ -198,16 +198,16 @@ def test_relay_refuses_advice_of_another_vessel_and_command_of_another_kind(rela
 def test_publication_on_the_vessel_is_ignored_by_the_relay(relay, console, publish):
     """The console receives it directly; the relay would deliver it twice."""
     service, screen = relay(), console()
-    publish(keys.advice("vessel-1"), wire.encode(advice()))
+    publish(keys.comment("vessel-1"), wire.encode(comment()))
     eventually(lambda: len(screen.received) == 1)
-    assert "advice_taken" not in service.health().counters
+    assert "comments_taken" not in service.health().counters
     assert service.store.inbox_depth() == 0
 
 
 def test_tasking_state_that_cannot_be_read_or_published_delays_no_other(runner, expert, relay, op_modem, begin, out):
     service = begin()
     with service.store.transaction() as tx:
-        tx.put_state("tasking/vessel-1/advice/a1", b"\xc1")
+        tx.put_state("tasking/vessel-1/comment/a1", b"\xc1")
         tx.put_state("tasking/vessel-1/command/c0", msgpack.packb(["vessel-1", "command", b"x", "waiting", "", 0.0]))
         tx.put_state("archive-owner", b"\xff")
     runner.stop(service)

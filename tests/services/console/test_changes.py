@@ -8,7 +8,7 @@ import time
 from dataclasses import asdict
 
 import pytest
-from builders.console import FIRST_UTC_S, Clock, advice_record, contact_ids, downlink_state, image_record
+from builders.console import FIRST_UTC_S, Clock, comment_record, contact_ids, downlink_state, image_record
 
 from sonarpost.errors import DeliveryError
 from sonarpost.messages import Decision, TaskingState
@@ -123,7 +123,7 @@ def test_each_change_is_one_event(console, call):
     names = {"vessel_id": "vessel-1", "vehicle_id": "uuv-1", "image_id": "0001", "image_version": 1}
     times = {"decided_utc_s": FIRST_UTC_S + 50}
     call("store_decision", Decision(decision_id="d-1", verdict="mine_like", operator="x", **names, **times))
-    call("store_advice", advice_record("0001"))
+    call("store_comment", comment_record("0001"))
     # A look whose object has contradictory verdicts is changed too.
     decide(other, "not_mine_like")
     assert call.changed == {one, other}
@@ -145,11 +145,11 @@ def test_each_change_is_one_event(console, call):
     reached = {"vessel_id": "vessel-1", "changed_utc_s": clock.now_utc_s}
     call("apply_tasking_state", TaskingState(kind="command", record_id=wanted, state="delivered", **reached))
     call("store_image", image_record("0004", version=2, total=400, position=(56.2, -5.0)))
-    comment = advice_record("0004", advice_id="a-2")
-    call("add_advice", fourth, comment, Actor("eva", "expert", "127.0.0.1"))
-    call("apply_tasking_state", TaskingState(kind="advice", record_id="a-2", state="delivered", **reached))
-    call("add_advice", fourth, advice_record("0004", advice_id="a-3"), Actor("eva", "expert", "127.0.0.1"))
-    call("apply_acknowledgement", "advice", "a-3", "c2", "no")
+    comment = comment_record("0004", comment_id="a-2")
+    call("add_comment", fourth, comment, Actor("eva", "expert", "127.0.0.1"))
+    call("apply_tasking_state", TaskingState(kind="comment", record_id="a-2", state="delivered", **reached))
+    call("add_comment", fourth, comment_record("0004", comment_id="a-3"), Actor("eva", "expert", "127.0.0.1"))
+    call("apply_acknowledgement", "comment", "a-3", "c2", "no")
     # Measurements.
     line = Line(2, "raw", "length", (2.0, 2.0), (10.0, 10.0))
     measured = call("measure", fourth, line, ANNA, keep=True)["id"]

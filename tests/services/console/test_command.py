@@ -154,7 +154,7 @@ def test_training_delivers_decisions_and_requests(console):
     assert more["complete"]
     assert (more["version"], more["bytes_received"] > detail["bytes_received"]) == (detail["version"] + 1, True)
     assert console.state.counts().total == 3
-    assert any(row["advised"] for row in anna.get("/api/contacts").json()["items"])
+    assert any(row["commented"] for row in anna.get("/api/contacts").json()["items"])
     vehicles = anna.get("/api/fleet").json()["vehicles"]
     assert any(vehicle["snr_in_db"] is not None and vehicle["queue"] for vehicle in vehicles)
 

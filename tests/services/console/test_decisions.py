@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from builders.console import Clock, advice_record, contact_id, image_record
+from builders.console import Clock, comment_record, contact_id, image_record
 from builders.records import decision_record
 from pydantic import ValidationError
 
@@ -78,11 +78,11 @@ def test_decisions_without_images_are_limited_for_each_vessel(console, clock, mo
 def test_comments_without_images_are_limited(console, monkeypatch):
     monkeypatch.setattr(requests, "MAX_WAITING", 3)
     for number in range(3):
-        console.state.store_advice(advice_record(f"B00{number}", advice_id=f"a-{number}"))
+        console.state.store_comment(comment_record(f"B00{number}", comment_id=f"a-{number}"))
     with pytest.raises(BadInputError, match="3 others have none yet"):
-        console.state.store_advice(advice_record("B003", advice_id="a-3"))
+        console.state.store_comment(comment_record("B003", comment_id="a-3"))
     console.state.store_image(image_record("B000"))
-    console.state.store_advice(advice_record("B003", advice_id="a-3"))
+    console.state.store_comment(comment_record("B003", comment_id="a-3"))
 
 
 def test_decision_taken_back_in_time_is_not_sent(console, clock):

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 
 import pytest
-from builders.console import FIRST_UTC_S, advice_record, contact_id, downlink_state, image_record
+from builders.console import FIRST_UTC_S, comment_record, contact_id, downlink_state, image_record
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -209,13 +209,13 @@ def test_records_before_their_image_are_attached_to_it(make_console):
     decision = Decision(decision_id="d-1", verdict="mine_like", operator="anna", decided_utc_s=at, **names)
     assert console.state.store_decision(decision)
     assert not console.state.store_decision(decision)
-    console.state.store_advice(advice_record())
+    console.state.store_comment(comment_record())
     console.state.store_image(image_record())
     detail = console.browser("watch").contact(ID)
     assert detail["contact"]["review"] == "mine_like"
-    assert detail["contact"]["advised"]
+    assert detail["contact"]["commented"]
     assert [d["elsewhere"] for d in detail["decisions"]] == [True]
-    assert [a["remark"] for a in detail["advice"]] == ["look again"]
+    assert [a["remark"] for a in detail["comments"]] == ["look again"]
 
 
 def test_request_costs_and_no_repeated_request(make_console):
@@ -290,8 +290,8 @@ def test_at_the_shore_site_experts_comment_and_no_role_decides(make_console):
     eva, anna = console.browser("eva"), console.browser("anna")
     assert eva.decide(ID).status_code == 403
     body = {"version": 1, "verdict": "unsure", "confidence": None, "mlo_class": None, "remark": "shadow too long"}
-    assert anna.post(f"/api/contacts/{ID}/advice", body).status_code == 403
-    answer = eva.post(f"/api/contacts/{ID}/advice", body)
+    assert anna.post(f"/api/contacts/{ID}/comment", body).status_code == 403
+    answer = eva.post(f"/api/contacts/{ID}/comment", body)
     assert answer.status_code == 201
     assert answer.json()["delivery"] == {"state": "waiting", "reason": ""}
     [item] = console.state.unsent_records()

@@ -41,7 +41,7 @@ PERMISSION_OF_PATH = {
     f"{ONE}/undo": "decide",
     f"{ONE}/measure": "measure",
     f"{ONE}/requests": "request",
-    f"{ONE}/advice": "advise",
+    f"{ONE}/comment": "comment",
 }
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>\"'&"
 
@@ -81,7 +81,7 @@ def test_role_permissions(with_contact):
         browser = with_contact.browser(user)
         may = browser.get("/api/session").json()["may"]
         for path, permission in PERMISSION_OF_PATH.items():
-            assert may[permission] == (role != "observer" and permission != "advise")
+            assert may[permission] == (role != "observer" and permission != "comment")
             # The body is invalid, so that a permitted request changes nothing.
             assert browser.post(path, {"x": 1}).status_code == (400 if may[permission] else 403)
 
@@ -90,8 +90,8 @@ def test_at_the_shore_site_only_experts_act(make_console):
     console = make_console(role="shore")
     may = {user: console.browser(user).get("/api/session").json()["may"] for user in ("watch", "anna", "eva")}
     assert not any(may["watch"].values())
-    assert may["anna"] == {"decide": False, "measure": True, "request": False, "advise": False}
-    assert may["eva"] == {"decide": False, "measure": True, "request": True, "advise": True}
+    assert may["anna"] == {"decide": False, "measure": True, "request": False, "comment": False}
+    assert may["eva"] == {"decide": False, "measure": True, "request": True, "comment": True}
 
 
 def test_session_cookie_attributes(console, make_console):
@@ -241,7 +241,7 @@ BODIES = {
     "/undo": {"decision_id": "x", "version": 1, "sha256": "0" * 64},
     "/measure": {"version": 1, "kind": "length", "from": [1, 2], "to": [3, 4]},
     "/requests": {"kind": "region", "airtime_s": 1, "box": [0, 0, 1, 1], "stream_bytes": 100},
-    "/advice": {"version": 1, "verdict": "unsure", "remark": "x"},
+    "/comment": {"version": 1, "verdict": "unsure", "remark": "x"},
     "/split": {"contact": ID},
     "/merge": {"contact": ID},
     "/api/settings": {"settings": {"theme": "x"}},

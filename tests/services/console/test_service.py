@@ -15,7 +15,7 @@ from builders.console import (
     VESSEL,
     Browser,
     EventReader,
-    advice_record,
+    comment_record,
     contact_id,
     downlink_state,
     image_record,
@@ -31,8 +31,8 @@ from sonarpost.archive.image_files import write_image
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import (
-    Advice,
     Command,
+    Comment,
     Decision,
     LinkQuality,
     ReceivedStatus,
@@ -215,9 +215,9 @@ def test_request_is_sent_to_the_modem(start_with_image, runner):
 def test_comment_from_the_shore_site_is_shown(start_with_image, runner):
     _, anna = start_with_image()
     relay = runner.peer(VESSEL, "relay")
-    relay.send(keys.advice(VESSEL), "console", advice_record())
-    eventually(lambda: anna.contact(ID)["contact"]["advised"], what="advice")
-    assert anna.contact(ID)["advice"][0]["remark"] == "look again"
+    relay.send(keys.comment(VESSEL), "console", comment_record())
+    eventually(lambda: anna.contact(ID)["contact"]["commented"], what="comment")
+    assert anna.contact(ID)["comments"][0]["remark"] == "look again"
 
 
 def test_received_frames_are_assigned_to_their_vehicle(start, client, log_in):
@@ -260,20 +260,20 @@ def test_image_of_another_vessel_is_refused(start, client, refused):
 
 
 def test_shore_console_shows_images_of_c2_and_sends_comments_to_it(runner, start, client, log_in):
-    c2 = runner.peer("shore-1", "c2", {keys.tasking_advice_all(): Advice, keys.tasking_command_all(): Command})
+    c2 = runner.peer("shore-1", "c2", {keys.tasking_comment_all(): Comment, keys.tasking_command_all(): Command})
     console = start(role="shore")
     put(client, keys.shore_image(VESSEL), image())
     eva = log_in(console, "eva", "expert")
     eventually(lambda: eva.get("/api/contacts").json()["total"] == 1, what="image")
     body = {"version": 1, "verdict": "unsure", "remark": "shadow too long"}
-    advice = eva.post(f"/api/contacts/{ID}/advice", body).json()
-    eventually(lambda: len(c2.received) == 1, what="advice")
-    assert (c2.received[0].advice_id, c2.received[0].author) == (advice["advice_id"], "eva")
+    comment = eva.post(f"/api/contacts/{ID}/comment", body).json()
+    eventually(lambda: len(c2.received) == 1, what="comment")
+    assert (c2.received[0].comment_id, c2.received[0].author) == (comment["comment_id"], "eva")
     state = TaskingState(
-        vessel_id=VESSEL, kind="advice", record_id=advice["advice_id"], state="delivered", changed_utc_s=time.time()
+        vessel_id=VESSEL, kind="comment", record_id=comment["comment_id"], state="delivered", changed_utc_s=time.time()
     )
     put(client, keys.tasking_state(VESSEL), state)
-    eventually(lambda: eva.contact(ID)["advice"][0]["delivery"]["state"] == "delivered", what="state")
+    eventually(lambda: eva.contact(ID)["comments"][0]["delivery"]["state"] == "delivered", what="state")
     put(client, keys.shore_decision(VESSEL), decision_record(image_id="00A7"))
     eventually(lambda: eva.contact(ID)["contact"]["review"] == "mine_like", what="decision")
     assert eva.contact(ID)["decisions"][0]["delivery"]["shore"] == "delivered"

@@ -205,7 +205,7 @@ def test_records_of_a_removed_site_are_kept_unless_dropped_by_configuration(begi
         {"upstreams": ({"bandwidth_bytes_per_s": 0},)},
         {"upstreams": ({"max_bytes": -1},)},
         {"upstreams": ({"sit": "a"},)},
-        {"advice_consumers": ("relay",)},
+        {"comment_consumers": ("relay",)},
         {"command_consumers": ("Op Modem",)},
         {"disk_reserve_bytes": -1},
     ],

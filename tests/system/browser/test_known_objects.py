@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 
-from builders.console import advice_record, image_record
+from builders.console import comment_record, image_record
 
 from sonarpost.services.console.known_objects import KnownObjects
 from sonarpost.services.console.store.truth import Truth
@@ -63,15 +63,15 @@ def test_object_is_shown_after_the_decision_and_counted_in_the_score(serve):
 
 def test_comments_are_folded_before_the_decision(served):
     add(served, "00A7", None)
-    served.state.store_advice(advice_record(verdict="mine_like", mlo_class="manta", remark="seen before, mark 3"))
+    served.state.store_comment(comment_record(verdict="mine_like", mlo_class="manta", remark="seen before, mark 3"))
     visit = served.visit()
     visit.wait_for_contact("00A7")
-    folded = '.details [data-name="advice"]'
+    folded = '.details [data-name="comments"]'
     visit.wait(folded)
     assert visit.page.get_attribute(folded, "open") is None
     visit.decide("2")
     visit.wait(f"{folded}[open]")
-    visit.wait(".advice >> text=seen before, mark 3")
+    visit.wait(".comment >> text=seen before, mark 3")
     # Without known objects, the score has the decisions by operator only.
     visit.page.click("#menu")
     visit.page.click('.menu [data-item="score"]')

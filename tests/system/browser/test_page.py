@@ -496,5 +496,5 @@ def test_expert_at_the_shore_site_writes_a_comment(serve):
     expert.page.keyboard.type("have a second look")
     expert.press("Escape")
     expert.decide("1")
-    eventually(lambda: len(shore.contact("0000")["advice"]) == 1, what="the comment")
-    expert.wait(".advice >> text=have a second look")
+    eventually(lambda: len(shore.contact("0000")["comments"]) == 1, what="the comment")
+    expert.wait(".comment >> text=have a second look")

@@ -286,8 +286,7 @@ def _print_tasking(rows: Iterable[TaskingRow], record_filter: RecordFilter, *, a
     for row in chosen:
         image = row.vehicle_id if row.image_id is None else f"{row.vehicle_id}/{row.image_id}"
         issued = time_text(row.issued_utc_s)
-        kind = "comment" if row.kind == "advice" else row.kind
-        names = (row.vessel_id, kind, row.record_id, image)
+        names = (row.vessel_id, row.kind, row.record_id, image)
         cells.append((*names, row.summary, row.author, issued, row.state, row.reason))
     _print_table(headings, cells, "records")
 

@@ -16,7 +16,7 @@ from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.shared import Subparsers, add_router_options, add_site_option, router_of
 from sonarpost.delivery.client import deliver
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.messages import Advice, Command, CommandKind, QueuePlace, Record, Verdict
+from sonarpost.messages import Command, CommandKind, Comment, QueuePlace, Record, Verdict
 from sonarpost.wire import first_error
 
 CONSUMER = "c2"
@@ -72,7 +72,7 @@ def run_comment(parsed: argparse.Namespace) -> int:
     """Send a comment to c2; return 0 after c2 has stored it."""
     vehicle, image = _vehicle_and_image(parsed)
     fields = {
-        "advice_id": parsed.id or f"a-{uuid.uuid4().hex}",
+        "comment_id": parsed.id or f"a-{uuid.uuid4().hex}",
         "vessel_id": parsed.vessel,
         "vehicle_id": vehicle,
         "image_id": image,
@@ -82,10 +82,10 @@ def run_comment(parsed: argparse.Namespace) -> int:
         "mlo_class": parsed.mlo_class,
         "remark": parsed.remark,
         "author": _author(parsed),
-        "advised_utc_s": time.time(),
+        "commented_utc_s": time.time(),
     }
-    _send(parsed, keys.tasking_advice(parsed.vessel, parsed.site), Advice, fields)
-    _print_accepted("comment", fields["advice_id"], parsed.vessel)
+    _send(parsed, keys.tasking_comment(parsed.vessel, parsed.site), Comment, fields)
+    _print_accepted("comment", fields["comment_id"], parsed.vessel)
     return 0
 
 

@@ -157,9 +157,8 @@ def line_of(record: Record) -> str:
         words = " ".join(part for part in (record.verdict, record.mlo_class or "", record.remark) if part)
         return f"{time_text(record.decided_utc_s)}  {record.vessel_id}  decision  {name}  {words} ({record.operator})"
     assert isinstance(record, TaskingState)
-    kind = "comment" if record.kind == "advice" else record.kind
     reason = f": {record.reason}" if record.reason else ""
-    state = f"{kind:8}  {record.record_id}  {record.state}{reason}"
+    state = f"{record.kind:8}  {record.record_id}  {record.state}{reason}"
     return f"{time_text(record.changed_utc_s)}  {record.vessel_id}  {state}"
 
 

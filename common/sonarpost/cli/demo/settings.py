@@ -219,7 +219,7 @@ def _service_table(settings: ChainSettings, service: str) -> str:
         + _vessel_link(settings),
         "decompressor": f'[decompressor]\nout_dir = "{settings.vessel_images}"\ncodebooks = [{codebooks}]\n'
         + ("" if page is None else 'image_consumers = ["relay", "console"]\n'),
-        "relay": "[relay]\n" + ("" if page is None else 'advice_consumers = ["console"]\n'),
+        "relay": "[relay]\n" + ("" if page is None else 'comment_consumers = ["console"]\n'),
         "c2": f'[c2]\nout_dir = "{settings.shore_images.parent}"\n',
         "acoustic_channel": f'[acoustic_channel]\ndriver = "{settings.modem}"\n'
         f'pty_dir = "{settings.ports_folder}"\nlog = "{settings.channel_log}"\n'

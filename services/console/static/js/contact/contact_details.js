@@ -13,9 +13,9 @@ import { t } from "../texts.js";
 const section = (name, title, count, children, open = true) => h("details", { data: { name }, open },
   h("summary", { text: count ? `${title} (${count})` : title }), children);
 
-function commentList(advice) {
-  return h("ul", {}, advice.map((one) => h("li", { class: "advice" },
-    h("p", {}, h("b", { text: one.author }), ` ${t("contact_details.on_version", { time: time(one.advised_utc_s), version: one.version })}`),
+function commentList(comments) {
+  return h("ul", {}, comments.map((one) => h("li", { class: "comment" },
+    h("p", {}, h("b", { text: one.author }), ` ${t("contact_details.on_version", { time: time(one.commented_utc_s), version: one.version })}`),
     one.verdict || one.mlo_class ? h("p", {}, h("b", { text: one.verdict ? decisionText(one) : one.mlo_class })) : null,
     one.remark ? h("p", { text: one.remark }) : null,
     one.delivery ? h("p", { class: "muted", text: t("contact_details.to_vessel", { state: t(`contact_details.delivery.${one.delivery.state}`), reason: one.delivery.reason }) }) : null)));
@@ -81,11 +81,11 @@ export class ContactDetails {
     if (focused) this.element.querySelector(`details[data-name="${CSS.escape(focused)}"] > summary`)?.focus();
   }
 
-  #render({ contact, record, advice, requests, measurements, group, earlier, audit, decisions }) {
+  #render({ contact, record, comments, requests, measurements, group, earlier, audit, decisions }) {
     const part = (name, title, count, make, open = true) => (count > 0 ? section(name, title, count, make(), this.open.get(name) ?? open) : null);
     fill(this.element,
       // Before a decision on the vessel, comments are folded, so that they do not influence it.
-      part("advice", t("contact_details.comments"), advice.length, () => commentList(advice), state.info.side === "shore" || contact.review !== "unreviewed"),
+      part("comments", t("contact_details.comments"), comments.length, () => commentList(comments), state.info.side === "shore" || contact.review !== "unreviewed"),
       part("requests", t("contact_details.requests"), requests.length, () => requestList(requests, contact.vehicle_id)),
       part("measurements", t("contact_details.measurements"), measurements.length, () => measurementList(measurements)),
       part("looks", t("contact_details.looks"), contact.looks - 1, () => lookList(group, contact.id)),

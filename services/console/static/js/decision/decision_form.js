@@ -44,7 +44,7 @@ export class DecisionForm {
   }
 
   get isComment() { return state.info.side === "shore"; }
-  get allowed() { return this.isComment ? state.session.may.advise : state.session.may.decide; }
+  get allowed() { return this.isComment ? state.session.may.comment : state.session.may.decide; }
 
   #build() {
     this.buttons = VERDICTS.map((name, index) => h("button", {
@@ -152,7 +152,7 @@ export class DecisionForm {
     this.drafts.change(contact, { verdict: name });
     const draft = this.drafts.get(contact.id);
     const body = { version: image.version, verdict: name, confidence: draft.confidence, mlo_class: draft.mlo_class.trim() || null, remark: draft.remark.trim() };
-    this.#post(contact, () => (this.isComment ? api.advise(contact.id, body) : api.decide(contact.id, { ...body, ...drawn })), draft);
+    this.#post(contact, () => (this.isComment ? api.comment(contact.id, body) : api.decide(contact.id, { ...body, ...drawn })), draft);
     if (this.form.contains(document.activeElement)) document.getElementById("queue").focus();
     this.#render();
     // A verdict that differs from the displayed one of another operator keeps the contact on the screen.

@@ -24,7 +24,7 @@ function marks(row) {
     unauthenticated(row) && ["⚠", authentication(row), "bad unauthenticated"],
     row.contradictory && ["▲○", t("object.contradictory"), "contradiction"],
     row.looks > 1 && [`×${row.looks}`, t("queue.looks", { count: row.looks }), ""],
-    row.advised && ["✉", t("queue.advised"), ""],
+    row.commented && ["✉", t("queue.commented"), ""],
     row.open_requests > 0 && ["⟳", t("queue.open_request"), ""],
     vehicle === "confirmed" && ["delivered", "none"].includes(shore) && ["✓", t("queue.delivered"), "good"],
     (FAILED.includes(shore) || FAILED.includes(vehicle)) && ["!", t("queue.not_delivered"), "bad"],

@@ -61,7 +61,7 @@ export default {
   "queue.class": "Klasse des Detektors",
   "queue.received_title": "Empfangen",
   "queue.looks": { one: "{count} Überlauf an einer Position", other: "{count} Überläufe an einer Position" },
-  "queue.advised": "Kommentar der Landstelle",
+  "queue.commented": "Kommentar der Landstelle",
   "queue.open_request": "Anforderung läuft",
   "queue.delivered": "Die Entscheidung ist bei der Landstelle und auf dem Fahrzeug",
   "queue.not_delivered": "Die Entscheidung wurde nicht zugestellt",

@@ -61,7 +61,7 @@ export default {
   "queue.class": "Class of the detector",
   "queue.received_title": "Received",
   "queue.looks": { one: "{count} look at one position", other: "{count} looks at one position" },
-  "queue.advised": "Comment from the shore site",
+  "queue.commented": "Comment from the shore site",
   "queue.open_request": "Request in progress",
   "queue.delivered": "The decision is at the shore site and on the vehicle",
   "queue.not_delivered": "The decision was not delivered",

@@ -61,7 +61,7 @@ export default {
   "queue.class": "Classe du détecteur",
   "queue.received_title": "Reçu",
   "queue.looks": { one: "{count} passage à une même position", other: "{count} passages à une même position" },
-  "queue.advised": "Commentaire du site à terre",
+  "queue.commented": "Commentaire du site à terre",
   "queue.open_request": "Demande en cours",
   "queue.delivered": "La décision est au site à terre et sur le véhicule",
   "queue.not_delivered": "La décision n'a pas été remise",
