@@ -27,6 +27,7 @@ import msgpack
 from sonarpost import wire
 from sonarpost.errors import StoredFileError
 from sonarpost.files import make_private
+from sonarpost.limits import limit
 from sonarpost.messages import Contact, Decision, Record
 from sonarpost.review.decisions import ReviewState, review_result
 
@@ -37,6 +38,9 @@ MAX_SEARCH_S: Final = 5.0
 """A search that takes more processor time is ended with an error."""
 _STEPS: Final = 10_000
 """Instructions of SQLite between two checks of that time."""
+MAX_REVIEWED: Final = limit(
+    1000, "decisions", "shares", "journal of c2", "vessel", "decisions on an image for its state", "the newest count"
+)
 DIGEST_BYTES: Final = 16
 COMPRESSION_WINDOW_BITS: Final = 12
 """4 KiB: to clear the largest window takes longer than to compress a record."""
@@ -277,8 +281,15 @@ class Journal:
 
     def append_dated(self, entries: Iterable[tuple[JournalEntry, float]]) -> list[Accepted]:
         """Number records with their times of acceptance; see `append`."""
+        numbered: list[tuple[str, Accepted]] = []
+        reviewed: dict[tuple[str, str, str], str] = {}
         with self._using(writing=True) as db:
-            numbered = [self._number(db, entry, utc_s) for entry, utc_s in entries]
+            for entry, utc_s in entries:
+                numbered.append(self._number(db, entry, utc_s))
+                if isinstance(entry.record, Decision):
+                    reviewed[entry.vessel_id, entry.vehicle_id, entry.image_id] = entry.key
+            for image, key in reviewed.items():
+                self._review(db, image, key)
         self._keys |= {key for key, _ in numbered}
         return [accepted for _, accepted in numbered]
 
@@ -295,18 +306,16 @@ class Journal:
         marks = ", ".join("?" * len(values))
         seq = db.execute(f"INSERT INTO record ({COLUMNS}) VALUES ({marks})", values).lastrowid  # noqa: S608 literals
         assert seq is not None
-        if isinstance(entry.record, Decision):
-            self._review(db, entry, seq, entry.record)
         return entry.key, Accepted(self.archive, seq, utc_s)
 
-    def _review(self, db: sqlite3.Connection, entry: JournalEntry, seq: int, decision: Decision) -> None:
-        image = (entry.vessel_id, entry.vehicle_id, entry.image_id)
+    def _review(self, db: sqlite3.Connection, image: tuple[str, str, str], key: str) -> None:
+        """Store the result of the decisions on an image."""
         rows = db.execute(
-            "SELECT payload FROM record"
-            " WHERE key = ? AND vessel_id = ? AND vehicle_id = ? AND image_id = ? AND seq <> ?",
-            (entry.key, *image, seq),
+            "SELECT payload FROM record WHERE vessel_id = ? AND vehicle_id = ? AND image_id = ? AND key = ?"
+            " ORDER BY seq DESC LIMIT ?",
+            (*image, key, MAX_REVIEWED),
         )
-        state = review_state([row[0] for row in rows], str(self.path), decision)
+        state = review_state([row[0] for row in rows], str(self.path))
         db.execute("INSERT OR REPLACE INTO review VALUES (?, ?, ?, ?)", (*image, state))
 
     def known_keys(self) -> list[str]:
@@ -375,9 +384,9 @@ def journal_row(accepted: Accepted, key: str, encoding: str, payload: bytes, ves
     return JournalRow(accepted, key, encoding, wire.unpack_map(zlib.decompress(payload), key), vessel_id, name)
 
 
-def review_state(payloads: Iterable[bytes], where: str, *more: Decision) -> ReviewState:
-    """Return the result of all decisions on an image: compressed payloads of the journal `where`, and `more`."""
-    decisions = [*more, *(wire.decode(Decision, zlib.decompress(payload), where) for payload in payloads)]
+def review_state(payloads: Iterable[bytes], where: str) -> ReviewState:
+    """Return the result of all decisions on an image, from their compressed payloads; `where` names the journal."""
+    decisions = [wire.decode(Decision, zlib.decompress(payload), where) for payload in payloads]
     return review_result(sorted(decisions, key=lambda d: (d.decided_utc_s, d.decision_id))).state
 
 

@@ -17,6 +17,7 @@ from typing import Final
 from sonarpost import wire
 from sonarpost.archive.journal import (
     COLUMNS,
+    MAX_REVIEWED,
     PAGE_COLUMNS,
     Accepted,
     Criteria,
@@ -244,8 +245,9 @@ def _review(sql: Sql, images: Iterable[tuple[str, str, str]]) -> None:
         values = {"vessel": vessel, "vehicle": vehicle, "image": image_id}
         rows = sql.rows(
             "SELECT payload FROM record WHERE encoding = :encoding AND vessel_id = :vessel AND vehicle_id = :vehicle"
-            " AND image_id = :image",
+            " AND image_id = :image ORDER BY seq DESC LIMIT :limit",
             encoding=_DECISION,
+            limit=MAX_REVIEWED,
             **values,
         )
         sql.rows(
