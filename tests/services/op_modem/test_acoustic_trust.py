@@ -164,7 +164,7 @@ def test_symbols_received_without_authentication_are_deleted(begin, runner):
     for _ in range(2):
         service.on_modem_event(packet(sender.next_frame(0.0)))
     runner.stop(service)
-    names = lambda service: [n for n in service.store.state_names("station/link/v1/") if "symbols/" in n]  # noqa: E731
+    names = lambda service: [n for n in service.store.state_names("vehicle/link/v1/") if "symbols/" in n]  # noqa: E731
     again = begin(SONARPOST_PLATFORM__ACOUSTIC_AUTH="none")
     assert names(again)
     runner.stop(again)

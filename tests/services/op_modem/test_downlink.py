@@ -393,7 +393,7 @@ def test_unreadable_state_is_discarded_and_counted(begin, runner, caplog):
     runner.stop(service)
     store = Store(service.store.path)
     with store.transaction() as tx:
-        tx.put_state("station/link/endpoint", b"\xc1")
+        tx.put_state("vehicle/link/endpoint", b"\xc1")
     store.close()
     service = begin()
     assert service.health().counters["states_discarded"] == 1
