@@ -50,6 +50,8 @@ UNREADABLE = (
 
 CACHE_KB = 8000
 """Page cache: records in flight are deleted without reading them from the disk."""
+BUSY_TIMEOUT_S = 10
+"""Longest wait for another process that reads or copies the file."""
 CHECKPOINT_BYTES = 4_096_000
 """Size of the write-ahead log at which its pages are copied into the file."""
 HANDLING_RESERVE_BYTES = 8_388_608
@@ -119,7 +121,7 @@ class Store:
 
     def _open(self, on_error: ExitStack) -> None:
         try:
-            self._db = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
+            self._db = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=BUSY_TIMEOUT_S)
             on_error.callback(self._db.close)
             self._db.execute(f"PRAGMA page_size={self._page_bytes}")
             self._db.execute("PRAGMA journal_mode=WAL")
@@ -131,7 +133,7 @@ class Store:
             self._db.execute(f"PRAGMA cache_size={-CACHE_KB}")
             self._require_sound()
             version, self.origin = schema.prepare(self._db, self._page_bytes)
-            self._reader = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=10)
+            self._reader = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=BUSY_TIMEOUT_S)
             on_error.callback(self._reader.close)
             self._reader.execute("PRAGMA query_only=ON")
         except sqlite3.Error as error:
@@ -311,6 +313,22 @@ class Store:
         """Return the free space inside the file in bytes; the file itself never shrinks."""
         return self._read_int("PRAGMA freelist_count") * self._read_int("PRAGMA page_size")
 
+    def truncate_log(self) -> None:
+        """Return the space of the write-ahead log to the disk, unless a reader still needs the log.
+
+        The log keeps the size that it once had, for example while a reader delayed its checkpoint.
+
+        Raises:
+            DeliveryError: The log cannot be written to the file, for example because the disk is full.
+        """
+        with self._lock:
+            # Without waiting for a reader of another process: a transaction would wait too.
+            self._query("PRAGMA busy_timeout=0")
+            try:
+                self._query("PRAGMA wal_checkpoint(TRUNCATE)")
+            finally:
+                self._query(f"PRAGMA busy_timeout={BUSY_TIMEOUT_S * 1000}")
+
     def inbox_items(self, limit: int = 1, max_bytes: int | None = None) -> tuple[InboxItem, ...]:
         """Return accepted records that are not handled yet, oldest first.
 
@@ -449,7 +467,15 @@ class DiskReserve:
 
     def degraded_reason(self) -> str:
         """Return why no records are accepted, empty if they are; checks again only after `require` has failed."""
-        return self._check() if self._reached else ""
+        if not self._reached:
+            return ""
+        failure = ""
+        try:
+            # Only new records would return this space, and none are accepted.
+            self._store.truncate_log()
+        except DeliveryError as error:
+            failure = str(error)
+        return self._check() or failure
 
     def _check(self) -> str:
         free_bytes = shutil.disk_usage(self._folder).free
