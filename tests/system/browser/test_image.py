@@ -287,8 +287,9 @@ def test_shadow_is_measured_across_the_track(served):
     left, right = dataset(visit, "mark")[0], dataset(visit, "mark")[2]
     drag(visit, (left[0] + 40, left[1] + 60), (right[0] - 20, left[1] + 110))
     visit.wait(".hint >> text=Enter keeps it")
-    visit.press("Enter")
     visit.wait(".size[data-kind=height] b >> text=/[0-9] ± /")
+    visit.press("Enter")
+    visit.wait("[data-size=withdraw-shadow]")
     [stored] = served.contact()["measurements"]
     assert stored["from"][0] == stored["to"][0]
     assert (stored["along_m"], stored["metres"]) == (0.0, "slant")

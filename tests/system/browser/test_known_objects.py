@@ -37,6 +37,8 @@ def test_object_is_shown_after_the_decision_and_counted_in_the_score(serve):
     least_s = time.monotonic() - shown_s
     visit.decide("1")
     visit.wait_for_contact("00A8")
+    # The page moves on before the decision is stored.
+    visit.until("() => document.querySelector('#to-do b').textContent === '1'")
     with served.state.database.read() as db:
         [decided_s] = db.execute("SELECT shown_s FROM decision").fetchone()
     assert least_s <= decided_s <= time.monotonic() - before_s
