@@ -71,7 +71,7 @@ ENV PATH=/opt/app/bin:/opt/sonarpost/bin:$PATH \
 RUN groupadd --gid 10001 sonarpost \
     && useradd --uid 10001 --gid 10001 --no-create-home --home-dir /var/lib/sonarpost --shell /usr/sbin/nologin sonarpost \
     && install -d -o sonarpost -g sonarpost /var/lib/sonarpost /var/lib/sonarpost/incoming \
-    && install -d -m 0700 -o sonarpost -g sonarpost /var/lib/sonarpost/state /var/lib/sonarpost/pictures \
+    && install -d -m 0700 -o sonarpost -g sonarpost /var/lib/sonarpost/state /var/lib/sonarpost/images \
         /var/lib/sonarpost/pki /var/lib/sonarpost/tls \
         /var/lib/sonarpost/tls/shore /var/lib/sonarpost/tls/vessel \
         /var/lib/sonarpost/acoustic /var/lib/sonarpost/acoustic/uuv /var/lib/sonarpost/acoustic/vessel

@@ -23,7 +23,7 @@ def cdr_string(text: str) -> bytes:
 def json_text(payload: bytes) -> str:
     """Return a record as JSON, without its pixels."""
     record = msgpack.unpackb(payload)
-    return json.dumps({name: value for name, value in record.items() if name not in ("picture", "missing_mask")})
+    return json.dumps({name: value for name, value in record.items() if name not in ("pixels", "missing_mask")})
 
 
 def connect(endpoint: str) -> zenoh.Session:

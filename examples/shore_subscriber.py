@@ -18,7 +18,7 @@ with zenoh.open(config) as session, session.declare_subscriber("sonarpost/v1/sho
         r = msgpack.unpackb(sample.payload.to_bytes())
         if r["type"] != "coded_image":  # the decoded image follows
             print(r["type"], r["vehicle_id"], r["image_id"], r.get("verdict"), r.get("contact"), flush=True)
-        if p := r.get("picture"):
+        if p := r.get("pixels"):
             data = p["data"] if p["bits"] == 8 else bytes(p["data"][n ^ 1] for n in range(len(p["data"])))  # big endian
             head = f"P5 {p['width_px']} {p['height_px']} {2 ** p['bits'] - 1}\n".encode()
             name = f"{r['vehicle_id']}_{r['first_frame_utc_s']:.0f}_{r['image_id']}_v{r['version']}.pgm"

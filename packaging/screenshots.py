@@ -43,7 +43,7 @@ class Scene:
         self.state, self.address, self._browser = state, address, browser
         self._users = users
         rows = state.list_contacts(ContactFilter(limit=200, sort="confidence"))["items"]
-        self.rows: list[Json] = [row for row in rows if row["has_picture"]]
+        self.rows: list[Json] = [row for row in rows if row["has_image"]]
 
     def contact(self, *, complete: bool, index: int = 0) -> str:
         """Return one of the contacts with the highest confidence of the detector."""

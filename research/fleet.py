@@ -95,8 +95,8 @@ def coded_streams() -> tuple[bytes, ...]:
     """Return streams of `emb` of 200 bytes each, of images of 300 x 100 px."""
     rng = np.random.default_rng(1)
     codec = default_registry().create("emb")
-    pictures = [np.clip(rng.rayleigh(40.0, SHAPE), 0, 255).astype(np.uint8) for _ in range(STREAMS)]
-    return tuple(codec.encode(picture, STREAM_BYTES) for picture in pictures)
+    images = [np.clip(rng.rayleigh(40.0, SHAPE), 0, 255).astype(np.uint8) for _ in range(STREAMS)]
+    return tuple(codec.encode(image, STREAM_BYTES) for image in images)
 
 
 def coded_image(vessel: str, vehicle: int, number: int, now_utc_s: float, stream: bytes | None = None) -> CodedImage:
@@ -196,7 +196,7 @@ class ReceivedImages:
             return  # the coded form, which c2 publishes before it decodes it
         name = (image["vehicle_id"], image["image_id"], image["first_frame_utc_s"])
         with self.lock:
-            if hashlib.sha256(image["picture"]["data"]).hexdigest() != image["picture_sha256"]:
+            if hashlib.sha256(image["pixels"]["data"]).hexdigest() != image["pixels_sha256"]:
                 self.wrong += 1
             if name in self.latency_s:
                 self.again += 1

@@ -194,7 +194,7 @@ def measure(objects: Iterator[KnownObject], sizes: Sequence[int], seed: int) -> 
 
 
 def _record(contact: Contact, decoded: npt.NDArray[np.uint8], size: int) -> ReconstructedImage:
-    picture = Pixels.from_array(decoded)
+    pixels = Pixels.from_array(decoded)
     return ReconstructedImage(
         vessel_id="simulated",
         vehicle_id="simulated",
@@ -203,8 +203,8 @@ def _record(contact: Contact, decoded: npt.NDArray[np.uint8], size: int) -> Reco
         contact=contact,
         codec="emb",
         model="",
-        picture=picture,
-        picture_sha256=picture.sha256,
+        pixels=pixels,
+        pixels_sha256=pixels.sha256,
         complete=True,
         missing_fraction=0.0,
         missing_mask=b"",

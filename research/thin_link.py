@@ -154,7 +154,7 @@ def linked_sites(folder: Path, setting: Setting) -> Iterator[Sites]:
     file.write_text(
         f'[platform]\nid = "{VESSEL}"\nrouter = ["{ends[VESSEL]}"]\nstate_dir = "{folder}/vessel"\n'
         f'acoustic_auth = "none"\n[modem]\ndriver = "udp"\n[op_modem]\nport = "udp://239.255.7.1:{modem}"\n'
-        f'address = 1\nvehicles = {{ 3 = "uuv-1" }}\n[decompressor]\nout_dir = "{folder}/pictures"\n'
+        f'address = 1\nvehicles = {{ 3 = "uuv-1" }}\n[decompressor]\nout_dir = "{folder}/images"\n'
         "[console]\nport = 0\n"
     )
     with ExitStack() as stack:

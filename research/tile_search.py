@@ -42,7 +42,7 @@ Search = Callable[[Tiles], npt.NDArray[np.int64]]
 def main() -> int:
     """Run; return 1 if a neighbour is not exact or the median ratio is above 1."""
     parser = argparse.ArgumentParser(description="VQ encode search against FAISS IndexFlatL2")
-    parser.add_argument("--pictures", type=int, default=48, metavar="N", help="default: 48")
+    parser.add_argument("--count", type=int, default=48, metavar="N", help="default: 48")
     parser.add_argument("--rounds", type=int, default=8, metavar="N", help="default: 8")
     parser.add_argument("--images", type=Path, metavar="DIR", help="folder of images (default: simulated ones)")
     args = parser.parse_args()
@@ -59,7 +59,7 @@ def main() -> int:
         return 2
     faiss.omp_set_num_threads(1)
     database = load_default(10).tiles
-    images = [cut_tiles(image, 10) for image in _images(args.images, args.pictures)]
+    images = [cut_tiles(image, 10) for image in _images(args.images, args.count)]
     if not images:
         print(f"tile_search: no image of {WIDTH_PX} × {HEIGHT_PX} px or more in {args.images}", file=sys.stderr)
         return 2

@@ -18,7 +18,7 @@ from sonarpost.logs import IntervalLog, JsonFormatter, TextFormatter, context_of
 from sonarpost.messages import Contact, Decision, ImagePart, Pixels, Relayed, Snippet
 
 
-def record(message="Picture stored", /, *args, **fields):
+def record(message="Image stored", /, *args, **fields):
     made = logging.LogRecord("n", logging.WARNING, "f.py", 1, message, args, None)
     made.created = 1476262800.25
     vars(made).update(kv(**fields))
@@ -42,7 +42,7 @@ def event(*args, **fields):
 def test_text_line():
     assert (
         text(image_id="0001", bytes=232)
-        == "2016-10-12T09:00:00.250Z WARNING relay: Picture stored image_id=0001 bytes=232"
+        == "2016-10-12T09:00:00.250Z WARNING relay: Image stored image_id=0001 bytes=232"
     )
     assert text("Took %d of %s", 2, "3") == "2016-10-12T09:00:00.250Z WARNING relay: Took 2 of 3"
 
@@ -80,7 +80,7 @@ def test_json_line():
         "time": "2016-10-12T09:00:00.250Z",
         "level": "warning",
         "service": "relay",
-        "message": "Picture stored",
+        "message": "Image stored",
         "image_id": "0001",
         "ratio": 0.5,
         "missing": None,
@@ -94,7 +94,7 @@ def test_json_value_of_another_type_is_text():
 
 def test_field_does_not_replace_time_or_level():
     got = event(time=1, level="x", service="y", message="z")
-    assert (got["level"], got["service"], got["message"]) == ("warning", "relay", "Picture stored")
+    assert (got["level"], got["service"], got["message"]) == ("warning", "relay", "Image stored")
     assert (got["time_"], got["level_"], got["service_"], got["message_"]) == (1, "x", "y", "z")
 
 
@@ -120,7 +120,7 @@ def with_exception():
 def test_traceback_follows_the_text_line_and_is_a_json_field():
     made = with_exception()
     lines = TextFormatter("relay").format(made).splitlines()
-    assert lines[0].endswith("Picture stored")
+    assert lines[0].endswith("Image stored")
     assert lines[1].startswith("Traceback")
     assert lines[-1].startswith("ValueError: invalid literal")
     line = JsonFormatter("relay").format(made)
@@ -132,7 +132,7 @@ def test_traceback_follows_the_text_line_and_is_a_json_field():
 def test_no_traceback_without_an_exception(nothing):
     made = record()
     made.exc_info = nothing
-    assert TextFormatter("relay").format(made).endswith("Picture stored")
+    assert TextFormatter("relay").format(made).endswith("Image stored")
     assert "traceback" not in json.loads(JsonFormatter("relay").format(made))
 
 
@@ -189,7 +189,7 @@ def test_context_holds_vehicle_image_and_contact_of_a_record():
     assert COMPLETE_IMAGE.contact is not None
     image = {"vehicle": "uuv-1", "image_id": "00A7", "contact_id": COMPLETE_IMAGE.contact.contact_id}
     contact = Contact(contact_id="line-7", vehicle_id="uuv-1")
-    snippet = Snippet(contact=contact, picture=Pixels(height_px=1, width_px=1, bits=8, data=b"\0"))
+    snippet = Snippet(contact=contact, pixels=Pixels(height_px=1, width_px=1, bits=8, data=b"\0"))
     assert context_of_payload(wire.encode(snippet)) == {"vehicle": "uuv-1", "contact_id": "line-7"}
     assert context_of_payload(wire.encode(COMPLETE_IMAGE)) == image
     assert context_of_payload(relayed(wire.encode(COMPLETE_IMAGE))) == image

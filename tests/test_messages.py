@@ -52,7 +52,7 @@ LIMITS = {
     "service": text(1, 40), "key": text(1, 300), "operator": text(1, 120), "author": text(1, 120),
     "issued_by": text(1, 120), "channel": (["port", "starboard"], ["", "Port", "nadir"]),
     "verdict": (["mine_like", "not_mine_like", "unsure"], ["", "MINE_LIKE", "maybe"]), "codec": text(0, 40),
-    "model": HASH, "original_sha256": SHA, "picture_sha256": ([], [*SHA[1], "0" * 64]), "version": FROM_1,
+    "model": HASH, "original_sha256": SHA, "pixels_sha256": ([], [*SHA[1], "0" * 64]), "version": FROM_1,
     "image_version": FROM_1, "lat_deg": between(-90, 90), "lon_deg": between(-180, 180),
     "depth_m": between(-100, 12000), "heading_deg": ([0, 359.9], [-0.1, 360.0, NAN]), "speed_mps": between(-50, 50),
     "atd_confidence": between(0, 2), "pixel_along_m": PIXEL, "pixel_across_m": PIXEL,
@@ -63,7 +63,7 @@ LIMITS = {
     "missing_halves": ([("bottom",), ("top", "bottom")], [("left",), ("top", "TOP")]),
     "missing_mask": ([b"", b"1"], [b"12", b"123456"]), "stream": ([bytes(65542)], [bytes(65543)]),
     "notes": ([("x" * 2000,)], [("x" * 2001,)]), "state": ([], ["", "OK", "lost"]),
-    "kind": ([], ["", "sink", "comments"]), "authenticated": ANY, "complete": ANY, "contact": ANY, "picture": ANY,
+    "kind": ([], ["", "sink", "comments"]), "authenticated": ANY, "complete": ANY, "contact": ANY, "pixels": ANY,
     "wide": ANY, "quality": ANY, "payload": ANY, "snr_in_db": ([], [NAN, INF]), "snr_out_db": ([], [NAN]),
     "spl_db": ([], [NAN]), "mse_db": ([], [-INF]), "doppler": ([], [NAN]),
     "direction": (["tx", "rx"], ["", "RX", "both"]), "destination": between(0, 255, 1),
@@ -71,7 +71,7 @@ LIMITS = {
     "airtime_s": ([1e-9, 600], [0.0, -1.0, 600.1]), "priority": between(1, 7, 1),
     "lifetime_s": ([1e-9, 604800], [0.0, 604800.1, NAN]), "packet_interval_s": between(0, 86400),
     "travel_s": between(0, 100), "sound_speed_mps": between(1300, 1700), "distance_m": between(0, 170_000),
-    "picture_crc32": between(0, 2**32 - 1, 1), "overrules": ([("d",) * 16], [("",), ("d",) * 17]),
+    "pixels_crc32": between(0, 2**32 - 1, 1), "overrules": ([("d",) * 16], [("",), ("d",) * 17]),
     "box": ([(0, 0, 32, 32)], [(-1, 0, 4, 4), (0, 0, 33, 4), (8, 0, 8, 32), (0, 9, 8, 9)]),
     "stream_bytes": between(24, 65535, 1), "place": (["first", "last"], ["", "second"]),
     "counters": ([{"n": 0}, {"n": 2**63 - 1}], [{"n": -1}, {"n": 2**63}]), "gauges": ([], [{"n": NAN}, {"n": -INF}]),
@@ -183,7 +183,7 @@ def test_text_that_utf8_cannot_encode_is_rejected(text):
 
 # Images
 
-pictures = st.one_of(
+images = st.one_of(
     *(
         hnp.arrays(dtype, hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9))
         for dtype in ("u1", "<u2", ">u2")
@@ -191,7 +191,7 @@ pictures = st.one_of(
 )
 
 
-@given(pictures)
+@given(images)
 def test_pixels_round_trip(image):
     raster = Pixels.from_array(image)
     back = raster.to_array()
@@ -237,10 +237,10 @@ def test_array_of_an_invalid_size_is_rejected(shape):
 
 @given(hnp.arrays(np.bool_, hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=11)))
 def test_mask_marks_the_missing_pixels(missing):
-    picture = Pixels.from_array(np.zeros(missing.shape, np.uint8))
+    pixels = Pixels.from_array(np.zeros(missing.shape, np.uint8))
     fields = COMPLETE_IMAGE.model_dump() | {
-        "picture": picture,
-        "picture_sha256": picture.sha256,
+        "pixels": pixels,
+        "pixels_sha256": pixels.sha256,
         "missing_mask": np.packbits(missing).tobytes(),
     }
     np.testing.assert_array_equal(ReconstructedImage(**fields).missing(), missing)
@@ -254,10 +254,10 @@ def test_first_bit_of_a_mask_is_the_first_pixel():
 
 def test_error_names_the_digest_of_another_image():
     with pytest.raises(ValidationError) as caught:
-        changed(ReconstructedImage, picture=RASTER)
-    assert caught.value.errors()[0]["loc"] == ("picture_sha256",)
+        changed(ReconstructedImage, pixels=RASTER)
+    assert caught.value.errors()[0]["loc"] == ("pixels_sha256",)
     assert RASTER.sha256 in str(caught.value)
-    assert changed(ReconstructedImage, picture=RASTER, picture_sha256=RASTER.sha256)
+    assert changed(ReconstructedImage, pixels=RASTER, pixels_sha256=RASTER.sha256)
 
 
 @pytest.mark.parametrize(

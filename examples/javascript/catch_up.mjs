@@ -51,7 +51,7 @@ export async function catchUp(server, handle, options = {}) {
   /** Query the records after the cursor; return whether more remain, null without a complete page. */
   async function nextPage() {
     // `_time` makes the REST interface return all records of a key instead of the last one.
-    const parameters = `_time=[..];format=json;picture=none;after=${cursor}`;
+    const parameters = `_time=[..];format=json;pixels=none;after=${cursor}`;
     const response = await fetch(`${server}/sonarpost/v1/${site}/${KEY}?${parameters}`, {
       headers: { accept: "application/json" },
       signal,

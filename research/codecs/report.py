@@ -217,14 +217,14 @@ def details(
     """Return all figures as a JSON object, for a file."""
     natural = [result for result in results if result.tested.is_natural]
     found = {
-        "pictures": len(measured.images),
+        "images": len(measured.images),
         "origin": measured.origin,
         "refused": list(measured.rejected),
         "results": detail_rows(at_budgets(results, budgets), weights),
         "natural_sizes": detail_rows(natural, weights),
         "bd_rate": {
             name: {
-                other: {"percent": d.percent, "ci": d.ci, "overlap_db": d.overlap, "pictures": d.images}
+                other: {"percent": d.percent, "ci": d.ci, "overlap_db": d.overlap, "images": d.images}
                 for other, d in compared.items()
             }
             for name, compared in differences.items()

@@ -66,7 +66,7 @@ def new_parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=FIRST_SEED, metavar="N", help="first seed (%(default)s)")
     parser.add_argument("--sdvd", type=Path, metavar="DIR", help="folder of the SDVD data set")
     parser.add_argument(
-        "--pictures", type=int, default=24, metavar="N", help="contacts to detect again after coding (%(default)s)"
+        "--contacts", type=int, default=24, metavar="N", help="contacts to detect again after coding (%(default)s)"
     )
     parser.add_argument("--plot", type=Path, metavar="DIR", help="write plots into this folder")
     add_codec_arguments(parser)
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     for option, value, low, high in (
         ("--files", args.files, 1, MAX_FILES),
         ("--seed", args.seed, 0, 2**31 - 1),
-        ("--pictures", args.pictures, 1, 10_000),
+        ("--contacts", args.contacts, 1, 10_000),
     ):
         if not low <= value <= high:
             raise ConfigError("detection", option, value, f"{low}..{high}")
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     for kind in SeabedKind:
         files += [evaluate_file(kind, args.seed + number) for number in range(args.files)]
         report_progress(f"{kind}: detected")
-    snippets = contact_snippets(files, args.pictures) if tested else []
+    snippets = contact_snippets(files, args.contacts) if tested else []
     effects = [effect for codec in tested for effect in codec_effects(snippets, codec, budgets)]
     if args.plot is not None:
         plot_all(args.plot, files, tiles, effects)

@@ -67,7 +67,7 @@ class Cell:
     @property
     def images(self) -> float:
         """Share of images received completely."""
-        return self.delivered.whole_pictures / self.delivered.pictures
+        return self.delivered.whole_images / self.delivered.images
 
 
 def new_parser() -> argparse.ArgumentParser:
@@ -79,7 +79,7 @@ def new_parser() -> argparse.ArgumentParser:
         "compare with the paper.",
     )
     parser.add_argument(
-        "--pictures",
+        "--images",
         type=int,
         default=40,
         metavar="N",
@@ -99,15 +99,15 @@ def run(args: argparse.Namespace) -> int:
         OSError: The plot cannot be written.
     """
     for option, value, low, high in (
-        ("--pictures", args.pictures, 1, _MAX_IMAGES),
+        ("--images", args.images, 1, _MAX_IMAGES),
         ("--seed", args.seed, 0, 1_000_000),
     ):
         if not low <= value <= high:
             raise ConfigError("sea_trial", option, value, f"{low}..{high}")
     if args.plot is not None:
         in_new_folder(args.plot)
-    report_progress(f"simulating {args.pictures} images")
-    cells = measure(args.pictures, args.seed, RANGES_M, SIZES_PX)
+    report_progress(f"simulating {args.images} images")
+    cells = measure(args.images, args.seed, RANGES_M, SIZES_PX)
     if args.plot is not None:
         save_figure(plot(cells), args.plot)
     if args.json:
@@ -178,12 +178,12 @@ def claims(cells: Sequence[Cell]) -> list[dict[str, str | float | bool]]:
         share = _share([(c.delivered.whole_packets, c.delivered.packets) for c in near])
         add("below 130 m most packets are received", share, agrees=min(c.packets for c in near) > 0.5)
     if largest:
-        share = _share([(c.delivered.whole_pictures, c.delivered.pictures) for c in largest])
-        add("below 130 m all pictures of 140 × 80 px are received", share, agrees=share == 1.0)
+        share = _share([(c.delivered.whole_images, c.delivered.images) for c in largest])
+        add("below 130 m all images of 140 × 80 px are received", share, agrees=share == 1.0)
     if smaller:
-        share = _share([(c.delivered.second_lost, c.delivered.pictures) for c in smaller])
+        share = _share([(c.delivered.second_lost, c.delivered.images) for c in smaller])
         only_smaller = not any(c.delivered.second_lost for c in largest)
-        add("the second packet is missing of some smaller pictures, only", share, agrees=only_smaller and share > 0)
+        add("the second packet is missing of some smaller images, only", share, agrees=only_smaller and share > 0)
     if far:
         share = 1 - _share([(c.delivered.whole_packets, c.delivered.packets) for c in far])
         add("beyond 130 m most packets are lost", share, agrees=share > 0.5)
@@ -249,7 +249,7 @@ def plot(cells: Sequence[Cell]) -> Figure:
             axis.text(295, 62, "the paper: in the tank only,\n3 m, a few packets lost", ha="right", fontsize=8)
     axes[0].set_ylabel("received, % of sent")
     axes[0].legend(fontsize=8, loc="lower left", title="images", title_fontsize=8)
-    count = cells[0].delivered.pictures
+    count = cells[0].delivered.images
     figure.suptitle(f"Sea trial, simulated: preset sea-trial, {count} images a point", fontsize=11)
     return figure
 

@@ -53,9 +53,9 @@ class DeliveryCounts:
         second_lost: Images with a complete first packet and an incomplete later one.
         frames: Frames sent.
         good_frames: Frames received.
-        pictures: Images sent.
-        whole_pictures: Images received completely.
-        partial_pictures: Images received in part.
+        images: Images sent.
+        whole_images: Images received completely.
+        partial_images: Images received in part.
         contacts_only: Images of which only the contact record was received.
     """
 
@@ -64,9 +64,9 @@ class DeliveryCounts:
     second_lost: int
     frames: int
     good_frames: int
-    pictures: int
-    whole_pictures: int
-    partial_pictures: int
+    images: int
+    whole_images: int
+    partial_images: int
     contacts_only: int
 
 
@@ -160,9 +160,9 @@ def send_images(
         second_lost=second_lost,
         frames=frames,
         good_frames=received_frames,
-        pictures=len(snippets),
-        whole_pictures=sum(stream == streams[image_id] for image_id, stream in received_streams.items()),
-        partial_pictures=sum(stream == b"" for stream in received_streams.values()),
+        images=len(snippets),
+        whole_images=sum(stream == streams[image_id] for image_id, stream in received_streams.items()),
+        partial_images=sum(stream == b"" for stream in received_streams.values()),
         contacts_only=sum(stream is None for stream in received_streams.values()),
     )
 

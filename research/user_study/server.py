@@ -220,7 +220,7 @@ class StudyApp:
             Route("/api/panel/next", endpoint(self._next)),
             Route("/api/panel/answers", endpoint(self._answer), methods=["POST"]),
             Route("/api/panel/results", endpoint(self._results)),
-            Route("/api/panel/pictures/{token}.png", endpoint(self._image)),
+            Route("/api/panel/images/{token}.png", endpoint(self._image)),
             Mount("/static", StaticFolder(directory=static)),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: routing_error})
@@ -272,7 +272,7 @@ class StudyApp:
         token = self._signed(f"{person.name}/{number}/{what}")
         with self._lock:
             person.images[token] = path
-        return f"/api/panel/pictures/{token}.png"
+        return f"/api/panel/images/{token}.png"
 
     def _image(self, call: Call) -> Response:
         token = str(call.request.path_params["token"])

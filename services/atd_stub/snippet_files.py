@@ -31,7 +31,7 @@ def write_snippet(folder: Path, snippet: Snippet) -> Path:
     """
     folder.mkdir(parents=True, exist_ok=True)
     tiff = folder / f"{_UNSAFE_CHARACTER.sub('_', snippet.contact.contact_id)}.tiff"
-    write_atomically(tiff, tiff_bytes(tiff, snippet.picture.to_array()))
+    write_atomically(tiff, tiff_bytes(tiff, snippet.pixels.to_array()))
     write_side_car(tiff.with_suffix(SIDE_CAR_SUFFIX), snippet.contact)
     return tiff
 
@@ -77,7 +77,7 @@ def read_snippet(path: Path, content: str, vehicle_id: str, fit: Fit) -> Snippet
             "pixel_across_m": _scaled(side_car.contact.pixel_across_m, fitted.scale_across, text),
         }
     )
-    snippet = Snippet(contact=contact, picture=Pixels.from_array(fitted.pixels), source=printable(path.name))
+    snippet = Snippet(contact=contact, pixels=Pixels.from_array(fitted.pixels), source=printable(path.name))
     return SnippetFile(snippet, image.notes + fitted.notes + side_car.notes)
 
 

@@ -264,7 +264,7 @@ def snippet_with_record(
         expanded = cut_expanded(survey, detection, *size)
     return Snippet(
         contact=contact.model_copy(update=pixel_sizes),
-        picture=Pixels.from_array(image),
+        pixels=Pixels.from_array(image),
         source=origin.source,
         wide=None if expanded is None or min(expanded.shape) < MIN_SIDE_PX else Pixels.from_array(expanded),
     )

@@ -165,13 +165,13 @@ class AcceptedRecords:
             return row.fields
         data = Pixels.from_array(self._archive.read_pixels(row.vessel_id, row.name)).data
         digest = hashlib.sha256(data).hexdigest()
-        if digest != row.fields["picture_sha256"]:
+        if digest != row.fields["pixels_sha256"]:
             raise BadInputError(
-                f"image {row.vessel_id}/{row.name}", "picture_sha256", digest, str(row.fields["picture_sha256"])
+                f"image {row.vessel_id}/{row.name}", "pixels_sha256", digest, str(row.fields["pixels_sha256"])
             )
-        picture = row.fields["picture"]
-        assert isinstance(picture, dict)
-        return {**row.fields, "picture": {**picture, "data": data}}
+        pixels = row.fields["pixels"]
+        assert isinstance(pixels, dict)
+        return {**row.fields, "pixels": {**pixels, "data": data}}
 
     def close(self) -> None:
         """Close the journal."""
@@ -305,7 +305,7 @@ def stored_image(content: bytes, pixels: GreyImage, where: str) -> Reconstructed
         raise BadInputError(where, "missing_pixels", count, f"{int(missing.sum())}, the black pixels of these rows")
     fields = side_car.model_dump(exclude={"type", "v", "height_px", "width_px", "missing_rows", "missing_pixels"})
     mask = np.packbits(missing).tobytes() if count else b""
-    return ReconstructedImage(**fields, picture=Pixels.from_array(pixels), missing_mask=mask)
+    return ReconstructedImage(**fields, pixels=Pixels.from_array(pixels), missing_mask=mask)
 
 
 def accepted_fields(fields: Mapping[str, object], accepted: Accepted) -> dict[str, object]:

@@ -410,10 +410,10 @@ def _groups(
     group: list[tuple[AcceptedImage, ReconstructedImage]] = []
     size_bytes = 0
     for each in decoded:
-        size_bytes += len(each[1].picture.data)
+        size_bytes += len(each[1].pixels.data)
         if group and size_bytes > BATCH_BYTES:
             yield group
-            group, size_bytes = [], len(each[1].picture.data)
+            group, size_bytes = [], len(each[1].pixels.data)
         group.append(each)
     if group:
         yield group

@@ -249,7 +249,7 @@ class QueryService:
     def _payload(self, row: JournalRow, parameters: QueryParameters) -> bytes | None:
         try:
             fields = accepted_fields(self._records.fields(row), row.accepted)
-            return json_payload(fields, parameters.picture) if parameters.format == "json" else payload_of(fields)
+            return json_payload(fields, parameters.pixels) if parameters.format == "json" else payload_of(fields)
         except (OSError, BadInputError, ValueError) as error:
             log.warning("Stored record cannot be read", extra=kv(file=row.name, error=str(error)))
             return None
@@ -257,7 +257,7 @@ class QueryService:
 
 def _pixel_bytes(row: JournalRow) -> int:
     """Return the size of the pixels of a record."""
-    picture = row.fields.get("picture")
-    if not isinstance(picture, dict):
+    pixels = row.fields.get("pixels")
+    if not isinstance(pixels, dict):
         return 0
-    return int(picture["height_px"]) * int(picture["width_px"]) * int(picture["bits"]) // 8
+    return int(pixels["height_px"]) * int(pixels["width_px"]) * int(pixels["bits"]) // 8

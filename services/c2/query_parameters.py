@@ -14,7 +14,7 @@ from sonarpost.errors import BadInputError
 from sonarpost.review.decisions import ReviewState
 
 Format = Literal["msgpack", "json"]
-Picture = Literal["raw", "png", "none"]
+PixelForm = Literal["raw", "png", "none"]
 
 MAX_RECORDS: Final = 256
 """Maximum number of records in the replies to one query."""
@@ -43,8 +43,8 @@ _REVIEW: Final[dict[str, ReviewState]] = {
 }
 _VERSION: Final = {"latest": True, "all": False}
 _FORMAT: Final[dict[str, Format]] = {"msgpack": "msgpack", "json": "json"}
-_PICTURE: Final[dict[str, Picture]] = {"raw": "raw", "png": "png", "none": "none"}
-NAMES: Final = ("_time", "vessel", "vehicle", "area", "review", "version", "limit", "after", "format", "picture")
+_PIXELS: Final[dict[str, PixelForm]] = {"raw": "raw", "png": "png", "none": "none"}
+NAMES: Final = ("_time", "vessel", "vehicle", "area", "review", "version", "limit", "after", "format", "pixels")
 
 T = TypeVar("T")
 
@@ -59,7 +59,7 @@ class QueryParameters:
         archive: Journal of the cursor; empty for the beginning.
         after: Number of the cursor: only records with higher ones.
         format: Form of the payloads.
-        picture: Form of pixels in JSON.
+        pixels: Form of pixels in JSON.
     """
 
     criteria: Criteria = field(default_factory=Criteria)
@@ -67,7 +67,7 @@ class QueryParameters:
     archive: str = ""
     after: int = 0
     format: Format = "msgpack"
-    picture: Picture = "raw"
+    pixels: PixelForm = "raw"
 
 
 def parse_parameters(text: str, where: str, now_utc_s: float) -> QueryParameters:
@@ -103,9 +103,9 @@ def parse_parameters(text: str, where: str, now_utc_s: float) -> QueryParameters
     since_utc_s, until_utc_s = get("_time", lambda text: _time_range(text, now_utc_s), _TIME_FORM) or (None, None)
     archive, after = get("after", _cursor, "the `next` of an earlier page") or ("", 0)
     form: Format = get("format", _FORMAT.__getitem__, "msgpack or json") or "msgpack"
-    picture: Picture = get("picture", _PICTURE.__getitem__, "raw, png or none") or "raw"
-    if picture != "raw" and form != "json":
-        raise BadInputError(where, "picture", picture, "raw, unless format is json")
+    pixels: PixelForm = get("pixels", _PIXELS.__getitem__, "raw, png or none") or "raw"
+    if pixels != "raw" and form != "json":
+        raise BadInputError(where, "pixels", pixels, "raw, unless format is json")
     return QueryParameters(
         Criteria(
             since_utc_s=since_utc_s,
@@ -120,7 +120,7 @@ def parse_parameters(text: str, where: str, now_utc_s: float) -> QueryParameters
         archive,
         after,
         form,
-        picture,
+        pixels,
     )
 
 

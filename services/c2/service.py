@@ -557,7 +557,7 @@ class C2Service(Service[C2Config]):
         waiting = [q for q in self.store.queues() if q.startswith(CONSUMER)]
         return {
             "images_undecoded": float(self.store.state_count(BACKLOG)),
-            "pictures_bytes": float(self._archive.images_bytes()),
+            "images_bytes": float(self._archive.images_bytes()),
             "waiting_for_vessels": float(sum(self.store.queue_depth(queue).records for queue in waiting)),
             **{f"records_{defect}": float(count) for defect, count in self._archive.defect_counts().items()},
         }

@@ -92,7 +92,7 @@ class SharedArchive:
         is_stored = found is not None and found[1]
         written = WrittenImage(Path(image.vessel_id, f"{name}.tiff"), not is_stored, is_conflict)
         if written.is_new:
-            pixels = image.picture.to_array()
+            pixels = image.pixels.to_array()
             files = (
                 (".json", text),
                 (".tiff", tiff_bytes(written.tiff, pixels)),

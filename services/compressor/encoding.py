@@ -16,7 +16,7 @@ from sonarpost.messages import Pixels, Snippet
 GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 EXPAND_FACTOR: Final = 2
-"""Ratio of the pixel sizes of `Snippet.wide` and `Snippet.picture`, along-track and across-track."""
+"""Ratio of the pixel sizes of `Snippet.wide` and `Snippet.pixels`, along-track and across-track."""
 _MAX_PIXEL_M: Final = 100.0
 
 
@@ -76,15 +76,15 @@ def expand(snippet: Snippet) -> Snippet | None:
         "pixel_along_m": _expanded_size(contact.pixel_along_m),
         "pixel_across_m": _expanded_size(contact.pixel_across_m),
     }
-    return Snippet(contact=contact.model_copy(update=sizes), picture=snippet.wide, source=snippet.source)
+    return Snippet(contact=contact.model_copy(update=sizes), pixels=snippet.wide, source=snippet.source)
 
 
 def cut_region(snippet: Snippet, box: RegionBox) -> Snippet:
     """Return a snippet of the same contact with a part of its image, in pixels of the same size."""
-    pixels = snippet.picture.to_array()
+    pixels = snippet.pixels.to_array()
     top, left, bottom, right = box.pixels(*pixels.shape)
     return Snippet(
-        contact=snippet.contact, picture=Pixels.from_array(pixels[top:bottom, left:right]), source=snippet.source
+        contact=snippet.contact, pixels=Pixels.from_array(pixels[top:bottom, left:right]), source=snippet.source
     )
 
 

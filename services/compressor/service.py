@@ -103,7 +103,7 @@ class CompressorService(Service[CompressorConfig]):
         budget = self.config.budget_bytes if budget_bytes is None else budget_bytes
         # A region is sent as long as the command says: the link sends up to its `stream_bytes` without a command.
         refine_bytes = self.config.refine_bytes if budget_bytes is None else 0
-        complete = encode(codec, snippet.picture.to_array(), budget, refine_bytes)
+        complete = encode(codec, snippet.pixels.to_array(), budget, refine_bytes)
         stream = transmit_part(codec, complete)
         number = self._next_number()
         effects.put_state(_NEXT_IMAGE, str(number % IMAGE_IDS + 1).encode())
@@ -113,10 +113,10 @@ class CompressorService(Service[CompressorConfig]):
             contact=snippet.contact,
             codec=codec.name,
             model=codec.model_hash,
-            height_px=snippet.picture.height_px,
-            width_px=snippet.picture.width_px,
+            height_px=snippet.pixels.height_px,
+            width_px=snippet.pixels.width_px,
             stream=stream,
-            original_sha256=snippet.picture.sha256,
+            original_sha256=snippet.pixels.sha256,
         )
         effects.send(keys.image_encoded(self.platform.id), _CONSUMER, image, priority=priority)
         effects.count("images_encoded")
@@ -220,7 +220,7 @@ class CompressorService(Service[CompressorConfig]):
         codec = self._codec_of(image)
         if kind == "refine" and codec is not None:
             snippet = wire.decode(Snippet, cached.snippet, entry_location(image_id))
-            longer = refine(codec, image.stream, snippet.picture.to_array())
+            longer = refine(codec, image.stream, snippet.pixels.to_array())
             if longer != image.stream:
                 image = image.model_copy(update={"stream": longer})
                 self._cache.put(effects, {image_id: replace(cached, image=wire.encode(image))})

@@ -50,7 +50,7 @@ interface Contact {
   complete: boolean;
   percent_received: number | null;
   stage: "record" | "preview" | "part" | "sent" | "refined";
-  has_picture: boolean;
+  has_image: boolean;
   looks: number;
   object: string | null;
   contradictory: boolean;

@@ -465,10 +465,10 @@ def stored_records(place: ArchivePlace) -> Iterator[ReconstructedImage | Decisio
 
 
 def _stored_image(side_car: SideCar, path: Path) -> ReconstructedImage:
-    picture = Pixels.from_array(read_image(path.with_suffix(".tiff")))
-    mask = np.zeros((picture.height_px, picture.width_px), np.bool_)
+    pixels = Pixels.from_array(read_image(path.with_suffix(".tiff")))
+    mask = np.zeros((pixels.height_px, pixels.width_px), np.bool_)
     if side_car.missing_rows:
         mask[side_car.missing_rows[0] : side_car.missing_rows[-1]] = True
     fields = side_car.model_dump(exclude={"type", "v", "height_px", "width_px", "contact", "missing_rows"})
     missing_mask = np.packbits(mask).tobytes() if mask.any() else b""
-    return ReconstructedImage(**fields, contact=side_car.contact, picture=picture, missing_mask=missing_mask)
+    return ReconstructedImage(**fields, contact=side_car.contact, pixels=pixels, missing_mask=missing_mask)

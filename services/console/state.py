@@ -401,7 +401,7 @@ class ConsoleState:
         body = {**measure_line(image, line, self.config.beam_width_deg), "user": actor.user, "utc_s": now}
         if not keep:
             return {"id": None, **body, **NOT_WITHDRAWN}
-        displayed = DisplayedImage(line.version, image.picture_sha256, line.layer)
+        displayed = DisplayedImage(line.version, image.pixels_sha256, line.layer)
         with self.database.transaction() as db:
             measurement_id = measurements.add_measurement(db, contact_id, body, displayed, actor, now)
         return {"id": measurement_id, **body, **NOT_WITHDRAWN}

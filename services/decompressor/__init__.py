@@ -1,1 +1,1 @@
-"""Decompressor: acoustic frames to pictures."""
+"""Decompressor: acoustic frames to images."""

@@ -318,7 +318,7 @@ class RelayService(Service[RelayConfig]):
         with self.store.transaction() as tx:
             dropped = tx.drop_oldest(upstream.queue, max_bytes, DECISION_PRIORITY)
         if dropped:
-            self.count("pictures_dropped", dropped)
+            self.count("images_dropped", dropped)
             log.warning(
                 "Images dropped: quota of a site exceeded",
                 extra=kv(site=upstream.options.site, images=dropped, max_bytes=max_bytes),

@@ -73,7 +73,7 @@ def test_record_costs_at_most_a_multiple_of_its_bytes(fields, tmp_path_factory):
         image, files_bytes, memory_bytes = cost(coded_image(part, "vessel-1", "key"), tmp_path_factory.mktemp("out"))
     except (ValidationError, BadInputError):
         return
-    assert max(image.picture.height_px, image.picture.width_px) <= MAX_SIDE_PX
+    assert max(image.pixels.height_px, image.pixels.width_px) <= MAX_SIDE_PX
     assert memory_bytes < MEMORY_BYTES
     if image.missing_fraction == 1.0:
         assert files_bytes <= FILES_BYTES + FILES_FACTOR * len(wire.encode(part))

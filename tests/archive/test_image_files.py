@@ -21,8 +21,8 @@ NAME = "uuv-1_20161012T090001Z_00A7_v1"
 
 
 def with_pixels(pixels, **more):
-    picture = Pixels.from_array(pixels)
-    fields = COMPLETE_IMAGE.model_dump() | {"picture": picture, "picture_sha256": picture.sha256} | more
+    stored = Pixels.from_array(pixels)
+    fields = COMPLETE_IMAGE.model_dump() | {"pixels": stored, "pixels_sha256": stored.sha256} | more
     return ReconstructedImage(**fields)
 
 
@@ -43,7 +43,7 @@ def test_image_is_three_consistent_files(tmp_path):
     assert tiff == tmp_path / "a" / "b" / f"{NAME}.tiff"
     assert sorted(contents(tiff.parent)) == [f"{NAME}.json", f"{NAME}.png", f"{NAME}.tiff"]
     for suffix in (".tiff", ".png"):
-        np.testing.assert_array_equal(read_image(tiff.with_suffix(suffix)), COMPLETE_IMAGE.picture.to_array())
+        np.testing.assert_array_equal(read_image(tiff.with_suffix(suffix)), COMPLETE_IMAGE.pixels.to_array())
     stored = json.loads(tiff.with_suffix(".json").read_text())
     assert stored == json.loads(json.dumps(side_car(COMPLETE_IMAGE)))
     assert stored["contact"]["lat_deg"] == 41.5251
@@ -54,7 +54,7 @@ def test_image_is_three_consistent_files(tmp_path):
         "00A7",
         True,
     )
-    assert "picture" not in stored
+    assert "pixels" not in stored
 
 
 def test_tiff_and_png_hold_16_bits(tmp_path):
@@ -87,7 +87,7 @@ def test_files_are_written_once_and_reproducible(tmp_path_factory, image):
     here, there = tmp_path_factory.mktemp("vessel"), tmp_path_factory.mktemp("shore")
     tiff, new, _ = write_image(here, image)
     assert new
-    np.testing.assert_array_equal(read_image(tiff), image.picture.to_array())
+    np.testing.assert_array_equal(read_image(tiff), image.pixels.to_array())
     write_image(there, image)
     assert contents(here) == contents(there)
     before = {path.name: path.stat().st_mtime_ns for path in here.iterdir()}
@@ -170,7 +170,7 @@ def test_other_image_of_the_same_name_is_kept(tmp_path):
     for found, image in zip(written, (second, third), strict=True):
         digest = hashlib.sha256(found.tiff.with_suffix(".json").read_bytes()).hexdigest()[:16]
         assert found.tiff.name == f"{NAME}_{digest}.tiff"
-        np.testing.assert_array_equal(read_image(found.tiff), image.picture.to_array())
+        np.testing.assert_array_equal(read_image(found.tiff), image.pixels.to_array())
     now = contents(tmp_path)
     assert len(now) == 9
     assert stored.items() <= now.items()

@@ -43,7 +43,7 @@ def image(stream, version=1, missing=(), **changes):
         "authenticated": True,
         "codec": "emb",
         "model": "",
-        "picture_crc32": 0xDEADBEEF,
+        "pixels_crc32": 0xDEADBEEF,
     }
     return CodedImage.model_validate(fields | changes)
 

@@ -15,8 +15,8 @@ NOW_UTC_S = 1_800_000_000.0
 
 
 def image(image_id, version=1):
-    picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
-    return reconstructed_image(picture, image_id=image_id, version=version)
+    pixels = Pixels(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
+    return reconstructed_image(pixels, image_id=image_id, version=version)
 
 
 def names(folder):

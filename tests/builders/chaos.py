@@ -27,7 +27,7 @@ from builders.chain import latest_versions, send_signal
 from builders.common import REPOSITORY, free_port
 from builders.history import History
 from builders.image_archive import ArchiveLog, name_of
-from builders.image_source import ImageSource, make_image, picture_sha256
+from builders.image_source import ImageSource, make_image, pixels_sha256
 from builders.numbered_snippet import number_of, numbered_snippet
 from builders.progress import wait_while_progressing
 from builders.small_disk import SmallDisk
@@ -173,7 +173,7 @@ class ChaosChain:
 
     def _log(self, operation, image):
         assert operation in ("queued", "acknowledged")
-        self.history.add(operation, "source", name_of(image), key=IMAGE_KEY, sha256=picture_sha256(image))
+        self.history.add(operation, "source", name_of(image), key=IMAGE_KEY, sha256=pixels_sha256(image))
 
     # Faults
 

@@ -18,12 +18,12 @@ PROFILES = ("sim", "uuv", "vessel", "shore")
 ROUTERS = ("router-uuv", "router-vessel", "router-shore", "router-sim")
 PUBLISHED = ("VESSEL_CONSOLE_PUBLISH", "SHORE_CONSOLE_PUBLISH", "SHORE_PUBLISH")
 SERVICES = (*PLATFORM_OF, "console", "console-shore", *ROUTERS)
-# Prints {file name: SHA-256} of the pictures under a folder, each in its latest version, and how many are complete.
-# Earlier versions need not be ashore: a newer one may take their place on the way. A picture's JSON is written last:
+# Prints {file name: SHA-256} of the images under a folder, each in its latest version, and how many are complete.
+# Earlier versions need not be ashore: a newer one may take their place on the way. An image's JSON is written last:
 # where it is, the files are whole.
-PICTURES = """
+IMAGES = """
 import hashlib, json, pathlib
-folder = pathlib.Path("/var/lib/sonarpost/pictures")
+folder = pathlib.Path("/var/lib/sonarpost/images")
 latest = {}
 for card in folder.rglob("*_v*.json"):
     name, _, version = card.stem.rpartition("_v")
@@ -32,7 +32,7 @@ for card in folder.rglob("*_v*.json"):
 cards = {card.with_suffix(".tiff"): card for _, card in latest.values()}
 found = {tiff.name: hashlib.sha256(tiff.read_bytes()).hexdigest() for tiff in cards}
 complete = sum(json.loads(card.read_text())["complete"] for card in cards.values())
-print(json.dumps({"pictures": found, "complete": complete}))
+print(json.dumps({"images": found, "complete": complete}))
 """
 # Kills the service as a fault would, so that the engine's restart policy acts; `docker kill` counts as a person's wish.
 KILL = """
@@ -144,15 +144,15 @@ class Project:
         files, owed = self.inside("atd_stub", script).split()
         return int(files) if owed == "0" else 0
 
-    def pictures(self, service):
-        """Return a service's pictures (name to SHA-256) and how many of them are complete."""
-        return read_pictures(self.inside(service, PICTURES))
+    def images(self, service):
+        """Return a service's images (name to SHA-256) and how many of them are complete."""
+        return read_images(self.inside(service, IMAGES))
 
     def kept(self, volume):
-        """Return the pictures in a volume, whether or not a service has it."""
-        mount = f"{self.name}_{volume}:/var/lib/sonarpost/pictures:ro"
-        return read_pictures(
-            docker("run", "--rm", "-v", mount, self.environment["SONARPOST_IMAGE"], "python", "-c", PICTURES)
+        """Return the images in a volume, whether or not a service has it."""
+        mount = f"{self.name}_{volume}:/var/lib/sonarpost/images:ro"
+        return read_images(
+            docker("run", "--rm", "-v", mount, self.environment["SONARPOST_IMAGE"], "python", "-c", IMAGES)
         )
 
     def wait_until_healthy(self, services=SERVICES):
@@ -170,10 +170,10 @@ def until(condition, what, within_s=400.0):
         time.sleep(1.0)  # noqa: TID251 polls
 
 
-def read_pictures(text):
-    """Return what the script PICTURES printed."""
+def read_images(text):
+    """Return what the script IMAGES printed."""
     found = json.loads(text)
-    return found["pictures"], found["complete"]
+    return found["images"], found["complete"]
 
 
 def docker(*arguments, check=True):

@@ -121,8 +121,8 @@ def partial_record(
 
 def with_pixels(record: ReconstructedImage, pixels: npt.NDArray[np.uint8]) -> ReconstructedImage:
     """The record with another image, all of it received."""
-    picture = Pixels.from_array(pixels)
-    return record.model_copy(update={"picture": picture, "picture_sha256": picture.sha256, "missing_mask": b""})
+    packed = Pixels.from_array(pixels)
+    return record.model_copy(update={"pixels": packed, "pixels_sha256": packed.sha256, "missing_mask": b""})
 
 
 def contact_id(image_id: str = "00A7", vehicle: str = "uuv-1") -> str:

@@ -6,7 +6,7 @@ import io
 import json
 import tempfile
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -18,14 +18,13 @@ from sonarpost.export.formats import FORMATS
 from sonarpost.export.source import ExportSource, StoredImages
 from sonarpost.export.tak.cot import cot_events
 from sonarpost.messages import Contact, Decision, Pixels, ReconstructedImage
-from sonarpost.review.measured_size import SIZE_FIELDS
 
 FIRST_UTC_S = 1476262801.25
 
 
 def image(image_id: str = "00A7", contact: dict[str, Any] | None = None, **changes: Any) -> ReconstructedImage:
     pixels = np.arange(16 * 24, dtype=np.uint16).astype(np.uint8).reshape(16, 24)
-    picture = changes.pop("picture", None) or Pixels.from_array(pixels)
+    packed = changes.pop("pixels", None) or Pixels.from_array(pixels)
     vehicle_id = changes.get("vehicle_id", "uuv-1")
     known = {
         "lat_deg": 41.52513339,
@@ -53,7 +52,7 @@ def image(image_id: str = "00A7", contact: dict[str, Any] | None = None, **chang
         "first_frame_utc_s": FIRST_UTC_S,
         "last_frame_utc_s": FIRST_UTC_S + 30,
     }
-    return reconstructed_image(picture, **(fields | changes))
+    return reconstructed_image(packed, **(fields | changes))
 
 
 def decision(image_id: str = "00A7", **changes: Any) -> Decision:
@@ -131,11 +130,6 @@ MISSIONS = {
     "classified": classified_mission,
     "reviewed": reviewed_mission,
 }
-NEWER: Final[dict[str, tuple[str, ...]]] = {"reviewed": ()}
-NEWER["classified"] = ("withdrawn_by", *(f"measured_{name}" for name in SIZE_FIELDS))
-NEWER["authenticated"] = ("p_mine_like", "p_other_object", *NEWER["classified"])
-NEWER["mission"] = ("authenticated", *NEWER["authenticated"])
-"""The last properties of contacts, which the golden files of a mission do not have because they are older."""
 
 
 def export(name: str, contacts: ContactSet, images: StoredImages | None = None) -> bytes:
@@ -154,21 +148,3 @@ def golden_files(name: str, contacts: ContactSet) -> dict[str, bytes]:
         f"{name}.csv": export("csv", contacts),
         f"{name}.cot": b"\n".join(cot_events(contacts, FIRST_UTC_S + 3600)) + b"\n",
     }
-
-
-def as_of_golden_file(name: str, data: bytes) -> bytes:
-    """Return an export without the properties that the golden file does not have; all of them must be unknown."""
-    mission, _, kind = name.rpartition(".")
-    newer = NEWER[mission]
-    if kind == "geojson":
-        document = json.loads(data)
-        for properties in [f["properties"] for f in document["features"]] + document["unlocated"]:
-            assert [properties.pop(property_name) for property_name in newer] == [None] * len(newer)
-        return (json.dumps(document, ensure_ascii=False, indent=1) + "\n").encode()
-    if kind == "csv":
-        header, *rows = data.split(b"\r\n")
-        assert all(row.endswith(b"," * len(newer)) for row in rows[:-1])
-        names = "".join(f",{property_name}" for property_name in newer).encode()
-        kept = [header.removesuffix(names), *(row[: len(row) - len(newer)] for row in rows[:-1]), b""]
-        return b"\r\n".join(kept)
-    return data

@@ -14,7 +14,7 @@ _BUDGETS = (40, 400)
 
 def golden_streams(ids):
     """Yield the golden streams of these codecs."""
-    found = [bytes.fromhex(path.read_text()) for path in sorted(GOLDEN.glob("*/*.hex")) if "picture" not in path.name]
+    found = [bytes.fromhex(path.read_text()) for path in sorted(GOLDEN.glob("*/*.hex")) if "pixels" not in path.name]
     for path in sorted(GOLDEN.glob("emb/*.json")):
         found += [bytes.fromhex(case["stream"]) for case in json.loads(path.read_text()).values()]
     yield from (stream for stream in found if stream and stream[0] in ids)

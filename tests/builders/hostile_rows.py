@@ -167,8 +167,8 @@ def queries_without_end(site: Site) -> Iterator[None]:
 
     def ask(number: int, stop: threading.Event) -> None:
         parameters = [
-            "?limit=256;format=json;picture=png",
-            "?limit=256;picture=raw",
+            "?limit=256;format=json;pixels=png",
+            "?limit=256;pixels=raw",
             f"?after={'9' * 900}",
             "?_time=[..[",
         ]
@@ -377,8 +377,8 @@ def refused_alerts(site: Site) -> Iterator[None]:
 def junk_snippets(site: Site) -> Iterator[None]:
     """Noise and images that claim pixels, in place of snippets and commands."""
     random, sender = Random(9), site.sender("uuv-1")
-    picture = {"height_px": 4096, "width_px": 4096, "bits": 8, "data": b""}
-    claim = {"type": "snippet", "v": 1, "contact": {"contact_id": "x", "vehicle_id": "uuv-1"}, "picture": picture}
+    pixels = {"height_px": 4096, "width_px": 4096, "bits": 8, "data": b""}
+    claim = {"type": "snippet", "v": 1, "contact": {"contact_id": "x", "vehicle_id": "uuv-1"}, "pixels": pixels}
     for key in (keys.contact_detected("uuv-1"), keys.command("uuv-1", "refine")):
         sender.send(key, "compressor", [*(random.randbytes(200) for _ in range(100)), msgpack.packb(claim)])
     yield

@@ -380,7 +380,7 @@ class Site:
         names = [f"c{number}" for number in self.numbers(5)]
         now_s, pixels = time.monotonic(), np.random.default_rng(1).integers(0, 256, (80, 140), dtype=np.uint8)
         contacts = [Contact(contact_id=name, vehicle_id="uuv-1") for name in names]
-        records = [wire.encode(Snippet(contact=one, picture=Pixels.from_array(pixels))) for one in contacts]
+        records = [wire.encode(Snippet(contact=one, pixels=Pixels.from_array(pixels))) for one in contacts]
         self.sender("uuv-1").send(keys.contact_detected("uuv-1"), "compressor", records)
         return self.logged("compressor", [f"contact_id={name} " for name in names], now_s)
 

@@ -69,13 +69,13 @@ class ArchiveLog:
             if self._vehicle not in (None, fields["vehicle_id"]):
                 continue
             sha256 = pixels_sha256(path)
-            assert sha256 == fields["picture_sha256"], path
+            assert sha256 == fields["pixels_sha256"], path
             if self._files.get(path) != sha256:
                 self._files[path] = sha256
                 name = record_name(*(fields[n] for n in ("vehicle_id", "image_id", "version", "first_frame_utc_s")))
                 self._history.add("handled", "c2", name, key=self._key, sha256=sha256)
         with contextlib.closing(sqlite3.connect(f"file:{self._out / 'index.db'}?mode=ro", uri=True)) as db:
-            rows = db.execute("SELECT vehicle_id, image_id, version, first_frame_utc_s FROM picture").fetchall()
+            rows = db.execute("SELECT vehicle_id, image_id, version, first_frame_utc_s FROM image").fetchall()
         found = Counter(record_name(*row) for row in rows if self._vehicle in (None, row[0]))
         for name in (found - self._rows).elements():
             self._history.add("handled", "c2 index", name, key=self._key)

@@ -55,13 +55,13 @@ def make_image(number, shape=(24, 32), mission=0, version=1):
     )
 
 
-def picture_sha256(image):
+def pixels_sha256(image):
     """Return the digest of the pixels of a coded image."""
-    return _picture_sha256(image.stream)
+    return _pixels_sha256(image.stream)
 
 
 @lru_cache(maxsize=1024)
-def _picture_sha256(stream):
+def _pixels_sha256(stream):
     return Pixels.from_array(_spiht().decode(stream).image).sha256
 
 

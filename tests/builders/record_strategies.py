@@ -103,12 +103,12 @@ def pixels(draw: st.DrawFn) -> Pixels:
 
 @st.composite
 def images(draw: st.DrawFn) -> ReconstructedImage:
-    fields = draw(_fields(ReconstructedImage, "picture_sha256", "missing_mask"))
-    picture = fields["picture"]
-    size = (picture.height_px * picture.width_px + 7) // 8
+    fields = draw(_fields(ReconstructedImage, "pixels_sha256", "missing_mask"))
+    pixels = fields["pixels"]
+    size = (pixels.height_px * pixels.width_px + 7) // 8
     mask = draw(st.just(b"") | st.binary(min_size=size, max_size=size))
-    digest = hashlib.sha256(picture.data).hexdigest()
-    return ReconstructedImage(**fields, picture_sha256=digest, missing_mask=mask)
+    digest = hashlib.sha256(pixels.data).hexdigest()
+    return ReconstructedImage(**fields, pixels_sha256=digest, missing_mask=mask)
 
 
 @st.composite

@@ -20,7 +20,7 @@ from sonarpost.messages import (
 FIRST_S = 1_700_000_000.0
 
 
-def reconstructed_image(picture: Pixels, **changes: object) -> ReconstructedImage:
+def reconstructed_image(pixels: Pixels, **changes: object) -> ReconstructedImage:
     """Return a complete image of vessel-1; `changes` override fields."""
     fields: dict[str, object] = {
         "vessel_id": "vessel-1",
@@ -30,8 +30,8 @@ def reconstructed_image(picture: Pixels, **changes: object) -> ReconstructedImag
         "contact": None,
         "codec": "vq",
         "model": "",
-        "picture": picture,
-        "picture_sha256": picture.sha256,
+        "pixels": pixels,
+        "pixels_sha256": pixels.sha256,
         "complete": True,
         "missing_fraction": 0.0,
         "missing_mask": b"",

@@ -214,8 +214,8 @@ def snippet(texture):
     """Make a snippet by its contact identifier."""
 
     def make(contact_id, height_px=40, width_px=60, **options):
-        picture = Pixels.from_array(texture(height_px, width_px, **options))
-        return Snippet(contact=Contact(contact_id=contact_id, vehicle_id="uuv-1"), picture=picture)
+        pixels = Pixels.from_array(texture(height_px, width_px, **options))
+        return Snippet(contact=Contact(contact_id=contact_id, vehicle_id="uuv-1"), pixels=pixels)
 
     return make
 

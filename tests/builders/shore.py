@@ -22,9 +22,9 @@ def image(
     image_id: str = "AAAA", value: int = 1, start_s: float = 1_700_000_000.0, **changes: Any
 ) -> ReconstructedImage:
     """Return a small image of vessel-1; all pixels have one value."""
-    picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([value]) * 600)
+    pixels = Pixels(height_px=20, width_px=30, bits=8, data=bytes([value]) * 600)
     times = {"first_frame_utc_s": start_s, "last_frame_utc_s": start_s + 1}
-    return reconstructed_image(picture, image_id=image_id, **times | changes)
+    return reconstructed_image(pixels, image_id=image_id, **times | changes)
 
 
 def relayed(record: ReconstructedImage | Decision, vessel: str = "", **changes: Any) -> Relayed:

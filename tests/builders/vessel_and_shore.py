@@ -22,7 +22,7 @@ from pathlib import Path
 from builders.common import REPOSITORY, WAIT_S, free_port
 from builders.history import History
 from builders.image_archive import ArchiveLog, name_of, side_cars
-from builders.image_source import VESSEL, ImageSource, picture_sha256
+from builders.image_source import VESSEL, ImageSource, pixels_sha256
 from builders.progress import wait_while_progressing
 from research.common.link_emulator import LinkEmulator
 from sonarpost import keys, wire
@@ -199,7 +199,7 @@ class VesselAndShore:
         self.expected.update(map(name_of, images))
 
     def _log(self, operation, process, image):
-        self.history.add(operation, process, name_of(image), key=KEY, sha256=picture_sha256(image))
+        self.history.add(operation, process, name_of(image), key=KEY, sha256=pixels_sha256(image))
 
     def close(self):
         for watcher in self._watchers:
@@ -232,7 +232,7 @@ class VesselAndShore:
 
     def _on_image(self, sample):
         image = wire.decode(ReconstructedImage, sample.payload.to_bytes(), str(sample.key_expr))
-        self.history.add("seen", "subscriber", name_of(image), key=KEY, sha256=image.picture_sha256)
+        self.history.add("seen", "subscriber", name_of(image), key=KEY, sha256=image.pixels_sha256)
 
     def wait_for_state(self, service, state, detail=""):
         """Wait until relay or c2 reports a state, and a detail that contains a pattern; needs `watch_health`."""

@@ -33,9 +33,9 @@ FIRST_S = 1_700_000_000.0
 
 
 def image(image_id="AAAA", version=1, vehicle="uuv-1", vessel="vessel-1", first_frame_utc_s=FIRST_S):
-    picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
+    pixels = Pixels(height_px=20, width_px=30, bits=8, data=bytes([version]) * 600)
     return reconstructed_image(
-        picture,
+        pixels,
         vessel_id=vessel,
         vehicle_id=vehicle,
         image_id=image_id,

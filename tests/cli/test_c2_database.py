@@ -25,10 +25,10 @@ COUNT = 40
 
 
 def image(number, value=1, version=1):
-    picture = Pixels(height_px=20, width_px=30, bits=8, data=bytes([value]) * 600)
+    pixels = Pixels(height_px=20, width_px=30, bits=8, data=bytes([value]) * 600)
     contact = Contact(contact_id="c", vehicle_id="uuv-1", lat_deg=56.0, lon_deg=-5.0 + number / 100)
     return reconstructed_image(
-        picture, vessel_id="vessel-1", image_id=f"{number:04d}", version=version, contact=contact, codec="emb"
+        pixels, vessel_id="vessel-1", image_id=f"{number:04d}", version=version, contact=contact, codec="emb"
     )
 
 

@@ -83,8 +83,8 @@ def test_one_file_with_another_codebook_and_output_folder(run, folder, tmp_path)
     assert run("encode", folder / "b.png", "--codec", "vq", "--codebook", "nominal-20", "--out", out) == 0
     assert [path.name for path in out.iterdir()] == ["b.vq"]
     # The decoder finds the shipped codebook by the tag in the stream.
-    assert run("decode", out / "b.vq", "--out", tmp_path / "pictures") == 0
-    assert read_image(tmp_path / "pictures" / "b.tiff").shape == (37, 81)
+    assert run("decode", out / "b.vq", "--out", tmp_path / "images") == 0
+    assert read_image(tmp_path / "images" / "b.tiff").shape == (37, 81)
     with pytest.raises(StreamError, match="another identity"):
         run("decode", out / "b.vq", "--codebook", "nominal-10")
 

@@ -64,20 +64,20 @@ def check_coco(out, document):
     assert categories == {1: "mine-like object", 2: "other object", 3: "structure"}
     assert len({each["id"] for each in document["annotations"]}) == len(document["annotations"])
     for annotation in document["annotations"]:
-        pictured = images[annotation["image_id"]]
+        entry = images[annotation["image_id"]]
         x, y, width, height = annotation["bbox"]
         assert x >= 0
         assert y >= 0
-        assert 0 < width <= pictured["width"] - x + 0.01
-        assert 0 < height <= pictured["height"] - y + 0.01
+        assert 0 < width <= entry["width"] - x + 0.01
+        assert 0 < height <= entry["height"] - y + 0.01
         assert annotation["area"] == pytest.approx(width * height, abs=0.01)
         assert annotation["iscrowd"] == 0
         assert annotation["category_id"] in categories
-    for pictured in images.values():
-        path = out / pictured["file_name"]
+    for entry in images.values():
+        path = out / entry["file_name"]
         assert path.resolve().parent == (out / "images").resolve()
         with Image.open(path) as png:
-            assert (png.mode, png.size) == ("L", (pictured["width"], pictured["height"]))
+            assert (png.mode, png.size) == ("L", (entry["width"], entry["height"]))
 
 
 def by_name(document):
@@ -94,7 +94,7 @@ def test_export_writes_images_and_annotations(archive, capsys):
     )
     found = by_name(document)
     assert {name: a["category_id"] for name, (_, a) in found.items()} == {"0001": 1, "0002": 2, "0003": 3}
-    pictured, annotation = found["0001"]
+    entry, annotation = found["0001"]
     expected = {
         "contact_id": "uuv-1/0001",
         "vehicle_id": "uuv-1",
@@ -108,9 +108,9 @@ def test_export_writes_images_and_annotations(archive, capsys):
         "image_version": 2,
         "codec": "vq",
         "bytes_received": 232,
-        "picture_sha256": MINE.picture_sha256,
+        "pixels_sha256": MINE.pixels_sha256,
     }
-    assert expected.items() <= pictured.items()
+    assert expected.items() <= entry.items()
     expected = {
         "bbox": [10.0, 6.0, 4.0, 4.0],
         "bbox_is_measured": True,
@@ -123,8 +123,8 @@ def test_export_writes_images_and_annotations(archive, capsys):
     }
     assert expected.items() <= annotation.items()
     assert annotation["decided_utc"] == "2016-10-12T09:10:01.250Z"
-    with Image.open(out / pictured["file_name"]) as png:
-        assert np.array_equal(np.asarray(png), MINE.picture.to_array())
+    with Image.open(out / entry["file_name"]) as png:
+        assert np.array_equal(np.asarray(png), MINE.pixels.to_array())
 
 
 def test_disputed_contacts_are_included_on_request_and_the_next_export_replaces_them(archive, capsys):
@@ -183,7 +183,7 @@ def test_groups_without_a_line_name_are_separated_by_time(tmp_path):
     records = [image(name, {"time_utc_s": FIRST_UTC_S + after_s}) for name, after_s in times.items()]
     records += [decision(name, decision_id=name) for name in times]
     _, document = export(store(tmp_path / "out", *records))
-    found = {name: pictured["group"] for name, (pictured, _) in by_name(document).items()}
+    found = {name: entry["group"] for name, (entry, _) in by_name(document).items()}
     first = "uuv-1/2016-10-12T09:00:01.250Z"
     assert found == {"0001": first, "0002": first, "0003": first, "0004": "uuv-1/2016-10-12T11:30:01.250Z"}
 
@@ -235,12 +235,12 @@ def test_exchanged_image_is_rejected(archive, capsys):
     Image.fromarray(np.zeros((16, 24), np.uint8)).save(path)
     _, document = export(archive, status=1)
     assert "0002" not in by_name(document)
-    assert "picture_sha256" in capsys.readouterr().err
+    assert "pixels_sha256" in capsys.readouterr().err
 
 
 def test_image_of_16_bits_is_scaled_to_8_bits(tmp_path):
     pixels = np.linspace(0, 4095, 64 * 64).astype(np.uint16).reshape(64, 64)
-    record = image("0001", picture=Pixels.from_array(pixels))
+    record = image("0001", pixels=Pixels.from_array(pixels))
     out, document = export(store(tmp_path / "out", record, decision("0001")))
     check_coco(out, document)
     with Image.open(out / document["images"][0]["file_name"]) as png:

@@ -129,8 +129,8 @@ def test_large_records_are_sent_in_chunks(producer, runner):
     key = keys.image_reconstructed("vessel-1")
     consumer = runner.peer("vessel-1", "consumer", {key: ReconstructedImage})
     sizes = ((64, 500), (64, 512), (1000, 1300))
-    pictures = [Pixels(height_px=h, width_px=w, bits=8, data=bytes(h * w)) for h, w in sizes]
-    images = [reconstructed_image(picture) for picture in pictures]
+    images = [Pixels(height_px=h, width_px=w, bits=8, data=bytes(h * w)) for h, w in sizes]
+    images = [reconstructed_image(image) for image in images]
     assert len(wire.encode(images[0])) < CHUNK_BYTES
     producer.send(key, "consumer", *images)
     eventually(lambda: consumer.received == images)

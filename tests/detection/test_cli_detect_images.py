@@ -12,7 +12,7 @@ from sonarpost.cli.main import main
 from sonarpost.sonar.image_files import write_png, write_tiff
 
 
-def picture(shape=(96, 128), seed=1):
+def seabed_image(shape=(96, 128), seed=1):
     """Return seabed with an object and its shadow, uint8."""
     image = np.random.default_rng(seed).rayleigh(40, shape)
     image[40:52, 40:52] *= 4.0
@@ -30,7 +30,7 @@ def scores(capsys):
 
 
 def test_json_is_one_line_with_the_score_of_every_image_and_invalid_files_are_reported(tmp_path, capsys):
-    image = picture()
+    image = seabed_image()
     write_png(tmp_path / "a.png", image)
     write_tiff(tmp_path / "b12.tiff", image.astype(np.uint16) * np.uint16(16))
     write_png(tmp_path / "c.png", np.ascontiguousarray(image[:, ::-1]))
@@ -58,7 +58,7 @@ def test_json_is_one_line_with_the_score_of_every_image_and_invalid_files_are_re
 
 def test_table_lists_the_most_confident_image_first_and_pixel_size_changes_the_score(tmp_path, capsys):
     write_png(tmp_path / "a.png", np.full((40, 40), 7, np.uint8))
-    write_png(tmp_path / "b.png", picture()[10:90, 10:100])
+    write_png(tmp_path / "b.png", seabed_image()[10:90, 10:100])
     assert main(["detect", "--images", str(tmp_path)]) == 0
     title, heading, *lines = capsys.readouterr().out.splitlines()
     assert title == f"{tmp_path}: 2 images"

@@ -52,15 +52,15 @@ def confidence(image, pixel_m=0.05):
     return found.confidence
 
 
-def pictures():
-    """Return pictures with scores from low to high: objects of different contrast on different seabeds."""
+def images():
+    """Return images with scores from low to high: objects of different contrast on different seabeds."""
     return [with_object(seabed(seed, (150, 170)) ** power, 70, 60) for seed, power in ((1, 1.0), (2, 0.9), (3, 1.1))]
 
 
 @pytest.fixture(scope="module", params=range(3))
 def scored(request):
-    """A picture and its detection."""
-    image = pictures()[request.param]
+    """An image and its detection."""
+    image = images()[request.param]
     return image, detect_in_image(ScaledImage(image, 0.05, 0.05))
 
 
@@ -98,7 +98,7 @@ def test_score_depends_neither_on_gain_direction_nor_bit_depth(scored):
 @pytest.mark.parametrize(
     ("shape", "pixel_m"), [((32, 32), 0.005), ((32, 32), 1.0), ((32, 200), 0.05), ((200, 32), 0.1), ((33, 47), 0.5)]
 )
-def test_picture_of_any_size_has_a_level_grid(shape, pixel_m):
+def test_image_of_any_size_has_a_level_grid(shape, pixel_m):
     image = ScaledImage(to_uint8(seabed(4, shape)), pixel_m, pixel_m)
     for side in Side:
         assert min(normalise_window(seabed_window(image), side).level.shape) >= 16

@@ -17,7 +17,7 @@ from sonarpost.export.formats import write_export
 from sonarpost.export.tables import COLUMNS, contact_properties
 
 
-def test_rows_hold_properties_points_and_pictures(tmp_path):
+def test_rows_hold_properties_points_and_images(tmp_path):
     contacts = load_contacts(mission(tmp_path / "out"))
     path = tmp_path / "contacts.gpkg"
     assert write_export("gpkg", path, contacts) == []
@@ -25,19 +25,19 @@ def test_rows_hold_properties_points_and_pictures(tmp_path):
         assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         assert db.execute("PRAGMA application_id").fetchone() == (0x47504B47,)
         names = ", ".join(f'"{name}"' for name in COLUMNS)
-        rows = db.execute(f"SELECT geom, picture, {names} FROM contacts ORDER BY fid").fetchall()
+        rows = db.execute(f"SELECT geom, image, {names} FROM contacts ORDER BY fid").fetchall()
         style = db.execute("SELECT styleQML FROM layer_styles WHERE f_table_name = 'contacts'").fetchone()[0]
     states = [category.get("value") for category in ET.fromstring(style).iter("category")]
     assert sorted(map(str, states)) == ["disputed", "mine_like", "not_mine_like", "unreviewed", "unsure"]
     assert '<prop k="color" v="224,0,0,255"/>' in style  # mine-like, as in KML
     assert len(rows) == len(contacts.contacts) > 0
-    for (geom, picture, *values), contact in zip(rows, contacts.contacts, strict=True):
+    for (geom, image, *values), contact in zip(rows, contacts.contacts, strict=True):
         assert values == list(contact_properties(contact).values())
-        assert picture == (contact.image_path.read_bytes() if contact.image_path else None)
+        assert image == (contact.image_path.read_bytes() if contact.image_path else None)
         point = None if geom is None else struct.unpack("<dd", geom[-16:])[::-1]
         assert point == contact.position
     assert sorted(p.name for p in tmp_path.iterdir()) == ["contacts.gpkg", "out"]
-    # An unreadable picture is reported.
+    # An unreadable image is reported.
     lost = next(c.image_path for c in contacts.contacts if c.image_path)
     lost.unlink()
     problems = write_export("gpkg", tmp_path / "other.gpkg", contacts)

@@ -185,15 +185,15 @@ def test_damaged_file_gives_messages_or_the_documented_error(tmp_path, at, junk)
 def test_derived_messages_match_their_schemas(tmp_path):
     record = image()
     fix = location_fix(record, TIME_NS)
-    picture = compressed_image(record, TIME_NS)
+    compressed = compressed_image(record, TIME_NS)
     contacts = load_contacts(mission(tmp_path / "out")).contacts
     document = contact_map(contacts)
-    for name, message in ((COMPRESSED_IMAGE, picture), (LOCATION_FIX, fix), (GEOJSON, document)):
+    for name, message in ((COMPRESSED_IMAGE, compressed), (LOCATION_FIX, fix), (GEOJSON, document)):
         jsonschema.Draft202012Validator.check_schema(SCHEMAS[name])
         jsonschema.validate(json.loads(json.dumps(message)), SCHEMAS[name])
-    with Image.open(io.BytesIO(base64.b64decode(str(picture["data"])))) as png:
+    with Image.open(io.BytesIO(base64.b64decode(str(compressed["data"])))) as png:
         assert (png.format, png.size) == ("PNG", (24, 16))
-    assert picture["timestamp"] == {"sec": 1_700_000_000, "nsec": 123_456_789}
+    assert compressed["timestamp"] == {"sec": 1_700_000_000, "nsec": 123_456_789}
     assert (fix["latitude"], fix["longitude"]) == (41.52513339, -70.67124561)
     assert fix["position_covariance"] == [20.25, 0, 0, 0, 20.25, 0, 0, 0, 0]
     collection = json.loads(str(document["geojson"]))

@@ -58,7 +58,7 @@ class Halving:
 
     def encode(self, image: np.ndarray, budget_bytes: int | None = None) -> bytes:
         if image.mean() < 20:
-            raise StreamError("halving", "picture", "dark", "a bright one")
+            raise StreamError("halving", "pixels", "dark", "a bright one")
         header = StreamHeader(self.codec_id, 0xAB, *image.shape).pack()
         for block in (4, 8, 16, 32):
             rows, columns = -(-image.shape[0] // block), -(-image.shape[1] // block)
@@ -133,11 +133,11 @@ def test_row_with_many_misses_is_null_and_details_have_the_figures(folder, tmp_p
     said = capsys.readouterr()
     rows = json.loads(said.out)["results"]
     assert [row["psnr"] for row in rows] == [None, None]  # 3 of 4 images are fewer than nine tenths
-    assert "emb at 900 B: 1 x picture: expected a bright one" in said.err
+    assert "emb at 900 B: 1 x image: expected a bright one" in said.err
     found = json.loads(file.read_text())
     assert [(row["n"], row["misses"]) for row in found["results"]] == [(3, 1), (3, 1)]
     assert all(row["psnr"] > 0 and len(row["ci"]["psnr"]) == 2 for row in found["results"])
-    assert found["pictures"] == 4
+    assert found["images"] == 4
 
 
 def test_vq_row_is_the_best_codebook_within_the_budget(folder: Path, tmp_path: Path) -> None:
@@ -214,7 +214,7 @@ def test_misses_are_counted_and_excluded_from_means() -> None:
     assert np.isnan(tight.psnr).all()
     assert roomy.misses == 2
     assert list(roomy.hits) == [True, False, True, False]
-    assert roomy.reasons["picture: expected a bright one"] == 2
+    assert roomy.reasons["image: expected a bright one"] == 2
     expected = Halving().decode(Halving().encode(arrays[0], 200)).image
     assert roomy.psnr[0] == psnr_db(arrays[0], expected)
     assert roomy.stream_bytes[0] == len(Halving().encode(arrays[0], 200)) <= 200
@@ -244,8 +244,8 @@ def test_table_lists_misses_and_rejected_files_and_the_sheet_shows_originals(fol
     assert "Misses (most frequent reason):" in text
     assert "jpeg2000 at 40 B: 3 x" in text
     assert "3 images of" in text
-    with Image.open(sheet) as picture:
-        drawn = np.asarray(picture.convert("L"))
+    with Image.open(sheet) as image:
+        drawn = np.asarray(image.convert("L"))
     # The first image of the first row is the original, enlarged by two.
     first = snippet(0).repeat(2, 0).repeat(2, 1)
     assert np.array_equal(drawn[56 : 56 + first.shape[0], 20 : 20 + first.shape[1]], first)
@@ -283,7 +283,7 @@ def test_folder_is_read_recursively_and_rejections_are_listed(folder: Path) -> N
     Image.fromarray(np.dstack([snippet(0), snippet(1), snippet(2)])).save(folder / "colour.jpg")
     (folder / "torn.png").write_bytes((folder / "a.png").read_bytes()[:60])
     (folder / "torn.jpg").write_bytes((folder / "deeper" / "c.JPG").read_bytes()[:200])
-    (folder / "notes.txt").write_text("not a picture")
+    (folder / "notes.txt").write_text("not an image")
     found = read_image_folder(folder)
     names = ["a.png", "colour.jpg", "colour.png", "deeper/b.tiff", "deeper/c.JPG"]
     assert [p.name for p in found.images] == names
@@ -335,9 +335,9 @@ def test_plot_without_matplotlib_is_an_error(monkeypatch: pytest.MonkeyPatch, tm
 def test_plot_is_written(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is an optional extra")
     run("--images", folder, "--codecs", "spiht", "--budgets", "40,300", "--plot", tmp_path / "plot.png")
-    with Image.open(tmp_path / "plot.png") as picture:
-        assert picture.width > 1000
-        assert len(set(picture.convert("L").tobytes())) > 50
+    with Image.open(tmp_path / "plot.png") as image:
+        assert image.width > 1000
+        assert len(set(image.convert("L").tobytes())) > 50
 
 
 def test_survey_line_of_a_tile_name() -> None:

@@ -73,8 +73,8 @@ def test_tables_and_sheet_of_the_command(pairs, tmp_path, capsys):
     output = capsys.readouterr().out
     assert "2 simulated pairs" in output
     assert sum(line.startswith("network 1 ") for line in output.splitlines()) == 4
-    with Image.open(sheet) as picture:
-        drawn = np.asarray(picture.convert("L"))
+    with Image.open(sheet) as image:
+        drawn = np.asarray(image.convert("L"))
     chosen = command.sheet_pairs(pairs[:2])
     first = chosen[0].clean.repeat(2, 0).repeat(2, 1)
     assert np.array_equal(drawn[56 : 56 + first.shape[0], 20 : 20 + first.shape[1]], first)

@@ -131,7 +131,7 @@ def bench(*arguments):
 
 
 def test_error_names_the_option_out_of_range():
-    for options in (("--files", 0), ("--seed", -1), ("--pictures", 0), ("--budgets", "x")):
+    for options in (("--files", 0), ("--seed", -1), ("--contacts", 0), ("--budgets", "x")):
         with pytest.raises(ConfigError):
             bench(*options)
 

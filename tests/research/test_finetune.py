@@ -39,7 +39,7 @@ def dataset(tmp_path_factory):
     for number in range(10):
         contact = {"line_name": f"line-{number % 5}", "pixel_along_m": 0.1, "pixel_across_m": 0.06}
         name = f"{number:04d}"
-        archive.store_image(image(name, contact, picture=Pixels.from_array(object_pixels(number))), 5.0)
+        archive.store_image(image(name, contact, pixels=Pixels.from_array(object_pixels(number))), 5.0)
         verdict = "mine_like" if number % 2 == 0 else "not_mine_like"
         archive.store_decision(decision(name, decision_id=f"d{number}", verdict=verdict))
     archive.flush()
@@ -75,8 +75,8 @@ def test_examples_are_the_candidates_at_the_centre(dataset):
 
 
 def test_object_has_a_higher_score_than_seabed():
-    pictures = [object_pixels(1), object_pixels(1, with_object=False)]
-    contacts = [LabelledContact(ScaledImage(p, 0.1, 0.06), MINE_LIKE_OBJECT, "a") for p in pictures]
+    images = [object_pixels(1), object_pixels(1, with_object=False)]
+    contacts = [LabelledContact(ScaledImage(p, 0.1, 0.06), MINE_LIKE_OBJECT, "a") for p in images]
     with_object, without = scores(contacts, DetectorSettings())
     assert with_object > without
 

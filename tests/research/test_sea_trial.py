@@ -24,10 +24,10 @@ from sonarpost.simulation.channel.parameters import ChannelParameters, build_par
 @pytest.fixture(scope="module")
 def samples() -> list[CodedSnippet]:
     codec = VqCodec(load_default(20).tiles, IndexPacking.ASCII5)
-    pictures = simulated_images(6, 3, 140).images
+    images = simulated_images(6, 3, 140).images
     return [
         CodedSnippet(codec.encode(p.pixels[:80]), ContactSummary(lat_deg=44.0, lon_deg=-63.0, time_utc_s=1.4e9 + n))
-        for n, p in enumerate(pictures)
+        for n, p in enumerate(images)
     ]
 
 
@@ -60,8 +60,8 @@ def test_counts_agree_with_the_events_of_the_channel(samples, monkeypatch):
     pairs = zip(outcomes[::2], outcomes[1::2], strict=True)
     lost = [FrameOutcome.LOST in second for first, second in pairs if FrameOutcome.LOST not in first]
     assert sum(lost) == found.second_lost
-    assert found.whole_pictures + found.partial_pictures + found.contacts_only <= found.pictures == 6
-    assert found.partial_pictures > 0
+    assert found.whole_images + found.partial_images + found.contacts_only <= found.images == 6
+    assert found.partial_images > 0
 
 
 def test_boundary_is_that_of_the_paper_and_results_are_reproducible() -> None:
@@ -100,20 +100,20 @@ def test_command_prints_and_plots(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sea_trial, "RANGES_M", (60, 130, 200))
     monkeypatch.setattr(sea_trial, "SIZES_PX", SIZES_PX[1:2])
     path = tmp_path / "plot.png"
-    assert sea_trial.main(["--pictures", "3", "--json", "--plot", str(path)]) == 0
+    assert sea_trial.main(["--images", "3", "--json", "--plot", str(path)]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert (printed["water"], printed["seed"]) == ("sea-trial", 0)
     found = [(row["rate"], row["width_px"], row["range_m"]) for row in printed["results"]]
     assert found == [(rate, 80, range_m) for rate in (1, 4) for range_m in (60, 130, 200)]
-    assert all(row["pictures"] == 3 and row["packets"] == 6 for row in printed["results"])
+    assert all(row["images"] == 3 and row["packets"] == 6 for row in printed["results"])
     with Image.open(path) as image:
         assert image.size[0] > 1000
-    assert sea_trial.main(["--pictures", "2"]) == 0
+    assert sea_trial.main(["--images", "2"]) == 0
     assert "| 130 | " in capsys.readouterr().out
 
 
 def test_invalid_option_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
-    for wrong in (["--pictures", "0"], ["--pictures", "1001"], ["--seed", "-1"]):
+    for wrong in (["--images", "0"], ["--images", "1001"], ["--seed", "-1"]):
         assert sea_trial.main(wrong) == 2
         assert wrong[0] in capsys.readouterr().err
 

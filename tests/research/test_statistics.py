@@ -80,18 +80,18 @@ def point(budget: int, sizes: list[float], psnr: list[float]) -> BudgetResult:
 
 
 def test_curves_use_the_images_coded_by_both_codecs() -> None:
-    pictures = 20
-    base = np.linspace(18, 24, pictures)
-    easy = np.arange(pictures) < 19
-    one = [point(int(b), [b] * pictures, list(base + curve(np.array(b)))) for b in RATES]
+    images = 20
+    base = np.linspace(18, 24, images)
+    easy = np.arange(images) < 19
+    one = [point(int(b), [b] * images, list(base + curve(np.array(b)))) for b in RATES]
     # The other is the same codec at twice the bytes; it misses the best image at one budget. It misses nearly
     # all at another, which is therefore excluded.
-    two = [point(int(b), [2 * b] * pictures, list(base + curve(np.array(b)))) for b in RATES]
+    two = [point(int(b), [2 * b] * images, list(base + curve(np.array(b)))) for b in RATES]
     for array in (two[2].stream_bytes, two[2].psnr):
         array[~easy] = np.nan
     for array in (two[0].stream_bytes, two[0].psnr):
         array[3:] = np.nan
-    weights = bootstrap_weights([str(i) for i in range(pictures)], 50)
+    weights = bootstrap_weights([str(i) for i in range(images)], 50)
     found = rate_difference(one, two, weights)
     assert found.percent == pytest.approx(-50.0)
     assert found.images == 19
@@ -149,12 +149,12 @@ def test_auc() -> None:
     assert auc(np.zeros(2000), is_target)[0] == 0.5
 
 
-def picture(seed: int, shape: tuple[int, int] = (80, 80)) -> np.ndarray:
+def made_image(seed: int, shape: tuple[int, int] = (80, 80)) -> np.ndarray:
     return np.clip(60 * np.random.default_rng(seed).rayleigh(1.0, shape), 0, 255).astype(np.uint8)
 
 
 def test_ms_ssim_of_equal_and_of_damaged_images() -> None:
-    image = picture(0)
+    image = made_image(0)
     assert ms_ssim(image, image) == pytest.approx(1.0)
     rng = np.random.default_rng(1)
     values = []
@@ -167,7 +167,7 @@ def test_ms_ssim_of_equal_and_of_damaged_images() -> None:
 
 def test_ms_ssim_equals_its_definition_and_invalid_pairs_are_errors() -> None:
     """Computed window by window over three scales of a mirrored image."""
-    a, b = picture(2, (17, 22)), picture(3, (17, 22))
+    a, b = made_image(2, (17, 22)), made_image(3, (17, 22))
     x, y, result = a.astype(float), b.astype(float), 1.0
     weights = np.array([0.0448, 0.2856, 0.3001])
     for scale, weight in enumerate(weights / weights.sum()):
@@ -178,6 +178,6 @@ def test_ms_ssim_equals_its_definition_and_invalid_pairs_are_errors() -> None:
         x, y = (z[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2).mean((1, 3)) for z in (x, y))
     assert ms_ssim(a, b) == pytest.approx(result, rel=1e-9)
     with pytest.raises(StreamError, match="at least 4 px"):
-        ms_ssim(picture(0, (3, 40)), picture(1, (3, 40)))
+        ms_ssim(made_image(0, (3, 40)), made_image(1, (3, 40)))
     with pytest.raises(StreamError, match="shape"):
-        ms_ssim(picture(0), picture(1, (80, 79)))
+        ms_ssim(made_image(0), made_image(1, (80, 79)))

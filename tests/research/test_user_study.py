@@ -95,7 +95,7 @@ def test_responses_do_not_reveal_the_answer(panel):
     for address in (question.json()["shown"], *question.json()["choices"]):
         data = panel.get(address).content
         assert not any(name.encode() in data for name in NAMES)
-    assert panel.get("/api/panel/pictures/contact-1.png").status_code == 404
+    assert panel.get("/api/panel/images/contact-1.png").status_code == 404
     assert set(panel.post("/api/panel/answers", json=body_of(), headers=headers).json()) == {"answered"}
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sonarpost.messages import Contact
 from sonarpost.review.true_scale import (
-    PictureLine,
+    ImageLine,
     auto_gain,
     bar_length_m,
     draw_lines,
@@ -142,7 +142,7 @@ def test_north_is_unknown_without_heading_or_side():
 def test_lines_are_drawn_at_their_place_in_their_colour():
     image = true_image(np.zeros((40, 80), np.uint8), np.zeros((40, 80), np.bool_), 0.2, 0.1, 400)
     # The values are at the top, the line is below them.
-    drawn = draw_lines(image, [PictureLine("length", (30.0, 20.0), (30.0, 60.0), "4.00 m")])
+    drawn = draw_lines(image, [ImageLine("length", (30.0, 20.0), (30.0, 60.0), "4.00 m")])
     row = drawn[round(30 * image.factors[0])]
     yellow = np.nonzero((row == (255, 212, 0)).all(axis=1))[0]
     assert (yellow.min(), yellow.max()) == pytest.approx((20 * image.factors[1], 60 * image.factors[1]), abs=2)

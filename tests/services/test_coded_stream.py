@@ -171,8 +171,8 @@ def test_stream_that_cannot_be_decoded_costs_that_image_only_and_other_pixels_ar
     def coded(data, number, **fields):
         return CodedImage(**dict(update(data, 1, number)), model="", **fields)
 
-    undecodable = coded(b"\x7f" + bytes(50), 1, codec="", picture_crc32=None)
-    peer.send(keys.image_coded(VESSEL), "relay", undecodable, coded(stream, 2, codec="spiht", picture_crc32=1))
+    undecodable = coded(b"\x7f" + bytes(50), 1, codec="", pixels_crc32=None)
+    peer.send(keys.image_coded(VESSEL), "relay", undecodable, coded(stream, 2, codec="spiht", pixels_crc32=1))
     eventually(lambda: at_shore)
     [(key, reason)] = refused(c2)
     assert key == keys.shore_part(VESSEL)

@@ -78,7 +78,7 @@ def run_service(installation, router, tmp_path):
         changes = {
             "SONARPOST_PLATFORM__ROUTER": json.dumps([router]),
             "SONARPOST_PLATFORM__STATE_DIR": str(state),
-            "SONARPOST_DECOMPRESSOR__OUT_DIR": str(state / "pictures"),
+            "SONARPOST_DECOMPRESSOR__OUT_DIR": str(state / "images"),
         }
         config = REPOSITORY / "config" / f"{platform}.toml"
         with (tmp_path / f"{service}.log").open("wb") as log:

@@ -82,7 +82,7 @@ class Decoder:
             **{name: getattr(received, name) for name in ReceivedImage.model_fields},
             codec=image.codec,
             model=image.model[:MODEL_DIGITS] if needs_tiles else "",
-            picture_crc32=zlib.crc32(image.picture.data),
+            pixels_crc32=zlib.crc32(image.pixels.data),
         )
 
     def _codec(self, received: ReceivedImage, further: Codebook | None) -> Codec:
@@ -105,8 +105,8 @@ class Decoder:
 def _record(
     received: ReceivedImage, decoded: DecodedImage, codec: Codec | None, notes: Sequence[str]
 ) -> ReconstructedImage:
-    picture = Pixels.from_array(decoded.image)
-    if isinstance(received, CodedImage) and received.picture_crc32 not in (None, zlib.crc32(picture.data)):
+    pixels = Pixels.from_array(decoded.image)
+    if isinstance(received, CodedImage) and received.pixels_crc32 not in (None, zlib.crc32(pixels.data)):
         notes = [*notes, OTHER_PIXELS]
     return ReconstructedImage(
         vessel_id=received.vessel_id,
@@ -116,8 +116,8 @@ def _record(
         contact=received.contact,
         codec=codec.name if codec else "",
         model=codec.model_hash if codec else "",
-        picture=picture,
-        picture_sha256=picture.sha256,
+        pixels=pixels,
+        pixels_sha256=pixels.sha256,
         complete=received.complete and not decoded.missing.any(),
         missing_fraction=float(decoded.missing.mean()),
         missing_mask=pack_mask(decoded.missing),

@@ -87,15 +87,15 @@ def side_car(image: ReconstructedImage) -> dict[str, object]:
     `authenticated` and `despeckle_strength` are absent if they are not known.
     """
     unknown = {name for name in ("authenticated", "despeckle_strength") if getattr(image, name) is None}
-    fields = image.model_dump(exclude={"picture", "missing_mask", *unknown})
+    fields = image.model_dump(exclude={"pixels", "missing_mask", *unknown})
     rows = np.flatnonzero(image.missing().any(axis=1))
     return {
         "type": image.TYPE,
         "v": image.VERSION,
         **fields,
-        "height_px": image.picture.height_px,
-        "width_px": image.picture.width_px,
-        "bits": image.picture.bits,
+        "height_px": image.pixels.height_px,
+        "width_px": image.pixels.width_px,
+        "bits": image.pixels.bits,
         "missing_pixels": int(image.missing().sum()),
         "missing_rows": [int(rows[0]), int(rows[-1]) + 1] if rows.size else [],
     }
@@ -153,7 +153,7 @@ def add_image(files: AtomicFiles, folder: Path, image: ReconstructedImage) -> Wr
     sidecar = other if is_conflict else plain
     tiff, png = sidecar.with_suffix(".tiff"), sidecar.with_suffix(".png")
     folder.mkdir(parents=True, exist_ok=True)
-    pixels = image.picture.to_array()
+    pixels = image.pixels.to_array()
     before = len(files)
     try:
         files.add(tiff, tiff_bytes(tiff, pixels))

@@ -68,7 +68,7 @@ def whole_part(image: CodedImage) -> ImagePart:
         "h": None if has_size else image.height_px,
         "w": None if has_size else image.width_px,
         **(_pieces(image.stream, _mask(length, missing)) | {"m": missing} if missing else {"p": image.stream}),
-        "x": image.picture_crc32,
+        "x": image.pixels_crc32,
         "f": image.frames_received,
         "e": None if image.bytes_total == length else image.bytes_total,
         "y": None if image.bytes_received == received else image.bytes_received,
@@ -211,7 +211,7 @@ def coded_image(part: ImagePart, vessel_id: str, where: str) -> CodedImage:
         "authenticated": authenticated,
         "codec": codec_name(stream),
         "model": part.a.hex(),
-        "picture_crc32": part.x,
+        "pixels_crc32": part.x,
     }
     return wire.validated(CodedImage, fields, where)
 

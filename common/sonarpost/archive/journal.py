@@ -161,7 +161,7 @@ class JournalRow:
         accepted: Number and time.
         key: Key on which it was published.
         encoding: Its Zenoh encoding.
-        fields: Its payload as a map; the pixels of a picture are empty if `name` is not.
+        fields: Its payload as a map; `data` of the pixels is empty if `name` is not.
         vessel_id: Its vessel.
         name: Name of the files with its pixels; empty if `fields` is complete.
     """
@@ -428,7 +428,7 @@ def _without_pixels(entry: JournalEntry, payload: bytes) -> bytes:
     if not entry.name:
         return payload
     fields = wire.unpack_map(payload, entry.key)
-    picture = fields["picture"]
-    assert isinstance(picture, dict)
-    packed: bytes = msgpack.packb({**fields, "picture": {**picture, "data": b""}}, use_bin_type=True)
+    pixels = fields["pixels"]
+    assert isinstance(pixels, dict)
+    packed: bytes = msgpack.packb({**fields, "pixels": {**pixels, "data": b""}}, use_bin_type=True)
     return packed

@@ -108,7 +108,7 @@ def row_of_image(
     height_px, width_px = (
         (image.height_px, image.width_px)
         if isinstance(image, SideCar)
-        else (image.picture.height_px, image.picture.width_px)
+        else (image.pixels.height_px, image.pixels.width_px)
     )
     contact = image.contact
     return ImageRow(
@@ -236,10 +236,8 @@ def find_image(images: Sequence[ImageRow], name: str, vessel: str | None, versio
     named = [r for r in images if r.name == name or (r.vehicle_id, r.image_id) == (vehicle, image_id)]
     found = [r for r in named if vessel in (None, r.vessel_id) and version in (None, r.version)]
     if not found:
-        raise StoredFileError("index", "picture", name, "an image that `sonarpost c2 ls` shows")
+        raise StoredFileError("index", "image", name, "an image that `sonarpost c2 ls` shows")
     if len({(r.vessel_id, r.vehicle_id, r.image_id, r.first_frame_utc_s) for r in found}) > 1:
         names = ", ".join(f"{r.vessel_id}/{r.name}" for r in found)
-        raise StoredFileError(
-            "index", "picture", name, f"one image, with --vessel or by the name of its files: {names}"
-        )
+        raise StoredFileError("index", "image", name, f"one image, with --vessel or by the name of its files: {names}")
     return max(found, key=lambda r: r.version)

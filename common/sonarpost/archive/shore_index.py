@@ -24,7 +24,7 @@ INDEX_VERSION = 5
 BUSY_S = 10.0
 
 _SCHEMA = """
-CREATE TABLE IF NOT EXISTS picture (
+CREATE TABLE IF NOT EXISTS image (
     vessel_id TEXT NOT NULL, name TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
     version INTEGER NOT NULL, first_frame_utc_s REAL NOT NULL, last_frame_utc_s REAL NOT NULL,
     relayed_utc_s REAL, accepted_utc_s REAL NOT NULL, complete INTEGER NOT NULL, missing_fraction REAL NOT NULL,
@@ -33,7 +33,7 @@ CREATE TABLE IF NOT EXISTS picture (
     conflict INTEGER NOT NULL DEFAULT 0, files_sha256 TEXT NOT NULL DEFAULT '', verified_utc_s REAL,
     fault TEXT NOT NULL DEFAULT '', despeckle_strength REAL, p_mine_like REAL, p_other_object REAL,
     PRIMARY KEY (vessel_id, name)) WITHOUT ROWID;
-CREATE INDEX IF NOT EXISTS picture_age ON picture (accepted_utc_s) WHERE removed_utc_s IS NULL;
+CREATE INDEX IF NOT EXISTS image_age ON image (accepted_utc_s) WHERE removed_utc_s IS NULL;
 CREATE TABLE IF NOT EXISTS decision (
     vessel_id TEXT NOT NULL, decision_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
     image_version INTEGER NOT NULL, verdict TEXT NOT NULL, confidence REAL, mlo_class TEXT, remark TEXT NOT NULL,
@@ -46,9 +46,9 @@ CREATE TABLE IF NOT EXISTS tasking (
     changed_utc_s REAL NOT NULL, PRIMARY KEY (vessel_id, kind, record_id)) WITHOUT ROWID;
 """
 _INDEXES = """
-CREATE INDEX IF NOT EXISTS picture_verified ON picture (verified_utc_s) WHERE removed_utc_s IS NULL;
-CREATE INDEX IF NOT EXISTS picture_fault ON picture (fault) WHERE fault <> '';
-CREATE INDEX IF NOT EXISTS picture_conflict ON picture (conflict) WHERE conflict <> 0;
+CREATE INDEX IF NOT EXISTS image_verified ON image (verified_utc_s) WHERE removed_utc_s IS NULL;
+CREATE INDEX IF NOT EXISTS image_fault ON image (fault) WHERE fault <> '';
+CREATE INDEX IF NOT EXISTS image_conflict ON image (conflict) WHERE conflict <> 0;
 CREATE INDEX IF NOT EXISTS decision_verified ON decision (verified_utc_s);
 CREATE INDEX IF NOT EXISTS decision_fault ON decision (fault) WHERE fault <> '';
 """
@@ -150,7 +150,7 @@ class TaskingRow:
 
 
 Row = TypeVar("Row", ImageRow, DecisionRow, TaskingRow)
-_TABLES: dict[type, str] = {ImageRow: "picture", DecisionRow: "decision", TaskingRow: "tasking"}
+_TABLES: dict[type, str] = {ImageRow: "image", DecisionRow: "decision", TaskingRow: "tasking"}
 _NAMES: dict[type, str] = {ImageRow: "name", DecisionRow: "decision_id"}
 Mark = Literal["exported_utc_s", "removed_utc_s"]
 DEFECTS = ("missing", "changed", "unreadable", "conflicting")
@@ -251,7 +251,7 @@ class ShoreIndex:
         """
         with self._writing() as db:
             for row in images:
-                sql = f"UPDATE picture SET {column} = ? WHERE vessel_id = ? AND name = ?"  # noqa: S608 literals
+                sql = f"UPDATE image SET {column} = ? WHERE vessel_id = ? AND name = ?"  # noqa: S608 literals
                 db.execute(sql, (at_utc_s, row.vessel_id, row.name))
 
     def images(self, *, removed: bool = False) -> list[ImageRow]:
@@ -295,7 +295,7 @@ class ShoreIndex:
         found: list[ImageRow | DecisionRow] = []
         due = "(verified_utc_s IS NULL OR verified_utc_s < ?) ORDER BY verified_utc_s LIMIT ?"
         with self._lock:
-            count = self._count("picture", "removed_utc_s IS NULL")
+            count = self._count("image", "removed_utc_s IS NULL")
             limit = math.ceil(count * interval_s / cycle_s)
             images = self._rows(ImageRow, f"WHERE removed_utc_s IS NULL AND {due}", (before_utc_s, limit))
             found += [_with_booleans(row) for row in images]
@@ -325,11 +325,11 @@ class ShoreIndex:
         """
         counts = dict.fromkeys(DEFECTS, 0)
         with self._lock:
-            for table, where in (("picture", " AND removed_utc_s IS NULL"), ("decision", "")):
+            for table, where in (("image", " AND removed_utc_s IS NULL"), ("decision", "")):
                 sql = f"SELECT fault, COUNT(*) FROM {table} WHERE fault <> ''{where} GROUP BY fault"  # noqa: S608
                 for fault, count in self._execute(sql):
                     counts[fault] += count
-            counts["conflicting"] = self._count("picture", "conflict <> 0 AND removed_utc_s IS NULL")
+            counts["conflicting"] = self._count("image", "conflict <> 0 AND removed_utc_s IS NULL")
         return counts
 
     def _count(self, table: str, where: str = "1") -> int:
@@ -338,15 +338,13 @@ class ShoreIndex:
     def size_bytes(self) -> int:
         """Return the size of all images that are not removed, in bytes."""
         with self._lock:
-            row = self._execute(
-                "SELECT COALESCE(SUM(size_bytes), 0) FROM picture WHERE removed_utc_s IS NULL"
-            ).fetchone()
+            row = self._execute("SELECT COALESCE(SUM(size_bytes), 0) FROM image WHERE removed_utc_s IS NULL").fetchone()
         return int(row[0])
 
     def oldest_utc_s(self) -> float | None:
         """Return when the oldest image that is not removed was accepted; None if there is none."""
         with self._lock:
-            row = self._execute("SELECT MIN(accepted_utc_s) FROM picture WHERE removed_utc_s IS NULL").fetchone()
+            row = self._execute("SELECT MIN(accepted_utc_s) FROM image WHERE removed_utc_s IS NULL").fetchone()
         return None if row[0] is None else float(row[0])
 
     def _rows(self, row_type: type[Row], rest: str, values: tuple[object, ...] = ()) -> list[Row]:

@@ -133,7 +133,9 @@ class Store:
             self._db.execute(f"PRAGMA cache_size={-CACHE_KB}")
             self._require_sound()
             version, self.origin = schema.prepare(self._db, self._page_bytes)
-            self._reader = sqlite3.connect(self.path, check_same_thread=False, isolation_level=None, timeout=BUSY_TIMEOUT_S)
+            self._reader = sqlite3.connect(
+                self.path, check_same_thread=False, isolation_level=None, timeout=BUSY_TIMEOUT_S
+            )
             on_error.callback(self._reader.close)
             self._reader.execute("PRAGMA query_only=ON")
         except sqlite3.Error as error:

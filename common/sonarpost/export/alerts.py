@@ -57,7 +57,7 @@ def alert_document(contact: ExportContact, sent_utc: str) -> bytes:
     known = {
         name: xml_text(value) if isinstance(value, str) else value
         for name, value in contact_properties(contact).items()
-        if value is not None and name != "picture_file"
+        if value is not None and name != "image_file"
     }
     head = {"type": TYPE, "v": VERSION, "id": contact.uid, "sent_utc": sent_utc, "score": score(contact)}
     return json.dumps({**head, "contact": known}, ensure_ascii=False, allow_nan=False).encode()

@@ -93,8 +93,8 @@ def load_labelled_image(contact: ExportContact) -> LabelledImage:
         raise ValueError(f"contact: got {state}, expected labelled or disputed")
     pixels = read_image(contact.image_path)
     sha256 = Pixels.from_array(pixels).sha256
-    if sha256 != contact.image.picture_sha256:
-        raise StoredFileError(str(contact.image_path), "picture_sha256", sha256, contact.image.picture_sha256)
+    if sha256 != contact.image.pixels_sha256:
+        raise StoredFileError(str(contact.image_path), "pixels_sha256", sha256, contact.image.pixels_sha256)
     operators = len(latest_verdicts(contact))
     return LabelledImage(contact, contact.decision, state == "disputed", operators, to_8_bits(pixels))
 
@@ -197,7 +197,7 @@ def _image(number: int, labelled: LabelledImage, group_of: Mapping[str, str]) ->
         "bytes_total": image.bytes_total,
         "missing_fraction": image.missing_fraction,
         "despeckle_strength": image.despeckle_strength,
-        "picture_sha256": image.picture_sha256,
+        "pixels_sha256": image.pixels_sha256,
     }
 
 

@@ -60,7 +60,7 @@ class SideCar(Record):
     contact: Contact | None
     codec: str
     model: str = ""
-    picture_sha256: Sha256
+    pixels_sha256: Sha256
     complete: bool
     missing_fraction: Fraction
     missing_halves: tuple[Literal["top", "bottom"], ...]

@@ -76,7 +76,7 @@ _UNKNOWN, _APPROXIMATED = 0, 1
 
 def compressed_image(image: ReconstructedImage, time_ns: int) -> Document:
     """Return the pixels as PNG of 8 bits; `frame_id` is `{vehicle}/{image}`."""
-    png = encode_png(eight_bits(image.picture.to_array()))
+    png = encode_png(eight_bits(image.pixels.to_array()))
     return {
         "timestamp": _time(time_ns),
         "frame_id": f"{image.vehicle_id}/{image.image_id}",

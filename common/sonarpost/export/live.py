@@ -29,8 +29,8 @@ class _Name:
 
 def side_car_of(image: ReconstructedImage) -> SideCar:
     """Return an image without its pixels, as c2 stores it."""
-    fields = image.model_dump(exclude={"picture", "missing_mask"})
-    size = {"height_px": image.picture.height_px, "width_px": image.picture.width_px}
+    fields = image.model_dump(exclude={"pixels", "missing_mask"})
+    size = {"height_px": image.pixels.height_px, "width_px": image.pixels.width_px}
     return SideCar.model_validate({"type": "reconstructed_image", "v": 1, **fields, **size})
 
 

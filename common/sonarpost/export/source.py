@@ -15,10 +15,10 @@ import numpy.typing as npt
 from sonarpost.errors import BadInputError, StoredFileError
 from sonarpost.export.contacts import ExportContact
 from sonarpost.files import read_regular
-from sonarpost.review.true_scale import PictureLine
+from sonarpost.review.true_scale import ImageLine
 from sonarpost.sonar.image_files import read_image
 
-MAX_PICTURE_BYTES: Final = 1 << 26
+MAX_IMAGE_BYTES: Final = 1 << 26
 """A larger image file is omitted and reported."""
 
 _SPOOL_BYTES: Final = 1 << 20
@@ -38,7 +38,7 @@ class ContactImage:
 
     pixels: Pixels
     missing: npt.NDArray[np.bool_] | None = None
-    lines: tuple[PictureLine, ...] = ()
+    lines: tuple[ImageLine, ...] = ()
 
 
 class ContactImages(Protocol):
@@ -75,7 +75,7 @@ class StoredImages:
         if path is None:
             return None
         try:
-            return read_regular(path, MAX_PICTURE_BYTES)
+            return read_regular(path, MAX_IMAGE_BYTES)
         except OSError as error:
             self.problems.append(StoredFileError(str(path), "", error.strerror or str(error), "a readable PNG"))
             return None

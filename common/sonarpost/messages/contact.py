@@ -175,7 +175,7 @@ class Snippet(Record):
 
     Attributes:
         contact: The contact.
-        picture: The pixels, nadir to the left if `channel` is known. The compressor accepts sides of 16 to 512 px.
+        pixels: The pixels, nadir to the left if `channel` is known. The compressor accepts sides of 16 to 512 px.
         source: Name of the file in which the contact was detected.
         wide: More seabed around the same centre, in pixels of twice the size along and across, sides of 16 to 512 px.
             It stays on the vehicle until a command of kind `expand` requests it. None if there is none.
@@ -184,6 +184,6 @@ class Snippet(Record):
     TYPE: ClassVar[str] = "snippet"
 
     contact: Contact
-    picture: Pixels
+    pixels: Pixels
     source: Text = ""
     wide: Pixels | None = None

@@ -153,7 +153,7 @@ class CodedImage(ReceivedImage):
         codec: Name of the codec; empty if only the contact frame arrived, or if the name is not known.
         model: First 32 hexadecimal digits of the identity of the codebook that the decoder needs; empty for a codec
             without codebooks, whose models are part of the software.
-        picture_crc32: CRC-32 of the pixels that the vessel decoded (`data` of the picture of its
+        pixels_crc32: CRC-32 of the pixels that the vessel decoded (`data` of the pixels of its
             `reconstructed_image`). None if not known.
     """
 
@@ -161,7 +161,7 @@ class CodedImage(ReceivedImage):
 
     codec: Annotated[str, Field(max_length=40)]
     model: ModelId
-    picture_crc32: Crc32 | None = None
+    pixels_crc32: Crc32 | None = None
 
 
 class ImagePart(Record):
@@ -191,7 +191,7 @@ class ImagePart(Record):
         m: Ranges of the stream that have not arrived (`missing`).
         k: In a difference, the CRC-32 of the stream, zeros in the missing ranges, followed by the bytes of `c` of the
             whole image. None in a whole image.
-        x: CRC-32 of the decoded pixels (`picture_crc32`).
+        x: CRC-32 of the decoded pixels (`pixels_crc32`).
         f: Frames (`frames_received`).
         e: Planned length (`bytes_total`). None: `z`.
         y: Received bytes (`bytes_received`). None: `z` without the ranges `m`.
@@ -287,8 +287,8 @@ class ReconstructedImage(Record):
         contact: The contact as far as the acoustic link carries it. None if the contact frame has not arrived.
         codec: Name of the codec; empty if only the contact frame arrived.
         model: Identity of the codebook or model; empty if none was needed.
-        picture: The pixels; missing ones are black.
-        picture_sha256: Digest of the pixels (`data`): equal for the same image on every platform.
+        pixels: The pixels; missing ones are black.
+        pixels_sha256: Digest of the pixels (`data`): equal for the same image on every platform.
         complete: Everything arrived that the vehicle has planned to send so far, and no pixel is missing. A later
             version can have more bytes, for example after a request for more detail.
         missing_fraction: Fraction of the pixels that is missing.
@@ -316,8 +316,8 @@ class ReconstructedImage(Record):
     contact: Contact | None
     codec: Annotated[str, Field(max_length=40)]
     model: ModelHash
-    picture: Pixels
-    picture_sha256: Sha256
+    pixels: Pixels
+    pixels_sha256: Sha256
     complete: bool
     missing_fraction: Fraction
     missing_mask: bytes
@@ -331,27 +331,27 @@ class ReconstructedImage(Record):
     authenticated: bool | None = None
     despeckle_strength: Fraction | None = None
 
-    @field_validator("picture_sha256")
+    @field_validator("pixels_sha256")
     @classmethod
     def _check_digest(cls, sha256: str, info: ValidationInfo) -> str:
-        picture = info.data.get("picture")
-        if isinstance(picture, Pixels) and picture.sha256 != sha256:
-            raise ValueError(f"{picture.sha256}, the sha256 of the picture's bytes")
+        pixels = info.data.get("pixels")
+        if isinstance(pixels, Pixels) and pixels.sha256 != sha256:
+            raise ValueError(f"{pixels.sha256}, the sha256 of the pixels")
         return sha256
 
     @field_validator("missing_mask")
     @classmethod
     def _check_mask(cls, mask: bytes, info: ValidationInfo) -> bytes:
-        picture = info.data.get("picture")
-        if isinstance(picture, Pixels):
-            size = (picture.height_px * picture.width_px + 7) // 8
+        pixels = info.data.get("pixels")
+        if isinstance(pixels, Pixels):
+            size = (pixels.height_px * pixels.width_px + 7) // 8
             if len(mask) not in (0, size):
                 raise ValueError(f"0 or {size} bytes, not {len(mask)}")
         return mask
 
     def missing(self) -> npt.NDArray[np.bool_]:
         """Return the mask of missing pixels, shape (height_px, width_px)."""
-        shape = (self.picture.height_px, self.picture.width_px)
+        shape = (self.pixels.height_px, self.pixels.width_px)
         if not self.missing_mask:
             return np.zeros(shape, dtype=np.bool_)
         bits = np.unpackbits(np.frombuffer(self.missing_mask, dtype=np.uint8))

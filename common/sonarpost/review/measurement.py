@@ -169,7 +169,7 @@ def measure_line(image: ReconstructedImage, line: Line, beam_width_deg: float) -
         return {**_body(line, line.start, end, (True, True), length), **_height(contact, length)}
     # The line as it was drawn is checked first.
     measure_length(contact, missing, line.start, line.end)
-    places = snapped_ends(eight_bits(image.picture.to_array()), missing, line.start, line.end)
+    places = snapped_ends(eight_bits(image.pixels.to_array()), missing, line.start, line.end)
     found = (places[0] is not None, places[1] is not None)
     start, end = places[0] or line.start, places[1] or line.end
     sigmas_px = tuple(

@@ -98,6 +98,6 @@ def pixel_m(image: ReconstructedImage) -> float | None:
 
 def sharp_to_m(image: ReconstructedImage) -> float | None:
     """Return the smallest detail of an image in metres, along the axis with the larger pixels; None if unknown."""
-    width_px = detail_px(image.codec, image.bytes_received, image.picture.height_px * image.picture.width_px)
+    width_px = detail_px(image.codec, image.bytes_received, image.pixels.height_px * image.pixels.width_px)
     size_m = pixel_m(image)
     return None if width_px is None or size_m is None else width_px * size_m

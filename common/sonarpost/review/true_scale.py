@@ -38,7 +38,7 @@ _LINE_COLOURS: Final[Mapping[str, tuple[int, int, int]]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class PictureLine:
+class ImageLine:
     """A measured line.
 
     Attributes:
@@ -146,7 +146,7 @@ def bar_length_m(width_m: float) -> float:
     return next(step * power for step in (5, 2, 1) if step * power <= longest_m * (1 + 1e-9))
 
 
-def draw_lines(image: TrueImage, lines: Iterable[PictureLine] = (), mark: Point | None = None) -> Rgb:
+def draw_lines(image: TrueImage, lines: Iterable[ImageLine] = (), mark: Point | None = None) -> Rgb:
     """Draw measured lines with their values at the top, and the mark of the contact at the edges.
 
     Args:
@@ -157,11 +157,11 @@ def draw_lines(image: TrueImage, lines: Iterable[PictureLine] = (), mark: Point 
     Returns:
         Shape (height, width, 3).
     """
-    picture = Image.fromarray(image.pixels).convert("RGB")
-    draw = ImageDraw.Draw(picture)
-    size_px = _font_px(max(picture.size))
+    drawn = Image.fromarray(image.pixels).convert("RGB")
+    draw = ImageDraw.Draw(drawn)
+    size_px = _font_px(max(drawn.size))
     if mark is not None:
-        _draw_mark(draw, picture.size, _place(image, mark), size_px)
+        _draw_mark(draw, drawn.size, _place(image, mark), size_px)
     for number, line in enumerate(lines):
         colour = _LINE_COLOURS.get(line.kind, (255, 255, 255))
         ends = [_place(image, line.start), _place(image, line.end)]
@@ -171,7 +171,7 @@ def draw_lines(image: TrueImage, lines: Iterable[PictureLine] = (), mark: Point 
         # The values are at the top, where they do not hide the object; the colours tell the lines apart.
         top = 2 + round(1.3 * number * size_px)
         draw.text((3, top), line.text, colour, font=_font(size_px), stroke_width=2, stroke_fill=(0, 0, 0))
-    return np.asarray(picture)
+    return np.asarray(drawn)
 
 
 def scale_strip(

@@ -26,10 +26,10 @@ async fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
             text("image_id"),
             text("verdict")
         );
-        if let Some(pixels) = record["picture"]["data"].as_slice() {
+        if let Some(pixels) = record["pixels"]["data"].as_slice() {
             let (height, width) = (
-                &record["picture"]["height_px"],
-                &record["picture"]["width_px"],
+                &record["pixels"]["height_px"],
+                &record["pixels"]["width_px"],
             );
             println!(
                 "  {height} x {width} px, {} bytes, at {} {}",

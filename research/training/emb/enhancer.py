@@ -136,7 +136,7 @@ def main() -> None:  # noqa: PLR0915  a script
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=12000)
     parser.add_argument("--streams", type=int, default=3, help="streams of each image")
-    parser.add_argument("--pictures", type=int, default=3000)
+    parser.add_argument("--images", type=int, default=3000)
     parser.add_argument("--resume", action="store_true", help="start with the enhancer of --model")
     parser.add_argument("--rate", type=float, default=1.5e-3)
     parser.add_argument("--seed", type=int, default=SEED)
@@ -148,7 +148,7 @@ def main() -> None:  # noqa: PLR0915  a script
     codec = EmbCodec(parse(args.model.read_bytes()))
     started_s = time.time()
     sets = {}
-    for name, part in (("train", slice(-args.pictures, None)), ("check", slice(100))):
+    for name, part in (("train", slice(-args.images, None)), ("check", slice(100))):
         key = "tp80" if name == "train" else "vp80"
         # A pool of despeckled images holds the scenes themselves as well.
         source, truth = pool[key][part], pool[f"truth_{key}" if f"truth_{key}" in pool else key][part]

@@ -182,7 +182,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pool", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--pictures", type=int, default=1000)
+    parser.add_argument("--images", type=int, default=1000)
     parser.add_argument("--steps", type=int, default=5000)
     parser.add_argument(
         "--order", type=Path, help="model whose contexts order the coefficients, and whose enhancer is kept"
@@ -192,7 +192,7 @@ def main() -> None:
     pool = np.load(args.pool)
     started_s = time.time()
     order = parse(args.order.read_bytes()) if args.order else blank_model()
-    rows, sign_rows = listed(order, pool, args.pictures, rng)
+    rows, sign_rows = listed(order, pool, args.images, rng)
     print(f"listed {len(rows)} decisions, {len(sign_rows)} signs, {time.time() - started_s:.0f} s")
     nets, signs = trained_contexts(rows, args.steps, rng), trained_signs(sign_rows, args.steps // 5, rng)
     arrays = integers(nets, signs) | tables()

@@ -223,9 +223,9 @@ def _update_contact(db: sqlite3.Connection, contact_id: str, image: Reconstructe
         "updated_utc_s": now_utc_s,
         "complete": int(image.complete),
         "percent": percent_received(image),
-        "has_picture": int(bool(image.codec)),
-        "height_px": image.picture.height_px,
-        "width_px": image.picture.width_px,
+        "has_image": int(bool(image.codec)),
+        "height_px": image.pixels.height_px,
+        "width_px": image.pixels.width_px,
         "authenticated": None if image.authenticated is None else int(image.authenticated),
     }
     columns = ", ".join((*constant, *variable))

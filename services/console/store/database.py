@@ -62,7 +62,7 @@ CREATE TABLE IF NOT EXISTS contact (
     vehicle_lat_deg REAL, vehicle_lon_deg REAL, seen_utc_s REAL, first_frame_utc_s REAL NOT NULL,
     last_frame_utc_s REAL NOT NULL, arrived_utc_s REAL NOT NULL, updated_utc_s REAL NOT NULL,
     complete INTEGER NOT NULL, percent REAL NOT NULL, bytes_received INTEGER NOT NULL, bytes_total INTEGER NOT NULL,
-    codec TEXT NOT NULL, has_picture INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL,
+    codec TEXT NOT NULL, has_image INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL,
     group_id TEXT, authenticated INTEGER, despeckle_strength REAL, p_mine_like REAL, p_other_object REAL,
     parent TEXT, relation TEXT, sealed INTEGER NOT NULL DEFAULT 0, length_m REAL, width_m REAL, height_m REAL,
     heading_deg REAL,

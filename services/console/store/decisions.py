@@ -328,7 +328,7 @@ def _check_displayed_image(db: sqlite3.Connection, contact_id: str, displayed: D
     if row is None:
         raise BadInputError("decision", "version", displayed.version, "a version of this contact's image")
     image = decode_image(row)
-    if image.picture_sha256 != displayed.sha256:
+    if image.pixels_sha256 != displayed.sha256:
         raise BadInputError("decision", "sha256", displayed.sha256, f"that of version {displayed.version}")
     return image
 

@@ -11,7 +11,7 @@ from sonarpost.archive.image_files import side_car
 from sonarpost.export.contacts import ExportContact, SideCar
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review.measured_size import measured_size
-from sonarpost.review.true_scale import PictureLine
+from sonarpost.review.true_scale import ImageLine
 from sonarpost.services.console.store.contacts import find_version
 from sonarpost.services.console.store.measurements import list_measurements
 from sonarpost.services.console.store.serialisers import Json, decode_image
@@ -31,7 +31,7 @@ class StoredContact:
 
     contact: ExportContact
     image: ReconstructedImage
-    lines: tuple[PictureLine, ...]
+    lines: tuple[ImageLine, ...]
 
 
 def find_stored_contact(db: sqlite3.Connection, contact_id: str, version: int) -> StoredContact | None:
@@ -45,10 +45,10 @@ def find_stored_contact(db: sqlite3.Connection, contact_id: str, version: int) -
     decisions = tuple(wire.decode(Decision, bytes(row["payload"]), "decision") for row in rows)
     measurements, image = list_measurements(db, contact_id), decode_image(row)
     contact = ExportContact(SideCar.model_validate(side_car(image)), decisions, None, measured_size(measurements))
-    return StoredContact(contact, image, _picture_lines(measurements))
+    return StoredContact(contact, image, _image_lines(measurements))
 
 
-def _picture_lines(measurements: Iterable[Json]) -> tuple[PictureLine, ...]:
+def _image_lines(measurements: Iterable[Json]) -> tuple[ImageLine, ...]:
     """Return the measured lines to draw; withdrawn ones are excluded."""
     found = []
     for body in measurements:
@@ -59,5 +59,5 @@ def _picture_lines(measurements: Iterable[Json]) -> tuple[PictureLine, ...]:
         assert isinstance(start, list)
         assert isinstance(end, list)
         text = f"{_LETTERS.get(kind, kind)} {body['value_m']:.2f} ± {body['sigma_m']:.2f} m"
-        found.append(PictureLine(kind, (start[0], start[1]), (end[0], end[1]), text))
+        found.append(ImageLine(kind, (start[0], start[1]), (end[0], end[1]), text))
     return tuple(found)

@@ -96,7 +96,7 @@ def _look_json(db: sqlite3.Connection, look: Look) -> dict[str, Any]:
     names = ("heading_deg", "channel", "pixel_along_m", "pixel_across_m")
     return {
         "contact": contact_json(row),
-        "sha256": image.picture_sha256,
+        "sha256": image.pixels_sha256,
         "has_missing": image.missing_fraction > 0,
         "seen_utc_s": look.seen_utc_s,
         "aspect_deg": None if record is None else aspect_deg(record),

@@ -48,7 +48,7 @@ def relation_of(image: ReconstructedImage, parent: ReconstructedImage) -> Relati
     if is_same_size and parent.despeckle_strength and image.despeckle_strength == 0.0:
         return "original"
     (height_px, width_px), (whole_height_px, whole_width_px) = (
-        (each.picture.height_px, each.picture.width_px) for each in (image, parent)
+        (each.pixels.height_px, each.pixels.width_px) for each in (image, parent)
     )
     is_part = height_px <= whole_height_px and width_px <= whole_width_px
     if is_same_size and is_part and (height_px, width_px) != (whole_height_px, whole_width_px):
@@ -150,8 +150,8 @@ def _box_in_expanded(db: sqlite3.Connection, contact_id: str, expanded: Reconstr
     image = decode_image(newest)
     if not image.codec or not expanded.codec:
         return None
-    place = place_in_expanded(image.picture.to_array(), expanded.picture.to_array())
+    place = place_in_expanded(image.pixels.to_array(), expanded.pixels.to_array())
     if place is None:
         return None
-    height, width = (size // EXPAND_FACTOR for size in (image.picture.height_px, image.picture.width_px))
+    height, width = (size // EXPAND_FACTOR for size in (image.pixels.height_px, image.pixels.width_px))
     return [*place, place[0] + height, place[1] + width]

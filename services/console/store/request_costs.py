@@ -89,7 +89,7 @@ def costs_json(
 def _gain(kind: CommandKind, cost: RequestCost, image: ReconstructedImage) -> Mapping[str, float | None]:
     """Return the smallest detail of the image now and with the answer, in metres; None if unknown or not better."""
     now_m, size_m = sharp_to_m(image), pixel_m(image)
-    pixels = image.picture.height_px * image.picture.width_px * (_REGION_SHARE if kind == "region" else 1.0)
+    pixels = image.pixels.height_px * image.pixels.width_px * (_REGION_SHARE if kind == "region" else 1.0)
     width_px = None
     if kind in ("refine", "resend", "region") and cost.bytes_total:
         width_px = detail_px(image.codec, cost.bytes_total, round(pixels))

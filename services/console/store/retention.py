@@ -54,16 +54,16 @@ def remove_images(db: sqlite3.Connection, now_utc_s: float, retain_days: float, 
         except BadInputError:
             payload = b""  # it cannot be shown either
         db.execute("UPDATE version SET payload = ?, removed = 1 WHERE contact_id = ? AND version = ?", (payload, *key))
-        db.execute("UPDATE contact SET has_picture = 0 WHERE id = ? AND version = ?", key)
+        db.execute("UPDATE contact SET has_image = 0 WHERE id = ? AND version = ?", key)
     return len(selected)
 
 
 def without_pixels(image: ReconstructedImage) -> ReconstructedImage:
     """Return the record as if only the contact record had arrived."""
-    picture = Pixels.from_array(np.zeros((_SIDE_PX, _SIDE_PX), dtype=np.uint8))
+    black = Pixels.from_array(np.zeros((_SIDE_PX, _SIDE_PX), dtype=np.uint8))
     changes = {
-        "picture": picture,
-        "picture_sha256": picture.sha256,
+        "pixels": black,
+        "pixels_sha256": black.sha256,
         "codec": "",
         "model": "",
         "missing_mask": np.packbits(np.ones((_SIDE_PX, _SIDE_PX), dtype=np.bool_)).tobytes(),

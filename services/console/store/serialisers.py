@@ -83,12 +83,12 @@ def contact_json(row: sqlite3.Row) -> Json:
         "percent_received": row["percent"] if row["complete"] or row["bytes_total"] else None,
         "stage": stage_of(
             complete=bool(row["complete"]),
-            has_picture=bool(row["has_picture"]),
+            has_image=bool(row["has_image"]),
             bytes_received=row["bytes_received"],
             bytes_total=row["bytes_total"],
             refine_base=row["refine_base"],
         ),
-        "has_picture": bool(row["has_picture"]),
+        "has_image": bool(row["has_image"]),
         "looks": max(1, row["looks"]),
         "object": row["group_id"],
         "contradictory": bool(row["contradictory"]),
@@ -147,18 +147,18 @@ def audit_json(row: sqlite3.Row) -> Json:
 
 
 def stage_of(
-    *, complete: bool, has_picture: bool, bytes_received: int, bytes_total: int, refine_base: int | None
+    *, complete: bool, has_image: bool, bytes_received: int, bytes_total: int, refine_base: int | None
 ) -> Stage:
     """Return how far the transmission of an image has come.
 
     Args:
         complete: Everything arrived that the vehicle has planned to send so far.
-        has_picture: Whether a part of the image arrived.
+        has_image: Whether a part of the image arrived.
         bytes_received: Received bytes of the stream.
         bytes_total: Announced length of the stream; 0 if unknown.
         refine_base: Length of the stream at the first request for more detail; None without such a request.
     """
-    if not has_picture:
+    if not has_image:
         return "record"
     if not complete:
         return "part" if bytes_total else "preview"
@@ -206,18 +206,18 @@ def version_json(row: sqlite3.Row, rates: Mapping[int, RateInfo], refine_base: i
     image = decode_image(row)
     contact = image.contact
     has_codebook = image.codec in CODEBOOK_CODECS
-    pixels = image.picture.height_px * image.picture.width_px
+    pixels = image.pixels.height_px * image.pixels.width_px
     percent = percent_received(image) if image.complete or image.bytes_total else None
     return {
         **{name: getattr(image, name) for name in _VERSION_FIELDS.split()},
         "received_utc_s": row["received_utc_s"],
-        "height_px": image.picture.height_px,
-        "width_px": image.picture.width_px,
-        "sha256": image.picture_sha256,
+        "height_px": image.pixels.height_px,
+        "width_px": image.pixels.width_px,
+        "sha256": image.pixels_sha256,
         "percent_received": percent,
         "stage": stage_of(
             complete=image.complete,
-            has_picture=bool(image.codec),
+            has_image=bool(image.codec),
             bytes_received=image.bytes_received,
             bytes_total=image.bytes_total,
             refine_base=refine_base,
@@ -239,6 +239,6 @@ def version_json(row: sqlite3.Row, rates: Mapping[int, RateInfo], refine_base: i
 
 def _mark_json(image: ReconstructedImage) -> Json:
     """Return the place of the contact in an image, and the box that contains it; null where unknown."""
-    size = image.picture.height_px, image.picture.width_px
+    size = image.pixels.height_px, image.pixels.width_px
     mark, box = contact_mark(image.contact, *size), contact_box(image.contact, *size)
     return {"mark": None if mark is None else asdict(mark), "box": None if box is None else asdict(box)}

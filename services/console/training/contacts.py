@@ -131,7 +131,7 @@ class SimulatedContact:
     def record(self, vessel_id: str, index: int, first_utc_s: float, now_utc_s: float) -> ReconstructedImage:
         """Return the record of the version with an index, from 0."""
         received, total, frames, decoded = self.versions[index]
-        picture = Pixels.from_array(decoded.image)
+        pixels = Pixels.from_array(decoded.image)
         missing = decoded.missing
         return ReconstructedImage(
             vessel_id=vessel_id,
@@ -141,8 +141,8 @@ class SimulatedContact:
             contact=self.contact,
             codec=self.codec.name,
             model=self.codec.model_hash,
-            picture=picture,
-            picture_sha256=picture.sha256,
+            pixels=pixels,
+            pixels_sha256=pixels.sha256,
             complete=received == total and not missing.any(),
             missing_fraction=float(missing.mean()),
             missing_mask=np.packbits(missing).tobytes() if missing.any() else b"",

@@ -152,12 +152,12 @@ def next_version(
     stream = codec.encode(snippet, bytes_total)
     received = min(bytes_received, len(stream))
     decoded = codec.decode(stream[:received])
-    picture = Pixels.from_array(decoded.image)
+    pixels = Pixels.from_array(decoded.image)
     changes = {
         "version": version,
         "model": codec.model_hash,
-        "picture": picture,
-        "picture_sha256": picture.sha256,
+        "pixels": pixels,
+        "pixels_sha256": pixels.sha256,
         "complete": received == len(stream),
         "missing_mask": b"",
         "missing_fraction": 0.0,
@@ -205,7 +205,7 @@ def _object_at(truth: Sequence[TruthObject], detection: Detection) -> int | None
 
 def _snippet(simulated: SimulatedSurvey, detection: Detection, reference: ReconstructedImage) -> npt.NDArray[np.uint8]:
     """Return the pixels of a detection, cut and projected as the vehicle does."""
-    contact, size = reference.contact, (reference.picture.height_px, reference.picture.width_px)
+    contact, size = reference.contact, (reference.pixels.height_px, reference.pixels.width_px)
     assert contact is not None
     if contact.pixel_along_m is not None and contact.pixel_along_m == contact.pixel_across_m:
         ground = ground_projected_image(simulated.survey, detection, *size, contact.pixel_along_m)

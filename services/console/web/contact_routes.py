@@ -83,7 +83,7 @@ class ContactRoutes:
                 "/api/contacts", read(lambda call: JSONResponse(state.list_contacts(call.parse_query(ContactFilter))))
             ),
             Route(contact, read(lambda call: JSONResponse(state.contact_detail(contact_id(call))))),
-            Route(version + "/picture.png", read(self._image)),
+            Route(version + "/image.png", read(self._image)),
             Route(version + "/mask.png", read(self._mask)),
             Route(version + "/thumbnail.png", read(self._thumbnail)),
             write(contact + "/measure", self._measure, "measure"),
@@ -95,21 +95,21 @@ class ContactRoutes:
     # Images
 
     def _image(self, call: Call) -> Response:
-        return self._png_response(call, lambda image: rendering.eight_bits(image.picture.to_array()))
+        return self._png_response(call, lambda image: rendering.eight_bits(image.pixels.to_array()))
 
     def _mask(self, call: Call) -> Response:
         return self._png_response(call, lambda image: np.where(image.missing(), np.uint8(255), np.uint8(0)))
 
     def _thumbnail(self, call: Call) -> Response:
         def draw(image: ReconstructedImage) -> npt.NDArray[np.uint8]:
-            grey = rendering.eight_bits(image.picture.to_array())
+            grey = rendering.eight_bits(image.pixels.to_array())
             return true_scale.thumbnail(grey, image.missing(), image.contact)
 
         return self._png_response(call, draw)
 
     def _png_response(self, call: Call, draw: Callable[[ReconstructedImage], npt.NDArray[np.uint8]]) -> Response:
         image = self._state.image(contact_id(call), int(call.request.path_params["version"]))
-        headers = {"Cache-Control": "private, max-age=86400, immutable", "X-Image-SHA256": image.picture_sha256}
+        headers = {"Cache-Control": "private, max-age=86400, immutable", "X-Image-SHA256": image.pixels_sha256}
         return Response(rendering.encode_png(draw(image)), media_type="image/png", headers=headers)
 
     # Actions

@@ -301,14 +301,14 @@ class DocumentContacts:
         stored = self.stored(contact)
         if not stored.image.codec:
             return None
-        pixels = rendering.eight_bits(stored.image.picture.to_array())
+        pixels = rendering.eight_bits(stored.image.pixels.to_array())
         return ContactImage(pixels, stored.image.missing(), stored.lines)
 
     def png(self, contact: ExportContact) -> bytes | None:
         """Return the image of the last contact as PNG, as c2 stores it; None if it has none."""
         image = self.stored(contact).image
         # Without a codec only the contact record was received; its image is black.
-        return png_bytes(Path(contact.uid), image.picture.to_array()) if image.codec else None
+        return png_bytes(Path(contact.uid), image.pixels.to_array()) if image.codec else None
 
     def stored(self, contact: ExportContact) -> StoredContact:
         """Return the last contact as it is stored."""

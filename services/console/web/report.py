@@ -27,7 +27,7 @@ from sonarpost.review.true_scale import (
 from sonarpost.services.console.store.exports import StoredContact
 from sonarpost.services.console.store.serialisers import Json
 
-PICTURE_PX: Final = 900
+IMAGE_PX: Final = 900
 MAX_AUDIT_ROWS: Final = 12
 """Latest entries of the audit on a sheet; the console has all of them."""
 
@@ -104,9 +104,9 @@ def _sheet(given: ReportContact, now_utc_s: float, *, training: bool) -> str:
 def _figure(given: ReportContact) -> str:
     """Return the image in true metres with its caption."""
     image, record = given.stored.image, given.stored.image.contact
-    grey, missing = rendering.eight_bits(image.picture.to_array()), image.missing()
-    scaled = true_image(grey, missing, *pixel_size_m(record), PICTURE_PX)
-    strip = scale_strip(scaled.pixels.shape[1], PICTURE_PX, scaled.px_per_m, north_in_image(record))
+    grey, missing = rendering.eight_bits(image.pixels.to_array()), image.missing()
+    scaled = true_image(grey, missing, *pixel_size_m(record), IMAGE_PX)
+    strip = scale_strip(scaled.pixels.shape[1], IMAGE_PX, scaled.px_per_m, north_in_image(record))
     mark = contact_mark(record, *grey.shape)
     place = None if mark is None else (mark.row, mark.column)
     png = rendering.encode_png(np.vstack([draw_lines(scaled, given.stored.lines, place), strip]))
@@ -215,7 +215,7 @@ def _integrity_text(given: ReportContact) -> str:
     detail = "" if sharp_to_m is None else f" Detail below about {sharp_to_m:.2g} m is not in it."
     return (
         f"Decoded from {image.bytes_received} bytes, {complete}. The compression is lossy.{detail} Apart from the gain"
-        f" and the resampling to square pixels nothing was changed. SHA-256 of the pixels: {image.picture_sha256}"
+        f" and the resampling to square pixels nothing was changed. SHA-256 of the pixels: {image.pixels_sha256}"
     )
 
 
@@ -227,10 +227,10 @@ def _despeckling_text(strength: float | None) -> str:
 
 def _scale_text(image: ReconstructedImage) -> str:
     along_m, across_m = pixel_size_m(image.contact)
-    size = f"{image.picture.width_px} × {image.picture.height_px} px as received"
+    size = f"{image.pixels.width_px} × {image.pixels.height_px} px as received"
     if along_m is None or across_m is None:
         return f"scale unknown; {size}"
-    length_m, width_m = image.picture.height_px * along_m, image.picture.width_px * across_m
+    length_m, width_m = image.pixels.height_px * along_m, image.pixels.width_px * across_m
     return f"{length_m:.1f} m along × {width_m:.1f} m across the track, true to scale; {size}"
 
 

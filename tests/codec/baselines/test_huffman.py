@@ -31,7 +31,7 @@ def test_golden_streams_are_reproduced_and_decoded(name: str) -> None:
     size, budget = name.split("-")
     golden = bytes.fromhex((GOLDEN / f"{name}.hex").read_text())
     decoded = HuffmanCodec().decode(golden)
-    expected = np.frombuffer(bytes.fromhex((GOLDEN / f"{name}-picture.hex").read_text()), np.uint8)
+    expected = np.frombuffer(bytes.fromhex((GOLDEN / f"{name}-image.hex").read_text()), np.uint8)
     scale = golden[StreamHeader.unpack(golden).size] + 1
     # Pillow enlarges a reduced image; its rounding may differ between versions.
     assert np.abs(decoded.image.ravel().astype(int) - expected).max() <= (0 if scale == 32 else 1)

@@ -32,7 +32,7 @@ def body(stream: bytes) -> bytes:
 )
 def test_golden_streams_are_decoded(name: str) -> None:
     stream = bytes.fromhex((GOLDEN / f"{name}.hex").read_text())
-    expected = np.frombuffer(bytes.fromhex((GOLDEN / f"{name}-picture.hex").read_text()), np.uint8)
+    expected = np.frombuffer(bytes.fromhex((GOLDEN / f"{name}-image.hex").read_text()), np.uint8)
     decoded = (RAW if name.startswith("raw") else PACKETS).decode(stream)
     # OpenJPEG's inverse 9/7 is floating point: another build may round a sample to its neighbour.
     assert np.abs(decoded.image.ravel().astype(int) - expected).max() <= 1

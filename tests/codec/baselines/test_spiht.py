@@ -27,7 +27,7 @@ def test_golden_streams_are_reproduced_and_decoded(name: str) -> None:
     stream = codec.encode(snippet(*map(int, size.split("x"))), None if budget == "None" else int(budget))
     assert stream.hex() == golden.hex()
     decoded = codec.decode(golden)
-    assert decoded.image.tobytes().hex() == (GOLDEN / f"{name}-picture.hex").read_text().strip()
+    assert decoded.image.tobytes().hex() == (GOLDEN / f"{name}-image.hex").read_text().strip()
     assert not decoded.missing.any()
 
 

@@ -43,7 +43,7 @@ def body(stream: bytes) -> bytes:
 
 
 def golden_names(image_format: StillImageFormat) -> list[str]:
-    return sorted(path.stem for path in GOLDEN.glob(f"{image_format.value}-*.hex") if not path.stem.endswith("picture"))
+    return sorted(path.stem for path in GOLDEN.glob(f"{image_format.value}-*.hex") if not path.stem.endswith("image"))
 
 
 @EACH_FORMAT
@@ -52,7 +52,7 @@ def test_golden_streams_are_decoded(image_format: StillImageFormat) -> None:
     assert len(names) == 3
     for name in names:
         stream = bytes.fromhex((GOLDEN / f"{name}.hex").read_text())
-        expected = np.frombuffer(bytes.fromhex((GOLDEN / f"{name}-picture.hex").read_text()), np.uint8)
+        expected = np.frombuffer(bytes.fromhex((GOLDEN / f"{name}-image.hex").read_text()), np.uint8)
         decoded = StillImageCodec(image_format).decode(stream)
         # WebP and AVIF are exact but converted to grey through RGB; JPEG XL is floating point.
         assert np.abs(decoded.image.ravel().astype(int) - expected).max() <= 2

@@ -52,7 +52,7 @@ def test_golden_streams_are_reproduced_and_decoded(tiles: TileDatabase, packing:
         assert len(header) == (4 if name == "80x80" else 7)
         assert header[:3] == bytes([packing.codec_id]) + bytes.fromhex(tiles.identity[:4])
         decoded = codec.decode(golden)
-        assert decoded.image.tobytes() == bytes.fromhex((GOLDEN / f"{name}-picture.hex").read_text())
+        assert decoded.image.tobytes() == bytes.fromhex((GOLDEN / f"{name}-image.hex").read_text())
         assert decoded.image.shape == (height_px, width_px)
         assert not decoded.missing.any()
         assert decoded.notes == ()

@@ -42,8 +42,8 @@ def test_an_object_is_one_contact_at_any_file_boundary(boundary, wait_s, tmp_pat
     assert len({s.contact.contact_id for s in sent}) == len(sent)
     if wait_s:
         # It waited for the continuation file: the object is in the middle of a complete image.
-        assert snippet.picture.height_px == 80
-        bright = snippet.picture.to_array().astype(float)
+        assert snippet.pixels.height_px == 80
+        bright = snippet.pixels.to_array().astype(float)
         rows = bright[:, 67:73].mean(axis=1)
         assert rows[36:44].mean() < 0.2 * np.r_[rows[:20], rows[-20:]].mean()
     number = 0 if snippet.contact.ping_number < boundary else 1
@@ -222,7 +222,7 @@ def test_a_contact_at_the_boundary_waits_for_the_continuation_file_and_is_sent_o
     gauges = lambda: service.health().gauges  # noqa: E731
     eventually(lambda: gauges()["contacts_waiting"] == gauges()["contacts_held"] and gauges()["outbox"] == 0)
     [snippet] = near(compressor.received, 120)
-    assert snippet.picture.height_px == 80
+    assert snippet.pixels.height_px == 80
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def test_contacts_of_a_survey_are_sent_most_confident_first(
             detection.side.value,
         )
         assert (contact.lat_deg, contact.lon_deg) == (detection.position.lat_deg, detection.position.lon_deg)
-        assert (snippet.picture.height_px, snippet.picture.width_px, snippet.source) == (80, 140, "line.xtf")
+        assert (snippet.pixels.height_px, snippet.pixels.width_px, snippet.source) == (80, 140, "line.xtf")
     assert len({s.contact.contact_id for s in compressor.received}) == 3
     health = service.health()
     assert (health.state, health.counters) == ("ok", {"files_processed": 1, "contacts_detected": 3})
@@ -221,13 +221,13 @@ def test_image_files_are_sent_unchanged_if_they_fit(start_service, compressor, p
     start_service(mode="snippets")
     eventually(lambda: len(compressor.received) == 3)
     found = {snippet.source: snippet for snippet in compressor.received}
-    assert found["large.tiff"].picture.to_array().shape == (512, 200)
+    assert found["large.tiff"].pixels.to_array().shape == (512, 200)
     eventually(lambda: lines("Image file warning"))
     assert lines("Image file warning")[-1]["warning"] == "400 × 1024 px resized to 200 × 512 px"
     for name, pixels in images.items():
         snippet = found[name]
-        assert snippet.picture.bits == 8 * pixels.dtype.itemsize
-        np.testing.assert_array_equal(snippet.picture.to_array(), pixels)
+        assert snippet.pixels.bits == 8 * pixels.dtype.itemsize
+        np.testing.assert_array_equal(snippet.pixels.to_array(), pixels)
         assert snippet.contact.contact_id.startswith(Path(name).stem + "-")
         assert snippet.contact.atd_confidence is None, "no confidence is invented"
         assert snippet.wide is None, "nothing is known of the seabed around"

@@ -25,7 +25,7 @@ def test_picks_are_sent_once_and_invalid_lines_reported(start_service, compresso
     (snippet,) = compressor.received
     assert (snippet.contact.ping_number, snippet.contact.channel) == (first + 5, "port")
     assert (snippet.contact.atd_class, snippet.contact.atd_confidence, snippet.source) == (PICKED, None, "line.xtf")
-    assert (snippet.picture.height_px, snippet.picture.width_px) == (80, 140)
+    assert (snippet.pixels.height_px, snippet.pixels.width_px) == (80, 140)
     eventually(lambda: counter(service, "picks_ignored") == 2)
     put_file(picks_path(survey).name, (text + f"{first + 9},starboard,4\n").encode())
     eventually(lambda: len(compressor.received) == 2, what="the new pick alone")
@@ -40,7 +40,7 @@ def test_picks_are_sent_once_and_invalid_lines_reported(start_service, compresso
 
 def snippet_of(contact_id, confidence):
     contact = Contact(contact_id=contact_id, vehicle_id="uuv-1", atd_confidence=confidence)
-    return Snippet(contact=contact, picture=Pixels(data=b"\0" * 256, height_px=16, width_px=16, bits=8), source="a")
+    return Snippet(contact=contact, pixels=Pixels(data=b"\0" * 256, height_px=16, width_px=16, bits=8), source="a")
 
 
 def test_picks_are_released_before_all_others_and_replace_those_that_wait(tmp_path):

@@ -135,7 +135,7 @@ def test_limit_0_gives_unlimited_credit():
 
 def snippet(name, confidence):
     image = Pixels.from_array(np.full((16, 16), 7, np.uint8))
-    return Snippet(contact=Contact(contact_id=name, vehicle_id="uuv-1", atd_confidence=confidence), picture=image)
+    return Snippet(contact=Contact(contact_id=name, vehicle_id="uuv-1", atd_confidence=confidence), pixels=image)
 
 
 def commit(store, effects):

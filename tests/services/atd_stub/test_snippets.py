@@ -216,7 +216,7 @@ def test_the_expanded_image_shows_twice_the_ground(pixel_m, detection):
     config = AtdStubConfig(snippet_height_px=60, snippet_width_px=60, snippet_pixel_m=pixel_m)
     record = snippet_of(survey, contact_at(survey, 150, 12.0, detection), ORIGIN, "uuv-1", config)
     sizes = []
-    for raster in (record.picture, record.wide):
+    for raster in (record.pixels, record.wide):
         bright = np.argwhere(raster.to_array() > 128)
         sizes.append(bright.max(axis=0) + 1 - bright.min(axis=0))
     assert (record.wide.height_px, record.wide.width_px) == (60, 60)
@@ -256,7 +256,7 @@ def test_the_record_has_the_pixel_size_of_its_image(line):
     config = AtdStubConfig(snippet_pixel_m=0.05, snippet_height_px=64, snippet_width_px=96)
     sent = snippet_of(survey, found, ORIGIN, "uuv-1", config)
     assert (sent.contact.pixel_along_m, sent.contact.pixel_across_m) == (0.05, 0.05)
-    assert (sent.picture.height_px, sent.picture.width_px) == (64, 96)
+    assert (sent.pixels.height_px, sent.pixels.width_px) == (64, 96)
     assert (native.pixel_along_m, native.pixel_across_m) == (found.pixel_along_m, found.pixel_across_m)
 
 
@@ -310,7 +310,7 @@ def test_errors_name_the_invalid_line_or_field_of_a_text_file(text, expected, tm
 def test_the_file_name_of_a_snippet_is_its_contact_id_without_path_separators(tmp_path):
     image = np.arange(400, dtype=np.uint8).reshape(20, 20)
     contact = Contact(contact_id="../a b/ü", vehicle_id="uuv-1", lat_deg=1.0)
-    tiff = write_snippet(tmp_path / "new" / "out", Snippet(contact=contact, picture=Pixels.from_array(image)))
+    tiff = write_snippet(tmp_path / "new" / "out", Snippet(contact=contact, pixels=Pixels.from_array(image)))
     assert tiff.parent == tmp_path / "new" / "out"
     np.testing.assert_array_equal(read_image(tiff), image)
     assert read_side_car(tiff.with_suffix(".txt"), "x", "uuv-1").contact == contact
@@ -323,7 +323,7 @@ def test_a_large_colour_image_is_fitted_and_its_pixel_size_corrected(fit, shape,
     (tmp_path / "p.txt").write_text("lat_deg: 56.4\nlon_deg: -5.6\npixel_along_m: 0.1\npixel_across_m: 0.05\nby: me\n")
     file = read_snippet(tmp_path / "p.jpg", "ab" * 32, "uuv-1", fit)
     contact = file.snippet.contact
-    assert file.snippet.picture.to_array().shape == shape
+    assert file.snippet.pixels.to_array().shape == shape
     assert (contact.lat_deg, contact.lon_deg) == (56.4, -5.6)
     assert contact.pixel_along_m == pytest.approx(0.1 * scale)
     assert contact.pixel_across_m == pytest.approx(0.05 * scale)
@@ -356,7 +356,7 @@ def test_stored_snippets_can_be_sent_again_with_their_positions(start_service, r
     eventually(lambda: len(compressor.received) == 4)
     for again in compressor.received[2:]:
         before = first[again.contact.contact_id]
-        assert again.picture == before.picture
+        assert again.pixels == before.pixels
         assert again.contact.model_copy(update={"time_utc_s": 0.0}) == before.contact.model_copy(
             update={"time_utc_s": 0.0}
         )

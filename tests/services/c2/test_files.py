@@ -178,8 +178,8 @@ def test_retention_removes_old_images_below_the_size_limit():
     st.none() | st.floats(0.001, 20),
     st.none() | st.integers(0, 5000),
 )
-def test_retention_keeps_the_limits_and_removes_no_more_than_needed(pictures, days, limit):
-    rows = [row(str(n), START_S + at, size, 1.0 if done else None) for n, (at, size, done) in enumerate(pictures)]
+def test_retention_keeps_the_limits_and_removes_no_more_than_needed(images, days, limit):
+    rows = [row(str(n), START_S + at, size, 1.0 if done else None) for n, (at, size, done) in enumerate(images)]
     now_utc_s = max((r.accepted_utc_s for r in rows), default=START_S)
     removed = select_images(rows, (), now_utc_s + 1e6, days, limit)
     assert removed == select_images(rows, (), now_utc_s, days, limit)
@@ -233,7 +233,7 @@ def test_service_removes_counts_and_logs(begin, relay, out, caplog):
     service = begin(max_bytes=0)
     relay.send(INBOX, "c2", relayed(image()))
     eventually(lambda: service.health().counters.get("images_removed") == 1)
-    assert service.health().gauges["pictures_bytes"] == 0
+    assert service.health().gauges["images_bytes"] == 0
     assert list(out.glob("*/*.tiff")) == []
     assert "Image removed by retention" in [record.message for record in caplog.records]
 

@@ -224,7 +224,7 @@ INVALID = [
     ("after=5", "after", "the `next` of an earlier page"),
     ("after=00000000.5", "after", "a cursor of "),
     ("format=xml", "format", "msgpack or json"),
-    ("picture=png", "picture", "raw, unless format is json"),
+    ("pixels=png", "pixels", "raw, unless format is json"),
     ("_time=yesterday", "_time", "[START..END["),
     ("_time=[2023-11-14T22:13:20..]", "_time", "[START..END["),
     ("_time=[now(99999999999999w)..]", "_time", "[START..END["),
@@ -302,10 +302,10 @@ def test_records_of_an_earlier_version_are_numbered_from_their_files(begin, runn
 def test_image_whose_missing_pixels_are_ambiguous_is_not_guessed(begin, runner, out, caplog):
     shore = begin()
     ambiguous = partial_image("0001")
-    pixels = ambiguous.picture.to_array()
+    pixels = ambiguous.pixels.to_array()
     pixels[3, 0] = 0  # received, black, in a row with missing pixels
-    picture = Pixels.from_array(pixels)
-    shore.accept(ambiguous.model_copy(update={"picture": picture, "picture_sha256": picture.sha256}), image("0002"))
+    packed = Pixels.from_array(pixels)
+    shore.accept(ambiguous.model_copy(update={"pixels": packed, "pixels_sha256": packed.sha256}), image("0002"))
     assert shore.names(CONTACTS) == ["0001.1", "0002.1"]
     runner.stop(shore.service)
     for path in out.glob("journal.db*"):
@@ -349,21 +349,21 @@ def test_json_has_the_same_fields_and_bytes_as_base64(shore):
     named = shown.pop("accepted")
     assert named["seq"] == 1
     assert f"{named['archive']}.2" == page["next"]
-    shown["picture"]["data"] = base64.b64decode(shown["picture"]["data"])
+    shown["pixels"]["data"] = base64.b64decode(shown["pixels"]["data"])
     shown["missing_mask"] = base64.b64decode(shown["missing_mask"])
     assert shown == msgpack.unpackb(wire.encode(sent))
 
 
-def test_json_pictures(shore):
+def test_json_images(shore):
     pixels = np.array([[0, 256, 65535]], np.uint16)
-    picture = Pixels.from_array(pixels)
-    shore.accept(reconstructed_image(picture, picture_sha256=picture.sha256))
-    [shown], _ = json_replies(shore, "picture=png")
-    assert sorted(shown["picture"]) == ["bits", "height_px", "png", "width_px"]
-    read = np.asarray(Image.open(io.BytesIO(base64.b64decode(shown["picture"]["png"]))))
+    packed = Pixels.from_array(pixels)
+    shore.accept(reconstructed_image(packed, pixels_sha256=packed.sha256))
+    [shown], _ = json_replies(shore, "pixels=png")
+    assert sorted(shown["pixels"]) == ["bits", "height_px", "png", "width_px"]
+    read = np.asarray(Image.open(io.BytesIO(base64.b64decode(shown["pixels"]["png"]))))
     np.testing.assert_array_equal(read, pixels)
-    [shown], _ = json_replies(shore, "picture=none")
-    assert shown["picture"] == {"bits": 16, "height_px": 1, "width_px": 3}
+    [shown], _ = json_replies(shore, "pixels=none")
+    assert shown["pixels"] == {"bits": 16, "height_px": 1, "width_px": 3}
 
 
 def test_json_mirror(begin, watch):

@@ -22,11 +22,11 @@ from sonarpost.sonar.image_files import read_image
 @pytest.fixture
 def image(texture):
     def make(image_id="AAAA", vessel="vessel-1", seed=1):
-        picture = Pixels.from_array(texture(seed=seed))
+        pixels = Pixels.from_array(texture(seed=seed))
         missing = np.zeros((40, 60), dtype=np.bool_)
         missing[30:, :] = True
         return reconstructed_image(
-            picture,
+            pixels,
             vessel_id=vessel,
             image_id=image_id,
             contact=Contact(contact_id="uuv-1/AAAA", vehicle_id="uuv-1", lat_deg=56.4, lon_deg=-5.6),
@@ -59,16 +59,16 @@ def test_image_is_stored_and_published_as_plain_msgpack(begin, relay, image, out
     eventually(lambda: len(seen) == 1)
     shown = msgpack.unpackb(seen[0].payload.to_bytes())
     assert (shown["type"], shown["image_id"], shown["contact"]["lat_deg"]) == ("reconstructed_image", "AAAA", 56.4)
-    picture = shown["picture"]
-    pixels = np.frombuffer(picture["data"], np.uint8).reshape(picture["height_px"], picture["width_px"])
-    assert hashlib.sha256(pixels.tobytes()).hexdigest() == shown["picture_sha256"]
+    shown_pixels = shown["pixels"]
+    pixels = np.frombuffer(shown_pixels["data"], np.uint8).reshape(shown_pixels["height_px"], shown_pixels["width_px"])
+    assert hashlib.sha256(pixels.tobytes()).hexdigest() == shown["pixels_sha256"]
     assert str(seen[0].encoding) == "application/msgpack;schema=sonarpost.reconstructed_image.v1"
     name = "uuv-1_20231114T221320Z_AAAA_v1"
     assert files(out) == [f"vessel-1/{name}.{kind}" for kind in ("json", "png", "tiff")]
     np.testing.assert_array_equal(read_image(out / "vessel-1" / f"{name}.tiff"), pixels)
     side = json.loads((out / "vessel-1" / f"{name}.json").read_text())
-    assert (side["picture_sha256"], side["missing_pixels"], side["missing_rows"]) == (
-        sent.picture_sha256,
+    assert (side["pixels_sha256"], side["missing_pixels"], side["missing_rows"]) == (
+        sent.pixels_sha256,
         600,
         [30, 40],
     )
@@ -90,13 +90,13 @@ def test_decision_is_stored_and_published(begin, relay, out, watch):
 
 
 def test_repeated_record_changes_no_file_and_is_published_again(begin, relay, image, out, watch):
-    pictures, decisions = watch(keys.shore_image("vessel-1")), watch(keys.shore_decision("vessel-1"))
+    images, decisions = watch(keys.shore_image("vessel-1")), watch(keys.shore_decision("vessel-1"))
     service = begin()
     send(relay, image(), decision_record())
     eventually(lambda: len(decisions) == 1)
     before = {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in out.rglob("*.[!d]*") if p.is_file()}
     send(relay, image(), decision_record())
-    eventually(lambda: (len(pictures), len(decisions)) == (2, 2))
+    eventually(lambda: (len(images), len(decisions)) == (2, 2))
     assert before == {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in out.rglob("*.[!d]*") if p.is_file()}
     eventually(lambda: service.health().counters.get("records_handled") == 4)
     counters = service.health().counters
@@ -172,7 +172,7 @@ def test_vessels_have_separate_folders(begin, runner, relay, image, out):
     eventually(lambda: len(list(out.rglob("*.json"))) == 4)
     one, two = (json.loads(next((out / v).glob("*.json")).read_text()) for v in ("vessel-1", "vessel-2"))
     assert (one["vessel_id"], two["vessel_id"]) == ("vessel-1", "vessel-2")
-    assert one["picture_sha256"] != two["picture_sha256"]
+    assert one["pixels_sha256"] != two["pixels_sha256"]
 
 
 def test_record_committed_before_a_stop_is_handled_after_the_restart(begin, runner, platform, relay, image, out, watch):

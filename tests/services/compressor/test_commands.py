@@ -36,7 +36,7 @@ def test_refine_doubles_the_stream_and_continues_it(budget_bytes, start_service,
         assert longer.stream.startswith(shorter.stream)
         assert len(longer.stream) >= 1.9 * len(shorter.stream)
     eventually(lambda: service.health().counters.get("images_refined") == 3)
-    original = sent.picture.to_array().astype(float)
+    original = sent.pixels.to_array().astype(float)
     errors = [float(((emb.decode(image.stream).image - original) ** 2).mean()) for image in images]
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 0.8 * errors[0]
@@ -69,7 +69,7 @@ def test_region_is_an_image_of_its_own_with_all_bytes(start_service, encoded, an
     sent = snippet("c1")
     [first] = encoded(sent)
     region = answer("region", first.image_id, box=(8, 16, 24, 32), stream_bytes=96)
-    pixels = sent.picture.to_array()
+    pixels = sent.pixels.to_array()
     height, width = pixels.shape
     inside = pixels[height // 4 : height * 3 // 4, width // 2 :]
     assert (region.height_px, region.width_px) == inside.shape

@@ -21,7 +21,7 @@ def strength_of(image):
 
 def expected_stream(snippet, strength):
     codec = EmbCodec(strength=strength)
-    return transmit_part(codec, encode(codec, snippet.picture.to_array(), BUDGET_BYTES, 0))
+    return transmit_part(codec, encode(codec, snippet.pixels.to_array(), BUDGET_BYTES, 0))
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.25, None])
@@ -110,9 +110,9 @@ def test_original_of_an_original_image_and_of_an_unknown_image_are_counted(
 
 def test_an_expanded_image_is_despeckled_and_its_original_can_be_requested(start_service, encoded, answer, snippet):
     start_service(**EMB)
-    wide = snippet("wide", 64, 64, seed=9).picture
+    wide = snippet("wide", 64, 64, seed=9).pixels
     contact = Contact(contact_id="c1", vehicle_id="uuv-1", pixel_along_m=0.05, pixel_across_m=0.1)
-    [first] = encoded(Snippet(contact=contact, picture=snippet("c1", 64, 64).picture, wide=wide))
+    [first] = encoded(Snippet(contact=contact, pixels=snippet("c1", 64, 64).pixels, wide=wide))
     expanded = answer("expand", first.image_id)
     original = answer("original", expanded.image_id)
     assert original.original_sha256 == expanded.original_sha256 == wide.sha256

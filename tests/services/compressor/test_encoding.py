@@ -31,8 +31,8 @@ def test_a_snippet_is_encoded_with_its_contact(start_service, atd, modem, snippe
     image = modem.received[0]
     assert image.contact == sent.contact
     assert (image.vehicle_id, image.codec, image.model) == ("uuv-1", "vq", vq.model_hash)
-    assert (image.height_px, image.width_px, image.original_sha256) == (40, 60, sent.picture.sha256)
-    assert image.stream == vq.encode(sent.picture.to_array())
+    assert (image.height_px, image.width_px, image.original_sha256) == (40, 60, sent.pixels.sha256)
+    assert image.stream == vq.encode(sent.pixels.to_array())
     assert is_image_id(image.image_id)
     eventually(lambda: atd.store.outbox_depth() == 0)
     # The header, and 14 bits for each tile of 10 x 10 px.
@@ -46,10 +46,10 @@ def test_a_snippet_is_encoded_with_its_contact(start_service, atd, modem, snippe
 def test_16_bit_images_are_mapped_over_their_own_range(start_service, encoded, snippet, vq):
     start_service()
     deep = snippet("deep", dtype=np.uint16)
-    assert deep.picture.bits == 16
+    assert deep.pixels.bits == 16
     [image] = encoded(deep)
-    assert image.stream == vq.encode(to_uint8(deep.picture.to_array()))
-    assert image.original_sha256 == deep.picture.sha256
+    assert image.stream == vq.encode(to_uint8(deep.pixels.to_array()))
+    assert image.original_sha256 == deep.pixels.sha256
 
 
 def test_a_snippet_of_invalid_size_is_quarantined(start_service, atd, modem, snippet, refused):
@@ -83,7 +83,7 @@ def test_malformed_snippets_are_refused_and_the_next_one_is_encoded(start_servic
         msgpack.packb(list(fields)),
         msgpack.packb(fields | {"v": 2}),
         msgpack.packb(fields | {"type": "decision"}),
-        msgpack.packb(fields | {"picture": fields["picture"] | {"data": b"short"}}),
+        msgpack.packb(fields | {"pixels": fields["pixels"] | {"data": b"short"}}),
     ]
     for payload in bad:
         atd.send_bytes(IN, "compressor", payload)

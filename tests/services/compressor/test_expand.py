@@ -24,8 +24,8 @@ def expandable_snippet(snippet):
     def make(contact_id, seed=1, **changes):
         sizes = {"pixel_along_m": 0.05, "pixel_across_m": 0.1}
         contact = Contact(contact_id=contact_id, vehicle_id="uuv-1", **(sizes | changes))
-        wide = snippet("expanded", seed=seed + 100).picture
-        return Snippet(contact=contact, picture=snippet(contact_id, seed=seed).picture, source="line", wide=wide)
+        wide = snippet("expanded", seed=seed + 100).pixels
+        return Snippet(contact=contact, pixels=snippet(contact_id, seed=seed).pixels, source="line", wide=wide)
 
     return make
 

@@ -244,7 +244,7 @@ def test_observer_has_no_decision_to_undo_or_acknowledge(console, clock):
 
 def test_image_response_has_the_digest_that_a_decision_states(console, clock):
     anna = console.browser("anna")
-    path = f"/api/contacts/{ID}/versions/1/picture.png"
+    path = f"/api/contacts/{ID}/versions/1/image.png"
     for layer in ("raw", "expand"):
         digest = anna.get(path, layer=layer).headers["X-Image-SHA256"]
         assert digest == anna.contact(ID)["versions"][0]["sha256"]

@@ -54,9 +54,9 @@ def test_exports_contain_the_filtered_contacts(console):
         assert any(name.endswith(".png") for name in archive.namelist())
     with sqlite3.connect(":memory:") as db:
         db.deserialize(anna.get("/api/export/contacts.gpkg").content)
-        rows = db.execute("SELECT name, review, geom IS NULL, picture FROM contacts ORDER BY fid").fetchall()
+        rows = db.execute("SELECT name, review, geom IS NULL, image FROM contacts ORDER BY fid").fetchall()
     assert [row[:3] for row in rows] == [("uuv-1/0001", "mine_like", 0), ("uuv-2/0002", "unreviewed", 1)]
-    assert np.array_equal(Image.open(io.BytesIO(rows[0][3])), image_record("0001").picture.to_array())
+    assert np.array_equal(Image.open(io.BytesIO(rows[0][3])), image_record("0001").pixels.to_array())
     events = ET.fromstring(anna.get("/api/export/contacts.cot.xml").content)
     assert (events.tag, [child.tag for child in events]) == ("events", ["event"])
     assert anna.get("/api/export/contacts.exe").status_code == 404

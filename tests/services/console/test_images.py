@@ -38,8 +38,8 @@ def pixels_of(answer) -> np.ndarray:
 
 
 def test_image_equals_the_received_pixels(anna):
-    answer = anna.get(f"{VERSION}/picture.png")
-    assert (pixels_of(answer) == image_record(missing_rows=10).picture.to_array()).all()
+    answer = anna.get(f"{VERSION}/image.png")
+    assert (pixels_of(answer) == image_record(missing_rows=10).pixels.to_array()).all()
     assert "immutable" in answer.headers["cache-control"]
     # Sixteen bits become the most significant eight.
     assert rendering.eight_bits(np.array([[0, 255, 256, 65535]], np.uint16)).tolist() == [[0, 0, 1, 255]]
@@ -83,8 +83,8 @@ def test_ends_move_to_half_brightness_and_beam_and_blur_are_subtracted(make_cons
     pixels = np.full((40, 60), 60, np.uint8)
     pixels[10:26, 20:26] = 200
     console = make_console(beam_width_deg=0.5)
-    picture = Pixels.from_array(pixels)
-    console.state.store_image(image.model_copy(update={"picture": picture, "picture_sha256": picture.sha256}))
+    packed = Pixels.from_array(pixels)
+    console.state.store_image(image.model_copy(update={"pixels": packed, "pixels_sha256": packed.sha256}))
     anna = console.browser("anna")
     found = measure(anna, kind="length", **{"from": [7.5, 23.0], "to": [27.0, 23.0]}).json()
     # The middle of the last dark and the first bright row.

@@ -232,7 +232,7 @@ def test_watch_adds_a_sealed_contact_of_the_kind_of_the_vehicles(console, short_
     [added] = set(contact_ids(console.state)) - {"00A7"}
     rows = {row["image_id"]: row for row in console.state.list_contacts(ContactFilter())["items"]}
     record = console.state.image(str(rows[added]["id"]), 1)
-    assert (record.picture.height_px, record.picture.width_px) == (40, 60)
+    assert (record.pixels.height_px, record.pixels.width_px) == (40, 60)
     assert (record.bytes_received, record.complete, record.vehicle_id) == (120, True, "uuv-1")
     assert record.notes == ()
     assert record.contact is not None

@@ -101,7 +101,7 @@ def test_answer_to_a_request_is_a_layer_of_its_contact(kind, console):
     detail = watch.contact(ID)
     [layer] = detail["related"]
     assert (layer["relation"], [one["version"] for one in layer["versions"]]) == (kind, [1, 2])
-    assert watch.get(f"/api/contacts/{layer['id']}/versions/2/picture.png").status_code == 200
+    assert watch.get(f"/api/contacts/{layer['id']}/versions/2/image.png").status_code == 200
     [request] = detail["requests"]
     assert request["result"] == {"id": layer["id"], "version": 2, "bytes": 300}
     assert request["arrived_utc_s"] is not None
@@ -236,11 +236,11 @@ def test_invalid_regions_are_rejected(console):
 def test_region_arrives_as_a_layer_with_its_place(console):
     whole = partial_record(received=200, complete=True)
     console.state.store_image(whole)
-    height, width = whole.picture.height_px, whole.picture.width_px
+    height, width = whole.pixels.height_px, whole.pixels.width_px
     ask(console, "region", box=[0, 16, 16, 32], stream_bytes=96)
-    pixels = Pixels.from_array(whole.picture.to_array()[: -(-height // 2), width // 2 :])
+    pixels = Pixels.from_array(whole.pixels.to_array()[: -(-height // 2), width // 2 :])
     part = partial_record("00B0", received=96, complete=True, first_utc_s=FIRST_UTC_S + 60)
-    changes = {"contact": whole.contact, "picture": pixels, "picture_sha256": pixels.sha256, "missing_mask": b""}
+    changes = {"contact": whole.contact, "pixels": pixels, "pixels_sha256": pixels.sha256, "missing_mask": b""}
     console.state.store_image(part.model_copy(update=changes | {"despeckle_strength": None}))
     detail = console.browser("watch").contact(ID)
     [layer] = detail["related"]

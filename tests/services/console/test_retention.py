@@ -32,7 +32,7 @@ def test_old_images_are_removed_by_default_and_decisions_stay(console):
     detail = anna.contact(FIRST)
     assert [decision["verdict"] for decision in detail["decisions"]] == ["mine_like"]
     assert len(detail["audit"]) > 0
-    assert detail["contact"]["has_picture"] is False
+    assert detail["contact"]["has_image"] is False
     assert detail["record"]["lat_deg"] == 56.0
     assert "image removed by retention" in str(detail["versions"])
     assert not console.state.store_image(image_record())

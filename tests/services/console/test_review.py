@@ -128,7 +128,7 @@ def test_decision_is_stored_with_the_displayed_image(make_console):
 
 def test_simultaneous_decisions_of_several_operators_are_all_stored(console):
     console.state.store_image(image_record())
-    displayed = DisplayedImage(1, console.state.image(ID, 1).picture_sha256, "raw")
+    displayed = DisplayedImage(1, console.state.image(ID, 1).pixels_sha256, "raw")
 
     def decide(name: str) -> None:
         verdict = "mine_like" if name == "op-3" else "not_mine_like"

@@ -286,7 +286,7 @@ def test_shore_console_reads_missed_records_from_the_folder_of_c2(start, tmp_pat
     eventually(lambda: console.state.counts().total == 1, what="stored image")
     stored = console.state.image(ID, 2)
     assert (stored.missing() == image(2, complete=False).missing()).all()
-    assert stored.picture == image(2, complete=False).picture
+    assert stored.pixels == image(2, complete=False).pixels
 
 
 def test_decision_is_sent_after_a_restart(start_with_image, runner, start, log_in):

@@ -146,12 +146,12 @@ def test_complete_image_is_decoded(begin, decoded, stream, vq, check_monitoring,
     assert (image.codec, image.model) == ("vq", vq.model_hash)
     assert (image.bytes_received, image.bytes_total) == (len(data) - size, len(data) - size)
     assert (image.frames_received, image.first_frame_utc_s) == (len(frames_of("0A1B", data, None)), START_UTC_S)
-    np.testing.assert_array_equal(image.picture.to_array(), vq.decode(data).image)
+    np.testing.assert_array_equal(image.pixels.to_array(), vq.decode(data).image)
     assert (image.contact.contact_id, image.contact.lat_deg) == ("uuv-1/0A1B", 56.4)
     eventually(lambda: service.health().counters.get("images_complete") == 1)
     eventually(lambda: len(seen) == 1, what="the publication for subscribers")
     shown = msgpack.unpackb(seen[0].payload.to_bytes())
-    assert hashlib.sha256(shown["picture"]["data"]).hexdigest() == shown["picture_sha256"] == image.picture.sha256
+    assert hashlib.sha256(shown["pixels"]["data"]).hexdigest() == shown["pixels_sha256"] == image.pixels.sha256
     check_monitoring(service)
 
 
@@ -164,10 +164,10 @@ def test_files_and_record_hold_the_same_image(begin, runner, decoded, stream, ou
     assert {p.name for p in out.iterdir()} == {f"{name}.{kind}" for kind in ("tiff", "png", "json")}
     tiff, png = read_image(out / f"{name}.tiff"), np.asarray(Image.open(out / f"{name}.png"))
     np.testing.assert_array_equal(tiff, png)
-    assert hashlib.sha256(tiff.tobytes()).hexdigest() == image.picture_sha256
+    assert hashlib.sha256(tiff.tobytes()).hexdigest() == image.pixels_sha256
     whole = (out / f"{name}.json").read_bytes()
     side = json.loads(whole)
-    assert side["picture_sha256"] == image.picture_sha256
+    assert side["pixels_sha256"] == image.pixels_sha256
     assert (side["image_id"], side["contact"]["lat_deg"], side["missing_pixels"]) == ("0A1B", 56.4, 0)
     assert (side["height_px"], side["width_px"], side["bits"]) == (40, 60, 8)
     # A damaged side car is written again.
@@ -184,7 +184,7 @@ def test_missing_half_is_black_and_marked(begin, decoded, stream, vq):
         [image] = decoded(*updates(half(image_id, stream(1), arrived)))
         assert (image.image_id, image.complete, image.missing_halves) == (image_id, False, (missing,))
         assert image.missing_fraction == pytest.approx(0.5, abs=0.1)
-        pixels, black = image.picture.to_array(), image.missing()
+        pixels, black = image.pixels.to_array(), image.missing()
         assert (pixels[black] == 0).all()
         np.testing.assert_array_equal(pixels[~black], vq.decode(stream(1)).image[~black])
         rows = np.flatnonzero(black.any(axis=1))
@@ -198,7 +198,7 @@ def test_versions_of_an_embedded_stream_become_finer(begin, decoded, emb, textur
     records = (embedded(whole[:n], version=v, complete=n == len(whole)) for v, n in enumerate(lengths, start=1))
     images = decoded(*records)
     for length, image in zip(lengths, images, strict=True):
-        np.testing.assert_array_equal(image.picture.to_array(), emb.decode(whole[:length]).image)
+        np.testing.assert_array_equal(image.pixels.to_array(), emb.decode(whole[:length]).image)
         assert (image.missing_fraction, image.missing_halves, image.frames_received) == (0.0, (), 0)
         assert (image.bytes_received, image.bytes_total) == (length, length if image.complete else 0)
     assert [(image.version, image.complete) for image in images] == [(1, False), (2, False), (3, True)]
@@ -213,8 +213,8 @@ def test_missing_end_of_a_stream_that_is_not_embedded_is_marked(begin, decoded, 
     assert 0.2 < image.missing_fraction < 0.8
     assert not image.complete
     black = image.missing()
-    assert (image.picture.to_array()[black] == 0).all()
-    np.testing.assert_array_equal(image.picture.to_array()[~black], whole[~black])
+    assert (image.pixels.to_array()[black] == 0).all()
+    np.testing.assert_array_equal(image.pixels.to_array()[~black], whole[~black])
 
 
 def test_contact_record_alone_gives_an_image_of_missing_pixels(begin, decoded, out):
@@ -225,8 +225,8 @@ def test_contact_record_alone_gives_an_image_of_missing_pixels(begin, decoded, o
         assert (image.contact.lat_deg, image.contact.time_utc_s) == (56.4, 1_475_568_000.0)
         assert (image.codec, image.bytes_total, image.missing_fraction, image.complete) == ("", 0, 1.0, False)
         assert (image.missing_halves, image.despeckle_strength) == (("top", "bottom"), None)
-        assert image.picture.to_array().shape == shape
-        assert not image.picture.to_array().any()
+        assert image.pixels.to_array().shape == shape
+        assert not image.pixels.to_array().any()
         assert "only the contact record arrived" in image.notes
     assert len(list(out.glob("*.json"))) == 2
 
@@ -245,7 +245,7 @@ def test_index_beyond_the_codebook_is_a_black_tile(begin, decoded, stream, vq):
     data[start : start + 2] = b"\xff\xff"
     [image] = decoded(*updates(*frames_of("AAAA", bytes(data))))
     whole = vq.decode(stream()).image
-    pixels, black = image.picture.to_array(), image.missing()
+    pixels, black = image.pixels.to_array(), image.missing()
     assert black[:10, :10].all()
     assert (pixels[black] == 0).all()
     assert 1 <= black.sum() / 100 <= 2, "this tile, and the one that shares its bits"

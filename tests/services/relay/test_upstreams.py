@@ -175,7 +175,7 @@ def test_quota_drops_images_of_one_site_and_no_decisions(begin, runner, c2, sour
     source.send(DECISIONS, "relay", decision_record())
     source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(6)))
     eventually(lambda: service.gauges()["waiting_for_shore-2"] == 7)
-    eventually(lambda: service.health().counters.get("pictures_dropped") == 3)
+    eventually(lambda: service.health().counters.get("images_dropped") == 3)
     assert service.gauges()["waiting_bytes_for_shore"] <= 15_000
     runner.stop(service)
     shore = c2()

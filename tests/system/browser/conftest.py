@@ -172,7 +172,7 @@ class Visit:
             self.page.keyboard.press(key)
 
     def decide(self, key: str) -> None:
-        """Press a verdict key after the picture has been in sight for the time from which verdicts count."""
+        """Press a verdict key after the image has been in sight for the time from which verdicts count."""
         self.wait(".decision[data-ready=true]")
         self.press(key)
 

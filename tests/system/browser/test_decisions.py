@@ -155,7 +155,7 @@ def test_held_early_and_hasty_verdict_keys(served):
     visit.wait("#toasts >> text=Ignored")
     visit.wait_for_contact("0003")
     assert len(visit.page.evaluate(shown)) == 1
-    # A key in one of the first frames of a picture is ignored. On an AZERTY keyboard, "1" has the character "&".
+    # A key in one of the first frames of an image is ignored. On an AZERTY keyboard, "1" has the character "&".
     visit.page.evaluate(PRESS_IN_THE_FIRST_FRAME, ["k", "0002", "Digit1", "&"])
     assert len(visit.page.evaluate(shown)) == 1
     visit.wait(".decision[data-ready=true]")

@@ -90,7 +90,7 @@ def test_updates_repeat_a_lost_answer(served):
     add_contacts(served, 120)
     visit = open_page(served, "0119")
     # Of an image.
-    lose_once(visit, "**/versions/2/picture.png")
+    lose_once(visit, "**/versions/2/image.png")
     served.state.store_image(image_record("0119", 2, seed=7))
     visit.wait("#toasts .bad >> text=No response from the console's server.")
     visit.until("() => document.querySelector('canvas').dataset.shows.endsWith(' 2 raw')")
@@ -185,7 +185,7 @@ def test_tools_end_with_the_image_on_which_they_began(served):
     panel.answer(1)
     drawn = "dialog.object canvas[data-shows]"
     visit.until(f"() => document.querySelectorAll('{drawn}').length === 2")
-    image = Held(visit, "**/versions/2/picture.png")
+    image = Held(visit, "**/versions/2/image.png")
     served.state.store_image(look(2, "uuv-2", 90.0, destination(56.0, -5.0, 0.0, 2), version=2))
     panel.wait(3)
     panel.answer(2)

@@ -134,15 +134,15 @@ def test_report_of_a_real_contact_is_one_page_in_true_metres(served, data_dir):
     assert record.pixel_across_m is not None
     # The recording has pixels of about 4 : 1; drawn as they are, they distort by that.
     assert record.pixel_along_m > 2 * record.pixel_across_m
-    picture = Pixels.from_array(eight_bits(snippet.picture.to_array()))
+    pixels = Pixels.from_array(eight_bits(snippet.pixels.to_array()))
     image = image_record("00A7").model_copy(
-        update={"contact": record, "picture": picture, "picture_sha256": picture.sha256}
+        update={"contact": record, "pixels": pixels, "pixels_sha256": pixels.sha256}
     )
     served.state.store_image(image)
     served.client("anna").decide(ID)
     report = served.visit("bo", path=f"report/{ID}").page
     height, width = drawn_shape(report)
-    metres = picture.height_px * record.pixel_along_m, picture.width_px * record.pixel_across_m
+    metres = pixels.height_px * record.pixel_along_m, pixels.width_px * record.pixel_across_m
     assert height / width == pytest.approx(metres[0] / metres[1], rel=0.02)
     assert_pages(report, 1)
     folder = os.environ.get("SONARPOST_REPORT_FOLDER")

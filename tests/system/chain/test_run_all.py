@@ -104,10 +104,10 @@ def test_contacts_reach_the_shore_site_from_the_shipped_configurations(bench):
         write_png(hidden, snippet(number))
         hidden.rename(hidden.with_name(hidden.name[1:]))
 
-    pictures = bench.folder / "shore" / "pictures" / "vessel-1"
+    images = bench.folder / "shore" / "images" / "vessel-1"
 
     def complete():
-        return len({image.image_id for image in read_images(pictures).values() if image.complete})
+        return len({image.image_id for image in read_images(images).values() if image.complete})
 
     eventually(lambda: complete() == IMAGES, LONG_WAIT_S, f"complete images at the shore site; see {bench.folder}")
     assert "Traceback" not in bench.log("uuv") + bench.log("vessel") + bench.log("shore")

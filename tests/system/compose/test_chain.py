@@ -1,4 +1,4 @@
-"""The chain in containers, one story: it starts, carries pictures, is disturbed, stopped, upgraded, filled up.
+"""The chain in containers, one story: it starts, carries images, is disturbed, stopped, upgraded, filled up.
 
 Each test starts from the state in which the previous one left the chain, as in a deployment.
 """
@@ -44,11 +44,11 @@ def wait_for_surveys(project, number):
 
 
 def wait_ashore(project, number):
-    """Wait until so many complete pictures are ashore; name to SHA-256."""
-    until(lambda: project.pictures("c2")[1] >= number, f"{number} pictures ashore")
-    pictures, complete = project.pictures("c2")
-    assert complete == len(pictures) == number
-    return pictures
+    """Wait until so many complete images are ashore; name to SHA-256."""
+    until(lambda: project.images("c2")[1] >= number, f"{number} images ashore")
+    images, complete = project.images("c2")
+    assert complete == len(images) == number
+    return images
 
 
 def test_every_container_is_healthy_and_a_simulated_survey_arrives(project):
@@ -57,7 +57,7 @@ def test_every_container_is_healthy_and_a_simulated_survey_arrives(project):
     contacts = wait_for_surveys(project, 1)
     assert contacts >= 4  # as many mine-like objects as the simulator has put there
     ashore = wait_ashore(project, contacts)
-    aboard, complete = project.pictures("decompressor")
+    aboard, complete = project.images("decompressor")
     assert aboard == ashore
     assert complete == contacts
 
@@ -67,16 +67,16 @@ def test_commands_of_the_page_show_and_copy_the_images(project, tmp_path):
     [commands] = re.findall(r"^```sh\n(docker-compose exec .*?)^```$", page, re.MULTILINE | re.DOTALL)
     assert commands in (REPOSITORY / "docs" / "how-to" / "containers.md").read_text()
     text = commands.replace("docker-compose ", " ".join(compose_command()) + " ")
-    text = text.replace(" exec ", " exec -T ").replace(" ./pictures", f" {tmp_path}/pictures")
+    text = text.replace(" exec ", " exec -T ").replace(" ./images", f" {tmp_path}/images")
     names = {"COMPOSE_PROJECT_NAME": project.name, "COMPOSE_FILE": ":".join(project.files)}
     environment = os.environ | project.environment | names
     command = ["bash", "-euc", text]
     done = subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    count = len(project.pictures("c2")[0])
+    count = len(project.images("c2")[0])
     assert f"{count} images" in done.stdout
-    assert "folder /var/lib/sonarpost/pictures" in done.stderr
-    assert len(list(tmp_path.glob("pictures/vessel-1/*.png"))) >= count
+    assert "folder /var/lib/sonarpost/images" in done.stderr
+    assert len(list(tmp_path.glob("images/vessel-1/*.png"))) >= count
 
 
 EFFECTIVE = """
@@ -173,50 +173,50 @@ def test_killed_services_come_back_and_lose_nothing(project):
         project.inside(service, KILL, check=False)
     contacts = wait_for_surveys(project, 2)
     ashore = wait_ashore(project, contacts)
-    assert project.pictures("decompressor")[0] == ashore
+    assert project.images("decompressor")[0] == ashore
     for service, count in starts.items():
         assert project.state(service)["RestartCount"] == count + 1, service
 
 
 def test_a_cut_link_delays_and_loses_nothing(project):
-    before = project.pictures("c2")[1]
+    before = project.images("c2")[1]
     link, vessel = f"{project.name}_link", project.container("router-vessel")
     docker("network", "disconnect", link, vessel)
     try:
         project.survey(3)
         contacts = wait_for_surveys(project, 3)
         assert contacts > before
-        until(lambda: project.pictures("decompressor")[1] == contacts, "all pictures aboard")
-        assert project.pictures("c2")[1] == before
+        until(lambda: project.images("decompressor")[1] == contacts, "all images aboard")
+        assert project.images("c2")[1] == before
     finally:
         docker("network", "connect", "--alias", "router-vessel", link, vessel)
     ashore = wait_ashore(project, contacts)
-    assert project.pictures("decompressor")[0] == ashore
+    assert project.images("decompressor")[0] == ashore
 
 
 def test_down_and_up_again_with_a_newer_image_loses_nothing(project):
-    aboard, ashore = project.pictures("decompressor")[0], project.pictures("c2")[0]
+    aboard, ashore = project.images("decompressor")[0], project.images("c2")[0]
     project.compose("down", "-t", "5")
-    assert project.kept("vessel-pictures")[0] == aboard
-    assert project.kept("shore-pictures")[0] == ashore
+    assert project.kept("vessel-images")[0] == aboard
+    assert project.kept("shore-images")[0] == ashore
     image = project.environment["SONARPOST_IMAGE"]
     upgrade = f"{image}-next"
     # What a release changes: the image's identity.
     container = docker("create", image).strip()
     docker("commit", "--change", "LABEL release=next", container, upgrade)
     docker("rm", container)
-    project.environment |= {"SONARPOST_IMAGE": upgrade, "VESSEL_PICTURES": "small-pictures"}
+    project.environment |= {"SONARPOST_IMAGE": upgrade, "VESSEL_IMAGES": "small-images"}
     project.compose("up", "-d", "--no-build")
     project.wait_until_healthy()
     assert project.state("c2")["Config"]["Labels"]["release"] == "next"
-    assert project.pictures("c2")[0] == ashore
+    assert project.images("c2")[0] == ashore
     # The same surveys are known, and not sent again.
     assert project.surveys_done() == 3
 
 
 def test_a_full_disk_is_told_and_nothing_is_lost_by_it(project):
-    before = project.pictures("c2")[1]
-    ballast = "/var/lib/sonarpost/pictures/ballast"
+    before = project.images("c2")[1]
+    ballast = "/var/lib/sonarpost/images/ballast"
     project.inside(
         "decompressor",
         f"import os\nwith open('{ballast}', 'wb', buffering=0) as f:\n"
@@ -227,7 +227,7 @@ def test_a_full_disk_is_told_and_nothing_is_lost_by_it(project):
     assert contacts > before
     until(lambda: project.health("decompressor").startswith("unhealthy: degraded"), "the full disk told")
     assert "No space left" in project.health("decompressor")
-    assert project.pictures("c2")[1] == before
+    assert project.images("c2")[1] == before
     project.inside("decompressor", f"import os; os.unlink('{ballast}')")
     wait_ashore(project, contacts)
     project.wait_until_healthy(("decompressor",))

@@ -137,7 +137,7 @@ def test_published_contact_reaches_consumer_and_watcher(run, router, platform):
         lon_deg=-70.6712,
         atd_confidence=1.5,
     )
-    assert snippet.picture.to_array()[5].tolist() == list(range(0, 192, 2))
+    assert snippet.pixels.to_array()[5].tolist() == list(range(0, 192, 2))
 
 
 def test_delivery_program_waits_for_its_consumer(run, router, client, platform, tmp_path):

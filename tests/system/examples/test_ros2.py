@@ -35,7 +35,7 @@ def test_mirror_publishes_records_as_ros_strings(router, client):
         process.wait()
     first, second = (json.loads(text_of(data)) for data in received)
     assert (first["type"], first["contact"]["lat_deg"]) == ("reconstructed_image", 41.52513339)
-    assert "picture" not in first
+    assert "pixels" not in first
     assert (second["type"], second["remark"]) == ("decision", "ü")
 
 

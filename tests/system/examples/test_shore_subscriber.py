@@ -50,8 +50,8 @@ def test_example_prints_records_and_saves_images(router, c2, tmp_path):
     command = [sys.executable, "-I", str(EXAMPLE), router, str(saved)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         eventually(lambda: publisher.matching_status.matching, what="subscription of the example")
-        relay(c2, image("0001", picture=Pixels.from_array(wide)))
-        relay(c2, image("0002", picture=Pixels.from_array(grey), version=2).model_copy(update={"contact": None}))
+        relay(c2, image("0001", pixels=Pixels.from_array(wide)))
+        relay(c2, image("0002", pixels=Pixels.from_array(grey), version=2).model_copy(update={"contact": None}))
         relay(c2, decision("0001", verdict="mine_like"))
         lines = [process.stdout.readline() for _ in range(3)]
         process.send_signal(signal.SIGINT)

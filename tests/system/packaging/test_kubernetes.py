@@ -248,7 +248,7 @@ def test_pods_agree_with_the_compose_file(built):
             path, _, mode = place.partition(":")
             if path == "/etc/sonarpost":
                 assert mounts["/etc/sonarpost/shore.toml"]
-            elif built[0] == "base" or not path.endswith("/pictures"):
+            elif built[0] == "base" or not path.endswith("/images"):
                 assert mounts[path] == (mode == "ro"), volume
     [router] = found["sonarpost-router"]["template"]["spec"]["containers"]
     [published] = compose["router-shore"]["ports"]
@@ -259,7 +259,7 @@ def test_variant_with_postgresql_has_two_c2_with_names_of_their_own(built, tmp_p
     variant, manifests = built
     [shore] = [m["spec"] for m in manifests if m["kind"] == "StatefulSet"]
     claims = [claim["metadata"]["name"] for claim in shore["volumeClaimTemplates"]]
-    assert (shore["replicas"], claims) == {"base": (1, ["state", "pictures"]), "postgresql": (2, ["state"])}[variant]
+    assert (shore["replicas"], claims) == {"base": (1, ["state", "images"]), "postgresql": (2, ["state"])}[variant]
     if variant == "base":
         return
     [text] = [m["data"]["shore.toml"] for m in manifests if m["kind"] == "ConfigMap"]
@@ -277,7 +277,7 @@ def test_variant_with_postgresql_has_two_c2_with_names_of_their_own(built, tmp_p
         assert (platform.id, config.database) == ("sonarpost-shore-1", url)
         mounts = {mount["mountPath"]: mount for mount in container["volumeMounts"]}
         assert "/etc/sonarpost/database" in mounts
-        assert "/var/lib/sonarpost/pictures" not in mounts
+        assert "/var/lib/sonarpost/images" not in mounts
 
 
 def test_configuration_is_valid_and_names_the_router(tmp_path):
@@ -287,7 +287,7 @@ def test_configuration_is_valid_and_names_the_router(tmp_path):
     path.write_text(text)
     platform, _ = load(path, "c2", C2Config, {})
     _, console = load(path, "console", ConsoleConfig, {})
-    assert console.out_dir.as_posix() == "/var/lib/sonarpost/pictures"
+    assert console.out_dir.as_posix() == "/var/lib/sonarpost/images"
     services = {m["metadata"]["name"]: m["spec"]["ports"] for m in manifests if m["kind"] == "Service"}
     [endpoint] = platform.router
     name, port = endpoint.removeprefix("tcp/").split(":")

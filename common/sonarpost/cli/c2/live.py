@@ -100,4 +100,4 @@ def _png_of(record: ReconstructedImage | Decision) -> bytes | None:
     if isinstance(record, Decision) or not record.codec:
         # Without a codec only the contact record was received; its pixels are black.
         return None
-    return encode_png(eight_bits(record.picture.to_array()))
+    return encode_png(eight_bits(record.pixels.to_array()))

@@ -90,7 +90,7 @@ def add_actions(actions: Subparsers) -> None:
     ls.set_defaults(run=run_ls)
 
     get = actions.add_parser("get", help="copy the TIFF, PNG and JSON files of one image")
-    get.add_argument("picture", metavar="VEHICLE/IMAGE", help="name from `ls`, or the name of the files")
+    get.add_argument("image", metavar="VEHICLE/IMAGE", help="name from `ls`, or the name of the files")
     get.add_argument("--vessel", metavar="NAME", help="vessel, if two vessels have an image of this name")
     get.add_argument("--version", type=int, metavar="N", help="version (default: the newest)")
     get.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="destination (default: current folder)")
@@ -312,7 +312,7 @@ def run_get(parsed: argparse.Namespace) -> int:
     """Copy the files of an image and print their paths; return 0."""
     place = archive_of(parsed)
     with open_reader(place) as index:
-        row = find_image(index.images(), parsed.picture, parsed.vessel, parsed.version)
+        row = find_image(index.images(), parsed.image, parsed.vessel, parsed.version)
     copies = [(parsed.out / name, content) for name, content in read_image_files(place, row).items()]
     make_output_folder(parsed.out)
     for path, data in copies:

@@ -59,7 +59,7 @@ def add_actions(actions: Subparsers) -> None:
 
 
 def _add_common_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("picture", metavar="VEHICLE[/IMAGE]", help="name from `ls`")
+    parser.add_argument("image", metavar="VEHICLE[/IMAGE]", help="name from `ls`")
     parser.add_argument("--vessel", required=True, metavar="NAME", help="vessel to send to")
     parser.add_argument("--author", default=None, metavar="NAME", help="author (default: login name)")
     parser.add_argument("--id", metavar="TEXT", help="identifier; c2 accepts a record with one identifier once")
@@ -115,7 +115,7 @@ def _print_accepted(noun: str, record_id: object, vessel: str) -> None:
 
 
 def _vehicle_and_image(parsed: argparse.Namespace) -> tuple[str, str | None]:
-    vehicle, _, image = parsed.picture.partition("/")
+    vehicle, _, image = parsed.image.partition("/")
     return vehicle, image or None
 
 

@@ -138,7 +138,7 @@ def _decode(key: str, payload: bytes) -> ReconstructedImage | Decision | Tasking
 
 
 def _fields(record: Record) -> dict[str, object]:
-    pixels = {"picture", "missing_mask"} if isinstance(record, ReconstructedImage) else set[str]()
+    pixels = {"pixels", "missing_mask"} if isinstance(record, ReconstructedImage) else set[str]()
     return {"type": record.TYPE, **record.model_dump(exclude=pixels)}
 
 
@@ -146,7 +146,7 @@ def line_of(record: Record) -> str:
     """Return a record as one line of text."""
     if isinstance(record, ReconstructedImage):
         contact = record.contact
-        parts = [f"{record.picture.width_px} × {record.picture.height_px} px"]
+        parts = [f"{record.pixels.width_px} × {record.pixels.height_px} px"]
         parts.append("complete" if record.complete else f"{100 * record.missing_fraction:.0f} % missing")
         if contact is not None and contact.lat_deg is not None and contact.lon_deg is not None:
             parts.append(f"at {contact.lat_deg:.5f} {contact.lon_deg:.5f}")

@@ -47,7 +47,7 @@ def _sheet_contacts(watcher: Watcher, settings: ChainSettings) -> list[SheetCont
     contacts = []
     for image_id, encoded in by_confidence:
         snippet, received = watcher.snippets.get(encoded.contact.contact_id), watcher.shore.get(image_id)
-        original = None if snippet is None else to_uint8(snippet.picture.to_array())
+        original = None if snippet is None else to_uint8(snippet.pixels.to_array())
         size = f"{encoded.width_px} x {encoded.height_px} px"  # the font of the sheet has no multiplication sign
         raw = f"{size}, {encoded.height_px * encoded.width_px} B"
         place = f"{_position(watcher, image_id, encoded)}   confidence {_confidence(encoded)}"
@@ -68,7 +68,7 @@ def _sheet_contacts(watcher: Watcher, settings: ChainSettings) -> list[SheetCont
 def _received_cell(received: ReconstructedImage | None, original: Image | None) -> SheetCell:
     if received is None or not received.codec:
         return SheetCell()
-    image = received.picture.to_array()
+    image = received.pixels.to_array()
     label = f"{received.codec}, {received.bytes_received} B"
     if received.despeckle_strength:
         label += f", despeckled, strength {received.despeckle_strength:.2f}"
@@ -138,7 +138,7 @@ def _print_table(watcher: Watcher, settings: ChainSettings, console: Console) ->
     for image_id, image in watcher.encoded.items():
         contact = image.contact
         vessel, shore = watcher.vessel.get(image_id), watcher.shore.get(image_id)
-        same = vessel is not None and shore is not None and vessel.picture_sha256 == shore.picture_sha256
+        same = vessel is not None and shore is not None and vessel.pixels_sha256 == shore.pixels_sha256
         state = _state(vessel)
         table.add_row(
             image_id,

@@ -1,6 +1,6 @@
 """GeoPackage 1.3 (OGC 12-128r17): contacts as points with images and a style for QGIS, covered seabed as polygons.
 
-The table `contacts` has one column for each of `tables.COLUMNS`, the geometry `geom` and the PNG `picture`. The table
+The table `contacts` has one column for each of `tables.COLUMNS`, the geometry `geom` and the PNG `image`. The table
 `layer_styles` has the form that QGIS reads.
 """
 
@@ -50,8 +50,8 @@ CREATE TABLE layer_styles (id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, f_tabl
   styleSLD TEXT, useAsDefault BOOLEAN, description TEXT, owner TEXT(30), ui TEXT(30), update_time DATETIME);
 """
 _CONTENTS: Final = "INSERT INTO gpkg_contents VALUES (?, ?, ?, '', ?, ?, ?, ?, ?, ?)"
-_INTEGERS: Final = ("version", "decided_version", "decisions", "picture_height_px", "picture_width_px")
-_BOOLEANS: Final = ("picture_complete", "authenticated")
+_INTEGERS: Final = ("version", "decided_version", "decisions", "image_height_px", "image_width_px")
+_BOOLEANS: Final = ("image_complete", "authenticated")
 _REALS: Final = ("_m", "_deg", "_confidence", "_fraction", "_mine_like", "_other_object")
 
 
@@ -173,11 +173,11 @@ class _Layer:
 
 
 def write_geopackage(file: IO[bytes], source: ExportSource) -> None:
-    """Write a GeoPackage of contacts. A contact without a position has no geometry; one without an image no picture."""
+    """Write a GeoPackage of contacts. A contact without a position has no geometry; one without an image has no PNG."""
     columns = ", ".join(f'"{name}" {_column_type(name)}' for name in COLUMNS)
     changed_utc_s = 0.0
     with _new_geopackage(file, source.path.parent) as db:
-        layer = _Layer(db, "contacts", "POINT", f"{columns}, picture BLOB")
+        layer = _Layer(db, "contacts", "POINT", f"{columns}, image BLOB")
         for contact in source.contacts:
             points = [] if contact.position is None else [contact.position[::-1]]
             layer.add(_point(contact), points, [*contact_properties(contact).values(), source.images.png(contact)])

@@ -27,7 +27,7 @@ from sonarpost.export.text import VERDICT_WORDS, html_text, utc_text, xml_text
 from sonarpost.review.decisions import ReviewState
 from sonarpost.review.image_geometry import contact_mark
 from sonarpost.review.true_scale import (
-    PictureLine,
+    ImageLine,
     draw_lines,
     north_in_image,
     pixel_size_m,
@@ -90,7 +90,7 @@ def write_kmz(file: IO[bytes], source: ExportSource) -> None:
                 pixels = _eight_bits(found.pixels)
                 missing = np.zeros(pixels.shape, np.bool_) if found.missing is None else found.missing
                 jpeg = _balloon_jpeg(contact, pixels, missing, found.lines)
-                archive.writestr(archive_entry(f"pictures/{contact.uid}.jpg"), jpeg)
+                archive.writestr(archive_entry(f"images/{contact.uid}.jpg"), jpeg)
                 overlay = _overlay(contact, pixels)
                 if overlay is not None:
                     # A ground overlay has the shape of its box: pixels need not be square.
@@ -181,7 +181,7 @@ def _placemark(contact: ExportContact, lat_deg: float, lon_deg: float, *, has_im
     values = contact_properties(contact)
     placemark = ET.Element("Placemark", {"id": xml_text(contact.uid)})
     _child(placemark, "name", contact.name + (UNAUTHENTICATED if contact.image.authenticated is False else ""))
-    _child(placemark, "description", _balloon_html(values, f"pictures/{contact.uid}.jpg" if has_image else None))
+    _child(placemark, "description", _balloon_html(values, f"images/{contact.uid}.jpg" if has_image else None))
     _child(_child(placemark, "TimeStamp"), "when", str(values["seen_utc"] or values["first_frame_utc"]))
     _child(placemark, "styleUrl", f"#{contact.review}")
     extended = _child(placemark, "ExtendedData")
@@ -260,7 +260,7 @@ def _overlay(contact: ExportContact, pixels: npt.NDArray[np.uint8]) -> _Overlay 
 
 
 def _balloon_jpeg(
-    contact: ExportContact, pixels: npt.NDArray[np.uint8], missing: npt.NDArray[np.bool_], lines: Iterable[PictureLine]
+    contact: ExportContact, pixels: npt.NDArray[np.uint8], missing: npt.NDArray[np.bool_], lines: Iterable[ImageLine]
 ) -> bytes:
     """Return the image of a balloon: true metres, as the console shows it, with lines, scale bar and verdict."""
     record = contact.image.contact
@@ -270,8 +270,8 @@ def _balloon_jpeg(
     mark = contact_mark(record, *pixels.shape)
     place = None if mark is None else (mark.row, mark.column)
     buffer = io.BytesIO()
-    picture = Image.fromarray(np.vstack([draw_lines(image, lines, place), strip]))
-    picture.save(buffer, format="JPEG", quality=_BALLOON_QUALITY)
+    balloon = Image.fromarray(np.vstack([draw_lines(image, lines, place), strip]))
+    balloon.save(buffer, format="JPEG", quality=_BALLOON_QUALITY)
     return buffer.getvalue()
 
 

@@ -173,7 +173,7 @@ def _add_detail(event: ET.Element, contact: ExportContact) -> None:
         "image": image.image_id,
         "version": str(image.version),
         "review": contact.review,
-        "sha256": image.picture_sha256,
+        "sha256": image.pixels_sha256,
     }
     if decision is not None:
         facts |= {"decision": decision.decision_id, "decided": utc_text(decision.decided_utc_s)}
@@ -202,7 +202,7 @@ def _remarks(contact: ExportContact) -> str:
         if record.atd_confidence is not None:
             parts.append(f"Detector's confidence {record.atd_confidence:.2f} of 2.")
     if image.missing_fraction > 0:
-        parts.append(f"{100 * image.missing_fraction:.0f} % of the picture is missing.")
+        parts.append(f"{100 * image.missing_fraction:.0f} % of the image is missing.")
     if contact.size.text:
         parts.append(f"Measured: {contact.size.text}.")
     return " ".join([*parts, *_decision_remarks(contact)])
@@ -220,7 +220,7 @@ def _decision_remarks(contact: ExportContact) -> list[str]:
         confidence = "" if decision.confidence is None else f", confidence {decision.confidence:.2f}"
         parts.append(f"Decided {utc_text(decision.decided_utc_s)} by {decision.operator}{confidence}.")
         if decision.image_version < contact.image.version:
-            parts.append(f"The picture has grown since: version {decision.image_version} was looked at.")
+            parts.append(f"The image has grown since: version {decision.image_version} was looked at.")
         parts += [f"Class: {text}." for text in (decision.mlo_class,) if text]
         parts += [f"Remark: {text}" for text in (decision.remark,) if text]
     return parts

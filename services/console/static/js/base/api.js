@@ -128,7 +128,7 @@ export const api = {
   streamError,
   image,
   reportUrl: (id) => `/report/${encodeURIComponent(id)}`,
-  imageUrl: (id, version) => `${contactPath(id)}/versions/${version}/picture.png`,
+  imageUrl: (id, version) => `${contactPath(id)}/versions/${version}/image.png`,
   maskUrl: (id, version) => `${contactPath(id)}/versions/${version}/mask.png`,
   thumbnailUrl: (id, version) => `${contactPath(id)}/versions/${version}/thumbnail.png`,
 };

@@ -39,7 +39,7 @@ function measurementList(measurements) {
 function lookList(group, id) {
   return h("ul", {}, group.filter((row) => row.id !== id).map((row) => h("li", {},
     h("button", { type: "button", class: "look", on: { click: () => emit("select", { id: row.id }) } },
-      row.has_picture ? h("img", { src: api.thumbnailUrl(row.id, row.version), alt: "" }) : null,
+      row.has_image ? h("img", { src: api.thumbnailUrl(row.id, row.version), alt: "" }) : null,
       h("span", {}, h("b", { text: row.name }), ` ${verdict(row.review)}, ${received(row)}, ${time(row.seen_utc_s ?? row.first_frame_utc_s, { date: true })}`)))));
 }
 

@@ -63,12 +63,12 @@ export class ContactView {
     this.sizes = h("div", { class: "size-panel", role: "region", "aria-label": t("measure.panel") });
     this.stage = h("div", { class: "stage" }, this.canvases, this.placeholder, this.loupe.element, this.loading);
     this.versions = h("div", { class: "versions", role: "group", "aria-label": t("versions_bar.title") });
-    this.picture = h("div", { class: "picture" }, h("div", { class: "image-bar" }, this.tools, this.versions), this.stage);
-    new ResizeObserver(() => this.#arrange()).observe(this.picture);
+    this.imageArea = h("div", { class: "image-area" }, h("div", { class: "image-bar" }, this.tools, this.versions), this.stage);
+    new ResizeObserver(() => this.#arrange()).observe(this.imageArea);
     this.strip = h("p", { class: "strip number", "aria-label": t("integrity_strip.title") });
     this.facts = h("dl", { class: "facts number" });
     this.data = h("details", { class: "image-data" }, h("summary", { text: t("integrity_strip.title") }), this.facts);
-    this.element = h("section", { class: "contact", "aria-label": t("contact_view.contact") }, this.heading, this.picture, this.sizes, this.strip);
+    this.element = h("section", { class: "contact", "aria-label": t("contact_view.contact") }, this.heading, this.imageArea, this.sizes, this.strip);
   }
 
   get shown() { return this.detail?.versions.find((one) => one.version === this.version) ?? null; }
@@ -206,7 +206,7 @@ export class ContactView {
     Object.assign(this, choice);
     this.target = null;
     this.canvases.forEach((canvas, index) => canvas.classList.toggle("hidden", !images[index]));
-    this.placeholder.textContent = this.shown && this.detail.contact.has_picture ? "" : t("contact_view.no_image");
+    this.placeholder.textContent = this.shown && this.detail.contact.has_image ? "" : t("contact_view.no_image");
     if (this.autoGain && images[0]) [this.display.low, this.display.high] = autoRange(images[0].image);
     this.views.forEach((view, index) => {
       if (images[index]) this.#showOn(view, images[index]);
@@ -224,13 +224,13 @@ export class ContactView {
   /** Put the tools beside the image or above it: where they leave more room for it. */
   #arrange() {
     const [view] = this.views;
-    const { clientWidth: width, clientHeight: height } = this.picture;
+    const { clientWidth: width, clientHeight: height } = this.imageArea;
     if (!view.image || width === 0) return;
     const count = this.comparedImage() ? 2 : 1;
     const rem_px = parseFloat(getComputedStyle(document.documentElement).fontSize);
     const { above, beside: column, height: least } = TOOLS_REM;
     const beside = height >= least * rem_px && view.scaleOn((width - column * rem_px) / count, height) > view.scaleOn(width / count, height - above * rem_px);
-    this.picture.classList.toggle("beside", beside);
+    this.imageArea.classList.toggle("beside", beside);
     this.redrawAll();
   }
 

@@ -5,14 +5,14 @@ import { t } from "../texts.js";
 const EXPANDED_PIXEL = 2; // ratio of the pixel sizes of the expanded image and of the contact's image
 const OUTLINE_COLOUR = "#52e0ff";
 
-const withPicture = (one) => one.versions.some((version) => version.codec);
+const withImage = (one) => one.versions.some((version) => version.codec);
 
-/** Related images of a layer that have a picture, the earliest first: `{id, relation, versions}`. */
-const relatedOf = (detail, layer) => (detail?.related ?? []).filter((one) => one.relation === layer && withPicture(one));
+/** Related images of a layer that have an image, the earliest first: `{id, relation, versions}`. */
+const relatedOf = (detail, layer) => (detail?.related ?? []).filter((one) => one.relation === layer && withImage(one));
 
-/** Layers of the related images that have a picture, with the reason why they are not measured. */
+/** Layers of the related images that have an image, with the reason why they are not measured. */
 export function relatedLayers(/** @type {ContactDetail} */ detail) {
-  const names = new Set((detail?.related ?? []).filter(withPicture).map((one) => one.relation));
+  const names = new Set((detail?.related ?? []).filter(withImage).map((one) => one.relation));
   return [...names].map((name) => ({ name, reason: t(`related_images.${name}_title`) }));
 }
 

@@ -137,7 +137,7 @@ export class DecisionForm {
       return false;
     }
     const image = this.view.drawn;
-    if (!contact.has_picture || image?.id !== contact.id) {
+    if (!contact.has_image || image?.id !== contact.id) {
       toast(t("decision_form.no_image", { name: contact.name }), { bad: true });
       return false;
     }

@@ -1,13 +1,13 @@
-// Guard of verdicts: they count after the picture was in sight, and many in a short time need a confirmation.
+// Guard of verdicts: they count after the image was in sight, and many in a short time need a confirmation.
 
-/** Time for which a picture is in sight before a verdict on it counts. */
+/** Time for which an image is in sight before a verdict on it counts. */
 export const SEEN_MS = 300;
 const MANY = 3;
 const MANY_MS = 2000;
 
 export class VerdictGuard {
   /**
-   * @param {() => boolean} inSight Whether the picture of the displayed contact is drawn and not hidden.
+   * @param {() => boolean} inSight Whether the image of the displayed contact is drawn and not hidden.
    * @param {(ready: boolean) => void} changed Called when verdicts begin or cease to count.
    */
   constructor(inSight, changed) {
@@ -16,7 +16,7 @@ export class VerdictGuard {
     /** @type {string | null} */
     this.id = null; // identifier of the displayed contact
     /** @type {number | null} */
-    this.drawn_ms = null; // time of the first frame with its picture
+    this.drawn_ms = null; // time of the first frame with its image
     this.timer = 0;
     /** @type {number[]} */
     this.sent_ms = []; // times of the latest verdicts
@@ -32,13 +32,13 @@ export class VerdictGuard {
     this.restart();
   }
 
-  /** Wait again: another view or page has covered the picture, or another contact was to follow. */
+  /** Wait again: another view or page has covered the image, or another contact was to follow. */
   restart() {
     clearTimeout(this.timer);
     this.timer = 0;
     this.#set(false);
     const { id } = this;
-    // The first callback is before the frame with the picture is painted, the second one after it.
+    // The first callback is before the frame with the image is painted, the second one after it.
     requestAnimationFrame(() => requestAnimationFrame(() => {
       if (id === null || id !== this.id || this.timer || document.hidden || !this.inSight()) return;
       this.drawn_ms ??= performance.now();
@@ -51,7 +51,7 @@ export class VerdictGuard {
     this.changed(ready);
   }
 
-  /** Seconds since the first frame with the picture of the contact. */
+  /** Seconds since the first frame with the image of the contact. */
   get shown_s() { return Math.min(86400, (performance.now() - this.drawn_ms) / 1000); }
 
   /** Whether a verdict at present is one of more than three within two seconds. */

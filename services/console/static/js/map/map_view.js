@@ -199,7 +199,7 @@ export class MapView {
       [received(contact), time(contact.seen_utc_s)].join(" · "),
     ];
     fill(this.card, h("div", { class: "card" }, h("h3", {}, contact.name, h("span", { class: `badge ${contact.review}`, text: `${symbol(contact.review)} ${verdict(contact.review)}` })),
-      contact.has_picture ? h("img", { src: api.thumbnailUrl(contact.id, contact.version), alt: "" }) : null,
+      contact.has_image ? h("img", { src: api.thumbnailUrl(contact.id, contact.version), alt: "" }) : null,
       lines.filter(Boolean).map((text) => h("p", { class: "number", text })),
       h("div", { class: "actions" }, h("button", { type: "button", class: "primary", on: { click: () => this.open() } }, t("map.review"), " ", h("kbd", { text: "Enter" })))));
   }

@@ -33,7 +33,7 @@ function marks(row) {
 
 /** Element of a row; `index` counts from 0, `count` is the length of the list. */
 export function queueRow(/** @type {Contact} */ row, index, count, selected) {
-  const image = row.has_picture
+  const image = row.has_image
     ? h("img", { src: api.thumbnailUrl(row.id, row.version), alt: "", decoding: "async" })
     : h("span", { class: "nothing", text: t("queue.no_image") });
   const likely = likelihood(row);

@@ -93,10 +93,10 @@ class ObjectPanel {
   /** Draw the images that stay, load the others, then draw all at one scale. */
   async #loadImages() {
     const { object } = this;
-    const pictures = object.looks.filter((look) => look.contact.has_picture);
+    const images = object.looks.filter((look) => look.contact.has_image);
     const stays = ({ contact }) => this.images.get(contact.id)?.look.contact.version === contact.version;
-    this.#display(pictures.filter(stays).map((look) => ({ ...this.images.get(look.contact.id), look })));
-    const loaded = await Promise.all(pictures.map(async (look) => {
+    this.#display(images.filter(stays).map((look) => ({ ...this.images.get(look.contact.id), look })));
+    const loaded = await Promise.all(images.map(async (look) => {
       const { id, version } = look.contact;
       if (this.images.has(id)) return this.images.get(id);
       try {
