@@ -34,7 +34,7 @@ from sonarpost.archive.image_files import side_car
 from sonarpost.export.contacts import ContactSet, ExportContact, SideCar, load_contacts
 from sonarpost.export.formats import write_export
 from sonarpost.export.source import ExportSource, StoredImages
-from sonarpost.export.tables import COLUMNS, contact_properties
+from sonarpost.export.tables import COLUMNS
 from sonarpost.export.tak.cot import CotOptions, cot_event, cot_events, cot_type
 from sonarpost.export.text import csv_text, html_text, probabilities_text, xml_text
 from sonarpost.messages import Pixels
@@ -116,14 +116,6 @@ def test_percentages_add_up_to_100():
         (0.3333, 0.3333): "mine-like 33 %, other object 33 %, seabed 34 %",
     }
     assert {probabilities: probabilities_text(*probabilities) for probabilities in texts} == texts
-
-
-def test_withdrawal_of_an_older_console_is_not_exported_as_unsure(tmp_path):
-    later = {"decided_utc_s": FIRST_UTC_S + 700, "verdict": "unsure"}
-    store(tmp_path, image(), decision(), decision(decision_id="d-2", remark="withdraws decision d-1", **later))
-    (contact,) = load_contacts(tmp_path).contacts
-    assert (contact.review, contact.withdrawn_by, cot_type(contact)) == ("unreviewed", "A. Operator", "b-m-p-s-m")
-    assert contact_properties(contact)["operator"] is None
 
 
 def test_every_export_states_the_measurements_of_operators():

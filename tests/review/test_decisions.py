@@ -5,7 +5,7 @@ from builders.records import decision_record
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.review.decisions import review_result, withdrawn_decision
+from sonarpost.review.decisions import review_result
 
 
 def decision(decision_id, verdict, operator="anna", **fields):
@@ -13,12 +13,7 @@ def decision(decision_id, verdict, operator="anna", **fields):
 
 
 def withdrawal(decision_id, of, verdict="unsure", operator="anna"):
-    return decision(decision_id, verdict, operator, withdraws=of, remark=f"withdraws decision {of}")
-
-
-def of_older_console(record):
-    """The record of a console that has no field `withdraws`."""
-    return record.model_copy(update={"withdraws": None})
+    return decision(decision_id, verdict, operator, withdraws=of)
 
 
 def state(*decisions):
@@ -36,19 +31,14 @@ def test_latest_decision_of_one_operator_counts(verdict):
     assert state(decision("d-1", "mine_like"), decision("d-2", verdict)) == (verdict, "d-2")
 
 
-@pytest.mark.parametrize("older", [False, True])
-def test_withdrawal_of_the_only_decision_gives_unreviewed(older):
-    undo = withdrawal("d-2", "d-1")
-    decisions = decision("d-1", "mine_like"), of_older_console(undo) if older else undo
-    found = review_result(decisions)
+def test_withdrawal_of_the_only_decision_gives_unreviewed():
+    found = review_result((decision("d-1", "mine_like"), withdrawal("d-2", "d-1")))
     assert (found.state, found.counting, found.is_withdrawn) == ("unreviewed", None, True)
     assert (found.withdrawn, found.withdrawals) == (frozenset({"d-1"}), frozenset({"d-2"}))
 
 
-@pytest.mark.parametrize("older", [False, True])
-def test_withdrawal_restores_the_decision_before(older):
-    undo = withdrawal("d-3", "d-2", "mine_like")
-    decisions = decision("d-1", "mine_like"), decision("d-2", "unsure"), of_older_console(undo) if older else undo
+def test_withdrawal_restores_the_decision_before():
+    decisions = decision("d-1", "mine_like"), decision("d-2", "unsure"), withdrawal("d-3", "d-2", "mine_like")
     # The restored decision counts, not the record that repeats its verdict.
     assert state(*decisions) == ("mine_like", "d-1")
 
@@ -57,13 +47,6 @@ def test_decision_after_a_withdrawal_counts():
     decisions = decision("d-1", "mine_like"), withdrawal("d-2", "d-1"), decision("d-3", "not_mine_like")
     assert state(*decisions) == ("not_mine_like", "d-3")
     assert not review_result(decisions).is_withdrawn
-
-
-def test_remark_that_names_no_decision_on_the_contact_is_a_remark():
-    assert state(decision("d-1", "mine_like", remark="withdraws decision d-9")) == ("mine_like", "d-1")
-    assert state(decision("d-1", "mine_like", remark="withdraws decision d-1")) == ("mine_like", "d-1")
-    assert state(decision("d-1", "mine_like", remark="maybe withdraws decision d-1")) == ("mine_like", "d-1")
-    assert withdrawn_decision(decision("d-2", "unsure", remark="withdraws decision d-1, see log")) is None
 
 
 def test_withdrawal_before_its_decision_arrives_does_not_count():

@@ -10,17 +10,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Literal
 
 from sonarpost.messages import Decision, Verdict
 
 ReviewState = Verdict | Literal["unreviewed", "disputed"]
-
-_WITHDRAWAL_REMARK: Final = re.compile(r"withdraws decision (\S+)")
-"""Remark of a withdrawal in records without the field `withdraws`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,17 +45,6 @@ class ReviewResult:
         return self.counting is None and bool(self.withdrawals)
 
 
-def withdrawn_decision(record: Decision) -> str | None:
-    """Return the identifier of the decision that a record withdraws; None if it is not a withdrawal.
-
-    Records without the field `withdraws` are recognised by their remark.
-    """
-    if record.withdraws is not None:
-        return record.withdraws
-    found = _WITHDRAWAL_REMARK.fullmatch(record.remark)
-    return None if found is None else found[1]
-
-
 def review_result(decisions: Sequence[Decision]) -> ReviewResult:
     """Return which decision on a contact counts, by the rule of this module.
 
@@ -69,16 +54,8 @@ def review_result(decisions: Sequence[Decision]) -> ReviewResult:
         decisions: All decisions on one contact, oldest first.
     """
     identifiers = {decision.decision_id for decision in decisions}
-    names_of = {decision.decision_id: withdrawn_decision(decision) for decision in decisions}
-    # A remark of an operator can resemble a withdrawal; only one that names another decision on this contact is one.
-    withdrawals = frozenset(
-        decision.decision_id
-        for decision in decisions
-        if decision.withdraws is not None or names_of[decision.decision_id] in identifiers - {decision.decision_id}
-    )
-    withdrawn = frozenset(
-        name for own, name in names_of.items() if own in withdrawals and name in identifiers and name is not None
-    )
+    withdrawals = frozenset(d.decision_id for d in decisions if d.withdraws is not None)
+    withdrawn = frozenset(d.withdraws for d in decisions if d.withdraws in identifiers)
     valid = [d for d in decisions if d.decision_id not in withdrawn | withdrawals]
     overruled = frozenset(name for d in valid for name in d.overrules if name in identifiers and name != d.decision_id)
     latest = {d.operator: d for d in valid if d.decision_id not in overruled}

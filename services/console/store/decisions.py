@@ -12,7 +12,7 @@ from typing import NamedTuple
 from sonarpost import wire
 from sonarpost.errors import BadInputError, SonarpostError
 from sonarpost.messages import Decision, DownlinkState, ReconstructedImage, Verdict
-from sonarpost.review.decisions import review_result, withdrawn_decision
+from sonarpost.review.decisions import review_result
 from sonarpost.services.console.store.association import update_decided_on
 from sonarpost.services.console.store.contacts import (
     NotFoundError,
@@ -374,7 +374,7 @@ def _insert(
         "version": record.image_version,
         "sha256": displayed.sha256,
         "layer": displayed.layer,
-        "undoes": withdrawn_decision(record),
+        "undoes": record.withdraws,
         "elsewhere": int(received),
         "shore": delivery.shore,
         "vehicle": delivery.vehicle,
