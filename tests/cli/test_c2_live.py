@@ -36,7 +36,7 @@ from sonarpost.cli.c2 import live as live_module
 from sonarpost.cli.c2 import tak as tak_module
 from sonarpost.cli.c2 import watch as watch_module
 from sonarpost.cli.c2.alert import AlertService, SentAlerts
-from sonarpost.cli.c2.alert_senders import AlertNotAcceptedError, AlertRefusedError, Mqtt, Webhook
+from sonarpost.cli.c2.alert_senders import AlertNotAcceptedError, AlertRefusedError, AlertWebhook, Mqtt
 from sonarpost.cli.c2.live import ContactChange, ContactStream
 from sonarpost.cli.c2.tak import MAX_IMAGES, REFRESH_S, RETRY_S, CotService
 from sonarpost.cli.main import main
@@ -538,7 +538,7 @@ def hook():
 def test_webhook_is_signed(hook):
     contact = contact_of()
     body = alert_document(contact, "2026-01-01T00:00:00.000Z")
-    Webhook(f"http://127.0.0.1:{hook.server_port}/in?x=1", TlsFiles(), SECRET).send(contact.uid, "vessel-1", body)
+    AlertWebhook(f"http://127.0.0.1:{hook.server_port}/in?x=1", TlsFiles(), SECRET).send(contact.uid, "vessel-1", body)
     [(path, headers, received)] = hook.received
     assert (path, headers["X-Sonarpost-Id"], headers["Content-Type"]) == ("/in?x=1", contact.uid, "application/json")
     signed = headers["X-Sonarpost-Timestamp"].encode() + b"." + received
@@ -560,7 +560,7 @@ def test_webhook_is_signed(hook):
 )
 def test_status_of_the_receiver(status, error, hook):
     hook.statuses.append(status)
-    webhook = Webhook(f"http://127.0.0.1:{hook.server_port}", TlsFiles(), None)
+    webhook = AlertWebhook(f"http://127.0.0.1:{hook.server_port}", TlsFiles(), None)
     with pytest.raises(PortError, match=str(status)) as caught:
         webhook.send("id", "vessel-1", b"{}")
     assert type(caught.value) is error
@@ -569,7 +569,7 @@ def test_status_of_the_receiver(status, error, hook):
 
 def test_silent_receiver_is_given_up():
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        webhook = Webhook(f"http://127.0.0.1:{silent.getsockname()[1]}", TlsFiles(), None, timeout_s=0.01)
+        webhook = AlertWebhook(f"http://127.0.0.1:{silent.getsockname()[1]}", TlsFiles(), None, timeout_s=0.01)
         with pytest.raises(PortError, match="not sent"):
             webhook.send("id", "vessel-1", b"{}")
 
@@ -581,8 +581,8 @@ def test_webhook_verifies_the_certificate(hook, tmp_path):
     hook.socket = context.wrap_socket(hook.socket, server_side=True)
     url = f"https://127.0.0.1:{hook.server_port}"
     with pytest.raises(PortError, match="CERTIFICATE_VERIFY_FAILED"):
-        Webhook(url, TlsFiles(), None).send("id", "vessel-1", b"{}")
-    Webhook(url, TlsFiles(ca=folder / CA_CERTIFICATE), None).send("id", "vessel-1", b"{}")
+        AlertWebhook(url, TlsFiles(), None).send("id", "vessel-1", b"{}")
+    AlertWebhook(url, TlsFiles(ca=folder / CA_CERTIFICATE), None).send("id", "vessel-1", b"{}")
     assert len(hook.received) == 1
 
 

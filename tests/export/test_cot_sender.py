@@ -12,7 +12,7 @@ from builders.tak_server import Authority, TakServer
 
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.export.tak import cot_stream
-from sonarpost.export.tak.cot_sender import DATAGRAMS, MAX_BATCH, CotSender, Endpoint, TlsFiles, parse_endpoint
+from sonarpost.export.tak.cot_sender import DATAGRAMS, MAX_BATCH, CotSender, TakEndpoint, TlsFiles, parse_endpoint
 from sonarpost.export.tak.cot_stream import ACKNOWLEDGED, READ
 
 EVENTS = (b'<event uid="a"/>', b'<event uid="b"/>')
@@ -53,10 +53,10 @@ def refused(sender, events=EVENTS):
 
 def test_endpoint_forms():
     for text, endpoint in (
-        ("tcp://tak.example:8087", Endpoint("tcp", "tak.example", 8087)),
-        ("ssl://tak.example:8089", Endpoint("tls", "tak.example", 8089)),
-        ("udp://239.2.3.1:6969", Endpoint("udp", "239.2.3.1", 6969)),
-        ("tcp://[::1]:8087", Endpoint("tcp", "::1", 8087)),
+        ("tcp://tak.example:8087", TakEndpoint("tcp", "tak.example", 8087)),
+        ("ssl://tak.example:8089", TakEndpoint("tls", "tak.example", 8089)),
+        ("udp://239.2.3.1:6969", TakEndpoint("udp", "239.2.3.1", 6969)),
+        ("tcp://[::1]:8087", TakEndpoint("tcp", "::1", 8087)),
     ):
         assert parse_endpoint(text) == endpoint
         assert str(endpoint) == text.replace("ssl", "tls")

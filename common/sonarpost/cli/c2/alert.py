@@ -19,8 +19,8 @@ from sonarpost.cli.c2.alert_senders import (
     AlertNotAcceptedError,
     AlertRefusedError,
     AlertSender,
+    AlertWebhook,
     Mqtt,
-    Webhook,
     read_secret,
 )
 from sonarpost.cli.c2.live import ContactStream, add_live_options
@@ -88,7 +88,7 @@ def run(parsed: argparse.Namespace) -> int:
     logs.configure_logging("alert", log_level(parsed))
     with stop_on_signals() as stop, ExitStack() as stack:
         sender: AlertSender = (
-            Webhook(parsed.webhook, tls, secret, stop=stop) if parsed.webhook else Mqtt(parsed.mqtt, tls, secret)
+            AlertWebhook(parsed.webhook, tls, secret, stop=stop) if parsed.webhook else Mqtt(parsed.mqtt, tls, secret)
         )
         stack.enter_context(closing(sender))
         sent = stack.enter_context(closing(SentAlerts(in_new_folder(parsed.state))))

@@ -66,7 +66,7 @@ def read_secret(path: Path, name: str) -> bytes:
     return secret
 
 
-class Webhook:
+class AlertWebhook:
     """HTTP POST of each alert. TLS certificate and name are verified, and redirections are not followed.
 
     Args:

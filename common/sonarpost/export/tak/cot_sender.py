@@ -36,7 +36,7 @@ _NO_PASSPHRASE: Final = b"-"
 
 
 @dataclass(frozen=True, slots=True)
-class Endpoint:
+class TakEndpoint:
     """Destination of events; `scheme` is tcp, tls or udp."""
 
     scheme: str
@@ -48,7 +48,7 @@ class Endpoint:
         return f"{self.scheme}://{host}:{self.port}"
 
 
-def parse_endpoint(text: str) -> Endpoint:
+def parse_endpoint(text: str) -> TakEndpoint:
     """Parse `tcp://host:port`, `tls://…` (or `ssl://…`) or `udp://…`.
 
     A UDP host may be a multicast address; the hop limit of Linux, 1, keeps its datagrams on the local network.
@@ -65,7 +65,7 @@ def parse_endpoint(text: str) -> Endpoint:
     extra = parts.path or parts.query or parts.fragment or parts.username
     if scheme not in ("tcp", "tls", "udp") or not host or not port or extra:
         raise ConfigError("CoT endpoint", "", text, _EXPECTED)
-    return Endpoint(scheme, host, port)
+    return TakEndpoint(scheme, host, port)
 
 
 @dataclass(frozen=True, slots=True)
