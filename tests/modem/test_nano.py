@@ -29,17 +29,17 @@ from sonarpost.modem.nano.driver import ANSWER_LIMIT_S, CHECK_INTERVAL_S, GUARD_
 from sonarpost.modem.nano.messages import (
     Answer,
     Confirmation,
-    Message,
-    MessageAssembler,
+    NanoData,
+    NanoMessage,
+    NanoMessageAssembler,
     NoAnswer,
-    Received,
     Refusal,
     Status,
 )
 from sonarpost.modem.nano.rates import airtime_s
 from sonarpost.modem.registry import ModemSettings
 
-GOLDEN: list[tuple[bytes, Message]] = [
+GOLDEN: list[tuple[bytes, NanoMessage]] = [
     (b"#A255V21941\r\n", Status(255, None)),
     (b"#A007\r\n", Status(7, None)),
     (b"#A007V21941R001.001.003B2021-06-01T12:00:00\r\n", Status(7, "001.001.003")),
@@ -47,11 +47,11 @@ GOLDEN: list[tuple[bytes, Message]] = [
     (b"$U12364\r\n", Confirmation(b"$U12364")),
     (b"$M00305\r\n", Confirmation(b"$M00305")),
     (b"$P003\r\n", Confirmation(b"$P003")),
-    (b"#B00305hello\r\n", Received(3, b"hello")),
-    (b"#U05hello\r\n", Received(None, b"hello")),
-    (b"#B00305helloQ12D-123T00000000012345\r\n", Received(3, b"hello")),
-    (b"#B00307\r\n#TO\r\n\r\n", Received(3, b"\r\n#TO\r\n")),
-    (b"#B00315#U03abc\r\n#A001$\r\n", Received(3, b"#U03abc\r\n#A001$")),
+    (b"#B00305hello\r\n", NanoData(3, b"hello")),
+    (b"#U05hello\r\n", NanoData(None, b"hello")),
+    (b"#B00305helloQ12D-123T00000000012345\r\n", NanoData(3, b"hello")),
+    (b"#B00307\r\n#TO\r\n\r\n", NanoData(3, b"\r\n#TO\r\n")),
+    (b"#B00315#U03abc\r\n#A001$\r\n", NanoData(3, b"#U03abc\r\n#A001$")),
     (b"#R003T01600\r\n", Answer(3, 0.05)),
     (b"#R003T99999Q12D0123\r\n", Answer(3, 99_999 * 31.25e-6)),
     (b"#TO\r\n", NoAnswer()),
@@ -59,16 +59,16 @@ GOLDEN: list[tuple[bytes, Message]] = [
 ]
 
 
-def each_byte(data: bytes) -> list[Message | SentenceError]:
-    assembler = MessageAssembler()
+def each_byte(data: bytes) -> list[NanoMessage | SentenceError]:
+    assembler = NanoMessageAssembler()
     return [item for index in range(len(data)) for item in assembler.feed(data[index : index + 1])]
 
 
 @pytest.mark.parametrize(("data", "message"), GOLDEN)
-def test_message_whole_by_byte_and_with_trailing_junk(data: bytes, message: Message) -> None:
-    assert MessageAssembler().feed(data * 2) == [message] * 2
+def test_message_whole_by_byte_and_with_trailing_junk(data: bytes, message: NanoMessage) -> None:
+    assert NanoMessageAssembler().feed(data * 2) == [message] * 2
     assert each_byte(data) == [message]
-    assembler = MessageAssembler()
+    assembler = NanoMessageAssembler()
     first, error = assembler.feed(data + b"!junk!")
     assert first == message
     assert isinstance(error, SentenceError)
@@ -94,7 +94,7 @@ def test_message_whole_by_byte_and_with_trailing_junk(data: bytes, message: Mess
     ],
 )
 def test_invalid_message_is_one_error_and_the_next_is_read(data: bytes, field: str) -> None:
-    found = MessageAssembler().feed(data + b"#TO\r\n")
+    found = NanoMessageAssembler().feed(data + b"#TO\r\n")
     assert found[-1] == NoAnswer()
     [error] = found[:-1]
     assert isinstance(error, SentenceError)
@@ -102,12 +102,15 @@ def test_invalid_message_is_one_error_and_the_next_is_read(data: bytes, field: s
 
 
 def test_cut_message_does_not_hide_the_next_one() -> None:
-    assert MessageAssembler().feed(b"#B00320hello#B00405world\r\n#TO\r\n")[-2:] == [Received(4, b"world"), NoAnswer()]
-    assembler = MessageAssembler()
+    assert NanoMessageAssembler().feed(b"#B00320hello#B00405world\r\n#TO\r\n")[-2:] == [
+        NanoData(4, b"world"),
+        NoAnswer(),
+    ]
+    assembler = NanoMessageAssembler()
     assert assembler.feed(b"#B00364hello#B00405world\r\n#TO\r\n") == []
     error, *found = assembler.flush()
     assert isinstance(error, SentenceError)
-    assert found == [Received(4, b"world"), NoAnswer()]
+    assert found == [NanoData(4, b"world"), NoAnswer()]
     assert assembler.flush() == []
 
 
@@ -118,9 +121,9 @@ noise = st.binary(max_size=80) | messages | messages.map(lambda data: data[:-3])
 
 @given(st.lists(noise, max_size=8).map(b"".join), st.data())
 def test_any_bytes_in_any_parts_give_the_same_messages(data: bytes, draw: st.DataObject) -> None:
-    whole, parts = MessageAssembler(), MessageAssembler()
+    whole, parts = NanoMessageAssembler(), NanoMessageAssembler()
     expected = [item for item in whole.feed(data) + whole.flush() if not isinstance(item, SentenceError)]
-    found: list[Message | SentenceError] = []
+    found: list[NanoMessage | SentenceError] = []
     at = 0
     while at < len(data):
         size = draw.draw(st.integers(1, 40))
@@ -130,14 +133,14 @@ def test_any_bytes_in_any_parts_give_the_same_messages(data: bytes, draw: st.Dat
     found += parts.flush()
     assert [item for item in found if not isinstance(item, SentenceError)] == expected
     for item in expected:
-        if isinstance(item, Received):
+        if isinstance(item, NanoData):
             assert 1 <= len(item.data) <= 64
             assert item.source is None or 0 <= item.source <= 255
 
 
 @given(st.binary(min_size=1, max_size=64), st.integers(0, 255))
 def test_data_of_any_bytes(data: bytes, source: int) -> None:
-    assert each_byte(b"#B%03d%02d%b\r\n" % (source, len(data), data)) == [Received(source, data)]
+    assert each_byte(b"#B%03d%02d%b\r\n" % (source, len(data), data)) == [NanoData(source, data)]
 
 
 def take(driver: NanoModem) -> bytes:

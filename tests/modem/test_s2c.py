@@ -30,12 +30,12 @@ from sonarpost.modem.s2c.messages import (
     MAX_TEXT_BYTES,
     DeliveryReport,
     Ignored,
-    MessageAssembler,
     RawMessage,
-    Received,
     ReceptionEnd,
     ReceptionStart,
-    Reply,
+    S2cData,
+    S2cMessageAssembler,
+    S2cReply,
     SendEnd,
     SendStart,
     parse,
@@ -57,7 +57,7 @@ RECORDED = (
     b"+++AT:99:USBLPHYD,10446.992626,10446.534642,3,0,-39278,-10591,16777215,-12608,-27941,23818,16777215,16777215\r\n"
 )
 PARSED = [
-    Reply("*SENDIM", "OK"),
+    S2cReply("*SENDIM", "OK"),
     SendStart(3, "im", 0.182272),
     SendEnd(3, "im", 0.182272),
     ReceptionStart(),
@@ -78,10 +78,10 @@ def framed(text: bytes, command: bytes = b"") -> bytes:
 
 
 def test_recorded_exchange_is_parsed_whole_byte_by_byte_and_with_junk() -> None:
-    assert parsed(MessageAssembler().feed(RECORDED)) == PARSED
-    assembler = MessageAssembler()
+    assert parsed(S2cMessageAssembler().feed(RECORDED)) == PARSED
+    assembler = S2cMessageAssembler()
     assert parsed([item for byte in RECORDED for item in assembler.feed(bytes([byte]))]) == PARSED
-    assembler = MessageAssembler()
+    assembler = S2cMessageAssembler()
     junk = parsed(assembler.feed(b"\x00\xff+++ATjunk" + RECORDED + b"+++AT:9:RECV"))
     assert [item for item in junk if not isinstance(item, SentenceError)] == PARSED
     assert isinstance(junk[0], SentenceError)
@@ -102,9 +102,9 @@ def test_recorded_exchange_is_parsed_whole_byte_by_byte_and_with_junk() -> None:
 def test_length_delimits_received_data(head: bytes, kind: str, ack: bool, is_escaped: bool) -> None:
     message = head % len(HOSTILE_DATA) + HOSTILE_DATA
     stream = framed(message) * 2 if is_escaped else (message + b"\r\n") * 2
-    expected = [Received(kind, 3, 1, ack, -36.0, 177, -0.125, HOSTILE_DATA)] * 2
-    assert parsed(MessageAssembler().feed(stream)) == expected
-    assembler = MessageAssembler()
+    expected = [S2cData(kind, 3, 1, ack, -36.0, 177, -0.125, HOSTILE_DATA)] * 2
+    assert parsed(S2cMessageAssembler().feed(stream)) == expected
+    assembler = S2cMessageAssembler()
     assert parsed([item for byte in stream for item in assembler.feed(bytes([byte]))]) == expected
 
 
@@ -151,7 +151,7 @@ def test_wrong_notification_is_refused(text: bytes) -> None:
     ],
 )
 def test_next_message_is_found_after_a_broken_one(broken: bytes) -> None:
-    assembler = MessageAssembler()
+    assembler = S2cMessageAssembler()
     items = assembler.feed(broken + framed(b"DELIVEREDIM,3") * 3) + assembler.abandon()
     assert any(item == RawMessage("", b"DELIVEREDIM,3") for item in items)
     assert not assembler.incomplete
@@ -159,7 +159,7 @@ def test_next_message_is_found_after_a_broken_one(broken: bytes) -> None:
 
 @given(st.lists(st.one_of(st.binary(max_size=80), st.sampled_from([RECORDED, b"+++AT:", b"RECVIM,4,", b"\r\n", b"+"]))))
 def test_parser_accepts_any_bytes(parts: list[bytes]) -> None:
-    assembler = MessageAssembler()
+    assembler = S2cMessageAssembler()
     for item in [item for part in parts for item in assembler.feed(part)] + assembler.abandon():
         if isinstance(item, RawMessage):
             with suppress(SentenceError):
@@ -170,10 +170,10 @@ def test_parser_accepts_any_bytes(parts: list[bytes]) -> None:
 @given(st.binary(max_size=64), st.integers(1, 5))
 def test_any_data_is_received_in_any_parts(data: bytes, size: int) -> None:
     stream = framed(b"RECVIM,%d,3,1,ack,182272,-36,177,0.0000,%b" % (len(data), data))
-    assembler = MessageAssembler()
+    assembler = S2cMessageAssembler()
     parts = [stream[n : n + size] for n in range(0, len(stream), size)]
     assert parsed([item for part in parts for item in assembler.feed(part)]) == [
-        Received("IM", 3, 1, True, -36.0, 177, 0.0, data)
+        S2cData("IM", 3, 1, True, -36.0, 177, 0.0, data)
     ]
 
 

@@ -91,7 +91,7 @@ class NanoModem(QueueingModem[_Sending]):
 
     def __init__(self, settings: ModemSettings, where: str = "modem port") -> None:
         super().__init__(CAPABILITIES, settings, where)
-        self._assembler = messages.MessageAssembler()
+        self._assembler = messages.NanoMessageAssembler()
         self._question: bytes | None = None
         self._asked_s = 0.0
         self._attempts = 0
@@ -271,7 +271,7 @@ class NanoModem(QueueingModem[_Sending]):
 
     # Messages of the modem
 
-    def _process(self, found: Sequence[messages.Message | SentenceError], now: float) -> None:
+    def _process(self, found: Sequence[messages.NanoMessage | SentenceError], now: float) -> None:
         for item in found:
             if isinstance(item, SentenceError):
                 self._events.append(SentenceRejected(item))
@@ -280,7 +280,7 @@ class NanoModem(QueueingModem[_Sending]):
             match item:
                 case messages.Status():
                     self._on_status(item, now)
-                case messages.Received():
+                case messages.NanoData():
                     self._on_data(item, now)
                 case messages.Refusal():
                     self._events.append(ModemError("E"))
@@ -289,7 +289,7 @@ class NanoModem(QueueingModem[_Sending]):
                 case _:
                     self._on_progress(item, now)
 
-    def _on_progress(self, item: messages.Message, now: float) -> None:
+    def _on_progress(self, item: messages.NanoMessage, now: float) -> None:
         """Process what concerns the packet in progress; ignore it if it belongs to another one."""
         sending = self._sending
         if sending is None:
@@ -308,7 +308,7 @@ class NanoModem(QueueingModem[_Sending]):
             case _:
                 pass
 
-    def _on_data(self, received: messages.Received, now: float) -> None:
+    def _on_data(self, received: messages.NanoData, now: float) -> None:
         address, data = received.data[0], received.data[1:]
         own = self._settings.address
         source, dest = (address, own) if received.source is None else (received.source, address)

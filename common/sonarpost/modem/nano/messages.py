@@ -73,7 +73,7 @@ class NoAnswer:
 
 
 @dataclass(frozen=True, slots=True)
-class Received:
+class NanoData:
     """`#B` or `#U`: data from another modem.
 
     Attributes:
@@ -85,7 +85,7 @@ class Received:
     data: bytes
 
 
-Message = Status | Confirmation | Refusal | Answer | NoAnswer | Received
+NanoMessage = Status | Confirmation | Refusal | Answer | NoAnswer | NanoData
 
 
 def broadcast_command(data: bytes) -> tuple[bytes, bytes]:
@@ -152,7 +152,7 @@ class _Cursor:
         return bytes(self.data[start : self.at])
 
 
-def _parse(cursor: _Cursor) -> Message:
+def _parse(cursor: _Cursor) -> NanoMessage:
     """Parse one message; its end is `cursor.at`.
 
     Raises:
@@ -164,7 +164,7 @@ def _parse(cursor: _Cursor) -> Message:
         cursor.expect(b"E\r\n")
         return Refusal()
     kind = cursor.take(2)
-    message: Message
+    message: NanoMessage
     if kind == b"#A":
         address = cursor.number("address", 3, 0, 255)
         text = cursor.run(_PRINTABLE, MAX_STATUS_BYTES).decode("ascii")
@@ -172,7 +172,7 @@ def _parse(cursor: _Cursor) -> Message:
         message = Status(address, release.group(1) if release else None)
     elif kind in (b"#B", b"#U"):
         source = cursor.number("address", 3, 0, 255) if kind == b"#B" else None
-        message = Received(source, cursor.take(cursor.number("length", 2, 1, MAX_PAYLOAD_BYTES)))
+        message = NanoData(source, cursor.take(cursor.number("length", 2, 1, MAX_PAYLOAD_BYTES)))
         cursor.run(_SUFFIX, MAX_SUFFIX_BYTES)
     elif kind == b"#R":
         source = cursor.number("address", 3, 0, 255)
@@ -194,7 +194,7 @@ def _parse(cursor: _Cursor) -> Message:
     return message
 
 
-class MessageAssembler:
+class NanoMessageAssembler:
     """Divides the bytes of the modem into messages. It keeps less than the longest message."""
 
     def __init__(self) -> None:
@@ -209,14 +209,14 @@ class MessageAssembler:
         """Drop an unfinished message."""
         self._buffer.clear()
 
-    def feed(self, data: bytes) -> list[Message | SentenceError]:
+    def feed(self, data: bytes) -> list[NanoMessage | SentenceError]:
         """Return the messages that are complete now, and an error for each run of other bytes."""
         self._buffer += data
         return self._take()
 
-    def flush(self) -> list[Message | SentenceError]:
+    def flush(self) -> list[NanoMessage | SentenceError]:
         """Give up the unfinished message: its rest was lost. Return what its bytes contain."""
-        found: list[Message | SentenceError] = []
+        found: list[NanoMessage | SentenceError] = []
         if self._buffer:
             found.append(SentenceError(_WHERE, "end", bytes(self._buffer[:20]), "a complete message"))
         while self._buffer:
@@ -224,8 +224,8 @@ class MessageAssembler:
             found += (item for item in self._take() if not isinstance(item, SentenceError))
         return found
 
-    def _take(self) -> list[Message | SentenceError]:
-        found: list[Message | SentenceError] = []
+    def _take(self) -> list[NanoMessage | SentenceError]:
+        found: list[NanoMessage | SentenceError] = []
         at, skipping = 0, False
         while at < len(self._buffer):
             cursor = _Cursor(self._buffer, at)

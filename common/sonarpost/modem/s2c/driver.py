@@ -36,13 +36,13 @@ from sonarpost.modem.registry import ModemSettings
 from sonarpost.modem.s2c.events import UsblPosition
 from sonarpost.modem.s2c.messages import (
     DeliveryReport,
-    Message,
-    MessageAssembler,
     RawMessage,
-    Received,
     ReceptionEnd,
     ReceptionStart,
-    Reply,
+    S2cData,
+    S2cMessage,
+    S2cMessageAssembler,
+    S2cReply,
     SendEnd,
     SendStart,
     parse,
@@ -87,7 +87,7 @@ class S2cModem(QueueingModem[Sending]):
 
     def __init__(self, settings: ModemSettings, where: str = "modem port") -> None:
         super().__init__(CAPABILITIES, settings, where)
-        self._assembler = MessageAssembler()
+        self._assembler = S2cMessageAssembler()
         self._has_sent_burst = False
         self._pings: set[int] = set()
         self._ready = False
@@ -301,12 +301,12 @@ class S2cModem(QueueingModem[Sending]):
         if self._assembler.incomplete and now >= self._received_s + PAUSE_S:
             self._process(self._assembler.abandon(), now)
 
-    def _on_message(self, message: Message, now: float) -> None:
+    def _on_message(self, message: S2cMessage, now: float) -> None:
         self._answered_s = now
         match message:
-            case Reply():
+            case S2cReply():
                 self._on_reply(message, now)
-            case Received():
+            case S2cData():
                 self._on_received(message, now)
             case DeliveryReport():
                 self._on_report(message, now)
@@ -328,7 +328,7 @@ class S2cModem(QueueingModem[Sending]):
             case _:
                 pass
 
-    def _on_reply(self, reply: Reply, now: float) -> None:
+    def _on_reply(self, reply: S2cReply, now: float) -> None:
         command = self._command
         if command is None or not _answers(reply, command):
             return  # a late or repeated answer
@@ -442,7 +442,7 @@ class S2cModem(QueueingModem[Sending]):
         self._pings.discard(failed.packet_id)
         return RequestFailed(failed.packet_id, "ping", failed.dest, failed.reason)
 
-    def _on_received(self, received: Received, now: float) -> None:
+    def _on_received(self, received: S2cData, now: float) -> None:
         self._receiving_until_s = None
         if received.data == PING_DATA:
             return
@@ -459,7 +459,7 @@ class S2cModem(QueueingModem[Sending]):
         self._events += [*frames, packet]
 
 
-def _answers(reply: Reply, command: _Command) -> bool:
+def _answers(reply: S2cReply, command: _Command) -> bool:
     """Return whether a reply can be the one to a command. In command mode a reply does not name its command."""
     if reply.command is None:
         return True

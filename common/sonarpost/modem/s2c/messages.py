@@ -53,7 +53,7 @@ class RawMessage:
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class S2cReply:
     """Answer to a command: `OK`, `BUSY …`, `ERROR …` or a value. `command` is as in `RawMessage`."""
 
     command: str | None
@@ -61,7 +61,7 @@ class Reply:
 
 
 @dataclass(frozen=True, slots=True)
-class Received:
+class S2cData:
     """Data of another modem.
 
     Attributes:
@@ -85,7 +85,7 @@ class Received:
 
 @dataclass(frozen=True, slots=True)
 class DeliveryReport:
-    """What became of a message: `result` is DELIVERED, FAILED, CANCELED or EXPIRED, `kind` is as in `Received`."""
+    """What became of a message: `result` is DELIVERED, FAILED, CANCELED or EXPIRED, `kind` is as in `S2cData`."""
 
     result: str
     kind: str
@@ -129,12 +129,12 @@ class Ignored:
     name: str
 
 
-Message = (
-    Reply | Received | DeliveryReport | SendStart | SendEnd | ReceptionStart | ReceptionEnd | UsblPosition | Ignored
+S2cMessage = (
+    S2cReply | S2cData | DeliveryReport | SendStart | SendEnd | ReceptionStart | ReceptionEnd | UsblPosition | Ignored
 )
 
 
-class MessageAssembler:
+class S2cMessageAssembler:
     """Divides the stream of bytes into messages of either mode. Its buffer holds at most one incomplete message."""
 
     def __init__(self) -> None:
@@ -234,14 +234,14 @@ class MessageAssembler:
         return SentenceError(_WHERE, "message", junk, "a message of the modem with its length and end")
 
 
-def parse(raw: RawMessage) -> Message:
+def parse(raw: RawMessage) -> S2cMessage:
     """Parse one message.
 
     Raises:
         SentenceError: A field is missing, superfluous or out of range.
     """
     if raw.command:
-        return Reply(raw.command, _text(raw.text[:MAX_TEXT_BYTES]))
+        return S2cReply(raw.command, _text(raw.text[:MAX_TEXT_BYTES]))
     if (received := _RECEIVED.match(raw.text)) is not None:
         return _received(raw.text, received)
     text = _text(raw.text)
@@ -254,11 +254,11 @@ def parse(raw: RawMessage) -> Message:
         _count(name, fields, 1 if report[2] else 2)
         return DeliveryReport(report[1], report[2], _address(fields[-1]))
     if raw.command is None or name in _IGNORED:
-        return Ignored(name) if name in _IGNORED else Reply(None, text)
+        return Ignored(name) if name in _IGNORED else S2cReply(None, text)
     raise SentenceError(_WHERE, "notification", text[:40], "a notification of the modem")
 
 
-def _received(text: bytes, received: re.Match[bytes]) -> Received:
+def _received(text: bytes, received: re.Match[bytes]) -> S2cData:
     kind, length = received[1].decode(), int(received[2])
     *fields, data = text[received.end() :].split(b",", _DATA_FIELDS[kind])
     name = "RECV" + kind
@@ -269,7 +269,7 @@ def _received(text: bytes, received: re.Match[bytes]) -> Received:
     # Signal strength, integrity and velocity; burst data has the travel time before the velocity.
     first = {"": 3, "PBM": 3}.get(kind, 4)
     rssi, integrity, velocity = values[first], values[first + 1], values[-1]
-    return Received(
+    return S2cData(
         kind,
         _address(values[0]),
         _address(values[1]),
@@ -333,7 +333,7 @@ def _usbl(fields: list[str]) -> UsblPosition:
     return UsblPosition(_address(fields[2]), east_m, north_m, up_m, _seconds(fields[12]), accuracy_m)
 
 
-_NOTIFICATIONS: Final[Mapping[str, tuple[int, Callable[[list[str]], Message]]]] = MappingProxyType(
+_NOTIFICATIONS: Final[Mapping[str, tuple[int, Callable[[list[str]], S2cMessage]]]] = MappingProxyType(
     {
         "RECVSTART": (0, lambda fields: ReceptionStart()),
         "RECVEND": (4, lambda fields: ReceptionEnd(failed=False)),
