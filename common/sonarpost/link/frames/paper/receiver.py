@@ -26,7 +26,7 @@ ReportedState = tuple[int, int, bool]
 """Index of the best candidate, bytes of its body, whether there is a contact record."""
 
 
-class FrameOutcome(Enum):
+class FrameEffect(Enum):
     """Effect of a frame on its image."""
 
     ADDED = "added"
@@ -119,7 +119,7 @@ class PendingImage:
             return -1, 0, self.contact is not None
         return self.candidates.index(best), best.body.received_bytes, self.contact is not None
 
-    def add_half(self, frame: HalfFrame, now: float) -> FrameOutcome:
+    def add_half(self, frame: HalfFrame, now: float) -> FrameEffect:
         """Add a half frame."""
         self.last_seen_s = now
         agreeing = (c for c in self.candidates if c.header == frame.header and len(c.body.data) == frame.body_length)
@@ -128,26 +128,26 @@ class PendingImage:
             self.conflicts += 1
         if candidate is None:
             if len(self.candidates) >= MAX_CANDIDATES:
-                return FrameOutcome.REJECTED
+                return FrameEffect.REJECTED
             candidate = ImageCandidate(frame.header, PartialBytes(bytearray(frame.body_length)), frames=0)
             self.candidates.append(candidate)
         added, conflict = candidate.body.write(frame.offset, frame.payload)
         self.conflicts += conflict
         if not added and candidate.frames:
-            return FrameOutcome.DUPLICATE
+            return FrameEffect.DUPLICATE
         candidate.frames += 1
         self.last_frame_s = self.wait_from_s = now
-        return FrameOutcome.ADDED
+        return FrameEffect.ADDED
 
-    def add_contact(self, contact: ContactSummary, now: float) -> FrameOutcome:
+    def add_contact(self, contact: ContactSummary, now: float) -> FrameEffect:
         """Add a contact record; the image keeps the first one."""
         self.last_seen_s = now
         if self.contact is not None:
             self.conflicts += contact != self.contact
-            return FrameOutcome.DUPLICATE
+            return FrameEffect.DUPLICATE
         self.contact = contact
         self.last_frame_s = self.wait_from_s = now
-        return FrameOutcome.ADDED
+        return FrameEffect.ADDED
 
     def next_update(self) -> ImageUpdate:
         """Return all that is known, as the next version."""
@@ -305,8 +305,8 @@ class PaperReceiver:
         earlier_conflicts = image.conflicts
         outcome = image.add_half(frame, now) if isinstance(frame, HalfFrame) else image.add_contact(frame.contact, now)
         self.counts.conflicts += image.conflicts - earlier_conflicts
-        self.counts.duplicates += outcome is FrameOutcome.DUPLICATE
-        if outcome is FrameOutcome.REJECTED:
+        self.counts.duplicates += outcome is FrameEffect.DUPLICATE
+        if outcome is FrameEffect.REJECTED:
             self.counts.rejected += 1
             reason = FrameError(
                 f"acoustic frame from modem {source}",
