@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sonarpost.detection.detector import Detection
-from sonarpost.sonar.maps.geotiff import GeoTransform, GreyImage
+from sonarpost.sonar.maps.geotiff import GeoTransform, Grey
 from sonarpost.sonar.maps.ground_canvas import GroundCanvas
 from sonarpost.sonar.maps.track import track_of, utm_epsg
 from sonarpost.sonar.projection import Projection
@@ -24,7 +24,7 @@ class ContactMap:
         transform: Place of the image, in a UTM zone.
     """
 
-    image: GreyImage
+    image: Grey
     transform: GeoTransform
 
 

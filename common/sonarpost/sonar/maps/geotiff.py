@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from sonarpost.files import atomic_file
 
-GreyImage = npt.NDArray[np.uint8]
+Grey = npt.NDArray[np.uint8]
 
 TILE_PX: Final = 512
 MAX_TILES: Final = 1 << 17
@@ -70,7 +70,7 @@ class _Level:
         return math.ceil(self.height_px / TILE_PX), math.ceil(self.width_px / TILE_PX)
 
 
-def write_image(path: Path, image: GreyImage, transform: GeoTransform) -> None:
+def write_image(path: Path, image: Grey, transform: GeoTransform) -> None:
     """Write an image in memory, shape (rows, columns), uint8; 0 means no data.
 
     Raises:
@@ -78,7 +78,7 @@ def write_image(path: Path, image: GreyImage, transform: GeoTransform) -> None:
         OSError: The file cannot be written.
     """
 
-    def tile(row: int, column: int) -> GreyImage:
+    def tile(row: int, column: int) -> Grey:
         part = image[row * TILE_PX : (row + 1) * TILE_PX, column * TILE_PX : (column + 1) * TILE_PX]
         return np.pad(part, ((0, TILE_PX - part.shape[0]), (0, TILE_PX - part.shape[1])))
 
@@ -87,7 +87,7 @@ def write_image(path: Path, image: GreyImage, transform: GeoTransform) -> None:
 
 
 def write_tiles(
-    path: Path, size_px: tuple[int, int], tile: Callable[[int, int], GreyImage], transform: GeoTransform
+    path: Path, size_px: tuple[int, int], tile: Callable[[int, int], Grey], transform: GeoTransform
 ) -> None:
     """Write an image tile by tile, atomically. Temporary files beside it need up to twice its size without compression.
 
@@ -136,7 +136,7 @@ def _levels(size_px: tuple[int, int]) -> list[_Level]:
     return levels
 
 
-def _write_raw(raw: BinaryIO, levels: list[_Level], tile: Callable[[int, int], GreyImage]) -> list[int]:
+def _write_raw(raw: BinaryIO, levels: list[_Level], tile: Callable[[int, int], Grey]) -> list[int]:
     """Write all tiles of all levels without compression; return the offset of each level."""
     starts = [0]
     rows, columns = levels[0].grid
@@ -152,7 +152,7 @@ def _write_raw(raw: BinaryIO, levels: list[_Level], tile: Callable[[int, int], G
     return starts
 
 
-def _four_tiles(raw: BinaryIO, level: _Level, start: int, row: int, column: int) -> GreyImage:
+def _four_tiles(raw: BinaryIO, level: _Level, start: int, row: int, column: int) -> Grey:
     """Return the tiles of a finer level that a tile covers, shape (1024, 1024), 0 beyond the level."""
     four = np.zeros((2 * TILE_PX, 2 * TILE_PX), np.uint8)
     rows, columns = level.grid
@@ -164,17 +164,17 @@ def _four_tiles(raw: BinaryIO, level: _Level, start: int, row: int, column: int)
     return four
 
 
-def _raw_tile(raw: BinaryIO, start: int, number: int) -> GreyImage:
+def _raw_tile(raw: BinaryIO, start: int, number: int) -> Grey:
     raw.seek(start + number * TILE_PX**2)
     return np.frombuffer(raw.read(TILE_PX**2), np.uint8).reshape(TILE_PX, TILE_PX)
 
 
-def _reduced(image: GreyImage) -> GreyImage:
+def _reduced(image: Grey) -> Grey:
     """Return the means of blocks of two by two pixels, of those with data; 0 without."""
     blocks = image.reshape(image.shape[0] // 2, 2, image.shape[1] // 2, 2)
     count = np.count_nonzero(blocks, axis=(1, 3))
     total = blocks.sum(axis=(1, 3), dtype=np.uint32)
-    means: GreyImage = ((total + count // 2) // np.maximum(count, 1)).astype(np.uint8)
+    means: Grey = ((total + count // 2) // np.maximum(count, 1)).astype(np.uint8)
     return means
 
 

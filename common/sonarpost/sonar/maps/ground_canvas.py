@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.ground_range import beam_normalised, ground_range_image
-from sonarpost.sonar.maps.geotiff import TILE_PX, GeoTransform, GreyImage
+from sonarpost.sonar.maps.geotiff import TILE_PX, GeoTransform, Grey
 from sonarpost.sonar.maps.track import MAX_GAP_M, MAX_GAP_S, Track
 from sonarpost.sonar.survey import FloatImage, Side
 
@@ -135,7 +135,7 @@ class GroundCanvas:
         self._tiles[number] = tile
         return tile
 
-    def grey(self, row: int, column: int) -> GreyImage:
+    def grey(self, row: int, column: int) -> Grey:
         """Return a tile of the image: 1 + 127 times the square root of the mean echo, at most 255; 0 without data."""
         number = row * self._columns + column
         if number not in self._tiles and number not in self._slots:
@@ -145,11 +145,11 @@ class GroundCanvas:
         grey = np.where(counts > 0, np.clip(1 + np.rint(_MEAN_GREY * level), 1, 255), 0)
         return grey.astype(np.uint8).reshape(TILE_PX, TILE_PX)
 
-    def image(self) -> GreyImage:
+    def image(self) -> Grey:
         """Return the whole image, shape (rows, columns), as the tiles of `grey`; for images of a few tiles."""
         rows, columns = (math.ceil(size / TILE_PX) for size in self._size_px)
         tiles = [[self.grey(row, column) for column in range(columns)] for row in range(rows)]
-        image: GreyImage = np.block(tiles)[: self._size_px[0], : self._size_px[1]]
+        image: Grey = np.block(tiles)[: self._size_px[0], : self._size_px[1]]
         return image
 
 

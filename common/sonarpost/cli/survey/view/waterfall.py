@@ -50,7 +50,7 @@ _ROW: Final = np.dtype(
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class PixelPlace:
     """The place of a pixel.
 
     Attributes:
@@ -195,7 +195,7 @@ class Waterfall:
         left, width = _window(column, SNIPPET_PX, 2 * self.side_px)
         return _png(np.asarray(self._grey[top : top + height, left : left + width]))
 
-    def place(self, row: int, column: int) -> Place | None:
+    def place(self, row: int, column: int) -> PixelPlace | None:
         """Return the place of a pixel; None where nothing was recorded.
 
         Raises:
@@ -217,7 +217,7 @@ class Waterfall:
         reference = georeference(ping, side, sample, self._options, tracked_altitude_m=tracked_m)
         index = self.ping_index(row)
         by_index = self.pings_per_row > 1 or ping.number in self._repeated or ping.number < 0
-        return Place(
+        return PixelPlace(
             pick=Pick(index if by_index else ping.number, side, sample, by_index),
             ping_number=ping.number,
             ping_index=index,

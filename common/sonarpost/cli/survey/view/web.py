@@ -25,7 +25,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from sonarpost.cli.shared import utc_text
-from sonarpost.cli.survey.view.waterfall import TILE_ROWS, Place, Waterfall
+from sonarpost.cli.survey.view.waterfall import TILE_ROWS, PixelPlace, Waterfall
 from sonarpost.detection.detector import Detection
 from sonarpost.detection.picks import MAX_PICKS, Pick, parse_pick, picks_text
 from sonarpost.errors import ConfigError
@@ -216,7 +216,7 @@ class SurveyViewApp:
         return self._waterfall.ping_index_of(pick) if known is None else known
 
 
-def _place_json(place: Place) -> Json:
+def _place_json(place: PixelPlace) -> Json:
     fields = asdict(place)
     return (
         fields
