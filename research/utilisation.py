@@ -30,7 +30,7 @@ from sonarpost.link.receiver import FeedbackReceived
 from sonarpost.link.sender import ImageToSend
 from sonarpost.modem.interface import FrameDecoded, FrameReceived, ModemEvent, PacketFailed, PacketSent
 from sonarpost.modem.micromodem import RATES, MicroModem
-from sonarpost.simulation.channel.events import Transmission
+from sonarpost.simulation.channel.events import TransmittedPacket
 from sonarpost.simulation.channel.parameters import ChannelParameters
 
 _VEHICLE: Final = 3
@@ -203,7 +203,7 @@ def measure_utilisation(spec: UtilisationSpec) -> UtilisationResult:
     )
 
 
-def _airtime_s(transmissions: Sequence[Transmission], start_s: float, stop_s: float) -> float:
+def _airtime_s(transmissions: Sequence[TransmittedPacket], start_s: float, stop_s: float) -> float:
     return sum(max(0.0, min(t.ended_s, stop_s) - max(t.started_s, start_s)) for t in transmissions)
 
 

@@ -7,7 +7,7 @@ from typing import Final
 from sonarpost.modem.interface import ModemEvent
 from sonarpost.modem.micromodem import MicroModem, MicroModemConfig
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.events import Transmission
+from sonarpost.simulation.channel.events import TransmittedPacket
 from sonarpost.simulation.channel.parameters import ChannelParameters
 from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
 from sonarpost.simulation.modem.settings import EmulatedModemConfig
@@ -42,7 +42,7 @@ class ModemPair:
         }
         self._simulator = ChannelSimulator(channel, modems, serial_baud=serial_baud)
         self.drivers = {number: MicroModem(MicroModemConfig(number)) for number in modems}
-        self.transmissions: list[Transmission] = []
+        self.transmissions: list[TransmittedPacket] = []
         self.now = 0.0
         for driver in self.drivers.values():
             driver.start(0.0)
@@ -58,7 +58,7 @@ class ModemPair:
         for number, driver in self.drivers.items():
             events += [(number, event) for event in driver.poll(self.now)]
             self._simulator.receive(number, driver.bytes_to_send(), self.now)
-        self.transmissions += [t for t in self._simulator.advance(self.now) if isinstance(t, Transmission)]
+        self.transmissions += [t for t in self._simulator.advance(self.now) if isinstance(t, TransmittedPacket)]
         for number, driver in self.drivers.items():
             for output in self._simulator.take_outputs(number):
                 events += [(number, event) for event in driver.receive(output.data, self.now)]

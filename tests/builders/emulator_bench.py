@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 
 from sonarpost.modem.micromodem import nmea
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.events import Transmission
+from sonarpost.simulation.channel.events import TransmittedPacket
 from sonarpost.simulation.channel.parameters import ChannelParameters
 from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
 from sonarpost.simulation.modem.receiver import PacketReport
@@ -30,7 +30,7 @@ class EmulatorBench:
         self.simulator = ChannelSimulator(ChannelParameters(**parameters), places, serial_baud)  # type: ignore[arg-type]
         self.output = dict.fromkeys(places, b"")
         self.reports: list[PacketReport] = []
-        self.transmissions: list[Transmission] = []
+        self.transmissions: list[TransmittedPacket] = []
         self.now = 0.0
         self.advance(1.0)
         self.clear_output()

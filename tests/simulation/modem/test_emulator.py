@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.modem.micromodem import nmea
-from sonarpost.simulation.channel.events import Transmission
+from sonarpost.simulation.channel.events import TransmittedPacket
 from sonarpost.simulation.channel.simulator import SerialLine
 from sonarpost.simulation.modem.emulator import EmulatedMicroModem
 from sonarpost.simulation.modem.settings import EmulatedModemConfig
@@ -77,7 +77,7 @@ def test_modem_answers_after_any_input(steps: list[tuple[int, bytes, float]]):
 
 @given(st.integers(1, 7), st.integers(0, 2**32))
 def test_result_is_independent_of_the_step_size(steps: int, seed: int):
-    def run(advances: int) -> tuple[dict[int, bytes], list[Transmission]]:
+    def run(advances: int) -> tuple[dict[int, bytes], list[TransmittedPacket]]:
         bench = EmulatorBench(frame_loss=0.3, seed=seed)
         bench.send(1, ("CCCYC", 0, 1, 2, 5, 1, 3), *(("CCTXD", 1, 2, 1, f"{n:02X}" * 20) for n in range(3)))
         for n in range(1, advances + 1):

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.events import PacketKind, Transmission
+from sonarpost.simulation.channel.events import PacketKind, TransmittedPacket
 from sonarpost.simulation.channel.parameters import build_parameters
 from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
 from sonarpost.simulation.modem.packet_modem import PacketModemSettings
@@ -24,7 +24,7 @@ class Water:
             number: PlacedModem(PacketModemSettings("s2c", number), LocalPosition(150.0 * number)) for number in (1, 2)
         }
         self.simulator = ChannelSimulator(build_parameters(parameters, "test"), modems)
-        self.transmissions: list[Transmission] = []
+        self.transmissions: list[TransmittedPacket] = []
 
     def say(self, number: int, command: bytes) -> None:
         """Send a command of data mode to a modem."""
@@ -33,7 +33,7 @@ class Water:
     def run(self, duration_s: float) -> None:
         """Let time pass."""
         happened = self.simulator.advance(self.simulator.now + duration_s)
-        self.transmissions += [item for item in happened if isinstance(item, Transmission)]
+        self.transmissions += [item for item in happened if isinstance(item, TransmittedPacket)]
 
     def messages(self, number: int) -> list[tuple[bytes, bytes]]:
         """Return the command and the text of each message that a modem has sent to its host since the last call."""

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from sonarpost.simulation.seabed.survey import SurveySpec, Track, echo_intensity, received_amplitude
+from sonarpost.simulation.seabed.survey import SonarPath, SurveySpec, echo_intensity, received_amplitude
 from sonarpost.simulation.seabed.targets import ObjectKind, SeabedObject, place_object
 from sonarpost.simulation.seabed.terrain import Seabed
 
@@ -19,9 +19,9 @@ def flat_bed() -> Seabed:
     return Seabed(np.zeros(shape, np.float32), np.full(shape, 0.3, np.float32), 0.05, -3.0, -32.5)
 
 
-def straight_track(pings: int = 200) -> Track:
+def straight_track(pings: int = 200) -> SonarPath:
     still = np.zeros(pings)
-    return Track(np.arange(pings) * 0.1, still, np.full(pings, ALTITUDE_M), still, still)
+    return SonarPath(np.arange(pings) * 0.1, still, np.full(pings, ALTITUDE_M), still, still)
 
 
 def sample_of(ground_m: float, height_m: float = 0.0) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.seabed.survey import SimulatedSurvey, SurveySpec, Track, echo_intensity, simulate_survey
+from sonarpost.simulation.seabed.survey import SimulatedSurvey, SonarPath, SurveySpec, echo_intensity, simulate_survey
 from sonarpost.simulation.seabed.targets import (
     FURTHER_CLUTTER_KINDS,
     FURTHER_MINE_LIKE_KINDS,
@@ -52,7 +52,7 @@ def flat_echo(*items: SeabedObject) -> np.ndarray:
     for item in items:
         place_object(bed, item)
     still = np.zeros(200)
-    track = Track(np.arange(200) * 0.1, still, np.full(200, ALTITUDE_M), still, still)
+    track = SonarPath(np.arange(200) * 0.1, still, np.full(200, ALTITUDE_M), still, still)
     return echo_intensity(bed, track, SurveySpec(samples=1024), 1)
 
 

@@ -66,7 +66,7 @@ class AcousticPacket:
 
 
 @dataclass(frozen=True, slots=True)
-class Transmission:
+class TransmittedPacket:
     """A transmitted packet: `number` counts the transmitter's packets from 1; times are simulated seconds."""
 
     transmitter: int
@@ -92,7 +92,7 @@ class ArrivalStarted:
 
     receiver: int
     time_s: float
-    transmission: Transmission
+    transmission: TransmittedPacket
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ class ArrivalEnded:
 
     receiver: int
     time_s: float
-    transmission: Transmission
+    transmission: TransmittedPacket
     outcome: PacketOutcome
     detected: bool
     frames: tuple[FrameArrival, ...]

@@ -22,7 +22,7 @@ from sonarpost.simulation.channel.events import (
     FrameArrival,
     FrameOutcome,
     PacketOutcome,
-    Transmission,
+    TransmittedPacket,
 )
 from sonarpost.simulation.channel.parameters import ChannelParameters, TailDamage
 
@@ -115,7 +115,7 @@ class _PendingArrival:
     """A transmission at one receiver, `start_s` to `end_s`."""
 
     receiver: int
-    transmission: Transmission
+    transmission: TransmittedPacket
     start_s: float
     end_s: float
     range_m: float
@@ -131,7 +131,7 @@ class _ModemState:
 
     position: LocalPosition
     sent: int = 0
-    transmissions: list[Transmission] = field(default_factory=list)
+    transmissions: list[TransmittedPacket] = field(default_factory=list)
     arrivals: list[_PendingArrival] = field(default_factory=list)
 
 
@@ -166,7 +166,7 @@ class ChannelModel:
         """Return the simulated time of the next event, or None when no packet is in flight."""
         return self._events[0][0] if self._events else None
 
-    def transmit(self, modem: int, packet: AcousticPacket, now: float) -> Transmission:
+    def transmit(self, modem: int, packet: AcousticPacket, now: float) -> TransmittedPacket:
         """Transmit a packet at `now`.
 
         Raises:
@@ -181,7 +181,7 @@ class ChannelModel:
                 f"modem {modem} transmits until {transmitter.transmissions[-1].ended_s}, not again at {now}"
             )
         transmitter.sent += 1
-        sent = Transmission(modem, transmitter.sent, packet, now, now + packet.airtime_s)
+        sent = TransmittedPacket(modem, transmitter.sent, packet, now, now + packet.airtime_s)
         transmitter.transmissions.append(sent)
         for receiver, other in self._modems.items():
             if receiver != modem:
@@ -204,7 +204,9 @@ class ChannelModel:
         loss_db = transmission_loss_db(range_m, self._absorption_db_per_km, self.parameters.spreading_db_per_decade)
         return self._reference_snr_db - loss_db
 
-    def _schedule_arrival(self, receiver: int, modem: _ModemState, sent: Transmission, origin: LocalPosition) -> None:
+    def _schedule_arrival(
+        self, receiver: int, modem: _ModemState, sent: TransmittedPacket, origin: LocalPosition
+    ) -> None:
         p = self.parameters
         range_m = origin.range_m(modem.position)
         start_s = sent.started_s + range_m / p.sound_speed_m_per_s
@@ -221,7 +223,7 @@ class ChannelModel:
             self._order += 1
             heapq.heappush(self._events, (time_s, is_start, self._order, arrival))
 
-    def _frame_loss(self, sent: Transmission, receiver: int, snr_db: float, time_s: float) -> float:
+    def _frame_loss(self, sent: TransmittedPacket, receiver: int, snr_db: float, time_s: float) -> float:
         """Return the probability that a frame arriving at `time_s` is lost by any of the three causes."""
         p = self.parameters
         faded = self._fading.faded(sent.transmitter, receiver, time_s)

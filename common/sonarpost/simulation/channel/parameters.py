@@ -21,10 +21,10 @@ from sonarpost.errors import ConfigError
 from sonarpost.simulation.channel.acoustics import SPHERICAL_DB_PER_DECADE, absorption_db_per_km, noise_db_per_hz
 from sonarpost.wire import first_error
 
-Value = float | int | bool | str
+ParameterValue = float | int | bool | str
 Probability = Annotated[float, Field(ge=0, le=1)]
 
-PRESETS: Mapping[str, Mapping[str, Value]] = MappingProxyType(
+PRESETS: Mapping[str, Mapping[str, ParameterValue]] = MappingProxyType(
     {
         "still": MappingProxyType({}),
         # The paper's trial in Bedford Basin: most packets arrive below 130 m, most are lost beyond.
@@ -123,7 +123,7 @@ class ChannelParameters(ServiceConfig):
         return self.source_level_db - self.excess_loss_db - self.noise_db
 
 
-def read_parameters(path: Path) -> dict[str, Value]:
+def read_parameters(path: Path) -> dict[str, ParameterValue]:
     """Read a TOML file of channel parameters, with or without `preset`.
 
     Raises:
@@ -137,7 +137,7 @@ def read_parameters(path: Path) -> dict[str, Value]:
     return table
 
 
-def build_parameters(values: Mapping[str, Value], where: str) -> ChannelParameters:
+def build_parameters(values: Mapping[str, ParameterValue], where: str) -> ChannelParameters:
     """Return the parameters of `values`, on top of those of the preset that `values` names.
 
     Raises:

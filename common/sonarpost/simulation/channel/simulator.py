@@ -15,19 +15,19 @@ from types import MappingProxyType
 from typing import Generic, TypeVar
 
 from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.events import ArrivalStarted, Transmission
+from sonarpost.simulation.channel.events import ArrivalStarted, TransmittedPacket
 from sonarpost.simulation.channel.model import ChannelModel
 from sonarpost.simulation.channel.parameters import ChannelParameters
 from sonarpost.simulation.modem.emulated import EmulatedModem, EmulatorSettings, create_modem
 from sonarpost.simulation.modem.receiver import HostOutput, PacketReport
 
-Item = TypeVar("Item")
+T = TypeVar("T")
 
 BITS_PER_BYTE = 10
 """Start bit, eight data bits, stop bit (8N1)."""
 
 
-class SerialLine(Generic[Item]):
+class SerialLine(Generic[T]):
     """One direction of a serial line: an item comes out when its last byte would have been transferred.
 
     Args:
@@ -41,23 +41,23 @@ class SerialLine(Generic[Item]):
         if baud is not None and not baud > 0:
             raise ValueError(f"baud: got {baud!r}, expected bits a second above 0, or None")
         self._baud = baud
-        self._items: deque[tuple[float, Item]] = deque()
+        self._items: deque[tuple[float, T]] = deque()
         self._free_s = 0.0
 
-    def put(self, item: Item, size_bytes: int, now: float) -> None:
+    def put(self, item: T, size_bytes: int, now: float) -> None:
         """Queue an item of `size_bytes` at `now`."""
         transfer_s = size_bytes * BITS_PER_BYTE / self._baud if self._baud else 0.0
         self._free_s = max(now, self._free_s) + transfer_s
         self._items.append((self._free_s, item))
 
-    def take(self, now: float) -> list[Item]:
+    def take(self, now: float) -> list[T]:
         """Remove and return the items transferred by `now`."""
         items = []
         while self._items and self._items[0][0] <= now:
             items.append(self._items.popleft()[1])
         return items
 
-    def discard(self) -> list[Item]:
+    def discard(self) -> list[T]:
         """Remove and return the items still on the line."""
         items = [item for _, item in self._items]
         self._items.clear()
@@ -137,14 +137,14 @@ class ChannelSimulator:
             times_s += [port.modem.next_deadline_s(), port.to_modem.next_s(), port.to_host.next_s()]
         return min(time_s for time_s in times_s if time_s is not None)
 
-    def advance(self, now: float) -> list[Transmission | PacketReport]:
+    def advance(self, now: float) -> list[TransmittedPacket | PacketReport]:
         """Process all events up to `now`.
 
         Returns:
             Every transmitted packet, and the reports of received packets that are not shown to the host. The other
             reports come with `take_outputs`, together with their bytes.
         """
-        happened: list[Transmission | PacketReport] = []
+        happened: list[TransmittedPacket | PacketReport] = []
         while (due_s := self.next_deadline_s()) <= now:
             happened += self._step(max(due_s, self.now))
         self.now = max(self.now, now)
@@ -160,10 +160,10 @@ class ChannelSimulator:
         """Remove and return the output of a modem, including the part still on its serial line."""
         return self.take_outputs(number) + self._ports[number].to_host.discard()
 
-    def _step(self, now: float) -> list[Transmission | PacketReport]:
+    def _step(self, now: float) -> list[TransmittedPacket | PacketReport]:
         """Process the events at `now`; none is earlier."""
         self.now = now
-        happened: list[Transmission | PacketReport] = []
+        happened: list[TransmittedPacket | PacketReport] = []
         for event in self.channel.poll(now):
             modem = self._ports[event.receiver].modem
             if isinstance(event, ArrivalStarted):

@@ -40,7 +40,7 @@ class FlexibleData:
 
 
 @dataclass(frozen=True, slots=True)
-class Ranging:
+class RangingRequest:
     """`CCPDT` or `CCPNT`: request of the travel times to transponders.
 
     Attributes:
@@ -101,7 +101,7 @@ def flexible_data(sentence: Sentence) -> FlexibleData:
     return FlexibleData(read.address(0, "destination"), rate, read.flag(2, "ack"), data)
 
 
-def ranging(sentence: Sentence) -> Ranging:
+def ranging(sentence: Sentence) -> RangingRequest:
     """Read a request of travel times.
 
     `CCPDT,group,channel,0,0,timeout_ms,A,B,C,D` interrogates the REMUS transponders whose flag is 1.
@@ -119,7 +119,7 @@ def ranging(sentence: Sentence) -> Ranging:
     timeout_ms = read.integer(4 if remus else 3, "timeout", 0, 60_000)
     first, highest = (5, 1) if remus else (4, 100_000)
     enabled = [read.integer(first + place, f"beacon {letter}", 0, highest) for place, letter in enumerate("ABCD")]
-    return Ranging(timeout_ms / 1000, "".join(letter for letter, on in zip("ABCD", enabled, strict=True) if on))
+    return RangingRequest(timeout_ms / 1000, "".join(letter for letter, on in zip("ABCD", enabled, strict=True) if on))
 
 
 def mini_packet(sentence: Sentence) -> MiniPacket:

@@ -40,7 +40,7 @@ from sonarpost.simulation.modem.settings import (
     REVISION_PERIOD_S,
     EmulatedModemConfig,
     ModemClock,
-    ModemSettings,
+    NvramSettings,
 )
 from sonarpost.simulation.modem.transmitter import BusyError, Transmitter, TransponderRanging, TravelTimes
 
@@ -60,7 +60,7 @@ class EmulatedMicroModem:
 
     def __init__(self, config: EmulatedModemConfig, now: float = 0.0, travel_times: TravelTimes = dict) -> None:
         self.config = config
-        self.settings = ModemSettings(config.address, config.data_timeout_s)
+        self.settings = NvramSettings(config.address, config.data_timeout_s)
         self.clock = ModemClock(config.utc_at_zero_s)
         self._receiver = Receiver(config, self.settings, self.clock)
         self._transmitter = Transmitter(config, self.settings, self.clock, self._write, self._receiver.expect_data)

@@ -20,7 +20,7 @@ from sonarpost.simulation.channel.events import (
     PacketKind,
     PacketOutcome,
 )
-from sonarpost.simulation.modem.settings import BROADCAST_ADDRESSES, EmulatedModemConfig, ModemClock, ModemSettings
+from sonarpost.simulation.modem.settings import BROADCAST_ADDRESSES, EmulatedModemConfig, ModemClock, NvramSettings
 from sonarpost.simulation.modem.statistics import PacketType, packet_type, receive_statistics
 
 _GOOD = frozenset({FrameOutcome.DELIVERED, FrameOutcome.DAMAGED})
@@ -75,7 +75,7 @@ class _ExpectedData:
 class Receiver:
     """Receiving half of one modem."""
 
-    def __init__(self, config: EmulatedModemConfig, settings: ModemSettings, clock: ModemClock) -> None:
+    def __init__(self, config: EmulatedModemConfig, settings: NvramSettings, clock: ModemClock) -> None:
         self._config = config
         self._settings = settings
         self._clock = clock

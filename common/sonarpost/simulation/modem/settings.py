@@ -86,7 +86,7 @@ class EmulatedModemConfig:
         return self.airtimes_s.get(rate, RATES[rate].airtime_s)
 
 
-class ModemSettings:
+class NvramSettings:
     """Named integers that survive a reboot. Names of three letters are stored in capitals, as hosts write them.
 
     Args:

@@ -21,7 +21,7 @@ from sonarpost.simulation.modem.settings import (
     TURNAROUND_S,
     EmulatedModemConfig,
     ModemClock,
-    ModemSettings,
+    NvramSettings,
 )
 from sonarpost.simulation.modem.statistics import transmit_statistics
 
@@ -86,7 +86,7 @@ class Transmitter:
     def __init__(
         self,
         config: EmulatedModemConfig,
-        settings: ModemSettings,
+        settings: NvramSettings,
         clock: ModemClock,
         write: Callable[[bytes], None],
         expect_data: Callable[[AcousticPacket, float], None],
@@ -306,7 +306,7 @@ class TransponderRanging:
 
     def __init__(
         self,
-        settings: ModemSettings,
+        settings: NvramSettings,
         clock: ModemClock,
         transmitter: Transmitter,
         travel_times: TravelTimes,

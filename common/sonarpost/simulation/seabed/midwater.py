@@ -29,7 +29,7 @@ _SCHOOL_ATTENUATION: Final = 0.9
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class SonarPath:
     """Position and attitude of the sonar at each ping, in the strip's coordinates; arrays (pings,), float64."""
 
     along_m: FloatArray
@@ -66,7 +66,7 @@ class Slices:
         return np.asarray(np.sqrt(np.clip(1 - (self.ahead_m / self.body.radius_m) ** 2, 0, None)))
 
 
-def slices(bodies: Sequence[SuspendedBody], track: Track, sign: int, pings: tuple[int, int]) -> list[Slices]:
+def slices(bodies: Sequence[SuspendedBody], track: SonarPath, sign: int, pings: tuple[int, int]) -> list[Slices]:
     """Return the bodies that the planes of pings [first, last) cut on one side; `sign` is 1 for starboard."""
     rows = slice(*pings)
     cut = []

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.seabed.midwater import Track, body_echoes, slices, unblocked
+from sonarpost.simulation.seabed.midwater import SonarPath, body_echoes, slices, unblocked
 from sonarpost.simulation.seabed.objects import settled
 from sonarpost.simulation.seabed.receiver import varied_amplitudes
 from sonarpost.simulation.seabed.scattering import bin_by_range, scattered, vertical_beam
@@ -41,8 +41,8 @@ from sonarpost.sonar.survey import ChannelPing, Ping, Samples, Side, Survey
 __all__ = [
     "SONAR_NAME",
     "SimulatedSurvey",
+    "SonarPath",
     "SurveySpec",
-    "Track",
     "TruthObject",
     "echo_intensity",
     "received_amplitude",
@@ -235,7 +235,7 @@ def _smooth_noise(count: int, scale_pings: float, rng: np.random.Generator) -> F
     return np.asarray(smooth * math.sqrt(2 * math.sqrt(math.pi) * scale_pings), dtype=np.float64)
 
 
-def _simulate_track(spec: SurveySpec, seabed: Seabed, rng: np.random.Generator) -> tuple[Track, FloatArray]:
+def _simulate_track(spec: SurveySpec, seabed: Seabed, rng: np.random.Generator) -> tuple[SonarPath, FloatArray]:
     """Return the track and the altitude above the seabed, both per ping."""
     slow, swell = 12.0 * spec.ping_rate_hz, 1.6 * spec.ping_rate_hz
     yaw_deg = spec.motion * (1.2 * _smooth_noise(spec.pings, slow, rng) + 0.12 * _smooth_noise(spec.pings, swell, rng))
@@ -249,7 +249,7 @@ def _simulate_track(spec: SurveySpec, seabed: Seabed, rng: np.random.Generator) 
     slow_error, fast_error = _smooth_noise(spec.pings, slow, rng), _smooth_noise(spec.pings, swell, rng)
     altitude_factor = 1 + spec.motion * (0.08 * slow_error + 0.006 * fast_error)
     height_m = followed_m + spec.altitude_m * np.clip(altitude_factor, 0.5, 1.5)
-    track = Track(along_m, across_m, height_m, np.radians(yaw_deg), np.radians(roll_deg))
+    track = SonarPath(along_m, across_m, height_m, np.radians(yaw_deg), np.radians(roll_deg))
     return track, height_m - bottom_m
 
 
@@ -266,7 +266,7 @@ def _geographic_position(spec: SurveySpec, along_m: float, across_m: float) -> P
     return offset_position(start, bearing_deg, math.hypot(along_m, across_m))
 
 
-def _survey(spec: SurveySpec, track: Track, altitude_m: FloatArray, sides: dict[Side, Samples]) -> Survey:
+def _survey(spec: SurveySpec, track: SonarPath, altitude_m: FloatArray, sides: dict[Side, Samples]) -> Survey:
     pings = []
     for row in range(spec.pings):
         position = _geographic_position(spec, float(track.along_m[row]), float(track.across_m[row]))
@@ -292,7 +292,7 @@ def _survey(spec: SurveySpec, track: Track, altitude_m: FloatArray, sides: dict[
     return Survey(Path(name), SONAR_NAME, name, tuple(pings))
 
 
-def _truth(spec: SurveySpec, track: Track, item: SeabedObject, ground_m: float) -> TruthObject:
+def _truth(spec: SurveySpec, track: SonarPath, item: SeabedObject, ground_m: float) -> TruthObject:
     """Return the ping in which an object is abeam, and the sample of its centre."""
     along = item.along_m - track.along_m
     across = item.across_m - track.across_m
@@ -318,7 +318,7 @@ def _truth(spec: SurveySpec, track: Track, item: SeabedObject, ground_m: float) 
     )
 
 
-def echo_intensity(seabed: Seabed, track: Track, spec: SurveySpec, sign: int) -> FloatImage:
+def echo_intensity(seabed: Seabed, track: SonarPath, spec: SurveySpec, sign: int) -> FloatImage:
     """Return the mean echo intensity of one side, without speckle and noise: 1 is flat sand at half range.
 
     `sign` is 1 for starboard, -1 for port.
@@ -335,7 +335,7 @@ def echo_intensity(seabed: Seabed, track: Track, spec: SurveySpec, sign: int) ->
     return _spread_beam(image, spec)
 
 
-def _cast_rays(seabed: Seabed, track: Track, spec: SurveySpec, sign: int, pings: tuple[int, int]) -> FloatImage:
+def _cast_rays(seabed: Seabed, track: SonarPath, spec: SurveySpec, sign: int, pings: tuple[int, int]) -> FloatImage:
     cell_m = spec.sample_m / _CELLS_PER_SAMPLE
     ground_m = (np.arange(spec.samples * _CELLS_PER_SAMPLE) + 0.5) * cell_m
     rows = slice(*pings)
