@@ -14,8 +14,8 @@ import sys
 
 import numpy as np
 
-from sonarpost.bearers.receiver import MessageReceiver
-from sonarpost.bearers.sender import MessageSender, image_items
+from sonarpost.bearers.receiver import ShortMessageReceiver
+from sonarpost.bearers.sender import ShortMessageSender, image_items
 from sonarpost.codec import encode
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.received_image import received_image
@@ -83,7 +83,7 @@ def main() -> int:
     args = parser.parse_args()
     images = contacts(args.contacts, args.stream_bytes, args.seed)
     rng = random.Random(args.seed)
-    sender, receiver = MessageSender(args.seed), MessageReceiver("vessel-1")
+    sender, receiver = ShortMessageSender(args.seed), ShortMessageReceiver("vessel-1")
     for image in images:
         sender.insert(image_items(image, sender.next_number, args.preview_bytes, 0.0))
     now_s = free_s = 0.0

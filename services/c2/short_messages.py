@@ -14,7 +14,7 @@ from pathlib import Path
 from sonarpost import keys, wire
 from sonarpost.archive.decoder import Decoder
 from sonarpost.archive.image_files import PREVIEW_NOTE
-from sonarpost.bearers.receiver import MessageReceiver
+from sonarpost.bearers.receiver import ShortMessageReceiver
 from sonarpost.bearers.rockblock import RockBlockAccount, TerminalMessage, Webhook, WebhookError
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
@@ -101,7 +101,7 @@ class ShortMessages:
         self._webhook: Webhook | None = None
         self._lock = threading.Lock()
         self._terminals = {vessel: imei for imei, vessel in config.vessels.items()}
-        self._receivers: dict[str, tuple[MessageReceiver, SavedParts]] = {}
+        self._receivers: dict[str, tuple[ShortMessageReceiver, SavedParts]] = {}
         self.faults: dict[str, str] = {}
 
     @property
@@ -150,10 +150,10 @@ class ShortMessages:
             self._count(f"short_{'decisions' if isinstance(record, Decision) else 'contacts'}_received")
 
     @contextmanager
-    def _receiver(self, vessel: str) -> Iterator[MessageReceiver]:
+    def _receiver(self, vessel: str) -> Iterator[ShortMessageReceiver]:
         """Return the receiver of a vessel; after an error its state is read again. Requires the lock."""
         if vessel not in self._receivers:
-            receiver = MessageReceiver(vessel)
+            receiver = ShortMessageReceiver(vessel)
             saved = self._store.read_states(_prefix(vessel), receiver.restore)
             self._receivers[vessel] = (receiver, SavedParts(saved))
         try:

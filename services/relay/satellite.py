@@ -13,10 +13,10 @@ import msgpack
 from sonarpost.bearers.iridium import IridiumTerminal, MessageBearer, TerminalError
 from sonarpost.bearers.policy import ByteBudget, Window
 from sonarpost.bearers.sender import (
-    MessageSender,
     NextMessage,
     PendingMessage,
     QueuedItem,
+    ShortMessageSender,
     decision_items,
     image_items,
     image_name,
@@ -80,7 +80,7 @@ class SatelliteUpstream:
         messages = store.read_states(f"{self._prefix}message/", lambda _, data: PendingMessage.unpack(data))
         items = store.read_states(f"{self._prefix}item/", lambda _, data: QueuedItem.unpack(data))
         epoch, next_seq = self._first_numbers(messages.values())
-        self._sender = MessageSender(epoch, next_seq, after_s=options.after_s if has_radio else 0.0)
+        self._sender = ShortMessageSender(epoch, next_seq, after_s=options.after_s if has_radio else 0.0)
         self._sender.restore(items.values(), messages.values(), time.time())
         number = store.read_state(
             f"{self._prefix}number", lambda data: from_plain(Count, int.from_bytes(data, "big"), _WHERE), 0

@@ -11,16 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.bearers.policy import ByteBudget
-from sonarpost.bearers.receiver import ACKNOWLEDGE_AFTER_S, MAX_FRAGMENTS_KEPT, MessageReceiver
+from sonarpost.bearers.receiver import ACKNOWLEDGE_AFTER_S, MAX_FRAGMENTS_KEPT, ShortMessageReceiver
 from sonarpost.bearers.sender import (
-    MessageSender,
     PendingMessage,
     QueuedItem,
+    ShortMessageSender,
     decision_items,
     image_items,
     image_name,
 )
-from sonarpost.bearers.short_message import Acknowledgement, Item, ItemType, ShortMessage, ShortMessageError
+from sonarpost.bearers.short_message import Item, ItemType, ShortAcknowledgement, ShortMessage, ShortMessageError
 from sonarpost.errors import BadInputError
 from sonarpost.link.state import SavedParts
 from sonarpost.messages import Decision
@@ -44,8 +44,8 @@ class Exchange:
         self.rng = random.Random(seed)
         self.loss, self.restarts, self.duplicates = loss, restarts, duplicates
         self.options = options
-        self.sender = MessageSender(7)
-        self.receiver = MessageReceiver("vessel-1")
+        self.sender = ShortMessageSender(7)
+        self.receiver = ShortMessageReceiver("vessel-1")
         self.stored_items, self.stored_messages = {}, {}
         self.records, self.sizes, self.now_s = [], [], 0.0
         self.to_shore, self.to_vessel = [], []
@@ -84,10 +84,10 @@ class Exchange:
             self.restart()
 
     def restart(self):
-        self.sender = MessageSender(7, self.sender.next_seq, self.sender.next_number)
+        self.sender = ShortMessageSender(7, self.sender.next_seq, self.sender.next_number)
         items = [QueuedItem.unpack(data) for data in self.stored_items.values()]
         self.sender.restore(items, map(PendingMessage.unpack, self.stored_messages.values()), self.now_s)
-        parts, self.receiver = self.receiver.parts(), MessageReceiver("vessel-1")
+        parts, self.receiver = self.receiver.parts(), ShortMessageReceiver("vessel-1")
         for name, data in parts.items():
             self.receiver.restore(name, data)
 
@@ -117,7 +117,7 @@ def test_every_record_arrives_once_with_any_loss_and_restarts(seed, loss, restar
 
 
 def test_several_contacts_share_a_message_and_decisions_go_first():
-    sender = MessageSender(1)
+    sender = ShortMessageSender(1)
     for n in range(1, 5):
         add(sender, received(n), preview_bytes=60)
     add(sender, decision())
@@ -129,7 +129,7 @@ def test_several_contacts_share_a_message_and_decisions_go_first():
 
 
 def test_many_contacts_of_one_vehicle_delay_one_of_another_by_one_message():
-    sender = MessageSender(1)
+    sender = ShortMessageSender(1)
     for n in range(1, 101):
         add(sender, received(n, vehicle="uuv-1"))
     add(sender, received(101, vehicle="uuv-2"))
@@ -140,14 +140,14 @@ def test_many_contacts_of_one_vehicle_delay_one_of_another_by_one_message():
 
 
 def test_newer_version_replaces_a_queued_one_and_a_delivered_image_is_withdrawn():
-    sender = MessageSender(1)
+    sender = ShortMessageSender(1)
     add(sender, received(1))
     _, replaced = add(sender, received(1, version=2))
     assert replaced == (0,)
     add(sender, received(2))
     assert sender.withdraw(image_name("uuv-1", "0002")) == (2,)
     assert sender.withdraw("unknown") == ()
-    [record] = MessageReceiver("vessel-1").receive(sender.next_message(0.0).data, 0.0)
+    [record] = ShortMessageReceiver("vessel-1").receive(sender.next_message(0.0).data, 0.0)
     assert record.version == 2
     # More detail of an image whose first version is in a message waits for another way.
     assert add(sender, received(1, version=3))[1] == (3,)
@@ -155,14 +155,14 @@ def test_newer_version_replaces_a_queued_one_and_a_delivered_image_is_withdrawn(
 
 
 def test_items_wait_for_another_way_first():
-    sender = MessageSender(1, after_s=60.0)
+    sender = ShortMessageSender(1, after_s=60.0)
     add(sender, received(1), now_s=100.0)
     assert sender.next_message(159.0) is None
     assert sender.next_message(160.0).packed == (0,)
 
 
 def test_message_is_repeated_later_and_later_and_at_once_when_a_later_one_arrived():
-    sender = MessageSender(1)
+    sender = ShortMessageSender(1)
     for n in (1, 2):
         add(sender, received(n))
     assert sender.next_message(0.0).seq == 0
@@ -174,41 +174,41 @@ def test_message_is_repeated_later_and_later_and_at_once_when_a_later_one_arrive
     sender.failed(0, 880.0, 5.0)
     assert sender.next_message(884.0) is None
     # Message 1 was sent after message 0 and has arrived.
-    assert sender.acknowledge(Acknowledgement(1, 0, frozenset({1})).pack(), 890.0) == (1,)
+    assert sender.acknowledge(ShortAcknowledgement(1, 0, frozenset({1})).pack(), 890.0) == (1,)
     assert sender.next_message(890.0).seq == 0
-    assert sender.acknowledge(Acknowledgement(1, 2).pack(), 900.0) == (0,)
+    assert sender.acknowledge(ShortAcknowledgement(1, 2).pack(), 900.0) == (0,)
     assert sender.next_message(100_000.0) is None
 
 
 def test_window_limits_unacknowledged_messages():
-    sender = MessageSender(1)
+    sender = ShortMessageSender(1)
     for n in range(1, 301):
         add(sender, received(n))
     sent = []
     while (message := sender.next_message(0.0)) is not None:
         sent.append(message)
     assert (len(sent), sender.waiting) == (256, 44)
-    sender.acknowledge(Acknowledgement(1, 3).pack(), 1.0)
+    sender.acknowledge(ShortAcknowledgement(1, 3).pack(), 1.0)
     assert sender.next_message(1.0).seq == 256
 
 
 def test_acknowledgement_of_messages_that_were_never_made_is_refused():
-    sender = MessageSender(1)
+    sender = ShortMessageSender(1)
     add(sender, received(1))
     sender.next_message(0.0)
     with pytest.raises(ShortMessageError, match="acknowledgement"):
-        sender.acknowledge(Acknowledgement(1, 2).pack(), 0.0)
-    assert sender.acknowledge(Acknowledgement(99, 1).pack(), 0.0) == ()
+        sender.acknowledge(ShortAcknowledgement(1, 2).pack(), 0.0)
+    assert sender.acknowledge(ShortAcknowledgement(99, 1).pack(), 0.0) == ()
     assert sender.unacknowledged == 1
     # c2 has received a forged message of this vessel: true messages are acknowledged nevertheless.
-    assert sender.acknowledge(Acknowledgement(1, 0, frozenset({5})).pack(), 0.0) == ()
-    assert sender.acknowledge(Acknowledgement(1, 1, frozenset({5})).pack(), 0.0) == (0,)
+    assert sender.acknowledge(ShortAcknowledgement(1, 0, frozenset({5})).pack(), 0.0) == ()
+    assert sender.acknowledge(ShortAcknowledgement(1, 1, frozenset({5})).pack(), 0.0) == (0,)
 
 
 def test_receiver_follows_the_sender_after_its_own_store_was_lost_and_bounds_its_state():
-    sender = MessageSender(1, next_seq=5000)
+    sender = ShortMessageSender(1, next_seq=5000)
     add(sender, received(1))
-    receiver = MessageReceiver("vessel-1")
+    receiver = ShortMessageReceiver("vessel-1")
     data = sender.next_message(0.0).data
     assert len(receiver.receive(data, 0.0)) == 1
     assert receiver.receive(data, 0.0) == []
@@ -240,7 +240,7 @@ def numbered(sender, count, first=0):
 
 @given(st.integers(0, 2**32 - 2), st.integers(0, 255))
 def test_message_with_any_numbers_displaces_no_message_of_the_vessel(seq, behind):
-    sender, receiver = MessageSender(7), MessageReceiver("vessel-1")
+    sender, receiver = ShortMessageSender(7), ShortMessageReceiver("vessel-1")
     messages = numbered(sender, 5)
     forged = ShortMessage(7, seq, max(0, seq - behind), ()).pack()
     records = [record for data in (*messages, forged) for record in receiver.receive(data, 0.0)]
@@ -255,7 +255,7 @@ def test_message_with_any_numbers_displaces_no_message_of_the_vessel(seq, behind
 
 
 def test_messages_of_forged_epochs_make_no_message_count_as_received():
-    sender, receiver = MessageSender(7), MessageReceiver("vessel-1")
+    sender, receiver = ShortMessageSender(7), ShortMessageReceiver("vessel-1")
     messages = numbered(sender, 20)
     forged = [ShortMessage(epoch, 0, 0, ()).pack() for epoch in range(100, 110)]
     records = [
@@ -271,20 +271,20 @@ def test_messages_of_forged_epochs_make_no_message_count_as_received():
 
 
 def test_last_sequence_number_is_refused_and_every_other_can_be_acknowledged():
-    receiver = MessageReceiver("vessel-1")
+    receiver = ShortMessageReceiver("vessel-1")
     with pytest.raises(ShortMessageError, match="seq"):
         receiver.receive(with_crc(struct.pack(">BIIB", 0xB1, 5, 2**32 - 1, 0)), 0.0)
     receiver.receive(ShortMessage(5, 2**32 - 2, 2**32 - 2, ()).pack(), 0.0)
     [ack] = receiver.acknowledgements(ACKNOWLEDGE_AFTER_S)
-    assert Acknowledgement.unpack(ack) == Acknowledgement(5, 2**32 - 1)
+    assert ShortAcknowledgement.unpack(ack) == ShortAcknowledgement(5, 2**32 - 1)
     with pytest.raises(ShortMessageError):
         ShortMessage(5, 2**32 - 1, 2**32 - 1, ()).pack()
     with pytest.raises(ShortMessageError):
-        Acknowledgement(5, 2**32).pack()
+        ShortAcknowledgement(5, 2**32).pack()
 
 
 def test_receiver_of_an_older_copy_of_the_store_and_a_sender_that_lost_a_message_continue():
-    sender, receiver = MessageSender(7), MessageReceiver("vessel-1")
+    sender, receiver = ShortMessageSender(7), ShortMessageReceiver("vessel-1")
     for n in range(1000):
         [data] = numbered(sender, 1, n)
         if n == 300:
@@ -300,7 +300,7 @@ def test_receiver_of_an_older_copy_of_the_store_and_a_sender_that_lost_a_message
 
 
 def test_wrong_fragment_costs_its_decision_only():
-    sender, receiver = MessageSender(7), MessageReceiver("vessel-1")
+    sender, receiver = ShortMessageSender(7), ShortMessageReceiver("vessel-1")
     add(sender, decision("d1", remark="x" * 500))
     first, last = (sender.next_message(0.0).data for _ in range(2))
     item = ShortMessage.unpack(first).items[0]
@@ -314,10 +314,10 @@ def test_wrong_fragment_costs_its_decision_only():
 
 @given(st.sampled_from(["windows", "1/2/3/0"]), st.binary(max_size=60) | st.recursive(ANY, st.lists).map(msgpack.packb))
 def test_damaged_state_of_the_receiver_is_refused_or_harmless(name, data):
-    receiver = MessageReceiver("vessel-1")
+    receiver = ShortMessageReceiver("vessel-1")
     with contextlib.suppress(BadInputError):
         receiver.restore(name, data)
-    assert len(receiver.receive(numbered(MessageSender(7), 1)[0], 0.0)) == 1
+    assert len(receiver.receive(numbered(ShortMessageSender(7), 1)[0], 0.0)) == 1
     receiver.acknowledgements(1e12)
 
 

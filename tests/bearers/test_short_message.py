@@ -9,15 +9,15 @@ from builders.short_messages import decision, golden, received, with_crc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.bearers.receiver import MessageReceiver
+from sonarpost.bearers.receiver import ShortMessageReceiver
 from sonarpost.bearers.short_message import (
     FRAGMENT_BYTES,
     MAX_ACKNOWLEDGEMENT_BYTES,
     MAX_ITEM_BYTES,
     MAX_MESSAGE_BYTES,
-    Acknowledgement,
     Item,
     ItemType,
+    ShortAcknowledgement,
     ShortMessage,
     ShortMessageError,
     contact_head_bytes,
@@ -35,16 +35,16 @@ GOLDEN = json.loads((REPOSITORY / "tests/golden/short-message/v1.json").read_tex
 
 def test_golden_messages_are_written_and_read_for_ever():
     assert golden() == GOLDEN
-    receiver = MessageReceiver("vessel-1")
+    receiver = ShortMessageReceiver("vessel-1")
     records = receiver.receive(bytes.fromhex(GOLDEN["contact with preview"]), 0.0)
     assert records == [received()]
     records = receiver.receive(bytes.fromhex(GOLDEN["decision and image without contact record"]), 0.0)
     assert records == [decision(), received(2, 0, contact=False)]
     parts = [bytes.fromhex(text) for name, text in GOLDEN.items() if name.startswith("fragment")]
-    found = [MessageReceiver.receive(receiver, part, 0.0) for part in reversed(parts)]
+    found = [ShortMessageReceiver.receive(receiver, part, 0.0) for part in reversed(parts)]
     assert found == [[]] * (len(parts) - 1) + [[decision("d2", remark="r" * 600)]]
-    ack = Acknowledgement.unpack(bytes.fromhex(GOLDEN["acknowledgement"]))
-    assert ack == Acknowledgement(0x01020304, 17, frozenset({18, 25, 40}))
+    ack = ShortAcknowledgement.unpack(bytes.fromhex(GOLDEN["acknowledgement"]))
+    assert ack == ShortAcknowledgement(0x01020304, 17, frozenset({18, 25, 40}))
 
 
 @given(st.integers(0, 500), st.booleans(), st.integers(1, 9999), st.integers(1, 2**32 - 1))
@@ -90,18 +90,18 @@ def test_decision_is_the_same_record(remark, confidence, overrules):
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 300), st.sets(st.integers(0, 255)))
 def test_acknowledgement_is_the_same(epoch, base, offsets):
-    ack = Acknowledgement(epoch, base, frozenset(base + n for n in offsets))
+    ack = ShortAcknowledgement(epoch, base, frozenset(base + n for n in offsets))
     packed = ack.pack()
     assert len(packed) <= MAX_ACKNOWLEDGEMENT_BYTES
-    assert Acknowledgement.unpack(packed) == ack
+    assert ShortAcknowledgement.unpack(packed) == ack
 
 
 @given(st.binary(max_size=400))
 def test_hostile_bytes_raise_the_documented_error_only(data):
     for body in (data, with_crc(data), with_crc(b"\xb1" + data[:330]), with_crc(b"\xb2" + data)):
         for parse in (
-            lambda body: MessageReceiver("vessel-1").receive(body, 0.0),
-            Acknowledgement.unpack,
+            lambda body: ShortMessageReceiver("vessel-1").receive(body, 0.0),
+            ShortAcknowledgement.unpack,
             lambda body: unpack_contact(body, "vessel-1"),
             lambda body: unpack_decision(body, "vessel-1"),
             fragment,
@@ -119,7 +119,7 @@ def test_damaged_contact_raises_the_documented_error_only(data):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     message = ShortMessage(1, 0, 0, (Item(ItemType.CONTACT, bytes(content[: data.draw(st.integers(0, 340))])),))
     try:
-        [record] = MessageReceiver("vessel-1").receive(message.pack(), 0.0)
+        [record] = ShortMessageReceiver("vessel-1").receive(message.pack(), 0.0)
     except BadInputError:
         return
     assert math.isfinite(record.first_frame_utc_s)
@@ -141,7 +141,7 @@ def test_damaged_contact_raises_the_documented_error_only(data):
 )
 def test_error_names_the_invalid_field(message, problem):
     with pytest.raises(ShortMessageError, match=problem):
-        MessageReceiver("vessel-1").receive(message, 0.0)
+        ShortMessageReceiver("vessel-1").receive(message, 0.0)
 
 
 def test_too_long_a_decision_is_refused():

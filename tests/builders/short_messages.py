@@ -9,9 +9,9 @@ import binascii
 import json
 
 from sonarpost.bearers.short_message import (
-    Acknowledgement,
     Item,
     ItemType,
+    ShortAcknowledgement,
     ShortMessage,
     pack_contact,
     pack_decision,
@@ -101,7 +101,7 @@ def golden() -> dict[str, str]:
         "contact with preview": ShortMessage(0x01020304, 0, 0, (contact,)).pack().hex(),
         "decision and image without contact record": ShortMessage(0x01020304, 5, 3, (verdict, other)).pack().hex(),
         **{f"fragment {n}": ShortMessage(9, n, 0, (item,)).pack().hex() for n, item in enumerate(long)},
-        "acknowledgement": Acknowledgement(0x01020304, 17, frozenset({18, 25, 40})).pack().hex(),
+        "acknowledgement": ShortAcknowledgement(0x01020304, 17, frozenset({18, 25, 40})).pack().hex(),
     }
 
 

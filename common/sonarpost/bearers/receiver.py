@@ -9,8 +9,8 @@ import msgpack
 
 from sonarpost.bearers.short_message import (
     WINDOW,
-    Acknowledgement,
     ItemType,
+    ShortAcknowledgement,
     ShortMessage,
     ShortMessageError,
     fragment,
@@ -64,11 +64,11 @@ class _Window:
 
     def acknowledgement(self) -> bytes:
         further = frozenset(seq for seq in self.received if seq >= self.base)
-        return Acknowledgement(self.epoch, self.base, further).pack()
+        return ShortAcknowledgement(self.epoch, self.base, further).pack()
 
 
 @dataclass(slots=True)
-class MessageReceiver:
+class ShortMessageReceiver:
     """Receives the messages of one vessel; each record is returned once.
 
     A message whose numbers do not continue those of its epoch begins a window of its own: a vessel whose messages were

@@ -13,9 +13,9 @@ from sonarpost.bearers.short_message import (
     MAX_MESSAGE_BYTES,
     MAX_SEQ,
     WINDOW,
-    Acknowledgement,
     Item,
     ItemType,
+    ShortAcknowledgement,
     ShortMessage,
     ShortMessageError,
     contact_head_bytes,
@@ -139,7 +139,7 @@ class NextMessage:
     Attributes:
         seq: Its sequence number.
         data: The bytes.
-        stored: The bytes for the store, for `MessageSender.restore`.
+        stored: The bytes for the store, for `ShortMessageSender.restore`.
         packed: Numbers of the queued items that it contains for the first time; empty for a repetition.
     """
 
@@ -150,7 +150,7 @@ class NextMessage:
 
 
 @dataclass(slots=True)
-class MessageSender:
+class ShortMessageSender:
     """Packs records into messages and repeats each message until it is acknowledged.
 
     The caller stores `queued` items and messages before it sends them, and gives both to the next object after a
@@ -282,7 +282,7 @@ class MessageSender:
         Raises:
             ShortMessageError: It is not a valid acknowledgement, or its base is above all messages that were made.
         """
-        ack = Acknowledgement.unpack(data)
+        ack = ShortAcknowledgement.unpack(data)
         if ack.epoch != self.epoch:
             return ()  # of an earlier store
         if ack.base > self.next_seq:
@@ -319,7 +319,7 @@ def decision_items(decision: Decision, number: int, now_s: float) -> list[Queued
 
 
 def image_name(vehicle_id: str, image_id: str) -> str:
-    """Return the name of an image for `MessageSender.withdraw`."""
+    """Return the name of an image for `ShortMessageSender.withdraw`."""
     return f"{vehicle_id}/{image_id}"
 
 

@@ -150,7 +150,7 @@ class ShortMessage:
 
 
 @dataclass(frozen=True, slots=True)
-class Acknowledgement:
+class ShortAcknowledgement:
     """Acknowledgement in the opposite direction.
 
     Attributes:
@@ -179,7 +179,7 @@ class Acknowledgement:
         return _with_crc(_ACKNOWLEDGEMENT.pack(_ACKNOWLEDGEMENT_TYPE, self.epoch, self.base) + bitmap.rstrip(b"\0"))
 
     @classmethod
-    def unpack(cls, data: bytes, where: str = _WHERE) -> Acknowledgement:
+    def unpack(cls, data: bytes, where: str = _WHERE) -> ShortAcknowledgement:
         """Parse an acknowledgement.
 
         Raises:
