@@ -15,7 +15,7 @@ from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.events import FailureReason
 from sonarpost.modem.micromodem.requests import RequestKind
 
-ExchangeResult = PacketSent | PacketFailed | RequestDone | RequestFailed
+CycleResult = PacketSent | PacketFailed | RequestDone | RequestFailed
 
 _OTHER_CAUSES = frozenset({FailureReason.PORT_LOST, FailureReason.QUEUE_FULL, FailureReason.DEFERRED_TOO_LONG})
 _REFUSALS = frozenset({FailureReason.NO_ECHO, FailureReason.REFUSED})
@@ -40,7 +40,7 @@ class TransmitMonitor:
     def _failing(self) -> bool:
         return self._failures >= self._config.failures_before_restart
 
-    def on_result(self, result: ExchangeResult, now: float) -> list[ModemEvent]:
+    def on_result(self, result: CycleResult, now: float) -> list[ModemEvent]:
         """Process the result of an exchange; report the beginning and the end of a failure."""
         reason = _failure(result)
         was_failing = self._failing
@@ -72,13 +72,13 @@ class TransmitMonitor:
         return True
 
 
-def _transmitted(result: ExchangeResult) -> bool:
+def _transmitted(result: CycleResult) -> bool:
     """Return whether a result shows that the modem transmits."""
     no_answer = isinstance(result, RequestFailed) and result.reason is FailureReason.NO_ANSWER
     return isinstance(result, (PacketSent, RequestDone)) or no_answer
 
 
-def _failure(result: ExchangeResult) -> str | None:
+def _failure(result: CycleResult) -> str | None:
     """Return why the modem did not transmit; None if the result has another cause or does not show it."""
     if isinstance(result, PacketFailed):
         return None if result.reason in _OTHER_CAUSES else result.reason
