@@ -21,7 +21,7 @@ from scipy.ndimage import gaussian_filter1d
 from sonarpost.errors import ConfigError
 from sonarpost.simulation.seabed.midwater import SonarPath, body_echoes, slices, unblocked
 from sonarpost.simulation.seabed.objects import settled
-from sonarpost.simulation.seabed.receiver import varied_amplitudes
+from sonarpost.simulation.seabed.receiver_variations import varied_amplitudes
 from sonarpost.simulation.seabed.scattering import bin_by_range, scattered, vertical_beam
 from sonarpost.simulation.seabed.spec import SurveySpec
 from sonarpost.simulation.seabed.targets import (
