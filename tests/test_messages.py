@@ -104,7 +104,7 @@ OWN_LIMITS = {
 EXAMPLE = {type(sample): sample for sample in SAMPLES.values()} | {
     type(SAMPLES[name]): SAMPLES[name] for name in ("contact-classified", "raster-8-bits", "vehicle-status-full")
 }
-EXAMPLE[Command] = Command(**(SAMPLES["command-to-revisit"].model_dump() | {"kind": "refine", "image_id": "00A7"}))
+EXAMPLE[Command] = Command(**(SAMPLES["command-revisit"].model_dump() | {"kind": "refine", "image_id": "00A7"}))
 EXAMPLE[ReconstructedImage] = COMPLETE_IMAGE
 
 

@@ -99,8 +99,7 @@ class DownlinkService(ModemService[OpModemConfig]):
                 tx.delete_state(_AUTHENTICATED_SINCE)
                 return 0.0
             names = self.store.state_names(_PARTS)
-            was_on = any(name.startswith(_PARTS + "authentication/") for name in names)
-            since_s = 0.0 if was_on or not names else time.time()
+            since_s = time.time() if names else 0.0
             for name in names if since_s else ():
                 if name.removeprefix(_PARTS).startswith(_UNFINISHED_BLOCKS):
                     tx.delete_state(name)

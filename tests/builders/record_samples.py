@@ -37,4 +37,4 @@ ACOUSTIC_CONTACT: bytes = SAMPLES["part-whole"].c  # type: ignore[attr-defined]
 COMPLETE_IMAGE: Any = SAMPLES["reconstructed-image-classified"].model_copy(
     update={"codec": "vq", "despeckle_strength": None}
 )
-DAMAGED_IMAGE: Any = SAMPLES["reconstructed-image-despeckling-unknown"]
+DAMAGED_IMAGE: Any = SAMPLES["reconstructed-image-unauthenticated"]

@@ -130,12 +130,8 @@ def test_every_export_states_the_measurements_of_operators():
     assert "Measured: L 1.23 ± 0.06 m, H 0.50 ± 0.12 m." in cot_event(contacts.contacts[0], NOW_UTC_S).decode()
 
 
-def test_images_of_earlier_versions_have_no_statement_about_authentication_and_despeckling(contacts):
+def test_unknown_authentication_is_not_stated(contacts):
     assert {contact.image.authenticated for contact in contacts.contacts} == {None}
-    assert "authenticated" not in side_car(image())
-    assert side_car(image(authenticated=False))["authenticated"] is False
-    assert "despeckle_strength" not in side_car(image())
-    assert side_car(image(despeckle_strength=0.0))["despeckle_strength"] == 0.0
     files = golden_files("mission", contacts)
     assert not any(b"nauthenticated" in data for data in files.values())
 

@@ -14,7 +14,7 @@ from sonarpost import keys
 from sonarpost.bus.session import client_config
 from sonarpost.cli.main import main
 from sonarpost.errors import BadInputError
-from sonarpost.security.fleet import Fleet, FleetIndex, PkiError
+from sonarpost.security.fleet import Fleet, PkiError
 from sonarpost.security.router_config import RouterOptions, router_json5
 
 
@@ -79,12 +79,6 @@ def test_revoked_name_is_not_admitted_because_it_was_prepared(fleet):
     fleet.issue("vessel-2", "vessel")
     fleet.revoke("vessel-2", "lost")
     assert fleet.index().allowed("vessel") == []
-
-
-def test_index_without_prepared_names_has_the_content_of_earlier_versions(fleet):
-    assert b"prepared" not in FleetIndex(fleet="test").to_bytes()
-    fleet.prepare(["vessel-2"], "vessel")
-    assert b"prepared" in fleet.index().to_bytes()
 
 
 def test_command_prepares_and_says_what_to_do(fleet, capsys):

@@ -82,12 +82,8 @@ def remove_old_images(folder: Path, now_utc_s: float, retain_days: float, max_by
 
 
 def side_car(image: ReconstructedImage) -> dict[str, object]:
-    """Return the content of the JSON file: all fields but the pixels, missing areas as a count and a range of rows.
-
-    `authenticated` and `despeckle_strength` are absent if they are not known.
-    """
-    unknown = {name for name in ("authenticated", "despeckle_strength") if getattr(image, name) is None}
-    fields = image.model_dump(exclude={"pixels", "missing_mask", *unknown})
+    """Return the content of the JSON file: all fields but the pixels, missing areas as a count and a range of rows."""
+    fields = image.model_dump(exclude={"pixels", "missing_mask"})
     rows = np.flatnonzero(image.missing().any(axis=1))
     return {
         "type": image.TYPE,

@@ -59,21 +59,21 @@ class SideCar(Record):
     version: Ordinal
     contact: Contact | None
     codec: str
-    model: str = ""
+    model: str
     pixels_sha256: Sha256
     complete: bool
     missing_fraction: Fraction
     missing_halves: tuple[Literal["top", "bottom"], ...]
-    missing_rows: Annotated[tuple[Count, ...], Field(strict=False)] = ()
-    missing_pixels: Count = 0
+    missing_rows: Annotated[tuple[Count, ...], Field(strict=False)]
+    missing_pixels: Count
     bytes_received: Count
     bytes_total: Count
     frames_received: Count
     first_frame_utc_s: Time
     last_frame_utc_s: Time
-    notes: tuple[Text, ...] = ()
-    authenticated: bool | None = None
-    despeckle_strength: Fraction | None = None
+    notes: tuple[Text, ...]
+    authenticated: bool | None
+    despeckle_strength: Fraction | None
     height_px: Annotated[int, Field(ge=1, le=4096)]
     width_px: Annotated[int, Field(ge=1, le=4096)]
 

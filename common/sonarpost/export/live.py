@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import Final
 
+from sonarpost.archive.image_files import side_car
 from sonarpost.export.contacts import ExportContact, SideCar, match_start_time
 from sonarpost.limits import limit, oldest_of_largest
 from sonarpost.messages import Decision, ReconstructedImage
@@ -25,13 +26,6 @@ MAX_IMAGES: Final = 64
 class _Name:
     images: dict[int, SideCar] = field(default_factory=dict)
     decisions: dict[str, Decision] = field(default_factory=dict)
-
-
-def side_car_of(image: ReconstructedImage) -> SideCar:
-    """Return an image without its pixels, as c2 stores it."""
-    fields = image.model_dump(exclude={"pixels", "missing_mask"})
-    size = {"height_px": image.pixels.height_px, "width_px": image.pixels.width_px}
-    return SideCar.model_validate({"type": "reconstructed_image", "v": 1, **fields, **size})
 
 
 class LiveContacts:
@@ -54,7 +48,7 @@ class LiveContacts:
         """
         if isinstance(record, Decision):
             return self._add_decision(record)
-        return self._add_image(side_car_of(record))
+        return self._add_image(SideCar.model_validate(side_car(record)))
 
     def restore(self, contacts: Iterable[ExportContact]) -> list[ExportContact]:
         """Add stored contacts; return those that were new or have changed, with their `image_path`."""

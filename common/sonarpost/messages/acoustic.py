@@ -94,8 +94,7 @@ class ReceivedMessage(Record):
         vehicle_id: Vehicle that sent it, identified by the address of its modem.
         received_utc_s: When it was received.
         data: Content, as its source on the vehicle gave it.
-        authenticated: Whether its acoustic frames were authenticated with a key. None: not known, in records of earlier
-            versions.
+        authenticated: Whether its acoustic frames were authenticated with a key.
     """
 
     TYPE: ClassVar[str] = "received_message"
@@ -104,7 +103,7 @@ class ReceivedMessage(Record):
     vehicle_id: PlatformId
     received_utc_s: Time
     data: Annotated[bytes, Field(min_length=1, max_length=4096)]
-    authenticated: bool | None = None
+    authenticated: bool
 
 
 class QueuedImage(Record):

@@ -137,9 +137,7 @@ class FleetIndex(BaseModel):
 
     def to_bytes(self) -> bytes:
         """Return the content of the file."""
-        # Versions without prepared names read an index that has none.
-        unused = set() if self.prepared else {"prepared"}
-        return (self.model_dump_json(indent=1, exclude=unused) + "\n").encode()
+        return (self.model_dump_json(indent=1) + "\n").encode()
 
     def find(self, platform: str) -> CertificateEntry | None:
         """Return the newest certificate of a platform that is not revoked; it can have expired."""

@@ -6,12 +6,10 @@ import os
 import time
 from types import SimpleNamespace
 
-import msgpack
 import numpy as np
 import pytest
 from builders.common import eventually
 
-from sonarpost.delivery.store import Store
 from sonarpost.services.atd_stub import service as atd_stub
 from sonarpost.sonar.image_files import write_tiff
 
@@ -91,25 +89,6 @@ def test_oldest_processed_files_are_removed_above_the_maximum_size(start, clock,
     assert 3 * (incoming / "b.tiff").stat().st_size > 6000
     assert sorted(path.name for path in incoming.iterdir()) == ["b.tiff", "c.tiff"]
     assert len(service.store.state_names("file:")) == 3
-
-
-def test_entry_of_an_older_version_starts_its_age_at_the_upgrade(start, runner, clock, add_file, incoming):
-    service = start()
-    add_file("a", 1)
-    eventually(lambda: service.store.state_names("file:"))
-    [name] = service.store.state_names("file:")
-    runner.stop(service)
-    store = Store(service.store.path)
-    with store.transaction() as tx:
-        tx.put_state(name, msgpack.packb({"file": "a.tiff", "contacts": 1}))
-    store.close()
-    clock.days = 1000.0
-    service = start()
-    eventually(lambda: "processed_utc_s" in msgpack.unpackb(service.store.get_state(name) or b"\x80"))
-    assert (incoming / "a.tiff").exists()
-    clock.days = 1366.0
-    add_file("b", 2)
-    eventually(lambda: not (incoming / "a.tiff").exists())
 
 
 def test_link_to_itself_is_skipped(start, add_file, incoming):

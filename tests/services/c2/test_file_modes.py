@@ -52,7 +52,7 @@ def test_files_of_c2_are_readable_by_its_user_only(runner, platform, tmp_path, c
     assert_private(tmp_path / "deep")
 
 
-def test_store_of_an_earlier_version_is_restricted(tmp_path):
+def test_store_that_others_can_read_is_restricted(tmp_path):
     path = tmp_path / "relay.db"
     Store(path).close()
     for each in tmp_path.iterdir():

@@ -282,7 +282,7 @@ def records(shore):
     return [wire.decode(types[msgpack.unpackb(payload)["type"]], payload, "k") for payload in payloads]
 
 
-def test_records_of_an_earlier_version_are_numbered_from_their_files(begin, runner, out):
+def test_records_of_a_lost_journal_are_numbered_from_their_files(begin, runner, out):
     shore = begin()
     sent = [image("0001"), partial_image("0002"), decision_record("d1")]
     shore.accept(*sent)

@@ -349,8 +349,7 @@ def test_record_and_side_car_state_authentication_and_despeckling(
     assert (image.authenticated, image.despeckle_strength) == (authenticated, strength)
     side_car = json.loads((out / f"{image_file_name(image)}.json").read_text())
     for name, value in {"authenticated": authenticated, "despeckle_strength": strength}.items():
-        assert side_car.get(name) == value
-        assert (name in side_car) == (value is not None)
+        assert side_car[name] == value
 
 
 def test_old_image_files_are_removed_by_default(begin, decoded, runner, stream, out, monkeypatch):

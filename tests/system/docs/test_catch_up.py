@@ -47,7 +47,7 @@ def test_example_of_an_error():
 
 def test_json_examples_equal_the_encoded_records():
     accepted = Accepted("3f9a1c2b", 1, 1_760_000_000.0)
-    fields = wire.unpack_map(wire.encode(SAMPLES["decision-plain"]), "k")
+    fields = wire.unpack_map(wire.encode(SAMPLES["decision-bare"]), "k")
     decision = json.loads(block(SPECIFICATION, "decision in JSON"))
     assert decision == json.loads(json_payload(accepted_fields(fields, accepted), "raw"))
     page = queries.Page(records=1, unreadable=0, more=False, next="3f9a1c2b.1")

@@ -47,7 +47,7 @@ def hex_block(name):
 
 
 def test_hex_examples_equal_the_encoded_records():
-    decision = wire.encode(SAMPLES["decision-plain"])
+    decision = wire.encode(SAMPLES["decision-bare"])
     item = OutboxItem("relay", 1, "k", "", 4, decision, hashlib.sha256(decision).digest())
     assert {name: hex_block(name) for name in blocks("hex")} == {
         "raster": wire.encode(SAMPLES["raster-16-bits"]),
@@ -154,7 +154,7 @@ def test_delivery_program_waits_for_its_consumer(run, router, client, platform, 
     try:
         program.wait()
         assert program.lines.get(timeout=120) == "stored"
-        eventually(lambda: consumer.received == [SAMPLES["decision-plain"]])
+        eventually(lambda: consumer.received == [SAMPLES["decision-bare"]])
     finally:
         consumer.stop()
 
@@ -186,7 +186,7 @@ class Producer(Service[ServiceConfig]):
 
 def queue_decision(producer, consumer, number):
     effects = UnitOfWork()
-    fields = SAMPLES["decision-plain"].model_dump() | {"decision_id": f"d{number}"}
+    fields = SAMPLES["decision-bare"].model_dump() | {"decision_id": f"d{number}"}
     effects.send(DecisionConsumer.key, consumer, Decision(**fields))
     producer.commit(effects)
 
