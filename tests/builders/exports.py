@@ -14,7 +14,7 @@ from builders.records import decision_record, reconstructed_image
 from sonarpost.archive.image_files import write_image
 from sonarpost.archive.shore_files import decision_file_name
 from sonarpost.export.contacts import ContactSet
-from sonarpost.export.formats import FORMATS
+from sonarpost.export.formats import exporters
 from sonarpost.export.source import ExportSource, StoredImages
 from sonarpost.export.tak.cot import cot_events
 from sonarpost.messages import Contact, Decision, Pixels, ReconstructedImage
@@ -136,7 +136,7 @@ def export(name: str, contacts: ContactSet, images: StoredImages | None = None) 
     """Return the contacts in a format."""
     file = io.BytesIO()
     path = Path(tempfile.gettempdir()) / f"contacts.{name}"
-    FORMATS[name].write(file, ExportSource(contacts, images or StoredImages(), path))
+    exporters().get(name).write(file, ExportSource(contacts, images or StoredImages(), path))
     return file.getvalue()
 
 

@@ -11,9 +11,11 @@ import sys
 import pytest
 
 from sonarpost.cli.main import COMMANDS, LOG_LEVEL_VARIABLE, exit_status, main, parser
-from sonarpost.cli.parsing.commands import EXAMPLES, EXTRAS
+from sonarpost.cli.parsing.commands import EXTRAS, added_commands, all_examples
 from sonarpost.cli.parsing.parser import actions_of, all_parsers
 
+EXAMPLES = all_examples()
+ADDED = {name: each.summary for name, each in added_commands().working().items() if " " not in name}
 LIGHT = "numpy scipy rich pydantic numba zenoh PIL cryptography"
 
 
@@ -39,7 +41,7 @@ def test_every_command_is_where_the_table_says():
 
 
 def test_the_table_has_the_summary_of_every_command(whole):
-    assert summaries_of(whole) == {name: summary for name, (_, summary) in COMMANDS.items()}
+    assert summaries_of(whole) == {name: summary for name, (_, summary) in COMMANDS.items()} | ADDED
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["help"]])
@@ -48,7 +50,7 @@ def test_help_lists_every_command(arguments, capsys):
         sys.exit(main(arguments))
     listed = capsys.readouterr().out
     assert {line.split()[0] for line in listed.splitlines() if line.startswith("    ") and line[4] != " "} >= set(
-        COMMANDS
+        {*COMMANDS, *ADDED}
     )
 
 

@@ -15,7 +15,7 @@ from sonarpost.codec.registry import (
     CodecRegistry,
     CodecResources,
     CodecSpec,
-    load_plugins,
+    codec_plug_ins,
 )
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.codec.vq.tiles import TileDatabase
@@ -87,25 +87,37 @@ def test_codec_with_a_codebook_needs_codec_ids_with_a_tag_of_two_bytes(registry:
         registry.register(CodecSpec("other", (0x90, codec_id), make_nothing))
 
 
-def test_plugin_is_registered(registry: CodecRegistry) -> None:
-    load_plugins(registry, [plugin("plugin", "PLUGIN")])
-    assert "plugin" in registry.names()
+def with_plug_ins(*points: EntryPoint) -> CodecRegistry:
+    return CodecRegistry(BUILTINS, codec_plug_ins(points))
+
+
+@pytest.mark.usefixtures("registry")
+def test_plug_in_is_registered_by_name_and_by_codec_id() -> None:
+    assert with_plug_ins(plugin("plugin", "PLUGIN")).create("plugin", CodecResources()).codec_id == 0x12
+    registry = with_plug_ins(plugin("plugin", "PLUGIN"))
     assert registry.spec_for_id(0x81) is PLUGIN
-    assert registry.create("plugin", CodecResources()).codec_id == 0x12
+    assert "plugin" in registry.names()
 
 
+@pytest.mark.usefixtures("registry")
 @pytest.mark.parametrize(
     ("name", "value", "match"),
     [
         ("plugin", "ABSENT", "an object that imports"),
         ("plugin", "NOT_A_SPEC", "CodecSpec"),
-        ("another", "PLUGIN", "entry point's name"),
+        ("another", "PLUGIN", "the name of the entry point"),
     ],
 )
-def test_error_names_an_invalid_plugin(registry: CodecRegistry, name: str, value: str, match: str) -> None:
+def test_invalid_plug_in_stops_only_who_uses_it(name: str, value: str, match: str) -> None:
+    registry = with_plug_ins(plugin(name, value))
+    assert registry.create("spiht").codec_id == registry.spec_for_id(0x04).codec_ids[0]
+    assert not registry.spec("huffman").needs_tiles
     with pytest.raises(ConfigError, match=match) as caught:
-        load_plugins(registry, [plugin(name, value)])
+        registry.create(name)
     assert name in caught.value.where
+    # It may be the codec of the stream.
+    with pytest.raises(StreamError, match=f"sonarpost.codecs:{name}"):
+        registry.spec_for_id(0xFE)
 
 
 def test_prefixes_of_embedded_codecs_are_images(registry: CodecRegistry) -> None:

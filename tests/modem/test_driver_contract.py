@@ -15,7 +15,7 @@ from builders.hostile_line import HOSTILE, PEER, Bench, Condition, Parts, Subjec
 from sonarpost.errors import ConfigError
 from sonarpost.modem.interface import ModemReady, PacketFailed, PacketSent
 from sonarpost.modem.micromodem import nmea
-from sonarpost.modem.registry import ModemRegistry, ModemSettings, modem_driver
+from sonarpost.modem.registry import ModemSettings, default_registry, modem_driver
 
 CONDITION_S = 90.0
 RECOVERY_S = 240.0
@@ -337,7 +337,7 @@ CONDITIONS: dict[str, Callable[[], Condition]] = {
 
 
 def test_every_builtin_driver_is_tested_and_every_exception_is_a_condition() -> None:
-    assert sorted({subject.driver for subject in SUBJECTS}) == list(ModemRegistry().names())
+    assert sorted({subject.driver for subject in SUBJECTS}) == list(default_registry().names())
     assert len(CONDITIONS) == 45
     assert all(subject.exceptions <= set(CONDITIONS) for subject in SUBJECTS)
 
@@ -399,7 +399,7 @@ def test_driver_accepts_any_bytes_in_any_parts(subject: Subject) -> None:
     assert len(bench.received(PEER)) >= 3
 
 
-@pytest.mark.parametrize("name", ModemRegistry().names())
+@pytest.mark.parametrize("name", default_registry().names())
 def test_address_of_the_modem_is_checked(name: str) -> None:
     limits = modem_driver(name).create(ModemSettings(1), "test port").capabilities
     for address in (limits.min_address - 1, limits.max_address + 1):

@@ -9,6 +9,7 @@ import types
 import pytest
 from builders.surveys import make_xtf
 
+from sonarpost import registry
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.sonar import readers
 from sonarpost.sonar.options import load_options
@@ -31,10 +32,10 @@ def plug_in(monkeypatch, small_survey):
         importlib.metadata.EntryPoint("odd", "plug_in_sonar:not_callable", readers.ENTRY_POINTS),
         importlib.metadata.EntryPoint("xtf", "absent_package:open", readers.ENTRY_POINTS),
     ]
-    monkeypatch.setattr(readers, "entry_points", lambda group: points if group == readers.ENTRY_POINTS else [])
-    readers._plug_ins.cache_clear()
+    monkeypatch.setattr(registry, "installed_points", lambda group: points if group == readers.ENTRY_POINTS else [])
+    readers.survey_readers.cache_clear()
     yield
-    readers._plug_ins.cache_clear()
+    readers.survey_readers.cache_clear()
 
 
 @pytest.mark.usefixtures("plug_in")
@@ -43,9 +44,9 @@ def test_plug_in_reader_opens_its_suffix(tmp_path, small_survey):
     assert recording_parts(tmp_path / "line.abc") == (tmp_path / "line.abc", tmp_path / "line.idx")
     assert recording_parts(tmp_path / "line.xtf") == (tmp_path / "line.xtf",)
     assert len(read_survey(tmp_path / "line.ABC").pings) == 5
-    with pytest.raises(SurveyFileError, match=r"survey reader bad: got .absent_package:open: ModuleNotFoundError"):
+    with pytest.raises(SurveyFileError, match=r"survey_readers:bad: got .absent_package:open .Mod"):
         open_survey(tmp_path / "line.bad")
-    with pytest.raises(SurveyFileError, match="a callable"):
+    with pytest.raises(SurveyFileError, match="a function"):
         open_survey(tmp_path / "line.odd")
     # Readers of this package are not replaced.
     assert len(read_survey(make_xtf(small_survey(), tmp_path)).pings) == 5

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from sonarpost import __version__
-from sonarpost.cli.parsing.commands import COMMANDS, EXTRAS
+from sonarpost.cli.parsing.commands import COMMANDS, EXTRAS, added_commands
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.errors import SonarpostError
 from sonarpost.stop_signals import exit_process
@@ -51,6 +51,12 @@ def parser(command: str | None = None) -> CommandParser:
         elif module not in added:  # a module adds all its commands
             importlib.import_module(f"sonarpost.{module}").add_parser(subparsers)
             added.add(module)
+    for name, each in added_commands().working().items():
+        if " " not in name:
+            if command in (None, name):
+                each.add(subparsers)
+            else:
+                subparsers.add_parser(name, help=each.summary)
     return whole
 
 

@@ -1,7 +1,7 @@
 """Codecs by name, for encoding, and by the codec id in a stream header, for decoding.
 
-`BUILTINS` lists the codecs of this package. Another distribution adds codecs through the entry-point group
-`sonarpost.codecs`: the entry point loads a `CodecSpec` with the name of the entry point.
+`BUILTINS` lists the codecs of the core; for others see `sonarpost.registry`. The group of entry points is
+`sonarpost.codecs`: an entry point loads a `CodecSpec` with its name.
 
 Codec ids are never reused. 0x01..0x0F have no model, 0x10..0x13 belong to vq (one for each packing), 0x20 to 0x23 to
 emb (one for each kind of model, with and without despeckling). 0x80 and above are for other distributions.
@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 
 from sonarpost.codec import emb
 from sonarpost.codec.baselines.huffman import HuffmanCodec
@@ -23,6 +23,7 @@ from sonarpost.codec.interface import Codec, StreamHeader, tag_length
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import ConfigError, StreamError
+from sonarpost.registry import Registry, installed_points
 
 ENTRY_POINT_GROUP = "sonarpost.codecs"
 CODEBOOK_TAG_BYTES = 2
@@ -129,11 +130,17 @@ BUILTINS = (
 
 
 class CodecRegistry:
-    """Codecs by name and by codec id. Both are unique."""
+    """Codecs by name and by codec id. Both are unique.
 
-    def __init__(self, specs: Iterable[CodecSpec] = ()) -> None:
+    Args:
+        specs: Codecs.
+        plug_ins: Codecs that are registered when they are asked for.
+    """
+
+    def __init__(self, specs: Iterable[CodecSpec] = (), plug_ins: Registry[CodecSpec] | None = None) -> None:
         self._by_name: dict[str, CodecSpec] = {}
         self._by_id: dict[int, CodecSpec] = {}
+        self._plug_ins = codec_plug_ins(()) if plug_ins is None else plug_ins
         for spec in specs:
             self.register(spec)
 
@@ -163,18 +170,20 @@ class CodecRegistry:
 
     def names(self) -> tuple[str, ...]:
         """Return the names, sorted."""
-        return tuple(sorted(self._by_name))
+        return tuple(sorted({*self._by_name, *self._plug_ins.names()}))
 
     def is_embedded(self, name: str) -> bool:
         """Return whether the streams of a codec can be truncated and extended; False for an unknown name."""
-        return name in self._by_name and self._by_name[name].is_embedded
+        return name in self.names() and self.spec(name).is_embedded
 
     def spec(self, name: str) -> CodecSpec:
         """Return the entry of a codec.
 
         Raises:
-            ConfigError: No codec has this name. The message lists the names.
+            ConfigError: No codec has this name, or it is a plug-in that cannot be used. The message lists the names.
         """
+        if name not in self._by_name and name in self._plug_ins.names():
+            self.register(self._plug_ins.get(name))
         if name not in self._by_name:
             raise ConfigError("codec registry", "name", name, "one of " + ", ".join(self.names()) + _requirement(name))
         return self._by_name[name]
@@ -193,10 +202,22 @@ class CodecRegistry:
         Raises:
             StreamError: No codec has it.
         """
+        unusable = [] if codec_id in self._by_id else self._register_plug_ins()
         if codec_id not in self._by_id:
             known = ", ".join(f"{number:#04x} ({self._by_id[number].name})" for number in sorted(self._by_id))
-            raise StreamError("stream", "codec_id", f"{codec_id:#04x}", f"one of {known}{_requirement(codec_id)}")
+            expected = "; ".join([f"one of {known}{_requirement(codec_id)}", *map(str, unusable)])
+            raise StreamError("stream", "codec_id", f"{codec_id:#04x}", expected)
         return self._by_id[codec_id]
+
+    def _register_plug_ins(self) -> list[ConfigError]:
+        """Register all plug-ins; return the errors of those that cannot be used."""
+        errors = []
+        for name in self._plug_ins.names():
+            try:
+                self.spec(name)
+            except ConfigError as error:
+                errors.append(error)
+        return errors
 
     def create_for_stream(self, stream: bytes, resources: CodecResources | None = None) -> Codec:
         """Create the codec that encoded a stream.
@@ -218,33 +239,18 @@ def _requirement(name_or_id: str | int) -> str:
     return "".join(f" ({one.value} needs {one.requirement})" for one in missing)
 
 
-def load_plugins(registry: CodecRegistry, found: Iterable[EntryPoint]) -> None:
-    """Register the codecs of other distributions, in the order of their names.
-
-    Raises:
-        ConfigError: An entry point does not load, is not a `CodecSpec`, has another name, or its name or codec id is
-            taken.
-    """
-    for point in sorted(found, key=lambda p: (p.name, p.value)):
-        where = f"entry point {ENTRY_POINT_GROUP}:{point.name}"
-        try:
-            spec = point.load()
-        except Exception as error:  # foreign code can raise any exception; the message names the entry point
-            raise ConfigError(where, "value", f"{point.value} ({error!r})", "an object that imports") from error
-        if not isinstance(spec, CodecSpec):
-            raise ConfigError(where, "value", repr(spec), "a sonarpost.codec.registry.CodecSpec")
-        if spec.name != point.name:
-            raise ConfigError(where, "name", spec.name, f"{point.name!r}, the entry point's name")
-        registry.register(spec)
+def codec_plug_ins(points: Iterable[EntryPoint]) -> Registry[CodecSpec]:
+    """Return the codecs of entry points."""
+    return Registry(
+        ENTRY_POINT_GROUP,
+        "a sonarpost.codec.registry.CodecSpec with the name of the entry point",
+        lambda found, name: isinstance(found, CodecSpec) and found.name == name,
+        {},
+        points,
+    )
 
 
 @cache
 def default_registry() -> CodecRegistry:
-    """Return the registry with the codecs of this package and of the installed plug-ins.
-
-    Raises:
-        ConfigError: A plug-in is invalid.
-    """
-    registry = CodecRegistry(BUILTINS)
-    load_plugins(registry, entry_points(group=ENTRY_POINT_GROUP))
-    return registry
+    """Return the registry with the codecs of this package and of the installed plug-ins."""
+    return CodecRegistry(BUILTINS, codec_plug_ins(installed_points(ENTRY_POINT_GROUP)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import IO, Final
 
@@ -17,6 +18,7 @@ from sonarpost.export.tables import write_csv, write_geojson
 from sonarpost.export.tak.cot import write_cot
 from sonarpost.export.tak.data_package import write_data_package
 from sonarpost.files import atomic_file
+from sonarpost.registry import Registry
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +29,7 @@ class Format:
     media_type: str
 
 
-FORMATS: Final[Mapping[str, Format]] = {
+_CORE: Final[Mapping[str, Format]] = {
     "geojson": Format(write_geojson, "application/geo+json"),
     "kml": Format(write_kml, "application/vnd.google-earth.kml+xml"),
     "kmz": Format(write_kmz, "application/vnd.google-earth.kmz"),
@@ -40,11 +42,18 @@ FORMATS: Final[Mapping[str, Format]] = {
 }
 
 
+@cache
+def exporters() -> Registry[Format]:
+    """Return the formats: see `sonarpost.registry`. The group of entry points is `sonarpost.exporters`."""
+    expected = "a sonarpost.export.formats.Format"
+    return Registry("sonarpost.exporters", expected, lambda found, _: isinstance(found, Format), _CORE)
+
+
 def write_export(name: str, path: Path, contacts: Iterable[ExportContact]) -> list[BadInputError]:
     """Write contacts from the folder of c2 to a file, atomically.
 
     Args:
-        name: The format, a key of `FORMATS`.
+        name: The format, a name in `exporters`.
         path: The file.
         contacts: The contacts.
 
@@ -52,9 +61,10 @@ def write_export(name: str, path: Path, contacts: Iterable[ExportContact]) -> li
         One error for each image that cannot be read. Its contact is exported without an image.
 
     Raises:
+        ConfigError: There is no such format, or its plug-in cannot be imported.
         OSError: The file cannot be written.
     """
     images = StoredImages()
     with atomic_file(path) as file:
-        FORMATS[name].write(file, ExportSource(contacts, images, path))
+        exporters().get(name).write(file, ExportSource(contacts, images, path))
     return images.problems

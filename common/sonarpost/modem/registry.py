@@ -1,21 +1,16 @@
-"""Modem drivers by name.
-
-`BUILTINS` names the drivers of this package. Another distribution adds drivers through the entry-point group
-`sonarpost.modems`: the entry point loads a `ModemDriver` with the name of the entry point.
-"""
+"""Modem drivers by name: see `sonarpost.registry`. The group of entry points is `sonarpost.modems`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
-from types import MappingProxyType
+from importlib.metadata import EntryPoint
 from typing import Final
 
 from sonarpost.errors import ConfigError
 from sonarpost.modem.interface import MAX_ADDRESS, MAX_FRAMES, MAX_RATE, Modem, ModemCapabilities
+from sonarpost.registry import Registry, installed_points
 
 ENTRY_POINT_GROUP: Final = "sonarpost.modems"
 DEFAULT_DRIVER: Final = "micromodem"
@@ -57,64 +52,8 @@ class ModemDriver:
     summary: str = ""
 
 
-BUILTINS: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "micromodem": "sonarpost.modem.micromodem.plugin",
-        "nano": "sonarpost.modem.nano.plugin",
-        "s2c": "sonarpost.modem.s2c.plugin",
-        "udp": "sonarpost.modem.udp.plugin",
-    }
-)
-"""Drivers of this package: the module whose `DRIVER` is the entry. A module is imported when its driver is used."""
-
-
-class ModemRegistry:
-    """Drivers by name.
-
-    Args:
-        builtins: As `BUILTINS`.
-        plugins: Entry points of other distributions.
-
-    Raises:
-        ConfigError: An entry point has the name of another driver.
-    """
-
-    def __init__(self, builtins: Mapping[str, str] = BUILTINS, plugins: Iterable[EntryPoint] = ()) -> None:
-        self._builtins = dict(builtins)
-        self._plugins: dict[str, EntryPoint] = {}
-        for point in plugins:
-            if point.name in self._builtins or point.name in self._plugins:
-                raise ConfigError(f"entry point {ENTRY_POINT_GROUP}", "name", point.name, "a name that is not taken")
-            self._plugins[point.name] = point
-
-    def names(self) -> tuple[str, ...]:
-        """Return the names, sorted."""
-        return tuple(sorted({*self._builtins, *self._plugins}))
-
-    def driver(self, name: str) -> ModemDriver:
-        """Return a driver.
-
-        Raises:
-            ConfigError: No driver has this name, or the entry point of the driver is invalid.
-        """
-        if name in self._builtins:
-            driver: object = import_module(self._builtins[name]).DRIVER
-            where = f"driver {name}"
-        elif name in self._plugins:
-            where = f"entry point {ENTRY_POINT_GROUP}:{name}"
-            try:
-                driver = self._plugins[name].load()
-            except Exception as error:  # foreign code can raise any exception; the message names the entry point
-                value = f"{self._plugins[name].value} ({error!r})"
-                raise ConfigError(where, "value", value, "an object that imports") from error
-        else:
-            raise ConfigError("[modem]", "driver", name, "one of " + ", ".join(self.names()))
-        if not isinstance(driver, ModemDriver):
-            raise ConfigError(where, "value", repr(driver), "a sonarpost.modem.registry.ModemDriver")
-        if driver.name != name:
-            raise ConfigError(where, "name", driver.name, f"{name!r}, the name in the registry")
-        check_capabilities(driver.capabilities, where)
-        return driver
+_CORE: Final = ("micromodem", "nano", "s2c", "udp")
+"""Drivers of the core. A module is imported when its driver is used."""
 
 
 def check_capabilities(capabilities: ModemCapabilities, where: str) -> None:
@@ -138,21 +77,32 @@ def check_capabilities(capabilities: ModemCapabilities, where: str) -> None:
         raise ConfigError(where, "addresses", addresses, f"within 0..{MAX_ADDRESS}")
 
 
+def drivers(points: Iterable[EntryPoint]) -> Registry[ModemDriver]:
+    """Return a registry of drivers; those of the core have priority."""
+    return Registry(
+        ENTRY_POINT_GROUP,
+        "a sonarpost.modem.registry.ModemDriver with the name of the entry point",
+        lambda found, name: isinstance(found, ModemDriver) and found.name == name,
+        {},
+        (*(EntryPoint(name, f"sonarpost.modem.{name}.plugin:DRIVER", "") for name in _CORE), *points),
+    )
+
+
 @cache
-def default_registry() -> ModemRegistry:
-    """Return the registry with the drivers of this package and of the installed plug-ins.
-
-    Raises:
-        ConfigError: Two drivers have the same name.
-    """
-    return ModemRegistry(plugins=sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: (p.name, p.value)))
+def default_registry() -> Registry[ModemDriver]:
+    """Return the drivers of this package and of the installed plug-ins."""
+    return drivers(installed_points(ENTRY_POINT_GROUP))
 
 
-@cache
 def modem_driver(name: str = DEFAULT_DRIVER) -> ModemDriver:
     """Return a driver of the default registry; by default the one that is used without configuration.
 
     Raises:
-        ConfigError: See `ModemRegistry.driver`.
+        ConfigError: There is no such driver, or it cannot be imported, or its capabilities are invalid.
     """
-    return default_registry().driver(name)
+    registry = default_registry()
+    if name not in registry.names():
+        raise ConfigError("[modem]", "driver", name, "one of " + ", ".join(registry.names()))
+    driver = registry.get(name)
+    check_capabilities(driver.capabilities, f"driver {name}")
+    return driver

@@ -21,7 +21,7 @@ from starlette.types import Receive, Scope, Send
 from sonarpost.delivery.store import HANDLING_RESERVE_BYTES
 from sonarpost.errors import BadInputError
 from sonarpost.export.contacts import ExportContact
-from sonarpost.export.formats import FORMATS, Format
+from sonarpost.export.formats import Format, exporters
 from sonarpost.export.source import ContactImage, ExportSource
 from sonarpost.limits import limit
 from sonarpost.logs import IntervalLog
@@ -44,7 +44,7 @@ CONNECTION_INTERVAL: Final = 16
 CHUNK_BYTES: Final = 65536
 _skipped_log: Final = IntervalLog(logging.getLogger(__name__), logging.ERROR, "Contact left out of a document")
 NAMES: Final[Mapping[str, Format]] = {
-    f"contacts.{name}": FORMATS[name] for name in ("geojson", "kmz", "csv", "gpkg", "cot.xml")
+    f"contacts.{name}": exporters().get(name) for name in ("geojson", "kmz", "csv", "gpkg", "cot.xml")
 }
 
 Writer = Callable[[IO[bytes], "DocumentContacts"], None]

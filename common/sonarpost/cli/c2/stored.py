@@ -30,7 +30,7 @@ from sonarpost.cli.shared import Subparsers, in_new_folder, make_output_folder, 
 from sonarpost.config import load
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError
 from sonarpost.export.contacts import ContactSet, ExportContact, load_contacts, match_start_time
-from sonarpost.export.formats import FORMATS, write_export
+from sonarpost.export.formats import exporters, write_export
 from sonarpost.export.tak.cot import cot_events
 from sonarpost.export.tak.cot_sender import CotSender
 from sonarpost.export.text import probabilities_text
@@ -107,7 +107,7 @@ def add_actions(actions: Subparsers) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="file to write, named *." + ", *.".join(FORMATS) + "; can be repeated",
+        help="file to write, named *." + ", *.".join(exporters().names()) + "; can be repeated",
     )
     export.add_argument("--cot", metavar="URL", help="send events to tcp://host:port, tls://… or udp://…")
     add_tls_options(export, "--cot tls://…")
@@ -370,10 +370,11 @@ def _write_contacts(
 def _export_files(parsed: argparse.Namespace) -> list[tuple[str, Path]]:
     """Return format and path of every file to write."""
     files = []
+    names = exporters().names()
     for path in parsed.out:
-        name = next((name for name in FORMATS if path.name.lower().endswith(f".{name}")), None)
+        name = next((name for name in names if path.name.lower().endswith(f".{name}")), None)
         if name is None:
-            raise ConfigError("c2 export", "--out", str(path), "a name that ends in ." + ", .".join(FORMATS))
+            raise ConfigError("c2 export", "--out", str(path), "a name that ends in ." + ", .".join(names))
         files.append((name, path))
     return files
 

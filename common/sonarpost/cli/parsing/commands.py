@@ -1,9 +1,19 @@
-"""Tables of the commands: modules, summaries, examples, extras."""
+"""Tables of the commands: modules, summaries, examples, extras; the commands of extensions and plug-ins."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import EntryPoint
+from typing import TYPE_CHECKING, Any, Final
+
+from sonarpost.registry import Registry
+
+if TYPE_CHECKING:
+    import argparse
+
+GROUP: Final = "sonarpost.commands"
 
 COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "demo": ("cli.demo", "run the whole chain on this host, from a survey file to the shore"),
@@ -35,6 +45,28 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "completion": ("cli.parsing.completion", "print the completion script of a shell"),
 }
 """Name -> module and summary. Only the module of the given command is imported: all of them together take seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command of an extension or a plug-in, in a module that imports nothing else.
+
+    The name of its entry point is that of the command, `record`, or of an action of a command of the core, `c2 cot`.
+
+    Attributes:
+        summary: One line for the list of commands.
+        parser: `module:function`; the function adds the parser of the command to the group of parsers that it gets.
+        examples: Arguments of an example by command, as `EXAMPLES`.
+    """
+
+    summary: str
+    parser: str
+    examples: Mapping[str, str]
+
+    def add(self, subparsers: argparse._SubParsersAction[Any]) -> None:
+        """Import the command and add its parser."""
+        EntryPoint("", self.parser, GROUP).load()(subparsers)
+
 
 EXTRAS: Final[Mapping[str, str]] = {
     "starlette": "console",
@@ -106,3 +138,32 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "completion": "completion bash > ~/.local/share/bash-completion/completions/sonarpost",
 }
 """Command -> arguments of its example. Every command without actions has one."""
+
+
+@cache
+def added_commands() -> Registry[Command]:
+    """Return the commands of extensions and plug-ins."""
+    return Registry(GROUP, "a sonarpost.cli.parsing.commands.Command", lambda found, _: isinstance(found, Command), {})
+
+
+def add_actions(actions: argparse._SubParsersAction[Any], command: str) -> None:
+    """Add the actions that extensions and plug-ins have for a command of the core."""
+    for name, added in added_commands().working().items():
+        if name.rpartition(" ")[0] == command:
+            added.add(actions)
+
+
+def example_of(command: str) -> str | None:
+    """Return the arguments of the example of a command; None if it has none."""
+    for name, added in added_commands().working().items():
+        if command.startswith(name) and command in added.examples:
+            return added.examples[command]
+    return EXAMPLES.get(command)
+
+
+def all_examples() -> dict[str, str]:
+    """Return the examples of all commands."""
+    found = dict(EXAMPLES)
+    for added in added_commands().working().values():
+        found |= added.examples
+    return found

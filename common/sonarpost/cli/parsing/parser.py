@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Never
 
-from sonarpost.cli.parsing.commands import EXAMPLES
+from sonarpost.cli.parsing.commands import example_of
 from sonarpost.cli.parsing.lists import requested_list
 
 _INVALID_CHOICE = re.compile(r"invalid choice: '(?P<given>[^']*)' \(choose from (?P<choices>.*)\)")
@@ -20,14 +20,14 @@ class CommandParser(argparse.ArgumentParser):
     """Parser with -v and -q, accepted before and after the name of a command.
 
     A usage error is reported by the parser of the command that it belongs to, with the most similar name. The help of
-    a command in `EXAMPLES` ends with its example.
+    a command that has an example ends with it.
 
     Parsed arguments have the attribute `verbosity`, `verbose` or `quiet`, only if the option was given.
     """
 
     def __init__(self, **options: Any) -> None:  # noqa: ANN401 the options of ArgumentParser
         super().__init__(**{"formatter_class": _Formatter, **options})
-        example = EXAMPLES.get(self.prog.partition(" ")[2])
+        example = example_of(self.prog.partition(" ")[2])
         if example is not None:
             self.epilog = f"example: sonarpost {example}"
         if "-" in self.prefix_chars:

@@ -11,11 +11,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Final
 
-from sonarpost.errors import SurveyFileError
+from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.registry import Registry
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers.humminbird import HumminbirdSource
 from sonarpost.sonar.readers.jsf import JsfSource
@@ -30,21 +30,27 @@ from sonarpost.sonar.survey import Survey
 SurveyReader = Callable[[Path, SurveyOptions], SurveySource]
 
 ENTRY_POINTS = "sonarpost.survey_readers"
-_READERS: Final[Mapping[str, SurveyReader]] = {
-    ".xtf": XtfSource,
-    ".dat": HumminbirdSource,
-    ".jsf": JsfSource,
-    ".sdf": SdfSource,
-    ".sl2": LowranceSource,
-    ".sl3": LowranceSource,
-    ".svlog": SvlogSource,
-    ".waterfall.toml": WaterfallSource,
+_CORE: Final[Mapping[str, SurveyReader]] = {
+    "xtf": XtfSource,
+    "dat": HumminbirdSource,
+    "jsf": JsfSource,
+    "sdf": SdfSource,
+    "sl2": LowranceSource,
+    "sl3": LowranceSource,
+    "svlog": SvlogSource,
+    "waterfall.toml": WaterfallSource,
 }
+
+
+@cache
+def survey_readers() -> Registry[SurveyReader]:
+    """Return the readers by suffix without its dot, lower case."""
+    return Registry(ENTRY_POINTS, "a function", lambda found, _: callable(found), _CORE)
 
 
 def supported_suffixes() -> tuple[str, ...]:
     """Return the suffixes that have a reader, including plug-ins, lower case, sorted."""
-    return tuple(sorted({*_READERS, *_plug_ins()}))
+    return tuple(f".{name}" for name in survey_readers().names())
 
 
 def recording_parts(path: Path) -> tuple[Path, ...]:
@@ -97,23 +103,7 @@ def _reader(path: Path) -> SurveyReader:
     matching = [suffix for suffix in supported_suffixes() if name.endswith(suffix)]
     if not matching:
         raise SurveyFileError(str(path), "suffix", path.suffix, "one of " + ", ".join(supported_suffixes()))
-    suffix = max(matching, key=len)
-    # The readers of the package have priority: a plug-in does not replace them.
-    return _READERS[suffix] if suffix in _READERS else _load_plug_in(path, _plug_ins()[suffix])
-
-
-def _load_plug_in(path: Path, point: EntryPoint) -> SurveyReader:
     try:
-        reader: SurveyReader = point.load()
-    except Exception as error:  # importing a plug-in may raise anything
-        value = f"{point.value}: {type(error).__name__}: {error}"
-        raise SurveyFileError(str(path), f"survey reader {point.name}", value, "a plug-in that loads") from error
-    if not callable(reader):
-        raise SurveyFileError(str(path), f"survey reader {point.name}", point.value, "a callable")
-    return reader
-
-
-@cache
-def _plug_ins() -> dict[str, EntryPoint]:
-    """Return suffix to entry point. A plug-in is imported only when its suffix is used."""
-    return {f".{point.name.lower()}": point for point in entry_points(group=ENTRY_POINTS)}
+        return survey_readers().get(max(matching, key=len).removeprefix("."))
+    except ConfigError as error:
+        raise SurveyFileError(str(path), error.where, error.value, error.expected) from error

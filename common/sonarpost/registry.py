@@ -1,0 +1,113 @@
+"""Objects by name: those of the core, of the extensions of this package, and of other installed packages (plug-ins).
+
+A registry is a group of entry points, for example `sonarpost.modems`. An extension names its objects in
+`entry_points.toml` in its folder, a plug-in in the metadata of its package. An object is imported when it is asked for:
+a plug-in that cannot be imported stops whoever asks for it, and nobody else.
+"""
+
+from __future__ import annotations
+
+import logging
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Final, Generic, TypeVar
+
+from sonarpost.errors import ConfigError
+
+log = logging.getLogger(__name__)
+
+ENTRY_POINTS_FILE: Final = "entry_points.toml"
+EXTENSIONS: Final = Path(__file__).with_name("extensions")
+
+T = TypeVar("T")
+
+
+class Registry(Generic[T]):
+    """Objects of one group by name.
+
+    The core has priority over an extension, an extension over a plug-in; the first of two plug-ins counts, in the order
+    of their modules. What does not count is reported in the log.
+
+    Args:
+        group: Name of the group of entry points.
+        expected: What an object has to be, for errors.
+        is_valid: Whether an object is one. It gets the object and its name.
+        core: Objects of the core.
+        points: Entry points of extensions and plug-ins, by priority; None: those that are installed.
+    """
+
+    def __init__(
+        self,
+        group: str,
+        expected: str,
+        is_valid: Callable[[object, str], bool],
+        core: Mapping[str, T],
+        points: Iterable[EntryPoint] | None = None,
+    ) -> None:
+        self.group = group
+        self._expected = expected
+        self._is_valid = is_valid
+        self._objects = dict(core)
+        self._points: dict[str, EntryPoint] = {}
+        self._reported: set[str] = set()
+        for point in installed_points(group) if points is None else points:
+            if point.name in self._objects or point.name in self._points:
+                log.warning("Plug-in ignored: its name is taken: %s:%s = %s", group, point.name, point.value)
+            else:
+                self._points[point.name] = point
+
+    def names(self) -> tuple[str, ...]:
+        """Return all names, sorted; whether an object can be imported is not known."""
+        return tuple(sorted({*self._objects, *self._points}))
+
+    def get(self, name: str) -> T:
+        """Return an object; import it if it was not used before.
+
+        Raises:
+            ConfigError: There is no such name, or its entry point cannot be imported or is invalid.
+        """
+        if name not in self._objects:
+            if name not in self._points:
+                raise ConfigError(self.group, "name", name, "one of " + ", ".join(self.names()))
+            self._objects[name] = self._load(self._points[name])
+        return self._objects[name]
+
+    def working(self) -> dict[str, T]:
+        """Return all objects that can be imported, by name; each of the others is reported in the log once."""
+        found = {}
+        for name in self.names():
+            try:
+                found[name] = self.get(name)
+            except ConfigError as error:
+                if name not in self._reported:
+                    log.warning("Plug-in ignored: %s", error)
+                self._reported.add(name)
+        return found
+
+    def _load(self, point: EntryPoint) -> T:
+        where = f"entry point {self.group}:{point.name}"
+        try:
+            found: T = point.load()
+        except Exception as error:  # foreign code can raise any exception; the message names the entry point
+            value = f"{point.value} ({error!r})"
+            raise ConfigError(where, "value", value, "an object that imports") from error
+        if not self._is_valid(found, point.name):
+            raise ConfigError(where, "value", f"{point.value} ({found!r})", self._expected)
+        return found
+
+
+@cache
+def installed_points(group: str) -> tuple[EntryPoint, ...]:
+    """Return the entry points of the extensions, then those of plug-ins, each in the order of names and values."""
+    return (*_extension_points(group), *sorted(entry_points(group=group), key=lambda p: (p.name, p.value)))
+
+
+def _extension_points(group: str) -> list[EntryPoint]:
+    found = []
+    for path in sorted(EXTENSIONS.glob(f"*/{ENTRY_POINTS_FILE}")):
+        named = tomllib.loads(path.read_text(encoding="utf-8")).get(group, {})
+        found += [EntryPoint(name, value, group) for name, value in named.items()]
+    return sorted(found, key=lambda p: (p.name, p.value))

@@ -1,0 +1,67 @@
+"""Objects by name: those of the core, of extensions and of plug-ins."""
+
+import logging
+import sys
+import types
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from sonarpost import registry
+from sonarpost.errors import ConfigError
+from sonarpost.registry import Registry
+
+GROUP = "sonarpost.numbers"
+
+
+@pytest.fixture
+def numbers(monkeypatch):
+    """Makes a registry of numbers from entry points, name to object of a module."""
+    module = types.ModuleType("plug_in_numbers")
+    module.ONE, module.TWO, module.TEXT = 1, 2, "two"
+    monkeypatch.setitem(sys.modules, "plug_in_numbers", module)
+
+    def make(**points):
+        found = [EntryPoint(name, f"plug_in_numbers:{value}", GROUP) for name, value in points.items()]
+        return Registry(GROUP, "a number", lambda each, _: isinstance(each, int), {"zero": 0}, found)
+
+    return make
+
+
+def test_object_is_imported_when_it_is_asked_for(numbers):
+    found = numbers(one="ONE", broken="NONE", text="TEXT")
+    assert found.names() == ("broken", "one", "text", "zero")
+    assert (found.get("zero"), found.get("one")) == (0, 1)
+    for name, expected in (("broken", "an object that imports"), ("text", "a number"), ("none", "one of broken, one")):
+        with pytest.raises(ConfigError, match=f"sonarpost.numbers.*{expected}"):
+            found.get(name)
+
+
+def test_broken_plug_in_is_left_out_and_reported_once(numbers, caplog):
+    found = numbers(one="ONE", broken="NONE", text="TEXT")
+    with caplog.at_level(logging.WARNING):
+        assert found.working() == found.working() == {"one": 1, "zero": 0}
+    assert len(caplog.records) == 2
+    assert "sonarpost.numbers:broken" in caplog.text
+
+
+def test_core_has_priority(numbers, caplog):
+    assert numbers(zero="ONE").get("zero") == 0
+    assert "its name is taken: sonarpost.numbers:zero = plug_in_numbers:ONE" in caplog.text
+
+
+def test_extension_is_found_by_its_folder_and_has_priority(monkeypatch, tmp_path):
+    for name, value in (("b", "b:TWO"), ("a", "a:ONE")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "entry_points.toml").write_text(f'["{GROUP}"]\n"{name} of" = "{value}"\n')
+    (tmp_path / "empty").mkdir()
+    installed = EntryPoint("a", "plug_in:A", GROUP)
+    monkeypatch.setattr(registry, "EXTENSIONS", tmp_path)
+    monkeypatch.setattr(registry, "entry_points", lambda group: [installed] if group == GROUP else [])
+    registry.installed_points.cache_clear()
+    try:
+        found = registry.installed_points(GROUP)
+        assert [point.value for point in found] == ["a:ONE", "b:TWO", "plug_in:A"]
+        assert registry.installed_points("sonarpost.others") == ()
+    finally:
+        registry.installed_points.cache_clear()
