@@ -1,10 +1,15 @@
-"""Calls that can wait, allocate or collect without limit occur at reviewed places only; each has its reason here."""
+"""Calls that can wait, allocate or collect without limit occur at reviewed places only; each has its reason here.
+
+Those of an extension are in `reviewed.toml` beside its tests: a table for each variable here, for example `[THREADS]`,
+with paths from the folder of the extension.
+"""
 
 from __future__ import annotations
 
 import ast
 import builtins
 import re
+import tomllib
 
 import pytest
 from builders.common import REPOSITORY
@@ -73,6 +78,7 @@ READS = {
     "common/sonarpost/export/tak/cot_stream.py": "bytes to send, from the TLS library",
     "common/sonarpost/monitoring/healthcheck.py": "heartbeat of a service on this computer",
     "common/sonarpost/network/http_client.py": "the connection delivers at most MAX_REPLY_BYTES",
+    "common/sonarpost/registry.py": SHIPPED,
     "common/sonarpost/security/fleet.py": OWN_SETTINGS,
     "common/sonarpost/security/tls_files.py": OWN_SETTINGS,
     "common/sonarpost/simulation/channel/emulator.py": "simulator",
@@ -136,7 +142,7 @@ def packages(*names):
     return tuple(f"common/sonarpost/{name}/" for name in names)
 
 
-CALLERS = ("services/", *packages("archive", "bearers", "cli", "delivery", "monitoring", "runtime"))
+CALLERS = ("services/", *packages("archive", "bearers", "cli", "delivery", "extensions", "monitoring", "runtime"))
 MAPPED = "its caller `main` reports it"
 RAISES = {
     "common/sonarpost/cli/c2/migrate.py: Migration._stored_images: read_image_files": "a folder, not a database",
@@ -147,6 +153,11 @@ RAISES = {
     "services/atd_stub/service.py: AtdStubService._process: _content_of": "its caller tries the file again",
     "services/atd_stub/service.py: _known_parts: recording_parts": "the listing of the folder reports the recording",
 }
+
+for path in (REPOSITORY / "tests" / "extensions").glob("*/reviewed.toml"):
+    for table, reviewed in tomllib.loads(path.read_text()).items():
+        (folder,) = packages(f"extensions/{path.parent.name}")
+        globals()[table].update({folder + place: reason for place, reason in reviewed.items()})
 
 ACCEPTS = ("super().accept", "listener.accept", "self._listener.accept", "server.accept")
 
@@ -218,7 +229,7 @@ def allocates_a_computed_size(call):
 
 
 PARSERS = (
-    *packages("archive", "bearers", "codec", "detection", "link", "messages", "modem", "sonar"),
+    *packages("archive", "bearers", "codec", "detection", "extensions", "link", "messages", "modem", "sonar"),
     *("services/c2/", "services/console/web/", "services/op_modem/"),
 )
 KINDS = [(opens_or_reads_a_socket, SOCKETS), (starts_a_thread, THREADS), (waits_for_a_process, PROCESSES)]
