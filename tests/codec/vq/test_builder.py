@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.codec.vq.build_journal import MAGIC, EntryKind, Journal, JournalEntry
+from sonarpost.codec.vq.build_journal import MAGIC, BuildEntry, BuildJournal, EntryKind
 from sonarpost.codec.vq.builder import (
     BuildProgress,
     RefinementProgress,
@@ -131,8 +131,8 @@ def test_images_of_a_round_are_evenly_spaced_from_the_first() -> None:
 
 def test_truncated_or_damaged_journal_keeps_complete_records(tmp_path: Path) -> None:
     path = tmp_path / "journal"
-    entries = [JournalEntry(EntryKind.IMAGE, 0, i, bytes(32), np.full((i, 16), i, np.uint8)) for i in range(4)]
-    with Journal(path, "fingerprint", 16) as journal:
+    entries = [BuildEntry(EntryKind.IMAGE, 0, i, bytes(32), np.full((i, 16), i, np.uint8)) for i in range(4)]
+    with BuildJournal(path, "fingerprint", 16) as journal:
         for entry in entries:
             journal.append(entry)
     data = path.read_bytes()
@@ -140,14 +140,14 @@ def test_truncated_or_damaged_journal_keeps_complete_records(tmp_path: Path) -> 
     assert ends[-1] == len(data)
     for length in range(0, len(data) + 1, 3):
         path.write_bytes(data[:length])
-        with Journal(path, "fingerprint", 16) as journal:
+        with BuildJournal(path, "fingerprint", 16) as journal:
             complete = [e.image_number for e in journal.entries()]
         assert len(complete) == max(0, int((ends <= length).sum()) - 1)
     for position in range(int(ends[0]), len(data), 3):
         damaged = bytearray(data)
         damaged[position] ^= 0x40
         path.write_bytes(damaged)
-        with Journal(path, "fingerprint", 16) as journal:
+        with BuildJournal(path, "fingerprint", 16) as journal:
             assert len(list(journal.entries())) == int((ends[1:] <= position).sum())
 
 
@@ -267,7 +267,7 @@ def test_interrupted_rounds_and_refinement_resume_to_the_same_codebook(tmp_path:
     uninterrupted = build(folder.images(), 8, ROUNDS, passes=3)
     journal = tmp_path / "journal"
     run_until(folder, journal, 3, stop)
-    with Journal(journal, build_fingerprint(folder.images(), 8, ROUNDS, 15_992, None), 64) as written:
+    with BuildJournal(journal, build_fingerprint(folder.images(), 8, ROUNDS, 15_992, None), 64) as written:
         kinds = [entry.kind for entry in written.entries()]
     assert kinds == [EntryKind.IMAGE] * min(stop, 10) + [EntryKind.PASS] * max(0, stop - 10)
     data = journal.read_bytes()
@@ -338,18 +338,18 @@ def test_image_changed_between_rounds_is_rejected() -> None:
 
 def test_journal_with_an_unknown_image_number_is_rejected(tmp_path: Path) -> None:
     folder = Folder(2)
-    with Journal(tmp_path / "journal", build_fingerprint(folder.images(), 8, ROUNDS, 15_992, None), 64) as journal:
-        journal.append(JournalEntry(EntryKind.IMAGE, 0, 2, bytes(32), np.zeros((1, 64), np.uint8)))
+    with BuildJournal(tmp_path / "journal", build_fingerprint(folder.images(), 8, ROUNDS, 15_992, None), 64) as journal:
+        journal.append(BuildEntry(EntryKind.IMAGE, 0, 2, bytes(32), np.zeros((1, 64), np.uint8)))
     with pytest.raises(CodebookError, match="number of images"):
         build(folder.images(), 8, ROUNDS, journal_path=tmp_path / "journal")
 
 
 def test_damaged_tile_count_does_not_allocate_memory(tmp_path: Path) -> None:
     path = tmp_path / "journal"
-    Journal(path, "fingerprint", 64).__exit__(None, None, None)
+    BuildJournal(path, "fingerprint", 64).__exit__(None, None, None)
     start = path.stat().st_size
     path.write_bytes(path.read_bytes() + bytes([0, 0, 0, 0, 0, 0, 0]) + b"\xff" * 4 + bytes(32) + b"xxxx")
-    with Journal(path, "fingerprint", 64) as journal:
+    with BuildJournal(path, "fingerprint", 64) as journal:
         assert list(journal.entries()) == []
     assert path.stat().st_size == start
 

@@ -40,7 +40,7 @@ class EntryKind(IntEnum):
 
 
 @dataclass(frozen=True)
-class JournalEntry:
+class BuildEntry:
     """The tiles that one image added, or all tiles after a refinement pass.
 
     Attributes:
@@ -58,7 +58,7 @@ class JournalEntry:
     tiles: Tiles
 
 
-class Journal:
+class BuildJournal:
     """A journal file, open for appending. Without a path, a journal that stores nothing.
 
     Args:
@@ -82,7 +82,7 @@ class Journal:
             except OSError as error:
                 raise CodebookError(str(path), "", str(error), "a journal that can be read and written") from error
 
-    def __enter__(self) -> Journal:
+    def __enter__(self) -> BuildJournal:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -94,7 +94,7 @@ class Journal:
         """The file's path, for messages."""
         return str(self._path)
 
-    def entries(self) -> Iterator[JournalEntry]:
+    def entries(self) -> Iterator[BuildEntry]:
         """Yield the complete records in order. Do not append during the iteration.
 
         Raises:
@@ -109,7 +109,7 @@ class Journal:
         except OSError as error:
             raise CodebookError(self.name, "", str(error), "a journal that can be read") from error
 
-    def append(self, entry: JournalEntry) -> None:
+    def append(self, entry: BuildEntry) -> None:
         """Write one record and force it to disk.
 
         Raises:
@@ -154,7 +154,7 @@ def _check_start(where: str, actual: bytes, start: bytes) -> None:
         raise CodebookError(where, "fingerprint", actual[len(MAGIC) :].hex(), expected)
 
 
-def _records(file: BinaryIO, tile_pixels: int) -> Iterator[JournalEntry]:
+def _records(file: BinaryIO, tile_pixels: int) -> Iterator[BuildEntry]:
     """Yield the complete records from the current position. The position is after each record when it is yielded."""
     size = os.fstat(file.fileno()).st_size
     while True:
@@ -168,4 +168,4 @@ def _records(file: BinaryIO, tile_pixels: int) -> Iterator[JournalEntry]:
         if zlib.crc32(body, zlib.crc32(head)) != _CRC.unpack(file.read(_CRC.size))[0] or kind not in tuple(EntryKind):
             return
         tiles = np.frombuffer(body, np.uint8).reshape(count, tile_pixels)
-        yield JournalEntry(EntryKind(kind), number, image_number, pixels_hash, tiles)
+        yield BuildEntry(EntryKind(kind), number, image_number, pixels_hash, tiles)

@@ -28,7 +28,7 @@ import numpy as np
 
 from sonarpost.codec.interface import Image
 from sonarpost.codec.quality import ssim
-from sonarpost.codec.vq.build_journal import EntryKind, Journal, JournalEntry
+from sonarpost.codec.vq.build_journal import BuildEntry, BuildJournal, EntryKind
 from sonarpost.codec.vq.tile_search import IncrementalTileSet
 from sonarpost.codec.vq.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase, Tiles, cut_tiles, join_tiles
 from sonarpost.errors import CodebookError, ConfigError
@@ -175,7 +175,7 @@ def build(
     """
     _check_arguments(images, tile_px, rounds, max_tiles, core)
     fingerprint = build_fingerprint(images, tile_px, rounds, max_tiles, core)
-    with Journal(journal_path, fingerprint, tile_px * tile_px) as journal:
+    with BuildJournal(journal_path, fingerprint, tile_px * tile_px) as journal:
         run = _BuildRun(images, tile_px, journal, progress or (lambda _: None), IncrementalTileSet(tile_px, max_tiles))
         run.restore(core)
         run.run_rounds(rounds, merit)
@@ -191,7 +191,7 @@ class _BuildRun:
 
     images: Sequence[TrainingImage]
     tile_px: int
-    journal: Journal
+    journal: BuildJournal
     progress: ProgressCallback
     tile_set: IncrementalTileSet
     completed: set[tuple[int, int]] = field(default_factory=set)
@@ -219,7 +219,7 @@ class _BuildRun:
                 if self.tile_set.full or (number, image_number) in self.completed:
                     continue
                 added = _learn(self.tile_set, self._load(image_number), settings, merit)
-                entry = JournalEntry(EntryKind.IMAGE, number, image_number, self.hashes[image_number], added)
+                entry = BuildEntry(EntryKind.IMAGE, number, image_number, self.hashes[image_number], added)
                 self.journal.append(entry)
                 place = (number, len(rounds), image_number, position, len(chosen))
                 self.progress(BuildProgress(*place, len(self.tile_set)))
@@ -236,7 +236,7 @@ class _BuildRun:
             self.progress(RefinementProgress(number, passes, done, count, math.nan))
 
         refined = refine_once(tiles, self.tile_px, self.images, report)
-        self.journal.append(JournalEntry(EntryKind.PASS, number, 0, refined.images_hash, refined.tiles))
+        self.journal.append(BuildEntry(EntryKind.PASS, number, 0, refined.images_hash, refined.tiles))
         self.progress(RefinementProgress(number, passes, count, count, refined.rms))
         return refined.tiles
 
