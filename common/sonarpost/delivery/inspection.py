@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class QueueState:
+class QueueContents:
     """Contents of an outbox queue, of the inbox or of the quarantine.
 
     Attributes:
@@ -54,7 +54,7 @@ class StoreState:
 
     problems: list[str] = field(default_factory=list)
     version: str = ""
-    queues: list[QueueState] = field(default_factory=list)
+    queues: list[QueueContents] = field(default_factory=list)
     side_car: str = ""
     unreported: LostRecords | None = None
     lost: LostRecords | None = None
@@ -123,22 +123,22 @@ def _version(db: sqlite3.Connection) -> str:
     return "" if row is None else bytes(row[0]).decode(errors="replace")
 
 
-def _queues(db: sqlite3.Connection) -> list[QueueState]:
+def _queues(db: sqlite3.Connection) -> list[QueueContents]:
     rows = db.execute(
         "SELECT consumer, seq, (SELECT COUNT(*) FROM outbox o WHERE o.consumer = n.consumer),"
         " (SELECT COALESCE(SUM(LENGTH(payload)), 0) FROM outbox o WHERE o.consumer = n.consumer),"
         " (SELECT MIN(created_utc_s) FROM outbox o WHERE o.consumer = n.consumer)"
         " FROM outbox_next n ORDER BY consumer"
     ).fetchall()
-    return [QueueState(str(queue), count, size, oldest, last) for queue, last, count, size, oldest in rows]
+    return [QueueContents(str(queue), count, size, oldest, last) for queue, last, count, size, oldest in rows]
 
 
-def _table(db: sqlite3.Connection, table: str, time_column: str, name: str = "") -> QueueState:
+def _table(db: sqlite3.Connection, table: str, time_column: str, name: str = "") -> QueueContents:
     count, size, oldest, last = db.execute(
         f"SELECT COUNT(*), COALESCE(SUM(LENGTH(payload)), 0), MIN({time_column}),"  # noqa: S608 literals
         f" COALESCE((SELECT seq FROM sqlite_sequence WHERE name = '{table}'), 0) FROM {table}"
     ).fetchone()
-    return QueueState(f"({name or table})", count, size, oldest, last)
+    return QueueContents(f"({name or table})", count, size, oldest, last)
 
 
 def _compare(path: Path, marks: Marks | None, found: StoreState) -> None:

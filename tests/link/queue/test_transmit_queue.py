@@ -14,7 +14,7 @@ from sonarpost.link.downlink.messages import image_of_number, number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.queue.messages import MessageIdentifier, MessageQueue, QueuedMessage
-from sonarpost.link.queue.transmit_queue import QueueState, TransmitQueue
+from sonarpost.link.queue.transmit_queue import TransmitQueue, TransmitState
 from sonarpost.link.receiver import ImageUpdate, MessageReceived
 from sonarpost.link.sender import ImageToSend, OutgoingPacket
 from sonarpost.link.state import SavedParts
@@ -314,7 +314,7 @@ def test_a_malformed_part_is_reported_and_the_rest_restored(name, change):
         queue.add_message(f"m{n}", "s", b"data", 0.0)
     again = TransmitQueue(queue_config())
     kinds = {
-        "queue": QueueState,
+        "queue": TransmitState,
         "packet": OutgoingPacket,
         "messages": MessageQueue,
         "message": QueuedMessage,

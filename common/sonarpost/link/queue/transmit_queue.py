@@ -38,7 +38,7 @@ _MAX_LOSS: Final = 0.95
 
 
 @dataclass(frozen=True, slots=True)
-class QueueState:
+class TransmitState:
     """The small state of the queue, which changes with every packet.
 
     Attributes:
@@ -390,7 +390,7 @@ class TransmitQueue(ImageSender):
 
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`."""
-        state = QueueState(
+        state = TransmitState(
             rate=self.rate,
             losses=self.rate_selector.losses,
             packet_interval_s=self.packet_interval_s,
@@ -410,7 +410,7 @@ class TransmitQueue(ImageSender):
         then counts as lost: the modem may not have its rate, or may be another one.
         """
         reader = PartReader(parts, "queue state")
-        state = reader.read("queue", QueueState)
+        state = reader.read("queue", TransmitState)
         self.in_flight = reader.read("packet", OutgoingPacket)
         self.messages = MessageQueue.restored(reader)
         if state is not None:
@@ -422,7 +422,7 @@ class TransmitQueue(ImageSender):
             self.sender.resize(self.config.rate(self.rate).frame_bytes)
         return errors
 
-    def _restore_plan(self, state: QueueState) -> None:
+    def _restore_plan(self, state: TransmitState) -> None:
         self.sender.config = replace(
             self.sender.config,
             frame_bytes=self.config.rate(state.rate).frame_bytes,
