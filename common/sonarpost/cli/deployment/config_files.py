@@ -76,7 +76,7 @@ def run_example(parsed: argparse.Namespace) -> int:
 
 
 @dataclass(frozen=True)
-class CheckedFile:
+class CheckedConfig:
     """Result of `check_file`.
 
     Attributes:
@@ -92,7 +92,7 @@ class CheckedFile:
     warnings: tuple[BadInputError, ...]
 
 
-def check_file(path: Path, environment: Mapping[str, str]) -> CheckedFile:
+def check_file(path: Path, environment: Mapping[str, str]) -> CheckedConfig:
     """Check a configuration file for all of its services.
 
     Args:
@@ -124,7 +124,7 @@ def check_file(path: Path, environment: Mapping[str, str]) -> CheckedFile:
             warnings.append(file.error((name, "port"), port, "a device; this one is absent now"))
     # Each once: two services can name the same key file.
     distinct = {str(error): error for error in errors}.values()
-    return CheckedFile(platform, services, tuple(sorted(distinct, key=_line_number)), tuple(warnings))
+    return CheckedConfig(platform, services, tuple(sorted(distinct, key=_line_number)), tuple(warnings))
 
 
 def _line_number(error: BadInputError) -> int:
@@ -190,7 +190,7 @@ def run_check(parsed: argparse.Namespace) -> int:
     return 0
 
 
-def print_problems(checked: CheckedFile) -> None:
+def print_problems(checked: CheckedConfig) -> None:
     """Print errors and warnings on standard error, one line each."""
     for error in checked.errors:
         print(error, file=sys.stderr)

@@ -33,7 +33,7 @@ from sonarpost.sonar.navigation import is_plausible
 from sonarpost.sonar.readers.file_source import FileSource
 from sonarpost.sonar.readers.records import Notes, RecordFormat, records
 from sonarpost.sonar.readers.svlog_messages import NavigationMessages, json_object, number
-from sonarpost.sonar.readers.svlog_timeline import Profile, Session, Timeline, has_restarted
+from sonarpost.sonar.readers.svlog_timeline import Profile, SessionClock, Timeline, has_restarted
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Ping, Side
 
 MAGIC: Final = b"BR"
@@ -120,7 +120,7 @@ class SvlogSource(FileSource):
     def _profiles(self, notes: Notes) -> Iterator[Profile]:
         """Yield the profiles; a session, and a restart of a sonar, begin a segment."""
         messages = NavigationMessages(notes)
-        session: Session | None = None
+        session: SessionClock | None = None
         segment = 0
         clocks_s: dict[tuple[Side, int], float] = {}
         for place, kind, payload in self._packets(notes):
@@ -152,7 +152,7 @@ class SvlogSource(FileSource):
                     heading_deg = vehicle_heading_deg % 360 if is_heading else None
                     yield Profile(place, segment, session, number_of_ping, clock_s, channel, received, heading_deg)
 
-    def _session(self, payload: bytes, place: str, notes: Notes) -> Session | None:
+    def _session(self, payload: bytes, place: str, notes: Notes) -> SessionClock | None:
         """Return the session that a packet starts; None if it has no date.
 
         Raises:
@@ -167,7 +167,7 @@ class SvlogSource(FileSource):
         if utc_s is None or utc_s < 0:
             expected = "an ISO 8601 date and time from 1970 on"
             raise self._file.error(f"{place}, timestamp", str(stamp)[:80], expected)
-        return Session(utc_s, number(session.get("os_uptime")))
+        return SessionClock(utc_s, number(session.get("os_uptime")))
 
     def _channel(self, place: str, raw: bytes, notes: Notes) -> ChannelPing | None:
         """Return the channel of a profile; None if it is not of a side, or its range or scale is impossible.

@@ -59,7 +59,7 @@ _Transducer = tuple[Side, int]
 _Values = dict[str, float]
 
 
-class Session(NamedTuple):
+class SessionClock(NamedTuple):
     """Date of a session, and time since the computer was started then; None if unknown."""
 
     utc_s: float
@@ -73,7 +73,7 @@ class Profile:
     Attributes:
         place: Place in the file.
         segment: Number of the segment.
-        session: Session that the profile is in, if any.
+        session: Clock of the session that the profile is in, if any.
         number: Ping number of the transducer.
         clock_s: Clock of the transducer.
         channel: Samples; the index is the channel number.
@@ -83,7 +83,7 @@ class Profile:
 
     place: str
     segment: int
-    session: Session | None
+    session: SessionClock | None
     number: int
     clock_s: float
     channel: ChannelPing
@@ -106,7 +106,7 @@ class Timeline:
 
     def __init__(self, file: CheckedFile, notes: Notes) -> None:
         self._file, self._notes = file, notes
-        self._session: Session | None = None
+        self._session: SessionClock | None = None
         self._known: dict[_Transducer, tuple[float, float]] = {}
         """Time minus clock, and last clock, of each transducer in the session."""
         self._last: tuple[float, float] | None = None
