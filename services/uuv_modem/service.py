@@ -32,7 +32,7 @@ from sonarpost.runtime.service import UnitOfWork, disk_gauges
 from sonarpost.security.acoustic_key import key_warning
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.status_beacon import StatusBeacon
-from sonarpost.services.uuv_modem.transmissions import TransmissionLog
+from sonarpost.services.uuv_modem.transmissions import TransmissionTimes
 from sonarpost.services.uuv_modem.vehicle_endpoint import VehicleEndpoint
 
 log = logging.getLogger(__name__)
@@ -76,7 +76,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
             raise
         self._mac = self.config.new_mac()
         self._failed_packets = self.interval_log(log, logging.WARNING, "Packet not sent; retrying")
-        self._transmissions = TransmissionLog()
+        self._transmissions = TransmissionTimes()
         self._beacon = StatusBeacon(platform.id, self.config.status_period_s)
         self._malformed_statuses = self.interval_log(log, logging.WARNING, "Ignoring malformed vehicle status")
         self._events: queue.SimpleQueue[ModemEvent | None] = queue.SimpleQueue()

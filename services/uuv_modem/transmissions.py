@@ -23,7 +23,7 @@ class _Open:
     airtime_s: float
 
 
-class TransmissionLog:
+class TransmissionTimes:
     """Transmissions of the last 30 minutes, at most 1000.
 
     A start and an end come from the modem's reports (`CATXP`, `CATXF`). Without a report of the end, the nominal air

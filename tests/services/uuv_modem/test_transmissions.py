@@ -12,7 +12,7 @@ from sonarpost import keys, wire
 from sonarpost.messages import Transmissions
 from sonarpost.modem.interface import PacketFailed, PacketSent, TransmissionEnded, TransmissionStarted
 from sonarpost.modem.micromodem import FailureReason
-from sonarpost.services.uuv_modem.transmissions import KEPT_S, MAX_KEPT, TransmissionLog
+from sonarpost.services.uuv_modem.transmissions import KEPT_S, MAX_KEPT, TransmissionTimes
 
 KEY = keys.acoustic_transmissions("uuv-1")
 
@@ -28,7 +28,7 @@ class Clock:
     """Two clocks and the log that is under test."""
 
     def __init__(self):
-        self.log = TransmissionLog()
+        self.log = TransmissionTimes()
         self.utc_s, self.monotonic_s = 1000.0, 5.0
 
     def event(self, event, after_s=0.0):
