@@ -24,7 +24,7 @@ from sonarpost.archive.shore_files import decision_path
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex
 from sonarpost.delivery.store import UNREADABLE
 from sonarpost.errors import BadInputError, RejectedByDatabaseError, StoredFileError
-from sonarpost.export.contacts import SideCar
+from sonarpost.export.contacts import ImageSideCar
 from sonarpost.files import read_regular
 from sonarpost.logs import kv
 from sonarpost.messages import CodedImage, Decision, Pixels, ReconstructedImage
@@ -295,7 +295,7 @@ def stored_image(content: bytes, pixels: GreyImage, where: str) -> Reconstructed
         BadInputError: The missing pixels cannot be identified, or the files do not match.
         ValidationError: The side-car is invalid.
     """
-    side_car = SideCar.model_validate_json(content)
+    side_car = ImageSideCar.model_validate_json(content)
     missing = np.zeros(pixels.shape, np.bool_)
     if side_car.missing_rows:
         first, end = side_car.missing_rows

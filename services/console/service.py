@@ -18,7 +18,7 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import BadInputError, DeliveryError, PayloadError
-from sonarpost.export.contacts import SideCar, read_stored_records
+from sonarpost.export.contacts import ImageSideCar, read_stored_records
 from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import (
     AcousticFrame,
@@ -464,7 +464,7 @@ def stored_records(place: ArchivePlace) -> Iterator[ReconstructedImage | Decisio
         log.error("Archive of c2 not readable", extra=kv(reason=str(error)))
 
 
-def _stored_image(side_car: SideCar, path: Path) -> ReconstructedImage:
+def _stored_image(side_car: ImageSideCar, path: Path) -> ReconstructedImage:
     pixels = Pixels.from_array(read_image(path.with_suffix(".tiff")))
     mask = np.zeros((pixels.height_px, pixels.width_px), np.bool_)
     if side_car.missing_rows:

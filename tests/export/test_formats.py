@@ -31,7 +31,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sonarpost.archive.image_files import side_car
-from sonarpost.export.contacts import ContactSet, ExportContact, SideCar, load_contacts
+from sonarpost.export.contacts import ContactSet, ExportContact, ImageSideCar, load_contacts
 from sonarpost.export.formats import write_export
 from sonarpost.export.source import ExportSource, StoredImages
 from sonarpost.export.tables import COLUMNS
@@ -57,7 +57,7 @@ def contacts(tmp_path):
 
 def single(record, *decisions):
     """One contact without files."""
-    side = SideCar.model_validate_json(json.dumps(side_car(record)))
+    side = ImageSideCar.model_validate_json(json.dumps(side_car(record)))
     return ContactSet((ExportContact(side, decisions, None),), (), ())
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sonarpost.archive.retention import remove_files, vehicle_source
-from sonarpost.export.contacts import SideCar
+from sonarpost.export.contacts import ImageSideCar
 from sonarpost.files import AtomicFiles
 from sonarpost.messages import ReconstructedImage
 from sonarpost.sonar.image_files import png_bytes, tiff_bytes
@@ -47,7 +47,7 @@ class WrittenImage(NamedTuple):
 SUFFIXES = (".json", ".tiff", ".png")
 
 
-def image_file_name(image: ReconstructedImage | SideCar) -> str:
+def image_file_name(image: ReconstructedImage | ImageSideCar) -> str:
     """Return the plain file name without suffix: vehicle, time of the first frame, image identifier, version.
 
     The time distinguishes images of a later mission, if the vehicle has restarted its identifiers.

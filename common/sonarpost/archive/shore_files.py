@@ -13,7 +13,7 @@ from sonarpost.archive.image_files import SUFFIXES, image_file_name
 from sonarpost.archive.retention import Stored, select_for_removal
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, Verified
 from sonarpost.errors import StoredFileError
-from sonarpost.export.contacts import DECISIONS, SideCar
+from sonarpost.export.contacts import DECISIONS, ImageSideCar
 from sonarpost.files import read_regular
 from sonarpost.limits import limit
 from sonarpost.logs import kv
@@ -77,7 +77,11 @@ def decision_file_name(decision_id: str) -> str:
 
 
 def image_row(
-    out_dir: Path, name: str, image: ReconstructedImage | SideCar, relayed_utc_s: float | None, accepted_utc_s: float
+    out_dir: Path,
+    name: str,
+    image: ReconstructedImage | ImageSideCar,
+    relayed_utc_s: float | None,
+    accepted_utc_s: float,
 ) -> ImageRow:
     """Return the index row of an image whose files are written.
 
@@ -91,7 +95,7 @@ def image_row(
 
 def row_of_image(
     name: str,
-    image: ReconstructedImage | SideCar,
+    image: ReconstructedImage | ImageSideCar,
     relayed_utc_s: float | None,
     accepted_utc_s: float,
     contents: Sequence[bytes],
@@ -107,7 +111,7 @@ def row_of_image(
     """
     height_px, width_px = (
         (image.height_px, image.width_px)
-        if isinstance(image, SideCar)
+        if isinstance(image, ImageSideCar)
         else (image.pixels.height_px, image.pixels.width_px)
     )
     contact = image.contact
@@ -172,7 +176,7 @@ def _missing_images(out_dir: Path, index: ShoreIndex) -> Iterator[ImageRow]:
         try:
             if index.has_image(path.parent.name, path.stem):
                 continue
-            side_car = SideCar.model_validate_json(read_regular(path, MAX_FILE_BYTES))
+            side_car = ImageSideCar.model_validate_json(read_regular(path, MAX_FILE_BYTES))
             yield image_row(out_dir, path.stem, side_car, None, path.stat().st_mtime)
         except (ValueError, OSError) as error:  # a name that is not UTF-8 is a ValueError too
             log.error("Stored image cannot be read", extra=kv(file=path, reason=str(error)[:200]))

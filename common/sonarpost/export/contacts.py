@@ -46,7 +46,7 @@ R = TypeVar("R", bound=Record)
 Seconds = TypeVar("Seconds", int, float)
 
 
-class SideCar(Record):
+class ImageSideCar(Record):
     """JSON file beside a stored image: the `reconstructed_image` record without its pixels."""
 
     TYPE = "reconstructed_image"
@@ -78,7 +78,7 @@ class SideCar(Record):
     width_px: Annotated[int, Field(ge=1, le=4096)]
 
 
-def contact_uid(image: SideCar | ReconstructedImage) -> str:
+def contact_uid(image: ImageSideCar | ReconstructedImage) -> str:
     """Return the permanent identifier of a contact: sonarpost.vessel-1.uuv-1.20161012T090001Z.00A7.
 
     The time of the first frame makes it unique over all missions.
@@ -99,7 +99,7 @@ class ExportContact:
         result: Result of the decisions.
     """
 
-    image: SideCar
+    image: ImageSideCar
     decisions: tuple[Decision, ...]
     image_path: Path | None
     size: MeasuredSize = field(default_factory=MeasuredSize)
@@ -183,7 +183,7 @@ class StoredRecords:
         problems: One error for each rejected file.
     """
 
-    images: tuple[tuple[SideCar, Path], ...]
+    images: tuple[tuple[ImageSideCar, Path], ...]
     decisions: tuple[Decision, ...]
     problems: tuple[BadInputError, ...]
 
@@ -202,7 +202,7 @@ def load_contacts(out_dir: Path) -> ContactSet:
     """
     stored = read_stored_records(out_dir)
     problems = list(stored.problems)
-    latest: dict[tuple[_Name, int], tuple[SideCar, Path]] = {}
+    latest: dict[tuple[_Name, int], tuple[ImageSideCar, Path]] = {}
     for image, path in stored.images:
         key = (_name(image), int(image.first_frame_utc_s))
         if key in latest and latest[key][0].version == image.version:
@@ -237,11 +237,11 @@ def read_stored_records(out_dir: Path) -> StoredRecords:
         StoredFileError: `out_dir` is not a readable folder.
     """
     problems: list[BadInputError] = []
-    images: list[tuple[SideCar, Path]] = []
+    images: list[tuple[ImageSideCar, Path]] = []
     decisions: list[Decision] = []
     for folder in _vessel_folders(out_dir):
         for path in _json_files(folder, problems):
-            image = _read(SideCar, path, problems)
+            image = _read(ImageSideCar, path, problems)
             if image is not None and _is_of_vessel(image, folder, path, problems):
                 images.append((image, path))
         for path in _json_files(folder / DECISIONS, problems):
@@ -298,7 +298,7 @@ def _read(model: type[R], path: Path, problems: list[BadInputError]) -> R | None
     return None
 
 
-def _is_of_vessel(record: SideCar | Decision, folder: Path, path: Path, problems: list[BadInputError]) -> bool:
+def _is_of_vessel(record: ImageSideCar | Decision, folder: Path, path: Path, problems: list[BadInputError]) -> bool:
     """Return whether a record names the vessel of its folder; otherwise report a problem."""
     if record.vessel_id == folder.name:
         return True
@@ -309,11 +309,11 @@ def _is_of_vessel(record: SideCar | Decision, folder: Path, path: Path, problems
 _Name = tuple[str, str, str]
 
 
-def _name(record: SideCar | Decision) -> _Name:
+def _name(record: ImageSideCar | Decision) -> _Name:
     return record.vessel_id, record.vehicle_id, record.image_id
 
 
-def _png_path(image: SideCar, side_car: Path) -> Path | None:
+def _png_path(image: ImageSideCar, side_car: Path) -> Path | None:
     png = side_car.with_suffix(".png")
     # Without a codec only the contact record was received; its PNG is black.
     return png if image.codec and os.access(png, os.R_OK) else None

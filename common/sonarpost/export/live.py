@@ -9,7 +9,7 @@ from operator import itemgetter
 from typing import Final
 
 from sonarpost.archive.image_files import side_car
-from sonarpost.export.contacts import ExportContact, SideCar, match_start_time
+from sonarpost.export.contacts import ExportContact, ImageSideCar, match_start_time
 from sonarpost.limits import limit, oldest_of_largest
 from sonarpost.messages import Decision, ReconstructedImage
 
@@ -24,7 +24,7 @@ MAX_IMAGES: Final = 64
 
 @dataclass(slots=True)
 class _Name:
-    images: dict[int, SideCar] = field(default_factory=dict)
+    images: dict[int, ImageSideCar] = field(default_factory=dict)
     decisions: dict[str, Decision] = field(default_factory=dict)
 
 
@@ -48,7 +48,7 @@ class LiveContacts:
         """
         if isinstance(record, Decision):
             return self._add_decision(record)
-        return self._add_image(SideCar.model_validate(side_car(record)))
+        return self._add_image(ImageSideCar.model_validate(side_car(record)))
 
     def restore(self, contacts: Iterable[ExportContact]) -> list[ExportContact]:
         """Add stored contacts; return those that were new or have changed, with their `image_path`."""
@@ -71,7 +71,7 @@ class LiveContacts:
                     found.append(contact)
         return found[::-1]
 
-    def _add_image(self, image: SideCar) -> ExportContact | None:
+    def _add_image(self, image: ImageSideCar) -> ExportContact | None:
         key, start_s = (image.vessel_id, image.vehicle_id, image.image_id), int(image.first_frame_utc_s)
         name = self._name(key)
         known = name.images.get(start_s)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from sonarpost import wire
 from sonarpost.archive.image_files import side_car
-from sonarpost.export.contacts import ExportContact, SideCar
+from sonarpost.export.contacts import ExportContact, ImageSideCar
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review.measured_size import measured_size
 from sonarpost.review.true_scale import ImageLine
@@ -44,7 +44,7 @@ def find_stored_contact(db: sqlite3.Connection, contact_id: str, version: int) -
     ).fetchall()
     decisions = tuple(wire.decode(Decision, bytes(row["payload"]), "decision") for row in rows)
     measurements, image = list_measurements(db, contact_id), decode_image(row)
-    contact = ExportContact(SideCar.model_validate(side_car(image)), decisions, None, measured_size(measurements))
+    contact = ExportContact(ImageSideCar.model_validate(side_car(image)), decisions, None, measured_size(measurements))
     return StoredContact(contact, image, _image_lines(measurements))
 
 
