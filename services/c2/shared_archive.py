@@ -15,10 +15,10 @@ import tifffile
 
 from sonarpost.archive.image_files import WrittenImage, image_file_name, other_name, side_car_text
 from sonarpost.archive.journal import Accepted, JournalRecord
-from sonarpost.archive.postgresql import Database, DatabaseAddress
+from sonarpost.archive.postgresql import ConnectionPool, DatabaseAddress
 from sonarpost.archive.retention import DAY_S
 from sonarpost.archive.shared_journal import SharedJournal
-from sonarpost.archive.shore_database import AcceptedRecord, ShoreDatabase, StoredImage
+from sonarpost.archive.shore_database import BacklogRecord, ShoreDatabase, StoredImage
 from sonarpost.archive.shore_files import decision_text, row_of_image, select_images
 from sonarpost.archive.shore_index import DEFECTS, DecisionRow, ImageRow, TaskingRow
 from sonarpost.errors import DatabaseUnavailableError, StoredFileError
@@ -50,13 +50,13 @@ class SharedArchive:
 
     def __init__(self, config: C2Config, address: DatabaseAddress, owner: str) -> None:
         self._config = config
-        self._database = ShoreDatabase(Database(address), owner=owner, site=config.site)
+        self._database = ShoreDatabase(ConnectionPool(address), owner=owner, site=config.site)
         # Connections of their own: a search that takes too long is no fault of the archive.
-        self._searched = ShoreDatabase(Database(address), site=config.site, writable=False)
+        self._searched = ShoreDatabase(ConnectionPool(address), site=config.site, writable=False)
         self._lock = threading.Lock()
         self._images: dict[tuple[str, str], StoredImage] = {}
         self._decisions: dict[tuple[str, str], tuple[DecisionRow, bytes]] = {}
-        self._handled: list[AcceptedRecord] = []
+        self._handled: list[BacklogRecord] = []
         self._defects = dict.fromkeys(DEFECTS, 0)
         self._images_bytes = 0
         self._take_over_records = TAKE_OVER_RECORDS
@@ -195,16 +195,16 @@ class SharedArchive:
 
     def accept(self, records: Sequence[tuple[str, bytes]]) -> None:
         """Commit records before they are acknowledged."""
-        self._database.accept([AcceptedRecord(*record) for record in records])
+        self._database.accept([BacklogRecord(*record) for record in records])
 
     def handled(self, key: str, payload: bytes) -> None:
         """Add an accepted record to the next flush, which deletes it."""
         with self._lock:
-            self._handled.append(AcceptedRecord(key, payload))
+            self._handled.append(BacklogRecord(key, payload))
 
     def discard(self, key: str, payload: bytes) -> None:
         """Delete an accepted record that is invalid."""
-        self._database.discard(AcceptedRecord(key, payload))
+        self._database.discard(BacklogRecord(key, payload))
 
     def take_over(self, store: Callable[[Sequence[tuple[str, bytes]]], None]) -> int:
         """Take over records that another c2 has accepted and not handled in time; return their number."""

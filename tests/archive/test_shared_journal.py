@@ -11,7 +11,7 @@ from builders.records import decision_record
 
 from sonarpost.archive import journal as sqlite_journal
 from sonarpost.archive.journal import Area, Criteria, Journal, JournalEntry, JournalRecord
-from sonarpost.archive.postgresql import Database, DatabaseAddress
+from sonarpost.archive.postgresql import ConnectionPool, DatabaseAddress
 from sonarpost.archive.shore_database import ShoreDatabase, StoredImage
 from sonarpost.archive.shore_files import row_of_image
 from sonarpost.errors import StoredFileError
@@ -63,7 +63,9 @@ def read(archive, criteria=ALL):
 def test_reader_of_pages_gets_every_record_once_while_several_c2_number(database_url):
     """A number that becomes visible before a lower one would be lost for a reader whose cursor is above it."""
     each, hosts, batch = 60, 4, 3
-    opened = [ShoreDatabase(Database(DatabaseAddress.parse(database_url)), owner=f"c2-{n}") for n in range(hosts + 1)]
+    opened = [
+        ShoreDatabase(ConnectionPool(DatabaseAddress.parse(database_url)), owner=f"c2-{n}") for n in range(hosts + 1)
+    ]
     opened[0].prepare()
     reader = opened[-1].journal()
     ended = threading.Event()

@@ -10,8 +10,8 @@ from builders.common import eventually, free_port
 from builders.records import decision_record
 from builders.shore import image
 
-from sonarpost.archive.postgresql import Database, DatabaseAddress
-from sonarpost.archive.shore_database import AcceptedRecord, ShoreDatabase, StoredImage
+from sonarpost.archive.postgresql import ConnectionPool, DatabaseAddress
+from sonarpost.archive.shore_database import BacklogRecord, ShoreDatabase, StoredImage
 from sonarpost.archive.shore_files import decision_text, row_of_image
 from sonarpost.archive.shore_index import DecisionRow, TaskingRow
 from sonarpost.errors import ConfigError, DatabaseUnavailableError, StoredFileError
@@ -48,7 +48,7 @@ def command_row(record_id="c1", **changes):
 
 
 def test_concurrent_starts_create_one_schema(database_url):
-    made = [ShoreDatabase(Database(DatabaseAddress.parse(database_url)), site="shore") for _ in range(8)]
+    made = [ShoreDatabase(ConnectionPool(DatabaseAddress.parse(database_url)), site="shore") for _ in range(8)]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda each: each.prepare(), made))
     assert made[0].images() == []
@@ -74,7 +74,7 @@ def test_database_without_an_archive_is_not_created_by_a_command(open_):
 def test_postgis_is_required(postgresql_server):
     postgresql_server.execute("postgres", "CREATE DATABASE plain OWNER sonarpost")
     address = DatabaseAddress.parse(f"postgresql://sonarpost@127.0.0.1:{postgresql_server.port}/plain")
-    database = Database(address)
+    database = ConnectionPool(address)
     with pytest.raises(DatabaseUnavailableError, match='create extension "postgis"'):
         ShoreDatabase(database).prepare()
     database.close()
@@ -170,7 +170,7 @@ def test_older_state_does_not_replace_a_newer_one(archive):
 
 def test_accepted_record_of_another_c2_is_taken_over_once(open_):
     first, second, third = (open_(name) for name in ("c2-a", "c2-b", "c2-c"))
-    record = AcceptedRecord("some/key", b"\x00payload")
+    record = BacklogRecord("some/key", b"\x00payload")
     first.accept([record, record])
     taken = []
     assert first.take_over(0.0, 10, 1000, taken.extend) == 0
@@ -184,7 +184,7 @@ def test_accepted_record_of_another_c2_is_taken_over_once(open_):
 
 
 def test_record_stays_with_its_owner_if_it_cannot_be_taken_over(open_):
-    open_("c2-a").accept([AcceptedRecord("k", b"p")])
+    open_("c2-a").accept([BacklogRecord("k", b"p")])
 
     def fails(_):
         raise OSError(28, "No space left on device")
@@ -213,7 +213,7 @@ def test_decision_with_another_content_is_not_written(archive):
 
 
 def test_restarted_server_is_reached_again(database_url, postgresql_server):
-    database = Database(DatabaseAddress.parse(database_url))
+    database = ConnectionPool(DatabaseAddress.parse(database_url))
     archive = ShoreDatabase(database, owner="c2-a")
     archive.write([stored()])
     postgresql_server.stop("immediate")
@@ -268,7 +268,7 @@ def test_address_has_tls_unless_the_server_is_local(tmp_path):
 
 
 def test_unreachable_server_is_named_without_the_password():
-    database = Database(DatabaseAddress.parse(f"postgresql://u:secret@127.0.0.1:{free_port()}/shore"))
+    database = ConnectionPool(DatabaseAddress.parse(f"postgresql://u:secret@127.0.0.1:{free_port()}/shore"))
     with pytest.raises(DatabaseUnavailableError) as caught:
         ShoreDatabase(database).images()
     assert "127.0.0.1" in str(caught.value)

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from builders.common import free_port
-from sonarpost.archive.postgresql import Database, DatabaseAddress
+from sonarpost.archive.postgresql import ConnectionPool, DatabaseAddress
 
 USER = "sonarpost"
 TEMPLATE = "with_postgis"
@@ -116,8 +116,8 @@ def database_url(postgresql_server: PostgresServer) -> str:
 
 
 @pytest.fixture
-def database(database_url: str) -> Iterator[Database]:
+def database(database_url: str) -> Iterator[ConnectionPool]:
     """Connections to an empty database."""
-    database = Database(DatabaseAddress.parse(database_url))
+    database = ConnectionPool(DatabaseAddress.parse(database_url))
     yield database
     database.close()

@@ -143,7 +143,7 @@ class Sql:
         return int(str(value)) if value is not None else 0
 
 
-class Database:
+class ConnectionPool:
     """Connections to one database, for several threads.
 
     A connection that fails is closed, and with it all idle ones. While the server is not reached, a transaction fails

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from sonarpost.archive.image_files import SUFFIXES
-from sonarpost.archive.postgresql import SCHEME, Database, DatabaseAddress
+from sonarpost.archive.postgresql import SCHEME, ConnectionPool, DatabaseAddress
 from sonarpost.archive.shore_database import ShoreDatabase
 from sonarpost.archive.shore_files import decision_path, image_paths
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, Mark, ShoreIndex, TaskingRow
@@ -79,7 +79,7 @@ def open_database(address: DatabaseAddress) -> ShoreDatabase:
         StoredFileError: It has no archive of this version.
         DatabaseUnavailableError: The server is not reached.
     """
-    database = ShoreDatabase(Database(address, COMMAND_TIMEOUT_S), writable=False)
+    database = ShoreDatabase(ConnectionPool(address, COMMAND_TIMEOUT_S), writable=False)
     database.prepare()
     return database
 

@@ -22,7 +22,7 @@ from pydantic import TypeAdapter
 
 from sonarpost.archive import shared_journal, shore_schema
 from sonarpost.archive.journal import Accepted, Journal, JournalRecord
-from sonarpost.archive.postgresql import Database, Sql
+from sonarpost.archive.postgresql import ConnectionPool, Sql
 from sonarpost.archive.shore_index import DEFECTS, DecisionRow, Fault, ImageRow, Mark, TaskingRow, Verified
 from sonarpost.errors import ConfigError, DatabaseUnavailableError, StoredFileError
 
@@ -41,7 +41,7 @@ class StoredImage:
 
 
 @dataclass(frozen=True, slots=True)
-class AcceptedRecord:
+class BacklogRecord:
     """A record that a c2 has acknowledged and not handled yet."""
 
     key: str
@@ -66,7 +66,7 @@ class ShoreDatabase:
         writable: Whether to create the schema.
     """
 
-    def __init__(self, database: Database, *, owner: str = "", site: str = "", writable: bool = True) -> None:
+    def __init__(self, database: ConnectionPool, *, owner: str = "", site: str = "", writable: bool = True) -> None:
         self.database = database
         self._owner = owner
         self._site = site
@@ -135,7 +135,7 @@ class ShoreDatabase:
         self,
         images: Sequence[StoredImage],
         decisions: Sequence[tuple[DecisionRow, bytes]] = (),
-        handled: Sequence[AcceptedRecord] = (),
+        handled: Sequence[BacklogRecord] = (),
         numbered: Sequence[JournalRecord] = (),
     ) -> list[Accepted]:
         """Write images and decisions, delete handled records from the accepted ones, number records: all or nothing.
@@ -439,7 +439,7 @@ class ShoreDatabase:
 
     # Accepted records
 
-    def accept(self, records: Sequence[AcceptedRecord]) -> None:
+    def accept(self, records: Sequence[BacklogRecord]) -> None:
         """Commit records that are acknowledged afterwards."""
         with self._transaction() as sql:
             sql.rows(
@@ -452,12 +452,12 @@ class ShoreDatabase:
                 payloads=[record.payload for record in records],
             )
 
-    def discard(self, record: AcceptedRecord) -> None:
+    def discard(self, record: BacklogRecord) -> None:
         """Delete an accepted record that cannot be handled."""
         with self._transaction() as sql:
             self._delete_accepted(sql, [record])
 
-    def _delete_accepted(self, sql: Sql, records: Sequence[AcceptedRecord]) -> None:
+    def _delete_accepted(self, sql: Sql, records: Sequence[BacklogRecord]) -> None:
         sql.rows(
             "DELETE FROM accepted USING unnest(:keys::text[], :digests::bytea[]) AS k (key, sha256)"
             " WHERE accepted.key = k.key AND accepted.sha256 = k.sha256",
@@ -466,7 +466,7 @@ class ShoreDatabase:
         )
 
     def take_over(
-        self, age_s: float, limit: int, limit_bytes: int, store: Callable[[list[AcceptedRecord]], None]
+        self, age_s: float, limit: int, limit_bytes: int, store: Callable[[list[BacklogRecord]], None]
     ) -> int:
         """Take over records of other c2 that do not call this method any more; return their number.
 
@@ -501,7 +501,7 @@ class ShoreDatabase:
                 keys=[key for key, _, _ in chosen],
                 digests=[digest for _, digest, _ in chosen],
             )
-            records = [AcceptedRecord(str(key), _bytes(payload)) for key, payload in found]
+            records = [BacklogRecord(str(key), _bytes(payload)) for key, payload in found]
             if records:
                 store(records)
                 sql.rows(

@@ -21,7 +21,7 @@ from builders.progress import wait_while_progressing
 from builders.records import decision_record, reconstructed_image
 
 from sonarpost import keys, wire
-from sonarpost.archive.postgresql import Database, DatabaseAddress
+from sonarpost.archive.postgresql import ConnectionPool, DatabaseAddress
 from sonarpost.archive.shore_database import ShoreDatabase
 from sonarpost.bus.catch_up import CatchUpSubscriber
 from sonarpost.bus.session import client_config, router_config
@@ -74,7 +74,7 @@ class SharedShore:
         self.server = server
         self.url = server.new_database()
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
-        self.archive = ShoreDatabase(Database(DatabaseAddress.parse(self.url)), writable=False)
+        self.archive = ShoreDatabase(ConnectionPool(DatabaseAddress.parse(self.url)), writable=False)
         self._processes = {}
         self.kills = Counter()
 

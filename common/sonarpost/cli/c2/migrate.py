@@ -19,7 +19,7 @@ from typing import TypeVar
 
 from sonarpost.archive.image_files import SUFFIXES, other_name
 from sonarpost.archive.journal import FILE_NAME, Journal
-from sonarpost.archive.postgresql import Database, DatabaseAddress
+from sonarpost.archive.postgresql import ConnectionPool, DatabaseAddress
 from sonarpost.archive.reader import COMMAND_TIMEOUT_S, read_image_files
 from sonarpost.archive.shore_database import ShoreDatabase, StoredImage
 from sonarpost.archive.shore_files import decision_path, index_missing_files
@@ -67,7 +67,7 @@ def run(parsed: argparse.Namespace) -> int:
     folder: Path = parsed.archive or config.out_dir
     with (
         closing(ShoreIndex(folder)) as index,
-        closing(ShoreDatabase(Database(address, COMMAND_TIMEOUT_S), site=config.site)) as database,
+        closing(ShoreDatabase(ConnectionPool(address, COMMAND_TIMEOUT_S), site=config.site)) as database,
     ):
         index_missing_files(folder, index)
         migration = Migration(folder, index, database)
