@@ -12,7 +12,8 @@ from builders.record_samples import COMPLETE_IMAGE, DAMAGED_IMAGE
 from builders.record_strategies import images
 from hypothesis import given
 
-from sonarpost.archive.image_files import add_image, image_file_name, side_car, write_image
+from sonarpost.archive.image_files import add_image, image_file_name, write_image
+from sonarpost.export.contacts import side_car
 from sonarpost.files import AtomicFiles
 from sonarpost.messages import Pixels, ReconstructedImage
 from sonarpost.sonar.image_files import read_image

@@ -30,8 +30,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from PIL import Image
 
-from sonarpost.archive.image_files import side_car
-from sonarpost.export.contacts import ContactSet, ExportContact, ImageSideCar, load_contacts
+from sonarpost.export.contacts import ContactSet, ExportContact, ImageSideCar, load_contacts, side_car
 from sonarpost.export.formats import write_export
 from sonarpost.export.source import ExportSource, StoredImages
 from sonarpost.export.tables import COLUMNS

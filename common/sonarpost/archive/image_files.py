@@ -14,10 +14,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from sonarpost.archive.retention import remove_files, vehicle_source
-from sonarpost.export.contacts import ImageSideCar
+from sonarpost.export.contacts import ImageSideCar, side_car
 from sonarpost.files import AtomicFiles
 from sonarpost.messages import ReconstructedImage
 from sonarpost.sonar.image_files import png_bytes, tiff_bytes
@@ -79,22 +77,6 @@ def remove_old_images(folder: Path, now_utc_s: float, retain_days: float, max_by
         order=lambda name, names: 0 if is_superseded(name, names) else 1,
         source=lambda name: vehicle_source(name.partition("_")[0]),
     )
-
-
-def side_car(image: ReconstructedImage) -> dict[str, object]:
-    """Return the content of the JSON file: all fields but the pixels, missing areas as a count and a range of rows."""
-    fields = image.model_dump(exclude={"pixels", "missing_mask"})
-    rows = np.flatnonzero(image.missing().any(axis=1))
-    return {
-        "type": image.TYPE,
-        "v": image.VERSION,
-        **fields,
-        "height_px": image.pixels.height_px,
-        "width_px": image.pixels.width_px,
-        "bits": image.pixels.bits,
-        "missing_pixels": int(image.missing().sum()),
-        "missing_rows": [int(rows[0]), int(rows[-1]) + 1] if rows.size else [],
-    }
 
 
 def side_car_text(image: ReconstructedImage) -> bytes:

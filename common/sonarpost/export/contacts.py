@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Final, Literal, TypeVar
 
+import numpy as np
 from pydantic import Field, ValidationError
 
 from sonarpost.errors import BadInputError, StoredFileError
@@ -76,6 +77,22 @@ class ImageSideCar(Record):
     despeckle_strength: Fraction | None
     height_px: Annotated[int, Field(ge=1, le=4096)]
     width_px: Annotated[int, Field(ge=1, le=4096)]
+
+
+def side_car(image: ReconstructedImage) -> dict[str, object]:
+    """Return the content of a side-car: all fields but the pixels, missing areas as a count and a range of rows."""
+    fields = image.model_dump(exclude={"pixels", "missing_mask"})
+    rows = np.flatnonzero(image.missing().any(axis=1))
+    return {
+        "type": image.TYPE,
+        "v": image.VERSION,
+        **fields,
+        "height_px": image.pixels.height_px,
+        "width_px": image.pixels.width_px,
+        "bits": image.pixels.bits,
+        "missing_pixels": int(image.missing().sum()),
+        "missing_rows": [int(rows[0]), int(rows[-1]) + 1] if rows.size else [],
+    }
 
 
 def contact_uid(image: ImageSideCar | ReconstructedImage) -> str:

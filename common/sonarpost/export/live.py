@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import Final
 
-from sonarpost.archive.image_files import side_car
-from sonarpost.export.contacts import ExportContact, ImageSideCar, match_start_time
+from sonarpost.export.contacts import ExportContact, ImageSideCar, match_start_time, side_car
 from sonarpost.limits import limit, oldest_of_largest
 from sonarpost.messages import Decision, ReconstructedImage
 

@@ -7,8 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from sonarpost import wire
-from sonarpost.archive.image_files import side_car
-from sonarpost.export.contacts import ExportContact, ImageSideCar
+from sonarpost.export.contacts import ExportContact, ImageSideCar, side_car
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.review.measured_size import measured_size
 from sonarpost.review.true_scale import ImageLine
