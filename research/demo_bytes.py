@@ -10,7 +10,7 @@ each contact:
 - received: bytes of the stream that the vessel has received acoustically, and the 25 bytes of the contact record;
 - coded: payloads of the coded records that went to the shore site, those of all versions together, refused ones
   included. The relay of the chain is `research.recording_relay`, which records them;
-- pixels: payloads of the records with decoded pixels of the same versions, as a relay of earlier versions sends them.
+- pixels: payloads of the records with decoded pixels of the same versions.
 
 Keys, attachments and headers of the transport are not included. The exit status is 0 if every image is complete and
 was refined that often.
@@ -59,7 +59,7 @@ class RecordedChain(Chain):
 
 
 class PixelRecords:
-    """Lengths of the records with decoded pixels, as a relay of earlier versions sends them to a shore site."""
+    """Lengths of the records with decoded pixels, if they were sent to a shore site."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.lengths: dict[tuple[str, int], int] = {}

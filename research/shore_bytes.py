@@ -1,4 +1,4 @@
-"""Bytes from vessel to shore for one contact: decoded images, as in earlier versions, and coded streams.
+"""Bytes from vessel to shore for one contact: decoded images, and coded streams.
 
     python -m research.shore_bytes --contacts 20 --lengths 64,200,400,640
 
