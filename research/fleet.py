@@ -115,7 +115,7 @@ def coded_image(vessel: str, vehicle: int, number: int, now_utc_s: float, stream
         heading_deg=90.0,
         altitude_m=5.0,
         depth_m=20.0,
-        atd_class="mine-like",
+        atd_class="mine_like",
         p_mine_like=0.75,
         p_other_object=0.2,
     ).rounded()

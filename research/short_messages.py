@@ -49,7 +49,7 @@ def contacts(number: int, stream_bytes: int, seed: int) -> list[ReceivedImage]:
             side=Side.PORT,
             ground_range_m=30.0,
             position_sigma_m=4.0,
-            atd_class="mine-like",
+            atd_class="mine_like",
             p_mine_like=0.7,
             p_other_object=0.2,
         )

@@ -100,7 +100,7 @@ def classified_mission(out_dir: Path) -> Path:
     """Write a contact of each class of the detector, and one with probabilities alone."""
     return store(
         out_dir,
-        image("0001", {"atd_class": "mine-like", "p_mine_like": 0.85, "p_other_object": 0.1}, authenticated=True),
+        image("0001", {"atd_class": "mine_like", "p_mine_like": 0.85, "p_other_object": 0.1}, authenticated=True),
         image("0002", {"lat_deg": 41.5261, "atd_class": "clutter", "p_mine_like": 0.0, "p_other_object": 1.0}),
         image("0003", {"lat_deg": 41.5271, "atd_class": "structure"}),
         image("0004", {"lat_deg": 41.5281, "p_mine_like": 0.5, "p_other_object": 0.25}),

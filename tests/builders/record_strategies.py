@@ -88,7 +88,7 @@ def _maybe(strategy: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
 def _contacts(draw: st.DrawFn) -> Contact:
     """Draw a contact with or without probabilities."""
     fields = draw(_fields(Contact, "p_other_object"))
-    known = st.sampled_from(["mine-like", "clutter", "structure"])
+    known = st.sampled_from(["mine_like", "clutter", "structure"])
     atd_class, p_mine_like = draw(known | _field(Contact, "atd_class")), fields["p_mine_like"]
     p_other_object = None if p_mine_like is None else draw(st.floats(0, 1 - p_mine_like))
     return Contact(**fields | {"atd_class": atd_class, "p_other_object": p_other_object})

@@ -39,7 +39,7 @@ SUMMARY = ContactSummary(
     pixel_along_m=0.05,
     pixel_across_m=0.05,
     position_sigma_m=4.0,
-    atd_class="mine-like",
+    atd_class="mine_like",
     p_mine_like=0.8,
     p_other_object=0.15,
 )

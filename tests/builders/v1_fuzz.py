@@ -31,7 +31,7 @@ def image_stream(number: int) -> bytes:
 
 def record(number: int) -> ContactSummary:
     plain = ContactSummary(lat_deg=number / 1000, lon_deg=1.0, confidence=1.0)
-    classified = replace(plain, atd_class="mine-like", p_mine_like=0.8, p_other_object=0.15)
+    classified = replace(plain, atd_class="mine_like", p_mine_like=0.8, p_other_object=0.15)
     return (classified if number % 2 else plain).rounded()
 
 

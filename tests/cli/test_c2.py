@@ -105,7 +105,7 @@ def test_ls_prints_a_table(capsys, out):
 
 def test_ls_states_class_and_probabilities(capsys, tmp_path):
     archive = Archive(C2Config(out_dir=tmp_path))
-    fields = {"atd_class": "mine-like", "atd_confidence": 1.5, "p_mine_like": 0.85, "p_other_object": 0.1}
+    fields = {"atd_class": "mine_like", "atd_confidence": 1.5, "p_mine_like": 0.85, "p_other_object": 0.1}
     for image_id, changes in (("AAAA", fields), ("BBBB", {"atd_class": "structure"})):
         record = image(image_id)
         archive.store_image(record.model_copy(update={"contact": record.contact.model_copy(update=changes)}), 5.0)
@@ -117,7 +117,7 @@ def test_ls_states_class_and_probabilities(capsys, tmp_path):
     assert main(["c2", "ls", "--archive", str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
     [line] = [line for line in lines if "uuv-1/AAAA" in line]
-    assert "mine-like 1.50, mine-like 85 %, other object 10 %, seabed 5 %" in line
+    assert "mine_like 1.50, mine-like 85 %, other object 10 %, seabed 5 %" in line
     [line] = [line for line in lines if "uuv-1/BBBB" in line]
     assert "structure" in line
     assert "seabed" not in line

@@ -61,7 +61,7 @@ def check_coco(out, document):
     images = {each["id"]: each for each in document["images"]}
     categories = {each["id"]: each["name"] for each in document["categories"]}
     assert len(images) == len(document["images"]) == len({each["file_name"] for each in images.values()})
-    assert categories == {1: "mine-like object", 2: "other object", 3: "structure"}
+    assert categories == {1: "mine_like", 2: "other_object", 3: "structure"}
     assert len({each["id"] for each in document["annotations"]}) == len(document["annotations"])
     for annotation in document["annotations"]:
         entry = images[annotation["image_id"]]

@@ -58,7 +58,7 @@ def test_table_lists_each_contact(file, capsys):
     )
     assert len(columns.split()) == len(line.split())
     assert {"lat_deg", "lon_deg", "sigma_m"} < set(columns.split())
-    assert line.split()[2] == "mine-like"
+    assert line.split()[2] == "mine_like"
     assert line.split()[5] == "starboard"
 
 

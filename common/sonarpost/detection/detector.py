@@ -27,7 +27,7 @@ from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import SurveySource, load_survey
 from sonarpost.sonar.survey import Side, Survey
 
-MINE_LIKE = "mine-like"
+MINE_LIKE = "mine_like"
 CLUTTER = "clutter"
 STRUCTURE = "structure"
 """A wreck, wall or outcrop: an object larger than a mine, with its extent."""

@@ -22,7 +22,7 @@ from sonarpost.sonar.image_files import read_image
 
 IMAGES_FOLDER: Final = "images"
 ANNOTATIONS_FILE: Final = "annotations.json"
-CATEGORIES: Final[Mapping[int, str]] = {1: "mine-like object", 2: "other object", 3: "structure"}
+CATEGORIES: Final[Mapping[int, str]] = {1: "mine_like", 2: "other_object", 3: "structure"}
 _STRUCTURE_CLASS: Final = "structure"
 """Class that the detector gives to wrecks, walls and outcrops."""
 _SAME_LINE_S: Final = 1800.0

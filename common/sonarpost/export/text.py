@@ -51,6 +51,11 @@ def csv_text(text: str) -> str:
     return f"'{cell}" if cell.lstrip().startswith(tuple(_FORMULA)) else cell
 
 
+def class_text(atd_class: str) -> str:
+    """Return the detector's class as text for people."""
+    return "mine-like" if atd_class == "mine_like" else atd_class
+
+
 def probabilities_text(p_mine_like: float | None, p_other_object: float | None) -> str:
     """Return the probabilities of a contact as whole percentages that add up to 100; empty if they are not known.
 

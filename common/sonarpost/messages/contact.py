@@ -110,7 +110,7 @@ class Contact(Record):
         speed_mps: Speed of the vehicle, forward positive.
         slant_range_m: Distance from the sonar to the object.
         ground_range_m: The same along a flat seabed.
-        atd_class: Class that the detector assigned: `mine-like`, `clutter` (any other object) or `structure` (a wreck,
+        atd_class: Class that the detector assigned: `mine_like`, `clutter` (any other object) or `structure` (a wreck,
             a wall, an outcrop); `picked` if only a person has marked the place. Other detectors may use other names;
             the acoustic link does not carry those.
         atd_confidence: Confidence of the detector as in the paper, 2 is the highest.

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from sonarpost.export.contacts import ExportContact
-from sonarpost.export.text import VERDICT_WORDS, probabilities_text
+from sonarpost.export.text import VERDICT_WORDS, class_text, probabilities_text
 from sonarpost.messages import Contact, ReconstructedImage
 from sonarpost.review import rendering
 from sonarpost.review.image_geometry import contact_mark
@@ -185,7 +185,7 @@ def _detector_facts(contact: ExportContact) -> list[Fact]:
             "Size (detector)",
             ", ".join(f"{letter} {value:.2f} m" for letter, value in sizes if value is not None) or None,
         ),
-        ("Class of the detector", record.atd_class or ""),
+        ("Class of the detector", class_text(record.atd_class or "")),
         ("Probabilities of the detector", probabilities_text(record.p_mine_like, record.p_other_object)),
         ("Confidence of the detector", confidence),
     ]

@@ -33,7 +33,7 @@ def maybe(strategy: st.SearchStrategy[float]) -> st.SearchStrategy[float | None]
 
 SIZES = st.none() | st.tuples(st.integers(16, 512), st.integers(16, 512))
 FIXES = st.none() | st.tuples(st.floats(-90, 90), st.floats(-180, 180), maybe(st.floats(0, 5500)))
-CLASSES = st.sampled_from([None, "mine-like", "clutter", "structure"])
+CLASSES = st.sampled_from([None, "mine_like", "clutter", "structure"])
 PLACES = st.none() | st.tuples(st.sampled_from(Side), maybe(st.floats(0, 3276)))
 
 
@@ -182,7 +182,7 @@ def test_all_codes_of_class_and_probabilities_round_trip_or_are_rejected() -> No
     reserved = [(c, code, "probabilities") for c in range(4) for code in range(231, 255)]
     assert sorted(rejected) == sorted([*reserved, (0, 255, "class")])
     assert len(values) == 4 * 232 - 1
-    for _, p_mine_like, p_other_object in values - {(c, None, None) for c in ("mine-like", "clutter", "structure")}:
+    for _, p_mine_like, p_other_object in values - {(c, None, None) for c in ("mine_like", "clutter", "structure")}:
         assert p_mine_like + p_other_object <= 1 + 1e-9
 
 
@@ -211,7 +211,7 @@ def test_position_out_of_range_is_rejected_in_the_classified_layout() -> None:
 
 
 def test_only_classes_of_the_layout_are_carried() -> None:
-    assert [*map(atd_class_of, ("mine-like", "clutter", "structure"))] == ["mine-like", "clutter", "structure"]
+    assert [*map(atd_class_of, ("mine_like", "clutter", "structure"))] == ["mine_like", "clutter", "structure"]
     assert [atd_class_of(name) for name in (None, "", "sphere", "Structure")] == [None] * 4
 
 

@@ -13,7 +13,7 @@ from sonarpost.messages import Command
 RECORD_FIELDS = ("authenticated", "despeckle_strength")
 CLASS_FIELDS = ("atd_class", "p_mine_like", "p_other_object")
 CONTACTS = {
-    "0001": (True, 1.0, "mine-like", 0.85, 0.1),
+    "0001": (True, 1.0, "mine_like", 0.85, 0.1),
     "0002": (False, 0.0625, "structure", 0.0, 0.95),
     "0003": (None, 0.0, "structure", None, None),
     "0004": (None, None, None, None, None),
@@ -89,7 +89,7 @@ def test_report_states_the_fields(watcher):
 def test_a_later_version_replaces_authentication_and_class(console):
     fill(console).state.store_image(record("0002", CONTACTS["0001"], version=2))
     row = console.browser("watch").rows()["0002"]
-    assert (row["authenticated"], row["atd_class"], row["p_mine_like"]) == (True, "mine-like", 0.85)
+    assert (row["authenticated"], row["atd_class"], row["p_mine_like"]) == (True, "mine_like", 0.85)
 
 
 def test_request_becomes_a_command_for_the_image_without_despeckling(console):

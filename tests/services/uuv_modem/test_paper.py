@@ -231,7 +231,7 @@ CONTACTS = st.builds(
     contact_id=st.just("c"),
     vehicle_id=st.just("uuv-1"),
     channel=st.sampled_from([None, "port", "starboard"]),
-    atd_class=st.sampled_from([None, "mine-like", "clutter", "structure", "sphere"]),
+    atd_class=st.sampled_from([None, "mine_like", "clutter", "structure", "sphere"]),
     **{name: st.none() | st.floats(*limits) for name, limits in RANGES.items()},
 )
 SIDES_PX = st.integers(16, 512)

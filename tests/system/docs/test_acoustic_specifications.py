@@ -34,7 +34,7 @@ def test_paper_example_frames_parse_to_the_stated_fields():
     assert isinstance(contact, ContactFrame)
     assert isinstance(classified, ContactFrame)
     found = classified.contact
-    assert (found.atd_class, found.p_mine_like, found.p_other_object) == ("mine-like", 0.85, 0.1)
+    assert (found.atd_class, found.p_mine_like, found.p_other_object) == ("mine_like", 0.85, 0.1)
     assert (found.lat_deg, found.lon_deg, found.height_px, found.width_px) == (44.7123456, -63.6543208, 113, 49)
     record = contact.contact
     assert (record.lat_deg, record.lon_deg, record.ground_range_m) == (44.7123456, -63.6543210, 33.3)

@@ -16,7 +16,7 @@ from xml.etree import ElementTree as ET
 from sonarpost.export.contacts import ExportContact
 from sonarpost.export.source import ExportSource
 from sonarpost.export.tables import DEGREE_DECIMALS
-from sonarpost.export.text import VERDICT_WORDS, probabilities_text, utc_text, xml_text
+from sonarpost.export.text import VERDICT_WORDS, class_text, probabilities_text, utc_text, xml_text
 from sonarpost.review.decisions import ReviewState
 
 SPOT: Final = "b-m-p-s-m"
@@ -196,7 +196,7 @@ def _remarks(contact: ExportContact) -> str:
         if record.depth_m is not None and record.altitude_m is not None:
             parts.append(f"Water depth {record.depth_m + record.altitude_m:.1f} m.")
         if record.atd_class:
-            parts.append(f"Detector's class {record.atd_class}.")
+            parts.append(f"Detector's class {class_text(record.atd_class)}.")
         if probabilities := probabilities_text(record.p_mine_like, record.p_other_object):
             parts.append(f"Detector: {probabilities}.")
         if record.atd_confidence is not None:

@@ -7,7 +7,7 @@ export default {
   "verdict.unsure": "unsicher",
   "verdict.disputed": "strittig",
   "verdict.unreviewed": "unbewertet",
-  "class.mine-like": "minenähnlich",
+  "class.mine_like": "minenähnlich",
   "class.structure": "Struktur",
   "class.clutter": "Störecho",
   "class.cylinder": "Zylinder",

@@ -7,7 +7,7 @@ export default {
   "verdict.unsure": "unsure",
   "verdict.disputed": "disputed",
   "verdict.unreviewed": "unreviewed",
-  "class.mine-like": "mine-like",
+  "class.mine_like": "mine-like",
   "class.structure": "structure",
   "class.clutter": "clutter",
   "class.cylinder": "cylinder",

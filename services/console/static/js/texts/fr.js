@@ -7,7 +7,7 @@ export default {
   "verdict.unsure": "incertain",
   "verdict.disputed": "contesté",
   "verdict.unreviewed": "non examiné",
-  "class.mine-like": "assimilé mine",
+  "class.mine_like": "assimilé mine",
   "class.structure": "structure",
   "class.clutter": "fouillis",
   "class.cylinder": "cylindre",

@@ -65,10 +65,12 @@ function box(rows, columns, kind, label, margin) {
   return made;
 }
 
+const classText = (contact) => contact.class.replace("_", "-");
+
 function drawBoxes() {
   const boxes = page.contacts.map((contact, number) => {
-    const label = `${contact.confidence.toFixed(2)} ${contact.class}`;
-    const made = box(contact.rows, contact.columns, contact.class === "mine-like" ? "mine" : "other", label, MARGIN_PX);
+    const label = `${contact.confidence.toFixed(2)} ${classText(contact)}`;
+    const made = box(contact.rows, contact.columns, contact.class === "mine_like" ? "mine" : "other", label, MARGIN_PX);
     made.classList.toggle("chosen", number === page.chosen);
     return made;
   });
@@ -127,7 +129,7 @@ async function showPlace(row, column, contact = null) {
       Position: positionText(place), Time: place.time_utc.replace("T", " "),
     };
     if (contact !== null) {
-      fields.Contact = `${contact.class}, ${contact.confidence.toFixed(2)} of 2`;
+      fields.Contact = `${classText(contact)}, ${contact.confidence.toFixed(2)} of 2`;
       fields.Length = metres(contact.length_m);
       fields.Height = metres(contact.height_m);
     }
