@@ -12,7 +12,6 @@ from sonarpost.errors import BadInputError
 from sonarpost.export.contacts import ExportContact
 from sonarpost.export.geo.geopackage import write_geopackage
 from sonarpost.export.geo.kml import write_kml, write_kmz
-from sonarpost.export.reports import write_caris_text, write_mine_report
 from sonarpost.export.source import ExportSource, StoredImages
 from sonarpost.export.tables import write_csv, write_geojson
 from sonarpost.export.tak.cot import write_cot
@@ -37,8 +36,6 @@ _CORE: Final[Mapping[str, Format]] = {
     "gpkg": Format(write_geopackage, "application/geopackage+sqlite3"),
     "cot.xml": Format(write_cot, "application/xml"),
     "tak.zip": Format(write_data_package, "application/zip"),
-    "caris.txt": Format(write_caris_text, "text/plain; charset=utf-8"),
-    "app11-like.txt": Format(write_mine_report, "text/plain; charset=us-ascii"),
 }
 
 

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from typing import IO, Final
 
 from sonarpost.export.contacts import ExportContact
+from sonarpost.export.formats import Format
 from sonarpost.export.source import ExportSource
 from sonarpost.export.text import csv_text
 from sonarpost.review.decisions import ReviewState
@@ -155,3 +156,7 @@ def _probability(contact: ExportContact) -> str:
 
 def _field(text: str) -> str:
     return _NOT_MTF.sub(" ", text.upper())[:MAX_FIELD_CHARACTERS].strip()
+
+
+CARIS_TEXT: Final = Format(write_caris_text, "text/plain; charset=utf-8")
+MINE_REPORT: Final = Format(write_mine_report, "text/plain; charset=us-ascii")

@@ -1,0 +1,1 @@
+"""Text reports of contacts: `caris.txt` and `app11-like.txt`."""
