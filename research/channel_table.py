@@ -11,11 +11,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
+from sonarpost.extensions.simulation.channel.events import AcousticPacket, ArrivalEnded, FrameOutcome, PacketKind
+from sonarpost.extensions.simulation.channel.model import ChannelModel
+from sonarpost.extensions.simulation.channel.parameters import (
+    PRESETS,
+    ChannelParameters,
+    build_parameters,
+    read_parameters,
+)
 from sonarpost.modem.micromodem import RATES
-from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.events import AcousticPacket, ArrivalEnded, FrameOutcome, PacketKind
-from sonarpost.simulation.channel.model import ChannelModel
-from sonarpost.simulation.channel.parameters import PRESETS, ChannelParameters, build_parameters, read_parameters
 
 RANGES_M = (2, 30, 60, 90, 110, 120, 130, 140, 160, 200, 250, 300)
 GAP_S = 10.0

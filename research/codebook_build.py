@@ -22,8 +22,8 @@ import numpy as np
 
 from research.common.patches import stretch
 from sonarpost.codec.vq.codebook import load
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import write_tiff
 
 LIMIT_S = 300.0

@@ -29,8 +29,8 @@ from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.vq.builder import ProgressCallback, Round, TrainingImage, build, rms_distance
 from sonarpost.codec.vq.codebook import Codebook, load, save
 from sonarpost.errors import CodebookError, ConfigError
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import read_image
 
 SOURCES = (

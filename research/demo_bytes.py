@@ -38,10 +38,10 @@ from sonarpost.cli.demo.settings import ROUTER_PORTS, UUV, VESSEL, ChainSettings
 from sonarpost.cli.demo.watch import Watcher
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.delivery.client import deliver
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.link.frames.contact_record import RECORD_SIZE
 from sonarpost.messages import Command, ReconstructedImage, Relayed
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.xtf_writer import write_xtf
 
 TIMEOUT_S = 600.0

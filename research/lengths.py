@@ -26,11 +26,11 @@ from research.common.command import command_parser, report_progress, run_command
 from sonarpost.codec import emb
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.detection.snippets import to_grey
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
+from sonarpost.extensions.simulation.seabed.targets import ObjectKind
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
 from sonarpost.review.measurement import Line, measure_line
-from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
-from sonarpost.simulation.seabed.targets import ObjectKind
-from sonarpost.simulation.seabed.terrain import SeabedKind
 
 BYTES: Final = (64, 128, 200)
 HEIGHT_PX, WIDTH_PX = 80, 140

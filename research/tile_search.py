@@ -31,8 +31,8 @@ from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.interface import to_uint8
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, Tiles, cut_tiles
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import read_image
 
 HEIGHT_PX, WIDTH_PX = 140, 80

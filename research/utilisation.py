@@ -18,6 +18,8 @@ import numpy as np
 from research.common.command import command_parser, run_command
 from research.common.modem_pair import VESSEL, ModemPair
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.simulation.channel.events import TransmittedPacket
+from sonarpost.extensions.simulation.channel.parameters import ChannelParameters
 from sonarpost.link.config import QueueConfig
 from sonarpost.link.downlink.commands import CommandTracker
 from sonarpost.link.downlink.messages import image_of_number
@@ -30,8 +32,6 @@ from sonarpost.link.receiver import FeedbackReceived
 from sonarpost.link.sender import ImageToSend
 from sonarpost.modem.interface import FrameDecoded, FrameReceived, ModemEvent, PacketFailed, PacketSent
 from sonarpost.modem.micromodem import RATES, MicroModem
-from sonarpost.simulation.channel.events import TransmittedPacket
-from sonarpost.simulation.channel.parameters import ChannelParameters
 
 _VEHICLE: Final = 3
 _DOWNLINK_RATE: Final = 0

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import sonarpost
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 

@@ -20,7 +20,6 @@ SOCKETS = {
     "common/sonarpost/network/connections.py": "limits of a server's connections",
     "common/sonarpost/network/http_client.py": "one deadline for the whole exchange",
     "common/sonarpost/runtime/udp_port.py": "datagrams; the socket has a time limit",
-    "common/sonarpost/simulation/channel/host_ports.py": "simulator; its sockets do not block",
     "common/sonarpost/stop_signals.py": "signals of this process",
 }
 THREADS = {
@@ -39,7 +38,6 @@ THREADS = {
     "common/sonarpost/runtime/process.py": "timer that ends the process",
     "common/sonarpost/runtime/serial_port.py": "guarded: reads a port",
     "common/sonarpost/runtime/service.py": "`start_thread`, whose exceptions stop the service; probe of the router",
-    "common/sonarpost/simulation/channel/emulator.py": "simulator",
     "common/sonarpost/stop_signals.py": "reads signals",
     "services/console/training/calibrated_watch.py": "guarded: counts calibrated contacts",
     "services/console/training/simulator.py": "guarded: simulator of a training",
@@ -81,8 +79,6 @@ READS = {
     "common/sonarpost/registry.py": SHIPPED,
     "common/sonarpost/security/fleet.py": OWN_SETTINGS,
     "common/sonarpost/security/tls_files.py": OWN_SETTINGS,
-    "common/sonarpost/simulation/channel/emulator.py": "simulator",
-    "common/sonarpost/simulation/channel/parameters.py": OWN_SETTINGS,
     "common/sonarpost/sonar/options.py": "its size is compared with 64 KiB first",
     "services/c2/archive.py": "decision of the archive",
     "services/c2/short_messages.py": OWN_SETTINGS,
@@ -101,7 +97,6 @@ QUEUES = {
     "common/sonarpost/modem/packet_queue.py": "its `limit`",
     "common/sonarpost/modem/s2c/driver.py": "commands of the configuration",
     "common/sonarpost/network/connections.py": "MAX_REFUSED",
-    "common/sonarpost/simulation/": "simulator",
     "common/sonarpost/sonar/heading.py": "_COURSE_PINGS",
     "common/sonarpost/sonar/readers/humminbird.py": "three pings",
     "services/console/events.py": "BUFFERED_EVENTS and MAX_BUFFERED_BYTES",

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from sonarpost.extensions.simulation.channel.acoustics import LocalPosition, frame_error_rate
+from sonarpost.extensions.simulation.channel.model import ChannelModel
+from sonarpost.extensions.simulation.channel.parameters import build_parameters
 from sonarpost.link.auth.key import AuthenticationSettings
 from sonarpost.link.frames.contact_record import RECORD_SIZE
 from sonarpost.link.frames.v1.frame import HEADER_BYTES
 from sonarpost.modem.micromodem import RATES
-from sonarpost.simulation.channel.acoustics import LocalPosition, frame_error_rate
-from sonarpost.simulation.channel.model import ChannelModel
-from sonarpost.simulation.channel.parameters import build_parameters
 
 PUBLISHED_ERROR_RATES = (1, 3, 5)
 """Rates whose frame error rates are published; the channel model replaces the others by the nearest of these."""

@@ -28,8 +28,8 @@ from sonarpost.codec.fitting import Fit, fit_image
 from sonarpost.codec.interface import MAX_SIDE_PX, MIN_SIDE_PX, Image, to_uint8
 from sonarpost.detection.snippets import HIGH_PERCENTILE, LOW_PERCENTILE, to_grey
 from sonarpost.errors import BadInputError, ConfigError, SurveyFileError
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_decoding import read_any_image
 from sonarpost.sonar.image_files import IMAGE_SUFFIXES, MAX_IMAGES, list_images, read_image
 

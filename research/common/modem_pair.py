@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
+from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
+from sonarpost.extensions.simulation.channel.events import TransmittedPacket
+from sonarpost.extensions.simulation.channel.parameters import ChannelParameters
+from sonarpost.extensions.simulation.channel.simulator import ChannelSimulator, PlacedModem
+from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 from sonarpost.modem.interface import ModemEvent
 from sonarpost.modem.micromodem import MicroModem, MicroModemConfig
-from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.events import TransmittedPacket
-from sonarpost.simulation.channel.parameters import ChannelParameters
-from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
-from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
 VESSEL: Final = 1
 _MIN_STEP_S: Final = 0.001

@@ -17,7 +17,7 @@ from scipy import ndimage
 from sonarpost.codec.interface import Image
 from sonarpost.codec.quality import psnr_db
 from sonarpost.detection.detector import height_from_shadow_m
-from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, TruthObject
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]

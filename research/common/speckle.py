@@ -16,8 +16,8 @@ import numpy.typing as npt
 from research.common.scene_measures import ObjectPlace, place_in_window
 from sonarpost.codec.interface import Image
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Side
 
 HEIGHT_PX: Final = 80

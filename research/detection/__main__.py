@@ -40,8 +40,8 @@ from research.detection.simulated import (
 from research.detection.tiles import TileScore, tile_auc, tile_scores
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.seabed.targets import MINE_LIKE_KINDS
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.targets import MINE_LIKE_KINDS
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 
 OPERATING_CONFIDENCE: Final = DetectorSettings().confidence_threshold
 PLAIN: Final = (SeabedKind.SAND, SeabedKind.MUD, SeabedKind.GRAVEL)

@@ -33,9 +33,9 @@ from sonarpost.detection.detector import search
 from sonarpost.detection.difficulty import Difficulty, PdModel
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.files import write_atomically
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
 
 Floats = npt.NDArray[np.float64]
 

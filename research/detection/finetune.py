@@ -43,7 +43,7 @@ from sonarpost.detection.images import ScaledImage, detect_in_image, normalise_w
 from sonarpost.detection.matched_filter import matched_response
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import read_image
 from sonarpost.sonar.survey import Side
 

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from sonarpost.detection.detector import STRUCTURE, Detection, detect
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Side, Survey
 
 Floats = npt.NDArray[np.float64]

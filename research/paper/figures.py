@@ -16,8 +16,8 @@ from sonarpost.codec.quality import ssim
 from sonarpost.detection.detector import detect
 from sonarpost.detection.snippets import cut_snippet
 from sonarpost.errors import SurveyFileError
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import Survey
 

@@ -20,8 +20,8 @@ from sonarpost.cli.shared import in_new_folder
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.simulation.channel.parameters import build_parameters
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.simulation.channel.parameters import build_parameters
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from research.common.modem_pair import VESSEL, ModemPair
+from sonarpost.extensions.simulation.channel.parameters import ChannelParameters
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.link.frames.paper.receiver import PaperReceiver
@@ -18,7 +19,6 @@ from sonarpost.link.frames.paper.sender import Packet, plan_packets
 from sonarpost.link.receiver import Event, ImageUpdate
 from sonarpost.modem.interface import FrameReceived, PacketFailed, PacketSent
 from sonarpost.modem.micromodem import RATES
-from sonarpost.simulation.channel.parameters import ChannelParameters
 
 VEHICLE: Final = 2
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sonarpost.simulation.channel.config import EmulatorConfig
+from sonarpost.extensions.simulation.channel.config import EmulatorConfig
 
 
 class AcousticChannelConfig(EmulatorConfig):

@@ -1,6 +1,6 @@
 """Runs a `ChannelEmulator` beside the other services.
 
-The emulator, `sonarpost.simulation.channel.emulator.ChannelEmulator`, needs neither this process nor Zenoh.
+The emulator, `sonarpost.extensions.simulation.channel.emulator.ChannelEmulator`, needs neither this process nor Zenoh.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ import logging
 from collections.abc import Mapping
 
 from sonarpost.config import PlatformConfig
+from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
 from sonarpost.logs import kv
 from sonarpost.messages import Record
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
-from sonarpost.simulation.channel.emulator import ChannelEmulator
 
 log = logging.getLogger(__name__)
 

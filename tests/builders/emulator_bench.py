@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
+from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
+from sonarpost.extensions.simulation.channel.events import TransmittedPacket
+from sonarpost.extensions.simulation.channel.parameters import ChannelParameters
+from sonarpost.extensions.simulation.channel.simulator import ChannelSimulator, PlacedModem
+from sonarpost.extensions.simulation.modem.receiver import PacketReport
+from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 from sonarpost.modem.micromodem import nmea
-from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.events import TransmittedPacket
-from sonarpost.simulation.channel.parameters import ChannelParameters
-from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
-from sonarpost.simulation.modem.receiver import PacketReport
-from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
 START_UTC_S = datetime(2016, 10, 12, 9, 0, 0, tzinfo=UTC).timestamp()
 RANGE_M = 150.0

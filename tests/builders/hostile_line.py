@@ -8,12 +8,12 @@ import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
+from sonarpost.extensions.simulation.channel.parameters import build_parameters
+from sonarpost.extensions.simulation.channel.simulator import ChannelSimulator, PlacedModem
+from sonarpost.extensions.simulation.modem.emulated import settings_for
 from sonarpost.modem.interface import FrameReceived, Modem, ModemEvent, PacketFailed, PacketSent
 from sonarpost.modem.registry import ModemSettings, modem_driver
-from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.parameters import build_parameters
-from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
-from sonarpost.simulation.modem.emulated import settings_for
 
 HOSTILE, PEER = 1, 2
 Parts = list[tuple[float, bytes]]

@@ -39,9 +39,9 @@ from sonarpost.bus.session import client_config
 from sonarpost.codec.registry import default_registry
 from sonarpost.delivery.outbox import Outbox, QueuePolicy
 from sonarpost.delivery.store import Store
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.messages import Contact, Health, ImagePart, Pixels, Snippet
 from sonarpost.services.console.store.users import Users
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 from sonarpost.stop_signals import EXIT_WITH_PARENT
 

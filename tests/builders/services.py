@@ -20,11 +20,11 @@ import zenoh
 from builders.common import eventually, publish_once
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.extensions.simulation.channel.config import EmulatorConfig, ModemSite
+from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.messages import Contact, Health, Pixels, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
-from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
-from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
 PlatformMaker = Callable[[str], PlatformConfig]

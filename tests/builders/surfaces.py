@@ -31,7 +31,7 @@ import reference  # type: ignore[import-not-found]  # packaging/docs is no packa
 LISTENING = {"bind", "listen", "create_server", "start_server"}
 OUTSIDE = ("watchers", "the configured consumers")
 """Receivers that are no service of the product."""
-SIMULATED = ("simulation", "cli.demo")
+SIMULATED = ("extensions.simulation", "cli.demo")
 """Packages for tests and demonstrations, which listen on the local host only."""
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
+from sonarpost.extensions.simulation.channel.parameters import ChannelParameters
+from sonarpost.extensions.simulation.channel.simulator import ChannelSimulator, PlacedModem
+from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 from sonarpost.modem.interface import ModemEvent
 from sonarpost.modem.micromodem import MicroModem, MicroModemConfig, nmea
-from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.parameters import ChannelParameters
-from sonarpost.simulation.channel.simulator import ChannelSimulator, PlacedModem
-from sonarpost.simulation.modem.settings import EmulatedModemConfig
 
 Fault = Callable[[bytes], bytes]
 

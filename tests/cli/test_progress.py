@@ -14,7 +14,7 @@ from sonarpost.cli import progress as module
 from sonarpost.cli.main import LOG_LEVEL_VARIABLE, main
 from sonarpost.cli.progress import ProgressDisplay, progress_console
 from sonarpost.codec.vq.builder import BuildProgress, RefinementProgress
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
 

@@ -14,8 +14,8 @@ from sonarpost.cli.main import main, parser
 from sonarpost.cli.shared import survey_options_of
 from sonarpost.config import load
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.services.atd_stub.config import AtdStubConfig
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.options import SurveyOptions, load_options
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.xtf_writer import write_xtf

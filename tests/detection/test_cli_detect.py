@@ -17,9 +17,9 @@ from sonarpost.cli.detection.command import annotated_waterfall
 from sonarpost.detection import candidates
 from sonarpost.detection.detector import CLUTTER, MINE_LIKE, STRUCTURE, detect
 from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.messages import AtdClass, Contact
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.side_car import read_side_car
 from sonarpost.sonar.source import InMemorySource

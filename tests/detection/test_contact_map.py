@@ -12,7 +12,7 @@ from builders.survey_lines import brightest_px, pixel
 from sonarpost.cli.main import main
 from sonarpost.detection.contact_map import contact_map
 from sonarpost.detection.detector import detect
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.maps.geotiff import write_image
 from sonarpost.sonar.xtf_writer import write_xtf
 

@@ -14,8 +14,8 @@ from sonarpost.detection import candidates
 from sonarpost.detection.detector import MINE_LIKE, STRUCTURE, detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.snippets import cut_snippet
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.bottom_track import track_bottom
 from sonarpost.sonar.geometry import Position, georeference, offset_between_m
 from sonarpost.sonar.options import SurveyOptions

@@ -11,10 +11,10 @@ from sonarpost.detection.detector import STRUCTURE, detect
 from sonarpost.detection.normalisation import normalise_side
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.structures import find_structures, find_water_structures, is_part_of_structure
-from sonarpost.simulation.seabed.objects import ObjectKind
-from sonarpost.simulation.seabed.spec import SurveySpec
-from sonarpost.simulation.seabed.survey import simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.objects import ObjectKind
+from sonarpost.extensions.simulation.seabed.spec import SurveySpec
+from sonarpost.extensions.simulation.seabed.survey import simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import ChannelPing, Side
 
 pytestmark = pytest.mark.usefixtures("few_candidates")

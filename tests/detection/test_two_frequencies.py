@@ -15,8 +15,8 @@ from sonarpost.detection.normalisation import normalise_side
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image
 from sonarpost.detection.stream import FileOrigin, StreamDetector
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.ground_range import MAX_COLUMNS
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource

@@ -8,8 +8,8 @@ import pytest
 
 from sonarpost.detection.detector import detect
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.geometry import along_track_m, ping_spacing_m
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import read_survey

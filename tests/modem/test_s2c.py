@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError, SentenceError
+from sonarpost.extensions.simulation.modem.packet_modem import PacketModemSettings
+from sonarpost.extensions.simulation.modem.s2c import EmulatedS2c
 from sonarpost.modem.interface import (
     FrameReceived,
     ModemEvent,
@@ -41,8 +43,6 @@ from sonarpost.modem.s2c.messages import (
     parse,
     parse_travel_time_s,
 )
-from sonarpost.simulation.modem.packet_modem import PacketModemSettings
-from sonarpost.simulation.modem.s2c import EmulatedS2c
 
 # An exchange of a USBL modem, quoted by a public client of such modems (docs/reference/modem-s2c.md).
 RECORDED = (

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import pytest
 from builders.two_drivers import Fault, TwoDrivers, corrupt, drop, duplicate, kinds_of, truncate
 
+from sonarpost.extensions.simulation.channel.parameters import ChannelParameters
 from sonarpost.modem.interface import (
     FrameReceived,
     ModemError,
@@ -25,7 +26,6 @@ from sonarpost.modem.interface import (
     SentenceRejected,
 )
 from sonarpost.modem.micromodem import RATES, FlexibleDataReceived, MiniPacketReceived, PingAnswered, nmea
-from sonarpost.simulation.channel.parameters import ChannelParameters
 
 READY_S = 30.0
 RECOVERY_S = 150.0

@@ -13,7 +13,7 @@ from builders.common import REPOSITORY
 
 from research import prepare_data
 from research.common.images import read_sdvd_index
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.image_files import read_image, write_png
 from sonarpost.sonar.survey import Side
 from sonarpost.sonar.xtf_writer import write_xtf

@@ -19,9 +19,9 @@ from research.detection.tiles import TileScore, tile_auc, tile_scores
 from sonarpost.codec.registry import default_registry
 from sonarpost.detection.detector import detect
 from sonarpost.errors import ConfigError, SurveyFileError
-from sonarpost.simulation.seabed.survey import TruthObject
-from sonarpost.simulation.seabed.targets import ObjectKind
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import TruthObject
+from sonarpost.extensions.simulation.seabed.targets import ObjectKind
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Side, Survey
 
 

@@ -20,8 +20,8 @@ from research.training.detection.examples import (
 from sonarpost.detection.chips import FINE_CENTRE, WINDOW_CENTRE, WINDOW_SHAPE, GroundPlane
 from sonarpost.detection.classifier import MINE_LIKE_OBJECT, OTHER_OBJECT, SEABED
 from sonarpost.detection.matched_filter import Peak
-from sonarpost.simulation.seabed.objects import ObjectKind
-from sonarpost.simulation.seabed.survey import TruthObject
+from sonarpost.extensions.simulation.seabed.objects import ObjectKind
+from sonarpost.extensions.simulation.seabed.survey import TruthObject
 from sonarpost.sonar.survey import Side
 
 

@@ -14,7 +14,7 @@ from research.detection.simulated import FIRST_SEED
 from sonarpost.detection import difficulty as shipped
 from sonarpost.detection.difficulty import Difficulty, PdModel, load_pd_model
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 
 WEIGHTS = {"clutter_weight": 0.8, "contrast_weight": 2.5, "ripple_weight": 0.0}
 TRUE_MODEL = PdModel(thresholds=[0.0, 2.0], offsets=[7.0, 3.0], **WEIGHTS)

@@ -25,7 +25,7 @@ from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.vq.tiles import cut_tiles
 from sonarpost.errors import ConfigError, SurveyFileError
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.image_files import write_png
 from sonarpost.sonar.survey import Survey
 from sonarpost.sonar.xtf_writer import write_xtf

@@ -15,10 +15,10 @@ from research.sea_trial.__main__ import SIZES_PX, Cell, claims, measure, table
 from research.sea_trial.rig import CodedSnippet, DeliveryCounts, send_images
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
+from sonarpost.extensions.simulation.channel.events import ArrivalEnded, ArrivalStarted, FrameOutcome
+from sonarpost.extensions.simulation.channel.model import ChannelModel
+from sonarpost.extensions.simulation.channel.parameters import ChannelParameters, build_parameters
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.simulation.channel.events import ArrivalEnded, ArrivalStarted, FrameOutcome
-from sonarpost.simulation.channel.model import ChannelModel
-from sonarpost.simulation.channel.parameters import ChannelParameters, build_parameters
 
 
 @pytest.fixture(scope="module")

@@ -25,9 +25,9 @@ from research.despeckling.filters import FILTERS
 from sonarpost.codec.quality import psnr_db
 from sonarpost.detection.snippets import to_grey
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.targets import ObjectKind
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.targets import ObjectKind
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 
 PLACE = ObjectPlace(row=40, column=30, half_rows=5, half_columns=6, sample_m=0.03, first_slant_m=10.0, altitude_m=5.0)
 

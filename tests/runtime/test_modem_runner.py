@@ -10,6 +10,8 @@ import pytest
 from builders.common import WAIT_S, eventually
 
 from sonarpost.errors import FrameError, PortError
+from sonarpost.extensions.simulation.channel.config import EmulatorConfig, ModemSite
+from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
 from sonarpost.modem.interface import (
     FrameReceived,
     ModemEvent,
@@ -34,8 +36,6 @@ from sonarpost.modem.udp import UdpModem
 from sonarpost.modem.udp.datagram import Datagram, DatagramKind
 from sonarpost.runtime.modem_runner import MAX_INPUTS, ModemRunner
 from sonarpost.runtime.serial_port import ModemPort, PortOpened, SerialPort
-from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
-from sonarpost.simulation.channel.emulator import ChannelEmulator
 
 CONFIG = MicroModemConfig(address=3, settings=())
 

@@ -10,10 +10,10 @@ import pytest
 from builders.common import eventually
 
 from sonarpost.errors import ConfigError, FrameError, PortError, TransmissionError
+from sonarpost.extensions.simulation.channel.config import EmulatorConfig, ModemSite
+from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
 from sonarpost.runtime import serial_modem
 from sonarpost.runtime.serial_modem import SerialModem
-from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
-from sonarpost.simulation.channel.emulator import ChannelEmulator
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.bottom_track import altitudes_m, track_bottom
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey

@@ -15,7 +15,7 @@ from pyproj import Transformer
 
 from sonarpost.cli.main import main
 from sonarpost.cli.survey.plot import SIDE_PX, angle_normalised, nice_step, reduce_survey, thinned_track
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource

@@ -12,7 +12,7 @@ import pytest
 from builders.surveys import MAKERS, make_lowrance, make_xtf
 
 from sonarpost.cli.main import main
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.survey import ChannelPing, Side
 

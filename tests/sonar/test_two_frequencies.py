@@ -10,7 +10,7 @@ import pytest
 from builders.two_frequencies import FIRST_HZ, SECOND_HZ, files_of, read_both
 
 from sonarpost.cli.main import main
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.bottom_track import track_bottom
 from sonarpost.sonar.ground_range import ground_range_image
 from sonarpost.sonar.survey import Side

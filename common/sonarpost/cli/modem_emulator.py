@@ -13,10 +13,10 @@ from pydantic import ValidationError
 
 from sonarpost.cli.shared import Subparsers, in_new_folder
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.simulation.channel.config import EmulatorConfig
+from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
+from sonarpost.extensions.simulation.channel.parameters import PRESETS, build_parameters, config_error, read_parameters
 from sonarpost.modem.registry import modem_driver
-from sonarpost.simulation.channel.config import EmulatorConfig
-from sonarpost.simulation.channel.emulator import ChannelEmulator
-from sonarpost.simulation.channel.parameters import PRESETS, build_parameters, config_error, read_parameters
 from sonarpost.stop_signals import stop_on_signals
 
 WATCH_S = 0.2

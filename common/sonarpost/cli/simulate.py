@@ -10,9 +10,9 @@ from pathlib import Path
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers, in_new_folder, projected_crs_of
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.simulation.seabed.survey import SimulatedSurvey, SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.files import write_atomically
-from sonarpost.simulation.seabed.survey import SimulatedSurvey, SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.xtf_writer import write_xtf
 
 TRUTH_SCHEMA = 1

@@ -25,9 +25,9 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from research.common.command import command_parser, run_command
 from research.training.emb.pool import survey_sheets
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.seabed import survey as simulator
-from sonarpost.simulation.seabed.targets import place_object
-from sonarpost.simulation.seabed.terrain import SeabedKind, make_seabed
+from sonarpost.extensions.simulation.seabed import survey as simulator
+from sonarpost.extensions.simulation.seabed.targets import place_object
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind, make_seabed
 from sonarpost.sonar.survey import Side
 
 Floats = npt.NDArray[np.float32]

@@ -33,9 +33,9 @@ from sonarpost.detection.classifier import (
 from sonarpost.detection.matched_filter import matched_response
 from sonarpost.detection.normalisation import normalise_side
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.simulation.seabed.spec import SurveySpec
-from sonarpost.simulation.seabed.survey import simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.spec import SurveySpec
+from sonarpost.extensions.simulation.seabed.survey import simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.bottom_track import altitudes_m
 
 Floats = npt.NDArray[np.float64]

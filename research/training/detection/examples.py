@@ -58,16 +58,16 @@ from sonarpost.detection.matched_filter import Peak, matched_response
 from sonarpost.detection.normalisation import LevelGrid, normalise_side
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.errors import ConfigError
-from sonarpost.simulation.seabed.objects import (
+from sonarpost.extensions.simulation.seabed.objects import (
     CLUTTER_KINDS,
     FURTHER_CLUTTER_KINDS,
     FURTHER_MINE_LIKE_KINDS,
     MINE_LIKE_KINDS,
     STRUCTURE_KINDS,
 )
-from sonarpost.simulation.seabed.spec import SurveySpec
-from sonarpost.simulation.seabed.survey import TruthObject, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.spec import SurveySpec
+from sonarpost.extensions.simulation.seabed.survey import TruthObject, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.bottom_track import altitudes_m
 from sonarpost.sonar.image_files import read_image
 from sonarpost.sonar.readers import read_survey

@@ -21,8 +21,8 @@ from PIL import Image
 from research.common.command import command_parser, run_command
 from research.common.images import missing_data
 from sonarpost.detection.snippets import to_grey
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.readers import read_survey
 
 Floats = npt.NDArray[np.float64]

@@ -17,12 +17,12 @@ from sonarpost.codec.interface import Codec, DecodedImage, StreamHeader
 from sonarpost.codec.region import RegionBox
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.codec.vq.codec import VqCodec
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
 from sonarpost.review.positions import destination
 from sonarpost.services.console.store.truth import Truth
-from sonarpost.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Survey
 
 HEIGHT_PX, WIDTH_PX = 80, 140

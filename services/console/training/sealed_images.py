@@ -17,9 +17,9 @@ from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.detection.detector import Detection, detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.snippets import cut_snippet, ground_projected_image
+from sonarpost.extensions.simulation.seabed.survey import SimulatedSurvey, SurveySpec, TruthObject, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
-from sonarpost.simulation.seabed.survey import SimulatedSurvey, SurveySpec, TruthObject, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
 
 PINGS: Final = 1000
 SAMPLES: Final = 1024

@@ -14,10 +14,10 @@ import pytest
 
 from sonarpost.cli.deployment import modem_ping
 from sonarpost.cli.main import main
+from sonarpost.extensions.simulation.channel.config import EmulatorConfig
+from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
 from sonarpost.modem.micromodem import plugin
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.simulation.channel.config import EmulatorConfig
-from sonarpost.simulation.channel.emulator import ChannelEmulator
 
 Emulate = Callable[..., list[str]]
 

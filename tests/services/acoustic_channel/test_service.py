@@ -23,13 +23,13 @@ from pydantic import ValidationError
 from sonarpost import keys, wire
 from sonarpost.cli import modem_emulator
 from sonarpost.errors import ConfigError, PortError
+from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
+from sonarpost.extensions.simulation.channel.config import EmulatorConfig, ModemSite
+from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
 from sonarpost.messages import Health
 from sonarpost.modem.micromodem import nmea
 from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.services.acoustic_channel.service import AcousticChannelService
-from sonarpost.simulation.channel.acoustics import LocalPosition
-from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
-from sonarpost.simulation.channel.emulator import ChannelEmulator
 
 MODEMS = (ModemSite(address=1), ModemSite(address=2, east_m=150.0))
 SCALE = 100.0

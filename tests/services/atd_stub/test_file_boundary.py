@@ -22,11 +22,11 @@ from builders.joined_surveys import (
 from sonarpost.detection.association import DetectionPlace
 from sonarpost.detection.settings import DetectorTuning
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamEnd
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import StoredEnd, pack, unpack
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Side
 from sonarpost.sonar.xtf_writer import write_xtf
 

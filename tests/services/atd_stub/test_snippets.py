@@ -21,12 +21,12 @@ from sonarpost.detection.settings import DetectorSettings, DetectorTuning, load_
 from sonarpost.detection.snippets import ground_projected_image
 from sonarpost.detection.stream import FileOrigin
 from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.input_folder import InputFile, StableFiles, list_input_files
 from sonarpost.services.atd_stub.snippet_files import read_snippet, write_snippet
 from sonarpost.services.atd_stub.survey_detection import snippet_of
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.image_files import read_image, write_tiff
 from sonarpost.sonar.options import ErrorBudget, Mounting

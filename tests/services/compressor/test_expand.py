@@ -10,11 +10,11 @@ from builders.joined_surveys import FEW_CANDIDATES
 from sonarpost.detection.detector import detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.stream import FileOrigin
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.messages import Contact, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.survey_detection import snippet_of
 from sonarpost.services.compressor.encoding import expand
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 
 
 @pytest.fixture

@@ -13,12 +13,12 @@ from builders.console import contact_id, image_record
 from PIL import Image
 
 from sonarpost.detection.snippets import cut_snippet
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.messages import Contact, Pixels
 from sonarpost.review import rendering
 from sonarpost.review.image_geometry import contact_box, contact_mark, range_axis
 from sonarpost.review.measurement import NotMeasurableError, height_from_shadow, measure_length
 from sonarpost.services.console.store import serialisers
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.survey import Side
 
 ID = contact_id()

@@ -15,6 +15,8 @@ from sonarpost import keys, wire
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.simulation.channel.config import EmulatorConfig, ModemSite
+from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
 from sonarpost.link.frames.contact_record import ContactSummary, summary_of
 from sonarpost.link.frames.paper.frame import parse_frame
 from sonarpost.link.frames.paper.sender import plan_packets
@@ -25,8 +27,6 @@ from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialPort
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService
-from sonarpost.simulation.channel.config import EmulatorConfig, ModemSite
-from sonarpost.simulation.channel.emulator import ChannelEmulator
 
 IN, TX, RX = keys.image_encoded("uuv-1"), keys.acoustic_tx("uuv-1"), keys.acoustic_rx("vessel-1")
 CONTACT = Contact(contact_id="c", vehicle_id="uuv-1", lat_deg=56.4, lon_deg=-5.6, atd_confidence=1.5, channel="port")

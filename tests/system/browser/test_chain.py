@@ -15,6 +15,7 @@ from builders.services import ModemPair, ServiceRunner, modem_pair, runner
 
 from sonarpost import keys, wire
 from sonarpost.codec.emb.codec import EmbCodec
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.messages import Command, Contact, Decision, EncodedImage, Pixels
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
@@ -29,7 +30,6 @@ from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 
 __all__ = ["modem_pair", "runner"]
 

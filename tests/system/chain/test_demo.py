@@ -15,8 +15,8 @@ from PIL import Image
 
 from sonarpost.cli.demo.settings import UUV_ADDRESS
 from sonarpost.cli.main import main
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import write_png, write_tiff
 from sonarpost.sonar.xtf_writer import write_xtf
 

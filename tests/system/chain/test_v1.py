@@ -8,8 +8,8 @@ import pytest
 from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.demo.settings import STREAM_BYTES, UUV, VESSEL
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.messages import Command
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
 pytestmark = pytest.mark.chain

@@ -25,10 +25,10 @@ from sonarpost.cli.demo.watch import Watcher
 from sonarpost.cli.progress import progress_console
 from sonarpost.cli.shared import add_fit_option, add_survey_options, print_notes, survey_options_of
 from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.extensions.simulation.modem.emulated import EMULATED
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.modem.registry import DEFAULT_DRIVER, modem_driver
-from sonarpost.simulation.modem.emulated import EMULATED
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import SIDE_CAR_SUFFIX
 from sonarpost.sonar.readers import open_survey, recording_parts, supported_suffixes
 from sonarpost.sonar.survey import Survey

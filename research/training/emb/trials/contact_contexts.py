@@ -33,8 +33,8 @@ from sonarpost.codec.emb.transform import HEIGHT, LL, OFFSET, ORIENT, STRIDE, WI
 from sonarpost.codec.interface import Image
 from sonarpost.codec.jit import jit
 from sonarpost.detection.snippets import to_grey
-from sonarpost.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 
 I16 = npt.NDArray[np.int16]
 I32 = npt.NDArray[np.int32]

@@ -1,0 +1,68 @@
+"""Emulated counterpart of the UDP driver: datagrams travel through the simulated channel as packets.
+
+The driver writes its datagrams to a pseudo-terminal or TCP port. Each data packet takes its nominal air time in the
+channel, and its frames are lost one by one, as those of a modem. This page's emulator does not model a radio.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from sonarpost.errors import SentenceError
+from sonarpost.extensions.simulation.channel.events import AcousticPacket, ArrivalEnded, PacketKind
+from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, PacketModemSettings, airtime_of, good_frames
+from sonarpost.modem.udp.datagram import Datagram, DatagramAssembler, DatagramKind
+from sonarpost.modem.udp.rates import RATES
+
+_ACK_AIRTIME_S = 0.05
+
+
+class UdpRelay(PacketModem):
+    """The channel's end of one station's port."""
+
+    INPUT_PAUSE_S: ClassVar[float] = 5.0  # longer than the longest datagram takes at 9600 bit/s
+
+    def __init__(self, settings: PacketModemSettings) -> None:
+        super().__init__(settings)
+        self._assembler = DatagramAssembler()
+
+    def host_disconnected(self) -> None:
+        """Drop an unfinished datagram."""
+        self._assembler.reset()
+
+    def _on_pause(self) -> None:
+        self._assembler.reset()
+
+    def _read_input(self, now: float) -> None:
+        """Transmit the datagrams of the host; other bytes are ignored, as a network has no answer for them."""
+        data = bytes(self._input)
+        self._input.clear()
+        for item in self._assembler.feed(data):
+            if isinstance(item, SentenceError):
+                continue
+            is_ack = item.kind is DatagramKind.ACK
+            packet = AcousticPacket(
+                PacketKind.ACK if is_ack else PacketKind.DATA,
+                item.source,
+                item.destination,
+                item.rate,
+                _ACK_AIRTIME_S if is_ack else airtime_of(RATES.get(item.rate), _ACK_AIRTIME_S),
+                () if is_ack else tuple(frame or b"" for frame in item.frames),
+                ack_requested=item.kind is DatagramKind.DATA_WITH_ACK,
+                acked_frames=tuple(n for n, frame in enumerate(item.frames, 1) if is_ack and frame is not None),
+                mini=item.number,
+                announced_frames=len(item.frames),
+            )
+            self._transmit(packet)
+
+    def _on_packet(self, arrival: ArrivalEnded, now: float) -> bytes:
+        packet = arrival.transmission.packet
+        if packet.kind is PacketKind.ACK:
+            kind = DatagramKind.ACK
+            numbers = range(1, packet.announced_frames + 1)
+            frames: list[bytes | None] = [b"" if n in packet.acked_frames else None for n in numbers]
+        else:
+            kind = DatagramKind.DATA_WITH_ACK if packet.ack_requested else DatagramKind.DATA
+            frames = good_frames(arrival)
+        datagram = Datagram(kind, packet.source, packet.destination, packet.rate, packet.mini, tuple(frames))
+        return datagram.pack()
