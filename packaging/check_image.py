@@ -13,11 +13,11 @@ import pkgutil
 import numpy as np
 
 import sonarpost
-from sonarpost.cli.parsing.commands import EXTRAS
+from sonarpost.cli.parsing.commands import all_extras
 from sonarpost.codec import codec_names, decode, encode
 from sonarpost.codec.jit import COMPILE_S
 
-OPTIONAL = ("matplotlib", "numba", "pillow_jxl", *EXTRAS)
+OPTIONAL = ("matplotlib", "numba", "pillow_jxl", *all_extras())
 """Packages that the image need not have."""
 
 

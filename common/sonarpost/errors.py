@@ -86,10 +86,6 @@ class StoredFileError(BadInputError):
     """A record file of c2 cannot be read, or does not match its name."""
 
 
-class McapFileError(BadInputError):
-    """An MCAP file cannot be read, or is incomplete."""
-
-
 class QueryRefusedError(SonarpostError):
     """c2 does not accept a query; the text is its error reply."""
 

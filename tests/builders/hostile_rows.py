@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from random import Random
 from typing import Literal
@@ -20,6 +21,7 @@ from typing import Literal
 import msgpack
 import zenoh
 
+from builders.common import REPOSITORY
 from builders.exports import image as contact_image
 from builders.hostile_site import HOSTILE, TOKEN, Site, coded_part, message, threads
 from builders.short_messages import with_crc
@@ -400,6 +402,12 @@ def hostile_recordings(site: Site) -> Iterator[None]:
     yield
 
 
+def rows() -> list[Row]:
+    """Return the attacks on the core, and those of `attacks.py` of the tests of each extension."""
+    names = sorted(path.parent.name for path in REPOSITORY.glob("tests/extensions/*/attacks.py"))
+    return [*ROWS, *(row for name in names for row in import_module(f"extensions.{name}.attacks").ROWS)]
+
+
 ROWS: tuple[Row, ...] = (
     Row(("zenoh:*/inbox/{vessel}/part",), "vessel", "claim", records_that_claim_pixels),
     Row(("zenoh:*/inbox/{vessel}/part",), "vessel", "claim", images_of_512_pixels),
@@ -505,7 +513,6 @@ ROWS: tuple[Row, ...] = (
     Row(("queryable:archive.codebook_transfer",), "shore", "junk", "tests/services/test_codebook_transfer.py"),
     Row(("subscriber:bus.catch_up", "subscriber:cli.c2.watch"), "vessel", "junk", "tests/cli/test_c2_live.py"),
     Row(("subscriber:monitoring.fleet",), "vessel", "junk", "tests/monitoring/test_fleet.py"),
-    Row(("subscriber:cli.record",), "vessel", "flood", "tests/cli/test_record.py"),
     Row(("port:runtime.udp_port",), "another host", "junk", "tests/modem/test_udp.py"),
     Row(("port:cli.metrics",), "client", "slow", "tests/monitoring/test_metrics.py"),
     Row(("folder:platform.state_dir",), "a damaged disk", "junk", "tests/runtime/test_store_damage.py"),

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
-from builders.common import free_port
+from builders.unreached_router import check_unreached_router
 
 
 @pytest.mark.parametrize(
@@ -16,25 +13,10 @@ from builders.common import free_port
         "c2 cot udp://127.0.0.1:9",
         "c2 alert --webhook http://127.0.0.1:9 --state {folder}/alerts.db",
         "c2 comment uuv-1/AAAA --vessel vessel-1 --timeout 0.1",
-        "record {folder}/new.mcap",
-        "replay {folder}/records.mcap",
-        "replay {folder}/records.mcap --to-c2",
         "status --interval 0.1",
         "status --interval 0.1 --json",
         "metrics --port 0",
     ],
 )
 def test_reason_is_printed_without_verbosity(arguments, tmp_path):
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    words = [*arguments.format(folder=tmp_path).split(), "--router", endpoint]
-    command = [sys.executable, "-m", "sonarpost.cli.main", *words]
-    lines = []
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
-        try:
-            for line in process.stdout:
-                lines.append(line)
-                if f"no connection: {endpoint}: Connection refused" in line:
-                    return
-        finally:
-            process.kill()
-    pytest.fail("".join(lines))
+    check_unreached_router(arguments.format(folder=tmp_path))

@@ -6,14 +6,14 @@ import os
 import time
 
 import pytest
-from builders.hostile_rows import ROWS
+from builders.hostile_rows import rows
 from builders.hostile_site import running_site
 
 pytestmark = pytest.mark.system
 
 ATTACK_S = 4.0
 WORKERS = int(os.environ.get("SONARPOST_HOSTILE_WORKERS", "1"))
-ATTACKS = [row for row in ROWS if callable(row.function)]
+ATTACKS = [row for row in rows() if callable(row.function)]
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from sonarpost import __version__
-from sonarpost.cli.parsing.commands import COMMANDS, EXTRAS, added_commands
+from sonarpost.cli.parsing.commands import COMMANDS, added_commands, all_extras
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.errors import SonarpostError
 from sonarpost.stop_signals import exit_process
@@ -115,7 +115,7 @@ def exit_status(run: Callable[[], int], prog: str = "sonarpost", needed_by: str 
             return 0
         return _failed(prog, error)
     except ModuleNotFoundError as error:
-        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        extra = all_extras().get((error.name or "").partition(".")[0])
         if extra is None:
             raise
         return _failed(needed_by or prog, error, f"needs the extra {extra}: pip install 'sonarpost[{extra}]'")

@@ -24,11 +24,19 @@ from pathlib import Path
 import pytest
 from builders.common import REPOSITORY
 
-from sonarpost.cli.main import COMMANDS, parser
+from sonarpost.cli.main import parser
+from sonarpost.cli.parsing.commands import all_examples
 
 PAGES = sorted(
     path.relative_to(REPOSITORY).as_posix()
-    for pattern in ("*.md", "docs/**/*.md", "services/*/README.md", "examples/README.md", "research/**/README.md")
+    for pattern in (
+        "*.md",
+        "docs/**/*.md",
+        "services/*/README.md",
+        "common/sonarpost/extensions/*/README.md",
+        "examples/README.md",
+        "research/**/README.md",
+    )
     for path in REPOSITORY.glob(pattern)
     if path.name != "CHANGELOG.md"
 )
@@ -107,7 +115,7 @@ def usage_error(arguments, capsys):
 
 
 def test_commands_have_valid_arguments(capsys):
-    names = "|".join(COMMANDS)
+    names = "|".join({name.split()[0] for name in all_examples()})
     span = re.compile(rf"`(sonarpost (?:{names})\b[^`\[…|{{]*|python -m research\.[^`\[…|{{]*)`")
     for page in PAGES:
         text = (REPOSITORY / page).read_text(encoding="utf-8")

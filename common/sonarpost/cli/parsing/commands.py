@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint
 from typing import TYPE_CHECKING, Any, Final
@@ -21,8 +21,6 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "router": ("cli.run", "run an embedded Zenoh router"),
     "status": ("cli.status", "show the services of all platforms, live"),
     "c2": ("cli.c2", "list, export and watch the contacts of a shore site; send commands"),
-    "record": ("cli.record", "record the keys of a router into an MCAP file"),
-    "replay": ("cli.record", "publish the records of an MCAP file again, or send them to a c2"),
     "dataset": ("cli.dataset", "training data from the verdicts of operators"),
     "store": (
         "cli.store",
@@ -57,11 +55,13 @@ class Command:
         summary: One line for the list of commands.
         parser: `module:function`; the function adds the parser of the command to the group of parsers that it gets.
         examples: Arguments of an example by command, as `EXAMPLES`.
+        extras: Package that the command needs -> the extra that installs it, as `EXTRAS`.
     """
 
     summary: str
     parser: str
     examples: Mapping[str, str]
+    extras: Mapping[str, str] = field(default_factory=dict)
 
     def add(self, subparsers: argparse._SubParsersAction[Any]) -> None:
         """Import the command and add its parser."""
@@ -72,9 +72,6 @@ EXTRAS: Final[Mapping[str, str]] = {
     "starlette": "console",
     "uvicorn": "console",
     "matplotlib": "research",
-    "lz4": "mcap",
-    "mcap": "mcap",
-    "zstandard": "mcap",
     "paho": "mqtt",
 }
 """Package -> the extra that installs it."""
@@ -93,8 +90,6 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "c2 migrate": "c2 migrate --config shore.toml --archive out",
     "c2 command": "c2 command uuv-1/0001 --vessel vessel-1 --kind refine",
     "c2 comment": "c2 comment uuv-1/0001 --vessel vessel-1 --verdict mine_like --remark 'same as last year'",
-    "record": "record dive.mcap --router tcp/127.0.0.1:7447 --duration 3600",
-    "replay": "replay dive.mcap --router tcp/127.0.0.1:7447 --to-c2 --speed 0",
     "dataset export": "dataset export --archive demo-out/shore/images --out dataset",
     "store check": "store check state/relay.db",
     "store quarantine": "store quarantine state/c2.db --requeue",
@@ -166,4 +161,12 @@ def all_examples() -> dict[str, str]:
     found = dict(EXAMPLES)
     for added in added_commands().working().values():
         found |= added.examples
+    return found
+
+
+def all_extras() -> dict[str, str]:
+    """Return the extras of all commands by package."""
+    found = dict(EXTRAS)
+    for added in added_commands().working().values():
+        found |= added.extras
     return found

@@ -23,8 +23,8 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from sonarpost import keys, messages, wire
-from sonarpost.errors import McapFileError
-from sonarpost.export.foxglove import SCHEMAS
+from sonarpost.errors import BadInputError
+from sonarpost.extensions.mcap.foxglove import SCHEMAS
 from sonarpost.messages import Record
 
 MAX_RECORD_BYTES: Final = 64 << 20
@@ -43,6 +43,10 @@ _ENCODING: Final = "zenoh_encoding"
 _RECORDS: Final[Mapping[str, type[Record]]] = {
     wire.encoding_of(t): t for t in vars(messages).values() if isinstance(t, type) and issubclass(t, Record) and t.TYPE
 }
+
+
+class McapFileError(BadInputError):
+    """An MCAP file cannot be read, or is incomplete."""
 
 
 class McapRecording:

@@ -23,7 +23,8 @@ from sonarpost.delivery.client import deliver
 from sonarpost.delivery.protocol import attachment, watcher_origin
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.errors import BadInputError, ConfigError, PayloadError
-from sonarpost.export.foxglove import (
+from sonarpost.export.live import LiveContacts
+from sonarpost.extensions.mcap.foxglove import (
     COMPRESSED_IMAGE,
     GEOJSON,
     LOCATION_FIX,
@@ -31,13 +32,12 @@ from sonarpost.export.foxglove import (
     contact_map,
     location_fix,
 )
-from sonarpost.export.live import LiveContacts
 from sonarpost.messages import CodedImage, Decision, ImagePart, ReconstructedImage, Relayed
 from sonarpost.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
     # Imported when a command runs: they need the extra `mcap`.
-    from sonarpost.export.mcap_file import McapRecording, RecordedMessage
+    from sonarpost.extensions.mcap.mcap_file import McapRecording, RecordedMessage
 
 MAX_QUEUED_BYTES: Final = 256 << 20
 """Received records that wait to be written; further ones are dropped, and counted."""
@@ -47,8 +47,8 @@ POLL_S: Final = 0.2
 EXIT_INCOMPLETE: Final = 1
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add both commands."""
+def add_record(subparsers: Subparsers) -> None:
+    """Add the command `record`."""
     record = subparsers.add_parser(
         "record",
         help="record the keys of a router into an MCAP file",
@@ -66,6 +66,9 @@ def add_parser(subparsers: Subparsers) -> None:
     record.add_argument("--duration", type=float, metavar="S", help="end after this time")
     record.set_defaults(run=run_record)
 
+
+def add_replay(subparsers: Subparsers) -> None:
+    """Add the command `replay`."""
     replay = subparsers.add_parser(
         "replay",
         help="publish the records of an MCAP file again, or send them to a c2",
@@ -168,7 +171,7 @@ class ContactChannels:
 def run_record(parsed: argparse.Namespace) -> int:
     """Record until interrupted or until the duration has passed; return 0, or 1 if records were dropped."""
     # Imported lazily: they need the extra `mcap`.
-    from sonarpost.export.mcap_file import McapRecording, RecordedMessage  # noqa: PLC0415
+    from sonarpost.extensions.mcap.mcap_file import McapRecording, RecordedMessage  # noqa: PLC0415
 
     endpoints, tls = router_of(parsed)
     expressions = [_key_expression(text) for text in parsed.key or [keys.everything()]]
@@ -220,7 +223,7 @@ def _key_expression(text: str) -> str:
 
 def run_replay(parsed: argparse.Namespace) -> int:
     """Replay a file; return 0, or 1 if c2 has refused records."""
-    from sonarpost.export.mcap_file import read_messages  # noqa: PLC0415  as in `run_record`
+    from sonarpost.extensions.mcap.mcap_file import read_messages  # noqa: PLC0415  as in `run_record`
 
     if not parsed.speed >= 0:
         raise ConfigError("command line", "--speed", parsed.speed, "0 or more")

@@ -18,10 +18,10 @@ from mcap.writer import CompressionType, Writer
 from PIL import Image
 
 from sonarpost import keys, wire
-from sonarpost.errors import McapFileError
-from sonarpost.export import mcap_file
 from sonarpost.export.contacts import load_contacts
-from sonarpost.export.foxglove import (
+from sonarpost.export.live import LiveContacts
+from sonarpost.extensions.mcap import mcap_file
+from sonarpost.extensions.mcap.foxglove import (
     COMPRESSED_IMAGE,
     GEOJSON,
     LOCATION_FIX,
@@ -30,8 +30,7 @@ from sonarpost.export.foxglove import (
     contact_map,
     location_fix,
 )
-from sonarpost.export.live import LiveContacts
-from sonarpost.export.mcap_file import McapRecording, RecordedMessage, read_messages
+from sonarpost.extensions.mcap.mcap_file import McapFileError, McapRecording, RecordedMessage, read_messages
 from sonarpost.messages import Decision, ReconstructedImage
 
 IMAGE_KEY = keys.shore_image("vessel-1")

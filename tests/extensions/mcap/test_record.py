@@ -11,6 +11,7 @@ import pytest
 import zenoh
 from builders.common import eventually, publish_once
 from builders.exports import decision, image
+from builders.unreached_router import check_unreached_router
 from mcap.reader import make_reader
 
 from sonarpost import keys, wire
@@ -18,10 +19,10 @@ from sonarpost.archive.decoder import Decoder
 from sonarpost.archive.journal import Accepted
 from sonarpost.bus.session import client_config
 from sonarpost.cli.main import main
-from sonarpost.cli.record import ContactChannels, RecordQueue, paced
 from sonarpost.codec.registry import default_registry
-from sonarpost.export.foxglove import COMPRESSED_IMAGE, GEOJSON, LOCATION_FIX
-from sonarpost.export.mcap_file import McapRecording, RecordedMessage, read_messages
+from sonarpost.extensions.mcap.foxglove import COMPRESSED_IMAGE, GEOJSON, LOCATION_FIX
+from sonarpost.extensions.mcap.mcap_file import McapRecording, RecordedMessage, read_messages
+from sonarpost.extensions.mcap.record import ContactChannels, RecordQueue, paced
 from sonarpost.messages import CodedImage, Decision, ReceivedImage, ReconstructedImage
 from sonarpost.services.c2.accepted import accepted_fields, payload_of
 from sonarpost.services.c2.config import C2Config
@@ -257,9 +258,16 @@ def test_map_is_written_at_most_every_ten_seconds(tmp_path):
 
 @pytest.mark.parametrize("missing", ["mcap", "zstandard"])
 def test_missing_extra_is_one_line(missing, tmp_path, monkeypatch, capsys):
-    for name in [n for n in sys.modules if n.partition(".")[0] == missing or n == "sonarpost.export.mcap_file"]:
+    for name in [
+        n for n in sys.modules if n.partition(".")[0] == missing or n == "sonarpost.extensions.mcap.mcap_file"
+    ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
     assert main(["replay", str(tmp_path / "a.mcap")]) == 2
     expected = "sonarpost replay: needs the extra mcap: pip install 'sonarpost[mcap]'\n"
     assert capsys.readouterr().err == expected
+
+
+@pytest.mark.parametrize("arguments", ["record {}/new.mcap", "replay {}/a.mcap", "replay {}/a.mcap --to-c2"])
+def test_reason_is_printed_without_verbosity(arguments, tmp_path):
+    check_unreached_router(arguments.format(tmp_path))
