@@ -17,6 +17,7 @@ from urllib.parse import quote, urlsplit
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from sonarpost.extensions.training.simulator import RATE, VESSEL, TrainingSimulator
 from sonarpost.messages import Comment
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.state import ConsoleState
@@ -25,7 +26,6 @@ from sonarpost.services.console.store.database import Actor, Database, Displayed
 from sonarpost.services.console.store.decisions import DecisionInput
 from sonarpost.services.console.store.serialisers import Json
 from sonarpost.services.console.store.users import Users
-from sonarpost.services.console.training.simulator import RATE, VESSEL, TrainingSimulator
 from sonarpost.services.console.web.access import COOKIE, cookie_name
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 

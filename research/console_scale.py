@@ -28,11 +28,11 @@ from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.config import PlatformConfig
+from sonarpost.extensions.training.contacts import simulated_contacts
+from sonarpost.extensions.training.simulator import VESSEL, TrainingSimulator
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
 from sonarpost.services.console.store.users import FILE_NAME, Users
-from sonarpost.services.console.training.contacts import simulated_contacts
-from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator
 
 PASSWORD = "a password for the benchmark"
 LISTS = (

@@ -25,12 +25,12 @@ from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig
+from sonarpost.extensions.training.contacts import simulated_contacts
+from sonarpost.extensions.training.simulator import VESSEL, TrainingSimulator
 from sonarpost.messages import ReconstructedImage
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
 from sonarpost.services.console.store.users import FILE_NAME, Users
-from sonarpost.services.console.training.contacts import simulated_contacts
-from sonarpost.services.console.training.simulator import VESSEL, TrainingSimulator
 from sonarpost.services.console.web.access import COOKIE, cookie_name
 
 # Time of the first row, in ms since the start of the navigation; time of an awaited change, in ms since 1970.

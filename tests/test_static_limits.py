@@ -39,8 +39,8 @@ THREADS = {
     "common/sonarpost/runtime/serial_port.py": "guarded: reads a port",
     "common/sonarpost/runtime/service.py": "`start_thread`, whose exceptions stop the service; probe of the router",
     "common/sonarpost/stop_signals.py": "reads signals",
-    "services/console/training/calibrated_watch.py": "guarded: counts calibrated contacts",
-    "services/console/training/simulator.py": "guarded: simulator of a training",
+    "common/sonarpost/extensions/training/calibrated_watch.py": "guarded: counts calibrated contacts",
+    "common/sonarpost/extensions/training/simulator.py": "guarded: simulator of a training",
     "services/console/web/server.py": "web server",
 }
 PROCESSES = {

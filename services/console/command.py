@@ -1,4 +1,4 @@
-"""`sonarpost console`: users, the training console, and the view of a folder of c2."""
+"""`sonarpost console`: users, and the view of a folder of c2."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from sonarpost.archive.reader import place_of
 from sonarpost.archive.shore_index import FILE_NAME as FILE_NAME_OF_INDEX
+from sonarpost.cli.parsing.commands import add_actions
 from sonarpost.config import load
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.keys import SHORE
@@ -29,24 +30,16 @@ if TYPE_CHECKING:
     from sonarpost.services.console.state import ConsoleState
     from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
-TRAINING_USERS = (("watch", "observer"), ("op", "operator"), ("expert", "expert"))
-
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command and its actions."""
-    summary = "manage the users of the console; serve simulated contacts for training"
+    summary = "manage the users of the console; serve the contacts of a folder"
     parser = subparsers.add_parser("console", help=summary, description=f"{summary.capitalize()}.")
     parser.set_defaults(run=run)
-    page = parser.add_mutually_exclusive_group()
-    page.add_argument("--training", type=int, metavar="N", help="serve a training console with N simulated contacts")
-    page.add_argument("--view", metavar="DIR", help="serve the contacts in a folder or database of c2, read only")
-    parser.add_argument("--port", type=int, help="port of the page (default: 8470, or any if it is in use; 0: any)")
-    parser.add_argument("--state", type=Path, metavar="DIR", help="folder for the training data (default: none)")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the simulation (default: 1)")
-    parser.add_argument("--interval", type=float, default=6.0, metavar="S", help="time between packets (default: 6)")
-    parser.add_argument("--open", action="store_true", help="open the log-in link in the default browser")
-    parser.add_argument("--password", help="password of the users of --training or --view (default: random)")
+    parser.add_argument("--view", metavar="DIR", help="serve the contacts in a folder or database of c2, read only")
+    add_page_options(parser)
     actions = parser.add_subparsers(metavar="ACTION", required=False)
+    add_actions(actions, "console")
     user = actions.add_parser("user", help="manage the users of a console")
     user_actions = user.add_subparsers(metavar="ACTION", required=True)
     for name, run_action, summary in (
@@ -69,6 +62,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         action.set_defaults(run_action=run_action)
 
 
+def add_page_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `serve_page`."""
+    parser.add_argument("--port", type=int, help="port of the page (default: 8470, or any if it is in use; 0: any)")
+    parser.add_argument("--open", action="store_true", help="open the log-in link in the default browser")
+    parser.add_argument("--password", help="password of the users of the page (default: random)")
+
+
 def run(parsed: argparse.Namespace) -> int:
     """Run `sonarpost console`; return the exit status.
 
@@ -85,14 +85,9 @@ def run(parsed: argparse.Namespace) -> int:
         with closing(Users(folder / FILE_NAME)) as users:
             parsed.run_action(parsed, users, config)
         return 0
-    if parsed.view is not None:
-        return _run_view(parsed)
-    if parsed.training is None:
-        expected = "`user …`, --training N or --view DIR; the service: `sonarpost run console`"
-        raise ConfigError("console", "", "no action", expected)
-    if not 1 <= parsed.training <= 100_000:
-        raise ConfigError("console", "--training", parsed.training, "1 to 100000")
-    return _run_training(parsed)
+    if parsed.view is None:
+        raise ConfigError("console", "", "no action", "an action or --view DIR; the service: `sonarpost run console`")
+    return _run_view(parsed)
 
 
 def _read_password(parsed: argparse.Namespace) -> str:
@@ -134,28 +129,6 @@ def _list(_parsed: argparse.Namespace, users: Users, _config: ConsoleConfig) -> 
         print(f"{user.name:<24} {user.role:<10} password of {changed:%Y-%m-%d}")
 
 
-def _run_training(parsed: argparse.Namespace) -> int:
-    # Imported lazily, as below: the management of users needs neither the codecs nor the web server.
-    from sonarpost.services.console.state import ConsoleState  # noqa: PLC0415
-    from sonarpost.services.console.training.simulator import RATE, VESSEL, TrainingSimulator  # noqa: PLC0415
-
-    config = ConsoleConfig(vessel_lat_deg=56.4495, vessel_lon_deg=-5.6012, assumed_rate=RATE)
-    with ExitStack() as stack:
-        scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="sonarpost-training-"))
-        folder: Path = parsed.state or Path(scratch)
-        state = ConsoleState(config, stack.enter_context(closing(Database(folder / DATABASE_NAME))))
-        simulator = TrainingSimulator(state, parsed.training, parsed.seed, parsed.interval)
-
-        def start() -> None:
-            stack.callback(simulator.stop)
-            simulator.load_backlog(parsed.training * 2 // 3)
-            simulator.start()
-
-        note = "All contacts are simulated. Ctrl-C ends the training."
-        _serve(parsed, state, folder, TRAINING_USERS, VESSEL, note, start)
-    return 0
-
-
 def _run_view(parsed: argparse.Namespace) -> int:
     from sonarpost.services.console.service import stored_records  # noqa: PLC0415
     from sonarpost.services.console.state import ConsoleState  # noqa: PLC0415
@@ -175,11 +148,11 @@ def _run_view(parsed: argparse.Namespace) -> int:
                 state.store_decision(record)
         note = f"{state.counts().total} contacts in {place}, read only. Ctrl-C ends the page."
         # An observer: a comment could not be sent.
-        _serve(parsed, state, folder, (("watch", "observer"),), SHORE, note)
+        serve_page(parsed, state, folder, (("watch", "observer"),), SHORE, note)
     return 0
 
 
-def _serve(
+def serve_page(
     parsed: argparse.Namespace,
     state: ConsoleState,
     folder: Path,
@@ -187,8 +160,20 @@ def _serve(
     platform_id: str,
     note: str,
     start: Callable[[], None] = lambda: None,
+    *,
+    training: bool = False,
 ) -> None:
-    """Print address, users and password, and serve the page until a signal; `start` is called before.
+    """Print address, users and password, and serve the page until a signal.
+
+    Args:
+        parsed: Options of `add_page_options`.
+        state: State of the page.
+        folder: Folder for the database of the users.
+        accounts: Names and roles of the users.
+        platform_id: Platform that the page shows.
+        note: Line that is printed.
+        start: Called when the page is served.
+        training: Whether all contacts are simulated.
 
     Raises:
         PortError: The port of `--port` is in use.
@@ -200,9 +185,8 @@ def _serve(
         password = parsed.password or secrets.token_urlsafe(9)
         for name, role in accounts:
             users.add(name, role, password)
-        app = ConsoleApp(state, users, platform_id, training=parsed.training is not None)
+        app = ConsoleApp(state, users, platform_id, training=training)
         server = _server(app, state.config, parsed.port)
-        # Of the users of a training, the operator.
         name = next((name for name, role in accounts if role == "operator"), accounts[0][0])
         link = login_link(server.address, users.make_login_link(name))
         print(f"{server.address}  user: {' or '.join(name for name, _ in accounts)}  password: {password}")

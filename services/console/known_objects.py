@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from typing import Protocol
 
 from sonarpost.messages import CommandKind, ReconstructedImage
+from sonarpost.registry import Registry
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store import requests, truth
 from sonarpost.services.console.store.contacts import find_contact
@@ -29,6 +33,25 @@ class SealedRequest:
     kind: CommandKind
     age_s: float
     airtime_s: float | None
+
+
+class Watch(Protocol):
+    """Adds sealed contacts to the queue of a console. Created with the state of the console and their share."""
+
+    def start(self) -> None:
+        """Start to add contacts and to answer their requests."""
+
+    def stop(self) -> None:
+        """Stop."""
+
+    def contact_arrived(self, image: ReconstructedImage, now_s: float) -> None:
+        """Note a new contact of a vehicle; `now_s` is monotonic."""
+
+
+@cache
+def watches() -> Registry[Callable[..., Watch]]:
+    """Return the kinds of watch: see `sonarpost.registry`. The group of entry points is `sonarpost.watches`."""
+    return Registry("sonarpost.watches", "a class of watches", lambda found, _: callable(found), {})
 
 
 class KnownObjects:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import zenoh
@@ -40,15 +40,13 @@ from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.known_objects import Watch, watches
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.database import DATABASE_NAME, ID_COLUMN, RECORD_TYPES, Database, Table
 from sonarpost.services.console.store.unsent import UnsentRecord
 from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 from sonarpost.sonar.image_files import read_image
-
-if TYPE_CHECKING:
-    from sonarpost.services.console.training.calibrated_watch import CalibratedWatch
 
 log = logging.getLogger(__name__)
 
@@ -99,14 +97,10 @@ class ConsoleService(Service[ConsoleConfig]):
             platform_id=platform.id, reached=False, changed_utc_s=time.time(), detail=", ".join(platform.router)
         )
         self._retention = Retention(self._apply_retention, self.stopping)
-        self._watch: CalibratedWatch | None = None
+        self._watch: Watch | None = None
         if config.calibration_share > 0:
-            # Imported lazily: it loads the simulation and the detector.
-            from sonarpost.services.console.training import calibrated_watch  # noqa: PLC0415
-
-            self._watch = calibrated_watch.CalibratedWatch(
-                self.state, config.calibration_share, count=lambda: self.count("sealed_contacts")
-            )
+            make = watches().get("calibrated")
+            self._watch = make(self.state, config.calibration_share, count=lambda: self.count("sealed_contacts"))
 
     @property
     def address(self) -> str:

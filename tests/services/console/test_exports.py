@@ -236,6 +236,21 @@ def test_stop_ends_a_running_export(console):
     assert error_of(watch.get("/api/export/contacts.kmz")) == (503, "busy")
 
 
+SERVE = """
+from argparse import Namespace
+from pathlib import Path
+from sonarpost.services.console.command import serve_page
+from sonarpost.services.console.config import ConsoleConfig
+from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.store.database import Database
+
+folder = Path({folder!r})
+state = ConsoleState(ConsoleConfig(), Database(folder / "console-review.db"))
+options = Namespace(port=0, open=False, password={password!r})
+serve_page(options, state, folder, [("watch", "observer")], "vessel-1", "")
+"""
+
+
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("end", "ending"), [(signal.SIGTERM, "kmz"), (signal.SIGKILL, "kmz"), (signal.SIGKILL, "gpkg")]
@@ -247,8 +262,7 @@ def test_no_file_remains_after_the_end_of_the_process(tmp_path, end, ending):
     records = [image_record(f"{number:04X}", first_utc_s=1_700_000_000.0 + number) for number in range(150)]
     ConsoleState(ConsoleConfig(), database).store_images(records)
     database.close()
-    words = ["console", "--training", "1", "--port", "0", "--state", str(state), "--password", PASSWORD]
-    code = f"import sys; from sonarpost.cli.main import main; sys.exit(main({words!r}))"
+    code = SERVE.format(folder=str(state), password=PASSWORD)
     before = {path.name for path in state.iterdir()}
     with subprocess.Popen(
         [sys.executable, "-c", code], env={**os.environ, "TMPDIR": str(temporary)}, stdout=subprocess.PIPE, text=True

@@ -105,7 +105,7 @@ def test_the_whole_chain_runs_without_an_extra(minimal, tmp_path):
 
 def test_a_command_without_its_extra_says_how_to_install_it(minimal, tmp_path):
     for command, *arguments in (
-        ("console", "--training", "3"),
+        ("console", "training", "3"),
         ("run", "console", "--config", "x.toml"),
         ("demo", "--console"),
     ):

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from sonarpost.errors import SonarpostError
 from sonarpost.export.contacts import contact_uid
+from sonarpost.extensions.training import sealed_images
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.logs import kv
 from sonarpost.messages import Contact, ReconstructedImage
@@ -28,7 +29,6 @@ from sonarpost.services.console.known_objects import KnownObjects, SealedRequest
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.association import looks_near
 from sonarpost.services.console.store.truth import Truth
-from sonarpost.services.console.training import sealed_images
 from sonarpost.sonar.survey import Side
 
 log = logging.getLogger(__name__)

@@ -12,6 +12,11 @@ from dataclasses import dataclass, field, replace
 from sonarpost import keys, wire
 from sonarpost.codec.region import RegionBox
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.training.contacts import (
+    VEHICLES,
+    SimulatedContact,
+    simulated_contacts,
+)
 from sonarpost.link.frames.paper.frame import format_image_id
 from sonarpost.messages import (
     AcousticFrame,
@@ -33,11 +38,6 @@ from sonarpost.services.console.fleet import DETECTOR
 from sonarpost.services.console.known_objects import KnownObjects
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.truth import Truth
-from sonarpost.services.console.training.contacts import (
-    VEHICLES,
-    SimulatedContact,
-    simulated_contacts,
-)
 
 VESSEL = "training"
 RATE = 1

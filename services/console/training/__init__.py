@@ -1,1 +1,0 @@
-"""Training mode: simulated contacts, vehicles and shore site."""
