@@ -39,8 +39,6 @@ THREADS = {
     "common/sonarpost/runtime/serial_port.py": "guarded: reads a port",
     "common/sonarpost/runtime/service.py": "`start_thread`, whose exceptions stop the service; probe of the router",
     "common/sonarpost/stop_signals.py": "reads signals",
-    "common/sonarpost/extensions/training/calibrated_watch.py": "guarded: counts calibrated contacts",
-    "common/sonarpost/extensions/training/simulator.py": "guarded: simulator of a training",
     "services/console/web/server.py": "web server",
 }
 PROCESSES = {
@@ -82,7 +80,7 @@ READS = {
     "common/sonarpost/sonar/options.py": "its size is compared with 64 KiB first",
     "services/c2/archive.py": "decision of the archive",
     "services/c2/short_messages.py": OWN_SETTINGS,
-    "services/console/command.py": "keyboard",
+    "common/sonarpost/cli/console.py": "keyboard",
     "services/console/web/installation_routes.py": SHIPPED,
 }
 QUEUES = {

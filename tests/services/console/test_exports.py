@@ -239,7 +239,7 @@ def test_stop_ends_a_running_export(console):
 SERVE = """
 from argparse import Namespace
 from pathlib import Path
-from sonarpost.services.console.command import serve_page
+from sonarpost.cli.console import serve_page
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.database import Database

@@ -28,7 +28,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     ),
     "config": ("cli.deployment.config_files", "print an example configuration; check a configuration file"),
     "install-units": ("cli.deployment.install_units", "write the systemd units of a platform"),
-    "console": ("services.console.command", "manage the users of the console; serve the contacts of a folder"),
+    "console": ("cli.console", "manage the users of the console; serve the contacts of a folder"),
     "metrics": ("cli.metrics", "serve the health of all platforms to Prometheus"),
     "simulate": ("cli.simulate", "write a simulated side-scan survey as XTF"),
     "survey": ("cli.survey", "describe, draw, view and export recordings of side-scan sonars"),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sonarpost.errors import ConfigError
-from sonarpost.services.console.command import add_page_options, serve_page
+from sonarpost.cli.console import add_page_options, serve_page
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.database import DATABASE_NAME, Database
 
