@@ -445,7 +445,7 @@ ROWS: tuple[Row, ...] = (
     Row(("port:bearers.rockblock",), "terminal", "junk", junk_messages, "messages_of_terminal"),
     Row(("port:bearers.rockblock",), "terminal", "replay", message_again, "messages_of_terminal"),
     Row(("route:GET /report*", "route:* /api/export*"), "observer", "flood", reports_of_observer, "requests_of_user"),
-    Row(("port:services.console.*",), "client", "slow", slow_browsers, "requests_of_user"),
+    Row(("port:services.console.*", "port:cli.console"), "client", "slow", slow_browsers, "requests_of_user"),
     Row(("route:GET /events",), "observer", "slow", event_streams, "requests_of_user"),
     Row(("route:POST /api/login*",), "client", "flood", wrong_passwords, "requests_of_user"),
     Row(("route:*",), "observer", "junk", junk_requests, "requests_of_user"),

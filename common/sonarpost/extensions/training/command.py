@@ -8,8 +8,8 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sonarpost.errors import ConfigError
 from sonarpost.cli.console import add_page_options, serve_page
+from sonarpost.errors import ConfigError
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.database import DATABASE_NAME, Database
 
