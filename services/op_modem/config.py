@@ -11,11 +11,9 @@ from sonarpost.errors import ConfigError
 from sonarpost.link.config import ReceiverConfig
 from sonarpost.link.mac import Tdma
 from sonarpost.link.receiver import WireFormat
-from sonarpost.messages import PlatformId
+from sonarpost.messages import Address, PlatformId, RateNumber
 from sonarpost.modem.interface import MAX_ADDRESS, ModemCapabilities
-from sonarpost.runtime.modem_service import Address, ModemServiceConfig, RateNumber
-
-Seconds = Annotated[float, Field(gt=0, le=86400)]
+from sonarpost.runtime.modem_service import ModemServiceConfig, Seconds
 
 
 class OpModemConfig(ModemServiceConfig):

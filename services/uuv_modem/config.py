@@ -10,11 +10,11 @@ from sonarpost.config import ConsumerName, PlatformConfig
 from sonarpost.errors import ConfigError
 from sonarpost.link.config import QueueConfig
 from sonarpost.link.mac import Continuous, Csma, MediumAccess, Polled, Tdma
+from sonarpost.messages import Address, RateNumber
 from sonarpost.modem.interface import ModemCapabilities
-from sonarpost.runtime.modem_service import Address, ModemServiceConfig, RateNumber
+from sonarpost.runtime.modem_service import ModemServiceConfig, Seconds
 
 MIN_STATUS_PERIOD_S = 5.0
-Seconds = Annotated[float, Field(gt=0, le=86400)]
 
 
 class UuvModemConfig(ModemServiceConfig):

@@ -12,9 +12,9 @@ from pydantic import Field, PrivateAttr
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.errors import ConfigError
 from sonarpost.logs import kv
-from sonarpost.messages import AcousticFrame
+from sonarpost.messages import AcousticFrame, Address
 from sonarpost.modem import interface as ev
-from sonarpost.modem.interface import MAX_ADDRESS, MAX_RATE, ModemCapabilities, ModemEvent, PacketSent, RateInfo
+from sonarpost.modem.interface import ModemCapabilities, ModemEvent, PacketSent, RateInfo
 from sonarpost.modem.registry import ModemSettings, modem_driver
 from sonarpost.runtime.modem_port import open_modem_port
 from sonarpost.runtime.modem_runner import ModemRunner
@@ -24,10 +24,7 @@ from sonarpost.security.acoustic_key import UNAUTHENTICATED, link_key
 log = logging.getLogger(__name__)
 
 
-RateNumber = Annotated[int, Field(ge=0, le=MAX_RATE)]
-"""Number of a rate; which numbers exist depends on the modem."""
-Address = Annotated[int, Field(ge=0, le=MAX_ADDRESS)]
-"""Address of a modem; which addresses exist depends on the modem."""
+Seconds = Annotated[float, Field(gt=0, le=86400)]
 
 
 class ModemServiceConfig(ServiceConfig):
