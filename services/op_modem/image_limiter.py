@@ -13,7 +13,7 @@ from typing import Annotated, Final
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import StreamError
 from sonarpost.limits import limit
-from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
+from sonarpost.link.state import Bounds, Errors, PartReader, Parts, SavedCount, pack_part
 from sonarpost.messages import ReceivedImage
 
 MAX_HELD_IMAGES: Final = limit(
@@ -65,9 +65,9 @@ class HeldImage:
     vehicle_id: str
     image_id: str
     first_frame_s: float
-    order: Count
+    order: SavedCount
     is_new: bool
-    cost_bytes: Count
+    cost_bytes: SavedCount
     payload: bytes
 
 

@@ -24,7 +24,7 @@ from sonarpost.bearers.sender import (
 from sonarpost.bearers.short_message import MAX_MESSAGE_BYTES, WINDOW
 from sonarpost.delivery.store import Store
 from sonarpost.errors import BadInputError, DeliveryError, PortError
-from sonarpost.link.state import Count, Word, from_plain, unpack_value
+from sonarpost.link.state import SavedCount, Word, from_plain, unpack_value
 from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import Decision, ReceivedImage
 from sonarpost.runtime.service import UnitOfWork
@@ -83,7 +83,7 @@ class SatelliteUpstream:
         self._sender = ShortMessageSender(epoch, next_seq, after_s=options.after_s if has_radio else 0.0)
         self._sender.restore(items.values(), messages.values(), time.time())
         number = store.read_state(
-            f"{self._prefix}number", lambda data: from_plain(Count, int.from_bytes(data, "big"), _WHERE), 0
+            f"{self._prefix}number", lambda data: from_plain(SavedCount, int.from_bytes(data, "big"), _WHERE), 0
         )
         self._next_number = max(number, self._sender.next_number)
         self._known = {f"{self._prefix}item/{name}" for name in items}

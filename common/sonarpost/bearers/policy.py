@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 import msgpack
 
-from sonarpost.link.state import Count, unpack_value
+from sonarpost.link.state import SavedCount, unpack_value
 
 DAY_S = 86400.0
 
@@ -109,5 +109,5 @@ class ByteBudget:
         Raises:
             BadInputError: They are not valid.
         """
-        counts = unpack_value(tuple[Count, Count, Count, Count], data, "state of the byte budget")
+        counts = unpack_value(tuple[SavedCount, SavedCount, SavedCount, SavedCount], data, "state of the byte budget")
         self.day, self.used_bytes, self.total_bytes, self.total_messages = counts

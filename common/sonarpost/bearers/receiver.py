@@ -19,7 +19,7 @@ from sonarpost.bearers.short_message import (
 )
 from sonarpost.errors import BadInputError
 from sonarpost.limits import limit
-from sonarpost.link.state import Count, Word, unpack_value
+from sonarpost.link.state import SavedCount, Word, unpack_value
 from sonarpost.messages import Decision, ReceivedImage
 
 ACKNOWLEDGE_AFTER_MESSAGES = 16
@@ -180,7 +180,7 @@ class ShortMessageReceiver:
             BadInputError, ValueError: It is not valid; nothing was added.
         """
         if name == _WINDOWS:
-            kind = list[tuple[Word, Word, Word, dict[Word, Word], Count, float]]
+            kind = list[tuple[Word, Word, Word, dict[Word, Word], SavedCount, float]]
             windows = [_Window(*fields) for fields in unpack_value(kind, data, _WHERE)]
             for window in windows:
                 window.acknowledgement()  # checks the numbers

@@ -17,7 +17,7 @@ from sonarpost.link.queue.messages import MessageQueue
 from sonarpost.link.state import Bounds, Errors, Parts
 from sonarpost.modem.interface import MAX_RATE
 
-RateNumber = Annotated[int, Bounds(0, MAX_RATE)]
+SavedRate = Annotated[int, Bounds(0, MAX_RATE)]
 
 _SMOOTHING: Final = 0.2
 
@@ -50,7 +50,7 @@ class OutgoingPacket:
         frames: Its frames.
     """
 
-    rate: RateNumber
+    rate: SavedRate
     frames: tuple[bytes, ...]
 
 

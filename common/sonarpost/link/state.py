@@ -48,7 +48,7 @@ class Bounds(NamedTuple):
     high: float
 
 
-Count = Annotated[int, Bounds(0, 2**62)]
+SavedCount = Annotated[int, Bounds(0, 2**62)]
 Byte = Annotated[int, Bounds(0, 255)]
 Word = Annotated[int, Bounds(0, 2**32 - 1)]
 

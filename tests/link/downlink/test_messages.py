@@ -17,7 +17,7 @@ from sonarpost.link.downlink.status_message import StatusMessage
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments, parse_frame
 
 GOLDEN = GOLDEN_FOLDER / "acoustic-v1" / "messages.json"
-SAMPLES: dict[str, dl.Content] = {
+SAMPLES: dict[str, dl.DownlinkContent] = {
     "refine-192": dl.RefineMessage(0x01020304, 1_790_000_000, 7, 192),
     "refine-all": dl.RefineMessage(0xFFFFFFFF, 1_790_000_001, 65535),
     "resend": dl.ResendMessage(0, 0, 1),

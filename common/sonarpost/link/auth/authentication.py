@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 
 from sonarpost.errors import ConfigError, FrameError
 from sonarpost.link.auth.key import MAX_ADDRESS, AcousticKey, AuthenticationSettings, Direction
-from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
+from sonarpost.link.state import Bounds, Errors, PartReader, Parts, SavedCount, pack_part
 
 WINDOW: Final = 64
 """A frame that arrives late by fewer counters than this is still accepted."""
@@ -40,11 +40,11 @@ class AuthenticationCounts:
         unconfirmed: Frames with a correct tag so far ahead that a second frame must confirm it.
     """
 
-    protected: Count = 0
-    genuine: Count = 0
-    forged: Count = 0
-    replayed: Count = 0
-    unconfirmed: Count = 0
+    protected: SavedCount = 0
+    genuine: SavedCount = 0
+    forged: SavedCount = 0
+    replayed: SavedCount = 0
+    unconfirmed: SavedCount = 0
 
 
 @dataclass(slots=True)
@@ -98,7 +98,7 @@ class AuthenticationState:
     """
 
     key: str
-    limit: Count
+    limit: SavedCount
     counts: AuthenticationCounts
 
 

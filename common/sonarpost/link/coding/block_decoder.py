@@ -21,7 +21,7 @@ from sonarpost.link.frames.v1.payload_objects import (
     entry_shape,
     unpack_object,
 )
-from sonarpost.link.state import SEPARATE, Bounds, Byte, Count
+from sonarpost.link.state import SEPARATE, Bounds, Byte, SavedCount
 
 DecodedObject = Preview | PieceList | MessageObject
 
@@ -67,7 +67,7 @@ class BlockDecoder:
     symbols: dict[int, bytes] = field(default_factory=dict, metadata=SEPARATE)
     descriptor: dict[int, int] = field(default_factory=dict, metadata=SEPARATE)
     layering: Layering | None = None
-    layers: Count = 0
+    layers: SavedCount = 0
     layer_ends: tuple[PieceEnd, ...] = ()
     complete: bool = False
 

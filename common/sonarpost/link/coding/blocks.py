@@ -38,7 +38,7 @@ from sonarpost.link.frames.v1.payload_objects import (
     contact_link,
     entry_shape,
 )
-from sonarpost.link.state import PROGRESS, SEPARATE, Bounds, Byte, Count
+from sonarpost.link.state import PROGRESS, SEPARATE, Bounds, Byte, SavedCount
 
 StreamSpan = tuple[ImageNumber, Byte, StreamPosition, StreamPosition]
 """Number and link of an image, and a part of its stream, [start, stop)."""
@@ -83,7 +83,7 @@ class OutgoingImage:
     added_s: float
     image_id: str = "0000"
     contact_id: str = "?"
-    order: Count = 0
+    order: SavedCount = 0
     sent: StreamPosition = field(default=0, metadata=PROGRESS)
     goal: StreamPosition = field(default=0, metadata=PROGRESS)
     delivered: Ranges = field(default=(), metadata=PROGRESS)
@@ -154,8 +154,8 @@ class SendBlock:
     contacts: tuple[ImageNumber, ...]
     urgency: Annotated[float, Bounds(1e-3, 1e3)]
     spans: tuple[StreamSpan, ...] = ()
-    planned: Count = field(default=0, metadata=PROGRESS)
-    sent: Count = field(default=0, metadata=PROGRESS)
+    planned: SavedCount = field(default=0, metadata=PROGRESS)
+    sent: SavedCount = field(default=0, metadata=PROGRESS)
     reported: bool = field(default=False, metadata=PROGRESS)
     last_activity_s: float = field(default=0.0, metadata=PROGRESS)
     missing: dict[int, Byte] = field(default_factory=dict, metadata=PROGRESS)

@@ -17,7 +17,7 @@ from sonarpost.link.coding.redundancy_plan import symbols_to_send
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.v1.frame import BLOCKS
 from sonarpost.link.frames.v1.payload_objects import NEVER_RECEIVED, WINDOW, Feedback
-from sonarpost.link.state import Bounds, Count
+from sonarpost.link.state import Bounds, SavedCount
 
 _MIN_FRAMES_TO_MEASURE: Final = 16
 _RECEIVER_MEMORY_S: Final = 3600.0
@@ -34,7 +34,7 @@ class LossMeter:
     """
 
     loss: Annotated[float, Bounds(0, 1)] | None = None
-    last_counts: tuple[Count, Count] | None = None
+    last_counts: tuple[SavedCount, SavedCount] | None = None
 
     def update(self, feedback: Feedback, frames_sent: int) -> None:
         """Add a feedback with a weight of a quarter. Intervals of fewer than 16 frames are joined."""

@@ -14,7 +14,7 @@ from typing import Annotated, Final
 from sonarpost.errors import FrameError
 from sonarpost.limits import limit
 from sonarpost.link.downlink.messages import CommandOutcome, token_of
-from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
+from sonarpost.link.state import Bounds, Errors, PartReader, Parts, SavedCount, pack_part
 
 MAX_PENDING: Final = limit(
     500, "commands", "shares", "acoustic link, vessel", "vehicle", "open commands", "further ones are refused"
@@ -69,10 +69,10 @@ class PendingCommand:
     added_s: float
     expires_s: float
     state: CommandState = CommandState.ASKED
-    times_sent: Count = 0
+    times_sent: SavedCount = 0
     due_s: float = 0.0
     reason: str = ""
-    order: Count = 0
+    order: SavedCount = 0
 
 
 def retry_factor(repetitions: int, max_doublings: float) -> float:

@@ -252,10 +252,10 @@ DownlinkCommand = (
     | RegionMessage
     | PrioritiseMessage
 )
-Content = DownlinkCommand | ConfirmationMessage | DataMessage | StatusMessage
+DownlinkContent = DownlinkCommand | ConfirmationMessage | DataMessage | StatusMessage
 
 
-def pack(content: Content, room_bytes: int = SMALLEST_ROOM_BYTES) -> bytes:
+def pack(content: DownlinkContent, room_bytes: int = SMALLEST_ROOM_BYTES) -> bytes:
     """Return the bytes of a message.
 
     Args:
@@ -271,7 +271,7 @@ def pack(content: Content, room_bytes: int = SMALLEST_ROOM_BYTES) -> bytes:
     return packed
 
 
-def _packed(content: Content, room_bytes: int) -> bytes:
+def _packed(content: DownlinkContent, room_bytes: int) -> bytes:
     match content:
         case DataMessage():
             return bytes([MessageKind.DATA]) + content.data
@@ -314,7 +314,7 @@ def _shortened(text: str, max_bytes: int) -> bytes:
     return text.encode()[: max(0, max_bytes)].decode(errors="ignore").encode()
 
 
-def unpack(data: bytes, where: str = _WHERE) -> Content:
+def unpack(data: bytes, where: str = _WHERE) -> DownlinkContent:
     """Parse the bytes of a message.
 
     Raises:
@@ -326,7 +326,7 @@ def unpack(data: bytes, where: str = _WHERE) -> Content:
         raise FrameError(where, error.field, error.value, error.expected) from error
 
 
-def _content(data: bytes) -> Content:
+def _content(data: bytes) -> DownlinkContent:
     kind, body = data[0] if data else -1, data[1:]
     if kind == MessageKind.DATA:
         return DataMessage(body)

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 from sonarpost.errors import FrameError
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind
-from sonarpost.link.state import SEPARATE, Bounds, Byte, Count, PartReader, pack_part
+from sonarpost.link.state import SEPARATE, Bounds, Byte, PartReader, SavedCount, pack_part
 
 LOWEST_PRIORITY: Final = 7
 FILLER_PRIORITY: Final = 6
@@ -32,7 +32,7 @@ class QueuedMessage:
         once: Whether it is sent once, without copies against loss.
     """
 
-    key: Count
+    key: SavedCount
     message_id: str
     source: str
     priority: Annotated[int, Bounds(1, LOWEST_PRIORITY)]
@@ -56,7 +56,7 @@ class MessageIdentifier:
         name: Program and identifier.
     """
 
-    order: Count
+    order: SavedCount
     name: str
 
 
@@ -72,9 +72,9 @@ class MessageQueue:
         known: Order of the recently accepted identifiers, to reject a message that arrives twice.
     """
 
-    next_key: Count = 0
-    served: dict[str, Count] = field(default_factory=dict)
-    expired: Count = 0
+    next_key: SavedCount = 0
+    served: dict[str, SavedCount] = field(default_factory=dict)
+    expired: SavedCount = 0
     waiting: dict[int, QueuedMessage] = field(default_factory=dict, metadata=SEPARATE)
     known: dict[str, int] = field(default_factory=dict, metadata=SEPARATE)
 

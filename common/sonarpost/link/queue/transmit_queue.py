@@ -21,8 +21,8 @@ from sonarpost.link.frames.v1.frame import SymbolKind
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, Feedback, RefineRequest
 from sonarpost.link.frames.v1.sender import FIRST_URGENCY, LAST_URGENCY, V1Sender
 from sonarpost.link.queue.messages import FILLER_PRIORITY, MessageQueue
-from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket, RateNumber, SentImage
-from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
+from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket, SavedRate, SentImage
+from sonarpost.link.state import Bounds, Errors, PartReader, Parts, SavedCount, pack_part
 
 _SEGMENTS: Final = 2
 _MIN_LOSS_CHANGE: Final = 0.02
@@ -52,12 +52,12 @@ class TransmitState:
         planned_loss: Loss that plans use.
     """
 
-    rate: RateNumber
-    losses: dict[RateNumber, tuple[Annotated[float, Bounds(0, 1)], float]]
+    rate: SavedRate
+    losses: dict[SavedRate, tuple[Annotated[float, Bounds(0, 1)], float]]
     packet_interval_s: Annotated[float, Bounds(0, 1e9)]
     image_credit: float
     last_feedback_s: float | None
-    frames_at_feedback: Count
+    frames_at_feedback: SavedCount
     feedback: bool
     planned_loss: Annotated[float, Bounds(0, _MAX_LOSS)]
 

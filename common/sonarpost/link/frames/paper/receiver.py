@@ -17,7 +17,7 @@ from sonarpost.link.coding.byte_ranges import PartialBytes, gaps_within
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, is_image_id, parse_frame
 from sonarpost.link.receiver import Event, FrameRejected, ImageUpdate
-from sonarpost.link.state import Count, Errors, PartReader, Parts, pack_part
+from sonarpost.link.state import Errors, PartReader, Parts, SavedCount, pack_part
 
 MAX_CANDIDATES: Final = 3
 """Different stream headers or body lengths that an image keeps."""
@@ -46,7 +46,7 @@ class ImageCandidate:
 
     header: StreamHeader
     body: PartialBytes
-    frames: Count = 1
+    frames: SavedCount = 1
 
     @property
     def complete(self) -> bool:
@@ -83,10 +83,10 @@ class PendingImage:
     last_seen_s: float
     candidates: list[ImageCandidate] = field(default_factory=list)
     contact: ContactSummary | None = None
-    conflicts: Count = 0
-    version: Count = 0
+    conflicts: SavedCount = 0
+    version: SavedCount = 0
     reported: ReportedState | None = None
-    order: Count = 0
+    order: SavedCount = 0
 
     @property
     def best(self) -> ImageCandidate | None:
@@ -189,14 +189,14 @@ class PaperReceiverCounts:
         evicted: Images deleted because `max_images` was reached.
     """
 
-    frames: Count = 0
-    rejected: Count = 0
-    duplicates: Count = 0
-    conflicts: Count = 0
-    images: Count = 0
-    complete_images: Count = 0
-    contacts_only: Count = 0
-    evicted: Count = 0
+    frames: SavedCount = 0
+    rejected: SavedCount = 0
+    duplicates: SavedCount = 0
+    conflicts: SavedCount = 0
+    images: SavedCount = 0
+    complete_images: SavedCount = 0
+    contacts_only: SavedCount = 0
+    evicted: SavedCount = 0
 
 
 class PaperReceiver:

@@ -33,7 +33,7 @@ from sonarpost.link.frames.paper.frame import (
 )
 from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
 from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket, SentImage
-from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
+from sonarpost.link.state import Bounds, Errors, PartReader, Parts, SavedCount, pack_part
 from sonarpost.modem.interface import RateInfo
 
 Packet = tuple[bytes, ...]
@@ -53,7 +53,7 @@ class WaitingImage:
         stream: The codec's stream.
     """
 
-    order: Count
+    order: SavedCount
     image_id: str
     contact_id: str
     contact: ContactSummary
@@ -71,9 +71,9 @@ class PaperProgress:
         packet_interval_s: Smoothed time from one packet to the next.
     """
 
-    order: Count
-    rate: Count
-    packets_sent: Count
+    order: SavedCount
+    rate: SavedCount
+    packets_sent: SavedCount
     packet_interval_s: Annotated[float, Bounds(0, 1e9)]
 
 

@@ -37,7 +37,7 @@ from sonarpost.link.frames.v1.payload_objects import (
     pack_mini,
 )
 from sonarpost.link.receiver import Event, FeedbackReceived, FrameRejected, ImageUpdate, MessageReceived
-from sonarpost.link.state import SEPARATE, Bounds, Byte, Count, Errors, PartReader, Parts, pack_part
+from sonarpost.link.state import SEPARATE, Bounds, Byte, Errors, PartReader, Parts, SavedCount, pack_part
 
 _MAX_RECENT_MESSAGES: Final = 64
 _MAX_WITHOUT_RECORD: Final = 128
@@ -73,9 +73,9 @@ class AssembledImage:
     link: Byte = 0
     stream: PartialBytes = field(default_factory=PartialBytes)
     end: Annotated[int, Bounds(0, MAX_STREAM_BYTES)] = 0
-    version: Count = 0
+    version: SavedCount = 0
     reported: tuple[int, bool] = (-1, False)
-    order: Count = 0
+    order: SavedCount = 0
     stopped: bool = False
 
     def belongs(self, preview: Preview) -> bool:
@@ -156,7 +156,7 @@ class PeerState:
 
     address: int
     last_frame_s: float
-    frames: Count = 0
+    frames: SavedCount = 0
     newest_block: Annotated[int, Bounds(-1, BLOCKS - 1)] = -1
     block_span: Annotated[int, Bounds(0, WINDOW)] = 0
     blocks: dict[int, BlockDecoder] = field(default_factory=dict, metadata=SEPARATE)
@@ -164,11 +164,11 @@ class PeerState:
     images: dict[int, AssembledImage] = field(default_factory=dict, metadata=SEPARATE)
     recent_messages: list[tuple[Byte, int, float]] = field(default_factory=list)
     feedback_s: float = 0.0
-    feedback_frames: Count = 0
-    redundant_symbols: Count = 0
-    order: Count = 0
-    image_order: Count = 0
-    moves: list[tuple[Count, Count]] = field(default_factory=list)
+    feedback_frames: SavedCount = 0
+    redundant_symbols: SavedCount = 0
+    order: SavedCount = 0
+    image_order: SavedCount = 0
+    moves: list[tuple[SavedCount, SavedCount]] = field(default_factory=list)
 
     def delete_old(self, now: float, config: ReceiverConfig) -> None:
         """Delete what has had no frame for too long; after the clock was set back nothing stays longer."""
@@ -382,15 +382,15 @@ class V1ReceiverCounts:
         late: Frames of other vessels that arrived too late to be used.
     """
 
-    frames: Count = 0
-    rejected: Count = 0
-    updates: Count = 0
-    complete: Count = 0
-    messages: Count = 0
-    feedback: Count = 0
-    evicted_sources: Count = 0
-    duplicates: Count = 0
-    late: Count = 0
+    frames: SavedCount = 0
+    rejected: SavedCount = 0
+    updates: SavedCount = 0
+    complete: SavedCount = 0
+    messages: SavedCount = 0
+    feedback: SavedCount = 0
+    evicted_sources: SavedCount = 0
+    duplicates: SavedCount = 0
+    late: SavedCount = 0
 
 
 class V1Receiver:

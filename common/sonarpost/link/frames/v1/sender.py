@@ -52,7 +52,7 @@ from sonarpost.link.frames.v1.payload_objects import (
     RefineRequest,
 )
 from sonarpost.link.queue.messages import MessageSender
-from sonarpost.link.state import Bounds, Count, Errors, PartReader, Parts, pack_part
+from sonarpost.link.state import Bounds, Errors, PartReader, Parts, SavedCount, pack_part
 
 _MIN_PREFIX_BYTES: Final = 16
 _MAX_SYMBOL_FACTOR: Final = 4
@@ -78,7 +78,7 @@ class SenderState:
     """
 
     next_block: Annotated[int, Bounds(0, BLOCKS - 1)]
-    frames_sent: Count = 0
+    frames_sent: SavedCount = 0
     messages: MessageSender = field(default_factory=MessageSender)
     tracker: FeedbackTracker = field(default_factory=FeedbackTracker)
 
