@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from sonarpost.monitoring.fleet import ServiceStatus
-from sonarpost.services.console.store.database import Side
+from sonarpost.services.console.store.database import ConsoleSide
 
-Place = Literal["server", "router", "decoder", "modem", "c2", "vehicle"]
+ChainPlace = Literal["server", "router", "decoder", "modem", "c2", "vehicle"]
 PlaceState = Literal["ok", "waiting", "degraded", "lost", "unknown"]
 Reason = Literal["", "not_reached", "no_report", "not_running", "no_modem", "reported", "no_frames"]
 
@@ -74,7 +74,7 @@ class ChainLink:
         heard_utc_s: Arrival of the last report or frame; None if there is none.
     """
 
-    place: Place
+    place: ChainPlace
     name: str
     state: PlaceState
     reason: Reason = ""
@@ -84,7 +84,7 @@ class ChainLink:
 
 
 def chain_links(
-    side: Side,
+    side: ConsoleSide,
     router: RouterState | None,
     services: Iterable[ServiceStatus],
     vehicles: Sequence[HeardVehicle],
@@ -114,7 +114,7 @@ def chain_links(
     else:
         links.append(ChainLink("router", "", "lost", "not_reached", router.detail, since))
     starting = now_utc_s - since < START_S
-    names: tuple[tuple[Place, str], ...] = (("decoder", "decompressor"), ("modem", "op_modem"))
+    names: tuple[tuple[ChainPlace, str], ...] = (("decoder", "decompressor"), ("modem", "op_modem"))
     if side == "shore":
         names = (("c2", "c2"),)
     links += [_service(place, name, own.get(name), now_utc_s, starting=starting) for place, name in names]
@@ -131,7 +131,9 @@ def _server(own: ServiceStatus | None, router: RouterState | None, now_utc_s: fl
     return ChainLink("server", "console", "ok", heard_utc_s=now_utc_s)
 
 
-def _service(place: Place, name: str, status: ServiceStatus | None, now_utc_s: float, *, starting: bool) -> ChainLink:
+def _service(
+    place: ChainPlace, name: str, status: ServiceStatus | None, now_utc_s: float, *, starting: bool
+) -> ChainLink:
     health = None if status is None else status.health
     if status is None or health is None or status.age_s is None:
         is_expected = starting or (status is not None and status.alive)
@@ -185,11 +187,11 @@ class ChainHistory:
     """Adds the time from which a place has its state, where the place itself does not state it."""
 
     def __init__(self) -> None:
-        self._states: dict[tuple[Place, str], tuple[PlaceState, float]] = {}
+        self._states: dict[tuple[ChainPlace, str], tuple[PlaceState, float]] = {}
 
     def with_times(self, links: Sequence[ChainLink], now_utc_s: float) -> list[ChainLink]:
         """Return the links with `since_utc_s`; call it with every observation, from one thread at a time."""
-        states: dict[tuple[Place, str], tuple[PlaceState, float]] = {}
+        states: dict[tuple[ChainPlace, str], tuple[PlaceState, float]] = {}
         timed: list[ChainLink] = []
         for link in links:
             state, since = self._states.get((link.place, link.name), (None, now_utc_s))

@@ -17,7 +17,7 @@ MAX_BUFFERED_BYTES = limit(16_000_000, "bytes", "claims", "event stream", "vesse
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class PageEvent:
     """One event of the HTTP interface: number within one run of the server, type, JSON text."""
 
     number: int
@@ -35,7 +35,7 @@ class EventHub:
         self.run = uuid.uuid4().hex[:8]
         self._lock = threading.Lock()
         self._buffered = buffered
-        self._events: deque[Event] = deque()
+        self._events: deque[PageEvent] = deque()
         self._bytes = 0
         self._last = 0
         self._subscribers: set[Callable[[], None]] = set()
@@ -45,7 +45,7 @@ class EventHub:
         text = json.dumps(data, allow_nan=False, separators=(",", ":"))
         with self._lock:
             self._last += 1
-            self._events.append(Event(self._last, name, text))
+            self._events.append(PageEvent(self._last, name, text))
             self._bytes += len(text)
             while len(self._events) > self._buffered or (self._bytes > MAX_BUFFERED_BYTES and len(self._events) > 1):
                 self._bytes -= len(self._events.popleft().data)
@@ -80,7 +80,7 @@ class EventHub:
         with self._lock:
             return self._last
 
-    def events_after(self, number: int) -> tuple[Event, ...] | None:
+    def events_after(self, number: int) -> tuple[PageEvent, ...] | None:
         """Return the events after a number; None if some of them are no longer buffered."""
         with self._lock:
             if number > self._last or (self._events and number < self._events[0].number - 1):

@@ -19,13 +19,13 @@ from sonarpost.errors import DeliveryError
 from sonarpost.files import make_private
 from sonarpost.messages import Command, Comment, Decision
 
-Role = Literal["observer", "operator", "expert"]
-Side = Literal["vessel", "shore"]
+UserRole = Literal["observer", "operator", "expert"]
+ConsoleSide = Literal["vessel", "shore"]
 Permission = Literal["decide", "measure", "request", "comment"]
 Table = Literal["decision", "request", "comment"]
 """Tables of the records that this console sends; their columns `payload` and `sent` hold what the outbox receives."""
 
-ROLES: Final[tuple[Role, ...]] = ("observer", "operator", "expert")
+ROLES: Final[tuple[UserRole, ...]] = ("observer", "operator", "expert")
 PERMISSIONS: Final[tuple[Permission, ...]] = ("decide", "measure", "request", "comment")
 ID_COLUMN: Final[dict[Table, str]] = {"decision": "decision_id", "request": "command_id", "comment": "comment_id"}
 RECORD_TYPES: Final[dict[Table, type[Decision] | type[Command] | type[Comment]]] = {
@@ -302,10 +302,10 @@ class Actor:
     """A user who is logged in, with the network address of the browser."""
 
     user: str
-    role: Role
+    role: UserRole
     address: str
 
-    def may(self, permission: Permission, side: Side) -> bool:
+    def may(self, permission: Permission, side: ConsoleSide) -> bool:
         """Return whether the user has a permission on a vessel or at a shore site.
 
         Decisions are made on the vessel, which can send them to the vehicle at once. Experts at the shore site comment

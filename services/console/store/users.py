@@ -16,7 +16,7 @@ from typing import Literal
 
 from sonarpost.errors import BadInputError
 from sonarpost.limits import limit
-from sonarpost.services.console.store.database import ROLES, Role, SqliteFile
+from sonarpost.services.console.store.database import ROLES, SqliteFile, UserRole
 
 FILE_NAME = "console-users.db"
 SCHEMA_VERSION = 1
@@ -63,7 +63,7 @@ class User:
     """A user of the console."""
 
     name: str
-    role: Role
+    role: UserRole
     changed_utc_s: float
 
 
@@ -79,7 +79,7 @@ class Session:
 
     token: str
     name: str
-    role: Role
+    role: UserRole
     csrf: str
     begun_utc_s: float
 

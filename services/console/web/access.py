@@ -22,7 +22,7 @@ from sonarpost.logs import IntervalLog
 from sonarpost.network.connections import TrustedProxies
 from sonarpost.review.measurement import NotMeasurableError
 from sonarpost.services.console.store.contacts import NotFoundError
-from sonarpost.services.console.store.database import Actor, Permission, Side
+from sonarpost.services.console.store.database import Actor, ConsoleSide, Permission
 from sonarpost.services.console.store.decisions import ConflictError
 from sonarpost.services.console.store.users import Session, Users, is_equal_secret
 from sonarpost.services.console.web.shares import ThreadShares, TooManyRequestsError
@@ -156,7 +156,7 @@ class AccessControl:
         proxies: Proxies whose `X-Forwarded-For` is used.
     """
 
-    def __init__(self, users: Users | None, side: Side, proxies: TrustedProxies | None = None) -> None:
+    def __init__(self, users: Users | None, side: ConsoleSide, proxies: TrustedProxies | None = None) -> None:
         self._users = users
         self._side = side
         self._proxies = TrustedProxies() if proxies is None else proxies

@@ -12,7 +12,7 @@ from starlette.routing import Route
 
 from sonarpost.logs import kv
 from sonarpost.network.connections import address_group
-from sonarpost.services.console.store.database import PERMISSIONS, Actor, Side
+from sonarpost.services.console.store.database import PERMISSIONS, Actor, ConsoleSide
 from sonarpost.services.console.store.serialisers import Json
 from sonarpost.services.console.store.users import DEVICE_S, LINK_S, MAX_PASSWORD, MIN_PASSWORD, Session, Users
 from sonarpost.services.console.web.access import COOKIE, AccessControl, ApiError, Call, ErrorCode, RequestBody
@@ -52,7 +52,7 @@ class SessionRoutes:
         max_age_s: Lifetime of the cookie.
     """
 
-    def __init__(self, users: Users, side: Side, *, tls: bool, max_age_s: float) -> None:
+    def __init__(self, users: Users, side: ConsoleSide, *, tls: bool, max_age_s: float) -> None:
         self._users = users
         self._side = side
         self._tls = tls
