@@ -18,7 +18,7 @@ from sonarpost.detection.normalisation import LevelGrid
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.sonar.survey import FloatImage
 
-Plane = npt.NDArray[np.float64]
+FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,18 +129,18 @@ class IntegralImage:
         np.divide(total, count, out=out, where=count >= max(1.0, min_fraction * area), casting="same_kind")
         return out
 
-    def _box_sums(self, plane: Plane, rows: tuple[int, int], columns: tuple[int, int]) -> Plane:
+    def _box_sums(self, plane: FloatArray, rows: tuple[int, int], columns: tuple[int, int]) -> FloatArray:
         height, width = self._shape
         top, bottom = (self._reach[0] + r for r in rows)
         left, right = (self._reach[1] + c for c in columns)
-        box: Plane = plane[bottom : bottom + height, right : right + width].copy()
+        box: FloatArray = plane[bottom : bottom + height, right : right + width].copy()
         box -= plane[top : top + height, right : right + width]
         box -= plane[bottom : bottom + height, left : left + width]
         box += plane[top : top + height, left : left + width]
         return box
 
 
-def _cumulative_sums(image: npt.NDArray[np.floating], reach: tuple[int, int]) -> Plane:
+def _cumulative_sums(image: npt.NDArray[np.floating], reach: tuple[int, int]) -> FloatArray:
     """Return running sums with a zero row and column first, extended by `reach` so that boxes end at the border."""
     rows, columns = image.shape
     plane = np.zeros((rows + 1 + 2 * reach[0], columns + 1 + 2 * reach[1]))

@@ -44,7 +44,7 @@ MAX_FILE_BYTES: Final = 1 << 20
 DECISIONS: Final = "decisions"
 
 R = TypeVar("R", bound=Record)
-Seconds = TypeVar("Seconds", int, float)
+N = TypeVar("N", int, float)
 
 
 class ImageSideCar(Record):
@@ -268,7 +268,7 @@ def read_stored_records(out_dir: Path) -> StoredRecords:
     return StoredRecords(tuple(images), tuple(decisions), tuple(problems))
 
 
-def match_start_time(start_times: Sequence[Seconds], utc_s: float) -> Seconds | None:
+def match_start_time(start_times: Sequence[N], utc_s: float) -> N | None:
     """Return which of several images with one identifier a record refers to.
 
     It is the last image whose first frame arrived before the record was made. A single candidate always matches,

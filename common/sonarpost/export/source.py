@@ -23,7 +23,7 @@ MAX_IMAGE_BYTES: Final = 1 << 26
 
 _SPOOL_BYTES: Final = 1 << 20
 
-Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class ContactImage:
         lines: Measured lines to draw.
     """
 
-    pixels: Pixels
+    pixels: GreyImage
     missing: npt.NDArray[np.bool_] | None = None
     lines: tuple[ImageLine, ...] = ()
 

@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 Point = tuple[float, float]
 Grey = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
-Profile = npt.NDArray[np.float64]
+FloatArray = npt.NDArray[np.float64]
 
 SEARCH_PX: Final = 7.0
 """Greatest distance of an edge from the end that a person has set."""
@@ -60,7 +60,7 @@ def snapped_ends(grey: Grey, missing: Mask, start: Point, end: Point) -> tuple[P
     )
 
 
-def _profile(grey: Grey, missing: Mask, start: Point, direction: Point, along_px: Profile) -> Profile:
+def _profile(grey: Grey, missing: Mask, start: Point, direction: Point, along_px: FloatArray) -> FloatArray:
     """Return mean grey levels of parallel lines; NaN where a line is outside the image or on a missing pixel."""
     height_px, width_px = grey.shape
     total = np.zeros(along_px.shape)
@@ -74,7 +74,7 @@ def _profile(grey: Grey, missing: Mask, start: Point, direction: Point, along_px
     return total / len(_OFFSETS_PX)
 
 
-def _edge_px(profile: Profile, outward_px: Profile, level: float, reach_px: float) -> float | None:
+def _edge_px(profile: FloatArray, outward_px: FloatArray, level: float, reach_px: float) -> float | None:
     """Return the outward distance of the half brightness from an end, the nearest one; None without one.
 
     Args:

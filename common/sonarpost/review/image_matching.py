@@ -13,10 +13,10 @@ EXPAND_FACTOR: Final = 2
 MIN_CORRELATION: Final = 0.4
 """Normalised cross-correlation below which the place counts as unknown."""
 
-Grey = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 
-def place_in_expanded(image: Grey, expanded: Grey) -> tuple[int, int] | None:
+def place_in_expanded(image: GreyImage, expanded: GreyImage) -> tuple[int, int] | None:
     """Return (row, column) of the upper left corner of an image in the expanded image, None if it is not found.
 
     Both windows are shifted at the borders of a recording, so that their centres can differ. The place is the maximum

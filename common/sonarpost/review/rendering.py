@@ -9,10 +9,10 @@ import numpy.typing as npt
 from PIL import Image
 
 Grey = npt.NDArray[np.uint8]
-Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 
-def eight_bits(pixels: Pixels) -> Grey:
+def eight_bits(pixels: GreyImage) -> Grey:
     """Return the most significant 8 bits of each pixel, same shape."""
     return pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)  # type: ignore[return-value]
 

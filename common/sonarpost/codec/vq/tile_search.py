@@ -31,7 +31,7 @@ P = ParamSpec("P")
 Tiles = npt.NDArray[np.uint8]
 Indices = npt.NDArray[np.int64]
 Distances = npt.NDArray[np.float64]
-FloatArray = npt.NDArray[np.float32]
+FloatMatrix = npt.NDArray[np.float32]
 Vectors = npt.NDArray[np.signedinteger]
 
 
@@ -56,7 +56,7 @@ class NearestSearch:
         keys: Shape (n,): keys, by place. If they are not ascending, no block is skipped.
     """
 
-    blocks: FloatArray
+    blocks: FloatMatrix
     order: Indices
     vectors: Vectors
     norms: Distances
@@ -140,7 +140,7 @@ class _SearchState:
         _compiled(_score_around)(self._search.blocks, self.query_rows, block, column, scores)
         self.compare(scores, np.arange(places.size), block * width + column)
 
-    def compare(self, scores: FloatArray, rows: Indices, first_places: Indices) -> None:
+    def compare(self, scores: FloatMatrix, rows: Indices, first_places: Indices) -> None:
         """Insert the vectors whose scores are within the limit.
 
         Args:
@@ -154,7 +154,7 @@ class _SearchState:
 
 
 def _score_around(
-    blocks: FloatArray, query_rows: FloatArray, block: Indices, column: Indices, scores: FloatArray
+    blocks: FloatMatrix, query_rows: FloatMatrix, block: Indices, column: Indices, scores: FloatMatrix
 ) -> None:
     """Score each query against the columns of its block, from `column`, as many as `scores` has columns."""
     for query in range(query_rows.shape[0]):
@@ -168,7 +168,7 @@ def _score_around(
 
 
 def _insert_nearest(
-    scores: FloatArray,
+    scores: FloatMatrix,
     rows: Indices,
     first_places: Indices,
     order: Indices,
@@ -246,14 +246,14 @@ def _squared_norms(vectors: npt.NDArray[np.generic]) -> Distances:
     return np.asarray(np.einsum("ij,ij->i", wide, wide), dtype=np.float64)
 
 
-def _empty_blocks(count: int, leading: int, width: int = BLOCK_TILES) -> FloatArray:
+def _empty_blocks(count: int, leading: int, width: int = BLOCK_TILES) -> FloatMatrix:
     """Return blocks of `NearestSearch` with empty places."""
     blocks = np.zeros((count, leading + 2, width), dtype=np.float32)
     blocks[:, -1] = _EMPTY
     return blocks
 
 
-def _fill_blocks(blocks: FloatArray, start: int, vectors: Vectors, norms: Distances) -> None:
+def _fill_blocks(blocks: FloatMatrix, start: int, vectors: Vectors, norms: Distances) -> None:
     """Write vectors, shape (m, dims), and their squared norms to the places from `start`."""
     block, column = np.divmod(np.arange(start, start + vectors.shape[0]), blocks.shape[2])
     leading = blocks.shape[1] - 2

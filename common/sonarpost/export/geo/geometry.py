@@ -6,11 +6,11 @@ import math
 from collections.abc import Sequence
 from typing import Literal
 
-Point = tuple[float, float]
+GeoPoint = tuple[float, float]
 """Longitude, -180 to 180, and latitude in degrees."""
 
 
-def split_line(points: Sequence[Point]) -> list[list[Point]]:
+def split_line(points: Sequence[GeoPoint]) -> list[list[GeoPoint]]:
     """Divide a line of at least one point where it crosses the 180th meridian.
 
     Consecutive points are connected the shorter way. A point on the meridian has the longitude 180 or -180 of its part.
@@ -34,7 +34,7 @@ def split_line(points: Sequence[Point]) -> list[list[Point]]:
     return parts
 
 
-def split_ring(ring: Sequence[Point]) -> list[list[Point]]:
+def split_ring(ring: Sequence[GeoPoint]) -> list[list[GeoPoint]]:
     """Divide a closed ring that does not cross itself where it crosses the 180th meridian.
 
     The rings have the same direction. One around a pole is returned whole.
@@ -55,7 +55,7 @@ def split_ring(ring: Sequence[Point]) -> list[list[Point]]:
         return [list(ring)]
     rings = []
     while following:
-        points: list[Point] = []
+        points: list[GeoPoint] = []
         number = next(iter(following))
         while number in following:
             points += parts[number]
@@ -66,7 +66,7 @@ def split_ring(ring: Sequence[Point]) -> list[list[Point]]:
     return rings
 
 
-def geojson_geometry(kind: Literal["LineString", "Polygon"], points: Sequence[Point]) -> dict[str, object]:
+def geojson_geometry(kind: Literal["LineString", "Polygon"], points: Sequence[GeoPoint]) -> dict[str, object]:
     """Return a line, or a polygon of a closed ring, as GeoJSON geometry; a line of a single point is a Point."""
     parts = split_line(points) if kind == "LineString" else split_ring(points)
     # One unit of the last digit is about 1 mm on the ground.

@@ -19,7 +19,7 @@ from typing import IO, Final
 
 from sonarpost.export.contacts import ExportContact
 from sonarpost.export.geo.coverage import coverage_properties
-from sonarpost.export.geo.geometry import Point, split_ring
+from sonarpost.export.geo.geometry import GeoPoint, split_ring
 from sonarpost.export.geo.kml import COLOURS
 from sonarpost.export.source import ExportSource
 from sonarpost.export.tables import COLUMNS, Value, contact_properties
@@ -71,7 +71,7 @@ def _point(contact: ExportContact) -> bytes | None:
     return struct.pack("<2sBBiBIdd", b"GP", 0, 1, 4326, 1, 1, lon_deg, lat_deg)
 
 
-def _polygons(rings: Sequence[Sequence[Point]], geometry: str) -> bytes:
+def _polygons(rings: Sequence[Sequence[GeoPoint]], geometry: str) -> bytes:
     """Return a `POLYGON` of one ring, or a `MULTIPOLYGON`, as GeoPackage geometry: header with envelope, then WKB."""
     lons, lats = zip(*chain(*rings), strict=True)
     header = struct.pack("<2sBBi4d", b"GP", 0, 3, 4326, min(lons), max(lons), min(lats), max(lats))
@@ -155,7 +155,7 @@ class _Layer:
         db.execute(_CONTENTS, (name, "features", name, "", *(None,) * 4, 4326))
         db.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, 4326, 0, 0)", (name, geometry))
 
-    def add(self, geometry: bytes | None, points: Iterable[Point], values: Iterable[Value | bytes]) -> None:
+    def add(self, geometry: bytes | None, points: Iterable[GeoPoint], values: Iterable[Value | bytes]) -> None:
         """Add a feature: its geometry, the points of it, and the values of the other columns."""
         for lon_deg, lat_deg in points:
             west, south, east, north = self._box or (lon_deg, lat_deg) * 2

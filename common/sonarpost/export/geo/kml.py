@@ -21,7 +21,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 from sonarpost.export.contacts import ExportContact
-from sonarpost.export.source import ExportSource, Pixels, archive_entry
+from sonarpost.export.source import ExportSource, GreyImage, archive_entry
 from sonarpost.export.tables import DEGREE_DECIMALS, Value, contact_properties
 from sonarpost.export.text import VERDICT_WORDS, html_text, utc_text, xml_text
 from sonarpost.review.decisions import ReviewState
@@ -230,7 +230,7 @@ def _child(parent: ET.Element, tag: str, text: str | None = None, /, **attribute
 # Images
 
 
-def _eight_bits(pixels: Pixels) -> npt.NDArray[np.uint8]:
+def _eight_bits(pixels: GreyImage) -> npt.NDArray[np.uint8]:
     """Scale 16-bit pixels to 8 bits by the brightest pixel; sonars rarely use the full range of 16 bits."""
     if pixels.dtype == np.uint8:
         return pixels.astype(np.uint8, copy=False)

@@ -33,7 +33,7 @@ _VERSION_BYTES: Final = (24, 64, 128, _STREAM_BYTES)
 _LINES: Final = 5
 """Simulated survey lines. Later contacts reuse their images at other positions."""
 
-Snippet = npt.NDArray[np.uint8]
+Grey = npt.NDArray[np.uint8]
 
 
 class ImageVersion(NamedTuple):
@@ -63,9 +63,9 @@ class SimulatedContact:
     image_id: str
     versions: tuple[ImageVersion, ...]
     codec: Codec
-    snippet: Snippet
+    snippet: Grey
     target: TruthObject
-    expanded_snippet: Snippet | None = None
+    expanded_snippet: Grey | None = None
 
     @property
     def truth(self) -> Truth:
@@ -218,7 +218,7 @@ def _survey_spec(seed: int, line: int, seabed: SeabedKind, first_utc_s: float) -
     return replace(spec, start_lat_deg=lat, start_lon_deg=lon, heading_deg=heading, start_time_utc_s=time_s)
 
 
-def cut_snippet(survey: Survey, target: TruthObject, look: int = 0, scale: int = 1) -> Snippet:
+def cut_snippet(survey: Survey, target: TruthObject, look: int = 0, scale: int = 1) -> Grey:
     """Return the snippet of an object, shape (80, 140), nadir on the left.
 
     Args:
@@ -239,7 +239,7 @@ def cut_snippet(survey: Survey, target: TruthObject, look: int = 0, scale: int =
     amplitude = np.stack(rows).astype(np.float64).reshape(HEIGHT_PX, scale, WIDTH_PX, scale).mean(axis=(1, 3))
     root = np.sqrt(amplitude)
     low, high = np.percentile(root, (0.5, 99.5))
-    grey: Snippet = np.clip(255 * (root - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
+    grey: Grey = np.clip(255 * (root - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
     return grey
 
 
@@ -276,7 +276,7 @@ def _contact(survey: Survey, target: TruthObject, vehicle: str, draws: random.Ra
     )
 
 
-def _versions(codec: Codec, snippet: Snippet, *, incomplete: bool) -> tuple[ImageVersion, ...]:
+def _versions(codec: Codec, snippet: Grey, *, incomplete: bool) -> tuple[ImageVersion, ...]:
     """Return the versions of an image; with `incomplete`, without the last one."""
     if isinstance(codec, EmbCodec):
         stream = codec.encode(snippet, _STREAM_BYTES)
