@@ -13,7 +13,7 @@ from sonarpost.archive.journal import Area, Criteria
 from sonarpost.errors import BadInputError
 from sonarpost.review.decisions import ReviewState
 
-Format = Literal["msgpack", "json"]
+PayloadFormat = Literal["msgpack", "json"]
 PixelForm = Literal["raw", "png", "none"]
 
 MAX_RECORDS: Final = 256
@@ -42,7 +42,7 @@ _REVIEW: Final[dict[str, ReviewState]] = {
     "disputed": "disputed",
 }
 _VERSION: Final = {"latest": True, "all": False}
-_FORMAT: Final[dict[str, Format]] = {"msgpack": "msgpack", "json": "json"}
+_FORMAT: Final[dict[str, PayloadFormat]] = {"msgpack": "msgpack", "json": "json"}
 _PIXELS: Final[dict[str, PixelForm]] = {"raw": "raw", "png": "png", "none": "none"}
 NAMES: Final = ("_time", "vessel", "vehicle", "area", "review", "version", "limit", "after", "format", "pixels")
 
@@ -66,7 +66,7 @@ class QueryParameters:
     limit: int = MAX_RECORDS
     archive: str = ""
     after: int = 0
-    format: Format = "msgpack"
+    format: PayloadFormat = "msgpack"
     pixels: PixelForm = "raw"
 
 
@@ -102,7 +102,7 @@ def parse_parameters(text: str, where: str, now_utc_s: float) -> QueryParameters
 
     since_utc_s, until_utc_s = get("_time", lambda text: _time_range(text, now_utc_s), _TIME_FORM) or (None, None)
     archive, after = get("after", _cursor, "the `next` of an earlier page") or ("", 0)
-    form: Format = get("format", _FORMAT.__getitem__, "msgpack or json") or "msgpack"
+    form: PayloadFormat = get("format", _FORMAT.__getitem__, "msgpack or json") or "msgpack"
     pixels: PixelForm = get("pixels", _PIXELS.__getitem__, "raw, png or none") or "raw"
     if pixels != "raw" and form != "json":
         raise BadInputError(where, "pixels", pixels, "raw, unless format is json")

@@ -12,7 +12,7 @@ from sonarpost.archive.image_files import SUFFIXES
 from sonarpost.archive.postgresql import SCHEME, ConnectionPool, DatabaseAddress
 from sonarpost.archive.shore_database import ShoreDatabase
 from sonarpost.archive.shore_files import decision_path, image_paths
-from sonarpost.archive.shore_index import DecisionRow, ImageRow, Mark, ShoreIndex, TaskingRow
+from sonarpost.archive.shore_index import DecisionRow, ImageRow, MarkColumn, ShoreIndex, TaskingRow
 from sonarpost.errors import StoredFileError
 from sonarpost.files import read_regular
 from sonarpost.sonar.image_decoding import MAX_FILE_BYTES
@@ -36,7 +36,7 @@ class RecordReader(Protocol):
     def tasking(self) -> list[TaskingRow]:
         """Return all comments and commands, oldest first."""
 
-    def mark(self, column: Mark, images: Iterable[ImageRow], at_utc_s: float) -> None:
+    def mark(self, column: MarkColumn, images: Iterable[ImageRow], at_utc_s: float) -> None:
         """Mark images as exported or removed."""
 
     def close(self) -> None:

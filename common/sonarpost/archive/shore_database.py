@@ -23,7 +23,7 @@ from pydantic import TypeAdapter
 from sonarpost.archive import shared_journal, shore_schema
 from sonarpost.archive.journal import Accepted, Journal, JournalRecord
 from sonarpost.archive.postgresql import ConnectionPool, Sql
-from sonarpost.archive.shore_index import DEFECTS, DecisionRow, Fault, ImageRow, Mark, TaskingRow, Verified
+from sonarpost.archive.shore_index import DEFECTS, DecisionRow, Fault, ImageRow, MarkColumn, TaskingRow, Verified
 from sonarpost.errors import ConfigError, DatabaseUnavailableError, StoredFileError
 
 _RETENTION_LOCK = 0x736F6E61725F02
@@ -244,13 +244,13 @@ class ShoreDatabase:
             )
         return {str(suffix): _bytes(content) for suffix, content in found}
 
-    def mark(self, column: Mark, images: Iterable[ImageRow], at_utc_s: float) -> None:
+    def mark(self, column: MarkColumn, images: Iterable[ImageRow], at_utc_s: float) -> None:
         """Mark images as exported or removed; the files of removed ones are deleted."""
         rows = sorted((row.vessel_id, row.name) for row in images)
         with self._transaction() as sql:
             self._mark(sql, column, rows, at_utc_s)
 
-    def _mark(self, sql: Sql, column: Mark, rows: Sequence[tuple[str, str]], at_utc_s: float) -> None:
+    def _mark(self, sql: Sql, column: MarkColumn, rows: Sequence[tuple[str, str]], at_utc_s: float) -> None:
         values = {"vessels": [row[0] for row in rows], "names": [row[1] for row in rows]}
         keys = "unnest(:vessels::text[], :names::text[]) AS k (vessel_id, name)"
         if column == "removed_utc_s":

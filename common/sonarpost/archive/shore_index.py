@@ -152,7 +152,7 @@ class TaskingRow:
 Row = TypeVar("Row", ImageRow, DecisionRow, TaskingRow)
 _TABLES: dict[type, str] = {ImageRow: "image", DecisionRow: "decision", TaskingRow: "tasking"}
 _NAMES: dict[type, str] = {ImageRow: "name", DecisionRow: "decision_id"}
-Mark = Literal["exported_utc_s", "removed_utc_s"]
+MarkColumn = Literal["exported_utc_s", "removed_utc_s"]
 DEFECTS = ("missing", "changed", "unreadable", "conflicting")
 Fault = Literal["", "missing", "changed", "unreadable"]
 
@@ -243,7 +243,7 @@ class ShoreIndex:
                 marks = ", ".join("?" * len(values))
                 db.execute(f"INSERT OR REPLACE INTO {_TABLES[type(row)]} VALUES ({marks})", values)  # noqa: S608
 
-    def mark(self, column: Mark, images: Iterable[ImageRow], at_utc_s: float) -> None:
+    def mark(self, column: MarkColumn, images: Iterable[ImageRow], at_utc_s: float) -> None:
         """Mark images as exported or removed.
 
         Raises:

@@ -135,7 +135,7 @@ def _logging_suppressed() -> Iterator[None]:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class StatusRow:
     """One service as text.
 
     Attributes:
@@ -154,17 +154,17 @@ class Row:
         return self.cells[2]
 
 
-def rows_of(state: FleetState, stale_after_s: float) -> tuple[Row, ...]:
+def rows_of(state: FleetState, stale_after_s: float) -> tuple[StatusRow, ...]:
     """Return a row for each service."""
     return tuple(_row(status, stale_after_s) for status in state.services)
 
 
-def is_ok(rows: Sequence[Row], state: FleetState) -> bool:
+def is_ok(rows: Sequence[StatusRow], state: FleetState) -> bool:
     """Return whether the router is reached and at least one service runs, all without a problem."""
     return state.connected and bool(rows) and all(row.severity == "ok" for row in rows)
 
 
-def _row(status: ServiceStatus, stale_after_s: float) -> Row:
+def _row(status: ServiceStatus, stale_after_s: float) -> StatusRow:
     health = status.health
     state, severity = _state_text(status, stale_after_s)
     gauges: Mapping[str, float] = health.gauges if health else {}
@@ -178,7 +178,7 @@ def _row(status: ServiceStatus, stale_after_s: float) -> Row:
         _link_text(health.counters, gauges) if health else UNKNOWN,
         bytes_text(gauges.get("disk_free_bytes")),
     )
-    return Row(cells, severity, health.detail if health else "")
+    return StatusRow(cells, severity, health.detail if health else "")
 
 
 def _state_text(status: ServiceStatus, stale_after_s: float) -> tuple[str, Severity]:
@@ -242,7 +242,7 @@ def bytes_text(size_bytes: float | None) -> str:
 # Output
 
 
-def table(state: FleetState, rows: Sequence[Row], router: str) -> RenderableType:
+def table(state: FleetState, rows: Sequence[StatusRow], router: str) -> RenderableType:
     """Return the table for a terminal. It fits 80 columns; longer names are folded."""
     whole = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, collapse_padding=True, show_edge=False)
     for heading in HEADINGS:
@@ -259,13 +259,13 @@ def table(state: FleetState, rows: Sequence[Row], router: str) -> RenderableType
     return Group(headline, whole, *vehicles, *(Text(line, style="red", overflow="fold") for line in _details(rows)))
 
 
-def plain_text(state: FleetState, rows: Sequence[Row], router: str) -> str:
+def plain_text(state: FleetState, rows: Sequence[StatusRow], router: str) -> str:
     """Return the table as plain text, with columns aligned by spaces."""
     lines = aligned([HEADINGS, *([printable(cell) for cell in row.cells] for row in rows)])
     return "\n".join([_headline(state, router), *lines, *_vehicle_lines(state), *_details(rows)])
 
 
-def as_json(state: FleetState, rows: Sequence[Row], time_utc: str) -> str:
+def as_json(state: FleetState, rows: Sequence[StatusRow], time_utc: str) -> str:
     """Return the health records and the states of the table as one line of JSON."""
     services = []
     for status, row in zip(state.services, rows, strict=True):
@@ -340,5 +340,5 @@ def vehicle_text(vehicle: VehicleState) -> str:
     return f"{received.vehicle_id}: " + ", ".join([position, *known, heard])
 
 
-def _details(rows: Sequence[Row]) -> list[str]:
+def _details(rows: Sequence[StatusRow]) -> list[str]:
     return [f"! {row.cells[0]}/{row.cells[1]}: {printable(row.detail)}" for row in rows if row.detail]

@@ -34,7 +34,7 @@ REQUIRED_TABLES = frozenset({"meta", "outbox", "outbox_next", "inbox", "refused"
 INCOMPLETE = "partial"
 """Prefix of the tables with incomplete records. They are not copied: their senders repeat them."""
 
-Row = tuple[Any, ...]
+Cells = tuple[Any, ...]
 
 
 @dataclass(slots=True)
@@ -195,7 +195,7 @@ def _quarantine(target: sqlite3.Connection, key: str, payload: object) -> None:
     )
 
 
-def _rows_by_id(db: sqlite3.Connection, result: TableResult, columns: Sequence[str]) -> Iterator[Row]:
+def _rows_by_id(db: sqlite3.Connection, result: TableResult, columns: Sequence[str]) -> Iterator[Cells]:
     """Yield the readable rows of a table with row identifiers."""
     # `>=`: a search for a greater identifier than the last one of a damaged page would read this page.
     sql = f"SELECT rowid, {', '.join(columns)} FROM {result.name} NOT INDEXED WHERE rowid >= ? ORDER BY rowid"  # noqa: S608
@@ -217,10 +217,10 @@ def _rows_by_id(db: sqlite3.Connection, result: TableResult, columns: Sequence[s
         start = int(following[0]) + 1
 
 
-def _next_readable(db: sqlite3.Connection, sql: str, start: int) -> Row | None:
+def _next_readable(db: sqlite3.Connection, sql: str, start: int) -> Cells | None:
     """Return the next readable row from `start` on, with its identifier; None if there is none."""
 
-    def row_from(number: int) -> tuple[bool, Row | None]:
+    def row_from(number: int) -> tuple[bool, Cells | None]:
         """Return whether the first row from `number` on can be read, and the row, None for the end of the table."""
         try:
             return True, db.execute(f"{sql} LIMIT 1", (number,)).fetchone()
@@ -243,7 +243,7 @@ def _next_readable(db: sqlite3.Connection, sql: str, start: int) -> Row | None:
     return found
 
 
-def _rows(db: sqlite3.Connection, result: TableResult, columns: Sequence[str], keys: Sequence[str]) -> Iterator[Row]:
+def _rows(db: sqlite3.Connection, result: TableResult, columns: Sequence[str], keys: Sequence[str]) -> Iterator[Cells]:
     """Yield the readable rows of a table without row identifiers: from both ends to the first unreadable one."""
     for direction in ("ASC", "DESC"):
         order = ", ".join(f"{key} {direction}" for key in keys)

@@ -52,7 +52,7 @@ _ENDPOINT = re.compile(
 _LOOPBACK = re.compile(r"localhost|127\.[0-9.]+|\[::1\]")
 
 Json = dict[str, object]
-Rule = tuple[Literal["ingress", "egress"], tuple[str, ...], tuple[str, ...]]
+AccessRule = tuple[Literal["ingress", "egress"], tuple[str, ...], tuple[str, ...]]
 """Something that is allowed: flow, kinds of Zenoh messages, key expressions."""
 
 
@@ -222,9 +222,9 @@ def _access_control(index: FleetIndex, router: CertificateEntry, options: Router
     if router.role not in PEER_ROLES:
         raise PkiError("pki", "role", router.role, "shore or vessel: only those have a router for other platforms")
     everywhere = (keys.ANY, keys.ROUTER_ADMINISTRATION)
-    local: list[Rule] = [("ingress", EVERY_MESSAGE, everywhere), ("egress", EVERY_MESSAGE, everywhere)]
+    local: list[AccessRule] = [("ingress", EVERY_MESSAGE, everywhere), ("egress", EVERY_MESSAGE, everywhere)]
     # The own services connect by plain TCP, to an address that no other program can reach.
-    grants: list[tuple[str, Json, list[Rule]]] = [("local services", {"link_protocols": ["tcp"]}, local)]
+    grants: list[tuple[str, Json, list[AccessRule]]] = [("local services", {"link_protocols": ["tcp"]}, local)]
     for entry in (entry for role in PEER_ROLES[router.role] for entry in index.allowed(role)):
         if entry.platform != router.platform:
             peer: Json = {"cert_common_names": [entry.common_name], "link_protocols": ["tls"]}
@@ -268,7 +268,7 @@ def _access_control(index: FleetIndex, router: CertificateEntry, options: Router
     }
 
 
-def _rules_at_shore(entry: CertificateEntry | PreparedName, sites: Sequence[str]) -> list[Rule]:
+def _rules_at_shore(entry: CertificateEntry | PreparedName, sites: Sequence[str]) -> list[AccessRule]:
     """Return the rights of a certificate at the router of a shore site."""
     own = (keys.everything_of(entry.platform),)
     match entry.role:
@@ -299,7 +299,7 @@ def _rules_at_shore(entry: CertificateEntry | PreparedName, sites: Sequence[str]
             return [("ingress", INTEREST, (keys.ANY,)), ("egress", ("put",), published), *_querying(contacts)]
 
 
-def _rules_at_vessel(entry: CertificateEntry | PreparedName, vessel: str, sites: Sequence[str]) -> list[Rule]:
+def _rules_at_vessel(entry: CertificateEntry | PreparedName, vessel: str, sites: Sequence[str]) -> list[AccessRule]:
     """Return the rights of a certificate at the router of a vessel.
 
     The shore can send comments and commands, and request codebooks. It can neither send images or decisions as if they
@@ -334,7 +334,7 @@ def _rules_at_vessel(entry: CertificateEntry | PreparedName, vessel: str, sites:
             return _reading()
 
 
-def _rules_of_other_vessels(router: CertificateEntry, options: RouterOptions) -> dict[str, list[Rule]]:
+def _rules_of_other_vessels(router: CertificateEntry, options: RouterOptions) -> dict[str, list[AccessRule]]:
     """Return the rights of the other vessels that are named, at the router of a vessel.
 
     A vessel delivers frames to its own inbox at the lead vessel. Neither of them reads or sends anything else.
@@ -347,7 +347,7 @@ def _rules_of_other_vessels(router: CertificateEntry, options: RouterOptions) ->
         raise PkiError("router-config", "vessel", ", ".join(names), "none: only vessels exchange frames")
     if len(set(names)) != len(names):
         raise PkiError("router-config", "vessel", ", ".join(names), "each name once")
-    found: dict[str, list[Rule]] = {}
+    found: dict[str, list[AccessRule]] = {}
     for name in options.other_vessels:
         inbox = (keys.below(keys.vessel_frames(router.platform, name)),)
         found[name] = [("ingress", ("query",), inbox), ("egress", ("reply", "declare_queryable"), inbox)]
@@ -360,18 +360,18 @@ def _rules_of_other_vessels(router: CertificateEntry, options: RouterOptions) ->
     return found
 
 
-def _reading() -> list[Rule]:
+def _reading() -> list[AccessRule]:
     return [("ingress", INTEREST, (keys.ANY,)), ("egress", ("put", "liveliness_token"), (keys.everything(),))]
 
 
-def _sending(expressions: tuple[str, ...]) -> list[Rule]:
+def _sending(expressions: tuple[str, ...]) -> list[AccessRule]:
     return [
         ("ingress", ("query", "put"), expressions),
         ("egress", ("reply", "declare_queryable", "declare_subscriber"), expressions),
     ]
 
 
-def _querying(expressions: tuple[str, ...]) -> list[Rule]:
+def _querying(expressions: tuple[str, ...]) -> list[AccessRule]:
     return [
         ("ingress", ("query",), expressions),
         ("egress", ("reply", "declare_queryable"), expressions),
