@@ -13,7 +13,7 @@ from sonarpost.errors import ConfigError
 from sonarpost.runtime.retention import MaxBytes, RetentionConfig
 from sonarpost.sonar.options import SurveyOptions, load_options
 
-SidePx = Annotated[int, Field(ge=MIN_SIDE_PX, le=MAX_SIDE_PX)]
+SnippetSidePx = Annotated[int, Field(ge=MIN_SIDE_PX, le=MAX_SIDE_PX)]
 
 
 class AtdStubConfig(RetentionConfig, SurveyOptions):
@@ -72,8 +72,8 @@ class AtdStubConfig(RetentionConfig, SurveyOptions):
     mask_before_s: Annotated[float, Field(ge=0, le=60)] = MARGIN_BEFORE_S
     mask_after_s: Annotated[float, Field(ge=0, le=60)] = MARGIN_AFTER_S
     transmissions_file: Path | None = None
-    snippet_height_px: SidePx = 80
-    snippet_width_px: SidePx = 140
+    snippet_height_px: SnippetSidePx = 80
+    snippet_width_px: SnippetSidePx = 140
     snippet_pixel_m: Annotated[float, Field(ge=0, le=10)] = 0.0
     fit: Fit = "resize"
     snippet_dir: Path | None = None

@@ -61,7 +61,7 @@ NADIR_LIMIT: Final = 1.05
 """Least ratio of slant range to altitude at which a column is converted to ground range; nearer is the water column."""
 
 MeasurementKind = Literal["length", "width", "shadow"]
-Metres = Literal["ground", "slant", "unknown"]
+RangeKind = Literal["ground", "slant", "unknown"]
 MEASURED_LAYER: Final = "raw"
 """Layer of the received pixels."""
 KINDS: Final[tuple[MeasurementKind, ...]] = ("length", "width", "shadow")
@@ -117,7 +117,7 @@ class Length:
     blur_m: float
     along_m: float
     across_m: float
-    metres: Metres
+    metres: RangeKind
     missing_fraction: float
 
 
