@@ -7,7 +7,8 @@ from pathlib import Path
 
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers, add_survey_options, make_output_folder, survey_options_of
-from sonarpost.cli.survey.mosaic import check_resolution
+from sonarpost.errors import ConfigError
+from sonarpost.sonar.maps.ground_canvas import MIN_RESOLUTION_M
 from sonarpost.sonar.maps.waterfall import write_waterfalls
 
 
@@ -48,3 +49,13 @@ def run(parsed: argparse.Namespace) -> int:
                 f"EPSG:{waterfall.transform.epsg}, pings {waterfall.first_ping} to {waterfall.last_ping}"
             )
     return 0
+
+
+def check_resolution(resolution_m: float, command: str) -> None:
+    """Check --resolution-m.
+
+    Raises:
+        ConfigError: It is out of range.
+    """
+    if not MIN_RESOLUTION_M <= resolution_m <= 1000:  # includes NaN
+        raise ConfigError(command, "--resolution-m", resolution_m, f"{MIN_RESOLUTION_M} to 1000 metres")

@@ -1,4 +1,4 @@
-"""GeoPackage 1.3 (OGC 12-128r17): contacts as points with images and a style for QGIS, covered seabed as polygons.
+"""GeoPackage 1.3 (OGC 12-128r17): contacts as points with images and a style for QGIS.
 
 The table `contacts` has one column for each of `tables.COLUMNS`, the geometry `geom` and the PNG `image`. The table
 `layer_styles` has the form that QGIS reads.
@@ -11,21 +11,17 @@ import shutil
 import sqlite3
 import struct
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
-from itertools import chain
 from pathlib import Path
 from typing import IO, Final
 
 from sonarpost.export.contacts import ExportContact
-from sonarpost.export.geo.coverage import coverage_properties
-from sonarpost.export.geo.geometry import GeoPoint, split_ring
+from sonarpost.export.geo.geometry import GeoPoint
 from sonarpost.export.geo.kml import COLOURS
 from sonarpost.export.source import ExportSource
 from sonarpost.export.tables import COLUMNS, Value, contact_properties
 from sonarpost.export.text import utc_text
-from sonarpost.files import atomic_file
-from sonarpost.sonar.maps.coverage import CoveragePolygon
 
 _APPLICATION_ID: Final = 0x47504B47
 _USER_VERSION: Final = 10300
@@ -71,15 +67,6 @@ def _point(contact: ExportContact) -> bytes | None:
     return struct.pack("<2sBBiBIdd", b"GP", 0, 1, 4326, 1, 1, lon_deg, lat_deg)
 
 
-def _polygons(rings: Sequence[Sequence[GeoPoint]], geometry: str) -> bytes:
-    """Return a `POLYGON` of one ring, or a `MULTIPOLYGON`, as GeoPackage geometry: header with envelope, then WKB."""
-    lons, lats = zip(*chain(*rings), strict=True)
-    header = struct.pack("<2sBBi4d", b"GP", 0, 3, 4326, min(lons), max(lons), min(lats), max(lats))
-    count = struct.pack("<BII", 1, 6, len(rings)) if geometry == "MULTIPOLYGON" else b""
-    polygons = (struct.pack(f"<BIII{2 * len(ring)}d", 1, 3, 1, len(ring), *chain(*ring)) for ring in rings)
-    return header + count + b"".join(polygons)
-
-
 def _style() -> str:
     """Return a QGIS style (QML) with one colour for each review state, as in KML."""
     categories = "".join(
@@ -102,7 +89,7 @@ def _rgba(colour: str) -> str:
 
 
 @contextmanager
-def _new_geopackage(file: IO[bytes], folder: Path) -> Iterator[sqlite3.Connection]:
+def new_geopackage(file: IO[bytes], folder: Path) -> Iterator[sqlite3.Connection]:
     """Create a GeoPackage without layers; when the block ends without an error, copy it to a file.
 
     The database has no name in the folder, so that the operating system deletes it when the process ends.
@@ -137,7 +124,7 @@ def _new_geopackage(file: IO[bytes], folder: Path) -> Iterator[sqlite3.Connectio
         shutil.copyfileobj(complete, file)
 
 
-class _Layer:
+class Layer:
     """A table of features in WGS 84, with the columns `fid` and `geom` and others.
 
     Args:
@@ -176,8 +163,8 @@ def write_geopackage(file: IO[bytes], source: ExportSource) -> None:
     """Write a GeoPackage of contacts. A contact without a position has no geometry; one without an image has no PNG."""
     columns = ", ".join(f'"{name}" {_column_type(name)}' for name in COLUMNS)
     changed_utc_s = 0.0
-    with _new_geopackage(file, source.path.parent) as db:
-        layer = _Layer(db, "contacts", "POINT", f"{columns}, image BLOB")
+    with new_geopackage(file, source.path.parent) as db:
+        layer = Layer(db, "contacts", "POINT", f"{columns}, image BLOB")
         for contact in source.contacts:
             points = [] if contact.position is None else [contact.position[::-1]]
             layer.add(_point(contact), points, [*contact_properties(contact).values(), source.images.png(contact)])
@@ -190,20 +177,3 @@ def write_geopackage(file: IO[bytes], source: ExportSource) -> None:
             "INSERT INTO layer_styles VALUES (1, '', '', 'contacts', 'geom', 'review', ?, '', 1, '', '', NULL, ?)",
             (_style(), changed),
         )
-
-
-def write_coverage_geopackage(path: Path, polygons: Sequence[CoveragePolygon]) -> None:
-    """Write the covered seabed atomically as the layer `coverage`: polygons in WGS 84.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    divided = [split_ring([(corner.lon_deg, corner.lat_deg) for corner in polygon.ring]) for polygon in polygons]
-    # A layer has one type.
-    geometry = "MULTIPOLYGON" if any(len(rings) > 1 for rings in divided) else "POLYGON"
-    columns = "line TEXT, first_ping INTEGER, last_ping INTEGER, start_utc TEXT, end_utc TEXT, area_m2 REAL"
-    with atomic_file(path) as file, _new_geopackage(file, path.parent) as db:
-        layer = _Layer(db, "coverage", geometry, columns)
-        for polygon, rings in zip(polygons, divided, strict=True):
-            layer.add(_polygons(rings, geometry), chain(*rings), coverage_properties(polygon).values())
-        layer.finish(utc_text(max((polygon.end_utc_s for polygon in polygons), default=0.0)))

@@ -1,1 +1,1 @@
-"""Maps of recordings: mosaic, waterfalls of lines, covered seabed, GeoTIFF files."""
+"""Georeferenced images of recordings: track, canvas, waterfalls of lines, GeoTIFF files."""

@@ -17,12 +17,13 @@ import numpy.typing as npt
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.ground_range import beam_normalised, ground_range_image
-from sonarpost.sonar.maps.geotiff import TILE_PX, GeoTransform, Grey
+from sonarpost.sonar.maps.geotiff import TILE_PX, GeoTransform, Grey, check_size
 from sonarpost.sonar.maps.track import MAX_GAP_M, MAX_GAP_S, Track
 from sonarpost.sonar.survey import FloatImage, Side
 
 FloatArray = npt.NDArray[np.float64]
 
+MIN_RESOLUTION_M: Final = 0.01
 NADIR_DEG: Final = 10.0
 """Angle from the vertical within which the seabed is left out: there a sample covers metres of it."""
 _STEP: Final = 0.7
@@ -168,3 +169,17 @@ def _sub_rows(track: Track, far_m: float, spacing_m: float) -> tuple[npt.NDArray
     rows = np.repeat(np.arange(len(counts)), counts)
     within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     return rows, within / counts[rows]
+
+
+def checked_size(out: Path, size_px: tuple[int, int]) -> tuple[int, int]:
+    """Return the rows and columns of an image.
+
+    Raises:
+        SurveyFileError: It would be too large; the error names its file.
+    """
+    try:
+        check_size(size_px)
+    except ValueError as error:
+        size = f"{size_px[0]} x {size_px[1]} px"
+        raise SurveyFileError(str(out), "size", size, "a smaller area or a coarser resolution") from error
+    return size_px

@@ -21,8 +21,7 @@ import numpy.typing as npt
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.maps.geotiff import GeoTransform, write_tiles
-from sonarpost.sonar.maps.ground_canvas import GroundCanvas
-from sonarpost.sonar.maps.mosaic import MIN_RESOLUTION_M, checked_size
+from sonarpost.sonar.maps.ground_canvas import MIN_RESOLUTION_M, GroundCanvas, checked_size
 from sonarpost.sonar.maps.track import Track, far_m, first_position, is_gap, no_positions, tracks, utm_epsg
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection
@@ -111,8 +110,8 @@ def write_waterfalls(
 ) -> list[LineWaterfall]:
     """Write a waterfall of each straight line of a recording as a cloud-optimised GeoTIFF.
 
-    The files are called LINE-waterfall-N.tif, N from 1. Grey is that of `write_mosaic`. Memory does not depend on the
-    length of the recording.
+    The files are called LINE-waterfall-N.tif, N from 1. Grey is 1 to 255, 128 at the mean echo of an angle, and 0
+    without data. Memory does not depend on the length of the recording.
 
     Args:
         path: Survey file.

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers, add_survey_options, in_new_folder, survey_options_of
-from sonarpost.cli.survey.coverage import coverage_writer, print_left_out
-from sonarpost.errors import ConfigError
-from sonarpost.sonar.maps.mosaic import MIN_RESOLUTION_M, write_mosaic
+from sonarpost.cli.survey.waterfall import check_resolution
+from sonarpost.extensions.maps.coverage_command import coverage_writer, print_left_out
+from sonarpost.extensions.maps.mosaic import write_mosaic
 
 
 def add_action(actions: Subparsers) -> None:
@@ -52,13 +52,3 @@ def run(parsed: argparse.Namespace) -> int:
     )
     print_left_out(result.coverage.left_out)
     return 0
-
-
-def check_resolution(resolution_m: float, command: str) -> None:
-    """Check --resolution-m.
-
-    Raises:
-        ConfigError: It is out of range.
-    """
-    if not MIN_RESOLUTION_M <= resolution_m <= 1000:  # includes NaN
-        raise ConfigError(command, "--resolution-m", resolution_m, f"{MIN_RESOLUTION_M} to 1000 metres")

@@ -10,9 +10,8 @@ from typing import Final
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers, add_survey_options, in_new_folder, survey_options_of
 from sonarpost.errors import ConfigError
-from sonarpost.export.geo.coverage import write_coverage_geojson
-from sonarpost.export.geo.geopackage import write_coverage_geopackage
-from sonarpost.sonar.maps.coverage import CoveragePolygon, survey_coverage
+from sonarpost.extensions.maps.coverage import CoveragePolygon, survey_coverage
+from sonarpost.extensions.maps.coverage_files import write_coverage_geojson, write_coverage_geopackage
 
 WRITERS: Final[Mapping[str, Callable[[Path, Sequence[CoveragePolygon]], None]]] = {
     ".gpkg": write_coverage_geopackage,

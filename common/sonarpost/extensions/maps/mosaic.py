@@ -11,18 +11,14 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
-from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.maps.coverage import Coverage, outline_of
-from sonarpost.sonar.maps.geotiff import GeoTransform, check_size, write_tiles
-from sonarpost.sonar.maps.ground_canvas import GroundCanvas
+from sonarpost.extensions.maps.coverage import Coverage, outline_of
+from sonarpost.sonar.maps.geotiff import GeoTransform, write_tiles
+from sonarpost.sonar.maps.ground_canvas import MIN_RESOLUTION_M, GroundCanvas, checked_size
 from sonarpost.sonar.maps.track import first_position, tracks, utm_epsg
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection
 from sonarpost.sonar.readers import open_survey
-
-MIN_RESOLUTION_M: Final = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,17 +77,3 @@ def write_mosaic(
                 canvas.draw(track)
         write_tiles(out, (height_px, width_px), canvas.grey, transform)
         return MosaicResult(transform, (height_px, width_px), outline.coverage())
-
-
-def checked_size(out: Path, size_px: tuple[int, int]) -> tuple[int, int]:
-    """Return the rows and columns of an image.
-
-    Raises:
-        SurveyFileError: It would be too large; the error names its file.
-    """
-    try:
-        check_size(size_px)
-    except ValueError as error:
-        size = f"{size_px[0]} x {size_px[1]} px"
-        raise SurveyFileError(str(out), "size", size, "a smaller area or a coarser resolution") from error
-    return size_px

@@ -1,0 +1,18 @@
+"""Maps of whole recordings: mosaic of the seabed as GeoTIFF, covered seabed as polygons."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from sonarpost.cli.parsing.commands import Command
+
+MOSAIC: Final = Command(
+    "write a mosaic of the seabed as cloud-optimised GeoTIFF",
+    "sonarpost.extensions.maps.mosaic_command:add_action",
+    {"survey mosaic": "survey mosaic line.xtf --out mosaic.tif --coverage coverage.geojson"},
+)
+COVERAGE: Final = Command(
+    "write the covered seabed as polygons",
+    "sonarpost.extensions.maps.coverage_command:add_action",
+    {"survey coverage": "survey coverage line.xtf --out coverage.gpkg"},
+)
