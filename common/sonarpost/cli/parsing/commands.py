@@ -107,7 +107,6 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "simulate": "simulate line.xtf --seabed ripples --truth truth.json",
     "survey info": "survey info line.xtf --json",
     "survey plot": "survey plot line.xtf --ground --out plots",
-    "survey view": "survey view line.xtf --out line.xtf.picks",
     "survey waterfall": "survey waterfall line.xtf --out waterfalls",
     "survey export": "survey export line.xtf --format geojson --out track.geojson",
     "detect": "detect line.xtf --threshold 0.5 --pick 73,port,720 --plot contacts.png",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import secrets
 import tempfile
 import threading
@@ -13,12 +12,12 @@ from typing import Final
 
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers, add_survey_options, in_new_folder, print_notes, survey_options_of
-from sonarpost.cli.survey.view.waterfall import Waterfall
 from sonarpost.detection.detector import Detection
 from sonarpost.detection.picks import Pick, locate_picks, parse_picks, picks_path
 from sonarpost.detection.settings import DetectorSettings, checked_settings, load_settings
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamDetector
 from sonarpost.errors import ConfigError, SonarpostError
+from sonarpost.extensions.survey_view.waterfall import Waterfall
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import SurveySource
@@ -61,9 +60,9 @@ def run(parsed: argparse.Namespace) -> int:
         PortError: The port is in use.
     """
     # Imported lazily: they need the extra `console`.
-    from sonarpost.cli.survey.view.web import DetectedContacts, SurveyViewApp  # noqa: PLC0415
+    from sonarpost.extensions.survey_view.web import DetectedContacts, SurveyViewApp  # noqa: PLC0415
+    from sonarpost.services.console.web.server import WebServer  # noqa: PLC0415
 
-    server_module = importlib.import_module("sonarpost.services.console.web.server")
     if not 0 <= parsed.port <= 65535:
         raise ConfigError("survey view", "--port", parsed.port, "0 to 65535")
     settings = _settings(parsed)
@@ -80,7 +79,7 @@ def run(parsed: argparse.Namespace) -> int:
         contacts = DetectedContacts()
         token = secrets.token_urlsafe(16)
         app = SurveyViewApp(info, waterfall, contacts, picks, out, _detect_command(parsed), token)
-        server = server_module.WebServer(app.asgi, HOST, parsed.port)
+        server = WebServer(app.asgi, HOST, parsed.port)
 
         def detect() -> None:
             try:

@@ -15,13 +15,13 @@ from PIL import Image
 from starlette.testclient import TestClient
 
 from sonarpost.cli.main import main
-from sonarpost.cli.survey.view import waterfall as waterfall_module
-from sonarpost.cli.survey.view.command import detected, stored_picks
-from sonarpost.cli.survey.view.waterfall import Waterfall
-from sonarpost.cli.survey.view.web import DetectedContacts, SurveyViewApp
 from sonarpost.detection.picks import Pick, parse_picks
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.survey_view import waterfall as waterfall_module
+from sonarpost.extensions.survey_view.command import detected, stored_picks
+from sonarpost.extensions.survey_view.waterfall import Waterfall
+from sonarpost.extensions.survey_view.web import DetectedContacts, SurveyViewApp
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import Side

@@ -6,7 +6,6 @@ Every path begins with a random token, so that other users and pages of this hos
 from __future__ import annotations
 
 import hmac
-import importlib
 import shlex
 import threading
 from collections.abc import Callable, Sequence
@@ -25,11 +24,12 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from sonarpost.cli.shared import utc_text
-from sonarpost.cli.survey.view.waterfall import TILE_ROWS, PixelPlace, Waterfall
 from sonarpost.detection.detector import Detection
 from sonarpost.detection.picks import MAX_PICKS, Pick, parse_pick, picks_text
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.survey_view.waterfall import TILE_ROWS, PixelPlace, Waterfall
 from sonarpost.files import write_atomically
+from sonarpost.services.console.web.access import SecurityMiddleware
 from sonarpost.sonar.source import SurveyInfo
 from sonarpost.wire import first_error
 
@@ -118,9 +118,7 @@ class SurveyViewApp:
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
         app = Starlette(routes=routes, exception_handlers={HTTPException: _error_response})
-        # A command imports a service by name only: the import rules separate them.
-        access = importlib.import_module("sonarpost.services.console.web.access")
-        self.asgi: ASGIApp = access.SecurityMiddleware(_TokenGate(app, token), (), tls=False)
+        self.asgi: ASGIApp = SecurityMiddleware(_TokenGate(app, token), (), tls=False)
 
     def _describe(self, _request: Request) -> Response:
         waterfall, info = self._waterfall, self._info

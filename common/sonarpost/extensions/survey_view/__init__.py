@@ -1,0 +1,13 @@
+"""`sonarpost survey view`: a local web page with the waterfall of a recording, for picks."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from sonarpost.cli.parsing.commands import Command
+
+VIEW: Final = Command(
+    "show a recording on a web page, and pick contacts in it",
+    "sonarpost.extensions.survey_view.command:add_action",
+    {"survey view": "survey view line.xtf --out line.xtf.picks"},
+)
