@@ -33,7 +33,7 @@ MAX_REGION_BYTES = 512
 """Longest stream of a region: what a vehicle sends of an image without a further command by default."""
 
 Version = Annotated[int, Field(ge=1, le=2**31)]
-Layer = Literal["raw", Relation]
+ImageLayer = Literal["raw", Relation]
 _Point = tuple[Annotated[float, Field(ge=0, le=4096)], Annotated[float, Field(ge=0, le=4096)]]
 
 
@@ -49,7 +49,7 @@ class CommentBody(RequestBody):
 
 class _MeasureBody(RequestBody):
     version: Version
-    layer: Layer = "raw"
+    layer: ImageLayer = "raw"
     kind: MeasurementKind
     start: Annotated[_Point, Field(alias="from")]
     to: _Point

@@ -13,7 +13,7 @@ from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.database import DisplayedImage
 from sonarpost.services.console.store.decisions import DecisionInput
 from sonarpost.services.console.web.access import AccessControl, Call, RequestBody
-from sonarpost.services.console.web.contact_routes import CommentBody, Layer, Version, contact_id
+from sonarpost.services.console.web.contact_routes import CommentBody, ImageLayer, Version, contact_id
 
 _Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
@@ -22,7 +22,7 @@ class _DecisionBody(CommentBody):
     verdict: Verdict
     revision: Annotated[int, Field(ge=0)]
     sha256: _Digest
-    layer: Layer = "raw"
+    layer: ImageLayer = "raw"
     overrules: bool = False
     shown_s: Annotated[float, Field(ge=0, le=86400)] | None = None
 
@@ -37,7 +37,7 @@ class _UndoBody(RequestBody):
     decision_id: Annotated[str, Field(max_length=64)]
     version: Version | None = None
     sha256: _Digest | None = None
-    layer: Layer | None = None
+    layer: ImageLayer | None = None
 
 
 class DecisionRoutes:

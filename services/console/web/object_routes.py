@@ -14,7 +14,7 @@ from sonarpost.services.console.store.database import DisplayedImage
 from sonarpost.services.console.store.decisions import DecisionInput
 from sonarpost.services.console.store.objects import MAX_OBJECT_LOOKS
 from sonarpost.services.console.web.access import AccessControl, Call, RequestBody
-from sonarpost.services.console.web.contact_routes import Layer, Version
+from sonarpost.services.console.web.contact_routes import ImageLayer, Version
 
 _ContactId = Annotated[str, Field(min_length=1, max_length=200)]
 
@@ -24,7 +24,7 @@ class _LookBody(RequestBody):
     revision: Annotated[int, Field(ge=0)]
     version: Version
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-    layer: Layer = "raw"
+    layer: ImageLayer = "raw"
 
 
 class _DecisionBody(RequestBody):
