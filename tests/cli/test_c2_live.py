@@ -83,7 +83,7 @@ class PublishedRecords:
 def test_vessels_have_places_and_turns_of_their_own(monkeypatch):
     monkeypatch.setattr(watch_module, "MAX_WAITING", 10)
     session = PublishedRecords()
-    watch = watch_module.Watch(session, keys.SHORE, None)
+    watch = watch_module.RecordSubscription(session, keys.SHORE, None)
     for vessel, count in (("vessel-2", 50), ("vessel-1", 3)):
         for number in range(count):
             record = decision(f"{number:04d}", vessel_id=vessel)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import zenoh
 
-from sonarpost.cli.c2.watch import Watch
+from sonarpost.cli.c2.watch import RecordSubscription
 from sonarpost.cli.shared import add_router_options, add_site_option
 from sonarpost.export.contacts import ExportContact, load_contacts
 from sonarpost.export.live import LiveContacts
@@ -56,7 +56,7 @@ class ContactStream:
     """
 
     def __init__(self, session: zenoh.Session, site: str, vessel: str | None, archive: Path | None) -> None:
-        self._watch = Watch(session, site, vessel)
+        self._watch = RecordSubscription(session, site, vessel)
         self._vessel = vessel
         self._archive = archive
         self._contacts = LiveContacts()

@@ -46,7 +46,7 @@ def run(parsed: argparse.Namespace) -> int:
     shown = 0
     with session, suppress(KeyboardInterrupt):
         _log(f"watching {parsed.site} at {', '.join(endpoints)}")
-        watch = Watch(session, parsed.site, parsed.vessel)
+        watch = RecordSubscription(session, parsed.site, parsed.vessel)
         while parsed.count is None or shown < parsed.count:
             record = watch.poll()
             if record is not None:
@@ -55,7 +55,7 @@ def run(parsed: argparse.Namespace) -> int:
     return 0
 
 
-class Watch:
+class RecordSubscription:
     """Subscription to the records that a site publishes. Zenoh reconnects; this class logs it.
 
     Attributes:
