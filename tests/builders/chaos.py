@@ -31,6 +31,7 @@ from builders.image_source import ImageSource, make_image, pixels_sha256
 from builders.numbered_snippet import number_of, numbered_snippet
 from builders.progress import wait_while_progressing
 from builders.small_disk import SmallDisk
+from builders.vessel_and_shore import UNFINISHED
 from research.common.link_emulator import LinkEmulator
 from sonarpost import keys
 from sonarpost.cli.demo.chain import ROUTERS, Chain
@@ -293,7 +294,7 @@ class ChaosChain:
 
 def queued_records(path):
     with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True, timeout=30)) as db:
-        return sum(int(db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]) for table in ("inbox", "outbox"))
+        return sum(int(db.execute(f"SELECT COUNT(*) FROM {rows}").fetchone()[0]) for rows in UNFINISHED)
 
 
 @contextmanager
