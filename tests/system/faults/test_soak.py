@@ -134,8 +134,13 @@ class Mission:
         """Log the images that are complete at the shore and were not seen before."""
         for path in side_cars(self.settings.shore_images):
             base = path.stem.rpartition("_v")[0]
-            if base in self._found or '"complete": true' not in path.read_text(encoding="utf-8"):
+            if base in self._found:
                 continue
+            try:
+                if '"complete": true' not in path.read_text(encoding="utf-8"):
+                    continue
+            except FileNotFoundError:
+                continue  # a superseded version, which retention has removed
             tiff = path.with_suffix(".tiff")
             number = number_of(tifffile.imread(tiff))
             record = f"unreadable {path.stem}" if number is None else f"snippet-{number:05}"
