@@ -16,7 +16,6 @@ from builders.common import REPOSITORY
 
 SOCKETS = {
     "common/sonarpost/bus/connectivity.py": "probes: three waits of at most 3 s; the signal thread ends the process",
-    "common/sonarpost/export/tak/cot_stream.py": "one deadline for the whole connection",
     "common/sonarpost/network/connections.py": "limits of a server's connections",
     "common/sonarpost/network/http_client.py": "one deadline for the whole exchange",
     "common/sonarpost/runtime/udp_port.py": "datagrams; the socket has a time limit",
@@ -68,11 +67,10 @@ READS = {
     "common/sonarpost/config.py": OWN_SETTINGS,
     "common/sonarpost/delivery/salvage.py": "database of this function",
     "common/sonarpost/detection/difficulty.py": SHIPPED,
-    "common/sonarpost/export/tak/cot_sender.py": OWN_SETTINGS,
-    "common/sonarpost/export/tak/cot_stream.py": "bytes to send, from the TLS library",
     "common/sonarpost/monitoring/healthcheck.py": "heartbeat of a service on this computer",
     "common/sonarpost/network/http_client.py": "the connection delivers at most MAX_REPLY_BYTES",
     "common/sonarpost/registry.py": SHIPPED,
+    "common/sonarpost/security/client_tls.py": OWN_SETTINGS,
     "common/sonarpost/security/fleet.py": OWN_SETTINGS,
     "common/sonarpost/security/tls_files.py": OWN_SETTINGS,
     "common/sonarpost/sonar/options.py": "its size is compared with 64 KiB first",

@@ -9,17 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hypothesis import strategies as st
 
 from builders.records import decision_record, reconstructed_image
 from sonarpost.archive.image_files import write_image
 from sonarpost.archive.shore_files import decision_file_name
-from sonarpost.export.contacts import ContactSet
+from sonarpost.export.contacts import ContactSet, ExportContact, ImageSideCar, side_car
 from sonarpost.export.formats import exporters
 from sonarpost.export.source import ExportSource, StoredImages
-from sonarpost.export.tak.cot import cot_events
 from sonarpost.messages import Contact, Decision, Pixels, ReconstructedImage
 
 FIRST_UTC_S = 1476262801.25
+HOSTILE = st.text(
+    st.one_of(st.characters(), st.sampled_from("<>&\"'=\x00\x08\x1b\x7f\x85\u2028\ufffe\ufdd0]]>%$[name]")), max_size=60
+).filter(lambda text: not any("\ud800" <= c <= "\udfff" for c in text))
+"""Text that no format may take for its own syntax."""
 
 
 def image(image_id: str = "00A7", contact: dict[str, Any] | None = None, **changes: Any) -> ReconstructedImage:
@@ -132,6 +136,12 @@ MISSIONS = {
 }
 
 
+def single(record: ReconstructedImage, *decisions: Decision) -> ContactSet:
+    """One contact without files."""
+    side = ImageSideCar.model_validate_json(json.dumps(side_car(record)))
+    return ContactSet((ExportContact(side, decisions, None),), (), ())
+
+
 def export(name: str, contacts: ContactSet, images: StoredImages | None = None) -> bytes:
     """Return the contacts in a format."""
     file = io.BytesIO()
@@ -146,5 +156,4 @@ def golden_files(name: str, contacts: ContactSet) -> dict[str, bytes]:
         f"{name}.geojson": export("geojson", contacts),
         f"{name}.kml": export("kml", contacts),
         f"{name}.csv": export("csv", contacts),
-        f"{name}.cot": b"\n".join(cot_events(contacts, FIRST_UTC_S + 3600)) + b"\n",
     }

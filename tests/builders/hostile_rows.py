@@ -471,7 +471,6 @@ ROWS: tuple[Row, ...] = (
         "endless",
         "tests/network/test_http_client.py",
     ),
-    Row(("exchange:export.tak.*",), "server", "endless", "tests/cli/test_c2_tak.py"),
     Row(("exchange:bus.connectivity",), "router", "slow", "tests/bus/test_connectivity.py"),
     Row(("zenoh:*/inbox/{vessel}/frame",), "another vessel", "junk", "tests/security/test_other_vessels.py"),
     Row(("zenoh:*/status/{vessel}",), "vessel", "junk", "tests/services/console/test_service.py"),

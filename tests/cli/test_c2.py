@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 import subprocess
 import sys
 import threading
-import zipfile
-from xml.etree import ElementTree as ET
 
 import pytest
 import zenoh
@@ -170,7 +167,6 @@ def test_export_writes_all_formats_and_marks_images_as_exported(capsys, out, tmp
     assert len(json.loads(files["geojson"].read_text())["features"]) == 2
     assert files["kmz"].read_bytes().startswith(b"PK")
     assert files["gpkg"].read_bytes().startswith(b"SQLite format 3")
-    assert zipfile.is_zipfile(files["tak.zip"])
     assert all(path.stat().st_size for path in files.values())
     assert "2 contacts, 0 of them without a position" in capsys.readouterr().out
     exported = {r["image_id"]: r["exported_utc_s"] is not None for r in ls(capsys, out, "--all-versions")}
@@ -183,37 +179,10 @@ def test_export_to_a_file_of_unknown_format_is_an_error(capsys, out, tmp_path):
     assert expected in capsys.readouterr().err
 
 
-def test_export_sends_cursor_on_target_events(capsys, out):
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-        received = bytearray()
-
-        def receive():
-            connection, _ = server.accept()
-            with connection:
-                while data := connection.recv(4096):
-                    received.extend(data)
-
-        listener = threading.Thread(target=receive)
-        listener.start()
-        options = ["--vessel", "vessel-1", "--cot", f"tcp://127.0.0.1:{port}"]
-        assert main(["c2", "export", "--archive", str(out), *options]) == 0
-        listener.join()
-    events = [ET.fromstring(text + "</event>") for text in received.decode().split("</event>")[:-1]]
-    assert sorted(event.attrib["type"][:3] for event in events) == ["a-s", "b-m"]
-    assert len({event.attrib["uid"] for event in events}) == 2
-    assert "2 events, 0 contacts without a position omitted" in capsys.readouterr().out
-
-
-def test_export_to_an_unreachable_endpoint_is_an_error(capsys, out):
-    endpoint = f"tcp://127.0.0.1:{free_port()}"
-    assert main(["c2", "export", "--archive", str(out), "--cot", endpoint, "--cot-wait", "0.5"]) == 2
-    assert "tcp://127.0.0.1" in capsys.readouterr().err
-
-
 def test_export_needs_an_output_and_reports_rejected_files(capsys, out, tmp_path):
-    assert main(["c2", "export", "--archive", str(out)]) == 2
-    assert "expected --out FILE or --cot URL" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["c2", "export", "--archive", str(out)])
+    assert "required: --out" in capsys.readouterr().err
     (out / "vessel-1" / "broken.json").write_text("{")
     assert main(["c2", "export", "--archive", str(out), "--out", str(tmp_path / "c.csv")]) == 1
     assert "rejected: " in capsys.readouterr().err

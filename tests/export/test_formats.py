@@ -9,55 +9,41 @@ import json
 import re
 import tempfile
 import zipfile
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
-import xmlschema
 from builders.common import GOLDEN_FOLDER
 from builders.exports import (
-    FIRST_UTC_S,
+    HOSTILE,
     MISSIONS,
     decision,
     export,
     golden_files,
     image,
     mission,
+    single,
     store,
 )
 from hypothesis import example, given
 from hypothesis import strategies as st
 from PIL import Image
 
-from sonarpost.export.contacts import ContactSet, ExportContact, ImageSideCar, load_contacts, side_car
+from sonarpost.export.contacts import ContactSet, load_contacts
 from sonarpost.export.formats import write_export
 from sonarpost.export.source import ExportSource, StoredImages
 from sonarpost.export.tables import COLUMNS
-from sonarpost.export.tak.cot import CotOptions, cot_event, cot_events, cot_type
 from sonarpost.export.text import csv_text, html_text, probabilities_text, xml_text
 from sonarpost.messages import Pixels
 from sonarpost.review.measured_size import MeasuredSize
 
 GOLDEN = GOLDEN_FOLDER / "export"
 KML = "{http://www.opengis.net/kml/2.2}"
-NOW_UTC_S = FIRST_UTC_S + 3600
-
-
-@pytest.fixture(scope="module")
-def schema():
-    return xmlschema.XMLSchema(Path(__file__).with_name("cot_event.xsd"))
 
 
 @pytest.fixture
 def contacts(tmp_path):
     return load_contacts(mission(tmp_path / "out"))
-
-
-def single(record, *decisions):
-    """One contact without files."""
-    side = ImageSideCar.model_validate_json(json.dumps(side_car(record)))
-    return ContactSet((ExportContact(side, decisions, None),), (), ())
 
 
 MARKS = {
@@ -67,29 +53,10 @@ MARKS = {
         b'<Data name="p_other_object">\n      <value>0.1<',
     ),
     "classified.csv": (b",true,0.85,0.1,", b",,0.0,1.0,", b",,0.5,0.25,"),
-    "classified.cot": (
-        b"Detector's class mine-like. Detector: mine-like 85 %, other object 10 %, seabed 5 %.",
-        b"Detector's class structure. Detector's confidence",
-        b"Z. Water depth 15.8 m. Detector: mine-like 50 %, other object 25 %, seabed 25 %.",
-    ),
     "authenticated.geojson": (b'"authenticated": false',),
     "authenticated.kml": (b"<name>uuv-1/0002 (unauthenticated)</name>",),
     "authenticated.csv": (b",,false,",),
-    "authenticated.cot": (b"Unauthenticated: any modem in range",),
-    "reviewed.geojson": (b'"review": "unreviewed"', b'"withdrawn_by": "anna"', b'"review": "disputed"'),
-    "reviewed.kml": (
-        b"#unreviewed<",
-        b'<Data name="withdrawn_by">\n      <value>anna<',
-        b"Disputed (1)",
-        b"#disputed<",
-    ),
     "reviewed.csv": (b",unreviewed,", b",anna,,,,,,,,\r\n", b",disputed,manta,"),
-    "reviewed.cot": (
-        b"Sonar contact, not reviewed.",
-        b"Decision withdrawn by anna.",
-        b"Disputed, counts as mine-like.",
-        b"Verdicts: anna mine-like, ben not mine-like.",
-    ),
 }
 """What a golden file contains once, beside what is compared with it."""
 
@@ -126,7 +93,6 @@ def test_every_export_states_the_measurements_of_operators():
     assert (properties["measured_height_sigma_m"], properties["measured_width_m"]) == (0.125, None)
     assert export("csv", contacts).endswith(b",1.234,0.06,,,,,0.5,0.125\r\n")
     assert b'<Data name="measured_height_m">\n      <value>0.5<' in export("kml", contacts)
-    assert "Measured: L 1.23 ± 0.06 m, H 0.50 ± 0.12 m." in cot_event(contacts.contacts[0], NOW_UTC_S).decode()
 
 
 def test_unknown_authentication_is_not_stated(contacts):
@@ -283,101 +249,29 @@ def test_sixteen_bits_are_scaled_to_eight_and_an_image_has_the_shape_of_the_seab
     assert pixels.shape[0] > height + 15
 
 
-def test_cot_events_match_the_schema(contacts, schema):
-    events = cot_events(contacts, NOW_UTC_S)
-    assert len(events) == 5
-    for event in events:
-        schema.validate(event.decode())
-    # The schema rejects invalid events.
-    event = events[0].decode()
-    changes = (
-        ('type="b-m-p-s-m"', 'type="b m"'),
-        ('lat="41.', 'lat="141.'),
-        (' how="m-i"', ""),
-        ('ce="4.5"', 'ce="4e1"'),
-    )
-    for right, wrong in changes:
-        assert right in event
-        assert not schema.is_valid(event.replace(right, wrong))
-
-
-def test_only_a_decision_gives_a_mine_type():
-    for verdict, mlo_class, expected in (
-        (None, None, "b-m-p-s-m"),
-        ("unsure", "bottom mine", "b-m-p-s-m"),
-        ("not_mine_like", "bottom mine", "a-u-U-N-B"),
-        ("mine_like", None, "a-s-U-W-M"),
-        ("mine_like", "Bottom_Mine", "a-s-U-W-M-G"),
-        ("mine_like", " moored  MINE", "a-s-U-W-M-M"),
-        ("mine_like", "drifting", "a-s-U-W-M-F"),
-        ("mine_like", "not a bottom mine", "a-s-U-W-M"),
-    ):
-        decisions = () if verdict is None else (decision(verdict=verdict, mlo_class=mlo_class),)
-        (contact,) = single(image(contact={"atd_confidence": 2.0, "atd_class": "mine"}), *decisions).contacts
-        assert cot_type(contact) == expected
-        assert cot_type(contact, CotOptions(mine_affiliation="h")) == expected.replace("a-s-", "a-h-")
-
-
-def attributes(event):
-    root = ET.fromstring(event)
-    point = root.find("point")
-    return dict(root.attrib), dict(point.attrib), root.findtext("detail/remarks") or ""
-
-
-def test_cot_event_times_and_accuracy():
-    (contact,) = single(image()).contacts
-    event, point, remarks = attributes(cot_event(contact, NOW_UTC_S, CotOptions(stale_after_s=60.0)))
-    times = ["2016-10-12T10:00:01.250Z", "2016-10-12T10:00:01.250Z", "2016-10-12T10:01:01.250Z"]
-    assert [event[name] for name in ("time", "start", "stale")] == times
-    assert point == {"lat": "41.5251334", "lon": "-70.6712456", "hae": "9999999.0", "ce": "4.5", "le": "9999999.0"}
-    assert "Seen 2016-10-12T08:59:50.500Z" in remarks
-    (contact,) = single(image(contact={"position_sigma_m": None})).contacts
-    assert attributes(cot_event(contact, NOW_UTC_S))[1]["ce"] == "9999999.0"
-
-
-def test_tiny_coordinate_has_no_exponent(schema):
+def test_tiny_coordinate_has_no_exponent():
     found = single(image(contact={"lat_deg": -0.00000012, "lon_deg": 1e-9}))
-    event = cot_event(found.contacts[0], NOW_UTC_S)
-    schema.validate(event.decode())
-    assert attributes(event)[1]["lat"] == "-0.0000001"
     assert b"e-" not in export("kml", found).split(b"<coordinates>")[1].split(b"</")[0]
 
 
-def test_contact_without_position_has_no_event():
-    found = single(image(contact={"lat_deg": None, "lon_deg": None}))
-    assert cot_events(found, NOW_UTC_S) == ()
-    with pytest.raises(ValueError, match="no position"):
-        cot_event(found.contacts[0], NOW_UTC_S)
-    with pytest.raises(ValueError, match="stale_after_s"):
-        CotOptions(stale_after_s=0)
+def test_contact_without_position_is_no_feature():
     found = single(image().model_copy(update={"contact": None}))
-    assert (len(found.unlocated), cot_events(found, NOW_UTC_S)) == (1, ())
+    assert len(found.unlocated) == 1
     assert json.loads(export("geojson", found))["features"] == []
 
 
 # Untrusted text
 
-HOSTILE = st.text(
-    st.one_of(st.characters(), st.sampled_from("<>&\"'=\x00\x08\x1b\x7f\x85\u2028\ufffe\ufdd0]]>%$[name]")), max_size=60
-).filter(lambda text: not any("\ud800" <= c <= "\udfff" for c in text))
-
 
 @given(remark=HOSTILE, mlo_class=HOSTILE, operator=HOSTILE.filter(bool), note=HOSTILE)
-def test_untrusted_text_is_escaped_in_all_formats(schema, remark, mlo_class, operator, note):
+def test_untrusted_text_is_escaped_in_all_formats(remark, mlo_class, operator, note):
     found = single(
         image(notes=(note,)), decision(remark=remark, mlo_class=mlo_class, operator=operator, verdict="mine_like")
     )
-    event = cot_events(found, NOW_UTC_S)[0]
-    schema.validate(event.decode())
-    assert b"\n" not in event.replace(b"\n", b"", remark.count("\n") + mlo_class.count("\n") + operator.count("\n"))
-    remarks = attributes(event)[2]
-    # XML readers normalise line ends.
-    if "\r" not in remark + mlo_class + operator:
-        assert remarks.endswith(f"Remark: {xml_text(remark)}" if remark else ".")
     root = ET.fromstring(export("kml", found))
     data = {d.get("name"): d.findtext(f"{KML}value") for d in root.iter(f"{KML}Data")}
     balloon = root.findtext(f".//{KML}Placemark/{KML}description") or ""
-    if "\r" not in remark:
+    if "\r" not in remark:  # XML readers normalise line ends
         assert data["remark"] == xml_text(remark)
         assert html_text(remark) in balloon
     assert set(re.findall(r"<(/?\w+)", balloon)) <= {"table", "/table", "tr", "/tr", "td", "/td"}

@@ -14,28 +14,31 @@ from sonarpost.export.geo.geopackage import write_geopackage
 from sonarpost.export.geo.kml import write_kml, write_kmz
 from sonarpost.export.source import ExportSource, StoredImages
 from sonarpost.export.tables import write_csv, write_geojson
-from sonarpost.export.tak.cot import write_cot
-from sonarpost.export.tak.data_package import write_data_package
 from sonarpost.files import atomic_file
 from sonarpost.registry import Registry
 
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A format: the function that writes it to a seekable binary file, and its media type."""
+    """A format.
+
+    Attributes:
+        write: Function that writes it to a seekable binary file.
+        media_type: Media type of the file.
+        label: Its name in the console, where that has no text of its own; empty: the console does not offer it.
+    """
 
     write: Callable[[IO[bytes], ExportSource], None]
     media_type: str
+    label: str = ""
 
 
 _CORE: Final[Mapping[str, Format]] = {
-    "geojson": Format(write_geojson, "application/geo+json"),
+    "geojson": Format(write_geojson, "application/geo+json", "GeoJSON"),
     "kml": Format(write_kml, "application/vnd.google-earth.kml+xml"),
-    "kmz": Format(write_kmz, "application/vnd.google-earth.kmz"),
-    "csv": Format(write_csv, "text/csv; charset=utf-8"),
-    "gpkg": Format(write_geopackage, "application/geopackage+sqlite3"),
-    "cot.xml": Format(write_cot, "application/xml"),
-    "tak.zip": Format(write_data_package, "application/zip"),
+    "kmz": Format(write_kmz, "application/vnd.google-earth.kmz", "KMZ"),
+    "csv": Format(write_csv, "text/csv; charset=utf-8", "CSV"),
+    "gpkg": Format(write_geopackage, "application/geopackage+sqlite3", "GeoPackage"),
 }
 
 

@@ -43,11 +43,13 @@ CONNECTION_INTERVAL: Final = 16
 """Contacts between two checks of the connection, which take about as long as a contact."""
 CHUNK_BYTES: Final = 65536
 _skipped_log: Final = IntervalLog(logging.getLogger(__name__), logging.ERROR, "Contact left out of a document")
-NAMES: Final[Mapping[str, Format]] = {
-    f"contacts.{name}": exporters().get(name) for name in ("geojson", "kmz", "csv", "gpkg", "cot.xml")
-}
 
 Writer = Callable[[IO[bytes], "DocumentContacts"], None]
+
+
+def offered_formats() -> dict[str, Format]:
+    """Return the formats that the console offers, by name."""
+    return {name: one for name, one in exporters().working().items() if one.label}
 
 
 @dataclass(eq=False)
@@ -189,9 +191,10 @@ class ExportRoutes:
 
     def _export(self, call: Call) -> Response:
         name = str(call.request.path_params["name"])
-        if name not in NAMES:
-            raise ApiError(404, "not_found", "one of " + ", ".join(NAMES))
-        query, chosen = call.parse_query(ContactFilter), NAMES[name]
+        names = {f"contacts.{format_name}": one for format_name, one in offered_formats().items()}
+        if name not in names:
+            raise ApiError(404, "not_found", "one of " + ", ".join(names))
+        query, chosen = call.parse_query(ContactFilter), names[name]
         headers = {"Content-Disposition": f'attachment; filename="{name}"', "Content-Type": chosen.media_type}
         path = self._state.database.path.with_name(name)
 

@@ -40,7 +40,7 @@ from sonarpost.services.console.web.connections import ConnectionDeadlines
 from sonarpost.services.console.web.contact_routes import ContactRoutes
 from sonarpost.services.console.web.decision_routes import DecisionRoutes
 from sonarpost.services.console.web.event_stream import EventStream
-from sonarpost.services.console.web.export_routes import ExportRoutes
+from sonarpost.services.console.web.export_routes import ExportRoutes, offered_formats
 from sonarpost.services.console.web.installation_routes import index_page, installation_routes
 from sonarpost.services.console.web.map_routes import MapRoutes
 from sonarpost.services.console.web.object_routes import ObjectRoutes
@@ -114,6 +114,7 @@ class ConsoleApp:
                     "contact": CONTACT_STALE_S,
                 },
                 "tiles": self._map.tiles(),
+                "exports": {name: one.label for name, one in offered_formats().items()},
             }
         )
 

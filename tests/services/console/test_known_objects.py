@@ -54,7 +54,7 @@ def outputs(console, user):
     ]
     shown = ("fleet", "map", "map/tracks", "score", "notices", "decisions/last", "export")
     details = [f"/api/contacts/{one}" for one in ids]
-    exports = [f"/api/export/contacts.{name}" for name in ("csv", "geojson", "cot.xml")]
+    exports = [f"/api/export/contacts.{name}" for name in ("csv", "geojson")]
     found = {path: browser.get(path) for path in (*lists, *(f"/api/{one}" for one in shown), *details, *exports)}
     objects = {one["object"] for one in found[lists[0]].json()["items"]}
     found |= {f"/api/objects/{one}": browser.get(f"/api/objects/{one}") for one in objects}
@@ -146,7 +146,7 @@ def test_nothing_about_a_sealed_contact_is_sent(console, clock):
         assert anna.post(f"/api/contacts/{contact_id}/requests", {"kind": "refine"}).status_code == 201
     clock.now_utc_s += 60.0
     assert {item.record.image_id for item in console.state.unsent_records()} == {"00A8"}
-    for name in ("contacts.csv", "contacts.geojson", "contacts.cot.xml"):
+    for name in ("contacts.csv", "contacts.geojson"):
         body = anna.get(f"/api/export/{name}").text
         assert "00A8" in body
         assert "00A7" not in body

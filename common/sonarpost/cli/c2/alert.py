@@ -28,10 +28,10 @@ from sonarpost.cli.shared import Subparsers, in_new_folder, log_level, router_of
 from sonarpost.errors import ConfigError, PortError, StoredFileError
 from sonarpost.export.alerts import alert_document, needs_alert
 from sonarpost.export.contacts import ExportContact
-from sonarpost.export.tak.cot_sender import TlsFiles
 from sonarpost.export.text import utc_text
 from sonarpost.limits import Turns, limit
 from sonarpost.logs import kv
+from sonarpost.security.client_tls import TlsFiles
 from sonarpost.stop_signals import stop_on_signals
 
 log = logging.getLogger(__name__)

@@ -13,8 +13,8 @@ from urllib.parse import SplitResult, unquote, urlsplit
 
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.export.alerts import signature
-from sonarpost.export.tak.cot_sender import TlsFiles
 from sonarpost.network import http_client
+from sonarpost.security.client_tls import TlsFiles
 
 if TYPE_CHECKING:
     # Imported when it is used: it needs the extra `mqtt`.

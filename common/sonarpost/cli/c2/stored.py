@@ -24,15 +24,12 @@ from rich.text import Text
 from sonarpost.archive.reader import ArchivePlace, as_folder, open_reader, place_of, read_image_files
 from sonarpost.archive.shore_files import find_image
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, TaskingRow
-from sonarpost.cli.c2.tak import add_tls_options, tls_files_of
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers, in_new_folder, make_output_folder, printable, time_text
 from sonarpost.config import load
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError
 from sonarpost.export.contacts import ContactSet, ExportContact, load_contacts, match_start_time
 from sonarpost.export.formats import exporters, write_export
-from sonarpost.export.tak.cot import cot_events
-from sonarpost.export.tak.cot_sender import CotSender
 from sonarpost.export.text import probabilities_text
 from sonarpost.files import write_atomically
 
@@ -97,22 +94,15 @@ def add_actions(actions: Subparsers) -> None:
     _add_archive(get)
     get.set_defaults(run=run_get)
 
-    export = actions.add_parser(
-        "export", help="write GeoJSON, KML, KMZ, CSV, GeoPackage, TAK packages or text, or send Cursor-on-Target events"
-    )
+    export = actions.add_parser("export", help="write the contacts as GeoJSON, KML, GeoPackage or in another format")
     add_filters(export)
     export.add_argument(
         "--out",
         type=Path,
         action="append",
-        default=[],
+        required=True,
         metavar="FILE",
         help="file to write, named *." + ", *.".join(exporters().names()) + "; can be repeated",
-    )
-    export.add_argument("--cot", metavar="URL", help="send events to tcp://host:port, tls://… or udp://…")
-    add_tls_options(export, "--cot tls://…")
-    export.add_argument(
-        "--cot-wait", type=float, default=10.0, metavar="SECONDS", help="time limit for connecting (default: 10)"
     )
     export.set_defaults(run=run_export)
 
@@ -327,19 +317,16 @@ def run_get(parsed: argparse.Namespace) -> int:
 def run_export(parsed: argparse.Namespace) -> int:
     """Export contacts; return 0, or 1 if a stored file was rejected."""
     outputs = _export_files(parsed)
-    if not outputs and parsed.cot is None:
-        raise ConfigError("c2 export", "", "no output", "--out FILE or --cot URL")
     record_filter = RecordFilter.of(parsed)
     place = archive_of(parsed)
     with ExitStack() as stack:
         with ProgressDisplay(step=f"reading {place}"):
             # Exports need no TIFF files.
             contacts = load_contacts(stack.enter_context(as_folder(place, (".json", ".png"))))
-        return _write_contacts(parsed, place, contacts, outputs, record_filter)
+        return _write_contacts(place, contacts, outputs, record_filter)
 
 
 def _write_contacts(
-    parsed: argparse.Namespace,
     place: ArchivePlace,
     contacts: ContactSet,
     outputs: Sequence[tuple[str, Path]],
@@ -356,11 +343,6 @@ def _write_contacts(
         with ProgressDisplay(step=f"writing {path}"):
             problems += write_export(name, in_new_folder(path), contacts)
         print(f"{path}: {len(contacts.contacts)} contacts, {len(contacts.unlocated)} of them without a position")
-    if parsed.cot is not None:
-        events = cot_events(contacts, time.time())
-        evidence = CotSender(parsed.cot, tls_files_of(parsed)).send(events, parsed.cot_wait)
-        omitted = f"{len(contacts.unlocated)} contacts without a position omitted"
-        print(f"{parsed.cot}: {len(events)} events, {omitted}; {evidence}")
     _mark_exported(place, contacts.contacts)
     for problem in problems:
         print(f"rejected: {problem}", file=sys.stderr)

@@ -3,9 +3,9 @@
 import { api } from "../base/api.js";
 import { fill, h, labelled, showDialog } from "../base/dom.js";
 import { quantity, secondsOf } from "../base/format.js";
-import { t } from "../texts.js";
+import { state } from "../base/state.js";
+import { hasText, t } from "../texts.js";
 
-const FORMATS = ["geojson", "kmz", "csv", "gpkg", "cot.xml"];
 const POLL_MS = 300;
 
 /**
@@ -22,7 +22,8 @@ export async function openExportDialog(filter, contact) {
 class ExportDialog {
   constructor(filter, contact) {
     this.filter = filter;
-    this.buttons = FORMATS.map((format) => h("button", { type: "button", text: t(`export_dialog.${format}`), data: { export: format }, on: { click: () => this.#save(format) } }));
+    const text = (format, label) => (hasText(`export_dialog.${format}`) ? t(`export_dialog.${format}`) : label);
+    this.buttons = Object.entries(state.info.exports).map(([format, label]) => h("button", { type: "button", text: text(format, label), data: { export: format }, on: { click: () => this.#save(format) } }));
     const field = (name) => h("input", { type: "datetime-local", step: 1, value: timeOf(filter[name]), on: { change: () => this.count() } });
     this.from = field("from_utc_s");
     this.to = field("to_utc_s");

@@ -447,7 +447,6 @@ export default {
   "export_dialog.kmz": "KMZ, für Google Earth, mit Bildern",
   "export_dialog.csv": "CSV, für Tabellenkalkulation",
   "export_dialog.gpkg": "GeoPackage, für GIS, mit Bildern",
-  "export_dialog.cot.xml": "Cursor-on-Target, für TAK",
   "export_dialog.report": "Druckbarer Bericht zu {name}",
   "export_dialog.sheets": { one: "Zielblatt von {count} Kontakt", other: "Zielblätter von {count} Kontakten" },
   "export_dialog.progress": "Fortschritt des Exports",

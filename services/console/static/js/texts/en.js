@@ -447,7 +447,6 @@ export default {
   "export_dialog.kmz": "KMZ, for Google Earth, with images",
   "export_dialog.csv": "CSV, for spreadsheets",
   "export_dialog.gpkg": "GeoPackage, for GIS, with images",
-  "export_dialog.cot.xml": "Cursor-on-Target, for TAK",
   "export_dialog.report": "Printable report of {name}",
   "export_dialog.sheets": { one: "Target sheet of {count} contact", other: "Target sheets of {count} contacts" },
   "export_dialog.progress": "Progress of the export",

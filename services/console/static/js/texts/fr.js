@@ -447,7 +447,6 @@ export default {
   "export_dialog.kmz": "KMZ, pour Google Earth, avec images",
   "export_dialog.csv": "CSV, pour tableurs",
   "export_dialog.gpkg": "GeoPackage, pour SIG, avec images",
-  "export_dialog.cot.xml": "Cursor-on-Target, pour TAK",
   "export_dialog.report": "Rapport imprimable sur {name}",
   "export_dialog.sheets": { one: "Fiche de cible de {count} contact", other: "Fiches de cible de {count} contacts" },
   "export_dialog.progress": "Avancement de l'export",

@@ -17,19 +17,19 @@ import pytest
 import xmlschema
 from builders.common import free_port
 from builders.exports import decision, image, mission, store
-from builders.tak_server import Authority
+from builders.tls_authority import Authority
 
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.export.contacts import load_contacts
 from sonarpost.export.formats import write_export
-from sonarpost.export.tak.data_package import (
+from sonarpost.extensions.tak.data_package import (
     MANIFEST,
     UploadedPackage,
     attachment_sha256,
     data_package,
     file_transfer_event,
 )
-from sonarpost.export.tak.tak_files import TakFiles
+from sonarpost.extensions.tak.tak_files import TakFiles
 
 NOW_S = 1_700_000_000.0
 

@@ -1,10 +1,11 @@
-"""`sonarpost c2 cot`: sends the contacts of a shore site to a TAK endpoint, live."""
+"""`sonarpost c2 cot`: sends the contacts of a shore site to a TAK endpoint, live or once."""
 
 from __future__ import annotations
 
 import argparse
 import logging
 import os
+import sys
 import time
 from collections import OrderedDict
 from collections.abc import Callable
@@ -17,23 +18,24 @@ from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.c2.live import ContactChange, ContactStream, add_live_options
 from sonarpost.cli.shared import Subparsers, log_level, router_of
 from sonarpost.config import PlatformConfig, load
-from sonarpost.errors import PortError
-from sonarpost.export.contacts import ExportContact
+from sonarpost.errors import ConfigError, PortError
+from sonarpost.export.contacts import ExportContact, load_contacts
 from sonarpost.export.live import MAX_NAMES
-from sonarpost.export.tak.cot import CotOptions, cot_event
-from sonarpost.export.tak.cot_sender import MAX_BATCH, CotSender, TlsFiles
-from sonarpost.export.tak.data_package import (
+from sonarpost.export.text import utc_text
+from sonarpost.extensions.tak.cot import CotOptions, cot_event, cot_events
+from sonarpost.extensions.tak.cot_sender import MAX_BATCH, CotSender
+from sonarpost.extensions.tak.data_package import (
     UploadedPackage,
     attachment_sha256,
     data_package,
     file_name,
     file_transfer_event,
 )
-from sonarpost.export.tak.tak_files import PackageRefusedError, TakFiles
-from sonarpost.export.text import utc_text
+from sonarpost.extensions.tak.tak_files import PackageRefusedError, TakFiles
 from sonarpost.limits import Turns, limit, oldest_of_largest
 from sonarpost.logs import kv
 from sonarpost.messages import Health, ServiceState
+from sonarpost.security.client_tls import TlsFiles
 from sonarpost.stop_signals import stop_on_signals
 
 log = logging.getLogger(__name__)
@@ -47,6 +49,9 @@ UPLOAD_RETRY_S: Final = 5.0
 MAX_IMAGES: Final = limit(
     64, "images", "shares", "TAK server", "vessel", "images to upload", "the largest source sends one without"
 )
+GIVE_UP_S: Final = 10.0
+"""With `--once`, no attempt starts later than this."""
+EXIT_INCOMPLETE: Final = 1
 HEALTH_INTERVAL_S: Final = 5.0
 NAME: Final = "cot"
 """Name in health records."""
@@ -64,48 +69,45 @@ class _Marker:
     transfers_left: int = 0
 
 
-def add_actions(actions: Subparsers) -> None:
+def add_parser(actions: Subparsers) -> None:
     """Add the action `cot`."""
-    parser = actions.add_parser("cot", help="send the contacts of a shore site to a TAK endpoint, live; Ctrl-C ends it")
-    parser.add_argument("url", metavar="URL", help="endpoint: tcp://host:port, tls://… or udp://…")
-    add_tls_options(parser, "tls://… and https://…")
-    parser.add_argument(
-        "--tak-api",
-        metavar="URL",
-        help="HTTP interface of the TAK server, for example https://host:8443, for the images of contacts",
+    parser = actions.add_parser(
+        "cot", help="send the contacts of a shore site to a TAK endpoint, live, until Ctrl-C, or once"
     )
-    add_live_options(parser)
-    parser.set_defaults(run=run)
-
-
-def add_tls_options(parser: argparse.ArgumentParser, scheme: str) -> None:
-    """Add the options of `tls_files_of`; `scheme` is what they are for."""
+    parser.add_argument("url", metavar="URL", help="endpoint: tcp://host:port, tls://… or udp://…")
     for name, help_text in (
         ("ca", "trusted authorities, PEM or PKCS#12 (*.p12)"),
         ("certificate", "client certificate, PEM, or PKCS#12 with its key (*.p12)"),
         ("key", "private key of a PEM certificate"),
         ("passphrase-file", "passphrase of an encrypted key and of PKCS#12 files; mode 0600"),
     ):
-        parser.add_argument(f"--cot-{name}", type=Path, metavar="FILE", help=f"{help_text}; for {scheme}")
+        parser.add_argument(f"--cot-{name}", type=Path, metavar="FILE", help=f"{help_text}; for tls://… and https://…")
     parser.add_argument(
-        "--cot-server-name", metavar="NAME", help=f"name in the server's certificate (default: the host); for {scheme}"
+        "--cot-server-name",
+        metavar="NAME",
+        help="name in the server's certificate (default: the host); for tls://… and https://…",
     )
-
-
-def tls_files_of(parsed: argparse.Namespace) -> TlsFiles:
-    """Return the TLS files of the command line."""
-    return TlsFiles(
-        parsed.cot_ca, parsed.cot_certificate, parsed.cot_key, parsed.cot_passphrase_file, parsed.cot_server_name
+    parser.add_argument(
+        "--tak-api",
+        metavar="URL",
+        help="HTTP interface of the TAK server, for example https://host:8443, for the images of contacts",
     )
+    parser.add_argument("--once", action="store_true", help="send the contacts of --archive, without images, and end")
+    add_live_options(parser)
+    parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Send events until interrupted; return 0."""
+    """Send events until interrupted, or once; return 0, or 1 if a stored file was rejected."""
+    tls = TlsFiles(
+        parsed.cot_ca, parsed.cot_certificate, parsed.cot_key, parsed.cot_passphrase_file, parsed.cot_server_name
+    )
+    if parsed.once:
+        return _send_once(CotSender(parsed.url, tls), parsed.archive, parsed.vessel)
     endpoints, router_tls = router_of(parsed)
     platform = parsed.site
     if parsed.config is not None:
         platform = load(parsed.config, "platform", PlatformConfig, os.environ)[0].id
-    tls = tls_files_of(parsed)
     files = None if parsed.tak_api is None else TakFiles(parsed.tak_api, tls)
     logs.configure_logging("cot", log_level(parsed))
     sender = CotSender(parsed.url, tls)
@@ -131,6 +133,20 @@ def run(parsed: argparse.Namespace) -> int:
                     session.put(keys.health(platform, NAME), health, encoding=wire.encoding_of(Health))
             token.undeclare()
     return 0
+
+
+def _send_once(sender: CotSender, archive: Path | None, vessel: str | None) -> int:
+    if archive is None:
+        raise ConfigError("c2 cot", "--once", "no archive", "--archive DIR")
+    stored = load_contacts(archive)
+    chosen = [contact for contact in stored.contacts if vessel in (None, contact.image.vessel_id)]
+    events = cot_events(chosen, time.time())
+    evidence = sender.send(events, GIVE_UP_S)
+    omitted = len(chosen) - len(events)
+    print(f"{sender.endpoint}: {len(events)} events, {omitted} contacts without a position omitted; {evidence}")
+    for problem in stored.problems:
+        print(f"rejected: {problem}", file=sys.stderr)
+    return EXIT_INCOMPLETE if stored.problems else 0
 
 
 class CotService:

@@ -8,9 +8,9 @@ from typing import Final
 from urllib.parse import urlencode, urlsplit
 
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.export.tak.cot_sender import TlsFiles
-from sonarpost.export.tak.data_package import UploadedPackage
+from sonarpost.extensions.tak.data_package import UploadedPackage
 from sonarpost.network import http_client
+from sonarpost.security.client_tls import TlsFiles
 
 _EXPECTED: Final = "https://host:port or http://host:port"
 

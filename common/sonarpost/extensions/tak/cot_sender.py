@@ -9,21 +9,15 @@ from __future__ import annotations
 
 import os
 import socket
-import ssl
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
-from cryptography.exceptions import UnsupportedAlgorithm
-from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, PrivateFormat, pkcs12
-
-from sonarpost.config import read_passphrase
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.export.tak.cot_stream import SETTLE_S, RefusedError, deliver, reason_of
+from sonarpost.extensions.tak.cot_stream import SETTLE_S, RefusedError, deliver, reason_of
+from sonarpost.security.client_tls import TlsFiles
 
 MAX_BATCH: Final = 500
 """Events of one connection."""
@@ -31,8 +25,6 @@ MAX_DATAGRAM_BYTES: Final = 65_000
 RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 DATAGRAMS: Final = "sent: UDP does not show whether anything has received them"
 _EXPECTED: Final = "tcp://host:port, tls://host:port or udp://host:port"
-_PKCS12: Final = (".p12", ".pfx")
-_NO_PASSPHRASE: Final = b"-"
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,75 +58,6 @@ def parse_endpoint(text: str) -> TakEndpoint:
     if scheme not in ("tcp", "tls", "udp") or not host or not port or extra:
         raise ConfigError("CoT endpoint", "", text, _EXPECTED)
     return TakEndpoint(scheme, host, port)
-
-
-@dataclass(frozen=True, slots=True)
-class TlsFiles:
-    """Files for `tls://`: PEM, or PKCS#12 with a name that ends in .p12 or .pfx, as TAK servers make them.
-
-    Attributes:
-        ca: Trusted certificate authorities; None trusts those of the operating system.
-        certificate: Client certificate, if the server requires one; a PKCS#12 file holds its key as well.
-        key: Private key of a PEM certificate.
-        passphrase_file: Passphrase of the key and of PKCS#12 files in its first line, readable by its owner only.
-        server_name: Name in the server's certificate; None for the host of the endpoint.
-    """
-
-    ca: Path | None = None
-    certificate: Path | None = None
-    key: Path | None = None
-    passphrase_file: Path | None = None
-    server_name: str | None = None
-
-    def context(self) -> ssl.SSLContext:
-        """Return a TLS context that verifies the server's certificate and its name.
-
-        Raises:
-            ConfigError: A file is missing or has another format, a key is encrypted and its passphrase missing or
-                wrong, or others can read the passphrase. The message holds no secret.
-        """
-        passphrase = None if self.passphrase_file is None else read_passphrase(self.passphrase_file)
-        asked: list[bool] = []
-
-        def give_passphrase() -> bytes:
-            asked.append(True)  # OpenSSL asks for that of an encrypted key only
-            return passphrase or b""
-
-        try:
-            if self.ca is not None and self.ca.suffix in _PKCS12:
-                context = ssl.create_default_context(cadata=_pem_of(self.ca, passphrase).decode() or "no certificate")
-            else:
-                context = ssl.create_default_context(cafile=self.ca)
-            if self.certificate is not None and self.certificate.suffix in _PKCS12:
-                with tempfile.NamedTemporaryFile() as file:  # OpenSSL reads files only; the key in it is encrypted
-                    file.write(_pem_of(self.certificate, passphrase))
-                    file.flush()
-                    context.load_cert_chain(file.name, password=passphrase or _NO_PASSPHRASE)
-            elif self.certificate is not None:
-                context.load_cert_chain(self.certificate, self.key, give_passphrase)
-        except OSError as error:  # includes ssl.SSLError
-            if asked:
-                raise _encrypted(self.key or self.certificate, "an encrypted key") from error
-            files = ", ".join(str(p) for p in (self.ca, self.certificate, self.key) if p is not None)
-            raise ConfigError("CoT endpoint", "TLS", files, f"readable PEM files ({error})") from error
-        context.minimum_version = ssl.TLSVersion.TLSv1_2
-        return context
-
-
-def _encrypted(path: Path | None, got: str) -> ConfigError:
-    return ConfigError(str(path), "TLS", got, "no passphrase, or its passphrase in --cot-passphrase-file")
-
-
-def _pem_of(path: Path, passphrase: bytes | None) -> bytes:
-    """Return the certificates and the key of a PKCS#12 file; the key is encrypted with the same passphrase."""
-    try:
-        content = pkcs12.load_pkcs12(path.read_bytes(), passphrase)
-    except (ValueError, UnsupportedAlgorithm) as error:
-        raise _encrypted(path, f"an encrypted or damaged file ({error})") from error
-    lock = BestAvailableEncryption(passphrase or _NO_PASSPHRASE)
-    found = [entry for entry in (content.cert, *content.additional_certs) if entry is not None]
-    key = b"" if content.key is None else content.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, lock)
-    return key + b"".join(entry.certificate.public_bytes(Encoding.PEM) for entry in found)
 
 
 def _sleep(timeout_s: float) -> bool:

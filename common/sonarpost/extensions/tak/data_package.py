@@ -17,9 +17,10 @@ from typing import IO, Final
 from xml.etree import ElementTree as ET
 
 from sonarpost.export.contacts import ExportContact
+from sonarpost.export.formats import Format
 from sonarpost.export.source import ExportSource, archive_entry
-from sonarpost.export.tak.cot import UNKNOWN, CotOptions, cot_event
 from sonarpost.export.text import utc_text, xml_text
+from sonarpost.extensions.tak.cot import UNKNOWN, CotOptions, cot_event
 
 MANIFEST: Final = "MANIFEST/manifest.xml"
 FILE_TRANSFER: Final = "b-f-t-r"
@@ -146,3 +147,6 @@ def _content(contents: ET.Element, entry: str, parameters: dict[str, str]) -> No
     content = ET.SubElement(contents, "Content", {"ignore": "false", "zipEntry": entry})
     for key, value in parameters.items():
         ET.SubElement(content, "Parameter", {"name": key, "value": xml_text(value)})
+
+
+TAK_ZIP: Final = Format(write_data_package, "application/zip")

@@ -1,4 +1,4 @@
-"""`c2 export --cot` and `c2 cot` with servers of every kind: what is reported and received, and the exit status."""
+"""`c2 cot` with servers of every kind: what is reported and received, and the exit status."""
 
 from __future__ import annotations
 
@@ -6,19 +6,23 @@ import signal
 import ssl
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from builders.common import eventually, free_port
 from builders.exports import image, store
-from builders.tak_server import Authority, TakServer
+from builders.tls_authority import Authority
+from extensions.tak.tak_server import TakServer
 
 from sonarpost import keys, wire
 from sonarpost.cli.c2.live import ContactChange
-from sonarpost.cli.c2.tak import RETRY_S, CotService
 from sonarpost.cli.main import main
 from sonarpost.export.live import LiveContacts
-from sonarpost.export.tak.cot_sender import CotSender, TlsFiles
+from sonarpost.extensions.tak import command
+from sonarpost.extensions.tak.command import RETRY_S, CotService
+from sonarpost.extensions.tak.cot_sender import CotSender
 from sonarpost.messages import Health
+from sonarpost.security.client_tls import TlsFiles
 
 PASSPHRASE = b"atakatak"
 
@@ -38,7 +42,8 @@ def options_of(files):
     return [part for name, path in given.items() if path is not None for part in (name, str(path))]
 
 
-def test_export_reports_what_the_server_has_received(authority, archive, tmp_path, capsys):
+def test_once_reports_what_the_server_has_received(authority, archive, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(command, "GIVE_UP_S", 0.0)
     good = authority.issue("client")
     other = Authority(tmp_path, "other").issue("client")
     late = authority.issue("late", expired=True)
@@ -54,8 +59,8 @@ def test_export_reports_what_the_server_has_received(authority, archive, tmp_pat
         (None, "tls", good, plain),
     ):
         server = TakServer(context, greeting=b"<event/>")
-        command = ["c2", "export", "--archive", archive, "--cot", f"{scheme}://127.0.0.1:{server.port}"]
-        status = main([*command, "--cot-wait", "0", *options_of(files)])
+        url = f"{scheme}://127.0.0.1:{server.port}"
+        status = main(["c2", "cot", url, "--once", "--archive", archive, *options_of(files)])
         out, err = capsys.readouterr()
         if text is None:
             assert (status, server.events()) == (0, 2)
@@ -67,17 +72,31 @@ def test_export_reports_what_the_server_has_received(authority, archive, tmp_pat
         server.close()
 
 
-def test_export_with_pkcs12_and_another_server_name(authority, archive, tmp_path, capsys):
+def test_once_with_pkcs12_and_another_server_name(authority, archive, tmp_path, capsys):
     client, truststore, _ = authority.encrypted(authority.issue("client"), PASSPHRASE)
     passphrase = tmp_path / "passphrase"
     passphrase.write_bytes(PASSPHRASE)
     passphrase.chmod(0o600)
     server = TakServer(authority.server_context(hosts=("takserver",)))
-    command = ["c2", "export", "--archive", archive, "--cot", f"tls://127.0.0.1:{server.port}"]
-    command += ["--cot-ca", str(truststore), "--cot-certificate", str(client), "--cot-server-name", "takserver"]
-    assert main(command) == 2
+    arguments = ["c2", "cot", f"tls://127.0.0.1:{server.port}", "--once", "--archive", archive]
+    arguments += ["--cot-ca", str(truststore), "--cot-certificate", str(client), "--cot-server-name", "takserver"]
+    assert main(arguments) == 2
     assert "an encrypted or damaged file" in capsys.readouterr().err
-    assert main([*command, "--cot-passphrase-file", str(passphrase)]) == 0
+    assert main([*arguments, "--cot-passphrase-file", str(passphrase)]) == 0
+    assert server.events() == 2
+    server.close()
+
+
+def test_once_needs_an_archive_and_reports_rejected_files(archive, capsys):
+    server = TakServer()
+    url = f"tcp://127.0.0.1:{server.port}"
+    assert main(["c2", "cot", url, "--once"]) == 2
+    assert "expected --archive DIR" in capsys.readouterr().err
+    assert main(["c2", "cot", url, "--once", "--archive", archive, "--vessel", "vessel-2"]) == 0
+    assert "0 events, 0 contacts" in capsys.readouterr().out
+    (Path(archive) / "vessel-1" / "broken.json").write_text("{")
+    assert main(["c2", "cot", url, "--once", "--archive", archive, "--vessel", "vessel-1"]) == 1
+    assert "rejected: " in capsys.readouterr().err
     assert server.events() == 2
     server.close()
 
@@ -148,8 +167,8 @@ def test_command_publishes_that_nothing_is_delivered(router, client, authority, 
     client.declare_subscriber(keys.health("shore", "cot"), receive)
     server = TakServer(authority.server_context())
     files = TlsFiles(authority.issue("client").ca)
-    command = ["c2", "cot", f"tls://127.0.0.1:{server.port}", "--router", router, "--archive", archive]
-    process = subprocess.Popen([sys.executable, "-m", "sonarpost.cli.main", *command, *options_of(files)])
+    arguments = ["c2", "cot", f"tls://127.0.0.1:{server.port}", "--router", router, "--archive", archive]
+    process = subprocess.Popen([sys.executable, "-m", "sonarpost.cli.main", *arguments, *options_of(files)])
     try:
         eventually(lambda: bool(records))
         assert records[0].state == "degraded"

@@ -14,6 +14,7 @@ from typing import IO, Final, Literal
 from xml.etree import ElementTree as ET
 
 from sonarpost.export.contacts import ExportContact
+from sonarpost.export.formats import Format
 from sonarpost.export.source import ExportSource
 from sonarpost.export.tables import DEGREE_DECIMALS
 from sonarpost.export.text import VERDICT_WORDS, class_text, probabilities_text, utc_text, xml_text
@@ -224,3 +225,6 @@ def _decision_remarks(contact: ExportContact) -> list[str]:
         parts += [f"Class: {text}." for text in (decision.mlo_class,) if text]
         parts += [f"Remark: {text}" for text in (decision.remark,) if text]
     return parts
+
+
+COT_XML: Final = Format(write_cot, "application/xml", "Cursor-on-Target (TAK)")

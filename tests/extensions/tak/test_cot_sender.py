@@ -8,12 +8,14 @@ import threading
 
 import pytest
 from builders.common import WAIT_S, eventually, free_port
-from builders.tak_server import Authority, TakServer
+from builders.tls_authority import Authority
+from extensions.tak.tak_server import TakServer
 
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.export.tak import cot_stream
-from sonarpost.export.tak.cot_sender import DATAGRAMS, MAX_BATCH, CotSender, TakEndpoint, TlsFiles, parse_endpoint
-from sonarpost.export.tak.cot_stream import ACKNOWLEDGED, READ
+from sonarpost.extensions.tak import cot_stream
+from sonarpost.extensions.tak.cot_sender import DATAGRAMS, MAX_BATCH, CotSender, TakEndpoint, parse_endpoint
+from sonarpost.extensions.tak.cot_stream import ACKNOWLEDGED, READ
+from sonarpost.security.client_tls import TlsFiles
 
 EVENTS = (b'<event uid="a"/>', b'<event uid="b"/>')
 STREAM = b'<event uid="a"/>\n<event uid="b"/>\n'
@@ -307,36 +309,6 @@ def test_encrypted_key_and_pkcs12(serve, authority, tmp_path):
     ):
         sender_to(server, "tls", tls).send(EVENTS)
     eventually(lambda: server.events() == 6)
-
-
-def test_invalid_files_of_tls(authority, tmp_path):
-    files = authority.issue("client")
-    client, truststore, key = authority.encrypted(files, PASSPHRASE)
-    wrong, readable = tmp_path / "wrong", tmp_path / "readable"
-    wrong.write_bytes(b"secret of another key")
-    wrong.chmod(0o600)
-    readable.write_bytes(PASSPHRASE)
-    readable.chmod(0o644)
-    bad = tmp_path / "bad.pem"
-    bad.write_text("no certificate")
-    for tls, text in (
-        (TlsFiles(files.ca, files.certificate, key), "key-locked.pem.*an encrypted key'.*--cot-passphrase-file"),
-        (TlsFiles(files.ca, files.certificate, key, wrong), "key-locked.pem.*an encrypted key'.*--cot-passphrase-file"),
-        (TlsFiles(files.ca, client), "client.p12.*an encrypted or damaged file.*--cot-passphrase-file"),
-        (TlsFiles(files.ca, client, None, wrong), "client.p12.*an encrypted or damaged file"),
-        (TlsFiles(files.ca, files.certificate, key, readable), "readable: mode: got '0644', expected 0600"),
-        (TlsFiles(files.ca, files.certificate, key, tmp_path / "none"), "none.*a readable file"),
-        (TlsFiles(files.ca, truststore, None, wrong), "truststore.p12.*an encrypted or damaged file"),
-        (TlsFiles(tmp_path / "nowhere.pem"), "TLS: got .*nowhere.pem.*expected readable PEM files"),
-        (TlsFiles(bad), "bad.pem"),
-        (TlsFiles(bad.with_suffix(".p12")), "bad.p12"),
-    ):
-        with pytest.raises(ConfigError, match=f"(?s){text}") as caught:
-            CotSender("tls://127.0.0.1:1", tls)
-        assert "secret of" not in str(caught.value)
-    readable.chmod(0o600)
-    with pytest.raises(ConfigError, match=r"truststore.p12.*readable PEM files"):
-        TlsFiles(files.ca, truststore, None, readable).context()
 
 
 def test_expected_name_of_the_server(serve, authority):

@@ -1,1 +1,0 @@
-"""TAK: Cursor-on-Target events, their delivery to servers, and data packages with images."""
