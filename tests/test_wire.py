@@ -71,7 +71,7 @@ def test_golden_delivery_messages_parse_and_encode_unchanged():
         assert (chunk.seq, chunk.size, chunk.offset) == (fields["seq"], fields["size"], fields["offset"])
         assert made["delivery-attachment"][name] == payload
         item = OutboxItem(fields["consumer"], chunk.seq, "k", "", 4, bytes(chunk.size), chunk.sha256)
-        assert chunk.done_up_to == fields.get("settled", 0)
+        assert chunk.done_up_to == fields.get("done_up_to", 0)
         assert attachment(chunk.origin, item, chunk.offset, chunk.done_up_to) == payload
 
 
@@ -85,7 +85,7 @@ def test_golden_batch_messages_parse_and_encode_unchanged():
         assert isinstance(chunks, tuple)
         assert [[c.seq, c.size] for c in chunks] == fields["records"]
         assert [c.data for c in chunks] == [bytes([number]) * size for number, size in enumerate(sizes)]
-        assert {c.done_up_to for c in chunks} == {fields.get("settled", 0)}
+        assert {c.done_up_to for c in chunks} == {fields.get("done_up_to", 0)}
         assert {c.origin.hex() for c in chunks} == {fields["origin"]["$hex"]}
         assert made["delivery-batch-attachment"][name] == payload
     for name, vector in vectors("delivery-batch-reply").items():

@@ -60,7 +60,7 @@ TOKENS_TIMEOUT_S = 1.0
 CATCH_UP_BATCH = 50
 SHORE_DELIVERY_MARGIN_S = 2.0
 """Age that a decision must have before the relay's health proves its delivery: health is older than its arrival."""
-_ACKNOWLEDGED = "settled/"
+_ACKNOWLEDGED = "acknowledged/"
 """Prefix of the store's state entries: {prefix}{table}/{consumer}/{record_id} -> reason of a refusal, or empty."""
 
 _Acknowledgement = tuple[Table, str, str, str | None]

@@ -319,14 +319,14 @@ def _status(reply):
     return AckReply.unpack(reply, "reply").status
 
 
-def query_of(key, origin, records, settled, *, whole_bytes=0):
+def query_of(key, origin, records, done_up_to, *, whole_bytes=0):
     """Return a query of a peer that is not bound to the rules of a producer.
 
     Args:
         key: Key of the records.
         origin: Origin that it states.
         records: (number, bytes, digest) of each; more than one makes a batch.
-        settled: Number that it states.
+        done_up_to: Number that it states.
         whole_bytes: Size of the record if the bytes are its first chunk only.
     """
     if len(records) == 1:
@@ -337,6 +337,6 @@ def query_of(key, origin, records, settled, *, whole_bytes=0):
         digests = b"".join(digest for _, _, digest in records)
         fields = {"v": 3, "records": [(seq, len(data)) for seq, data, _ in records]}
         fields["sha256"] = hashlib.sha256(digests).digest()
-    attached = msgpack.packb(fields | {"origin": origin, "consumer": CONSUMER, "settled": settled})
+    attached = msgpack.packb(fields | {"origin": origin, "consumer": CONSUMER, "done_up_to": done_up_to})
     content = b"".join(data for _, data, _ in records)
     return SentQuery(keys.delivery_query(key, CONSUMER), content, attached)

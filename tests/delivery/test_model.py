@@ -40,17 +40,17 @@ def test_peer_with_the_same_key_and_origin_cannot_suppress_records():
     ("world", "changes", "lost", "steps"),
     [
         # A consumer with one window for all keys obeys an invalid record on key H; the record on key A is then lost.
-        (HOSTILE, {}, "a1", {2: "hostile peer sends origin-1/", 3: "on key A, settled 0: refused"}),
-        # Refused numbers are not remembered here, so that only `settled` of the refused query remains.
+        (HOSTILE, {}, "a1", {2: "hostile peer sends origin-1/", 3: "on key A, done_up_to 0: refused"}),
+        # Refused numbers are not remembered here, so that only `done_up_to` of the refused query remains.
         (
             replace(HOSTILE, hostile_records=(JUNK,)),
             {"forget_refused": True},
             "a1",
-            {2: "on key H, settled", 3: "a1 on key A, settled 0: stored"},
+            {2: "on key H, done_up_to", 3: "a1 on key A, done_up_to 0: stored"},
         ),
-        (RESTORE, {}, "a2", {-2: "a2 on key A, settled 0: stored"}),
+        (RESTORE, {}, "a2", {-2: "a2 on key A, done_up_to 0: stored"}),
     ],
-    ids=["one window", "settled of a refused query", "restore"],
+    ids=["one window", "done_up_to of a refused query", "restore"],
 )
 def test_search_finds_the_loss_with_earlier_rules(world, changes, lost, steps):
     result = explore(replace(world, rules=replace(OLD, **changes)), "I1")

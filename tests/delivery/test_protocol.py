@@ -33,9 +33,11 @@ def item(seq, payload):
 @given(st.dictionaries(st.integers(1, 2**63 - 1), st.binary(max_size=200), min_size=1, max_size=MAX_BATCH_RECORDS))
 def test_packed_batch_parses_unchanged(records):
     items = [item(seq, payload) for seq, payload in records.items()]
-    settled = min(records) - 1
-    chunks = parse_query(batch_attachment(ORIGIN, items, settled), b"".join(records.values()), WHERE)
-    assert chunks == tuple(ReceivedChunk(ORIGIN, i.seq, len(i.payload), i.sha256, 0, i.payload, settled) for i in items)
+    done_up_to = min(records) - 1
+    chunks = parse_query(batch_attachment(ORIGIN, items, done_up_to), b"".join(records.values()), WHERE)
+    assert chunks == tuple(
+        ReceivedChunk(ORIGIN, i.seq, len(i.payload), i.sha256, 0, i.payload, done_up_to) for i in items
+    )
 
 
 def test_packed_chunk_parses_unchanged():
@@ -57,7 +59,7 @@ DIGESTS = BATCH["sha256"]
         (SINGLE, {"size": 1 << 40}, b"data", "size"),
         (SINGLE, {"sha256": "text"}, b"data", "sha256"),
         (SINGLE, {"offset": 10}, b"data", "payload"),
-        (SINGLE, {"settled": 5}, b"data", "settled"),
+        (SINGLE, {"done_up_to": 5}, b"data", "done_up_to"),
         (SINGLE, {"v": 3}, b"data", "records"),
         (SINGLE, {"v": 2}, b"data", "v"),
         (BATCH, {"v": 2}, b"ab", "v"),
@@ -66,8 +68,8 @@ DIGESTS = BATCH["sha256"]
         (BATCH, {}, b"ba", "sha256"),
         (BATCH, {"v": True}, b"ab", "v"),
         (BATCH, {"origin": b"short"}, b"ab", "origin"),
-        (BATCH, {"settled": -1}, b"ab", "settled"),
-        (BATCH, {"settled": 4}, b"ab", "settled"),
+        (BATCH, {"done_up_to": -1}, b"ab", "done_up_to"),
+        (BATCH, {"done_up_to": 4}, b"ab", "done_up_to"),
         (BATCH, {"records": []}, b"", "records"),
         (BATCH, {"records": [[n, 0] for n in range(1, MAX_BATCH_RECORDS + 2)]}, b"", "records"),
         (BATCH, {"records": [[4, 1], [4, 1]], "sha256": DIGESTS}, b"ab", "records"),

@@ -183,12 +183,12 @@ class DeliveryFaults(RuleBasedStateMachine):
         key=st.sampled_from(HOSTILE_KEYS),
         number=ANY,
         seq_from=st.sampled_from(["same", "next", "small", "far"]),
-        settled_below_seq=st.booleans(),
+        done_up_to_below_seq=st.booleans(),
         content=st.sampled_from(["junk", "own", "same", "wrong digest", "first chunk", "batch"]),
         own_origin=st.one_of(st.none(), st.integers(0, 9)),
         with_producer=st.booleans(),
     )
-    def attack(self, key, number, seq_from, settled_below_seq, content, own_origin, with_producer):
+    def attack(self, key, number, seq_from, done_up_to_below_seq, content, own_origin, with_producer):
         origin, seq, payload = bytes([number % 5]) * 16, 1, b"x"
         companions = []
         if self.sent:
@@ -201,7 +201,7 @@ class DeliveryFaults(RuleBasedStateMachine):
         if own_origin is not None:
             origin = bytes([own_origin]) * 16
         seq = {"same": seq, "next": seq + 1, "small": 1 + number % 9, "far": 2**62}[seq_from]
-        settled = seq - 1 if settled_below_seq else 0
+        done_up_to = seq - 1 if done_up_to_below_seq else 0
         own = f"{key} valid own {number % 7}".encode()
         records = {
             "junk": [(seq, b"junk")],
@@ -215,7 +215,7 @@ class DeliveryFaults(RuleBasedStateMachine):
         if content == "wrong digest":
             with_digest = [(seq, own, hashlib.sha256(payload).digest())]
         whole_bytes = 40_000 if content == "first chunk" else 0
-        query = query_of(key, origin, with_digest, settled, whole_bytes=whole_bytes)
+        query = query_of(key, origin, with_digest, done_up_to, whole_bytes=whole_bytes)
         if not companions:
             before = self.delivery.consumer_state_of_producers()
             self.delivery.receive([query])

@@ -50,7 +50,7 @@ class _Attachment(_Fields):
     size: Annotated[int, Field(ge=0, le=MAX_RECORD_BYTES)]
     sha256: _Digest
     offset: _Natural
-    settled: _Natural = 0
+    done_up_to: _Natural = 0
 
 
 class _BatchAttachment(_Fields):
@@ -60,7 +60,7 @@ class _BatchAttachment(_Fields):
     origin: _Origin
     records: Annotated[tuple[_BatchRecord, ...], Field(min_length=1, max_length=MAX_BATCH_RECORDS)]
     sha256: _Digest
-    settled: _Natural = 0
+    done_up_to: _Natural = 0
 
 
 class _Reply(_Fields):
@@ -159,7 +159,7 @@ def attachment(origin: bytes, item: OutboxItem, offset: int = 0, done_up_to: int
         "sha256": item.sha256,
         "offset": offset,
     }
-    return _pack(fields | ({"settled": done_up_to} if done_up_to else {}))
+    return _pack(fields | ({"done_up_to": done_up_to} if done_up_to else {}))
 
 
 def batch_attachment(origin: bytes, items: Sequence[OutboxItem], done_up_to: int = 0) -> bytes:
@@ -177,7 +177,7 @@ def batch_attachment(origin: bytes, items: Sequence[OutboxItem], done_up_to: int
         "records": [(item.seq, len(item.payload)) for item in items],
         "sha256": _digest_of(item.sha256 for item in items),
     }
-    return _pack(fields | ({"settled": done_up_to} if done_up_to else {}))
+    return _pack(fields | ({"done_up_to": done_up_to} if done_up_to else {}))
 
 
 def parse_query(attached: bytes, data: bytes, where: str) -> tuple[ReceivedChunk, ...] | ReceivedChunk:
@@ -190,12 +190,12 @@ def parse_query(attached: bytes, data: bytes, where: str) -> tuple[ReceivedChunk
     if _is_batch(fields):
         return _parse_batch(wire.validated(_BatchAttachment, fields, where), data, where)
     chunk = wire.validated(_Attachment, fields, where)
-    if chunk.settled >= chunk.seq:
-        raise PayloadError(where, "settled", chunk.settled, "a number below seq")
+    if chunk.done_up_to >= chunk.seq:
+        raise PayloadError(where, "done_up_to", chunk.done_up_to, "a number below seq")
     if len(data) > CHUNK_BYTES or chunk.offset + len(data) > chunk.size:
         expected = f"a chunk of at most {CHUNK_BYTES} bytes inside size"
         raise PayloadError(where, "payload", f"{len(data)} bytes", expected)
-    return ReceivedChunk(chunk.origin, chunk.seq, chunk.size, chunk.sha256, chunk.offset, data, chunk.settled)
+    return ReceivedChunk(chunk.origin, chunk.seq, chunk.size, chunk.sha256, chunk.offset, data, chunk.done_up_to)
 
 
 def _parse_batch(batch: _BatchAttachment, data: bytes, where: str) -> tuple[ReceivedChunk, ...]:
@@ -206,7 +206,7 @@ def _parse_batch(batch: _BatchAttachment, data: bytes, where: str) -> tuple[Rece
     for seq, size in batch.records:
         record = data[start : start + size]
         sha256 = hashlib.sha256(record).digest()
-        chunks.append(ReceivedChunk(batch.origin, seq, size, sha256, 0, record, batch.settled))
+        chunks.append(ReceivedChunk(batch.origin, seq, size, sha256, 0, record, batch.done_up_to))
         start += size
     if start != len(data):
         raise PayloadError(where, "payload", f"{len(data)} bytes", f"{start} bytes, the sum of the records' sizes")
@@ -215,8 +215,8 @@ def _parse_batch(batch: _BatchAttachment, data: bytes, where: str) -> tuple[Rece
     numbers = {chunk.seq for chunk in chunks}
     if len(numbers) < len(chunks):
         raise PayloadError(where, "records", sorted(chunk.seq for chunk in chunks), "each seq once")
-    if batch.settled >= min(numbers):
-        raise PayloadError(where, "settled", batch.settled, "a number below every seq")
+    if batch.done_up_to >= min(numbers):
+        raise PayloadError(where, "done_up_to", batch.done_up_to, "a number below every seq")
     return tuple(chunks)
 
 

@@ -45,7 +45,7 @@ class Query(NamedTuple):
     name: str
     chunk: int
     data: tuple[str, int]
-    settled: int
+    done_up_to: int
 
 
 class Reply(NamedTuple):
@@ -282,10 +282,9 @@ def _started(world: World, producer: Producer) -> Producer:
 def _queries_of(world: World, producer: Producer, row: Row) -> list[Query]:
     record = world.record(row.name)
     origin = row.origin if world.rules.origin_of_row else producer.origin
-    done_up_to = producer.rows[0].seq - 1
-    settled = min(done_up_to, row.seq - 1)
+    done_up_to = min(producer.rows[0].seq, row.seq) - 1
     return [
-        Query(record.key, origin, row.seq, row.name, index, (row.name, index), settled)
+        Query(record.key, origin, row.seq, row.name, index, (row.name, index), done_up_to)
         for index in range(record.chunks)
     ]
 
@@ -353,8 +352,8 @@ def _names(world: World, which: int) -> set[str]:
 def react(world: World, consumer: Consumer, query: Query, *, hostile: bool = False) -> tuple[Consumer, str]:
     """Return the consumer after a query, and the status of its reply."""
     rules = world.rules
-    if not rules.settled_after_acceptance:
-        consumer = _use_settled(rules, consumer, query)
+    if not rules.done_up_to_after_acceptance:
+        consumer = _use_done_up_to(rules, consumer, query)
     window, number = _window(rules, consumer, query), _number(rules, query)
     if number in window.refused:
         return consumer, "refused"
@@ -387,7 +386,7 @@ def _judge(
 
 
 def _accepted(rules: Rules, consumer: Consumer, query: Query) -> tuple[Consumer, str]:
-    return _use_settled(rules, consumer, query) if rules.settled_after_acceptance else consumer, "stored"
+    return _use_done_up_to(rules, consumer, query) if rules.done_up_to_after_acceptance else consumer, "stored"
 
 
 def _commit_pending(world: World, consumer: Consumer) -> Consumer:
@@ -435,17 +434,17 @@ def _replaced(rules: Rules, consumer: Consumer, query: Query, window: Window) ->
     return consumer._replace(windows=tuple(sorted([*others, (scope, window)], key=lambda item: item[0])))
 
 
-def _use_settled(rules: Rules, consumer: Consumer, query: Query) -> Consumer:
+def _use_done_up_to(rules: Rules, consumer: Consumer, query: Query) -> Consumer:
     window = _window(rules, consumer, query)
-    if rules.settled_prunes:
+    if rules.done_up_to_prunes:
         newest = set(sorted(window.seen)[-rules.keep :]) if rules.keep else set()
-        kept = frozenset(number for number in window.seen if number[0] > query.settled or number in newest)
+        kept = frozenset(number for number in window.seen if number[0] > query.done_up_to or number in newest)
         return consumer if kept == window.seen else _replaced(rules, consumer, query, window._replace(seen=kept))
-    if query.settled <= window.edge:
+    if query.done_up_to <= window.edge:
         return consumer
-    seen = frozenset(number for number in window.seen if number[0] > query.settled)
-    refused = frozenset(number for number in window.refused if number[0] > query.settled)
-    return _replaced(rules, consumer, query, _extended(Window(seen, query.settled, refused)))
+    seen = frozenset(number for number in window.seen if number[0] > query.done_up_to)
+    refused = frozenset(number for number in window.refused if number[0] > query.done_up_to)
+    return _replaced(rules, consumer, query, _extended(Window(seen, query.done_up_to, refused)))
 
 
 def _extended(window: Window) -> Window:
@@ -542,8 +541,8 @@ def _attacks(world: World, state: State) -> Iterator[Step]:
         contents += [(name, data) for name in published for data in (name, *own)]
     after = state._replace(attacks=state.attacks - 1)
     for key, origin, seq, (name, data) in product(world.hostile_keys, origins, numbers, contents):
-        for settled in {0, seq - 1}:
-            query = Query(key, origin, seq, name, 0, (data, 0), settled)
+        for done_up_to in {0, seq - 1}:
+            query = Query(key, origin, seq, name, 0, (data, 0), done_up_to)
             consumer, status = react(world, state.consumer, query, hostile=True)
             if consumer != state.consumer:
                 label = f"hostile peer sends {_text(query)}: {status}"
@@ -554,4 +553,4 @@ def _text(query: Query) -> str:
     chunk = f" chunk {query.chunk}" if query.chunk else ""
     if query.data[0] != query.name:
         chunk += f" with the bytes of {query.data[0]}"
-    return f"{query.origin}/{query.seq} {query.name}{chunk} on key {query.key}, settled {query.settled}"
+    return f"{query.origin}/{query.seq} {query.name}{chunk} on key {query.key}, done_up_to {query.done_up_to}"

@@ -12,9 +12,9 @@ class Rules:
     Attributes:
         window_of_key: A duplicate window belongs to a key and an origin; otherwise to an origin.
         compare_digest: The identity of a record includes its digest.
-        settled_prunes: `settled` only permits to delete digests; otherwise all numbers up to it count as received.
-        settled_after_acceptance: `settled` is used only if the record of the query was accepted.
-        keep: Number of the newest digests of a window that `settled` never deletes.
+        done_up_to_prunes: `done_up_to` only permits to delete digests; else all numbers up to it count as received.
+        done_up_to_after_acceptance: `done_up_to` is used only if the record of the query was accepted.
+        keep: Number of the newest digests of a window that `done_up_to` never deletes.
         forget_refused: A refused record is validated again; otherwise its number stays refused.
         secret_origin: Watchers do not receive the origin.
         detect_restore: A reply states the highest number; a producer that finds itself older uses a new origin.
@@ -35,8 +35,8 @@ class Rules:
 
     window_of_key: bool = True
     compare_digest: bool = True
-    settled_prunes: bool = True
-    settled_after_acceptance: bool = True
+    done_up_to_prunes: bool = True
+    done_up_to_after_acceptance: bool = True
     keep: int = 9
     forget_refused: bool = True
     secret_origin: bool = True
@@ -57,8 +57,8 @@ NEW = Rules()
 OLD = Rules(
     window_of_key=False,
     compare_digest=False,
-    settled_prunes=False,
-    settled_after_acceptance=False,
+    done_up_to_prunes=False,
+    done_up_to_after_acceptance=False,
     forget_refused=False,
     secret_origin=False,
     detect_restore=False,

@@ -99,9 +99,9 @@ class Removal(NamedTuple):
 
 REMOVALS = (
     Removal("identity without digest", {"compare_digest": False}, RESTORE, "I1"),
-    Removal("settled counts as received", {"settled_prunes": False}, RESTORE, "I1"),
-    Removal("settled counts as received, shared key", {"settled_prunes": False}, WITH_SHARED_ORIGIN, "I1"),
-    Removal("settled deletes all digests", {"keep": 0}, DROPS, "I2"),
+    Removal("done_up_to counts as received", {"done_up_to_prunes": False}, RESTORE, "I1"),
+    Removal("done_up_to counts as received, shared key", {"done_up_to_prunes": False}, WITH_SHARED_ORIGIN, "I1"),
+    Removal("done_up_to deletes all digests", {"keep": 0}, DROPS, "I2"),
     Removal("origin visible to watchers", {"secret_origin": False}, SHARED_KEY, "I6"),
     Removal("queued records get the new origin", {"origin_of_row": False}, RESTORE, "I2"),
     Removal("age compared for earlier origins", {"current_origin_only": False}, RESTORE, "I6"),
@@ -120,8 +120,8 @@ REMOVALS = (
         "I1",
     ),
     Removal(
-        "settled of a refused record counts as received",
-        {"settled_prunes": False, "settled_after_acceptance": False, "window_of_key": False},
+        "done_up_to of a refused record counts as received",
+        {"done_up_to_prunes": False, "done_up_to_after_acceptance": False, "window_of_key": False},
         HOSTILE_WITH_ORIGIN,
         "I1",
     ),
@@ -140,7 +140,7 @@ REMOVALS = (
 )
 DEPTH_RULES: Mapping[str, str] = {
     "window_of_key": "a record is valid only on its own key, and its identity has the digest",
-    "settled_after_acceptance": "`settled` only permits to delete digests, and the newest ones stay",
+    "done_up_to_after_acceptance": "`done_up_to` only permits to delete digests, and the newest ones stay",
     "forget_refused": "the refused identity has the digest of a record that stays invalid",
     "chunks_of_digest": "the digest of the assembled record is checked",
     "validate_key": "a window belongs to a key",
