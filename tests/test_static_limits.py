@@ -88,7 +88,6 @@ QUEUES = {
     "common/sonarpost/modem/micromodem/driver.py": "packets to send; more fail with QUEUE_FULL",
     "common/sonarpost/modem/micromodem/supervisor.py": "commands of the configuration",
     "common/sonarpost/modem/packet_queue.py": "its `limit`",
-    "common/sonarpost/modem/s2c/driver.py": "commands of the configuration",
     "common/sonarpost/network/connections.py": "MAX_REFUSED",
     "common/sonarpost/sonar/heading.py": "_COURSE_PINGS",
     "common/sonarpost/sonar/readers/humminbird.py": "three pings",

@@ -19,6 +19,19 @@ HOSTILE, PEER = 1, 2
 Parts = list[tuple[float, bytes]]
 """What becomes of one message: parts, each with a delay in seconds."""
 
+# Names of conditions that a driver may declare as not applicable.
+DUMPS = ("configuration dump every 30 s", "dump after the echo", "start in a dump")
+DATA_REQUESTS = ("data requests lost", "echo of the data late", "echo of the data never")
+RESTARTS = ("restart after the echo", "restart after the data", "restart on the air", "restart while receiving")
+RESTARTS += ("restarts when idle", "killed with restarts")
+REPORTS = ("ends of transmissions lost", "ends and statistics of transmissions lost", "statistics doubled")
+REPORTS += ("start of the transmission never", "statistics never", "start of the reception never")
+REPORTS += ("reports of transmissions off",)
+FALSE_RECEPTIONS = ("false receptions", "false receptions every second", "false receptions that time out")
+COMMANDS = ("echo of the command late", "echo of the command never", "mostly busy", "all commands refused")
+COMMANDS += ("errors and messages every second", "unknown sentences")
+PADDED = ("padded and blank frames",)
+
 
 @dataclass
 class Subject:

@@ -10,7 +10,22 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from builders.hostile_line import HOSTILE, PEER, Bench, Condition, Parts, Subject
+from builders.extensions import modules
+from builders.hostile_line import (
+    COMMANDS,
+    DATA_REQUESTS,
+    DUMPS,
+    FALSE_RECEPTIONS,
+    HOSTILE,
+    PADDED,
+    PEER,
+    REPORTS,
+    RESTARTS,
+    Bench,
+    Condition,
+    Parts,
+    Subject,
+)
 
 from sonarpost.errors import ConfigError
 from sonarpost.modem.interface import ModemReady, PacketFailed, PacketSent
@@ -29,61 +44,11 @@ def sentence_kind(message: bytes) -> str:
     return message[1:6].decode("ascii", "replace")
 
 
-def message_kind(message: bytes) -> str:
-    """Return the command that a message of an S2C modem answers, or the name of a notification."""
-    command, _, text = message.removeprefix(b"+++AT").partition(b":")
-    return (command or text.partition(b":")[2].partition(b",")[0].strip()).decode("ascii", "replace")
-
-
-def messages(data: bytes) -> list[bytes]:
-    """Divide the bytes of an emulated S2C modem, which does not send `+++AT` as data in these tests."""
-    return [b"+++AT" + part for part in data.split(b"+++AT")[1:]]
-
-
-DUMPS = ("configuration dump every 30 s", "dump after the echo", "start in a dump")
-DATA_REQUESTS = ("data requests lost", "echo of the data late", "echo of the data never")
-RESTARTS = ("restart after the echo", "restart after the data", "restart on the air", "restart while receiving")
-RESTARTS += ("restarts when idle", "killed with restarts")
-REPORTS = ("ends of transmissions lost", "ends and statistics of transmissions lost", "statistics doubled")
-REPORTS += ("start of the transmission never", "statistics never", "start of the reception never")
-REPORTS += ("reports of transmissions off",)
-FALSE_RECEPTIONS = ("false receptions", "false receptions every second", "false receptions that time out")
-COMMANDS = ("echo of the command late", "echo of the command never", "mostly busy", "all commands refused")
-COMMANDS += ("errors and messages every second", "unknown sentences")
-PADDED = ("padded and blank frames",)
-
-S2C_NOT_APPLICABLE = {
-    "the modem does not send its settings without a request": DUMPS,
-    "the command contains the data: the modem does not request it": (*DATA_REQUESTS, "restart after the data"),
-    "messages have a length and no checksum": ("no checksums",),
-    "messages have the length of their data": PADDED,
-    "errors are answers to commands": ("errors and messages every second",),
-}
-NANO_NOT_APPLICABLE = {
-    "the modem has no such message": (*DUMPS, *DATA_REQUESTS, *PADDED),
-    "the modem reports no start, end or statistics of a packet": REPORTS,
-    "the modem has no report of a restart: a restart is a missing confirmation": RESTARTS,
-    "the driver senses no carrier": FALSE_RECEPTIONS,
-}
 UDP_NOT_APPLICABLE = {
     "the driver has no dialogue with a modem": (*DUMPS, *DATA_REQUESTS, *PADDED, *REPORTS, *COMMANDS),
     "there is no modem that can restart": RESTARTS,
     "the driver senses no carrier": FALSE_RECEPTIONS,
 }
-
-
-def s2c(command: str, rate: int | None = None) -> Subject:
-    return Subject(
-        "s2c",
-        message_kind,
-        messages,
-        restart=b"+++ATZ0\n",
-        refusal=(command, b"+++AT%b:23:BUSY DELIVERING MESSAGE\r\n" % command.encode()),
-        reception=(b"+++AT:9:RECVSTART\r\n", b"+++AT:23:RECVFAILED,0.0000,-40,0\r\n"),
-        unknown=b"+++AT:11:RECVXYZ,1,2\r\n",
-        not_applicable=S2C_NOT_APPLICABLE,
-        rate=rate,
-    )
 
 
 SUBJECTS = [
@@ -96,17 +61,8 @@ SUBJECTS = [
         reception=(nmea.format("CARXP", 1), nmea.format("CAMSG", "PACKET_TIMEOUT", 1)),
         unknown=nmea.format("CAXYZ", 1, 2, 3),
     ),
-    s2c("*SENDIM"),
-    s2c("*SEND", rate=1),
-    Subject(
-        "nano",
-        lambda message: message[:2].decode("latin-1"),
-        lambda data: [data],
-        refusal=("$B", b"E\r\n"),
-        unknown=b"#Zxyz\r\n",
-        not_applicable=NANO_NOT_APPLICABLE,
-    ),
     Subject("udp", lambda message: "datagram", lambda data: [data], not_applicable=UDP_NOT_APPLICABLE),
+    *(subject for module in modules("modem_subjects") for subject in module.SUBJECTS),
 ]
 
 
@@ -336,7 +292,7 @@ CONDITIONS: dict[str, Callable[[], Condition]] = {
 }
 
 
-def test_every_builtin_driver_is_tested_and_every_exception_is_a_condition() -> None:
+def test_every_driver_is_tested_and_every_exception_is_a_condition() -> None:
     assert sorted({subject.driver for subject in SUBJECTS}) == list(default_registry().names())
     assert len(CONDITIONS) == 45
     assert all(subject.exceptions <= set(CONDITIONS) for subject in SUBJECTS)

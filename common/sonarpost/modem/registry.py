@@ -52,7 +52,7 @@ class ModemDriver:
     summary: str = ""
 
 
-_CORE: Final = ("micromodem", "nano", "s2c", "udp")
+_CORE: Final = ("micromodem", "udp")
 """Drivers of the core. A module is imported when its driver is used."""
 
 

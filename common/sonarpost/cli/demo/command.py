@@ -25,7 +25,7 @@ from sonarpost.cli.demo.watch import Watcher
 from sonarpost.cli.progress import progress_console
 from sonarpost.cli.shared import add_fit_option, add_survey_options, print_notes, survey_options_of
 from sonarpost.errors import ConfigError, SurveyFileError
-from sonarpost.extensions.simulation.modem.emulated import EMULATED
+from sonarpost.extensions.simulation.modem.emulated import emulated_drivers
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.modem.registry import DEFAULT_DRIVER, modem_driver
@@ -73,7 +73,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--modem",
-        choices=EMULATED,
+        choices=emulated_drivers(),
         default=DEFAULT_DRIVER,
         help="driver whose modems are emulated (default: %(default)s)",
     )

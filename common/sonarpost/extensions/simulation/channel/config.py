@@ -11,7 +11,12 @@ from pydantic import Field, model_validator
 from sonarpost.config import ServiceConfig
 from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
 from sonarpost.extensions.simulation.channel.parameters import ChannelParameters, build_parameters
-from sonarpost.extensions.simulation.modem.emulated import DEFAULT_MODEM, EMULATED, EmulatorSettings, settings_for
+from sonarpost.extensions.simulation.modem.emulated import (
+    DEFAULT_MODEM,
+    EmulatorSettings,
+    emulated_drivers,
+    settings_for,
+)
 from sonarpost.modem.interface import MAX_ADDRESS, MAX_RATE
 from sonarpost.modem.registry import modem_driver
 
@@ -96,8 +101,8 @@ class EmulatorConfig(ChannelParameters):
     @model_validator(mode="after")
     def _check_together(self) -> Self:
         addresses = [modem.address for modem in self.modem]
-        if self.driver not in EMULATED:
-            raise ValueError(f"driver: got {self.driver!r}, expected one of {', '.join(EMULATED)}")
+        if self.driver not in emulated_drivers():
+            raise ValueError(f"driver: got {self.driver!r}, expected one of {', '.join(emulated_drivers())}")
         modem = modem_driver(self.driver).capabilities
         if unknown := set(self.airtime_s) - set(modem.rates):
             raise ValueError(f"airtime_s: got rates {sorted(unknown)}, expected {sorted(modem.rates)}")

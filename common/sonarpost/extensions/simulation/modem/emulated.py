@@ -1,29 +1,20 @@
-"""Emulated modems by the name of their driver."""
+"""Emulated modems by the name of their driver. The group of entry points is `sonarpost.emulated_modems`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
+from functools import cache
 from typing import Final, Protocol
 
 from sonarpost.extensions.simulation.channel.events import AcousticPacket, ArrivalEnded, ArrivalStarted
 from sonarpost.extensions.simulation.modem.emulator import EmulatedMicroModem
-from sonarpost.extensions.simulation.modem.nanomodem import EmulatedNanomodem
 from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, PacketModemSettings
 from sonarpost.extensions.simulation.modem.receiver import HostOutput, PacketReport
-from sonarpost.extensions.simulation.modem.s2c import EmulatedS2c
 from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 from sonarpost.extensions.simulation.modem.transmitter import TravelTimes
 from sonarpost.extensions.simulation.modem.udp_relay import UdpRelay
+from sonarpost.registry import Registry
 
 DEFAULT_MODEM: Final = "micromodem"
-
-PACKET_MODEMS: Final[Mapping[str, Callable[[PacketModemSettings], PacketModem]]] = MappingProxyType(
-    {"nano": EmulatedNanomodem, "s2c": EmulatedS2c, "udp": UdpRelay}
-)
-"""Emulated modems that are a `PacketModem`."""
-EMULATED: Final = (DEFAULT_MODEM, *PACKET_MODEMS)
-"""Names of the drivers that have an emulated modem."""
 
 EmulatorSettings = EmulatedModemConfig | PacketModemSettings
 
@@ -60,11 +51,27 @@ class EmulatedModem(Protocol):
         """Drop the unfinished input of a host that has disconnected."""
 
 
+@cache
+def packet_modems() -> Registry[type[PacketModem]]:
+    """Return the emulated modems that are a `PacketModem`, by the name of their driver; see `sonarpost.registry`."""
+    expected = "a subclass of sonarpost.extensions.simulation.modem.packet_modem.PacketModem"
+
+    def is_valid(found: object, _: str) -> bool:
+        return isinstance(found, type) and issubclass(found, PacketModem)
+
+    return Registry("sonarpost.emulated_modems", expected, is_valid, {"udp": UdpRelay})
+
+
+def emulated_drivers() -> tuple[str, ...]:
+    """Return the names of the drivers that have an emulated modem."""
+    return (DEFAULT_MODEM, *packet_modems().names())
+
+
 def create_modem(settings: EmulatorSettings, travel_times: TravelTimes) -> EmulatedModem:
     """Return the modem of its settings, switched on at time zero."""
     if isinstance(settings, EmulatedModemConfig):
         return EmulatedMicroModem(settings, travel_times=travel_times)
-    return PACKET_MODEMS[settings.driver](settings)
+    return packet_modems().get(settings.driver)(settings)
 
 
 def settings_for(driver: str, *, address: int, **micromodem: object) -> EmulatorSettings:

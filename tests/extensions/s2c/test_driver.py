@@ -9,25 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError, SentenceError
-from sonarpost.extensions.simulation.modem.packet_modem import PacketModemSettings
-from sonarpost.extensions.simulation.modem.s2c import EmulatedS2c
-from sonarpost.modem.interface import (
-    FrameReceived,
-    ModemEvent,
-    ModemReady,
-    ModemUnresponsive,
-    PacketFailed,
-    PacketReceived,
-    PacketSent,
-    RangeMeasured,
-    RequestDone,
-    RequestFailed,
-    SentenceRejected,
-    SettingUnconfirmed,
-)
-from sonarpost.modem.registry import ModemSettings
-from sonarpost.modem.s2c import CAPABILITIES, S2cModem, UsblPosition
-from sonarpost.modem.s2c.messages import (
+from sonarpost.extensions.s2c.driver import S2cModem
+from sonarpost.extensions.s2c.emulated import EmulatedS2c
+from sonarpost.extensions.s2c.events import UsblPosition
+from sonarpost.extensions.s2c.messages import (
     MAX_DATA_BYTES,
     MAX_TEXT_BYTES,
     DeliveryReport,
@@ -43,6 +28,23 @@ from sonarpost.modem.s2c.messages import (
     parse,
     parse_travel_time_s,
 )
+from sonarpost.extensions.s2c.rates import CAPABILITIES
+from sonarpost.extensions.simulation.modem.packet_modem import PacketModemSettings
+from sonarpost.modem.interface import (
+    FrameReceived,
+    ModemEvent,
+    ModemReady,
+    ModemUnresponsive,
+    PacketFailed,
+    PacketReceived,
+    PacketSent,
+    RangeMeasured,
+    RequestDone,
+    RequestFailed,
+    SentenceRejected,
+    SettingUnconfirmed,
+)
+from sonarpost.modem.registry import ModemSettings
 
 # An exchange of a USBL modem, quoted by a public client of such modems (docs/reference/modem-s2c.md).
 RECORDED = (

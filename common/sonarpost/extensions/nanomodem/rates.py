@@ -16,7 +16,7 @@ from sonarpost.modem.interface import ModemCapabilities, RateInfo
 MAX_PAYLOAD_BYTES: Final = 64
 """Greatest length of a message."""
 HEADER_BYTES: Final = 1
-"""Address that the driver puts in front of a frame; see `sonarpost.modem.nano.driver`."""
+"""Address that the driver puts in front of a frame; see `sonarpost.extensions.nanomodem.driver`."""
 CHIRP_S: Final = 0.105
 """Duration of a packet without data: a ping, or an acknowledgement."""
 SECONDS_PER_BYTE: Final = 0.0125

@@ -9,22 +9,12 @@ transmits no piggyback messages and repeats no instant message.
 from __future__ import annotations
 
 import re
-from collections import deque
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
-from sonarpost.extensions.simulation.channel.events import (
-    AcousticPacket,
-    ArrivalEnded,
-    ArrivalStarted,
-    PacketKind,
-    PacketOutcome,
-)
-from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, PacketModemSettings, good_frames
-from sonarpost.extensions.simulation.modem.receiver import PacketReport
-from sonarpost.extensions.simulation.modem.s2c_burst import ANSWER_LIMIT_S, BurstLink
-from sonarpost.modem.s2c.messages import MAX_DATA_BYTES
-from sonarpost.modem.s2c.rates import (
+from sonarpost.extensions.s2c.emulated_burst import ANSWER_LIMIT_S, BurstLink
+from sonarpost.extensions.s2c.messages import MAX_DATA_BYTES
+from sonarpost.extensions.s2c.rates import (
     ACK_AIRTIME_S,
     BROADCAST,
     BURST_BIT_RATE_BPS,
@@ -34,6 +24,15 @@ from sonarpost.modem.s2c.rates import (
     INSTANT_RATE,
     message_airtime_s,
 )
+from sonarpost.extensions.simulation.channel.events import (
+    AcousticPacket,
+    ArrivalEnded,
+    ArrivalStarted,
+    PacketKind,
+    PacketOutcome,
+)
+from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, PacketModemSettings, good_frames
+from sonarpost.extensions.simulation.modem.receiver import PacketReport
 
 FIRMWARE: Final = "1.8-sonarpost-emulator"
 
@@ -306,7 +305,9 @@ class EmulatedS2c(PacketModem):
     def _drop(self, *, bursts: bool, messages: bool) -> None:
         """Drop burst data or the instant message without a report; a transmission on the air is completed."""
         rates = (BURST_RATE,) * bursts + (INSTANT_RATE,) * messages
-        self._queue = deque(sent for sent in self._queue if sent.kind is PacketKind.ACK or sent.rate not in rates)
+        kept = [sent for sent in self._queue if sent.kind is PacketKind.ACK or sent.rate not in rates]
+        self._queue.clear()
+        self._queue.extend(kept)
         if bursts:
             self._bursts.drop()
         if messages:

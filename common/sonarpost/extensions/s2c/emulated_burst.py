@@ -9,14 +9,13 @@ modems also divide long data into several packets and adapt their bit rate to th
 from __future__ import annotations
 
 import struct
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from sonarpost.extensions.s2c.rates import ACK_AIRTIME_S, BURST_RATE, burst_airtime_s
 from sonarpost.extensions.simulation.channel.events import AcousticPacket, PacketKind
 from sonarpost.extensions.simulation.channel.model import RandomDraws
-from sonarpost.modem.s2c.rates import ACK_AIRTIME_S, BURST_RATE, burst_airtime_s
 
 ANSWER_LIMIT_S: Final = 6.0
 """How long a modem waits for an acknowledgement or a confirmation: a travel of 3 km and back, and the air time."""
@@ -57,7 +56,7 @@ class BurstLink:
     def __init__(self, transmit: Callable[[AcousticPacket], bool], notify: Callable[[str], None]) -> None:
         self._transmit = transmit
         self._notify = notify
-        self._bursts: deque[_Burst] = deque()
+        self._bursts: list[_Burst] = []
         self._sequence = self._number = 0
         self._is_started = False
         self._transmissions = 0
@@ -166,7 +165,7 @@ class BurstLink:
         self._bursts.append(_Burst(self._sequence, number, source, destination, data))
 
     def _end_burst(self, result: str) -> None:
-        burst = self._bursts.popleft()
+        burst = self._bursts.pop(0)
         self._end_wait()
         if burst.number:
             self._notify(f"{result},{burst.number},{burst.destination}")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from sonarpost.extensions.s2c.messages import DeliveryReport
+from sonarpost.extensions.s2c.rates import BURST_FRAME_BYTES, BURST_RATE, RATES
 from sonarpost.modem.interface import PacketSent
 from sonarpost.modem.packet_queue import WaitingPacket
-from sonarpost.modem.s2c.messages import DeliveryReport
-from sonarpost.modem.s2c.rates import BURST_FRAME_BYTES, BURST_RATE, RATES
 
 PING_DATA: Final = b"\0"
 """Data of a ping and of an empty frame. The driver does not report such a message as a frame."""

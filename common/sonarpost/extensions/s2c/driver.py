@@ -8,12 +8,28 @@ older commands are not taken for new ones.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from sonarpost.errors import FrameError, SentenceError
+from sonarpost.extensions.s2c.events import UsblPosition
+from sonarpost.extensions.s2c.messages import (
+    DeliveryReport,
+    RawMessage,
+    ReceptionEnd,
+    ReceptionStart,
+    S2cData,
+    S2cMessage,
+    S2cMessageAssembler,
+    S2cReply,
+    SendEnd,
+    SendStart,
+    parse,
+    parse_travel_time_s,
+)
+from sonarpost.extensions.s2c.rates import BURST_FRAME_BYTES, BURST_RATE, CAPABILITIES, INSTANT_RATE
+from sonarpost.extensions.s2c.sending import PING_DATA, Sending
 from sonarpost.modem.interface import (
     FrameReceived,
     ModemError,
@@ -32,24 +48,7 @@ from sonarpost.modem.interface import (
     TransmissionStarted,
 )
 from sonarpost.modem.packet_queue import QueueingModem
-from sonarpost.modem.registry import ModemSettings
-from sonarpost.modem.s2c.events import UsblPosition
-from sonarpost.modem.s2c.messages import (
-    DeliveryReport,
-    RawMessage,
-    ReceptionEnd,
-    ReceptionStart,
-    S2cData,
-    S2cMessage,
-    S2cMessageAssembler,
-    S2cReply,
-    SendEnd,
-    SendStart,
-    parse,
-    parse_travel_time_s,
-)
-from sonarpost.modem.s2c.rates import BURST_FRAME_BYTES, BURST_RATE, CAPABILITIES, INSTANT_RATE
-from sonarpost.modem.s2c.sending import PING_DATA, Sending
+from sonarpost.modem.registry import ModemDriver, ModemSettings
 
 LINE_ENDS: Final = (b"\n", b"\r")
 """End of a command: the first on Ethernet, the second on a serial port. The driver uses the one that is answered."""
@@ -96,7 +95,7 @@ class S2cModem(QueueingModem[Sending]):
         self._line_end = 0
         self._line_end_known = False
         self._escaped = False
-        self._steps: deque[tuple[bytes, bool]] = deque()
+        self._steps: list[tuple[bytes, bool]] = []
         self._command: _Command | None = None
         self._firmware: str | None = None
         self._answered_s: float | None = None
@@ -229,7 +228,7 @@ class S2cModem(QueueingModem[Sending]):
             (b"!AL" + own, True),
             (b"?AL", True),
         )
-        self._steps = deque(steps)
+        self._steps = list(steps)
         self._command = None
         self._ready = False
         self._events_since_s = now
@@ -361,7 +360,7 @@ class S2cModem(QueueingModem[Sending]):
             self._events.append(SettingUnconfirmed("AT@ZX1"))
         if step == b"I0" and not is_refused:
             self._firmware = text[:40]
-        self._steps.popleft()
+        self._steps.pop(0)
         if is_last:
             self._failures = 0
             self._unresponsive = False
@@ -467,3 +466,6 @@ def _answers(reply: S2cReply, command: _Command) -> bool:
     asked = f"AT{reply.command}".encode()
     # `*SEND` is no answer to `*SENDIM`; the answer to `@ZX1` names `@ZX`.
     return name == asked if comma else reply.command != "" and name.startswith(asked)
+
+
+DRIVER = ModemDriver("s2c", CAPABILITIES, S2cModem, "EvoLogics S2C: instant messages and burst data")

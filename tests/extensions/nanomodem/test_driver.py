@@ -7,6 +7,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import FrameError, SentenceError
+from sonarpost.extensions.nanomodem.driver import ANSWER_LIMIT_S, CHECK_INTERVAL_S, GUARD_S, PAUSE_S, NanoModem
+from sonarpost.extensions.nanomodem.messages import (
+    Answer,
+    Confirmation,
+    NanoData,
+    NanoMessage,
+    NanoMessageAssembler,
+    NoAnswer,
+    Refusal,
+    Status,
+)
+from sonarpost.extensions.nanomodem.rates import RATES, airtime_s
 from sonarpost.modem.interface import (
     FrameReceived,
     ModemError,
@@ -24,19 +36,6 @@ from sonarpost.modem.interface import (
     TransmissionEnded,
     TransmissionStarted,
 )
-from sonarpost.modem.nano import RATES, NanoModem
-from sonarpost.modem.nano.driver import ANSWER_LIMIT_S, CHECK_INTERVAL_S, GUARD_S, PAUSE_S
-from sonarpost.modem.nano.messages import (
-    Answer,
-    Confirmation,
-    NanoData,
-    NanoMessage,
-    NanoMessageAssembler,
-    NoAnswer,
-    Refusal,
-    Status,
-)
-from sonarpost.modem.nano.rates import airtime_s
 from sonarpost.modem.registry import ModemSettings
 
 GOLDEN: list[tuple[bytes, NanoMessage]] = [

@@ -2,7 +2,7 @@
 
 It answers `$?`, `$A`, `$B`, `$U`, `$M` and `$P`. Any other command is answered with `E`: its length is not known, so it
 ends with the next `$`, after 7 bytes or after a pause. A command that is cut ends in the same way. Packets take the air
-time of their length. Sources are those of `sonarpost.modem.nano`; how a real modem treats a command during a
+time of their length. Sources are those of `sonarpost.extensions.nanomodem`; how a real modem treats a command during a
 transmission is not known, here the packet waits.
 """
 
@@ -12,11 +12,11 @@ import math
 import re
 from typing import ClassVar, Final
 
+from sonarpost.extensions.nanomodem.messages import TRAVEL_STEP_S
+from sonarpost.extensions.nanomodem.rates import MAX_PAYLOAD_BYTES, RATE, airtime_s
 from sonarpost.extensions.simulation.channel.events import AcousticPacket, ArrivalEnded, PacketKind
 from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, PacketModemSettings, good_frames
 from sonarpost.modem.interface import MAX_ADDRESS
-from sonarpost.modem.nano.messages import TRAVEL_STEP_S
-from sonarpost.modem.nano.rates import MAX_PAYLOAD_BYTES, RATE, airtime_s
 
 ANSWER_TIMEOUT_S: Final = 4.0
 """Time after its transmission until the modem reports `#TO`."""

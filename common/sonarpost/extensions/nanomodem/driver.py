@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from sonarpost.errors import SentenceError
+from sonarpost.extensions.nanomodem import messages
+from sonarpost.extensions.nanomodem.rates import CAPABILITIES, RATE, airtime_s
 from sonarpost.modem.interface import (
     FrameReceived,
     ModemError,
@@ -31,10 +33,8 @@ from sonarpost.modem.interface import (
     TransmissionEnded,
     TransmissionStarted,
 )
-from sonarpost.modem.nano import messages
-from sonarpost.modem.nano.rates import CAPABILITIES, RATE, airtime_s
 from sonarpost.modem.packet_queue import QueueingModem, WaitingPacket
-from sonarpost.modem.registry import ModemSettings
+from sonarpost.modem.registry import ModemDriver, ModemSettings
 
 PAUSE_S: Final = 1.0
 """After such a pause an unfinished message is given up: the modem sends the longest message in 0.1 s."""
@@ -318,3 +318,6 @@ class NanoModem(QueueingModem[_Sending]):
     def _result(self, failed: PacketFailed) -> ModemEvent:
         """Return the failure of a packet, or of a ping, which is a packet without frames in the queue."""
         return failed if failed.frames else RequestFailed(failed.packet_id, _PING, failed.dest, failed.reason)
+
+
+DRIVER = ModemDriver("nano", CAPABILITIES, NanoModem, "nanomodem v3 (NM3): 64-byte messages and ranging")

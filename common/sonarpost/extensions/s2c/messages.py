@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Final
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.s2c.events import UsblPosition
+from sonarpost.extensions.s2c.events import UsblPosition
 
 MAX_TEXT_BYTES: Final = 4096
 """Greatest length of a message."""

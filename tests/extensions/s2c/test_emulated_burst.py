@@ -6,12 +6,12 @@ import re
 
 import pytest
 
+from sonarpost.extensions.s2c.emulated_burst import IDLE_LIMIT_S, MAX_BURSTS, TRANSMISSIONS
 from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
 from sonarpost.extensions.simulation.channel.events import PacketKind, TransmittedPacket
 from sonarpost.extensions.simulation.channel.parameters import build_parameters
 from sonarpost.extensions.simulation.channel.simulator import ChannelSimulator, PlacedModem
 from sonarpost.extensions.simulation.modem.packet_modem import PacketModemSettings
-from sonarpost.extensions.simulation.modem.s2c_burst import IDLE_LIMIT_S, MAX_BURSTS, TRANSMISSIONS
 
 ESCAPED = re.compile(rb"\+\+\+AT([^:]*):(\d+):")
 

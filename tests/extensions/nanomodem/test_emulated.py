@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from sonarpost.extensions.nanomodem.rates import airtime_s
 from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
 from sonarpost.extensions.simulation.channel.parameters import build_parameters
 from sonarpost.extensions.simulation.channel.simulator import ChannelSimulator, PlacedModem
 from sonarpost.extensions.simulation.modem.packet_modem import PacketModemSettings
-from sonarpost.modem.nano.rates import airtime_s
 
 RANGE_M = 150.0
 STEPS = round(RANGE_M / 1500.0 / 31.25e-6)

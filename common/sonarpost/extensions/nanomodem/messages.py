@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.nano.rates import MAX_PAYLOAD_BYTES
+from sonarpost.extensions.nanomodem.rates import MAX_PAYLOAD_BYTES
 
 TRAVEL_STEP_S: Final = 31.25e-6
 """Unit of the travel time."""

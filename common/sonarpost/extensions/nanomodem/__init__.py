@@ -1,0 +1,1 @@
+"""Driver of the nanomodem v3 (NM3) of Newcastle University and of modems with its command set."""
