@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from sonarpost.modem.micromodem.plugin import DRIVER
+from sonarpost.modem.micromodem.driver import DRIVER
 
 OTHER = replace(DRIVER, name="other")
 BROKEN = "not a driver"

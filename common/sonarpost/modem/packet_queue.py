@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final, Generic, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
-from sonarpost.modem.interface import Modem, ModemCapabilities, ModemEvent, PacketFailed, PacketSent
+from sonarpost.errors import SentenceError
+from sonarpost.modem.interface import (
+    Modem,
+    ModemCapabilities,
+    ModemEvent,
+    PacketFailed,
+    PacketSent,
+    SentenceRejected,
+)
 from sonarpost.modem.registry import ModemSettings
 
 QUEUED_PACKETS: Final = 8
 MAX_DEFER_S: Final = 120.0
 S = TypeVar("S")
+M = TypeVar("M")
+M_co = TypeVar("M_co", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,27 +92,58 @@ class PacketQueue:
         return self._packets[0].queued_s + self._max_age_s if self._packets else None
 
 
-class QueueingModem(Modem, Generic[S]):
+class Assembler(Protocol[M_co]):
+    """Divides received bytes into messages. What is not a message is an error."""
+
+    @property
+    def incomplete(self) -> bool:
+        """Whether the beginning of a message waits for its end."""
+
+    def feed(self, data: bytes) -> Sequence[M_co | SentenceError]:
+        """Return the messages that are complete with these bytes."""
+
+    def abandon(self) -> Sequence[M_co | SentenceError]:
+        """Give up the incomplete message; return what its bytes come to."""
+
+    def reset(self) -> None:
+        """Forget the incomplete message."""
+
+
+class QueueingModem(Modem, Generic[S, M]):
     """Base class of drivers with a `PacketQueue`, which have one packet or request in progress, `_sending`.
+
+    A subclass starts packets and requests in `_advance` and puts what it sends into `_out`, one part for each write.
 
     Args:
         capabilities: Capabilities of the modem.
         settings: Settings of the driver.
         where: Names the port in errors.
+        assembler: Divides received bytes.
+        pause_s: After such a pause an incomplete message is given up.
 
     Raises:
         ConfigError: The modem does not have the address.
     """
 
-    def __init__(self, capabilities: ModemCapabilities, settings: ModemSettings, where: str) -> None:
+    def __init__(
+        self,
+        capabilities: ModemCapabilities,
+        settings: ModemSettings,
+        where: str,
+        assembler: Assembler[M],
+        pause_s: float,
+    ) -> None:
         capabilities.check_address(settings.address, where)
         self._capabilities = capabilities
         self._settings = settings
+        self._assembler = assembler
+        self._pause_s = pause_s
         self._queue = PacketQueue()
         self._sending: S | None = None
         self._next_id = 1
         self._is_open = False
         self._received_s = 0.0
+        self._out: list[bytes] = []
         self._events: list[ModemEvent] = []
         self._events_since_s = 0.0
 
@@ -121,15 +162,89 @@ class QueueingModem(Modem, Generic[S]):
         """False: the modem does not report the start of a reception."""
         return False
 
+    def port_opened(self, now: float) -> None:
+        """Begin to send and receive; see `_begin`."""
+        if self._is_open:
+            self.port_lost(now)
+        self._is_open = True
+        self._begin(now)
+        self._advance(now)
+
+    def port_lost(self, now: float) -> None:
+        """Fail the packet or request in progress; see `_end`."""
+        self._is_open = False
+        self._end()
+        self._out.clear()
+        self._assembler.reset()
+        self._events_since_s = now
+
+    def send_packet(
+        self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False, now: float
+    ) -> int:
+        """Queue a packet; see `Modem.send_packet`. A broadcast is not acknowledged."""
+        self._capabilities.check_packet(destination, rate, frames)
+        ack = ack and destination != self._capabilities.broadcast
+        return self._add(destination, rate, frames, ack=ack, now=now)
+
+    def receive(self, data: bytes, now: float) -> list[ModemEvent]:
+        """Process received bytes; invalid ones are reported as events."""
+        self._give_up_incomplete(now)
+        self._received_s = now
+        if self._is_open:
+            self._process(self._divided(data), now)
+        self._advance(now)
+        return self._take_events()
+
     def poll(self, now: float) -> list[ModemEvent]:
         """Do what is due."""
         self._advance(now)
         return self._take_events()
 
+    def next_wakeup(self) -> float | None:
+        """Return when `poll` has something to do, or None."""
+        times_s = [*self._deadlines_s(), self._queue.deadline_s()]
+        if self._events:
+            times_s.append(self._events_since_s)
+        if self._assembler.incomplete:
+            times_s.append(self._received_s + self._pause_s)
+        return min((time_s for time_s in times_s if time_s is not None), default=None)
+
+    def bytes_to_send(self) -> bytes:
+        """Remove and return the bytes of the next write to the port."""
+        return self._out.pop(0) if self._out else b""
+
+    def _begin(self, now: float) -> None:
+        """Begin the dialogue with the modem: the port was opened."""
+
+    def _end(self) -> None:
+        """End the dialogue with the modem: the port was lost."""
+
+    def _deadlines_s(self) -> Iterable[float | None]:
+        """Return the times at which `_advance` has something to do."""
+        return ()
+
+    def _on_message(self, message: M, now: float) -> None:
+        """Process a message."""
+
     def _advance(self, now: float) -> None:
         """Do what is due; subclasses extend it."""
+        self._give_up_incomplete(now)
         self._events_since_s = now
         self._events += map(self._result, self._queue.expire(now))
+
+    def _divided(self, data: bytes) -> Sequence[M | SentenceError]:
+        return self._assembler.feed(data)
+
+    def _give_up_incomplete(self, now: float) -> None:
+        if self._assembler.incomplete and now >= self._received_s + self._pause_s:
+            self._process(self._assembler.abandon(), now)
+
+    def _process(self, items: Sequence[M | SentenceError], now: float) -> None:
+        for item in items:
+            if isinstance(item, SentenceError):
+                self._events.append(SentenceRejected(item))
+            else:
+                self._on_message(item, now)
 
     def _add(self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool, now: float) -> int:
         number, self._next_id = self._next_id, self._next_id + 1

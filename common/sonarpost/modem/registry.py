@@ -84,7 +84,7 @@ def drivers(points: Iterable[EntryPoint]) -> Registry[ModemDriver]:
         "a sonarpost.modem.registry.ModemDriver with the name of the entry point",
         lambda found, name: isinstance(found, ModemDriver) and found.name == name,
         {},
-        (*(EntryPoint(name, f"sonarpost.modem.{name}.plugin:DRIVER", "") for name in _CORE), *points),
+        (*(EntryPoint(name, f"sonarpost.modem.{name}.driver:DRIVER", "") for name in _CORE), *points),
     )
 
 

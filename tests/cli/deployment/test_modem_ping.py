@@ -16,7 +16,7 @@ from sonarpost.cli.deployment import modem_ping
 from sonarpost.cli.main import main
 from sonarpost.extensions.simulation.channel.config import EmulatorConfig
 from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
-from sonarpost.modem.micromodem import plugin
+from sonarpost.modem.micromodem import driver
 from sonarpost.modem.micromodem.config import MicroModemConfig
 
 Emulate = Callable[..., list[str]]
@@ -57,7 +57,7 @@ def test_the_travel_time_to_the_other_modem_is_printed(emulate, capsys):
 
 
 def test_a_modem_that_does_not_answer_is_status_1(emulate, capsys, monkeypatch):
-    monkeypatch.setattr(plugin, "MicroModemConfig", partial(MicroModemConfig, poll_wait_s=0.1, ack_wait_s=0.1))
+    monkeypatch.setattr(driver, "MicroModemConfig", partial(MicroModemConfig, poll_wait_s=0.1, ack_wait_s=0.1))
     assert ping(emulate()[0], "--count", "1", destination=9) == 1
     assert capsys.readouterr().out.splitlines()[1:] == [
         "ping 1: not answered (no answer from the far modem)",

@@ -71,7 +71,7 @@ def test_message_whole_by_byte_and_with_trailing_junk(data: bytes, message: Nano
     first, error = assembler.feed(data + b"!junk!")
     assert first == message
     assert isinstance(error, SentenceError)
-    assert not assembler.unfinished
+    assert not assembler.incomplete
 
 
 @pytest.mark.parametrize(
@@ -107,10 +107,10 @@ def test_cut_message_does_not_hide_the_next_one() -> None:
     ]
     assembler = NanoMessageAssembler()
     assert assembler.feed(b"#B00364hello#B00405world\r\n#TO\r\n") == []
-    error, *found = assembler.flush()
+    error, *found = assembler.abandon()
     assert isinstance(error, SentenceError)
     assert found == [NanoData(4, b"world"), NoAnswer()]
-    assert assembler.flush() == []
+    assert assembler.abandon() == []
 
 
 messages = st.sampled_from([data for data, _ in GOLDEN])
@@ -121,15 +121,15 @@ noise = st.binary(max_size=80) | messages | messages.map(lambda data: data[:-3])
 @given(st.lists(noise, max_size=8).map(b"".join), st.data())
 def test_any_bytes_in_any_parts_give_the_same_messages(data: bytes, draw: st.DataObject) -> None:
     whole, parts = NanoMessageAssembler(), NanoMessageAssembler()
-    expected = [item for item in whole.feed(data) + whole.flush() if not isinstance(item, SentenceError)]
+    expected = [item for item in whole.feed(data) + whole.abandon() if not isinstance(item, SentenceError)]
     found: list[NanoMessage | SentenceError] = []
     at = 0
     while at < len(data):
         size = draw.draw(st.integers(1, 40))
         found += parts.feed(data[at : at + size])
         at += size
-        assert len(parts._buffer) < 110, "an unfinished message is bounded"
-    found += parts.flush()
+        assert len(parts._buffer) < 110, "an incomplete message is bounded"
+    found += parts.abandon()
     assert [item for item in found if not isinstance(item, SentenceError)] == expected
     for item in expected:
         if isinstance(item, NanoData):
@@ -283,7 +283,7 @@ def test_frames_of_broadcasts_and_unicasts(driver: NanoModem) -> None:
     assert driver.receive(b"#U05\x01data\r\n", 6.0)[0] == FrameReceived(1, 3, True, 1, b"data", 6.0, 1, None)
 
 
-def test_unfinished_message_is_given_up_after_a_pause(driver: NanoModem) -> None:
+def test_incomplete_message_is_given_up_after_a_pause(driver: NanoModem) -> None:
     assert driver.receive(b"#B00120half", 5.0) == []
     assert driver.next_wakeup() == 5.0 + PAUSE_S
     [rejected] = driver.poll(5.0 + PAUSE_S)

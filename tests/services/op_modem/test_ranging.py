@@ -10,7 +10,7 @@ from sonarpost.config import ModemTable
 from sonarpost.errors import ConfigError
 from sonarpost.messages import VehicleRange
 from sonarpost.modem.interface import RangeMeasured, RequestDone, RequestFailed
-from sonarpost.modem.micromodem.plugin import DRIVER
+from sonarpost.modem.micromodem.driver import DRIVER
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.ranging import Ranging
 from sonarpost.services.op_modem.service import OpModemService

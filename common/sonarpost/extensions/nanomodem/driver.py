@@ -10,11 +10,10 @@ The modem does not report the end of a transmission or the start of a reception.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from sonarpost.errors import SentenceError
 from sonarpost.extensions.nanomodem import messages
 from sonarpost.extensions.nanomodem.rates import CAPABILITIES, RATE, airtime_s
 from sonarpost.modem.interface import (
@@ -29,7 +28,6 @@ from sonarpost.modem.interface import (
     RangeMeasured,
     RequestDone,
     RequestFailed,
-    SentenceRejected,
     TransmissionEnded,
     TransmissionStarted,
 )
@@ -37,7 +35,7 @@ from sonarpost.modem.packet_queue import QueueingModem, WaitingPacket
 from sonarpost.modem.registry import ModemDriver, ModemSettings
 
 PAUSE_S: Final = 1.0
-"""After such a pause an unfinished message is given up: the modem sends the longest message in 0.1 s."""
+"""After such a pause an incomplete message is given up: the modem sends the longest message in 0.1 s."""
 GUARD_S: Final = 0.1
 """Added to the air time before the next command: the delays of the serial line and of the modem."""
 ANSWER_LIMIT_S: Final = 8.0
@@ -75,10 +73,10 @@ class _Sending:
 
     @property
     def expects_answer(self) -> bool:
-        return self.is_ping or (self.packet.ack and self.packet.destination != CAPABILITIES.broadcast)
+        return self.is_ping or self.packet.ack
 
 
-class NanoModem(QueueingModem[_Sending]):
+class NanoModem(QueueingModem[_Sending, messages.NanoMessage]):
     """One nanomodem.
 
     Args:
@@ -90,81 +88,44 @@ class NanoModem(QueueingModem[_Sending]):
     """
 
     def __init__(self, settings: ModemSettings, where: str = "modem port") -> None:
-        super().__init__(CAPABILITIES, settings, where)
-        self._assembler = messages.NanoMessageAssembler()
+        super().__init__(CAPABILITIES, settings, where, messages.NanoMessageAssembler(), PAUSE_S)
         self._question: bytes | None = None
         self._asked_s = 0.0
         self._attempts = 0
         self._is_ready = self._is_unresponsive = False
         self._message_s: float | None = None
-        self._out: list[bytes] = []
 
     @property
     def ready(self) -> bool:
         """Whether the modem has the address of the settings and answers."""
         return self._is_ready
 
-    def port_opened(self, now: float) -> None:
-        """Request the status of the modem, then set its address if that is another one."""
-        if self._is_open:
-            self.port_lost(now)
-        self._is_open = True
-        self._attempts = 0
-        self._ask(_STATUS, now)
-        self._events_since_s = now
-
-    def port_lost(self, now: float) -> None:
-        """Fail the packet or ping in progress."""
-        self._is_open = self._is_ready = self._is_unresponsive = False
-        self._question = None
-        if self._sending is not None:
-            self._fail("the port was lost", maybe_sent=True)
-        self._out.clear()
-        self._assembler.reset()
-        self._events_since_s = now
-
-    def send_packet(
-        self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False, now: float
-    ) -> int:
-        """Queue a packet; see `Modem.send_packet`."""
-        CAPABILITIES.check_packet(destination, rate, frames)
-        return self._add(destination, RATE, frames, ack=ack, now=now)
-
     def ping(self, destination: int, now: float) -> int:
         """Queue a ping; see `Modem.ping`."""
         CAPABILITIES.check_packet(destination, RATE, [b""])
         return self._add(destination, RATE, (), ack=False, now=now)
 
-    def receive(self, data: bytes, now: float) -> list[ModemEvent]:
-        """Process bytes of the modem; invalid ones are reported as events."""
-        self._give_up_message(now)
-        self._received_s = now
-        if self._is_open:
-            self._process(self._assembler.feed(data), now)
-        self._advance(now)
-        return self._take_events()
+    def _begin(self, now: float) -> None:
+        self._attempts = 0
+        self._ask(_STATUS, now)
 
-    def next_wakeup(self) -> float | None:
-        """Return when `poll` has something to do, or None."""
-        times_s = [self._events_since_s if self._events else None, self._queue.deadline_s()]
-        if self._assembler.unfinished:
-            times_s.append(self._received_s + PAUSE_S)
+    def _end(self) -> None:
+        self._is_ready = self._is_unresponsive = False
+        self._question = None
         if self._sending is not None:
-            times_s.append(self._deadline_s(self._sending))
-        elif self._question is not None:
-            times_s.append(self._asked_s + self._settings.reply_timeout_s)
-        elif self._is_open:
-            times_s.append(self._check_s())
-        return min((time_s for time_s in times_s if time_s is not None), default=None)
-
-    def bytes_to_send(self) -> bytes:
-        """Remove and return the next command."""
-        return self._out.pop(0) if self._out else b""
+            self._fail("the port was lost", maybe_sent=True)
 
     # Time
 
+    def _deadlines_s(self) -> Iterable[float | None]:
+        if self._sending is not None:
+            yield self._deadline_s(self._sending)
+        elif self._question is not None:
+            yield self._asked_s + self._settings.reply_timeout_s
+        elif self._is_open:
+            yield self._check_s()
+
     def _advance(self, now: float) -> None:
-        self._give_up_message(now)
         super()._advance(now)
         if self._sending is not None:
             self._advance_sending(self._sending, now)
@@ -181,10 +142,6 @@ class NanoModem(QueueingModem[_Sending]):
 
     def _check_s(self) -> float:
         return max(self._asked_s, self._message_s or 0.0) + CHECK_INTERVAL_S
-
-    def _give_up_message(self, now: float) -> None:
-        if self._assembler.unfinished and now >= self._received_s + PAUSE_S:
-            self._process(self._assembler.flush(), now)
 
     # Address and status
 
@@ -271,23 +228,19 @@ class NanoModem(QueueingModem[_Sending]):
 
     # Messages of the modem
 
-    def _process(self, found: Sequence[messages.NanoMessage | SentenceError], now: float) -> None:
-        for item in found:
-            if isinstance(item, SentenceError):
-                self._events.append(SentenceRejected(item))
-                continue
-            self._message_s = now
-            match item:
-                case messages.Status():
-                    self._on_status(item, now)
-                case messages.NanoData():
-                    self._on_data(item, now)
-                case messages.Refusal():
-                    self._events.append(ModemError("E"))
-                    if self._sending is not None and self._sending.confirmed_s is None:
-                        self._fail("the modem refused the command", maybe_sent=False)
-                case _:
-                    self._on_progress(item, now)
+    def _on_message(self, message: messages.NanoMessage, now: float) -> None:
+        self._message_s = now
+        match message:
+            case messages.Status():
+                self._on_status(message, now)
+            case messages.NanoData():
+                self._on_data(message, now)
+            case messages.Refusal():
+                self._events.append(ModemError("E"))
+                if self._sending is not None and self._sending.confirmed_s is None:
+                    self._fail("the modem refused the command", maybe_sent=False)
+            case _:
+                self._on_progress(message, now)
 
     def _on_progress(self, item: messages.NanoMessage, now: float) -> None:
         """Process what concerns the packet in progress; ignore it if it belongs to another one."""

@@ -106,7 +106,7 @@ def ping_command(destination: int) -> tuple[bytes, bytes]:
     return head, head
 
 
-class _UnfinishedError(Exception):
+class _IncompleteError(Exception):
     """The bytes end within a message."""
 
 
@@ -118,7 +118,7 @@ class _Cursor:
 
     def peek(self) -> int:
         if self.at >= len(self.data):
-            raise _UnfinishedError
+            raise _IncompleteError
         return self.data[self.at]
 
     def expect(self, text: bytes) -> None:
@@ -141,7 +141,7 @@ class _Cursor:
 
     def take(self, count: int) -> bytes:
         if self.at + count > len(self.data):
-            raise _UnfinishedError
+            raise _IncompleteError
         self.at += count
         return bytes(self.data[self.at - count : self.at])
 
@@ -157,7 +157,7 @@ def _parse(cursor: _Cursor) -> NanoMessage:
 
     Raises:
         SentenceError: No message begins here.
-        _UnfinishedError: The bytes end within the message.
+        _IncompleteError: The bytes end within the message.
     """
     start = cursor.at
     if cursor.peek() == ord("E"):
@@ -201,12 +201,12 @@ class NanoMessageAssembler:
         self._buffer = bytearray()
 
     @property
-    def unfinished(self) -> bool:
+    def incomplete(self) -> bool:
         """Whether the bytes so far end within a message."""
         return bool(self._buffer)
 
     def reset(self) -> None:
-        """Drop an unfinished message."""
+        """Drop an incomplete message."""
         self._buffer.clear()
 
     def feed(self, data: bytes) -> list[NanoMessage | SentenceError]:
@@ -214,8 +214,8 @@ class NanoMessageAssembler:
         self._buffer += data
         return self._take()
 
-    def flush(self) -> list[NanoMessage | SentenceError]:
-        """Give up the unfinished message: its rest was lost. Return what its bytes contain."""
+    def abandon(self) -> list[NanoMessage | SentenceError]:
+        """Give up the incomplete message: its rest was lost. Return what its bytes contain."""
         found: list[NanoMessage | SentenceError] = []
         if self._buffer:
             found.append(SentenceError(_WHERE, "end", bytes(self._buffer[:20]), "a complete message"))
@@ -231,7 +231,7 @@ class NanoMessageAssembler:
             cursor = _Cursor(self._buffer, at)
             try:
                 found.append(_parse(cursor))
-            except _UnfinishedError:
+            except _IncompleteError:
                 break
             except SentenceError as error:
                 start = _START.search(self._buffer, at + 1)

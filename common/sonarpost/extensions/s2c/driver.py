@@ -8,7 +8,7 @@ older commands are not taken for new ones.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -73,7 +73,7 @@ class _Command:
     attempts: int = 1
 
 
-class S2cModem(QueueingModem[Sending]):
+class S2cModem(QueueingModem[Sending, RawMessage]):
     """One modem.
 
     Args:
@@ -85,8 +85,7 @@ class S2cModem(QueueingModem[Sending]):
     """
 
     def __init__(self, settings: ModemSettings, where: str = "modem port") -> None:
-        super().__init__(CAPABILITIES, settings, where)
-        self._assembler = S2cMessageAssembler()
+        super().__init__(CAPABILITIES, settings, where, S2cMessageAssembler(), PAUSE_S)
         self._has_sent_burst = False
         self._pings: set[int] = set()
         self._ready = False
@@ -101,7 +100,6 @@ class S2cModem(QueueingModem[Sending]):
         self._answered_s: float | None = None
         self._receiving_until_s: float | None = None
         self._receiving_since_s = 0.0
-        self._out = bytearray()
 
     @property
     def ready(self) -> bool:
@@ -113,34 +111,13 @@ class S2cModem(QueueingModem[Sending]):
         """Whether the modem has reported the start of a reception and not yet its end."""
         return self._receiving_until_s is not None
 
-    def port_opened(self, now: float) -> None:
-        """Configure the modem."""
-        if self._is_open:
-            self.port_lost(now)
-        self._is_open = True
-        self._line_end_known = self._escaped = False
-        self._configure(now)
-        self._advance(now)
-
-    def port_lost(self, now: float) -> None:
-        """Fail the message in progress."""
-        self._is_open = self._ready = False
-        self._fail("the port was lost")
-        self._steps.clear()
-        self._command = self._receiving_until_s = None
-        self._out.clear()
-        self._assembler.reset()
-        self._events_since_s = now
-
     def send_packet(
         self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False, now: float
     ) -> int:
         """Queue a packet; see `Modem.send_packet`. Burst data has no broadcast."""
-        CAPABILITIES.check_packet(destination, rate, frames)
         if rate == BURST_RATE and destination == CAPABILITIES.broadcast:
             raise FrameError("packet to send", "destination", destination, f"the address of one modem at rate {rate}")
-        is_acknowledged = ack and destination != CAPABILITIES.broadcast
-        return self._add(destination, rate, frames, ack=is_acknowledged, now=now)
+        return super().send_packet(destination, rate, frames, ack=ack, now=now)
 
     def ping(self, destination: int, now: float) -> int:
         """Queue an acknowledged message whose travel time is measured; see `Modem.ping`."""
@@ -150,38 +127,24 @@ class S2cModem(QueueingModem[Sending]):
         self._pings.add(self._next_id)
         return self._add(destination, INSTANT_RATE, (PING_DATA,), ack=True, now=now)
 
-    def receive(self, data: bytes, now: float) -> list[ModemEvent]:
-        """Process received bytes; invalid ones are reported as events."""
-        if self._is_open:
-            self._give_up_incomplete(now)
-            self._received_s = now
-            self._process(self._assembler.feed(data), now)
-        self._advance(now)
-        return self._take_events()
+    def _begin(self, now: float) -> None:
+        self._line_end_known = self._escaped = False
+        self._configure(now)
 
-    def poll(self, now: float) -> list[ModemEvent]:
-        """Do what is due."""
-        self._give_up_incomplete(now)
-        return super().poll(now)
+    def _end(self) -> None:
+        self._ready = False
+        self._fail("the port was lost")
+        self._steps.clear()
+        self._command = self._receiving_until_s = None
 
-    def next_wakeup(self) -> float | None:
-        """Return when `poll` has something to do, or None."""
-        times_s = [self._events_since_s if self._events else None, self._queue.deadline_s(), self._receiving_until_s]
+    def _deadlines_s(self) -> Iterable[float | None]:
+        yield self._receiving_until_s
         if self._command is not None:
-            times_s.append(self._command.deadline_s)
+            yield self._command.deadline_s
         elif self._is_open:
-            times_s.append(max(self._answered_s or 0.0, self._received_s) + CHECK_INTERVAL_S)
+            yield max(self._answered_s or 0.0, self._received_s) + CHECK_INTERVAL_S
         if self._sending is not None and (self._sending.accepted or self._sending.refused):
-            times_s.append(self._sending.deadline_s)
-        if self._assembler.incomplete:
-            times_s.append(self._received_s + PAUSE_S)
-        return min((time_s for time_s in times_s if time_s is not None), default=None)
-
-    def bytes_to_send(self) -> bytes:
-        """Remove and return the bytes for the port."""
-        data = bytes(self._out)
-        self._out.clear()
-        return data
+            yield self._sending.deadline_s
 
     def _advance(self, now: float) -> None:
         super()._advance(now)
@@ -238,7 +201,7 @@ class S2cModem(QueueingModem[Sending]):
         self._write(text)
 
     def _write(self, text: bytes) -> None:
-        self._out += b"+++" + text + LINE_ENDS[self._line_end]
+        self._out.append(b"+++" + text + LINE_ENDS[self._line_end])
 
     def _on_no_answer(self, command: _Command, now: float) -> None:
         if not self._line_end_known:
@@ -280,27 +243,21 @@ class S2cModem(QueueingModem[Sending]):
             self._configure(now)
             self._send_command(b"AT" + self._steps[0][0], now)
 
-    def _process(self, items: Sequence[RawMessage | SentenceError], now: float) -> None:
-        for item in items:
-            if isinstance(item, SentenceError):
-                self._events.append(SentenceRejected(item))
-                continue
-            if item.command is None and self._escaped:
-                # Bytes outside messages are data of another modem: it must not pass for a message.
-                error = SentenceError("S2C modem", "message", item.text[:40], "a message of data mode")
-                self._events.append(SentenceRejected(error))
-                continue
-            self._escaped = self._escaped or item.command is not None
-            try:
-                self._on_message(parse(item), now)
-            except SentenceError as error:
-                self._events.append(SentenceRejected(error))
+    def _on_message(self, message: RawMessage, now: float) -> None:
+        if message.command is None and self._escaped:
+            # Bytes outside messages are data of another modem: it must not pass for a message.
+            error = SentenceError("S2C modem", "message", message.text[:40], "a message of data mode")
+            self._events.append(SentenceRejected(error))
+            return
+        self._escaped = self._escaped or message.command is not None
+        try:
+            parsed = parse(message)
+        except SentenceError as error:
+            self._events.append(SentenceRejected(error))
+        else:
+            self._on_parsed(parsed, now)
 
-    def _give_up_incomplete(self, now: float) -> None:
-        if self._assembler.incomplete and now >= self._received_s + PAUSE_S:
-            self._process(self._assembler.abandon(), now)
-
-    def _on_message(self, message: S2cMessage, now: float) -> None:
+    def _on_parsed(self, message: S2cMessage, now: float) -> None:
         self._answered_s = now
         match message:
             case S2cReply():

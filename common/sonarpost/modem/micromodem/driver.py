@@ -71,6 +71,7 @@ from sonarpost.modem.micromodem.statistics import TransmitStatistics
 from sonarpost.modem.micromodem.supervisor import ModemSupervisor, Phase
 from sonarpost.modem.micromodem.transmit_cycle import QueuedPacket, TransmitCycle
 from sonarpost.modem.micromodem.transmit_monitor import TransmitMonitor
+from sonarpost.modem.registry import ModemDriver, ModemSettings
 
 
 class MicroModem(Modem):
@@ -525,3 +526,15 @@ class MicroModem(Modem):
         "CAMUR": _on_answer,
         "CARDP": _on_flexible_data,
     }
+
+
+def _create(settings: ModemSettings, where: str) -> MicroModem:
+    config = MicroModemConfig(
+        settings.address,
+        reply_timeout_s=settings.reply_timeout_s,
+        max_carrier_sense_s=settings.max_carrier_sense_s,
+    )
+    return MicroModem(config, where)
+
+
+DRIVER = ModemDriver("micromodem", CAPABILITIES, _create, "WHOI Micro-Modem 1 and 2, on a serial line")

@@ -104,8 +104,18 @@ class DatagramAssembler:
     def __init__(self) -> None:
         self._buffer = bytearray()
 
+    @property
+    def incomplete(self) -> bool:
+        """Whether the beginning of a datagram waits for its end."""
+        return bool(self._buffer)
+
+    def abandon(self) -> list[Datagram | SentenceError]:
+        """Drop an incomplete datagram."""
+        self.reset()
+        return []
+
     def reset(self) -> None:
-        """Drop an unfinished datagram."""
+        """Drop an incomplete datagram."""
         self._buffer.clear()
 
     def feed(self, data: bytes) -> list[Datagram | SentenceError]:

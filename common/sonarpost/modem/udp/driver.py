@@ -6,29 +6,27 @@ A packet is one datagram. After it the driver waits for the packet's air time, s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.interface import (
     FrameReceived,
-    ModemEvent,
     ModemReady,
     PacketReceived,
-    SentenceRejected,
     TransmissionEnded,
     TransmissionStarted,
 )
 from sonarpost.modem.packet_queue import QueueingModem, WaitingPacket
-from sonarpost.modem.registry import ModemSettings
+from sonarpost.modem.registry import ModemDriver, ModemSettings
 from sonarpost.modem.udp.datagram import Datagram, DatagramAssembler, DatagramKind, parse
 from sonarpost.modem.udp.rates import CAPABILITIES, RATES
 
 REMEMBERED_PACKETS: Final = 256
 """Received datagrams that are kept to recognise a repeated one."""
 PAUSE_S: Final = 2.0
-"""After such a pause an unfinished datagram of a stream is dropped."""
+"""After such a pause an incomplete datagram of a stream is dropped."""
 
 
 @dataclass(slots=True)
@@ -44,7 +42,7 @@ class _Sending:
     on_air: bool = True
 
 
-class UdpModem(QueueingModem[_Sending]):
+class UdpModem(QueueingModem[_Sending, Datagram]):
     """One station.
 
     Args:
@@ -56,56 +54,24 @@ class UdpModem(QueueingModem[_Sending]):
     """
 
     def __init__(self, settings: ModemSettings, where: str = "modem port") -> None:
-        super().__init__(CAPABILITIES, settings, where)
-        self._assembler = DatagramAssembler()
+        super().__init__(CAPABILITIES, settings, where, DatagramAssembler(), PAUSE_S)
         self._seen: dict[Datagram, None] = {}
-        self._out: list[bytes] = []
 
     @property
     def ready(self) -> bool:
         """Whether the port is open."""
         return self._is_open
 
-    def port_opened(self, now: float) -> None:
-        """Begin to send and receive."""
-        if self._is_open:
-            self.port_lost(now)
-        self._is_open = True
+    def _begin(self, now: float) -> None:
         self._events.append(ModemReady(self._settings.address, None))
-        self._advance(now)
 
-    def port_lost(self, now: float) -> None:
-        """Fail the packet in progress."""
-        self._is_open = False
+    def _end(self) -> None:
         if self._sending is not None:
             self._events.append(self._sending.packet.failed("the port was lost", maybe_sent=True))
         self._sending = None
-        self._out.clear()
-        self._assembler.reset()
-        self._events_since_s = now
 
-    def send_packet(
-        self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False, now: float
-    ) -> int:
-        """Queue a packet; see `Modem.send_packet`."""
-        CAPABILITIES.check_packet(destination, rate, frames)
-        return self._add(destination, rate, frames, ack=ack, now=now)
-
-    def receive(self, data: bytes, now: float) -> list[ModemEvent]:
-        """Process a datagram, or bytes of a stream; invalid ones are reported as events."""
-        for item in self._divided(data, now) if self._is_open else ():
-            if isinstance(item, SentenceError):
-                self._events.append(SentenceRejected(item))
-            elif item.source != self._settings.address:  # a multicast socket also receives its own datagrams
-                self._on_datagram(item, now)
-        self._advance(now)
-        return self._take_events()
-
-    def _divided(self, data: bytes, now: float) -> list[Datagram | SentenceError]:
+    def _divided(self, data: bytes) -> Sequence[Datagram | SentenceError]:
         if self._settings.stream:
-            if now - self._received_s > PAUSE_S:
-                self._assembler.reset()
-            self._received_s = now
             return self._assembler.feed(data)
         # Every station of the network can send: a datagram neither completes nor damages another one.
         try:
@@ -113,16 +79,9 @@ class UdpModem(QueueingModem[_Sending]):
         except SentenceError as error:
             return [error]
 
-    def next_wakeup(self) -> float | None:
-        """Return when `poll` has something to do, or None."""
-        times_s = [self._events_since_s if self._events else None, self._queue.deadline_s()]
+    def _deadlines_s(self) -> Iterable[float | None]:
         if self._sending is not None:
-            times_s.append(self._sending.ends_s if self._sending.on_air else self._sending.ack_s)
-        return min((time_s for time_s in times_s if time_s is not None), default=None)
-
-    def bytes_to_send(self) -> bytes:
-        """Remove and return the next datagram, so that each write of the port is one."""
-        return self._out.pop(0) if self._out else b""
+            yield self._sending.ends_s if self._sending.on_air else self._sending.ack_s
 
     def _advance(self, now: float) -> None:
         super()._advance(now)
@@ -134,12 +93,11 @@ class UdpModem(QueueingModem[_Sending]):
     def _start(self, packet: WaitingPacket, now: float) -> None:
         rate = RATES[packet.rate]
         number = packet.number & 0xFFFF
-        ack = packet.ack and packet.destination != CAPABILITIES.broadcast
-        kind = DatagramKind.DATA_WITH_ACK if ack else DatagramKind.DATA
+        kind = DatagramKind.DATA_WITH_ACK if packet.ack else DatagramKind.DATA
         frames = packet.frames
         self._send(Datagram(kind, self._settings.address, packet.destination, packet.rate, number, frames))
         ends_s = now + rate.airtime_s
-        ack_s = ends_s + (self._settings.reply_timeout_s if ack else 0.0)
+        ack_s = ends_s + (self._settings.reply_timeout_s if packet.ack else 0.0)
         self._sending = _Sending(packet, number, now, ends_s, ack_s)
         self._events.append(TransmissionStarted(rate.airtime_s))
 
@@ -151,6 +109,10 @@ class UdpModem(QueueingModem[_Sending]):
         if not sending.on_air and (complete or now >= sending.ack_s):
             self._events.append(sending.packet.sent(sorted(sending.acknowledged), sending.started_s, now))
             self._sending = None
+
+    def _on_message(self, message: Datagram, now: float) -> None:
+        if message.source != self._settings.address:  # a multicast socket also receives its own datagrams
+            self._on_datagram(message, now)
 
     def _on_datagram(self, datagram: Datagram, now: float) -> None:
         numbers = [number for number, frame in enumerate(datagram.frames, start=1) if frame is not None]
@@ -191,3 +153,6 @@ class UdpModem(QueueingModem[_Sending]):
 
     def _send(self, datagram: Datagram) -> None:
         self._out.append(datagram.pack())
+
+
+DRIVER = ModemDriver("udp", CAPABILITIES, UdpModem, "UDP multicast: for tests, and for radio above water")
