@@ -6,7 +6,6 @@ The command can be interrupted and repeated: what the database has is not copied
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
 import sys
 from collections import Counter
@@ -29,6 +28,7 @@ from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers
 from sonarpost.config import load
 from sonarpost.errors import ConfigError, StoredFileError
+from sonarpost.services.c2.config import C2Config
 
 BATCH = 32
 """Number of records that are copied in one transaction."""
@@ -59,8 +59,7 @@ def run(parsed: argparse.Namespace) -> int:
         ConfigError: The file has no database.
         DatabaseUnavailableError: The server is not reached; the command can be repeated.
     """
-    model = importlib.import_module("sonarpost.services.c2.config").C2Config
-    config = load(parsed.config, "c2", model, os.environ)[1]
+    config = load(parsed.config, "c2", C2Config, os.environ)[1]
     address: DatabaseAddress | None = config.database_address()
     if address is None:
         raise ConfigError(str(parsed.config), "c2.database", "nothing", "the address of a PostgreSQL database")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import math
 import os
@@ -32,6 +31,7 @@ from sonarpost.export.contacts import ContactSet, ExportContact, load_contacts, 
 from sonarpost.export.formats import exporters, write_export
 from sonarpost.export.text import probabilities_text
 from sonarpost.files import write_atomically
+from sonarpost.services.c2.config import C2Config
 
 DEMO_IMAGES = Path("demo-out/shore/images")
 SHORE_CONFIG = Path("/etc/sonarpost/shore.toml")
@@ -134,9 +134,7 @@ def archive_of(parsed: argparse.Namespace) -> ArchivePlace:
         path = SHORE_CONFIG if SHORE_CONFIG.is_file() else None
         place = Path("out")
     if path is not None:
-        # The import contract does not allow a static import of a service here.
-        model = importlib.import_module("sonarpost.services.c2.config").C2Config
-        config = load(path, "c2", model, os.environ)[1]
+        config = load(path, "c2", C2Config, os.environ)[1]
         place = config.database_address() or config.out_dir
     noun = "folder" if isinstance(place, Path) else "database"
     print(f"sonarpost c2: {noun} {place}", file=sys.stderr)

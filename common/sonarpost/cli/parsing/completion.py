@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import shlex
 from collections.abc import Mapping
 
+from sonarpost.cli import main
 from sonarpost.cli.parsing.parser import actions_of, all_parsers
 
 SHELLS = ("bash", "zsh", "fish")
@@ -36,8 +36,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(parsed: argparse.Namespace) -> int:
     """Print the script; return 0."""
-    whole = importlib.import_module("sonarpost.cli.main").parser()
-    words = {name: completions(parser) for name, parser in all_parsers(whole).items()}
+    words = {name: completions(parser) for name, parser in all_parsers(main.parser()).items()}
     print(fish_script(words) if parsed.shell == "fish" else bash_script(words, zsh=parsed.shell == "zsh"), end="")
     return 0
 
