@@ -30,7 +30,7 @@ def test_bash_completes_commands_actions_options_and_values(tmp_path, capsys):
     assert completed(text, tmp_path, "-q", "c2", "ex") == ["export"]
     assert completed(text, tmp_path, "console", "user", "pass") == ["passwd"]
     assert completed(text, tmp_path, "encode", "a.png", "--codeb") == ["--codebook"]
-    assert completed(text, tmp_path, "simulate", "a.xtf", "--seabed", "rip") == ["ripples"]
+    assert completed(text, tmp_path, "pki", "prepare", "uuv-8", "--role", "ve") == ["vessel"]
     assert completed(text, tmp_path, "run", "comp") == ["compressor"]
     assert completed(text, tmp_path, "encode", "photo.p") == []
 

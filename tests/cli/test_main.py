@@ -69,13 +69,13 @@ def test_help_of_a_command(capsys):
         (["pkii"], "sonarpost", "did you mean pki?"),
         (["--verison"], "sonarpost", "did you mean --version?"),
         (
-            ["simulate", "a.xtf", "--sed", "3"],
-            "sonarpost simulate",
-            "unrecognized arguments: --sed 3; did you mean --seed?",
+            ["pki", "prepare", "uuv-8", "--role", "uuv", "--di", "x"],
+            "sonarpost pki prepare",
+            "unrecognized arguments: --di x; did you mean --dir?",
         ),
         (["store", "chekc", "x"], "sonarpost store", "did you mean check?"),
         (["store", "check", "x", "y"], "sonarpost store check", "unrecognized arguments: y"),
-        (["simulate", "a.xtf", "--seabed", "sandy"], "sonarpost simulate", "did you mean sand?"),
+        (["pki", "prepare", "uuv-8", "--role", "vesel"], "sonarpost pki prepare", "did you mean vessel?"),
     ],
 )
 def test_a_usage_error_has_the_usage_of_the_command_and_a_suggestion(arguments, usage, expected, capsys):

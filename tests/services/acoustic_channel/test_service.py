@@ -21,8 +21,8 @@ from builders.common import WAIT_S, eventually, free_port
 from pydantic import ValidationError
 
 from sonarpost import keys, wire
-from sonarpost.cli import modem_emulator
 from sonarpost.errors import ConfigError, PortError
+from sonarpost.extensions.simulation import modem_emulator
 from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
 from sonarpost.extensions.simulation.channel.config import EmulatorConfig, ModemSite
 from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
@@ -329,7 +329,8 @@ def test_invalid_configuration_is_rejected(config, tmp_path):
 
 def run_command(*arguments):
     code = (
-        "import argparse, sys; from sonarpost.cli import modem_emulator as m; p = argparse.ArgumentParser();"
+        "import argparse, sys; from sonarpost.extensions.simulation import modem_emulator as m;"
+        "p = argparse.ArgumentParser();"
         "m.add_parser(p.add_subparsers()); a = p.parse_args(sys.argv[1:]); sys.exit(a.run(a))"
     )
     return subprocess.Popen(

@@ -30,7 +30,6 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "install-units": ("cli.deployment.install_units", "write the systemd units of a platform"),
     "console": ("cli.console", "manage the users of the console; serve the contacts of a folder"),
     "metrics": ("cli.metrics", "serve the health of all platforms to Prometheus"),
-    "simulate": ("cli.simulate", "write a simulated side-scan survey as XTF"),
     "survey": ("cli.survey", "describe, draw, view and export recordings of side-scan sonars"),
     "detect": ("cli.detection.command", "detect contacts in survey files, or in a folder of images"),
     "encode": ("cli.encode", "encode an image or a folder of images"),
@@ -39,7 +38,6 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "prepare": ("cli.prepare", "compile the machine code of the codecs in advance"),
     "pki": ("cli.pki", "certificates of the fleet, access control of its routers, key of its acoustic link"),
     "modem": ("cli.deployment.modem_ping", "test a modem without services"),
-    "modem-emulator": ("cli.modem_emulator", "emulated acoustic modems on pseudo-terminals or TCP ports"),
     "completion": ("cli.parsing.completion", "print the completion script of a shell"),
 }
 """Name -> module and summary. Only the module of the given command is imported: all of them together take seconds."""
@@ -103,7 +101,6 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "console user rm": "console user rm anna --state-dir state",
     "console user ls": "console user ls --state-dir state",
     "metrics": "metrics --router tcp/127.0.0.1:7447 --port 9464",
-    "simulate": "simulate line.xtf --seabed ripples --truth truth.json",
     "survey info": "survey info line.xtf --json",
     "survey plot": "survey plot line.xtf --ground --out plots",
     "survey waterfall": "survey waterfall line.xtf --out waterfalls",
@@ -125,7 +122,6 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "pki router-config": "pki router-config --dir fleet --platform vessel-1 --out vessel-1.json5",
     "pki acoustic": "pki acoustic --dir fleet",
     "modem ping": "modem ping --port /dev/ttyUSB0 --address 3 --destination 1",
-    "modem-emulator": "modem-emulator --modems 2 --tcp --loss 0.1",
     "completion": "completion bash > ~/.local/share/bash-completion/completions/sonarpost",
 }
 """Command -> arguments of its example. Every command without actions has one."""

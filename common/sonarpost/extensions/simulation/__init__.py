@@ -1,1 +1,18 @@
 """Simulation of what sonarpost needs at sea: modems, the acoustic channel, and side-scan surveys of the seabed."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from sonarpost.cli.parsing.commands import Command
+
+SIMULATE: Final = Command(
+    "write a simulated side-scan survey as XTF",
+    "sonarpost.extensions.simulation.simulate:add_parser",
+    {"simulate": "simulate line.xtf --seabed ripples --truth truth.json"},
+)
+MODEM_EMULATOR: Final = Command(
+    "emulated acoustic modems on pseudo-terminals or TCP ports",
+    "sonarpost.extensions.simulation.modem_emulator:add_parser",
+    {"modem-emulator": "modem-emulator --modems 2 --tcp --loss 0.1"},
+)
