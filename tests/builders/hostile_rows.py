@@ -22,7 +22,6 @@ import msgpack
 import zenoh
 
 from builders.common import REPOSITORY
-from builders.exports import image as contact_image
 from builders.hostile_site import HOSTILE, TOKEN, Site, coded_part, message, threads
 from builders.short_messages import with_crc
 from sonarpost import keys, wire
@@ -364,14 +363,6 @@ def junk_requests(site: Site) -> Iterator[None]:
     yield
 
 
-@contextmanager
-def refused_alerts(site: Site) -> Iterator[None]:
-    """200 contacts of one vessel whose alerts the receiver refuses, or answers without an end."""
-    for number in range(200):
-        site.session.put(keys.shore_image(HOSTILE), wire.encode(contact_image(f"{number:04d}", vessel_id=HOSTILE)))
-    yield
-
-
 # A program of the vehicle, and its folders
 
 
@@ -457,13 +448,6 @@ ROWS: tuple[Row, ...] = (
         "snippets_of_detector",
     ),
     Row(("folder:atd_stub.input_dir",), "a file", "crash", hostile_recordings, "recording_of_sonar"),
-    Row(
-        ("exchange:cli.c2.alert_senders", "exchange:network.http_client"),
-        "vessel",
-        "endless",
-        refused_alerts,
-        "alerts_of_vessel",
-    ),
     # Rows of other tests
     Row(
         ("exchange:network.http_client", "exchange:bearers.rockblock"),

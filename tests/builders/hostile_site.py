@@ -16,10 +16,9 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from http.client import HTTPException
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -29,7 +28,6 @@ import numpy as np
 import zenoh
 
 from builders.common import REPOSITORY, WAIT_S, eventually, free_port
-from builders.exports import image as contact_image
 from builders.fleet_certificates import World
 from builders.message_gateway import MessageGatewayEmulator
 from builders.short_messages import decision
@@ -103,41 +101,6 @@ class Arrivals:
         return [self.at_s[name] - sent_s[name] for name in sent_s]
 
 
-class AlertReceiver(ThreadingHTTPServer):
-    """Accepts the alerts of vessel-1; to those of the hostile vessel it replies 403, 500, or without an end."""
-
-    daemon_threads = True
-    at_s: dict[str, float]
-    replies = 0
-
-    def server_activate(self) -> None:
-        self.at_s = {}
-        super().server_activate()
-
-
-class _AlertHandler(BaseHTTPRequestHandler):
-    server: AlertReceiver
-
-    def do_POST(self) -> None:
-        alert = json.loads(self.rfile.read(int(self.headers["Content-Length"])))["contact"]
-        if alert["vessel_id"] == VESSEL:
-            self.server.at_s.setdefault(alert["image_id"], time.monotonic())
-            self.send_response(200)
-            self.end_headers()
-            return
-        self.server.replies += 1
-        if self.server.replies % 8:
-            self.send_response(403 if self.server.replies % 2 else 500)
-            self.end_headers()
-            return
-        with suppress(OSError):
-            while True:
-                self.wfile.write(b"HTTP/1.1 100 Continue\r\n\r\n")
-
-    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 of the base class
-        """Log nothing."""
-
-
 @dataclass
 class Process:
     """A service: its process on this host, which can be the client of a container."""
@@ -197,8 +160,6 @@ class Site:
         self.images = Arrivals(self.session, keys.shore_image(VESSEL), "image_id")
         self.decisions = Arrivals(self.session, keys.shore_decision(VESSEL), "decision_id")
         self.session.declare_subscriber(keys.health_everywhere(), self._on_health)
-        self.alerts = AlertReceiver(("127.0.0.1", 0), _AlertHandler)
-        threading.Thread(target=self.alerts.serve_forever, args=(0.1,), daemon=True).start()
 
     def _on_health(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
@@ -310,8 +271,6 @@ class Site:
                 subprocess.run(["docker", "rm", "-f", process.container], check=True, stdout=subprocess.DEVNULL)
                 assert not state["OOMKilled"], process.name
         self._stack.close()
-        self.alerts.shutdown()
-        self.alerts.server_close()
         assert set(codes.values()) == {0}, codes
 
     # Measured sources. Each returns the delay of every item in seconds; a missing one fails the test.
@@ -401,19 +360,6 @@ class Site:
             delays.append(time.monotonic() - begin_s)
         return delays
 
-    def alerts_of_vessel(self) -> list[float]:
-        """Alerts about contacts of vessel-1, until the receiver has accepted them."""
-        names, sent_s = [f"{number:04d}" for number in self.numbers(3)], {}
-        for name in names:
-            sent_s[name] = time.monotonic()
-            self.session.put(keys.shore_image(VESSEL), wire.encode(contact_image(name, vessel_id=VESSEL)))
-
-        def received() -> bool:
-            return set(names) <= self.alerts.at_s.keys()
-
-        eventually(received, what="alerts")
-        return [self.alerts.at_s[name] - sent_s[name] for name in names]
-
     # HTTP
 
     def log_in(self, user: str) -> str:
@@ -488,10 +434,6 @@ def running_site(folder: Path, world: World, decode_workers: int) -> Iterator[Si
             "uuv-2",
             f'mode = "survey"\ninput_dir = "{site.incoming}"\npoll_s = 0.2\nsettle_s = 0.2\nmax_in_flight = 0\n',
         )
-        receiver = f"http://127.0.0.1:{site.alerts.server_address[1]}/"
-        command = ["c2", "alert", "--webhook", receiver, "--state", str(folder / "alerts.db"), "--router", local]
-        alert = site.run("alert", [str(Path(sys.executable).with_name("sonarpost")), *command])
-        eventually(lambda: "Sending alerts" in alert.log.read_text(), what="start of the alerts")
         yield site
         site.check()
     finally:

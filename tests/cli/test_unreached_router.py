@@ -10,13 +10,11 @@ from builders.unreached_router import check_unreached_router
     "arguments",
     [
         "c2 watch",
-        "c2 cot udp://127.0.0.1:9",
-        "c2 alert --webhook http://127.0.0.1:9 --state {folder}/alerts.db",
         "c2 comment uuv-1/AAAA --vessel vessel-1 --timeout 0.1",
         "status --interval 0.1",
         "status --interval 0.1 --json",
         "metrics --port 0",
     ],
 )
-def test_reason_is_printed_without_verbosity(arguments, tmp_path):
-    check_unreached_router(arguments.format(folder=tmp_path))
+def test_reason_is_printed_without_verbosity(arguments):
+    check_unreached_router(arguments)

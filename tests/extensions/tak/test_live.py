@@ -17,6 +17,7 @@ import pytest
 import xmlschema
 from builders.common import WAIT_S, free_port, publish_once
 from builders.exports import image, store
+from builders.unreached_router import check_unreached_router
 
 from sonarpost import keys, wire
 from sonarpost.cli.c2.live import ContactChange
@@ -240,3 +241,7 @@ def test_cot_command_rejects_invalid_addresses(capsys):
     assert "CoT endpoint" in capsys.readouterr().err
     assert main(["c2", "cot", "tcp://tak:8087", "--tak-api", "tak"]) == 2
     assert "TAK server" in capsys.readouterr().err
+
+
+def test_unreached_router_is_reported():
+    check_unreached_router("c2 cot udp://127.0.0.1:9")

@@ -70,7 +70,6 @@ EXTRAS: Final[Mapping[str, str]] = {
     "starlette": "console",
     "uvicorn": "console",
     "matplotlib": "research",
-    "paho": "mqtt",
 }
 """Package -> the extra that installs it."""
 
@@ -83,7 +82,6 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "c2 get": "c2 get uuv-1/0001",
     "c2 export": "c2 export --out contacts.geojson --out contacts.kmz",
     "c2 watch": "c2 watch --router tcp/127.0.0.1:7447 --count 1",
-    "c2 alert": "c2 alert --webhook https://hooks.example/mines --threshold 0.7 --state alerts.db --archive out",
     "c2 migrate": "c2 migrate --config shore.toml --archive out",
     "c2 command": "c2 command uuv-1/0001 --vessel vessel-1 --kind refine",
     "c2 comment": "c2 comment uuv-1/0001 --vessel vessel-1 --verdict mine_like --remark 'same as last year'",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from urllib.parse import SplitResult, unquote, urlsplit
 
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.export.alerts import signature
+from sonarpost.extensions.alerts.document import signature
 from sonarpost.network import http_client
 from sonarpost.security.client_tls import TlsFiles
 

@@ -19,17 +19,18 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 import pytest
 from builders.common import WAIT_S, eventually, free_port
 from builders.exports import decision, image, store
+from builders.unreached_router import check_unreached_router
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
-from sonarpost.cli.c2 import alert as alert_module
-from sonarpost.cli.c2.alert import AlertService, SentAlerts
-from sonarpost.cli.c2.alert_senders import AlertNotAcceptedError, AlertRefusedError, AlertWebhook, Mqtt
 from sonarpost.cli.main import main
 from sonarpost.errors import PortError, StoredFileError
-from sonarpost.export.alerts import alert_document, needs_alert, score, signature
 from sonarpost.export.contacts import load_contacts
 from sonarpost.export.live import LiveContacts
+from sonarpost.extensions.alerts import command
+from sonarpost.extensions.alerts.command import AlertService, SentAlerts
+from sonarpost.extensions.alerts.document import alert_document, needs_alert, score, signature
+from sonarpost.extensions.alerts.senders import AlertNotAcceptedError, AlertRefusedError, AlertWebhook, Mqtt
 from sonarpost.security.client_tls import TlsFiles
 from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
 
@@ -121,7 +122,7 @@ def test_failed_alert_is_repeated_and_a_refused_one_is_not(tmp_path):
 
 
 def test_waiting_alerts_and_state_are_limited(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(alert_module, "MAX_WAITING", 2)
+    monkeypatch.setattr(command, "MAX_WAITING", 2)
     sent = SentAlerts(tmp_path / "state.db", max_rows=2)
     sender = Alerts()
     service = AlertService(sender, sent, 0.5)
@@ -167,8 +168,8 @@ def test_alerts_that_are_not_accepted_delay_no_other_vessel(tmp_path):
         service.add(contact_of("0200", "vessel-2"))
         added_s = clock.now_s
         run(60)
-        assert sender.times_s[0] <= added_s + alert_module.MAX_NOT_ACCEPTED_RETRY_S
-        assert sender.times_s[4] <= added_s + 4 * alert_module.MAX_NOT_ACCEPTED_RETRY_S
+        assert sender.times_s[0] <= added_s + command.MAX_NOT_ACCEPTED_RETRY_S
+        assert sender.times_s[4] <= added_s + 4 * command.MAX_NOT_ACCEPTED_RETRY_S
         # An alert that was not tried before precedes the failed ones of its vessel.
         assert contact_of("0200", "vessel-2").uid in sender.ids
         assert len(sender.ids) == 6
@@ -178,7 +179,7 @@ def test_alerts_that_are_not_accepted_delay_no_other_vessel(tmp_path):
 
 
 def test_waiting_alerts_have_places_by_vessel(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(alert_module, "MAX_WAITING", 3)
+    monkeypatch.setattr(command, "MAX_WAITING", 3)
     sender = Alerts()
     with closing(SentAlerts(tmp_path / "state.db")) as sent:
         service = AlertService(sender, sent, 0.5)
@@ -196,7 +197,7 @@ def test_alert_that_fails_ends_no_batch(monkeypatch, tmp_path):
     def fails_for_0001(contact, sent_utc):
         return 1 / 0 if contact.image.image_id == "0001" else alert_document(contact, sent_utc)
 
-    monkeypatch.setattr(alert_module, "alert_document", fails_for_0001)
+    monkeypatch.setattr(command, "alert_document", fails_for_0001)
     alerts, clock = Alerts(), Clock()
     with closing(SentAlerts(tmp_path / "sent.db")) as sent:
         service = AlertService(alerts, sent, 0.0, clock=clock)
@@ -326,6 +327,10 @@ def test_alert_command_reads_the_folder_and_the_key(hook, router, tmp_path):
 def test_invalid_options_are_errors(options, text, capsys, tmp_path):
     assert main(["c2", "alert", *options.split(), "--state", str(tmp_path / "state.db")]) == 2
     assert text in capsys.readouterr().err
+
+
+def test_unreached_router_is_reported(tmp_path):
+    check_unreached_router(f"c2 alert --webhook http://127.0.0.1:9 --state {tmp_path}/alerts.db")
 
 
 MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")

@@ -15,7 +15,13 @@ from typing import Final
 
 from sonarpost import logs
 from sonarpost.bus.session import open_with_retry
-from sonarpost.cli.c2.alert_senders import (
+from sonarpost.cli.c2.live import ContactStream, add_live_options
+from sonarpost.cli.shared import Subparsers, in_new_folder, log_level, router_of
+from sonarpost.errors import ConfigError, PortError, StoredFileError
+from sonarpost.export.contacts import ExportContact
+from sonarpost.export.text import utc_text
+from sonarpost.extensions.alerts.document import alert_document, needs_alert
+from sonarpost.extensions.alerts.senders import (
     AlertNotAcceptedError,
     AlertRefusedError,
     AlertSender,
@@ -23,12 +29,6 @@ from sonarpost.cli.c2.alert_senders import (
     Mqtt,
     read_secret,
 )
-from sonarpost.cli.c2.live import ContactStream, add_live_options
-from sonarpost.cli.shared import Subparsers, in_new_folder, log_level, router_of
-from sonarpost.errors import ConfigError, PortError, StoredFileError
-from sonarpost.export.alerts import alert_document, needs_alert
-from sonarpost.export.contacts import ExportContact
-from sonarpost.export.text import utc_text
 from sonarpost.limits import Turns, limit
 from sonarpost.logs import kv
 from sonarpost.security.client_tls import TlsFiles
@@ -47,7 +47,7 @@ MAX_SENT: Final = 200_000
 """Identifiers in the state file; the oldest are deleted."""
 
 
-def add_actions(actions: Subparsers) -> None:
+def add_parser(actions: Subparsers) -> None:
     """Add the action `alert`."""
     parser = actions.add_parser(
         "alert", help="send an alert for each contact above a threshold to a webhook or an MQTT broker; Ctrl-C ends it"
