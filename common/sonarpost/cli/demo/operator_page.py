@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import secrets
 import webbrowser
 
 from rich.console import Console
 
 from sonarpost.cli.demo.settings import VESSEL, ChainSettings
+from sonarpost.services.console.store.users import FILE_NAME, LINK_S, Users, login_link
 
 USER = "op"
 
@@ -23,10 +23,8 @@ class OperatorPage:
     def __init__(self, settings: ChainSettings) -> None:
         self._password = secrets.token_urlsafe(9)
         self.address = f"http://127.0.0.1:{settings.console_port}/"
-        # A command imports a service by name only: the import rules separate them.
-        self._module = importlib.import_module("sonarpost.services.console.store.users")
-        self._path = settings.folder / "state" / VESSEL / self._module.FILE_NAME
-        users = self._module.Users(self._path)
+        self._path = settings.folder / "state" / VESSEL / FILE_NAME
+        users = Users(self._path)
         try:
             users.add(USER, "operator", self._password)
         finally:
@@ -34,9 +32,9 @@ class OperatorPage:
 
     def login_link(self) -> str:
         """Return a new log-in link, which is valid once, for 10 minutes."""
-        users = self._module.Users(self._path)
+        users = Users(self._path)
         try:
-            return str(self._module.login_link(self.address, users.make_login_link(USER)))
+            return login_link(self.address, users.make_login_link(USER))
         finally:
             users.close()
 
@@ -49,7 +47,7 @@ class OperatorPage:
         """
         for line in (
             f"operator's page: {self.address}  user: {USER}  password: {self._password}",
-            f"log-in link, valid once, for {self._module.LINK_S / 60:.0f} minutes: {self.login_link()}",
+            f"log-in link, valid once, for {LINK_S / 60:.0f} minutes: {self.login_link()}",
         ):
             console.print(line, highlight=False, soft_wrap=True)
         if opened:
