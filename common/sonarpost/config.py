@@ -11,8 +11,9 @@ import stat
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Final, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 from pydantic_core import to_json
@@ -20,6 +21,7 @@ from pydantic_core import to_json
 from sonarpost.errors import ConfigError
 from sonarpost.logs import LogFormat
 from sonarpost.messages import PlatformId
+from sonarpost.registry import installed_points
 from sonarpost.wire import expected_text
 
 ENVIRONMENT_PREFIX = "SONARPOST_"
@@ -27,23 +29,38 @@ ENVIRONMENT_PREFIX = "SONARPOST_"
 ConsumerName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 """Name of a service that records are delivered to, as in `sonarpost.keys`."""
 
+SERVICE_GROUP: Final = "sonarpost.services"
 SERVICES = (
     "atd_stub",
     "compressor",
     "uuv_modem",
-    "acoustic_channel",
     "op_modem",
     "decompressor",
     "relay",
     "c2",
     "console",
 )
-
-TABLES = ("platform", "modem", *SERVICES)
-"""Every table of a configuration file."""
+"""Services of the core."""
 
 # Inline tables of which environment variables can override single keys: SONARPOST_PLATFORM__TLS__KEY.
 NESTED_TABLES = {("platform", "tls")}
+
+
+@cache
+def service_packages() -> Mapping[str, str]:
+    """Return the package of each service by name: those of the core, then those of extensions and plug-ins.
+
+    A package has the modules `__main__` and `config`. A service `good_name` has the table `GoodNameConfig` there.
+    """
+    found = {name: f"sonarpost.services.{name}" for name in SERVICES}
+    for point in installed_points(SERVICE_GROUP):
+        found.setdefault(point.name, point.value)
+    return found
+
+
+def table_names() -> tuple[str, ...]:
+    """Return the name of every table of a configuration file."""
+    return ("platform", "modem", *service_packages())
 
 
 class ServiceConfig(BaseModel):
@@ -167,7 +184,7 @@ class ConfigFile:
 
     Attributes:
         path: The TOML file.
-        services: Services that have a table in the file, in the order of `SERVICES`.
+        services: Services that have a table in the file, in the order of `service_packages`.
         errors: What is invalid: unknown tables and overrides, and the keys of the tables that `table` has validated.
 
     Raises:
@@ -185,11 +202,11 @@ class ConfigFile:
         except (ValueError, RecursionError) as error:
             # tomllib raises other errors than its own for very long numbers and deep nesting.
             raise ConfigError(str(path), "", str(error), "valid TOML") from error
-        self.services = tuple(name for name in SERVICES if name in self._tables)
+        self.services = tuple(name for name in service_packages() if name in self._tables)
         self.errors: list[ConfigError] = []
         for name, table in self._tables.items():
-            if name not in TABLES:
-                self.errors.append(self.error((name,), "an unknown table", ", ".join(TABLES)))
+            if name not in table_names():
+                self.errors.append(self.error((name,), "an unknown table", ", ".join(table_names())))
             elif not isinstance(table, dict):
                 self.errors.append(self.error((name,), table, f"a table [{name}]"))
         self._overrides: dict[str, dict[str, object]] = {}
@@ -245,7 +262,7 @@ class ConfigFile:
         if not text or not name.startswith(ENVIRONMENT_PREFIX) or "__" not in name:
             return
         table, _, key = name[len(ENVIRONMENT_PREFIX) :].lower().partition("__")
-        if key and table in TABLES:
+        if key and table in table_names():
             self._overrides.setdefault(table, {})[key] = _toml_value(text)
         else:
             expected = "SONARPOST_{platform or a service's name}__{KEY}"

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import glossary
 import reference
 
-from sonarpost.config import SERVICES
+from sonarpost.config import service_packages
 
 _log = logging.getLogger("mkdocs.hooks.pages")
 
@@ -33,7 +33,12 @@ REPOSITORY_PAGES: Mapping[str, str] = {
     "examples/README.md": "how-to/subscriber.md",
     "research/README.md": "research/index.md",
     "research/training/emb/README.md": "research/training-emb.md",
-    **{f"services/{name}/README.md": f"reference/services/{name}.md" for name in SERVICES},
+    **{
+        f"common/{package.replace('.', '/')}/README.md".replace("common/sonarpost/services", "services"): (
+            f"reference/services/{name}.md"
+        )
+        for name, package in service_packages().items()
+    },
 }
 # Pages whose text consists of names.
 WITHOUT_TERMS = frozenset({"changelog.md"})

@@ -22,7 +22,7 @@ import sonarpost
 from sonarpost import keys, limits, messages
 from sonarpost.cli.deployment import config_files
 from sonarpost.cli.main import parser
-from sonarpost.config import TABLES, ModemTable, PlatformConfig, ServiceConfig
+from sonarpost.config import ModemTable, PlatformConfig, ServiceConfig, table_names
 from sonarpost.messages import Record
 from sonarpost.monitoring.fleet import FleetState
 from sonarpost.monitoring.metrics import FleetCollector
@@ -178,7 +178,7 @@ def configuration(service: str = "") -> str:
     """Return the tables of the configuration of one service, of `platform`, or of all of them with headings."""
     if service:
         return _configuration_tables(configuration_type(service), service)
-    names = TABLES
+    names = table_names()
     return "\n\n".join(f"## [{name}]\n\n{_configuration_tables(configuration_type(name), name)}" for name in names)
 
 

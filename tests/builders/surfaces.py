@@ -18,7 +18,7 @@ from pydantic import BaseModel
 from starlette.routing import Mount, Route
 
 from builders.common import REPOSITORY
-from sonarpost.config import TABLES
+from sonarpost.config import SERVICES
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.database import Database
@@ -39,7 +39,7 @@ def surfaces() -> set[str]:
     """Return the names of all surfaces."""
     found = {f"zenoh:{row.key}" for row in reference.key_rows() if row.to not in ("", *OUTSIDE)}
     found |= {f"route:{method} {path}" for method, path in console_routes()}
-    for name in set(TABLES) - {"acoustic_channel"}:
+    for name in ("platform", "modem", *SERVICES):
         found |= {f"folder:{name}.{field}" for field in _paths(reference.configuration_type(name))}
     for path, package in ((REPOSITORY / "common/sonarpost", ""), (REPOSITORY / "services", "services.")):
         for file in sorted(path.rglob("*.py")):

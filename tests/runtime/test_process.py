@@ -358,7 +358,7 @@ def test_help_names_the_service(capsys):
     with pytest.raises(SystemExit, match="0"):
         main(RelayService, RelayConfig, ["--help"])
     out = capsys.readouterr().out
-    assert "usage: python -m sonarpost.services.relay" in out
+    assert "usage: sonarpost run relay" in out
     assert RelayService.__doc__.split(".")[0] in " ".join(out.split())
 
 

@@ -8,20 +8,20 @@ import inspect
 import pytest
 from builders.common import REPOSITORY
 
-from sonarpost.config import SERVICES, ServiceConfig, load
+from sonarpost.config import ServiceConfig, load, service_packages
 from sonarpost.runtime.service import Service
 
 FILES = ("uuv", "vessel", "shore", "sim")
 
 
 def class_of(service, module_name, base):
-    module = importlib.import_module(f"sonarpost.services.{service}.{module_name}")
+    module = importlib.import_module(f"{service_packages()[service]}.{module_name}")
     classes = [c for _, c in inspect.getmembers(module, inspect.isclass) if c.__module__ == module.__name__]
     [found] = [c for c in classes if issubclass(c, base) and c.__name__.endswith(("Config", "Service"))]
     return found
 
 
-@pytest.mark.parametrize("name", SERVICES)
+@pytest.mark.parametrize("name", service_packages())
 def test_health_has_the_reason_for_which_the_router_is_not_reached(name, tmp_path, capsys):
     text = next(t for f in FILES if f"[{name}]" in (t := (REPOSITORY / "config" / f"{f}.toml").read_text()))
     text = text.replace("/var/lib/sonarpost", str(tmp_path)).replace('"key"', '"none"').replace("acoustic_key", "# ")

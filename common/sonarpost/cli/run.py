@@ -13,7 +13,7 @@ from sonarpost import logs
 from sonarpost.bus import router
 from sonarpost.cli.deployment import run_all
 from sonarpost.cli.shared import Subparsers, add_survey_options, log_level, survey_options_of
-from sonarpost.config import ENVIRONMENT_PREFIX, SERVICES
+from sonarpost.config import ENVIRONMENT_PREFIX, service_packages
 from sonarpost.errors import ConfigError
 
 _DESCRIPTION = """Run one service until Ctrl-C, or all services that have a table in the file: a test on a bench needs
@@ -28,7 +28,7 @@ def add_parser(subparsers: Subparsers) -> None:
     run = subparsers.add_parser(
         "run", help="run one service of the chain, or all services of a platform", description=_DESCRIPTION
     )
-    run.add_argument("service", choices=("all", *SERVICES), help="name of the service, or all")
+    run.add_argument("service", choices=("all", *service_packages()), help="name of the service, or all")
     run.add_argument("--config", type=Path, required=True, help="TOML file of the platform")
     add_survey_options(run)
     run_all.add_options(run)
@@ -39,7 +39,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run_service(parsed: argparse.Namespace) -> int:
-    """Run the service's own module, as `python -m sonarpost.services.NAME` does, or all services.
+    """Run the service's own package, as `python -m PACKAGE` does, or all services.
 
     Raises:
         ConfigError: Invalid survey options, or options for another service than the given one.
@@ -50,7 +50,7 @@ def run_service(parsed: argparse.Namespace) -> int:
     if parsed.router_config is not None or parsed.listen:
         raise ConfigError("command line", "--router-config or --listen", parsed.service, "the service all")
     sys.argv[1:] = ["--config", str(parsed.config)]
-    runpy.run_module(f"sonarpost.services.{parsed.service}", run_name="__main__", alter_sys=True)
+    runpy.run_module(service_packages()[parsed.service], run_name="__main__", alter_sys=True)
     return 0
 
 

@@ -40,9 +40,7 @@ def main(service_type: type[Service[C]], config_type: type[C], arguments: Sequen
     """
     # Stores, images and logs hold positions: only the user of the service can read what it creates.
     os.umask(PRIVATE_UMASK)
-    parser = argparse.ArgumentParser(
-        prog=f"python -m sonarpost.services.{service_type.NAME}", description=service_type.__doc__
-    )
+    parser = argparse.ArgumentParser(prog=f"sonarpost run {service_type.NAME}", description=service_type.__doc__)
     parser.add_argument("--config", type=Path, required=True, help="TOML file of the platform")
     path: Path = parser.parse_args(arguments).config
     try:

@@ -20,7 +20,7 @@ from pathlib import PurePosixPath
 from typing import Literal
 
 from sonarpost import keys
-from sonarpost.config import SERVICES
+from sonarpost.config import service_packages
 from sonarpost.errors import BadInputError
 from sonarpost.security import fleet
 from sonarpost.security.fleet import CertificateEntry, FleetIndex, PkiError, PreparedName, Role
@@ -164,7 +164,7 @@ def _thinned_health(router: CertificateEntry) -> list[Json]:
     """
     if router.role != "vessel":
         return []
-    names = ("router", *SERVICES)
+    names = ("router", *service_packages())
     return [
         {
             "id": "health",

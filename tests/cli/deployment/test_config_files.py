@@ -64,7 +64,6 @@ def test_examples_are_valid_with_a_line_for_each_service(tmp_path, capsys):
         "uuv": ["atd_stub", "compressor", "uuv_modem"],
         "vessel": ["op_modem", "decompressor", "relay", "console"],
         "shore": ["c2", "console"],
-        "sim": ["acoustic_channel"],
     }.items():
         status, out, _ = check(example(tmp_path, name), capsys)
         assert status == 0

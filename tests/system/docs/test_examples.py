@@ -33,7 +33,7 @@ PAGES = sorted(
         "*.md",
         "docs/**/*.md",
         "services/*/README.md",
-        "common/sonarpost/extensions/*/README.md",
+        "common/sonarpost/extensions/**/README.md",
         "examples/README.md",
         "research/**/README.md",
     )

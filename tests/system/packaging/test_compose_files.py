@@ -13,7 +13,7 @@ import yaml
 from builders.common import REPOSITORY
 from builders.compose import PUBLISHED
 
-from sonarpost.config import SERVICES, load, overridden_keys
+from sonarpost.config import load, overridden_keys, service_packages
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.compressor.config import CompressorConfig
 
@@ -34,7 +34,7 @@ def configured(platform):
 
 
 def test_every_service_of_the_chain_runs_with_its_platforms_file():
-    for service in SERVICES:
+    for service in service_packages():
         platform, name = BLOCKS[service]["command"]
         assert name == service
         assert BLOCKS[service]["profiles"] == [platform]
@@ -92,7 +92,7 @@ def test_the_routers_of_the_files_in_config_get_endpoints_that_other_containers_
 
 
 def configuration_type(name):
-    module = importlib.import_module(f"sonarpost.services.{name}.config")
+    module = importlib.import_module(f"{service_packages()[name]}.config")
     return getattr(module, "".join(part.capitalize() for part in name.split("_")) + "Config")
 
 
@@ -214,4 +214,4 @@ def test_compose_accepts_the_files(files, tmp_path):
     for command in compose_commands():
         services = compose_config(command, tmp_path, *options)["services"]
         routers = {"router-uuv", "router-vessel", "router-shore"}
-        assert set(services) >= {*SERVICES, *routers, "pki", "database", "c2-second"}
+        assert set(services) >= {*service_packages(), *routers, "pki", "database", "c2-second"}

@@ -7,6 +7,7 @@ from typing import IO
 
 from sonarpost.cli.demo.settings import PLATFORM_OF, ChainSettings, write_config
 from sonarpost.cli.deployment.processes import Processes
+from sonarpost.config import service_packages
 from sonarpost.errors import SonarpostError
 
 ROUTERS = ("router-uuv", "router-vessel", "router-shore")
@@ -76,7 +77,7 @@ class Chain(Processes):
     def module(self, name: str) -> tuple[str, ...]:
         """Return the module of a process and its arguments."""
         if name not in ROUTERS:
-            return (f"sonarpost.services.{name}", "--config", str(self.settings.config_file(name)))
+            return (service_packages()[name], "--config", str(self.settings.config_file(name)))
         uuv, vessel, shore = (f"tcp/127.0.0.1:{port}" for port in self.settings.router_ports)
         listen = {"router-uuv": uuv, "router-vessel": vessel, "router-shore": shore}[name]
         link: tuple[str, ...] = ()

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import cast
 
 from sonarpost.cli.shared import Subparsers, add_command
-from sonarpost.config import ConfigFile, PlatformConfig, ServiceConfig
+from sonarpost.config import ConfigFile, PlatformConfig, ServiceConfig, service_packages
 from sonarpost.errors import BadInputError, ConfigError
 from sonarpost.files import PUBLIC_FILE, write_atomically
 from sonarpost.security.tls_files import check_tls_files
@@ -81,7 +81,7 @@ class CheckedConfig:
 
     Attributes:
         platform: The `[platform]` table; None if it is invalid.
-        services: Table of each service in the file, in the order of `sonarpost.config.SERVICES`; None if it is invalid.
+        services: Table of each service in the file, in the order of `service_packages`; None if it is invalid.
         errors: Why services would not start.
         warnings: What may be intended, for example an absent serial device.
     """
@@ -136,7 +136,7 @@ def _line_number(error: BadInputError) -> int:
 def configuration_type(service: str) -> type[ServiceConfig]:
     """Return the type of the configuration table of a service."""
     # The import contract does not allow a static import of a service here.
-    module = importlib.import_module(f"sonarpost.services.{service}.config")
+    module = importlib.import_module(f"{service_packages()[service]}.config")
     name = "".join(part.capitalize() for part in service.split("_")) + "Config"
     return cast(type[ServiceConfig], getattr(module, name))
 

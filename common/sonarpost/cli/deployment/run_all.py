@@ -16,7 +16,7 @@ from typing import IO
 from sonarpost.bus.connectivity import ConnectivityState, probe_endpoint
 from sonarpost.cli.deployment.config_files import EXIT_INVALID, check_file, print_problems
 from sonarpost.cli.deployment.processes import STOP_S, Processes
-from sonarpost.config import PlatformConfig
+from sonarpost.config import PlatformConfig, service_packages
 from sonarpost.errors import ConfigError
 from sonarpost.monitoring.heartbeat import VARIABLE as HEARTBEAT_VARIABLE
 from sonarpost.monitoring.service_manager import SOCKET_VARIABLE
@@ -61,7 +61,8 @@ def run(parsed: argparse.Namespace) -> int:
     if checked.errors:
         return EXIT_INVALID
     assert checked.platform is not None
-    modules = {name: [f"sonarpost.services.{name}", "--config", str(parsed.config)] for name in checked.services}
+    packages = service_packages()
+    modules = {name: [packages[name], "--config", str(parsed.config)] for name in checked.services}
     router = router_module(checked.platform, parsed.router_config, parsed.listen)
     with stop_on_signals(exit_after_s=2 * STOP_S) as stop:
         supervisor = Supervisor(stop, width=max(map(len, (ROUTER, *modules))))

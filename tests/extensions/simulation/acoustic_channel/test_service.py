@@ -6,6 +6,7 @@ import argparse
 import hashlib
 import json
 import random
+import runpy
 import select
 import signal
 import socket
@@ -21,15 +22,17 @@ from builders.common import WAIT_S, eventually, free_port
 from pydantic import ValidationError
 
 from sonarpost import keys, wire
+from sonarpost.cli.deployment.config_files import example_text
+from sonarpost.cli.main import main
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.extensions.simulation import modem_emulator
+from sonarpost.extensions.simulation.acoustic_channel.config import AcousticChannelConfig
+from sonarpost.extensions.simulation.acoustic_channel.service import AcousticChannelService
 from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
 from sonarpost.extensions.simulation.channel.config import EmulatorConfig, ModemSite
 from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
 from sonarpost.messages import Health
 from sonarpost.modem.micromodem import nmea
-from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
-from sonarpost.services.acoustic_channel.service import AcousticChannelService
 
 MODEMS = (ModemSite(address=1), ModemSite(address=2, east_m=150.0))
 SCALE = 100.0
@@ -406,6 +409,21 @@ def test_command_rejects_invalid_options(arguments, named):
 
 
 # The service
+
+
+def test_the_example_configuration_is_valid(tmp_path, capsys):
+    path = tmp_path / "sim.toml"
+    path.write_text(example_text("sim").replace("/var/lib/sonarpost", str(tmp_path)))
+    assert main(["config", "check", str(path)]) == 0
+    assert "[acoustic_channel]: valid" in capsys.readouterr().out
+
+
+def test_run_finds_the_service(monkeypatch):
+    started = []
+    monkeypatch.setattr(runpy, "run_module", lambda name, **_: started.append(name))
+    monkeypatch.setattr(sys, "argv", ["sonarpost"])
+    assert main(["run", "acoustic_channel", "--config", "sim.toml"]) == 0
+    assert started == ["sonarpost.extensions.simulation.acoustic_channel"]
 
 
 def test_service_provides_modems_and_publishes_gauges(platform, client, tmp_path):

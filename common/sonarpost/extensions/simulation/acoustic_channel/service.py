@@ -9,11 +9,11 @@ import logging
 from collections.abc import Mapping
 
 from sonarpost.config import PlatformConfig
+from sonarpost.extensions.simulation.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
 from sonarpost.logs import kv
 from sonarpost.messages import Record
 from sonarpost.runtime.service import Service, UnitOfWork
-from sonarpost.services.acoustic_channel.config import AcousticChannelConfig
 
 log = logging.getLogger(__name__)
 
