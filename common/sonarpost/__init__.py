@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from sonarpost.wire import decode as decode_record
     from sonarpost.wire import encode as encode_record
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _HOMES = {
     "codec": "Codec DecodedImage StreamHeader codec_names decode decode_image encode get_codec",
