@@ -1,6 +1,5 @@
 """The compose file says of every service what it must, and .env.example knows every variable."""
 
-import importlib
 import json
 import os
 import re
@@ -13,6 +12,7 @@ import yaml
 from builders.common import REPOSITORY
 from builders.compose import PUBLISHED
 
+from sonarpost.cli.deployment.config_files import configuration_type
 from sonarpost.config import load, overridden_keys, service_packages
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.compressor.config import CompressorConfig
@@ -89,11 +89,6 @@ def test_the_routers_of_the_files_in_config_get_endpoints_that_other_containers_
     assert all("'--listen', 'tcp/router:7447'" in block for block in with_file.values())
     options = re.findall(r"^#(\w+)_ROUTER_OPTIONS=(.*)$", (REPOSITORY / ".env.example").read_text(), flags=re.MULTILINE)
     assert {name for name, text in options if "--listen tcp/router:7447" in text} == {"SHORE", "VESSEL"}
-
-
-def configuration_type(name):
-    module = importlib.import_module(f"{service_packages()[name]}.config")
-    return getattr(module, "".join(part.capitalize() for part in name.split("_")) + "Config")
 
 
 def settings():

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
 import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from importlib.metadata import EntryPoint
 from importlib.resources import files
 from pathlib import Path
-from typing import cast
 
 from sonarpost.cli.shared import Subparsers, add_command
-from sonarpost.config import ConfigFile, PlatformConfig, ServiceConfig, service_packages
+from sonarpost.config import SERVICE_GROUP, ConfigFile, PlatformConfig, ServiceConfig, service_packages
 from sonarpost.errors import BadInputError, ConfigError
 from sonarpost.files import PUBLIC_FILE, write_atomically
 from sonarpost.security.tls_files import check_tls_files
@@ -135,10 +134,10 @@ def _line_number(error: BadInputError) -> int:
 
 def configuration_type(service: str) -> type[ServiceConfig]:
     """Return the type of the configuration table of a service."""
-    # The import contract does not allow a static import of a service here.
-    module = importlib.import_module(f"{service_packages()[service]}.config")
     name = "".join(part.capitalize() for part in service.split("_")) + "Config"
-    return cast(type[ServiceConfig], getattr(module, name))
+    point = EntryPoint(service, f"{service_packages()[service]}.config:{name}", SERVICE_GROUP)
+    found: type[ServiceConfig] = point.load()
+    return found
 
 
 def _platform_errors(platform: PlatformConfig) -> Iterator[BadInputError]:
