@@ -6,6 +6,8 @@ to a file of that name instead. The line before a block may hold a mark:
 - `<!-- example: stop -->`: the command runs until Ctrl-C; the test interrupts it after its first line of output.
 - `<!-- example: run by PATH -->`: another test runs it.
 - `<!-- example: not run, REASON -->`: it cannot run here.
+
+A page with the mark `<!-- extension: NAME -->` is read only if there is this extension.
 """
 
 from __future__ import annotations
@@ -27,6 +29,14 @@ from builders.common import REPOSITORY
 from sonarpost.cli.main import parser
 from sonarpost.cli.parsing.commands import all_examples
 
+EXTENSIONS = REPOSITORY / "common/sonarpost/extensions"
+
+
+def describes_what_exists(path):
+    extension = re.search(r"^<!-- extension: (\w+) -->$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return extension is None or (EXTENSIONS / extension[1]).is_dir()
+
+
 PAGES = sorted(
     path.relative_to(REPOSITORY).as_posix()
     for pattern in (
@@ -38,7 +48,7 @@ PAGES = sorted(
         "research/**/README.md",
     )
     for path in REPOSITORY.glob(pattern)
-    if path.name != "CHANGELOG.md"
+    if path.name != "CHANGELOG.md" and describes_what_exists(path)
 )
 LANGUAGES = {"sh", "python", "text", "toml", "json", "json5", "yaml", "ini", "hex", "sql"}
 BLOCK = re.compile(
