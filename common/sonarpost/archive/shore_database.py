@@ -16,19 +16,17 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from itertools import accumulate
-from typing import TypeVar
 
 from pydantic import TypeAdapter
 
 from sonarpost.archive import shared_journal, shore_schema
 from sonarpost.archive.journal import Accepted, Journal, JournalRecord
 from sonarpost.archive.postgresql import ConnectionPool, Sql
-from sonarpost.archive.shore_index import DEFECTS, DecisionRow, Fault, ImageRow, MarkColumn, TaskingRow, Verified
+from sonarpost.archive.shore_index import DEFECTS, DecisionRow, Fault, ImageRow, MarkColumn, Row, TaskingRow, Verified
 from sonarpost.errors import ConfigError, DatabaseUnavailableError, StoredFileError
 
 _RETENTION_LOCK = 0x736F6E61725F02
 _VERIFICATION_LOCK = 0x736F6E61725F03
-Row = TypeVar("Row", ImageRow, DecisionRow, TaskingRow)
 _TABLES: dict[type, str] = {ImageRow: "image", DecisionRow: "decision", TaskingRow: "tasking"}
 
 
