@@ -44,7 +44,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class AddedCommand:
     """A command of an extension or a plug-in, in a module that imports nothing else.
 
     The name of its entry point is that of the command, `record`, or of an action of a command of the core, `c2 cot`.
@@ -126,9 +126,11 @@ EXAMPLES: Final[Mapping[str, str]] = {
 
 
 @cache
-def added_commands() -> Registry[Command]:
+def added_commands() -> Registry[AddedCommand]:
     """Return the commands of extensions and plug-ins."""
-    return Registry(GROUP, "a sonarpost.cli.parsing.commands.Command", lambda found, _: isinstance(found, Command), {})
+    return Registry(
+        GROUP, "a sonarpost.cli.parsing.commands.AddedCommand", lambda found, _: isinstance(found, AddedCommand), {}
+    )
 
 
 def add_actions(actions: argparse._SubParsersAction[Any], command: str) -> None:

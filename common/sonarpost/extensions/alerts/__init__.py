@@ -2,9 +2,9 @@
 
 from typing import Final
 
-from sonarpost.cli.parsing.commands import Command
+from sonarpost.cli.parsing.commands import AddedCommand
 
-ALERT: Final = Command(
+ALERT: Final = AddedCommand(
     "send an alert for each contact above a threshold",
     "sonarpost.extensions.alerts.command:add_parser",
     {"c2 alert": "c2 alert --webhook https://hooks.example/mines --threshold 0.7 --state alerts.db --archive out"},

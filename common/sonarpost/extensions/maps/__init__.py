@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Final
 
-from sonarpost.cli.parsing.commands import Command
+from sonarpost.cli.parsing.commands import AddedCommand
 
-MOSAIC: Final = Command(
+MOSAIC: Final = AddedCommand(
     "write a mosaic of the seabed as cloud-optimised GeoTIFF",
     "sonarpost.extensions.maps.mosaic_command:add_action",
     {"survey mosaic": "survey mosaic line.xtf --out mosaic.tif --coverage coverage.geojson"},
 )
-COVERAGE: Final = Command(
+COVERAGE: Final = AddedCommand(
     "write the covered seabed as polygons",
     "sonarpost.extensions.maps.coverage_command:add_action",
     {"survey coverage": "survey coverage line.xtf --out coverage.gpkg"},

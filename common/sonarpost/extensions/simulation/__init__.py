@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Final
 
-from sonarpost.cli.parsing.commands import Command
+from sonarpost.cli.parsing.commands import AddedCommand
 
-SIMULATE: Final = Command(
+SIMULATE: Final = AddedCommand(
     "write a simulated side-scan survey as XTF",
     "sonarpost.extensions.simulation.simulate:add_parser",
     {"simulate": "simulate line.xtf --seabed ripples --truth truth.json"},
 )
-MODEM_EMULATOR: Final = Command(
+MODEM_EMULATOR: Final = AddedCommand(
     "emulated acoustic modems on pseudo-terminals or TCP ports",
     "sonarpost.extensions.simulation.modem_emulator:add_parser",
     {"modem-emulator": "modem-emulator --modems 2 --tcp --loss 0.1"},

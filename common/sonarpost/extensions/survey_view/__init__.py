@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from sonarpost.cli.parsing.commands import Command
+from sonarpost.cli.parsing.commands import AddedCommand
 
-VIEW: Final = Command(
+VIEW: Final = AddedCommand(
     "show a recording on a web page, and pick contacts in it",
     "sonarpost.extensions.survey_view.command:add_action",
     {"survey view": "survey view line.xtf --out line.xtf.picks"},

@@ -2,9 +2,9 @@
 
 from typing import Final
 
-from sonarpost.cli.parsing.commands import Command
+from sonarpost.cli.parsing.commands import AddedCommand
 
-TRAINING: Final = Command(
+TRAINING: Final = AddedCommand(
     "serve simulated contacts for training",
     "sonarpost.extensions.training.command:add_parser",
     {"console training": "console training 40"},
