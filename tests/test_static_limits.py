@@ -405,3 +405,20 @@ def test_http_is_spoken_by_one_module(nodes):
         if isinstance(node, ast.Import) and {alias.name for alias in node.names} & {"http.client", "urllib.request"}
     }
     assert clients == {"common/sonarpost/network/http_client.py"}
+
+
+def meanings(path, tree):
+    """Yield each class and type alias of a module with its meaning; equal aliases of several modules have one."""
+    yield from ((node.name, f"{path}:{node.lineno}") for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+    for node in tree.body:
+        if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value:
+            yield ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target), ast.unparse(node.value)
+
+
+def test_public_class_name_has_one_meaning(modules):
+    found = {}
+    for path, tree in modules.items():
+        for name, meaning in meanings(path, tree):
+            if re.fullmatch(r"[A-Z]+[a-z]\w*", name):
+                found.setdefault(name, set()).add(meaning)
+    assert {name: places for name, places in found.items() if len(places) > 1} == {}
