@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Several tests run at once; a second thread of each would only wait for the others.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: setup demo test test-busy test-system test-processes check docs docs-serve fmt lock sbom audit clean images test-compose screenshots
+.PHONY: setup demo test test-busy test-extensions test-system test-processes check docs docs-serve fmt lock sbom audit clean images test-compose screenshots
 
 setup: $(TEST)
 
@@ -81,6 +81,10 @@ images:
 # The whole chain in containers: build, start, inject faults, remove. Needs a container engine.
 test-compose: $(DEV)
 	PYTHON=$(BIN)/python packaging/test-compose.sh $(ARGS)
+
+# The quick tests without each extension, and without all of them; ARGS=NAME for one. About four minutes each.
+test-extensions: setup
+	$(BIN)/python tests/check_extensions.py $(ARGS)
 
 # The screenshots in docs/explanation/console; needs Chromium.
 screenshots: $(DEV)
