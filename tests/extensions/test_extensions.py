@@ -32,7 +32,7 @@ def test_every_entry_point_loads(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_extension_has_tests(name):
-    assert list((REPOSITORY / "tests" / "extensions" / name).glob("test_*.py"))
+    assert list((REPOSITORY / "tests" / "extensions" / name).rglob("test_*.py"))
 
 
 def test_every_folder_is_an_extension():
