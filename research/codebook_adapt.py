@@ -24,7 +24,7 @@ import numpy.typing as npt
 from research.common.images import missing_data
 from research.common.patches import stretch
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split
+from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split_images
 from sonarpost.codec.vq.builder import TrainingImage
 from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, load_default
 from sonarpost.sonar.image_files import read_image
@@ -87,7 +87,7 @@ def _image(name: str, pixels: npt.NDArray[np.uint8]) -> TrainingImage:
 
 def _row(title: str, images: list[TrainingImage], tile_px: int) -> bool:
     base = load_default(tile_px).tiles
-    training, held_out = split(images)
+    training, held_out = split_images(images)
     start_s = time.process_time()
     adapted = adapt(base, training)
     duration_s = time.process_time() - start_s

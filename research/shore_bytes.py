@@ -15,17 +15,64 @@ from hashlib import sha256
 
 import numpy as np
 
-from research.short_messages import contacts
 from sonarpost import keys, wire
 from sonarpost.archive import image_parts
 from sonarpost.archive.decoder import Decoder
+from sonarpost.codec import encode
 from sonarpost.delivery.protocol import attachment
 from sonarpost.delivery.records import OutboxItem
-from sonarpost.link.frames.contact_record import RECORD_SIZE
+from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary
+from sonarpost.link.received_image import received_image
+from sonarpost.link.receiver import ImageUpdate
 from sonarpost.messages import ReceivedImage, Record, Relayed
+from sonarpost.sonar.survey import Side
 
 ORIGIN = bytes(16)
+START_S = 1_700_000_000.0
 VESSEL = "vessel-1"
+
+
+def contacts(number: int, stream_bytes: int, seed: int) -> list[ReceivedImage]:
+    """Return received images of speckle with a target and its shadow."""
+    rng = np.random.default_rng(seed)
+    images = []
+    for n in range(1, number + 1):
+        pixels = rng.gamma(4.0, 20.0, (80, 140))
+        row, column = rng.integers(20, 60), rng.integers(20, 70)
+        pixels[row : row + 8, column : column + 10] *= 2.5
+        pixels[row : row + 8, column + 10 : column + 40] *= 0.15
+        stream = encode(pixels.clip(0, 255).astype(np.uint8), "emb", stream_bytes)
+        summary = ContactSummary(
+            height_px=80,
+            width_px=140,
+            lat_deg=50.0 + n / 1000,
+            lon_deg=-1.0,
+            time_utc_s=START_S + n,
+            confidence=1.2,
+            side=Side.PORT,
+            ground_range_m=30.0,
+            position_sigma_m=4.0,
+            atd_class="mine_like",
+            p_mine_like=0.7,
+            p_other_object=0.2,
+        )
+        update = ImageUpdate(
+            source=1,
+            image_id=f"{n:04d}",
+            version=1,
+            contact=summary.rounded(),
+            stream=stream,
+            missing=(),
+            complete=True,
+            received_bytes=len(stream),
+            total_bytes=len(stream),
+            frames=3,
+            conflicts=0,
+            first_frame_s=START_S + n,
+            last_frame_s=START_S + n + 60,
+        )
+        images.append(received_image(update, "vessel-1", "uuv-1"))
+    return images
 
 
 def delivery_bytes(record: Record, key: str) -> tuple[int, int]:

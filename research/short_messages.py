@@ -2,8 +2,8 @@
 
     python -m research.short_messages --contacts 100 --loss 0.2
 
-Encodes simulated contacts, sends them with the sender and receiver of `sonarpost.bearers`, and prints messages, bytes
-and time. The exit status is 1 if a record is missing or arrived twice.
+Encodes simulated contacts, sends them with the sender and receiver of `sonarpost.extensions.satellite`, and prints
+messages, bytes and time. The exit status is 1 if a record is missing or arrived twice.
 """
 
 from __future__ import annotations
@@ -14,62 +14,14 @@ import sys
 
 import numpy as np
 
-from sonarpost.bearers.receiver import ShortMessageReceiver
-from sonarpost.bearers.sender import ShortMessageSender, image_items
-from sonarpost.codec import encode
-from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.received_image import received_image
-from sonarpost.link.receiver import ImageUpdate
+from research.shore_bytes import contacts
+from sonarpost.extensions.satellite.receiver import ShortMessageReceiver
+from sonarpost.extensions.satellite.sender import ShortMessageSender, image_items
 from sonarpost.messages import ReceivedImage
-from sonarpost.sonar.survey import Side
 
-START_S = 1_700_000_000.0
 STEP_S = 1.0
 SESSION_S = 20.0
 """Time of one exchange of a terminal with the network."""
-
-
-def contacts(number: int, stream_bytes: int, seed: int) -> list[ReceivedImage]:
-    """Return received images of speckle with a target and its shadow."""
-    rng = np.random.default_rng(seed)
-    images = []
-    for n in range(1, number + 1):
-        pixels = rng.gamma(4.0, 20.0, (80, 140))
-        row, column = rng.integers(20, 60), rng.integers(20, 70)
-        pixels[row : row + 8, column : column + 10] *= 2.5
-        pixels[row : row + 8, column + 10 : column + 40] *= 0.15
-        stream = encode(pixels.clip(0, 255).astype(np.uint8), "emb", stream_bytes)
-        summary = ContactSummary(
-            height_px=80,
-            width_px=140,
-            lat_deg=50.0 + n / 1000,
-            lon_deg=-1.0,
-            time_utc_s=START_S + n,
-            confidence=1.2,
-            side=Side.PORT,
-            ground_range_m=30.0,
-            position_sigma_m=4.0,
-            atd_class="mine_like",
-            p_mine_like=0.7,
-            p_other_object=0.2,
-        )
-        update = ImageUpdate(
-            source=1,
-            image_id=f"{n:04d}",
-            version=1,
-            contact=summary.rounded(),
-            stream=stream,
-            missing=(),
-            complete=True,
-            received_bytes=len(stream),
-            total_bytes=len(stream),
-            frames=3,
-            conflicts=0,
-            first_frame_s=START_S + n,
-            last_frame_s=START_S + n + 60,
-        )
-        images.append(received_image(update, "vessel-1", "uuv-1"))
-    return images
 
 
 def main() -> int:

@@ -22,7 +22,6 @@ SOCKETS = {
     "common/sonarpost/stop_signals.py": "signals of this process",
 }
 THREADS = {
-    "common/sonarpost/bearers/rockblock.py": "serves requests, each in a thread that logs its exceptions",
     "common/sonarpost/bus/router.py": "health of the router",
     "common/sonarpost/cli/c2/tasking.py": "timer that sets an event",
     "common/sonarpost/cli/deployment/run_all.py": "copies the output of a process",
@@ -50,7 +49,7 @@ READS = {
     "common/sonarpost/archive/codebook_transfer.py": "written by this function, in pieces up to the limit",
     "common/sonarpost/archive/image_files.py": "side-car of the archive",
     "common/sonarpost/archive/postgresql.py": OWN_SETTINGS,
-    "common/sonarpost/bearers/serial_device.py": "/proc of the kernel",
+    "common/sonarpost/runtime/serial_device.py": "/proc of the kernel",
     "common/sonarpost/bus/router.py": OWN_SETTINGS,
     "common/sonarpost/cli/c2/migrate.py": "decision of the archive",
     "common/sonarpost/cli/demo/chain.py": "log of the demonstration",
@@ -75,7 +74,6 @@ READS = {
     "common/sonarpost/security/tls_files.py": OWN_SETTINGS,
     "common/sonarpost/sonar/options.py": "its size is compared with 64 KiB first",
     "services/c2/archive.py": "decision of the archive",
-    "services/c2/short_messages.py": OWN_SETTINGS,
     "common/sonarpost/cli/console.py": "keyboard",
     "services/console/web/installation_routes.py": SHIPPED,
 }
@@ -129,7 +127,7 @@ def packages(*names):
     return tuple(f"common/sonarpost/{name}/" for name in names)
 
 
-CALLERS = ("services/", *packages("archive", "bearers", "cli", "delivery", "extensions", "monitoring", "runtime"))
+CALLERS = ("services/", *packages("archive", "cli", "delivery", "extensions", "monitoring", "runtime"))
 MAPPED = "its caller `main` reports it"
 RAISES = {
     "common/sonarpost/cli/c2/migrate.py: Migration._stored_images: read_image_files": "a folder, not a database",
@@ -216,7 +214,7 @@ def allocates_a_computed_size(call):
 
 
 PARSERS = (
-    *packages("archive", "bearers", "codec", "detection", "extensions", "link", "messages", "modem", "sonar"),
+    *packages("archive", "codec", "detection", "extensions", "link", "messages", "modem", "sonar"),
     *("services/c2/", "services/console/web/", "services/op_modem/"),
 )
 KINDS = [(opens_or_reads_a_socket, SOCKETS), (starts_a_thread, THREADS), (waits_for_a_process, PROCESSES)]

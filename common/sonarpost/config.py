@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import stat
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar, cast
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, create_model
 from pydantic_core import to_json
 
 from sonarpost.errors import ConfigError
@@ -77,6 +77,17 @@ class ServiceConfig(BaseModel):
 
 
 C = TypeVar("C", bound=ServiceConfig)
+
+
+def with_keys(*added: type[ServiceConfig]) -> Callable[[type[C]], type[C]]:
+    """Return a decorator that adds the keys of other models to a configuration table."""
+
+    def extended(table: type[C]) -> type[C]:
+        bases: Any = (*added, table)  # in this order their keys follow those of the table
+        model = create_model(table.__name__, __base__=bases, __module__=table.__module__, __doc__=table.__doc__)
+        return cast(type[C], model)
+
+    return extended
 
 
 class TlsConfig(ServiceConfig):

@@ -7,37 +7,14 @@ from pydantic import Field
 
 from sonarpost.archive.postgresql import DatabaseAddress
 from sonarpost.codec.vq.codebook import open_codebook
-from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.config import PlatformConfig, with_keys
 from sonarpost.keys import SHORE
 from sonarpost.messages import PlatformId
 from sonarpost.runtime.retention import MaxBytes, RetentionConfig
-
-Imei = Annotated[str, Field(pattern=r"^[0-9]{15}$")]
-
-
-class ShortMessageOptions(ServiceConfig):
-    """The `short_messages` table of c2: messages of satellite terminals, through a gateway like RockBLOCK's.
-
-    Attributes:
-        vessels: IMEI of the terminal = name of its vessel.
-        token_file: File with a secret of at least 16 characters: the gateway's address for deliveries is
-            `http://HOST:PORT/SECRET`.
-        host: Address of the webhook, without TLS; a reverse proxy adds it.
-        port: Port of the webhook; 0 for any.
-        gateway: Address of the gateway, for acknowledgements.
-        username: Name of the account at the gateway.
-        password_file: File with its password.
-    """
-
-    vessels: Annotated[dict[Imei, PlatformId], Field(min_length=1)]
-    token_file: Path
-    host: str = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=65535)] = 8480
-    gateway: Annotated[str, Field(pattern=r"^https?://")]
-    username: str
-    password_file: Path
+from sonarpost.services.c2.inputs import inputs
 
 
+@with_keys(*(each.KEYS for each in inputs().working().values()))
 class C2Config(RetentionConfig):
     """The `[c2]` table.
 
@@ -56,7 +33,6 @@ class C2Config(RetentionConfig):
         database_password_file: File with the password, in place of one in the address.
         verify_days: Time in which every stored file is compared with the index once; 0 disables the comparison.
         json_mirror: Whether c2 also publishes every record as JSON below `{site}/json`, for clients without msgpack.
-        short_messages: Reception of short messages from satellite terminals; none by default.
     """
 
     site: PlatformId = SHORE
@@ -68,7 +44,6 @@ class C2Config(RetentionConfig):
     database_password_file: Path | None = None
     verify_days: Annotated[float, Field(ge=0, le=36500)] = 1.0
     json_mirror: bool = False
-    short_messages: ShortMessageOptions | None = None
 
     def check_with(self, platform: PlatformConfig) -> None:
         """Check that the codebooks can be read, and the address of the database.

@@ -43,10 +43,10 @@ from sonarpost.services.c2.accepted import AcceptedRecords, accepted_fields, pay
 from sonarpost.services.c2.archive import Archive, Storage
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.decoding import BACKLOG, AcceptedImage, BacklogNames, Decoding
+from sonarpost.services.c2.inputs import inputs
 from sonarpost.services.c2.json_form import ENCODING, json_payload
 from sonarpost.services.c2.queries import QueryService
 from sonarpost.services.c2.shared_archive import SharedArchive
-from sonarpost.services.c2.short_messages import Access, ShortMessages
 from sonarpost.services.c2.tasking import Tasking
 
 log = logging.getLogger(__name__)
@@ -90,7 +90,8 @@ class C2Service(Service[C2Config]):
 
     def __init__(self, platform: PlatformConfig, config: C2Config) -> None:
         # Before the store is opened: a wrong secret ends the service.
-        access = None if config.short_messages is None else Access.read(config.short_messages)
+        added = {name: each.configured(config) for name, each in inputs().working().items()}
+        self._inputs = {name: each for name, each in added.items() if each is not None}
         super().__init__(platform, config)
         address = config.database_address()
         self._archive: Storage = Archive(config) if address is None else SharedArchive(config, address, self._owner())
@@ -101,19 +102,6 @@ class C2Service(Service[C2Config]):
         self._changed_names: set[str] = set()
         self._changed_lock = threading.Lock()
         self._background_faults: dict[str, str] = {}
-        self._short_messages: ShortMessages | None = None
-        if config.short_messages is not None and access is not None:
-            self._short_messages = ShortMessages(
-                config.short_messages,
-                access,
-                config.codebooks,
-                config.site,
-                self.store,
-                self.count,
-                self.check_capacity,
-                self.before_accepting,
-                self.interval_log(log, logging.WARNING, "Short message refused or not acknowledged"),
-            )
         # Of the records that are handled and not committed yet.
         self._to_publish: list[JournalEntry] = []
         self._uncommitted: dict[str, bytes] = {}
@@ -489,15 +477,15 @@ class C2Service(Service[C2Config]):
         self.start_thread(self.decoding.run, "decoding")
         self.start_thread(lambda: self._codebooks.run(self.session), "codebooks")
         self.start_thread(self._run_queries, "queries")
-        if self._short_messages is not None:
-            self._short_messages.open()
-            self.start_thread(partial(self._short_messages.run, self.stopping), "short-messages")
+        for name, each in self._inputs.items():
+            each.open(self)
+            self.start_thread(partial(each.run, self.stopping), name)
         declare_presence(self.session, self.platform.id, self.NAME, self.config.site)
 
     def on_stop(self) -> None:
-        """Wake the background threads and close the webhook."""
-        if self._short_messages is not None:
-            self._short_messages.close()
+        """Close the other inputs and wake the background threads."""
+        for each in self._inputs.values():
+            each.close()
         self._retention.wake()
         self._changed.set()
         self.decoding.close()
@@ -546,7 +534,7 @@ class C2Service(Service[C2Config]):
         faults = (
             self._archive.fault(),
             *self._background_faults.values(),
-            *(() if self._short_messages is None else list(self._short_messages.faults.values())),
+            *(fault for each in self._inputs.values() for fault in each.faults()),
             self.decoding.fault,
             self._retention.error,
         )

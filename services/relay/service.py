@@ -13,7 +13,6 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.archive import image_parts
-from sonarpost.bearers.short_message import ShortMessageError
 from sonarpost.bus.connectivity import MonitoredSite, SiteMonitor
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig, TlsConfig
@@ -34,8 +33,8 @@ from sonarpost.messages import (
     Relayed,
 )
 from sonarpost.runtime.service import Service, UnitOfWork
+from sonarpost.services.relay.bearers import bearers
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
-from sonarpost.services.relay.satellite import SatelliteUpstream
 
 log = logging.getLogger(__name__)
 
@@ -121,10 +120,8 @@ class RelayService(Service[RelayConfig]):
         sites = [self._monitored(upstream) for upstream in upstreams]
         self._site_monitor = SiteMonitor(platform.id, sites, platform.tls)
         radio = {upstream.options.site for upstream in upstreams}
-        terminal_log = self.interval_log(log, logging.WARNING, "Satellite terminal failed")
-        self._satellites = [
-            SatelliteUpstream(options, self.store, self.count, terminal_log, has_radio=options.site in radio)
-            for options in config.satellites()
+        self._added = [
+            bearers().get(options.bearer)(options, self, has_radio=options.site in radio) for options in config.added()
         ]
         self._image_reserve = DiskReserve(self.store, config.disk_reserve_bytes, "senders keep their images")
 
@@ -187,34 +184,26 @@ class RelayService(Service[RelayConfig]):
             effects.count("commands_taken")
         elif isinstance(record, ReceivedStatus):
             self._queue_status(key, record, effects)
-        elif isinstance(record, CodedImage):
-            self._queue_short(record, effects)
-            self._queue_image(record, effects)
         else:
-            assert isinstance(record, Decision)
-            self._queue_short(record, effects)
-            self._queue_decision(key, effects)
+            assert isinstance(record, (CodedImage, Decision))
+            for added in self._added:
+                added.queue(record, effects)
+            if isinstance(record, CodedImage):
+                self._queue_image(record, effects)
+            else:
+                self._queue_decision(key, effects)
 
-    def _queue_short(self, record: CodedImage | Decision, effects: UnitOfWork) -> None:
-        for satellite in self._satellites:
-            try:
-                satellite.queue(record, effects)
-            except ShortMessageError as error:
-                # The radio still delivers it.
-                effects.count("records_too_long_for_short_messages")
-                log.warning("Record not sent by short message", extra=kv(reason=str(error)))
-
-    def _withdraw_short(self, item: OutboxItem) -> None:
-        """Withdraw the short message of a record that the radio has delivered."""
+    def _withdraw(self, item: OutboxItem) -> None:
+        """Withdraw from other bearers a record that the radio has delivered."""
         site = self._upstreams[item.queue].options.site
         fields = wire.unpack_map(item.payload, item.key)
         if isinstance(payload := fields.get("payload"), bytes):
             fields = wire.unpack_map(payload, item.key)  # an envelope
         if fields.get("type") == ReceivedStatus.TYPE:
             return  # only the radio sends it
-        for satellite in self._satellites:
-            if satellite.options.site == site:
-                satellite.delivered_by_radio(fields)
+        for added in self._added:
+            if added.site == site:
+                added.delivered_by_radio(fields)
 
     def _queue_status(self, key: str, record: ReceivedStatus, effects: UnitOfWork) -> None:
         """Queue a status for each site; it replaces older ones of the vehicle."""
@@ -258,8 +247,8 @@ class RelayService(Service[RelayConfig]):
 
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> bool:
         """Store which version of an image a site has; send the whole image if the site has refused a difference."""
-        if self._satellites and reason is None and item.queue in self._upstreams:
-            self._withdraw_short(item)
+        if self._added and reason is None and item.queue in self._upstreams:
+            self._withdraw(item)
         if item.key != self._part_keys.get(item.queue):
             return False
         part, whole = image_parts.head_of(item.payload), item.payload
@@ -304,8 +293,8 @@ class RelayService(Service[RelayConfig]):
         if any(counts.values()):
             payloads = [effects.payload for effects in handled]
             log_batch(log, "Records queued for the shore", payloads, **{name: n for name, n in counts.items() if n})
-        for satellite in self._satellites:
-            satellite.committed()
+        for added in self._added:
+            added.committed()
         if superseded:
             self.count("records_superseded", superseded)
         for upstream in self._upstreams.values():
@@ -342,14 +331,14 @@ class RelayService(Service[RelayConfig]):
         for upstream in self._upstreams.values():
             if upstream.options.router:
                 self.start_thread(partial(upstream.connect, self.stopping), f"upstream-{upstream.options.site}")
-        for satellite in self._satellites:
-            self.start_thread(partial(satellite.run, self.stopping), f"satellite-{satellite.options.site}")
+        for options, added in zip(self.config.added(), self._added, strict=True):
+            self.start_thread(partial(added.run, self.stopping), f"{options.bearer}-{options.site}")
         self.start_thread(lambda: self._site_monitor.run(self.stopping), "site-monitor")
 
     def on_stop(self) -> None:
-        """Close the sites' own sessions and the terminals."""
-        for satellite in self._satellites:
-            satellite.stop()
+        """Close the sites' own sessions and the other bearers."""
+        for added in self._added:
+            added.stop()
         for upstream in self._upstreams.values():
             upstream.close()
 
@@ -361,8 +350,8 @@ class RelayService(Service[RelayConfig]):
         return self._image_reserve.degraded_reason() or self._site_monitor.degraded_reason()
 
     def warning(self) -> str:
-        """Return which sites are not reached, and what prevents short messages."""
-        warnings = (self._site_monitor.warning(), *(satellite.warning() for satellite in self._satellites))
+        """Return which sites are not reached, and what prevents sending by other bearers."""
+        warnings = (self._site_monitor.warning(), *(added.warning() for added in self._added))
         return "; ".join(warning for warning in warnings if warning)
 
     def gauges(self) -> Mapping[str, float]:
@@ -377,8 +366,8 @@ class RelayService(Service[RelayConfig]):
             found[f"oldest_s_for_{site}"] = age_s
             found[f"delivered_to_{site}"] = float(self.acknowledged_count(queue))
             found[f"answering_{site}"] = float(self.is_responding(queue))
-        for satellite in self._satellites:
-            found |= satellite.gauges()
+        for added in self._added:
+            found |= added.gauges()
         # The console shows by this gauge and the inbox whether every decision has reached the shore.
         urgent = (self.store.queue_depth(queue, DECISION_PRIORITY).records for queue in self._upstreams)
         found["decisions_waiting"] = float(sum(urgent))

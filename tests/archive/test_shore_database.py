@@ -267,6 +267,13 @@ def test_address_has_tls_unless_the_server_is_local(tmp_path):
     assert "secret" not in repr(parse("postgresql://u:secret@db/shore"))
 
 
+def test_password_file_that_is_no_text_is_refused(tmp_path):
+    path = tmp_path / "password"
+    path.write_bytes(b"\xff\x00")
+    with pytest.raises(ConfigError, match="database_password_file"):
+        DatabaseAddress.parse("postgresql://u@127.0.0.1/shore", path)
+
+
 def test_unreachable_server_is_named_without_the_password():
     database = ConnectionPool(DatabaseAddress.parse(f"postgresql://u:secret@127.0.0.1:{free_port()}/shore"))
     with pytest.raises(DatabaseUnavailableError) as caught:

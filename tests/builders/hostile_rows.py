@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
-from importlib import import_module
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Literal
@@ -21,11 +21,8 @@ from typing import Literal
 import msgpack
 import zenoh
 
-from builders.common import REPOSITORY
-from builders.hostile_site import HOSTILE, TOKEN, Site, coded_part, message, threads
-from builders.short_messages import with_crc
+from builders.hostile_site import HOSTILE, Site, attack_modules, coded_part, threads
 from sonarpost import keys, wire
-from sonarpost.bearers.short_message import ShortMessage
 from sonarpost.messages import ImagePart
 
 Attack = Literal["claim", "flood", "slow", "endless", "junk", "replay", "crash"]
@@ -41,20 +38,24 @@ class Row:
         source: Who attacks.
         attack: Kind.
         function: Starts the attack; it ends with the context. Or path of the tests that attack.
-        measured: Method of `Site`: the other source that is measured during the attack.
+        measured: Method of `Site`, or another function: the other source that is measured during the attack.
     """
 
     surface: tuple[str, ...]
     source: str
     attack: Attack
     function: Function | str
-    measured: str = "images_of_vessel"
+    measured: str | Callable[[Site], list[float]] = "images_of_vessel"
 
     @property
     def name(self) -> str:
         """Name of the test."""
         assert callable(self.function)
-        return f"{self.function.__name__}-{self.measured}"
+        return f"{self.function.__name__}-{getattr(self.measured, '__name__', self.measured)}"
+
+    def delays_s(self, site: Site) -> list[float]:
+        """Measure the other source; return the delays of its records."""
+        return (getattr(site, self.measured) if isinstance(self.measured, str) else partial(self.measured, site))()
 
 
 PART, INBOX = keys.shore_part(HOSTILE), keys.shore_inbox(HOSTILE)
@@ -238,10 +239,7 @@ def killed_decoder(site: Site) -> Iterator[None]:
         yield
 
 
-# Short messages
-
-
-def _connections(port: int, count: int, head: bytes, interval_s: float) -> AbstractContextManager[None]:
+def connections(port: int, count: int, head: bytes, interval_s: float) -> AbstractContextManager[None]:
     """Connections that send a byte at intervals, and are opened again."""
 
     def drip(_number: int, stop: threading.Event) -> None:
@@ -252,52 +250,6 @@ def _connections(port: int, count: int, head: bytes, interval_s: float) -> Abstr
                     opened.sendall(b"x")
 
     return threads(count, drip)
-
-
-@contextmanager
-def slow_gateways(site: Site) -> Iterator[None]:
-    """24 clients without the token that send a byte every 2 s."""
-    with _connections(site.webhook_port, 24, b"POST /guess HTTP/1.1\r\nX: ", 2.0):
-        yield
-
-
-@contextmanager
-def slow_bodies(site: Site) -> Iterator[None]:
-    """24 clients with the token, whose bodies arrive one byte every 2 s."""
-    head = f"POST /{TOKEN} HTTP/1.1\r\nContent-Length: 4000\r\n\r\n".encode()
-    with _connections(site.webhook_port, 24, head, 2.0):
-        yield
-
-
-@contextmanager
-def last_sequence_numbers(site: Site) -> Iterator[None]:
-    """Messages with the last numbers of an epoch, and fragments that are never complete."""
-    valid = ShortMessage(1, 0, 0, ()).pack()
-    for number in (2**32 - 1, 2**32 - 2, 2**31, 300):
-        # Type, epoch, sequence number, and how far the oldest is behind it.
-        for behind in (0, 255):
-            body = valid[:5] + number.to_bytes(4, "big") + bytes([behind])
-            site.deliver(HOSTILE, with_crc(body))
-    yield
-
-
-@contextmanager
-def junk_messages(site: Site) -> Iterator[None]:
-    """Mutated messages of a terminal."""
-    random, valid = Random(7), message(5, 0, "mutated")
-    for _ in range(60):
-        data = bytearray(valid)
-        data[random.randrange(len(data))] ^= 1 << random.randrange(8)
-        site.deliver(HOSTILE, bytes(data))
-    yield
-
-
-@contextmanager
-def message_again(site: Site) -> Iterator[None]:
-    """One message 100 times."""
-    for _ in range(100):
-        site.deliver(HOSTILE, message(6, 0, "again"))
-    yield
 
 
 # The console
@@ -319,7 +271,7 @@ def reports_of_observer(site: Site) -> Iterator[None]:
 @contextmanager
 def slow_browsers(site: Site) -> Iterator[None]:
     """200 connections without a session, one byte every 2 s."""
-    with _connections(site.console_port, 200, b"GET / HTTP/1.1\r\nX: ", 2.0):
+    with connections(site.console_port, 200, b"GET / HTTP/1.1\r\nX: ", 2.0):
         yield
 
 
@@ -328,7 +280,7 @@ def event_streams(site: Site) -> Iterator[None]:
     """Event streams that are not read."""
     cookie = site.log_in("ben")
     head = f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{site.console_port}\r\nCookie: {cookie}\r\n\r\n".encode()
-    with _connections(site.console_port, 60, head, 3.0):
+    with connections(site.console_port, 60, head, 3.0):
         yield
 
 
@@ -395,8 +347,7 @@ def hostile_recordings(site: Site) -> Iterator[None]:
 
 def rows() -> list[Row]:
     """Return the attacks on the core, and those of `attacks.py` of the tests of each extension."""
-    names = sorted(path.parent.name for path in REPOSITORY.glob("tests/extensions/*/attacks.py"))
-    return [*ROWS, *(row for name in names for row in import_module(f"extensions.{name}.attacks").ROWS)]
+    return [*ROWS, *(row for module in attack_modules() for row in module.ROWS)]
 
 
 ROWS: tuple[Row, ...] = (
@@ -428,15 +379,14 @@ ROWS: tuple[Row, ...] = (
     Row(("queryable:services.c2.queries",), "observer", "flood", queries_without_end),
     Row(("zenoh:*/tasking/{vessel}/*",), "console", "junk", tasking_of_user),
     Row(("zenoh:*/inbox/{vessel}/part",), "the machine", "crash", killed_decoder),
-    Row(
-        ("port:bearers.rockblock", "port:network.connections"), "client", "slow", slow_gateways, "messages_of_terminal"
-    ),
-    Row(("port:bearers.rockblock",), "gateway", "slow", slow_bodies, "messages_of_terminal"),
-    Row(("port:bearers.rockblock",), "terminal", "crash", last_sequence_numbers, "messages_of_terminal"),
-    Row(("port:bearers.rockblock",), "terminal", "junk", junk_messages, "messages_of_terminal"),
-    Row(("port:bearers.rockblock",), "terminal", "replay", message_again, "messages_of_terminal"),
     Row(("route:GET /report*", "route:* /api/export*"), "observer", "flood", reports_of_observer, "requests_of_user"),
-    Row(("port:services.console.*", "port:cli.console"), "client", "slow", slow_browsers, "requests_of_user"),
+    Row(
+        ("port:services.console.*", "port:cli.console", "port:network.connections"),
+        "client",
+        "slow",
+        slow_browsers,
+        "requests_of_user",
+    ),
     Row(("route:GET /events",), "observer", "slow", event_streams, "requests_of_user"),
     Row(("route:POST /api/login*",), "client", "flood", wrong_passwords, "requests_of_user"),
     Row(("route:*",), "observer", "junk", junk_requests, "requests_of_user"),
@@ -450,7 +400,7 @@ ROWS: tuple[Row, ...] = (
     Row(("folder:atd_stub.input_dir",), "a file", "crash", hostile_recordings, "recording_of_sonar"),
     # Rows of other tests
     Row(
-        ("exchange:network.http_client", "exchange:bearers.rockblock"),
+        ("exchange:network.http_client",),
         "server",
         "endless",
         "tests/network/test_http_client.py",
@@ -507,7 +457,6 @@ ROWS: tuple[Row, ...] = (
         "junk",
         "tests/services/c2/test_storage.py",
     ),
-    Row(("folder:*_file",), "a file", "junk", "tests/services/test_short_messages.py"),
     Row(("folder:console.tiles_dir",), "a file", "junk", "tests/services/console/test_security.py"),
     Row(
         (
@@ -519,4 +468,5 @@ ROWS: tuple[Row, ...] = (
         "junk",
         "tests/services/atd_stub/test_input_files.py",
     ),
+    Row(("folder:*_file",), "a file", "junk", "tests/archive/test_shore_database.py"),
 )

@@ -19,9 +19,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from http.client import HTTPException
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
-from urllib.parse import urlencode
 
 import msgpack
 import numpy as np
@@ -29,10 +30,7 @@ import zenoh
 
 from builders.common import REPOSITORY, WAIT_S, eventually, free_port
 from builders.fleet_certificates import World
-from builders.message_gateway import MessageGatewayEmulator
-from builders.short_messages import decision
 from sonarpost import keys, wire
-from sonarpost.bearers.short_message import Item, ItemType, ShortMessage, pack_decision
 from sonarpost.bus.session import client_config
 from sonarpost.codec.registry import default_registry
 from sonarpost.delivery.outbox import Outbox, QueuePolicy
@@ -44,8 +42,6 @@ from sonarpost.sonar.xtf_writer import write_xtf
 from sonarpost.stop_signals import EXIT_WITH_PARENT
 
 VESSEL, HOSTILE = "vessel-1", "vessel-2"
-IMEI = {VESSEL: "300234010753370", HOSTILE: "300234010753371"}
-TOKEN = "0123456789abcdef"
 PASSWORD = "correct horse battery"
 USERS = {"eva": "expert", "ben": "observer"}
 """eva is measured, ben is hostile."""
@@ -60,10 +56,10 @@ def coded_part(number: int, side_px: int = 48) -> ImagePart:
     return ImagePart(u="uuv-1", i=f"{number:04d}", n=1, t=1_700_000_000.0 + number, p=stream)
 
 
-def message(epoch: int, seq: int, name: str) -> bytes:
-    """Return a short message with one decision."""
-    item = Item(ItemType.DECISION, pack_decision(decision(name)))
-    return ShortMessage(epoch, seq, seq, (item,)).pack()
+def attack_modules() -> list[ModuleType]:
+    """Return `attacks.py` of the tests of each extension: its rows `ROWS`, and `c2_table`, which adds to `[c2]`."""
+    names = sorted(path.parent.name for path in REPOSITORY.glob("tests/extensions/*/attacks.py"))
+    return [import_module(f"extensions.{name}.attacks") for name in names]
 
 
 class Sender:
@@ -147,13 +143,14 @@ class Site:
     decode_workers: int = 1
     processes: dict[str, Process] = field(default_factory=dict)
     health: dict[str, Health] = field(default_factory=dict)
+    added: dict[str, Any] = field(default_factory=dict)
+    """What the attacks of extensions keep."""
     _stack: ExitStack = field(default_factory=ExitStack)
     _senders: dict[str, Sender] = field(default_factory=dict)
     _number: int = 0
-    _seq: int = 0
 
     def __post_init__(self) -> None:
-        self.webhook_port, self.console_port = free_port(), free_port()
+        self.console_port = free_port()
         self.console_url = f"http://127.0.0.1:{self.console_port}"
         self.incoming = self.folder / "incoming"
         self.session = self.keep(zenoh.open(client_config([self.local])))
@@ -286,28 +283,6 @@ class Site:
         self.sender(VESSEL).send(keys.shore_part(VESSEL), "c2", [wire.encode(part) for part in parts])
         return self.images.delays_s({part.i: now_s for part in parts})
 
-    def messages_of_terminal(self) -> list[float]:
-        """Short messages of vessel-1's terminal, until the decision in each is stored and published."""
-        sent_s = {}
-        for number in self.numbers(5):
-            sent_s[f"short-{number}"] = time.monotonic()
-            assert self.deliver(VESSEL, message(7, self._seq, f"short-{number}")) == 200
-            self._seq += 1
-        return self.decisions.delays_s(sent_s)
-
-    def deliver(self, vessel: str, data: bytes) -> int:
-        """Deliver a short message as the gateway does, which repeats what fails; return the status, 200 or 400."""
-        status = 0
-
-        def delivered() -> bool:
-            nonlocal status
-            body = urlencode({"imei": IMEI[vessel], "momsn": "1", "data": data.hex()}).encode()
-            status = request(f"http://127.0.0.1:{self.webhook_port}/{TOKEN}", body)
-            return status in (200, 400)
-
-        eventually(delivered, what="delivery of a short message")
-        return status
-
     def requests_of_user(self) -> list[float]:
         """Requests of the user eva to the console."""
         cookie = self.log_in("eva")
@@ -403,9 +378,8 @@ def running_site(folder: Path, world: World, decode_workers: int) -> Iterator[Si
     """A site with its services, while the memory of its processes is measured."""
     tls, local = f"tls/localhost:{free_port()}", f"tcp/127.0.0.1:{free_port()}"
     router = world.start("shore-1", world.shore_wanted(tls, local), zenoh_log=None)
-    gateway = MessageGatewayEmulator("http://127.0.0.1:9/", list(IMEI.values()))
     site = Site(folder, world, tls, local, decode_workers)
-    stop = threading.Event()
+    stop, stack = threading.Event(), ExitStack()
 
     def measure() -> None:
         while not stop.wait(0.25):
@@ -415,17 +389,13 @@ def running_site(folder: Path, world: World, decode_workers: int) -> Iterator[Si
     thread = threading.Thread(target=measure, daemon=True)
     thread.start()
     try:
-        (folder / "token").write_text(TOKEN)
-        (folder / "password").write_text("password")
         site.incoming.mkdir()
-        terminals = ", ".join(f'{imei} = "{vessel}"' for vessel, imei in IMEI.items())
+        modules = [module for module in attack_modules() if hasattr(module, "c2_table")]
+        added = "".join(stack.enter_context(module.c2_table(site)) for module in modules)
         site.start(
             "c2",
             "shore-1",
-            f'out_dir = "{folder / "out"}"\ndecode_workers = {decode_workers}\njson_mirror = true\n'
-            f'[c2.short_messages]\nvessels = {{ {terminals} }}\ntoken_file = "{folder / "token"}"\n'
-            f'port = {site.webhook_port}\ngateway = "{gateway.mt_url}"\nusername = "user"\n'
-            f'password_file = "{folder / "password"}"\n',
+            f'out_dir = "{folder / "out"}"\ndecode_workers = {decode_workers}\njson_mirror = true\n{added}',
         )
         site.start("console", "shore-1", f'role = "shore"\nport = {site.console_port}\n')
         site.start("compressor", "uuv-1", 'codec = "spiht"\n')  # needs no compilation
@@ -439,7 +409,7 @@ def running_site(folder: Path, world: World, decode_workers: int) -> Iterator[Si
     finally:
         stop.set()
         thread.join()
-        gateway.close()
+        stack.close()
         try:
             site.close()
         finally:

@@ -17,11 +17,9 @@ import pytest
 import serial
 from builders.common import WAIT_S, eventually, free_port
 
-from sonarpost.bearers import serial_device
-from sonarpost.bearers.iridium import IridiumTerminal
-from sonarpost.bearers.serial_device import close_port, open_port
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.runtime import serial_port
+from sonarpost.runtime import serial_device, serial_port
+from sonarpost.runtime.serial_device import close_port, open_port
 from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialPort
 
 
@@ -315,11 +313,6 @@ def test_each_reason_of_a_port_that_is_not_open_is_logged_once(pty_port, first, 
     absent, in_use = [record.fields["reason"] for record in caplog.records if "cannot be opened" in record.message]
     assert "No such file" in absent
     assert in_use.startswith("in use by ")
-
-
-def test_satellite_terminal_does_not_take_a_port_in_use(pty_port, first):
-    with closing(IridiumTerminal(str(pty_port.path))) as terminal, pytest.raises(PortError, match="in use by "):
-        terminal.exchange(b"x")
 
 
 def test_port_that_the_system_refuses_names_the_program_that_has_it_open(pty_port, monkeypatch):

@@ -13,7 +13,7 @@ from rich.console import Console
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers, add_command, in_new_folder
 from sonarpost.codec.interface import Image, to_uint8
-from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split
+from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split_images
 from sonarpost.codec.vq.builder import MAX_TILES, Round, TrainingImage, build, rms_distance
 from sonarpost.codec.vq.codebook import Codebook, open_codebook, save
 from sonarpost.codec.vq.codec import codebook_tag
@@ -198,7 +198,7 @@ def run_adapt(args: argparse.Namespace) -> int:
     in_new_folder(args.out)
     base = open_codebook(args.base).tiles
     images, skipped = _training_images(args.images, console)
-    training, held_out = split(images)
+    training, held_out = split_images(images)
     with ProgressDisplay() as display:
         adapted = adapt(base, training, max_tiles=args.max_tiles, keep=args.keep, progress=display.show)
         before, after = measure(base, held_out), measure(adapted.tiles, held_out)

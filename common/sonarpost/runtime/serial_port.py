@@ -21,9 +21,9 @@ from typing import ClassVar
 
 import serial
 
-from sonarpost.bearers.serial_device import close_port, open_port
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.logs import kv
+from sonarpost.runtime.serial_device import close_port, open_port
 
 log = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonarpost.codec.vq.adaptation import MAX_PSNR_DB, adapt, measure, split
+from sonarpost.codec.vq.adaptation import MAX_PSNR_DB, adapt, measure, split_images
 from sonarpost.codec.vq.builder import TrainingImage
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
 from sonarpost.errors import ConfigError
@@ -69,7 +69,7 @@ def test_requested_number_of_tiles_stays(keep: int) -> None:
 
 def test_adapted_codebook_improves_unseen_images_of_the_seabed() -> None:
     base = speckle(1, 60)
-    training_images, held_out = split(training(*[ripples(seed, 40) for seed in range(12)]))
+    training_images, held_out = split_images(training(*[ripples(seed, 40) for seed in range(12)]))
     adapted = adapt(base, training_images, max_tiles=60).tiles
     before, after = measure(base, held_out), measure(adapted, held_out)
     assert len(before) == 3
@@ -87,12 +87,12 @@ def test_exactly_reconstructed_images_change_nothing() -> None:
 
 def test_last_quarter_is_held_out() -> None:
     images = training(*[ripples(seed, 16) for seed in range(9)])
-    training_images, held_out = split(images)
+    training_images, held_out = split_images(images)
     assert [image.name for image in training_images] == [f"image {i}" for i in range(7)]
     assert [image.name for image in held_out] == ["image 7", "image 8"]
-    assert [len(part) for part in split(images[:2])] == [1, 1]
+    assert [len(part) for part in split_images(images[:2])] == [1, 1]
     with pytest.raises(ConfigError, match="at least 2"):
-        split(images[:1])
+        split_images(images[:1])
 
 
 @pytest.mark.parametrize(

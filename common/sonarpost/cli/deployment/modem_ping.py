@@ -6,7 +6,6 @@ import argparse
 import queue
 import time
 
-from sonarpost.bearers.serial_device import IN_USE
 from sonarpost.cli.shared import Subparsers, add_command
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.modem import interface as ev
@@ -14,6 +13,7 @@ from sonarpost.modem.interface import ModemEvent, RangeMeasured
 from sonarpost.modem.registry import DEFAULT_DRIVER, ModemSettings, modem_driver
 from sonarpost.runtime.modem_port import open_modem_port
 from sonarpost.runtime.modem_runner import ModemRunner
+from sonarpost.runtime.serial_device import IN_USE
 from sonarpost.runtime.serial_port import ModemPort
 
 EXIT_UNANSWERED = 1

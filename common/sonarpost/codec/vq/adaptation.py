@@ -111,7 +111,7 @@ def adapt(
     return AdaptedCodebook(adapted, int((uses > 0).sum()), replaced, new.shape[0])
 
 
-def split(images: Sequence[TrainingImage]) -> tuple[list[TrainingImage], list[TrainingImage]]:
+def split_images(images: Sequence[TrainingImage]) -> tuple[list[TrainingImage], list[TrainingImage]]:
     """Split into training images and test images. The test images are the last quarter, at least one.
 
     Neighbours in a folder often show the same piece of seabed, so the test images are consecutive.

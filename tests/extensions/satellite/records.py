@@ -1,6 +1,6 @@
 """Records for tests of short messages, and the writer of their golden file.
 
-`PYTHONPATH=tests python -m builders.short_messages` prints the golden file. It is added to, never changed.
+`PYTHONPATH=tests python -m extensions.satellite.records` prints the golden file. It is added to, never changed.
 """
 
 from __future__ import annotations
@@ -8,16 +8,16 @@ from __future__ import annotations
 import binascii
 import json
 
-from sonarpost.bearers.short_message import (
+from sonarpost.codec.interface import StreamHeader
+from sonarpost.extensions.satellite.short_message import (
     Item,
     ItemType,
     ShortAcknowledgement,
     ShortMessage,
+    decision_fragments,
     pack_contact,
     pack_decision,
-    split,
 )
-from sonarpost.codec.interface import StreamHeader
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
@@ -96,7 +96,7 @@ def golden() -> dict[str, str]:
     contact = Item(ItemType.CONTACT, pack_contact(received()))
     other = Item(ItemType.CONTACT, pack_contact(received(2, 0, contact=False)))
     verdict = Item(ItemType.DECISION, pack_decision(decision()))
-    long = split(pack_decision(decision("d2", remark="r" * 600)), 7)
+    long = decision_fragments(pack_decision(decision("d2", remark="r" * 600)), 7)
     return {
         "contact with preview": ShortMessage(0x01020304, 0, 0, (contact,)).pack().hex(),
         "decision and image without contact record": ShortMessage(0x01020304, 5, 3, (verdict, other)).pack().hex(),

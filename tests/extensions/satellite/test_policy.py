@@ -2,7 +2,7 @@
 
 import pytest
 
-from sonarpost.bearers.policy import ByteBudget, Window
+from sonarpost.extensions.satellite.policy import ByteBudget, Window
 
 DAY_S = 86400.0
 

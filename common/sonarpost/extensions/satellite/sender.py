@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 import msgpack
 
-from sonarpost.bearers.short_message import (
+from sonarpost.extensions.satellite.short_message import (
     ITEM_HEAD_BYTES,
     MAX_MESSAGE_BYTES,
     MAX_SEQ,
@@ -20,10 +20,10 @@ from sonarpost.bearers.short_message import (
     ShortMessageError,
     contact_head_bytes,
     contact_version,
+    decision_fragments,
     items_bytes,
     pack_contact,
     pack_decision,
-    split,
     unpack_contact,
 )
 from sonarpost.limits import Turns
@@ -312,7 +312,7 @@ def decision_items(decision: Decision, number: int, now_s: float) -> list[Queued
     Raises:
         ShortMessageError: It is too long.
     """
-    items = split(pack_decision(decision), number)
+    items = decision_fragments(pack_decision(decision), number)
     return [
         QueuedItem(number + n, DECISION_PRIORITY, decision.decision_id, now_s, item) for n, item in enumerate(items)
     ]

@@ -10,21 +10,22 @@ from urllib.request import urlopen
 import msgpack
 import pytest
 from builders.common import WAIT_S, eventually
-from builders.message_gateway import MessageGatewayEmulator
 from builders.records import decision_record
-from builders.short_messages import decision, with_crc
-from builders.short_messages import received as received_image
+from extensions.satellite.gateway import MessageGatewayEmulator
+from extensions.satellite.records import decision, with_crc
+from extensions.satellite.records import received as received_image
 from pydantic import ValidationError
 
 from sonarpost import keys
 from sonarpost.archive.image_files import PREVIEW_NOTE, image_file_name
-from sonarpost.bearers.rockblock import RockBlockAccount
-from sonarpost.bearers.short_message import ShortMessage, pack_decision, split
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.delivery.store import Store
 from sonarpost.errors import ConfigError, DatabaseUnavailableError, DeliveryError
+from sonarpost.extensions.satellite.config import ShortMessageOptions
+from sonarpost.extensions.satellite.rockblock import RockBlockAccount
+from sonarpost.extensions.satellite.short_message import ShortMessage, decision_fragments, pack_decision
 from sonarpost.messages import CodedImage
-from sonarpost.services.c2.config import C2Config, ShortMessageOptions
+from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
 from sonarpost.services.relay.service import RelayService
@@ -42,12 +43,12 @@ def received(number):
 
 @pytest.fixture(autouse=True)
 def fast(monkeypatch):
-    monkeypatch.setattr("sonarpost.bearers.receiver.ACKNOWLEDGE_AFTER_S", 0.1)
-    monkeypatch.setattr("sonarpost.bearers.sender.FIRST_TIMEOUT_S", 0.5)
-    monkeypatch.setattr("sonarpost.services.relay.satellite.POLL_S", 0.05)
-    monkeypatch.setattr("sonarpost.services.relay.satellite.RETRY_S", 0.1)
-    monkeypatch.setattr("sonarpost.services.c2.short_messages.CHECK_S", 0.05)
-    monkeypatch.setattr("sonarpost.services.c2.short_messages.RETRY_S", 0.1)
+    monkeypatch.setattr("sonarpost.extensions.satellite.receiver.ACKNOWLEDGE_AFTER_S", 0.1)
+    monkeypatch.setattr("sonarpost.extensions.satellite.sender.FIRST_TIMEOUT_S", 0.5)
+    monkeypatch.setattr("sonarpost.extensions.satellite.upstream.POLL_S", 0.05)
+    monkeypatch.setattr("sonarpost.extensions.satellite.upstream.RETRY_S", 0.1)
+    monkeypatch.setattr("sonarpost.extensions.satellite.input.CHECK_S", 0.05)
+    monkeypatch.setattr("sonarpost.extensions.satellite.input.RETRY_S", 0.1)
 
 
 @pytest.fixture
@@ -73,7 +74,7 @@ def begin_c2(runner, platform, tmp_path, gateway):
         )
         config = C2Config(out_dir=tmp_path / "out", short_messages=messages)
         service = runner.start(C2Service(platform("shore-1"), config))
-        gateway.webhook_url = f"http://127.0.0.1:{service._short_messages.port}/{TOKEN}"
+        gateway.webhook_url = f"http://127.0.0.1:{input_of(service).port}/{TOKEN}"
         return service
 
     return begin
@@ -92,6 +93,10 @@ def begin_relay(runner, platform, gateway):
 @pytest.fixture
 def source(runner):
     return runner.peer("vessel-1", "decompressor")
+
+
+def input_of(service):
+    return service._inputs["short-messages"]
 
 
 def side_cars(tmp_path):
@@ -211,7 +216,7 @@ def deliver(gateway, imei, data):
 
 
 def message(seq, *records):
-    items = tuple(item for n, record in enumerate(records) for item in split(pack_decision(record), n))
+    items = tuple(item for n, record in enumerate(records) for item in decision_fragments(pack_decision(record), n))
     return ShortMessage(5, seq, seq, items).pack()
 
 
@@ -239,7 +244,7 @@ def test_state_and_errors_of_one_vessel_do_not_delay_the_others(runner, begin_c2
     for imei in reversed(vessels):
         assert deliver(gateway, imei, message(0, decision("d1"))) == 200
     eventually(lambda: gateway.mailbox(IMEI)[0] is not None)
-    eventually(lambda: {"vessel-2", "vessel-3"} <= set(c2._short_messages.faults))
+    eventually(lambda: {"vessel-2", "vessel-3"} <= set(input_of(c2)._faults))
     health = c2.health()
     assert health.state == "degraded"
     assert health.counters["states_discarded"] == 2
@@ -299,7 +304,7 @@ def test_invalid_upstreams_are_refused(options, problem):
 def test_site_has_one_upstream_of_each_kind():
     satellite = UpstreamOptions(bearer="satellite", terminal="x")
     config = RelayConfig(upstreams=(UpstreamOptions(), satellite))
-    assert (config.sites(), config.satellites()) == ((UpstreamOptions(),), (satellite,))
+    assert (config.sites(), config.added()) == ((UpstreamOptions(),), (satellite,))
     assert RelayConfig(upstreams=(satellite,)).sites() == ()
     with pytest.raises(ValidationError, match="each site once by satellite"):
         RelayConfig(upstreams=(satellite, satellite))

@@ -15,9 +15,9 @@ from typing import Final, Protocol
 
 import serial
 
-from sonarpost.bearers.serial_device import close_port, open_port
 from sonarpost.errors import BadInputError, PortError
 from sonarpost.limits import limit
+from sonarpost.runtime.serial_device import close_port, open_port
 
 MAX_INCOMING_BYTES: Final = 270
 MAX_LINE_BYTES: Final = 200

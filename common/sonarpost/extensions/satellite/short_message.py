@@ -307,7 +307,7 @@ def unpack_decision(content: bytes, vessel_id: str, where: str = _WHERE) -> Deci
     return validated(Decision, fields | {"vessel_id": vessel_id}, where)
 
 
-def split(content: bytes, record_number: int) -> list[Item]:
+def decision_fragments(content: bytes, record_number: int) -> list[Item]:
     """Return a decision as one item, or as fragments if it does not fit a message.
 
     Raises:

@@ -7,7 +7,8 @@ from typing import Final
 
 import msgpack
 
-from sonarpost.bearers.short_message import (
+from sonarpost.errors import BadInputError
+from sonarpost.extensions.satellite.short_message import (
     WINDOW,
     ItemType,
     ShortAcknowledgement,
@@ -17,7 +18,6 @@ from sonarpost.bearers.short_message import (
     unpack_contact,
     unpack_decision,
 )
-from sonarpost.errors import BadInputError
 from sonarpost.limits import limit
 from sonarpost.link.state import SavedCount, Word, unpack_value
 from sonarpost.messages import Decision, ReceivedImage

@@ -6,13 +6,14 @@ import struct
 
 import msgpack
 import pytest
-from builders.short_messages import decision, received, with_crc
+from extensions.satellite.records import decision, received, with_crc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.bearers.policy import ByteBudget
-from sonarpost.bearers.receiver import ACKNOWLEDGE_AFTER_S, MAX_FRAGMENTS_KEPT, ShortMessageReceiver
-from sonarpost.bearers.sender import (
+from sonarpost.errors import BadInputError
+from sonarpost.extensions.satellite.policy import ByteBudget
+from sonarpost.extensions.satellite.receiver import ACKNOWLEDGE_AFTER_S, MAX_FRAGMENTS_KEPT, ShortMessageReceiver
+from sonarpost.extensions.satellite.sender import (
     PendingMessage,
     QueuedItem,
     ShortMessageSender,
@@ -20,8 +21,13 @@ from sonarpost.bearers.sender import (
     image_items,
     image_name,
 )
-from sonarpost.bearers.short_message import Item, ItemType, ShortAcknowledgement, ShortMessage, ShortMessageError
-from sonarpost.errors import BadInputError
+from sonarpost.extensions.satellite.short_message import (
+    Item,
+    ItemType,
+    ShortAcknowledgement,
+    ShortMessage,
+    ShortMessageError,
+)
 from sonarpost.link.state import SavedParts
 from sonarpost.messages import Decision
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import os
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -12,13 +13,15 @@ from urllib.parse import urlencode
 from urllib.request import Request, urlopen
 
 import pytest
+import serial
 from builders.common import eventually
-from builders.message_gateway import MessageGatewayEmulator
+from extensions.satellite.gateway import MessageGatewayEmulator
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.bearers import iridium
-from sonarpost.bearers.iridium import (
+from sonarpost.errors import BadInputError, ConfigError, DeliveryError, PortError
+from sonarpost.extensions.satellite import iridium
+from sonarpost.extensions.satellite.iridium import (
     ExchangeResult,
     IridiumTerminal,
     ReadBytes,
@@ -26,8 +29,14 @@ from sonarpost.bearers.iridium import (
     TerminalError,
     exchange_steps,
 )
-from sonarpost.bearers.rockblock import MAX_BODY_BYTES, RockBlockAccount, Webhook, WebhookError, parse_webhook
-from sonarpost.errors import BadInputError, ConfigError, DeliveryError, PortError
+from sonarpost.extensions.satellite.rockblock import (
+    MAX_BODY_BYTES,
+    RockBlockAccount,
+    Webhook,
+    WebhookError,
+    parse_webhook,
+)
+from sonarpost.runtime.serial_device import close_port, open_port
 
 IMEI = "300234010753370"
 TOKEN = "t0ken"
@@ -279,3 +288,16 @@ def test_exchange_with_a_terminal_has_a_time_limit_in_total(monkeypatch):
     with pytest.raises(TerminalError):
         terminal.exchange(b"x")
     assert clock[0] <= iridium.EXCHANGE_S + 2
+
+
+def test_terminal_does_not_take_a_port_in_use():
+    ends = os.openpty()
+    port = serial.serial_for_url(os.ttyname(ends[1]), do_not_open=True)
+    open_port(port)
+    try:
+        with closing(IridiumTerminal(port.port)) as terminal, pytest.raises(PortError, match="in use by "):
+            terminal.exchange(b"x")
+    finally:
+        close_port(port)
+        for end in ends:
+            os.close(end)

@@ -6,13 +6,16 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Any, cast
 
 import msgpack
 
-from sonarpost.bearers.iridium import IridiumTerminal, MessageBearer, TerminalError
-from sonarpost.bearers.policy import ByteBudget, Window
-from sonarpost.bearers.sender import (
+from sonarpost.errors import BadInputError, DeliveryError, PortError
+from sonarpost.extensions.satellite.config import SatelliteKeys
+from sonarpost.extensions.satellite.iridium import IridiumTerminal, TerminalError
+from sonarpost.extensions.satellite.policy import ByteBudget, Window
+from sonarpost.extensions.satellite.sender import (
     NextMessage,
     PendingMessage,
     QueuedItem,
@@ -21,14 +24,15 @@ from sonarpost.bearers.sender import (
     image_items,
     image_name,
 )
-from sonarpost.bearers.short_message import MAX_MESSAGE_BYTES, WINDOW
-from sonarpost.delivery.store import Store
-from sonarpost.errors import BadInputError, DeliveryError, PortError
+from sonarpost.extensions.satellite.short_message import MAX_MESSAGE_BYTES, WINDOW, ShortMessageError
 from sonarpost.link.state import SavedCount, Word, from_plain, unpack_value
-from sonarpost.logs import IntervalLog, kv
-from sonarpost.messages import Decision, ReceivedImage
-from sonarpost.runtime.service import UnitOfWork
-from sonarpost.services.relay.config import UpstreamOptions
+from sonarpost.logs import kv
+from sonarpost.messages import CodedImage, Decision
+from sonarpost.runtime.service import Service, UnitOfWork
+from sonarpost.services.relay.bearers import Bearer
+
+if TYPE_CHECKING:
+    from sonarpost.services.relay.config import UpstreamOptions
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +42,7 @@ RETRY_S = 30.0
 """Delay after a message that the terminal could not send."""
 
 
-class SatelliteUpstream:
+class SatelliteUpstream(Bearer):
     """Sends short messages to one site and processes the acknowledgements.
 
     Its records are copies: the images themselves wait for the radio. A record that a radio upstream of the same site
@@ -46,41 +50,32 @@ class SatelliteUpstream:
 
     Args:
         options: Configuration of the upstream.
+        service: The relay. States of its store with the site's prefix hold items, messages and the budget.
         has_radio: Whether the site also has a radio upstream.
-        store: Store of the relay; keys with the site's prefix hold items, messages and the budget.
-        count: Increases a health counter.
-        interval_log: Log of repeated faults of the terminal.
-        bearer: The terminal; by default that of the options.
     """
 
-    def __init__(
-        self,
-        options: UpstreamOptions,
-        store: Store,
-        count: Callable[[str], None],
-        interval_log: IntervalLog,
-        *,
-        has_radio: bool,
-        bearer: MessageBearer | None = None,
-    ) -> None:
-        self.options = options
-        self._store = store
-        self._count = count
-        self._log = interval_log
-        self._bearer = bearer or IridiumTerminal(options.terminal, options.baud)
-        self._prefix = f"short/{options.site}/"
+    KEYS = SatelliteKeys
+
+    def __init__(self, options: UpstreamOptions, service: Service[Any], *, has_radio: bool) -> None:
+        self.site = options.site
+        self._options = own = cast(SatelliteKeys, options)
+        self._store = store = service.store
+        self._count = service.count
+        self._log = service.interval_log(log, logging.WARNING, "Satellite terminal failed")
+        self._bearer = IridiumTerminal(own.terminal, own.baud)
+        self._prefix = f"short/{self.site}/"
         self._wake = threading.Event()
         self._lock = threading.Lock()
         self._withdrawn: list[str] = []
         self._fault = ""
         self._checked_s = 0.0
-        windows = tuple(Window.parse(text) for text in options.windows)
-        self._budget = ByteBudget(options.bytes_per_day, windows)
+        windows = tuple(Window.parse(text) for text in own.windows)
+        self._budget = ByteBudget(own.bytes_per_day, windows)
         store.read_state(f"{self._prefix}budget", self._budget.restore, None)
         messages = store.read_states(f"{self._prefix}message/", lambda _, data: PendingMessage.unpack(data))
         items = store.read_states(f"{self._prefix}item/", lambda _, data: QueuedItem.unpack(data))
         epoch, next_seq = self._first_numbers(messages.values())
-        self._sender = ShortMessageSender(epoch, next_seq, after_s=options.after_s if has_radio else 0.0)
+        self._sender = ShortMessageSender(epoch, next_seq, after_s=own.after_s if has_radio else 0.0)
         self._sender.restore(items.values(), messages.values(), time.time())
         number = store.read_state(
             f"{self._prefix}number", lambda data: from_plain(SavedCount, int.from_bytes(data, "big"), _WHERE), 0
@@ -101,17 +96,19 @@ class SatelliteUpstream:
 
     # Records
 
-    def queue(self, record: ReceivedImage | Decision, effects: UnitOfWork) -> None:
-        """Queue a record with the other effects of its handling; `committed` has to follow.
-
-        Raises:
-            ShortMessageError: It does not fit the format.
-        """
+    def queue(self, record: CodedImage | Decision, effects: UnitOfWork) -> None:
+        """Queue a record with the other effects of its handling; `committed` has to follow."""
         now_s = time.time()
-        if isinstance(record, Decision):
-            items = decision_items(record, self._next_number, now_s)
-        else:
-            items = image_items(record, self._next_number, self.options.preview_bytes, now_s)
+        try:
+            if isinstance(record, Decision):
+                items = decision_items(record, self._next_number, now_s)
+            else:
+                items = image_items(record, self._next_number, self._options.preview_bytes, now_s)
+        except ShortMessageError as error:
+            # The radio still delivers it.
+            effects.count("records_too_long_for_short_messages")
+            log.warning("Record not sent by short message", extra=kv(reason=str(error)))
+            return
         self._next_number += len(items)
         effects.put_state(f"{self._prefix}number", self._next_number.to_bytes(8, "big"))
         for item in items:
@@ -155,9 +152,9 @@ class SatelliteUpstream:
                 busy = False
                 self._fault = str(error) or type(error).__name__
                 if isinstance(error, (PortError, BadInputError, DeliveryError)):
-                    self._log.log(site=self.options.site, error=str(error))
+                    self._log.log(site=self.site, error=str(error))
                 else:  # a defect, or a library's own error: the radio and the other sites continue
-                    log.exception("Short messages failed; retrying", extra=kv(site=self.options.site))
+                    log.exception("Short messages failed; retrying", extra=kv(site=self.site))
                     self._count("short_messages_failed")
                     stopping.wait(RETRY_S)
             if not busy:
@@ -211,7 +208,7 @@ class SatelliteUpstream:
 
     def _is_check_due(self, now_s: float) -> bool:
         waits = self._sender.unacknowledged > 0 and self._budget.is_open(now_s)
-        return waits and now_s - self._checked_s >= self.options.check_interval_s
+        return waits and now_s - self._checked_s >= self._options.check_interval_s
 
     def _store_message(self, message: NextMessage, now_s: float) -> None:
         """Store a message and its cost before it is sent, so that no restart sends it under another number."""
@@ -236,13 +233,13 @@ class SatelliteUpstream:
             done = self._sender.acknowledge(data, time.time())
         except BadInputError as error:
             self._count("short_messages_refused")
-            self._log.log(site=self.options.site, error=str(error))
+            self._log.log(site=self.site, error=str(error))
             return
         with self._store.transaction() as tx:
             for seq in done:
                 tx.delete_state(self._message_name(seq))
         if done:
-            log.info("Short messages acknowledged", extra=kv(site=self.options.site, messages=len(done)))
+            log.info("Short messages acknowledged", extra=kv(site=self.site, messages=len(done)))
 
     def _item_name(self, number: int) -> str:
         return f"{self._prefix}item/{number}"
@@ -259,18 +256,18 @@ class SatelliteUpstream:
 
     def warning(self) -> str:
         """Return the fault of the terminal, or that the budget of the day is used."""
-        site = self.options.site
+        site = self.site
         if self._fault:
             return f"{site} by satellite: {self._fault}"
         now_s = time.time()
-        limit = self.options.bytes_per_day
+        limit = self._options.bytes_per_day
         if limit is not None and self._sender.waiting and self._budget.used_today(now_s) + MAX_MESSAGE_BYTES > limit:
             return f"{site} by satellite: {limit} bytes of the day are used; {self._sender.waiting} items wait"
         return ""
 
     def gauges(self) -> dict[str, float]:
         """Return queue, budget and cost; those that wait for the radio first are included."""
-        site, budget = self.options.site, self._budget
+        site, budget = self.site, self._budget
         found = {
             f"satellite_waiting_for_{site}": float(self._sender.waiting),
             f"satellite_unacknowledged_{site}": float(self._sender.unacknowledged),
@@ -278,6 +275,6 @@ class SatelliteUpstream:
             f"satellite_bytes_{site}": float(budget.total_bytes),
             f"satellite_messages_{site}": float(budget.total_messages),
         }
-        if self.options.cost_per_kb is not None:
-            found[f"satellite_cost_{site}"] = budget.total_bytes / 1000 * self.options.cost_per_kb
+        if self._options.cost_per_kb is not None:
+            found[f"satellite_cost_{site}"] = budget.total_bytes / 1000 * self._options.cost_per_kb
         return found

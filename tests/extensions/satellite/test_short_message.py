@@ -5,12 +5,13 @@ import math
 
 import pytest
 from builders.common import REPOSITORY
-from builders.short_messages import decision, golden, received, with_crc
+from extensions.satellite.records import decision, golden, received, with_crc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.bearers.receiver import ShortMessageReceiver
-from sonarpost.bearers.short_message import (
+from sonarpost.errors import BadInputError
+from sonarpost.extensions.satellite.receiver import ShortMessageReceiver
+from sonarpost.extensions.satellite.short_message import (
     FRAGMENT_BYTES,
     MAX_ACKNOWLEDGEMENT_BYTES,
     MAX_ITEM_BYTES,
@@ -21,14 +22,13 @@ from sonarpost.bearers.short_message import (
     ShortMessage,
     ShortMessageError,
     contact_head_bytes,
+    decision_fragments,
     fragment,
     pack_contact,
     pack_decision,
-    split,
     unpack_contact,
     unpack_decision,
 )
-from sonarpost.errors import BadInputError
 
 GOLDEN = json.loads((REPOSITORY / "tests/golden/short-message/v1.json").read_text())
 
@@ -80,7 +80,7 @@ def test_preview_ends_before_the_first_missing_byte():
 def test_decision_is_the_same_record(remark, confidence, overrules):
     record = decision("d9", remark=remark, confidence=confidence, overrules=tuple(overrules))
     assert unpack_decision(pack_decision(record), "vessel-1") == record
-    items = split(pack_decision(record), 3)
+    items = decision_fragments(pack_decision(record), 3)
     if len(items) > 1:
         content = b"".join(fragment(item.content)[3] for item in items)
         assert content == pack_decision(record)
@@ -145,9 +145,9 @@ def test_error_names_the_invalid_field(message, problem):
 
 
 def test_too_long_a_decision_is_refused():
-    assert len(split(bytes(255 * FRAGMENT_BYTES), 0)) == 255
+    assert len(decision_fragments(bytes(255 * FRAGMENT_BYTES), 0)) == 255
     with pytest.raises(ShortMessageError, match="decision"):
-        split(bytes(255 * FRAGMENT_BYTES + 1), 0)
+        decision_fragments(bytes(255 * FRAGMENT_BYTES + 1), 0)
     with pytest.raises(ShortMessageError, match="length: got"):
         ShortMessage(0, 0, 0, (Item(ItemType.CONTACT, bytes(400)),)).pack()
     with pytest.raises(ShortMessageError, match="values that fit"):

@@ -6,23 +6,28 @@ import logging
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self, cast
 
 from sonarpost import keys, wire
 from sonarpost.archive.decoder import Decoder
 from sonarpost.archive.image_files import PREVIEW_NOTE
-from sonarpost.bearers.receiver import ShortMessageReceiver
-from sonarpost.bearers.rockblock import RockBlockAccount, TerminalMessage, Webhook, WebhookError
-from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError
+from sonarpost.extensions.satellite.config import ShortMessageKeys, ShortMessageOptions
+from sonarpost.extensions.satellite.receiver import ShortMessageReceiver
+from sonarpost.extensions.satellite.rockblock import RockBlockAccount, TerminalMessage, Webhook, WebhookError
 from sonarpost.link.state import SavedParts
-from sonarpost.logs import IntervalLog, kv
+from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReceivedImage, ReconstructedImage, Relayed
-from sonarpost.services.c2.config import ShortMessageOptions
+from sonarpost.runtime.service import Service
+from sonarpost.services.c2.inputs import Input
+
+if TYPE_CHECKING:
+    from sonarpost.services.c2.config import C2Config
 
 log = logging.getLogger(__name__)
 
@@ -56,53 +61,41 @@ class Access:
         return cls(token, RockBlockAccount(config.gateway, config.username, _secret(config.password_file, 1)))
 
 
-class ShortMessages:
+class ShortMessages(Input):
     """Accepts messages of terminals. Their records enter c2's inbox as if a relay had delivered them.
 
     Args:
-        config: Configuration.
-        access: Its secrets.
-        codebooks: Names or files of tile codebooks.
-        site: Name of the site.
-        store: Store of c2, with the inbox.
-        count: Increases a health counter.
-        check_capacity: Raises RetryLaterError if a record on a key cannot be stored now.
-        before_accepting: Commits records to an archive that several c2 share; see `Service.before_accepting`.
-        interval_log: Log of refused messages and failed acknowledgements.
-
-    Attributes:
-        faults: Why a vessel's messages are not acknowledged at present, by vessel.
+        config: The table of c2.
+        options: Its table `short_messages`.
 
     Raises:
         CodebookError: A codebook cannot be read.
+        ConfigError: A secret is invalid.
     """
 
-    def __init__(
-        self,
-        config: ShortMessageOptions,
-        access: Access,
-        codebooks: Sequence[str],
-        site: str,
-        store: Store,
-        count: Callable[[str], None],
-        check_capacity: Callable[[str], None],
-        before_accepting: Callable[[Sequence[tuple[str, bytes]]], None],
-        interval_log: IntervalLog,
-    ) -> None:
-        self._config = config
-        self._site = site
-        self._store = store
-        self._count = count
-        self._check_capacity = check_capacity
-        self._before_accepting = before_accepting
-        self._log = interval_log
-        self._access = access
-        self._decoder = Decoder(codebooks)
+    KEYS = ShortMessageKeys
+
+    def __init__(self, config: C2Config, options: ShortMessageOptions) -> None:
+        self._config = options
+        self._site = config.site
+        self._access = Access.read(self._config)
+        self._decoder = Decoder(config.codebooks)
         self._webhook: Webhook | None = None
         self._lock = threading.Lock()
-        self._terminals = {vessel: imei for imei, vessel in config.vessels.items()}
+        self._terminals = {vessel: imei for imei, vessel in self._config.vessels.items()}
         self._receivers: dict[str, tuple[ShortMessageReceiver, SavedParts]] = {}
-        self.faults: dict[str, str] = {}
+        # Why a vessel's messages are not acknowledged at present.
+        self._faults: dict[str, str] = {}
+
+    @classmethod
+    def configured(cls, config: C2Config) -> Self | None:
+        """Return the input for the table of c2; None without `short_messages`."""
+        options = cast(ShortMessageKeys, config).short_messages
+        return None if options is None else cls(config, options)
+
+    def faults(self) -> Iterable[str]:
+        """Return whose messages are not acknowledged at present, and why."""
+        return list(self._faults.values())
 
     @property
     def port(self) -> int:
@@ -110,8 +103,13 @@ class ShortMessages:
         assert self._webhook is not None
         return self._webhook.port
 
-    def open(self) -> None:
-        """Open the webhook."""
+    def open(self, service: Service[Any]) -> None:
+        """Open the webhook for a c2."""
+        self._store = service.store
+        self._count = service.count
+        self._check_capacity = service.check_capacity
+        self._before_accepting = service.before_accepting
+        self._log = service.interval_log(log, logging.WARNING, "Short message refused or not acknowledged")
         self._webhook = Webhook(self._config.host, self._config.port, self._access.token, self._receive)
         log.info("Webhook for short messages open", extra=kv(host=self._config.host, port=self._webhook.port))
 
@@ -207,10 +205,10 @@ class ShortMessages:
                     continue
                 try:
                     self._acknowledge(vessel, imei)
-                    self.faults.pop(vessel, None)
+                    self._faults.pop(vessel, None)
                 except Exception as error:
                     retry_s[vessel] = time.monotonic() + RETRY_S
-                    self.faults[vessel] = f"short messages of {vessel} not acknowledged: {error}"
+                    self._faults[vessel] = f"short messages of {vessel} not acknowledged: {error}"
                     self._count("short_acknowledgements_failed")
                     if not isinstance(error, DeliveryError):
                         log.exception("Short messages not acknowledged after an unexpected exception")
