@@ -35,7 +35,6 @@ from sonarpost.bus.session import client_config
 from sonarpost.codec.registry import default_registry
 from sonarpost.delivery.outbox import Outbox, QueuePolicy
 from sonarpost.delivery.store import Store
-from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.messages import Contact, Health, ImagePart, Pixels, Snippet
 from sonarpost.services.console.store.users import Users
 from sonarpost.sonar.xtf_writer import write_xtf
@@ -322,7 +321,8 @@ class Site:
         """A recording in the folder of the detector, until it is processed."""
         [number] = self.numbers(1)
         path = self.folder / f"good-{number}.xtf"
-        write_xtf(simulate_survey(SurveySpec(seed=number + 1, pings=200, samples=512)).survey, path)
+        simulator = import_module("sonarpost.extensions.simulation.seabed.survey")
+        write_xtf(simulator.simulate_survey(simulator.SurveySpec(seed=number + 1, pings=200, samples=512)).survey, path)
         begin_s = time.monotonic()
         path.rename(self.incoming / path.name)
         return self.logged("atd_stub", [f"File processed file={path.name} "], begin_s)

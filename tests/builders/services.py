@@ -10,6 +10,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,12 @@ import zenoh
 from builders.common import eventually, publish_once
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.extensions.simulation.channel.config import EmulatorConfig, ModemSite
-from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
-from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.messages import Contact, Health, Pixels, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.sonar.xtf_writer import write_xtf
+
+SIMULATION = "sonarpost.extensions.simulation"
+"""Tests that use it are skipped without that extension."""
 
 PlatformMaker = Callable[[str], PlatformConfig]
 
@@ -189,7 +190,9 @@ def survey_bytes(tmp_path_factory):
     def make(seed):
         if seed not in made:
             path = folder / f"{seed}.xtf"
-            write_xtf(simulate_survey(SurveySpec(seed=seed, pings=200, samples=512)).survey, path)
+            simulator = pytest.importorskip(f"{SIMULATION}.seabed.survey")
+            spec = simulator.SurveySpec(seed=seed, pings=200, samples=512)
+            write_xtf(simulator.simulate_survey(spec).survey, path)
             made[seed] = path.read_bytes()
         return made[seed]
 
@@ -299,15 +302,16 @@ class ModemPair:
 
     def __init__(self, folder):
         self.folder = folder
-        self._channel: ChannelEmulator | None = None
+        self._channel: Any = None
 
     def port(self, modem):
         return str(self.folder / f"modem-{modem}")
 
     def start(self, *, time_scale=150.0, echo=None, **channel):
-        modems = (ModemSite(address=1), ModemSite(address=3, east_m=150.0))
-        config = EmulatorConfig(modem=modems, **channel, pty_dir=self.folder, time_scale=time_scale)
-        self._channel = ChannelEmulator(config, echo)
+        config = pytest.importorskip(f"{SIMULATION}.channel.config")
+        modems = (config.ModemSite(address=1), config.ModemSite(address=3, east_m=150.0))
+        settings = config.EmulatorConfig(modem=modems, **channel, pty_dir=self.folder, time_scale=time_scale)
+        self._channel = import_module(f"{SIMULATION}.channel.emulator").ChannelEmulator(settings, echo)
         self._channel.start()
         return self._channel
 
