@@ -23,8 +23,8 @@ from playwright.sync_api import Page, sync_playwright
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
-from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import PlatformConfig
+from sonarpost.extensions.simulation.demo.settings import free_ports
 from sonarpost.extensions.training.contacts import simulated_contacts
 from sonarpost.extensions.training.simulator import VESSEL, TrainingSimulator
 from sonarpost.messages import ReconstructedImage

@@ -32,12 +32,12 @@ import zenoh
 from research.fleet import open_session
 from research.recording_relay import acknowledged
 from sonarpost import keys, wire
-from sonarpost.cli.demo.chain import Chain
-from sonarpost.cli.demo.outcome import read_channel_log
-from sonarpost.cli.demo.settings import ROUTER_PORTS, UUV, VESSEL, ChainSettings, reserved_ports
-from sonarpost.cli.demo.watch import Watcher
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.delivery.client import deliver
+from sonarpost.extensions.simulation.demo.chain import Chain
+from sonarpost.extensions.simulation.demo.outcome import read_channel_log
+from sonarpost.extensions.simulation.demo.settings import ROUTER_PORTS, UUV, VESSEL, ChainSettings, reserved_ports
+from sonarpost.extensions.simulation.demo.watch import Watcher
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.link.frames.contact_record import RECORD_SIZE

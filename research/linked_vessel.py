@@ -18,10 +18,10 @@ from research.fleet import open_session
 from research.relay_throughput import VESSEL, Sink, decision, platform
 from sonarpost import keys, wire
 from sonarpost.bus.session import router_config
-from sonarpost.cli.demo.settings import free_ports
 from sonarpost.config import ServiceConfig
 from sonarpost.delivery.records import OutboxItem, ReceivedChunk
 from sonarpost.delivery.transaction import Transaction
+from sonarpost.extensions.simulation.demo.settings import free_ports
 from sonarpost.messages import CodedImage, ImagePart, Record, Relayed
 from sonarpost.runtime.service import UnitOfWork
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions

@@ -53,12 +53,12 @@ from research.peers.base import StartError
 from sonarpost import keys, wire
 from sonarpost.archive.image_parts import whole_part
 from sonarpost.bus.session import client_config, router_config
-from sonarpost.cli.demo.settings import free_ports
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.congestion import MAX_WINDOW_BYTES
 from sonarpost.delivery.protocol import CHUNK_BYTES
 from sonarpost.delivery.scheduler import WINDOW
+from sonarpost.extensions.simulation.demo.settings import free_ports
 from sonarpost.logs import configure_logging
 from sonarpost.messages import Decision, ImagePart, Record, Relayed
 from sonarpost.runtime.process import tune_interpreter

@@ -35,10 +35,10 @@ from research.common.link_emulator import LinkEmulator
 from research.fleet import Processes, coded_image, open_session
 from sonarpost import keys
 from sonarpost.bus import router
-from sonarpost.cli.demo.settings import free_ports
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.client import deliver
+from sonarpost.extensions.simulation.demo.settings import free_ports
 from sonarpost.messages import ImagePart, Record, Relayed
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.security.fleet import Fleet

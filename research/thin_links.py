@@ -49,8 +49,8 @@ from research.peers import PEERS, AbsentError
 from research.relay_throughput import VESSEL
 from sonarpost import keys, wire
 from sonarpost.archive.image_parts import whole_part
-from sonarpost.cli.demo.settings import free_ports
 from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.extensions.simulation.demo.settings import free_ports
 from sonarpost.messages import CodedImage
 
 RATES = (2000, 8000, 16_000, 32_000, 128_000)

@@ -52,9 +52,6 @@ READS = {
     "common/sonarpost/runtime/serial_device.py": "/proc of the kernel",
     "common/sonarpost/bus/router.py": OWN_SETTINGS,
     "common/sonarpost/cli/c2/migrate.py": "decision of the archive",
-    "common/sonarpost/cli/demo/chain.py": "log of the demonstration",
-    "common/sonarpost/cli/demo/command.py": "log of the demonstration",
-    "common/sonarpost/cli/demo/outcome.py": "files of the demonstration",
     "common/sonarpost/cli/deployment/config_files.py": SHIPPED,
     "common/sonarpost/cli/deployment/install_units.py": SHIPPED,
     "common/sonarpost/cli/detection/transmissions.py": OWN_SETTINGS,
@@ -134,7 +131,6 @@ RAISES = {
     "common/sonarpost/cli/dataset.py: _load: load_labelled_image": "the states of the contacts were selected before",
     "common/sonarpost/cli/pki.py: run_acoustic: create_key": MAPPED,
     "common/sonarpost/cli/pki.py: run_router_config: write_new": MAPPED,
-    "common/sonarpost/delivery/inspection.py: inspect.read: query": "a method of another class",
     "services/atd_stub/service.py: AtdStubService._process: _content_of": "its caller tries the file again",
     "services/atd_stub/service.py: _known_parts: recording_parts": "the listing of the folder reports the recording",
 }

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from research.peers.base import POLL_S, START_TIMEOUT_S, Peer, StartError, program, server
-from sonarpost.cli.demo.settings import free_ports
+from sonarpost.extensions.simulation.demo.settings import free_ports
 
 WINDOW = 512
 SENT, RECEIVED = "sent", "received"

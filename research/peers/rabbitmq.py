@@ -20,7 +20,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from research.peers.base import START_TIMEOUT_S, AbsentError, Peer, StartError, program, server
-from sonarpost.cli.demo.settings import free_ports
+from sonarpost.extensions.simulation.demo.settings import free_ports
 
 if TYPE_CHECKING:
     import pika

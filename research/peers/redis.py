@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from research.peers.base import Peer, StartError, program, server
-from sonarpost.cli.demo.settings import free_ports
+from sonarpost.extensions.simulation.demo.settings import free_ports
 
 BATCH = 512
 RECONNECT_S = 1.0

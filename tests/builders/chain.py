@@ -13,10 +13,10 @@ from builders.common import eventually, free_port
 from builders.history import History
 from builders.progress import wait_while_progressing
 from sonarpost import keys
-from sonarpost.cli.demo.chain import Chain
-from sonarpost.cli.demo.outcome import evaluate, last_versions, read_images
-from sonarpost.cli.demo.settings import VESSEL, ChainSettings
-from sonarpost.cli.demo.watch import Watcher
+from sonarpost.extensions.simulation.demo.chain import Chain
+from sonarpost.extensions.simulation.demo.outcome import evaluate, last_versions, read_images
+from sonarpost.extensions.simulation.demo.settings import VESSEL, ChainSettings
+from sonarpost.extensions.simulation.demo.watch import Watcher
 from sonarpost.link.frames.paper.frame import parse_frame
 from sonarpost.messages import AcousticFrame, ReceivedImage
 from sonarpost.sonar.image_files import write_png

@@ -34,9 +34,9 @@ from builders.small_disk import SmallDisk
 from builders.vessel_and_shore import UNFINISHED
 from research.common.link_emulator import LinkEmulator
 from sonarpost import keys
-from sonarpost.cli.demo.chain import ROUTERS, Chain
-from sonarpost.cli.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
 from sonarpost.config import PlatformConfig
+from sonarpost.extensions.simulation.demo.chain import ROUTERS, Chain
+from sonarpost.extensions.simulation.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
 from sonarpost.sonar.image_files import write_png
 
 PROCESSES = (*ROUTERS, *PLATFORM_OF)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from builders.common import REPOSITORY
-from sonarpost.cli.demo.settings import PLATFORM_OF
+from sonarpost.extensions.simulation.demo.settings import PLATFORM_OF
 
 PROFILES = ("sim", "uuv", "vessel", "shore")
 ROUTERS = ("router-uuv", "router-vessel", "router-shore", "router-sim")

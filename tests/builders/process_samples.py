@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.cli.demo.chain import Chain
+from sonarpost.extensions.simulation.demo.chain import Chain
 
 
 @dataclass(frozen=True)

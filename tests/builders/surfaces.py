@@ -31,8 +31,8 @@ import reference  # type: ignore[import-not-found]  # packaging/docs is no packa
 LISTENING = {"bind", "listen", "create_server", "start_server"}
 OUTSIDE = ("watchers", "the configured consumers")
 """Receivers that are no service of the product."""
-SIMULATED = ("extensions.simulation", "cli.demo")
-"""Packages for tests and demonstrations, which listen on the local host only."""
+SIMULATED = "extensions.simulation"
+"""Package for tests and demonstrations, which listens on the local host only."""
 
 
 def surfaces() -> set[str]:

@@ -97,7 +97,7 @@ def test_no_library_is_loaded_without_a_command_and_none_of_the_other_commands()
         f"loaded = set('{LIGHT}'.split()) & sys.modules.keys()\n"
         "assert not loaded, loaded\n"
         "parser('pki')\n"
-        "assert not {'scipy', 'numba', 'sonarpost.cli.demo'} & sys.modules.keys(), 'loaded what pki does not need'\n"
+        "assert not {'scipy', 'numba', 'sonarpost.cli.encode'} & sys.modules.keys(), 'loaded what pki does not need'\n"
         "parser()\nassert not all_extras().keys() & sys.modules.keys(), 'loaded what few commands need'"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
@@ -168,7 +168,6 @@ def test_another_missing_module_is_a_defect():
         ("decode --codebook help", "nominal-10", "FILE"),
         ("encode --model help", "standard (default)", "structure"),
         ("encode --packing help", "14bit", "ascii5"),
-        ("demo --rate help", "0  1 x  32 B =   32 B in", "5  8 x 256 B = 2048 B in"),
         ("pki issue --role help", "uuv", "vessel"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Survey options: one file and one pair of options for `detect`, `survey`, `demo`, `run atd_stub` and the vehicle."""
+"""Survey options: one file and one pair of options for `detect`, `survey`, `run atd_stub` and the vehicle."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import runpy
 import pytest
 from pyproj import Transformer
 
-from sonarpost.cli.demo.command import _detection_settings
 from sonarpost.cli.main import main, parser
 from sonarpost.cli.shared import survey_options_of
 from sonarpost.config import load
@@ -80,10 +79,6 @@ def test_every_command_and_the_vehicle_use_the_same_options(crs, options, tmp_pa
     for command in (["detect", "x.xtf"], *(["survey", name, "x.xtf"] for name in ("info", "plot", "export"))):
         assert survey_options_of(parser(command[0]).parse_args([*command, *given])) == want
 
-    lines = "\n".join(line for _, line in _detection_settings(parser("demo").parse_args(["demo", *given])))
-    (tmp_path / "demo.toml").write_text(f'[platform]\nid = "uuv-1"\n[atd_stub]\n{lines}\n')
-    assert as_options(load(tmp_path / "demo.toml", "atd_stub", AtdStubConfig, {})[1]) == want
-
     found = []
 
     def run_module(name, **_):
@@ -117,26 +112,19 @@ def test_keys_of_the_vehicle_can_be_in_a_file_or_in_the_table(options, tmp_path)
 @pytest.mark.parametrize(
     ("command", "given", "message"),
     [("detect", *each) for each in WRONG]
-    + [(name, *WRONG[0]) for name in ("survey info", "survey plot", "survey export", "demo", "run")],
+    + [(name, *WRONG[0]) for name in ("survey info", "survey plot", "survey export", "run")],
 )
 def test_wrong_options_are_one_line_before_any_work(command, given, message, tmp_path, config, capsys):
     (tmp_path / "a.xtf").write_bytes(b"not read before the options are valid")
-    file = {
-        "demo": ["--survey", str(tmp_path / "a.xtf"), "--out", str(tmp_path / "out")],
-        "run": ["atd_stub", "--config", str(config)],
-    }.get(command, [str(tmp_path / "a.xtf")])
+    file = ["atd_stub", "--config", str(config)] if command == "run" else [str(tmp_path / "a.xtf")]
     assert main([*command.split(), *file, *given]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert message in line
-    assert not (tmp_path / "out").exists()
 
 
-def test_other_services_and_images_take_no_survey_options(tmp_path, config, capsys):
+def test_other_services_take_no_survey_options(tmp_path, config, capsys):
     assert main(["run", "compressor", "--config", str(config), "--crs", "EPSG:32616"]) == 2
     assert "survey options for atd_stub only" in capsys.readouterr().err
-    (tmp_path / "a.png").touch()
-    assert main(["demo", "--images", str(tmp_path), "--crs", "EPSG:32616", "--out", str(tmp_path / "out")]) == 2
-    assert "expected --survey with --options, --crs or --threshold" in capsys.readouterr().err
 
 
 def test_positions_in_metres_are_those_of_pyproj(tmp_path):

@@ -8,8 +8,8 @@ from builders.chain import latest_versions
 from builders.common import free_port
 
 from research.common.link_emulator import LinkEmulator
-from sonarpost.cli.demo.outcome import read_channel_log, read_images
-from sonarpost.cli.demo.settings import PLATFORM_OF
+from sonarpost.extensions.simulation.demo.outcome import read_channel_log, read_images
+from sonarpost.extensions.simulation.demo.settings import PLATFORM_OF
 
 pytestmark = pytest.mark.chain
 

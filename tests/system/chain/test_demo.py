@@ -13,8 +13,8 @@ from builders.chain import snippet
 from builders.common import eventually
 from PIL import Image
 
-from sonarpost.cli.demo.settings import UUV_ADDRESS
 from sonarpost.cli.main import main
+from sonarpost.extensions.simulation.demo.settings import UUV_ADDRESS
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.image_files import write_png, write_tiff

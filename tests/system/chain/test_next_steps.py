@@ -14,7 +14,7 @@ import pytest
 from builders.chain import snippet
 from builders.common import LONG_WAIT_S, REPOSITORY, eventually
 
-from sonarpost.cli.demo.settings import reserved_ports
+from sonarpost.extensions.simulation.demo.settings import reserved_ports
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.image_files import write_png
 from sonarpost.sonar.xtf_writer import write_xtf

@@ -14,7 +14,7 @@ from builders.chain import snippet
 from builders.common import LONG_WAIT_S, eventually, free_port
 from builders.installation import installation
 
-from sonarpost.cli.demo.outcome import read_images
+from sonarpost.extensions.simulation.demo.outcome import read_images
 from sonarpost.security.acoustic_key import create_key
 from sonarpost.sonar.image_files import write_png
 

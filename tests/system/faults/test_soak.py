@@ -25,9 +25,9 @@ from builders.numbered_snippet import number_of, numbered_snippet
 from builders.process_samples import Samples
 from builders.progress import wait_while_progressing
 
-from sonarpost.cli.demo.chain import ROUTERS, Chain
-from sonarpost.cli.demo.outcome import read_images
-from sonarpost.cli.demo.settings import PLATFORM_OF, ChainSettings
+from sonarpost.extensions.simulation.demo.chain import ROUTERS, Chain
+from sonarpost.extensions.simulation.demo.outcome import read_images
+from sonarpost.extensions.simulation.demo.settings import PLATFORM_OF, ChainSettings
 from sonarpost.sonar.image_files import write_png
 
 CONTACTS = int(os.environ.get("SONARPOST_SOAK_CONTACTS", "60"))

@@ -12,7 +12,7 @@ import pytest
 from builders.common import REPOSITORY
 from packaging.requirements import Requirement
 
-from sonarpost.cli.demo.settings import PLATFORM_OF
+from sonarpost.extensions.simulation.demo.settings import PLATFORM_OF
 from sonarpost.sonar.image_files import write_png
 
 

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 GROUP: Final = "sonarpost.commands"
 
 COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
-    "demo": ("cli.demo", "run the whole chain on this host, from a survey file to the shore"),
     "run": ("cli.run", "run one service of the chain, or all services of a platform"),
     "router": ("cli.run", "run an embedded Zenoh router"),
     "status": ("cli.status", "show the services of all platforms, live"),
@@ -74,7 +73,6 @@ EXTRAS: Final[Mapping[str, str]] = {
 """Package -> the extra that installs it."""
 
 EXAMPLES: Final[Mapping[str, str]] = {
-    "demo": "demo --loss 0.3 --seed 3",
     "run": "run compressor --config uuv.toml",
     "router": "router --listen tcp/127.0.0.1:7447",
     "status": "status --router tcp/127.0.0.1:7447 --once",

@@ -6,6 +6,11 @@ from typing import Final
 
 from sonarpost.cli.parsing.commands import AddedCommand
 
+DEMO: Final = AddedCommand(
+    "run the whole chain on this host, from a survey file to the shore",
+    "sonarpost.extensions.simulation.demo.command:add_parser",
+    {"demo": "demo --loss 0.3 --seed 3"},
+)
 SIMULATE: Final = AddedCommand(
     "write a simulated side-scan survey as XTF",
     "sonarpost.extensions.simulation.simulate:add_parser",

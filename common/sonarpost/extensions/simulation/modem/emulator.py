@@ -240,7 +240,7 @@ class EmulatedMicroModem:
         version = "info.firmware_version"
         if self.config.generation > 1 and (everything or version == name or version.startswith(f"{name}.")):
             settings.append((version, FIRMWARE_VERSIONS[2]))
-        for stored, value in settings or [self.settings.query(name)]:
+        for stored, value in settings or [self.settings.stored(name)]:
             self._send("CACFG", stored, value)
 
     def _on_reboot(self, sentence: Sentence, now: float) -> None:

@@ -115,7 +115,7 @@ class NvramSettings:
         """Return the settings whose dotted names begin with `name.`, in alphabetical order."""
         return [(stored, value) for stored, value in self.items() if stored.startswith(f"{name}.")]
 
-    def query(self, name: str) -> tuple[str, int]:
+    def stored(self, name: str) -> tuple[str, int]:
         """Return the stored form of a name, and its value.
 
         Raises:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 from typing import IO
 
-from sonarpost.cli.demo.settings import PLATFORM_OF, ChainSettings, write_config
 from sonarpost.cli.deployment.processes import Processes
 from sonarpost.config import service_packages
 from sonarpost.errors import SonarpostError
+from sonarpost.extensions.simulation.demo.settings import PLATFORM_OF, ChainSettings, write_config
 
 ROUTERS = ("router-uuv", "router-vessel", "router-shore")
 

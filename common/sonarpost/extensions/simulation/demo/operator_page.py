@@ -7,7 +7,7 @@ import webbrowser
 
 from rich.console import Console
 
-from sonarpost.cli.demo.settings import VESSEL, ChainSettings
+from sonarpost.extensions.simulation.demo.settings import VESSEL, ChainSettings
 from sonarpost.services.console.store.users import FILE_NAME, LINK_S, Users, login_link
 
 USER = "op"

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from sonarpost.cli.demo import command
-from sonarpost.cli.main import main
+from sonarpost.cli.main import main, parser
+from sonarpost.config import load
+from sonarpost.extensions.simulation.demo import command
+from sonarpost.services.atd_stub.config import AtdStubConfig
 
 
 def test_a_foreign_output_folder_is_refused_before_the_survey_is_simulated(tmp_path, monkeypatch, capsys):
@@ -41,6 +43,7 @@ def test_a_file_that_cannot_be_read_is_refused_before_anything_is_started(name, 
 @pytest.mark.parametrize(
     ("option", "message"),
     [
+        ("--crs=EPSG:4326", "--crs: projected_crs: got 'EPSG:4326', expected a projected coordinate system"),
         *((f"--threshold={value}", "--threshold: got") for value in ("2.1", "-0.1", "nan")),
         ("--rate=9", "--rate: got 9, expected one of [0, 1, 2, 3, 4, 5, 6]"),
     ],
@@ -49,3 +52,27 @@ def test_an_option_out_of_range_is_refused(option, message, tmp_path, capsys):
     assert main(["demo", option, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_survey_options_are_those_of_the_vehicle(tmp_path):
+    options = tmp_path / "options.toml"
+    options.write_text('port_order = "nearest_first"\n')
+    given = ["--options", str(options), "--crs", "EPSG:32616"]
+    lines = "\n".join(line for _, line in command._detection_settings(parser("demo").parse_args(["demo", *given])))
+    (tmp_path / "demo.toml").write_text(f'[platform]\nid = "uuv-1"\n[atd_stub]\n{lines}\n')
+    table = load(tmp_path / "demo.toml", "atd_stub", AtdStubConfig, {})[1]
+    assert (table.port_order, table.projected_crs) == ("nearest_first", "EPSG:32616")
+
+
+def test_images_take_no_survey_options(tmp_path, capsys):
+    (tmp_path / "a.png").touch()
+    assert main(["demo", "--images", str(tmp_path), "--crs", "EPSG:32616", "--out", str(tmp_path / "out")]) == 2
+    assert "expected --survey with --options, --crs or --threshold" in capsys.readouterr().err
+
+
+def test_rates_are_listed(capsys):
+    with pytest.raises(SystemExit):
+        main(["demo", "--rate", "help"])
+    printed = capsys.readouterr().out
+    assert printed.startswith("0  1 x  32 B =   32 B in")
+    assert "5  8 x 256 B = 2048 B in" in printed

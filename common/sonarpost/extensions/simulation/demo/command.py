@@ -14,17 +14,17 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from sonarpost.cli.demo.chain import Chain
-from sonarpost.cli.demo.next_steps import commands, folder_lines, routers_line
-from sonarpost.cli.demo.operator_page import OperatorPage
-from sonarpost.cli.demo.outcome import evaluate
-from sonarpost.cli.demo.own_images import usable_images
-from sonarpost.cli.demo.report import show
-from sonarpost.cli.demo.settings import CONSOLE_PORT, ROUTER_PORTS, ChainSettings, reserved_ports
-from sonarpost.cli.demo.watch import Watcher
 from sonarpost.cli.progress import progress_console
 from sonarpost.cli.shared import add_fit_option, add_survey_options, print_notes, survey_options_of
 from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.extensions.simulation.demo.chain import Chain
+from sonarpost.extensions.simulation.demo.next_steps import commands, folder_lines, routers_line
+from sonarpost.extensions.simulation.demo.operator_page import OperatorPage
+from sonarpost.extensions.simulation.demo.outcome import evaluate
+from sonarpost.extensions.simulation.demo.own_images import usable_images
+from sonarpost.extensions.simulation.demo.report import show
+from sonarpost.extensions.simulation.demo.settings import CONSOLE_PORT, ROUTER_PORTS, ChainSettings, reserved_ports
+from sonarpost.extensions.simulation.demo.watch import Watcher
 from sonarpost.extensions.simulation.modem.emulated import emulated_drivers
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind

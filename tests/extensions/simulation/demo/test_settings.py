@@ -7,7 +7,7 @@ from itertools import islice
 
 from builders.common import PORTS, free_port, worker_ports
 
-from sonarpost.cli.demo.settings import free_ports, reserved_ports
+from sonarpost.extensions.simulation.demo.settings import free_ports, reserved_ports
 
 
 def test_free_port_is_reserved_and_can_be_listened_on():

@@ -9,8 +9,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sonarpost.cli.demo.settings import UUV_ADDRESS, ChainSettings
 from sonarpost.errors import FrameError
+from sonarpost.extensions.simulation.demo.settings import UUV_ADDRESS, ChainSettings
 from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, parse_frame
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.receiver import ImageUpdate

@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from sonarpost.cli.demo.outcome import evaluate
-from sonarpost.cli.demo.settings import UUV_ADDRESS, ChainSettings
 from sonarpost.codec import encode
+from sonarpost.extensions.simulation.demo.outcome import evaluate
+from sonarpost.extensions.simulation.demo.settings import UUV_ADDRESS, ChainSettings
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.sender import plan_packets
 

@@ -9,7 +9,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from sonarpost.cli.demo.settings import ChainSettings
+from sonarpost.extensions.simulation.demo.settings import ChainSettings
 
 SUBSCRIBER = Path("examples/shore_subscriber.py")
 

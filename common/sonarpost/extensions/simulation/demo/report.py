@@ -8,14 +8,14 @@ from typing import Literal
 from rich.console import Console
 from rich.table import Table
 
-from sonarpost.cli.demo.next_steps import shown
-from sonarpost.cli.demo.outcome import Outcome
-from sonarpost.cli.demo.settings import ChainSettings
-from sonarpost.cli.demo.sheet import SheetCell, SheetContact, write_sheet
-from sonarpost.cli.demo.watch import Watcher
 from sonarpost.codec import decode_image, get_codec
 from sonarpost.codec.interface import Image, to_uint8
 from sonarpost.codec.quality import psnr_db
+from sonarpost.extensions.simulation.demo.next_steps import shown
+from sonarpost.extensions.simulation.demo.outcome import Outcome
+from sonarpost.extensions.simulation.demo.settings import ChainSettings
+from sonarpost.extensions.simulation.demo.sheet import SheetCell, SheetContact, write_sheet
+from sonarpost.extensions.simulation.demo.watch import Watcher
 from sonarpost.messages import EncodedImage, ReconstructedImage
 
 _COLUMNS: tuple[tuple[str, Literal["left", "right"]], ...] = (
