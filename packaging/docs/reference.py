@@ -25,6 +25,7 @@ from sonarpost.config import ModemTable, PlatformConfig, ServiceConfig, table_na
 from sonarpost.messages import Record
 from sonarpost.monitoring.fleet import FleetState
 from sonarpost.monitoring.metrics import FleetCollector
+from sonarpost.registry import EXTENSIONS
 
 UNITS = {
     "airtime_s": "s",
@@ -247,6 +248,17 @@ def limit_table(_: str = "") -> str:
     )
 
 
+def extension_table(_: str = "") -> str:
+    """Return the table of the extensions: the first paragraph of each README, and the extensions that it names."""
+    rows = []
+    for path in sorted(EXTENSIONS.glob("*/README.md")):
+        text = path.read_text(encoding="utf-8")
+        paragraph = " ".join(text.split("\n\n")[1].split()).partition(" Needs the extension")[0]
+        needs = ", ".join(f"`{name}`" for name in re.findall(r"\]\(\.\./(\w+)/README\.md\)", text))
+        rows.append((f"`{path.parent.name}`", re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", paragraph), needs))
+    return table(("extension", "what it adds", "needs"), rows)
+
+
 GENERATORS: Mapping[str, Callable[[str], str]] = {
     "records": records,
     "keys": key_table,
@@ -257,6 +269,7 @@ GENERATORS: Mapping[str, Callable[[str], str]] = {
     "images": image_table,
     "metrics": metrics,
     "limits": limit_table,
+    "extensions": extension_table,
 }
 
 
