@@ -2,7 +2,7 @@
 
 A registry is a group of entry points, for example `sonarpost.modems`. An extension names its objects in
 `entry_points.toml` in its folder, a plug-in in the metadata of its package. An object is imported when it is asked for:
-a plug-in that cannot be imported stops whoever asks for it, and nobody else.
+a plug-in that cannot be imported is an error only for the command or service that asks for it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Ways into c2 besides the relays of the vessels. The group of entry points is `sonarpost.inputs`."""
+"""Ways into c2 other than the relays of the vessels. The group of entry points is `sonarpost.inputs`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bearers of upstreams besides the radio. The group of entry points is `sonarpost.upstreams`."""
+"""Bearers of upstreams other than the radio. The group of entry points is `sonarpost.upstreams`."""
 
 from __future__ import annotations
 
