@@ -40,7 +40,8 @@ def test_object_is_imported_when_it_is_asked_for(numbers):
 def test_broken_plug_in_is_left_out_and_reported_once(numbers, caplog):
     found = numbers(one="ONE", broken="NONE", text="TEXT")
     with caplog.at_level(logging.WARNING):
-        assert found.working() == found.working() == {"one": 1, "zero": 0}
+        assert found.working() == found.working() == {"zero": 0, "one": 1}
+    assert [*found.working()] == ["zero", "one"], "the core first"
     assert len(caplog.records) == 2
     assert "sonarpost.numbers:broken" in caplog.text
 

@@ -50,6 +50,7 @@ class Registry(Generic[T]):
         self.group = group
         self._expected = expected
         self._is_valid = is_valid
+        self._core = tuple(core)
         self._objects = dict(core)
         self._points: dict[str, EntryPoint] = {}
         self._reported: set[str] = set()
@@ -76,9 +77,12 @@ class Registry(Generic[T]):
         return self._objects[name]
 
     def working(self) -> dict[str, T]:
-        """Return all objects that can be imported, by name; each of the others is reported in the log once."""
+        """Return all objects that can be imported, by name; each of the others is reported in the log once.
+
+        Those of the core are first, in their order.
+        """
         found = {}
-        for name in self.names():
+        for name in (*self._core, *sorted(self._points)):
             try:
                 found[name] = self.get(name)
             except ConfigError as error:
