@@ -18,9 +18,9 @@ from typing import Final
 
 import numpy as np
 
+from research.codebook.shipped import read_channel
 from research.common.command import command_parser, report_progress, run_command
 from research.common.images import SDVD_FIELDS, missing_data
-from research.default_codebooks import read_channel
 from sonarpost.files import write_atomically
 from sonarpost.sonar.image_decoding import GreyImage, read_any_image
 from sonarpost.sonar.image_files import list_images, write_png

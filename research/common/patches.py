@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from research.codebook.builder import TrainingImage
 from sonarpost.codec.interface import Image
-from sonarpost.codec.vq.builder import TrainingImage
 
 SonarLine = npt.NDArray[np.float32]
 

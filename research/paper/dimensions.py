@@ -15,9 +15,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from research.codebook.builder import figure_of_merit
 from sonarpost.codec.interface import Image
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.vq.builder import figure_of_merit
 from sonarpost.codec.vq.tiles import BASIS_SCALE, Tiles, cut_tiles, join_tiles, principal_basis
 
 TILE_PX: Final = 20

@@ -13,13 +13,8 @@ from rich.console import Console
 from sonarpost.cli import progress as module
 from sonarpost.cli.main import LOG_LEVEL_VARIABLE, main
 from sonarpost.cli.progress import ProgressDisplay, progress_console
-from sonarpost.codec.vq.builder import BuildProgress, RefinementProgress
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.xtf_writer import write_xtf
-
-
-def progress(done, total=100, round_number=0):
-    return BuildProgress(round_number, 2, done, done, total, 10 * done)
 
 
 def test_state_has_step_amount_and_time():
@@ -28,15 +23,15 @@ def test_state_has_step_amount_and_time():
     display = ProgressDisplay(Console(file=out, width=200), "reading", clock=lambda: now[0])
     now[0] = 3.0
     assert display.state() == "reading: 3 s"
-    display.build(progress(11))
-    assert display.state() == "round 1 of 2: 11 of 100, 110 tiles, 0 s"
+    display.show("round 1", 11, 100, "110 tiles")
+    assert display.state() == "round 1: 11 of 100, 110 tiles, 0 s"
     now[0] = 15.0
-    display.build(progress(20))
-    assert display.state() == "round 1 of 2: 20 of 100, 200 tiles, 12 s"
-    display.build(RefinementProgress(1, 3, 50, 100, float("nan")))
-    assert display.state() == "refining 1 of 3: 50 of 100, 0 s"
-    display.build(RefinementProgress(1, 3, 100, 100, 12.345))
-    assert out.getvalue() == "refining 1 of 3: the error was 12.35 grey levels RMS before\n"
+    display.show("round 1", 20, 100, "200 tiles")
+    assert display.state() == "round 1: 20 of 100, 200 tiles, 12 s"
+    display.show("round 2", 50, 100)
+    assert display.state() == "round 2: 50 of 100, 0 s"
+    display.line("a result")
+    assert out.getvalue() == "a result\n"
     assert ProgressDisplay(Console(file=out)).state() == ""
 
 
@@ -67,11 +62,11 @@ def test_quiet_prints_no_progress(capsys):
 def test_terminal_gets_a_bar_and_lines():
     out = io.StringIO()
     with ProgressDisplay(Console(file=out, force_terminal=True, width=100)) as display:
-        display.build(progress(50))
+        display.show("round 1 of 2", 50, 100, "500 tiles")
         display._bar.refresh()
         assert "round 1 of 2" in out.getvalue()
         assert "50 of 100, 500 tiles" in out.getvalue()
-        display.build(RefinementProgress(1, 1, 100, 100, 1.0))
+        display.line("the error was 1.00")
     assert "the error was 1.00" in out.getvalue()
 
 

@@ -1,4 +1,4 @@
-"""PSNR, SSIM and the figure of merit."""
+"""PSNR and SSIM."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pytest
 from builders.images import ssim_windows
 
 from sonarpost.codec.quality import psnr_db, ssim
-from sonarpost.codec.vq.builder import figure_of_merit
 from sonarpost.errors import StreamError
 
 
@@ -31,7 +30,6 @@ def test_ssim_matches_its_definition() -> None:
         np.mean([luminance * structure for luminance, structure in ssim_windows(a, b)]), abs=1e-9
     )
     assert 0.5 < ssim(a, b) < 1
-    assert figure_of_merit(a, b) == 100 * ssim(a, b)
 
 
 def test_ssim_of_images_narrower_than_the_window() -> None:
@@ -40,7 +38,7 @@ def test_ssim_of_images_narrower_than_the_window() -> None:
     assert ssim(a, noise(6, 30, 1)) < 0.5
 
 
-@pytest.mark.parametrize("measure", [psnr_db, ssim, figure_of_merit])
+@pytest.mark.parametrize("measure", [psnr_db, ssim])
 def test_images_that_cannot_be_compared_are_rejected(measure) -> None:
     image = noise(16, 16)
     for a, b, field in (

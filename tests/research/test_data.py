@@ -91,7 +91,7 @@ def test_derived_files_are_those_of_the_published_figures(tmp_path: Path, data_d
         "codecs.__main__ --sdvd {}",
         "recognition.__main__ --sdvd {}",
         "detection.__main__ --sdvd {}",
-        "default_codebooks --humminbird {} --out {}/out",
+        "codebook.shipped --humminbird {} --out {}/out",
         "training.emb.evaluate --data {}",
         "training.emb.pool --data {} --out {}/pool.npz",
         "training.emb.sheets --data {} --out {} 22",
@@ -105,7 +105,7 @@ def test_command_without_its_data_says_where_to_get_it(command: str, tmp_path: P
 
 
 def test_command_that_restarts_itself_says_where_to_get_its_data(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "research.codebook_adapt", "--data", str(tmp_path)]
+    command = [sys.executable, "-m", "research.codebook.adaptation_gain", "--data", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPOSITORY)
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import logging
-import math
 import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
-
-if TYPE_CHECKING:
-    from sonarpost.codec.vq.builder import BuildProgress, RefinementProgress
 
 LINE_EVERY_S = 10.0
 
@@ -85,21 +80,6 @@ class ProgressDisplay:
         count = ", ".join(part for part in ("" if total is None else f"{done} of {total}", detail) if part)
         self._step, self._count = step, count
         self._bar.update(self._task, description=step, completed=done, total=total, count=count)
-
-    def build(self, progress: BuildProgress | RefinementProgress) -> None:
-        """Set the progress of a codebook build."""
-        # Imported lazily: most commands do not need it.
-        from sonarpost.codec.vq.builder import BuildProgress  # noqa: PLC0415
-
-        if isinstance(progress, BuildProgress):
-            step = f"round {progress.round_number + 1} of {progress.rounds}"
-            self.show(step, progress.done_in_round, progress.images_in_round, f"{progress.tiles} tiles")
-            return
-        step = f"refining {progress.pass_number} of {progress.passes}"
-        if math.isnan(progress.rms):
-            self.show(step, progress.done_images, progress.images)
-        else:
-            self.line(f"{step}: the error was {progress.rms:.2f} grey levels RMS before")
 
     def line(self, text: str) -> None:
         """Print a line, above the bar if there is one."""

@@ -23,7 +23,7 @@ def _codebooks() -> list[str]:
     books = ((tile_px, load_default(tile_px).tiles) for tile_px in DEFAULT_TILE_PX)
     return [
         *(f"nominal-{tile_px:<9} {len(tiles)} tiles of {tile_px} × {tile_px} px" for tile_px, tiles in books),
-        f"{'FILE':17} output of `sonarpost codebook build` or `adapt`",
+        f"{'FILE':17} output of `python -m research.codebook build` or `adapt`",
     ]
 
 

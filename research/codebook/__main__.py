@@ -1,23 +1,26 @@
-"""`sonarpost codebook`: build (the paper's Table IV), show, compare and adapt tile codebooks."""
+"""`python -m research.codebook`: build (the paper's Table IV), show, compare and adapt tile codebooks."""
 
 from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
+from research.codebook.adaptation import CodebookQuality, adapt, measure, split_images
+from research.codebook.builder import MAX_TILES, Round, TrainingImage, build, rms_distance
+from research.codebook.comparison import UnmatchedTiles, compare
+from sonarpost.cli.main import apply_verbosity, exit_status
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers, add_command, in_new_folder
+from sonarpost.cli.shared import Subparsers, in_new_folder
 from sonarpost.codec.interface import Image, to_uint8
-from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split_images
-from sonarpost.codec.vq.builder import MAX_TILES, Round, TrainingImage, build, rms_distance
 from sonarpost.codec.vq.codebook import Codebook, open_codebook, save
 from sonarpost.codec.vq.codec import codebook_tag
-from sonarpost.codec.vq.comparison import UnmatchedTiles, compare
 from sonarpost.codec.vq.tiles import MAX_DIMS
 from sonarpost.errors import CodebookError, ConfigError, SurveyFileError
 from sonarpost.sonar.image_decoding import read_any_image
@@ -29,13 +32,36 @@ EXIT_DIFFERENT = 1
 _ROUND = re.compile(r"(?P<fom>\d{1,6}(\.\d{1,6})?):(?P<rms>\d{1,6}(\.\d{1,6})?)(:(?P<images>\d{1,9}))?", re.ASCII)
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the command and its actions."""
-    actions = add_command(subparsers, "codebook", "build, compare and adapt tile codebooks")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return the exit status."""
+    parser = new_parser()
+    parsed = parser.parse_args(arguments)
+    apply_verbosity(parsed)
+    return exit_status(lambda: run(parsed), parser.prog)
+
+
+def new_parser() -> argparse.ArgumentParser:
+    """Return the parser of this command."""
+    # Not that of `research.common.command`: it loads all codecs and what they are compared with.
+    parser: argparse.ArgumentParser = CommandParser(
+        prog="python -m research.codebook", description="Build, compare and adapt tile codebooks."
+    )
+    actions = parser.add_subparsers(metavar="ACTION", required=True)
     _add_build(actions)
     _add_info(actions)
     _add_diff(actions)
     _add_adapt(actions)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the action; return the exit status.
+
+    Raises:
+        SonarpostError: Invalid options, images or codebooks.
+    """
+    status: int = args.run(args)
+    return status
 
 
 def _add_build(actions: Subparsers) -> None:
@@ -126,7 +152,7 @@ def run_build(args: argparse.Namespace) -> int:
             core=core,
             passes=args.refine,
             journal_path=journal,
-            progress=display.build,
+            progress=lambda progress: progress.show_on(display),
         )
     notes = {"images": str(len(images)), "rounds": args.rounds, "refine passes": str(args.refine)}
     if core is not None:
@@ -278,3 +304,7 @@ def _training_images(sources: list[Path], console: Console) -> tuple[list[Traini
 
 def _loader(path: Path) -> Callable[[], Image]:
     return lambda: to_uint8(read_any_image(path).pixels)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -26,9 +26,10 @@ from pathlib import Path
 
 import numpy as np
 
+from research.codebook.build_journal import BuildEntry, BuildJournal, EntryKind
+from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.interface import Image
 from sonarpost.codec.quality import ssim
-from sonarpost.codec.vq.build_journal import BuildEntry, BuildJournal, EntryKind
 from sonarpost.codec.vq.tile_search import IncrementalTileSet
 from sonarpost.codec.vq.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase, Tiles, cut_tiles, join_tiles
 from sonarpost.errors import CodebookError, ConfigError
@@ -89,6 +90,11 @@ class BuildProgress:
     images_in_round: int
     tiles: int
 
+    def show_on(self, display: ProgressDisplay) -> None:
+        """Show this progress."""
+        step = f"round {self.round_number + 1} of {self.rounds}"
+        display.show(step, self.done_in_round, self.images_in_round, f"{self.tiles} tiles")
+
 
 @dataclass(frozen=True)
 class RefinementProgress:
@@ -107,6 +113,14 @@ class RefinementProgress:
     done_images: int
     images: int
     rms: float
+
+    def show_on(self, display: ProgressDisplay) -> None:
+        """Show this progress, and at the end of the pass the error."""
+        step = f"refining {self.pass_number} of {self.passes}"
+        if math.isnan(self.rms):
+            display.show(step, self.done_images, self.images)
+        else:
+            display.line(f"{step}: the error was {self.rms:.2f} grey levels RMS before")
 
 
 @dataclass(frozen=True)

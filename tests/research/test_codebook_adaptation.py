@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonarpost.codec.vq.adaptation import MAX_PSNR_DB, adapt, measure, split_images
-from sonarpost.codec.vq.builder import TrainingImage
+from research.codebook.adaptation import MAX_PSNR_DB, adapt, measure, split_images
+from research.codebook.builder import TrainingImage
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
 from sonarpost.errors import ConfigError
 

@@ -1,6 +1,4 @@
-"""`python -m research.codebook_adapt`: gain of adapting the shipped codebooks to real seabeds, on held-out images.
-
-    python -m research.codebook_adapt [--data DIR]
+"""`python -m research.codebook.adaptation_gain [--data DIR]`: gain of adapting the shipped codebooks to real seabeds.
 
 Three sets of real images are cut into windows of 80 x 140 px without overlap: a Marine Sonic survey line of 2013, a
 survey line of a river bed of 2009, and synthetic-aperture tiles. Both sides of a line are cut at the same pings, so the
@@ -21,11 +19,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from research.codebook.adaptation import CodebookQuality, adapt, measure, split_images
+from research.codebook.builder import TrainingImage
 from research.common.images import missing_data
 from research.common.patches import stretch
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.codec.vq.adaptation import CodebookQuality, adapt, measure, split_images
-from sonarpost.codec.vq.builder import TrainingImage
 from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, load_default
 from sonarpost.sonar.image_files import read_image
 
@@ -53,10 +51,10 @@ def main() -> int:
     if os.environ.get("OMP_NUM_THREADS") != "1":
         # The libraries read this when they are loaded, so the program restarts itself.
         os.environ.update({f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")})
-        os.execv(sys.executable, [sys.executable, "-m", "research.codebook_adapt", *sys.argv[1:]])
+        os.execv(sys.executable, [sys.executable, "-m", "research.codebook.adaptation_gain", *sys.argv[1:]])
     for pattern in SETS.values():
         if not any(args.data.glob(pattern)):
-            print(f"codebook_adapt: {missing_data(args.data, f'no {pattern}')}", file=sys.stderr)
+            print(f"adaptation_gain: {missing_data(args.data, f'no {pattern}')}", file=sys.stderr)
             return 2
     print("| images | base | PSNR before / after | FOM before / after | better in | time, one core |")
     print("|---|---|---|---|---|---|")
@@ -107,5 +105,5 @@ def _means(measured: list[CodebookQuality]) -> tuple[float, float]:
 
 
 if __name__ == "__main__":
-    with ProgressDisplay(step="codebook_adapt"):
+    with ProgressDisplay(step="adaptation_gain"):
         sys.exit(main())

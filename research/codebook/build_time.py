@@ -1,10 +1,10 @@
-"""`python -m research.codebook_build`: time and memory to build a codebook of 16,000 tiles on one core.
+"""`python -m research.codebook.build_time`: time and memory to build a codebook of 16,000 tiles on one core.
 
-    python -m research.codebook_build [--tile 10] [--refine 2]
+    python -m research.codebook.build_time [--tile 10] [--refine 2]
 
 500 images of 100 to 200 px a side are cut from simulated survey lines over every kind of seabed and written as TIFF.
-The command `sonarpost codebook build` runs in its own process, bound to one core and one thread; its time, processor
-time and peak resident memory are printed. The simulation is not included.
+`python -m research.codebook build` runs in its own process, bound to one core and one thread; its time, processor time
+and peak resident memory are printed. The simulation is not included.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def main() -> int:
         print(f"{args.images} images ...", file=sys.stderr)
         pixels = _write_images(folder, args.images)
         out = folder / "out.tiles"
-        arguments = ["codebook", "build", "--images", str(folder), "--out", str(out), "--rounds", args.rounds]
+        arguments = ["build", "--images", str(folder), "--out", str(out), "--rounds", args.rounds]
         arguments += ["--tile", str(args.tile), "--max-tiles", str(args.max_tiles), "--refine", str(args.refine)]
         seconds, cpu_seconds, peak_mib = _run(arguments)
         tiles = load(out).tiles
@@ -87,13 +87,13 @@ def _run(arguments: list[str]) -> tuple[float, float, float]:
     """Run the command on one core; return elapsed and processor time in seconds, and peak resident memory in MiB."""
     environment = os.environ | {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
     start = time.perf_counter()
-    child = subprocess.Popen([sys.executable, "-m", "sonarpost.cli.main", *arguments], env=environment)
+    child = subprocess.Popen([sys.executable, "-m", "research.codebook", *arguments], env=environment)
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(child.pid, {max(os.sched_getaffinity(0))})
     _, status, usage = os.wait4(child.pid, 0)
     seconds = time.perf_counter() - start
     if status != 0:
-        sys.exit(f"codebook_build: the build exited with status {os.waitstatus_to_exitcode(status)}")
+        sys.exit(f"build_time: the build exited with status {os.waitstatus_to_exitcode(status)}")
     peak_mib = usage.ru_maxrss / (1024 if sys.platform != "darwin" else 1 << 20)
     return seconds, usage.ru_utime + usage.ru_stime, peak_mib
 

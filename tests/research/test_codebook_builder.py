@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import tracemalloc
 from collections.abc import Callable
@@ -9,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from sonarpost.codec.vq.build_journal import MAGIC, BuildEntry, BuildJournal, EntryKind
-from sonarpost.codec.vq.builder import (
+from research.codebook.build_journal import MAGIC, BuildEntry, BuildJournal, EntryKind
+from research.codebook.builder import (
     BuildProgress,
     RefinementProgress,
     Round,
@@ -24,9 +26,11 @@ from sonarpost.codec.vq.builder import (
     rms_distance,
     without_duplicates,
 )
+from sonarpost.cli.progress import ProgressDisplay
+from sonarpost.codec.quality import ssim
 from sonarpost.codec.vq.tile_search import IncrementalTileSet
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
-from sonarpost.errors import CodebookError, ConfigError
+from sonarpost.errors import CodebookError, ConfigError, StreamError
 
 ALWAYS, NEVER = 1e9, -1e9
 
@@ -406,3 +410,20 @@ def test_memory_depends_on_tiles_not_on_images_and_is_within_the_documented_limi
     images = [TrainingImage("small", lambda: large[:100, :100]), TrainingImage("large", lambda: large)]
     peak = peak_of(lambda: build(images, 10, [Round(1e9, 300.0)], max_tiles=300, passes=1))
     assert peak < 16_000_000 + 40 * 300 * 100 + 100 * large.size
+
+
+def test_progress_is_shown_with_its_step() -> None:
+    out = io.StringIO()
+    display = ProgressDisplay(Console(file=out, width=200), clock=lambda: 0.0)
+    BuildProgress(0, 2, 11, 11, 100, 110).show_on(display)
+    assert display.state() == "round 1 of 2: 11 of 100, 110 tiles, 0 s"
+    RefinementProgress(1, 3, 50, 100, math.nan).show_on(display)
+    assert display.state() == "refining 1 of 3: 50 of 100, 0 s"
+    RefinementProgress(1, 3, 100, 100, 12.345).show_on(display)
+    assert out.getvalue() == "refining 1 of 3: the error was 12.35 grey levels RMS before\n"
+
+
+def test_figure_of_merit_is_the_mean_ssim_in_percent() -> None:
+    assert figure_of_merit(image(1), image(2)) == 100 * ssim(image(1), image(2))
+    with pytest.raises(StreamError):
+        figure_of_merit(image(1), image(1, 41))

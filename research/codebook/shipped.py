@@ -1,4 +1,4 @@
-"""`python -m research.default_codebooks`: builds the shipped codebooks; the same input gives the same bytes.
+"""`python -m research.codebook.shipped`: builds the shipped codebooks; the same input gives the same bytes.
 
 A codebook contains parts of the images it was built from, so its sources must be free to redistribute: the survey
 simulator of the project, and the public-domain Humminbird recording of the PyHum 1.4.6 source distribution (US
@@ -23,10 +23,10 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
+from research.codebook.builder import ProgressCallback, Round, TrainingImage, build, rms_distance
 from research.common.command import command_parser, run_command
 from research.common.patches import PatchPlan, SonarLine, cut_around, cut_line, shuffled
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.codec.vq.builder import ProgressCallback, Round, TrainingImage, build, rms_distance
 from sonarpost.codec.vq.codebook import Codebook, load, save
 from sonarpost.errors import CodebookError, ConfigError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
@@ -199,7 +199,7 @@ SIMULATED_SURVEYS = tuple(
 
 def new_parser() -> argparse.ArgumentParser:
     """Return the parser of this command."""
-    parser = command_parser("default_codebooks", "Build the shipped codebooks; the same input gives the same bytes.")
+    parser = command_parser("codebook.shipped", "Build the shipped codebooks; the same input gives the same bytes.")
     parser.add_argument(
         "--humminbird", type=Path, required=True, metavar="DIR", help="folder with the channels of the PyHum recording"
     )
@@ -247,7 +247,7 @@ def simulated_images(console: Console) -> Iterator[TrainingImage]:
 def _write(recipe: Recipe, images: list[TrainingImage], folder: Path, console: Console) -> None:
     path = folder / f"nominal-{recipe.tile_px}.tiles"
     with ProgressDisplay(console) as display:
-        save(path, build_nominal(recipe, images, display.build))
+        save(path, build_nominal(recipe, images, lambda progress: progress.show_on(display)))
     tiles = load(path).tiles
     console.print(f"{path}: {len(tiles)} tiles, identity {tiles.identity}")
 

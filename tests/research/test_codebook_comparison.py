@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import subspace_angles
 
-from sonarpost.codec.vq.comparison import compare, principal_angles_deg
+from research.codebook.comparison import compare, principal_angles_deg
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CodebookError
 

@@ -1,4 +1,4 @@
-"""The shipped codebooks: the Humminbird recording, the recipes, `python -m research.default_codebooks`."""
+"""The shipped codebooks: the Humminbird recording, the recipes, `python -m research.codebook.shipped`."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from builders.images import speckle_line
 
-from research import default_codebooks
+from research.codebook import shipped
+from research.codebook.builder import Round
+from research.codebook.shipped import Recipe, build_nominal, humminbird_images, humminbird_lines, read_channel
 from research.common.patches import PatchPlan, cut_line
-from research.default_codebooks import Recipe, build_nominal, humminbird_images, humminbird_lines, read_channel
-from sonarpost.codec.vq.builder import Round
 from sonarpost.codec.vq.codebook import load, to_bytes
 from sonarpost.codec.vq.tiles import cut_tiles
 from sonarpost.errors import CodebookError, SonarpostError
@@ -20,8 +20,8 @@ from sonarpost.sonar.image_files import write_png
 
 
 def run(*arguments: object) -> int:
-    parsed = default_codebooks.new_parser().parse_args([str(argument) for argument in arguments])
-    return default_codebooks.run(parsed)
+    parsed = shipped.new_parser().parse_args([str(argument) for argument in arguments])
+    return shipped.run(parsed)
 
 
 def recording(folder: Path, channel: str, pings: list[np.ndarray]) -> None:
@@ -36,9 +36,9 @@ def recording(folder: Path, channel: str, pings: list[np.ndarray]) -> None:
 def test_refinement_passes_are_an_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     speckle = 60 * np.random.default_rng(4).rayleigh(1.0, (170, 170))
     images = list(cut_line("x", speckle.astype(np.float32), PatchPlan(copies=2)))
-    monkeypatch.setattr(default_codebooks, "humminbird_images", lambda _: images)
-    monkeypatch.setattr(default_codebooks, "simulated_images", lambda _: iter(()))
-    monkeypatch.setattr(default_codebooks, "RECIPES", (Recipe(10, 80, (Round(100.0, 60.0),), 2),))
+    monkeypatch.setattr(shipped, "humminbird_images", lambda _: images)
+    monkeypatch.setattr(shipped, "simulated_images", lambda _: iter(()))
+    monkeypatch.setattr(shipped, "RECIPES", (Recipe(10, 80, (Round(100.0, 60.0),), 2),))
     made = []
     for options in (("--refine", 0), ("--refine", 2), ()):
         assert run("--humminbird", tmp_path, "--out", tmp_path / "new" / "folder", *options) == 0

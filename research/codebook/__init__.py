@@ -1,0 +1,1 @@
+"""Builds, compares and adapts tile codebooks: `python -m research.codebook`."""
