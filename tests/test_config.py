@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from abc import ABC, abstractmethod
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -26,6 +27,10 @@ class Kind(StrEnum):
 class Part(ServiceConfig):
     depth_m: float
     name: str = ""
+
+
+class PartOfPlugIn(Part):
+    extra: int = 0
 
 
 class Table(ServiceConfig):
@@ -190,6 +195,26 @@ def test_error_names_an_unreadable_file(tmp_path):
         assert caught.value.where == str(path)
         assert message in str(caught.value)
         assert "a readable TOML file" in str(caught.value)
+
+
+@pytest.mark.parametrize("added", [(), (ServiceConfig,), (Part, Part), (Part, ServiceConfig), (Part, PartOfPlugIn)])
+def test_keys_of_other_models_are_added_to_a_table(added):
+    found = config.with_keys(*added)(Table)
+    assert {*found.model_fields} == {*Table.model_fields}.union(*(model.model_fields for model in added))
+    assert [*found.model_fields][: len(Table.model_fields)] == [*Table.model_fields]
+
+
+def test_only_a_concrete_class_with_a_model_adds_keys():
+    class Base(ABC):
+        @abstractmethod
+        def run(self): ...
+
+    run = {"run": lambda _: None}
+    assert config.adds_keys(type("Whole", (Base,), {**run, "KEYS": Part}), Base)
+    for found in (5, Base, Part, type("Abstract", (Base,), {"KEYS": Part})):
+        assert not config.adds_keys(found, Base)
+    for keys in ({}, {"KEYS": 5}, {"KEYS": dict}):
+        assert not config.adds_keys(type("Without", (Base,), {**run, **keys}), Base)
 
 
 @given(st.text(max_size=60))

@@ -46,6 +46,35 @@ def test_broken_plug_in_is_left_out_and_reported_once(numbers, caplog):
     assert "sonarpost.numbers:broken" in caplog.text
 
 
+def test_plug_in_that_exits_is_left_out(numbers, monkeypatch, tmp_path, caplog):
+    (tmp_path / "plug_in_that_exits.py").write_text("import sys\nsys.exit(7)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    found = Registry(GROUP, "a number", lambda *_: True, {}, [EntryPoint("exits", "plug_in_that_exits:ONE", GROUP)])
+    assert found.working() == {}
+    assert "entry point sonarpost.numbers:exits: value: got 'plug_in_that_exits:ONE (SystemExit(7))'" in caplog.text
+
+
+def test_name_of_an_empty_registry():
+    with pytest.raises(ConfigError, match="got 'one', expected an extension or a plug-in that has it"):
+        Registry(GROUP, "a number", lambda *_: True, {}, []).get("one")
+
+
+@pytest.mark.parametrize("content", [b"x = [", b"\xff\xfe", b'"sonarpost.numbers" = 3'])
+def test_invalid_entry_points_of_an_extension_are_reported_once(content, monkeypatch, tmp_path, caplog):
+    for name, written in (("broken", content), ("whole", b'["sonarpost.numbers"]\none = "a:ONE"\n')):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "entry_points.toml").write_bytes(written)
+    monkeypatch.setattr(registry, "EXTENSIONS", tmp_path)
+    registry.installed_points.cache_clear()
+    try:
+        assert [point.value for point in registry.installed_points(GROUP)] == ["a:ONE"]
+        assert registry.installed_points("sonarpost.others") == ()
+    finally:
+        registry.installed_points.cache_clear()
+    [record] = caplog.records
+    assert str(tmp_path / "broken" / "entry_points.toml") in record.getMessage()
+
+
 def test_core_has_priority(numbers, caplog):
     assert numbers(zero="ONE").get("zero") == 0
     assert "its name is taken: sonarpost.numbers:zero = plug_in_numbers:ONE" in caplog.text

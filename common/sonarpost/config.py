@@ -7,6 +7,7 @@ is parsed as a TOML value, or used as a string if it is not one. An empty variab
 
 from __future__ import annotations
 
+import inspect
 import stat
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -79,11 +80,20 @@ class ServiceConfig(BaseModel):
 C = TypeVar("C", bound=ServiceConfig)
 
 
+def adds_keys(found: object, base: type) -> bool:
+    """Return whether an object is a concrete class of `base` whose `KEYS` are a model for `with_keys`."""
+    if not (isinstance(found, type) and issubclass(found, base)) or inspect.isabstract(found):
+        return False
+    added = getattr(found, "KEYS", None)
+    return isinstance(added, type) and issubclass(added, ServiceConfig)
+
+
 def with_keys(*added: type[ServiceConfig]) -> Callable[[type[C]], type[C]]:
     """Return a decorator that adds the keys of other models to a configuration table."""
 
     def extended(table: type[C]) -> type[C]:
-        bases: Any = (*added, table)  # in this order their keys follow those of the table
+        models = dict.fromkeys((*added, table))  # in this order the added keys follow those of the table
+        bases: Any = tuple(each for each in models if not any(issubclass(one, each) for one in models if one != each))
         model = create_model(table.__name__, __base__=bases, __module__=table.__module__, __doc__=table.__doc__)
         return cast(type[C], model)
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Final, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from sonarpost.errors import ConfigError
 
@@ -72,7 +72,8 @@ class Registry(Generic[T]):
         """
         if name not in self._objects:
             if name not in self._points:
-                raise ConfigError(self.group, "name", name, "one of " + ", ".join(self.names()))
+                known = "one of " + ", ".join(self.names()) if self.names() else "an extension or a plug-in that has it"
+                raise ConfigError(self.group, "name", name, known)
             self._objects[name] = self._load(self._points[name])
         return self._objects[name]
 
@@ -92,15 +93,24 @@ class Registry(Generic[T]):
         return found
 
     def _load(self, point: EntryPoint) -> T:
-        where = f"entry point {self.group}:{point.name}"
-        try:
-            found: T = point.load()
-        except Exception as error:  # foreign code can raise any exception; the message names the entry point
-            value = f"{point.value} ({error!r})"
-            raise ConfigError(where, "value", value, "an object that imports") from error
+        found: T = load(point)
         if not self._is_valid(found, point.name):
+            where = f"entry point {self.group}:{point.name}"
             raise ConfigError(where, "value", f"{point.value} ({found!r})", self._expected)
         return found
+
+
+def load(point: EntryPoint) -> Any:  # noqa: ANN401 whatever the entry point names
+    """Import the object of an entry point.
+
+    Raises:
+        ConfigError: It cannot be imported.
+    """
+    try:
+        return point.load()
+    except (Exception, SystemExit) as error:  # foreign code can raise any exception, and call `sys.exit`
+        where, value = f"entry point {point.group}:{point.name}", f"{point.value} ({error!r})"
+        raise ConfigError(where, "value", value, "an object that imports") from error
 
 
 @cache
@@ -112,6 +122,16 @@ def installed_points(group: str) -> tuple[EntryPoint, ...]:
 def _extension_points(group: str) -> list[EntryPoint]:
     found = []
     for path in sorted(EXTENSIONS.glob(f"*/{ENTRY_POINTS_FILE}")):
-        named = tomllib.loads(path.read_text(encoding="utf-8")).get(group, {})
-        found += [EntryPoint(name, value, group) for name, value in named.items()]
+        found += [EntryPoint(name, value, group) for name, value in _named_in(path).get(group, {}).items()]
     return sorted(found, key=lambda p: (p.name, p.value))
+
+
+@cache
+def _named_in(path: Path) -> Mapping[str, Mapping[str, str]]:
+    """Return the entry points in the file of an extension by group; none, and one line in the log, if it is invalid."""
+    try:
+        groups = tomllib.loads(path.read_text(encoding="utf-8"))
+        return {group: {name: str(value) for name, value in named.items()} for group, named in groups.items()}
+    except (OSError, ValueError, AttributeError) as error:
+        log.warning("Extension ignored: %s", ConfigError(str(path), "", str(error), "TOML with a table for each group"))
+        return {}

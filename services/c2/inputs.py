@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from sonarpost.config import ServiceConfig
+from sonarpost.config import ServiceConfig, adds_keys
 from sonarpost.registry import Registry
 from sonarpost.runtime.service import Service
 
@@ -54,8 +54,4 @@ class Input(ABC):
 @cache
 def inputs() -> Registry[type[Input]]:
     """Return all inputs."""
-    return Registry("sonarpost.inputs", "a class of Input", _is_input, {})
-
-
-def _is_input(found: object, _: str) -> bool:
-    return isinstance(found, type) and issubclass(found, Input)
+    return Registry("sonarpost.inputs", "a class of Input with KEYS", lambda found, _: adds_keys(found, Input), {})

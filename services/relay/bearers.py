@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from sonarpost.config import ServiceConfig
+from sonarpost.config import ServiceConfig, adds_keys
 from sonarpost.messages import CodedImage, Decision
 from sonarpost.registry import Registry
 from sonarpost.runtime.service import Service, UnitOfWork
@@ -68,8 +68,7 @@ class Bearer(ABC):
 @cache
 def bearers() -> Registry[type[Bearer]]:
     """Return the bearers by the value of `bearer` in the configuration."""
-    return Registry("sonarpost.upstreams", "a class of Bearer", _is_bearer, {})
-
-
-def _is_bearer(found: object, _: str) -> bool:
-    return isinstance(found, type) and issubclass(found, Bearer)
+    expected = "a class of Bearer with KEYS, not radio"
+    return Registry(
+        "sonarpost.upstreams", expected, lambda found, name: adds_keys(found, Bearer) and name != "radio", {}
+    )

@@ -7,11 +7,13 @@ import os
 import shlex
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 
 import pytest
 
+from sonarpost import registry
 from sonarpost.cli.main import COMMANDS, LOG_LEVEL_VARIABLE, exit_status, main, parser
-from sonarpost.cli.parsing.commands import added_commands, all_examples, all_extras
+from sonarpost.cli.parsing.commands import GROUP, AddedCommand, added_commands, all_examples, all_extras
 from sonarpost.cli.parsing.parser import actions_of, all_parsers
 
 EXAMPLES = all_examples()
@@ -101,6 +103,26 @@ def test_no_library_is_loaded_without_a_command_and_none_of_the_other_commands()
         "parser()\nassert not all_extras().keys() & sys.modules.keys(), 'loaded what few commands need'"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_broken_command_of_a_plug_in_stops_no_other(monkeypatch, capsys, caplog):
+    added = AddedCommand("of a plug-in", "plug_in_that_is_absent:add_parser", {})
+    monkeypatch.setattr(sys.modules[__name__], "ABSENT", added, raising=False)
+    names = ("boom", "survey boom", "run", "c2 ls")
+    points = [EntryPoint(name, f"{__name__}:ABSENT", GROUP) for name in names]
+    monkeypatch.setattr(registry, "installed_points", lambda group: points if group == GROUP else [])
+    added_commands.cache_clear()
+    try:
+        assert set(all_parsers(parser())) >= {"run", "survey info", "c2 ls", "encode"}
+        for command in ("survey info", "run", "c2 ls", "boom"):
+            with pytest.raises(SystemExit) as caught:
+                main([*command.split(), "--help"])
+            assert caught.value.code == (2 if command == "boom" else 0)
+    finally:
+        added_commands.cache_clear()
+    assert "invalid choice: 'boom'" in capsys.readouterr().err
+    assert "Command ignored: plug_in_that_is_absent:add_parser: ModuleNotFoundError" in caplog.text
+    assert "sonarpost.commands:run" in caplog.text
 
 
 def test_every_command_has_an_example_that_parses(whole):

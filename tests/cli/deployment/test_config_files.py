@@ -172,6 +172,13 @@ def test_certificates_of_a_fleet_are_valid(tmp_path, capsys):
     assert check(path, capsys)[0] == 0
 
 
+def test_a_service_of_a_plug_in_that_cannot_be_imported_is_named(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(config_files, "service_packages", lambda: {"c2": "package_that_is_absent"})
+    status, _, errors = check(example(tmp_path, "shore"), capsys)
+    assert status == 2
+    assert errors[-1].startswith("sonarpost: entry point sonarpost.services:c2: value: got ")
+
+
 def test_a_file_without_a_service_and_an_unreadable_file_are_errors(tmp_path, capsys):
     path = tmp_path / "empty.toml"
     path.write_text('[platform]\nid = "uuv-1"\n')

@@ -16,6 +16,7 @@ from sonarpost.cli.shared import Subparsers, add_command
 from sonarpost.config import SERVICE_GROUP, ConfigFile, PlatformConfig, ServiceConfig, service_packages
 from sonarpost.errors import BadInputError, ConfigError
 from sonarpost.files import PUBLIC_FILE, write_atomically
+from sonarpost.registry import load
 from sonarpost.security.tls_files import check_tls_files
 
 EXIT_INVALID = 2
@@ -99,7 +100,7 @@ def check_file(path: Path, environment: Mapping[str, str]) -> CheckedConfig:
         environment: Environment variables with overrides.
 
     Raises:
-        ConfigError: The file is unreadable or not TOML.
+        ConfigError: The file is unreadable or not TOML, or it has a service that cannot be imported.
     """
     file = ConfigFile(path, environment)
     platform = file.platform()
@@ -133,10 +134,14 @@ def _line_number(error: BadInputError) -> int:
 
 
 def configuration_type(service: str) -> type[ServiceConfig]:
-    """Return the type of the configuration table of a service."""
+    """Return the type of the configuration table of a service.
+
+    Raises:
+        ConfigError: It is a service of a plug-in that cannot be imported.
+    """
     name = "".join(part.capitalize() for part in service.split("_")) + "Config"
     point = EntryPoint(service, f"{service_packages()[service]}.config:{name}", SERVICE_GROUP)
-    found: type[ServiceConfig] = point.load()
+    found: type[ServiceConfig] = load(point)
     return found
 
 

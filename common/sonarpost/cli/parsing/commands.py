@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -12,6 +13,8 @@ from sonarpost.registry import Registry
 
 if TYPE_CHECKING:
     import argparse
+
+log = logging.getLogger(__name__)
 
 GROUP: Final = "sonarpost.commands"
 
@@ -60,8 +63,11 @@ class AddedCommand:
     extras: Mapping[str, str] = field(default_factory=dict)
 
     def add(self, subparsers: argparse._SubParsersAction[Any]) -> None:
-        """Import the command and add its parser."""
-        EntryPoint("", self.parser, GROUP).load()(subparsers)
+        """Import the command and add its parser; one that cannot be added is reported in the log."""
+        try:
+            EntryPoint("", self.parser, GROUP).load()(subparsers)
+        except (Exception, SystemExit) as error:  # noqa: BLE001 foreign code can raise any exception, and call `sys.exit`
+            log.warning("Command ignored: %s: %r", self.parser, error)
 
 
 EXTRAS: Final[Mapping[str, str]] = {
@@ -122,7 +128,10 @@ EXAMPLES: Final[Mapping[str, str]] = {
 def added_commands() -> Registry[AddedCommand]:
     """Return the commands of extensions and plug-ins."""
     return Registry(
-        GROUP, "a sonarpost.cli.parsing.commands.AddedCommand", lambda found, _: isinstance(found, AddedCommand), {}
+        GROUP,
+        "a sonarpost.cli.parsing.commands.AddedCommand with a name that no command of the core has",
+        lambda found, name: isinstance(found, AddedCommand) and name not in COMMANDS and name not in EXAMPLES,
+        {},
     )
 
 
