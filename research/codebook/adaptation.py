@@ -25,9 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from research.codebook.builder import MAX_TILES, TrainingImage, figure_of_merit, refine_once
+from research.codebook.tile_set import IncrementalTileSet
 from sonarpost.codec.interface import Image
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.vq.tile_search import IncrementalTileSet
 from sonarpost.codec.vq.tiles import TileDatabase, Tiles, cut_tiles, join_tiles
 from sonarpost.errors import ConfigError
 

@@ -27,10 +27,10 @@ from pathlib import Path
 import numpy as np
 
 from research.codebook.build_journal import BuildEntry, BuildJournal, EntryKind
+from research.codebook.tile_set import IncrementalTileSet
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.interface import Image
 from sonarpost.codec.quality import ssim
-from sonarpost.codec.vq.tile_search import IncrementalTileSet
 from sonarpost.codec.vq.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase, Tiles, cut_tiles, join_tiles
 from sonarpost.errors import CodebookError, ConfigError
 

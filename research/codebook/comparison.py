@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.vq.tile_search import IncrementalTileSet
+from research.codebook.tile_set import IncrementalTileSet
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CodebookError
 

@@ -26,9 +26,9 @@ from research.codebook.builder import (
     rms_distance,
     without_duplicates,
 )
+from research.codebook.tile_set import IncrementalTileSet
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.quality import ssim
-from sonarpost.codec.vq.tile_search import IncrementalTileSet
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
 from sonarpost.errors import CodebookError, ConfigError, StreamError
 

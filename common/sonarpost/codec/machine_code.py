@@ -9,8 +9,6 @@ import numpy as np
 from sonarpost.codec.interface import Codec, ExtensibleCodec, Image
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import load_default
-from sonarpost.codec.vq.tile_search import IncrementalTileSet
-from sonarpost.codec.vq.tiles import cut_tiles
 
 
 def prepare_machine_code(progress: Callable[[str], None] | None = None) -> None:
@@ -21,18 +19,15 @@ def prepare_machine_code(progress: Callable[[str], None] | None = None) -> None:
     Args:
         progress: Called with the name of each step before it starts.
     """
-    registry, tiles = default_registry(), load_default(10).tiles
+    registry = default_registry()
     for name, resources in (
         ("emb, model standard", CodecResources(model="standard")),
         ("emb, model structure", CodecResources(model="structure")),
-        ("vq", CodecResources(tiles)),
+        ("vq", CodecResources(load_default(10).tiles)),
     ):
         if progress is not None:
             progress(name)
         _run_all_paths(registry.create(name.partition(",")[0], resources))
-    tile_set = IncrementalTileSet(tiles.tile_px, 100)
-    tile_set.append(tiles.tiles[:100])
-    tile_set.nearest(cut_tiles(_sample_snippet(), tiles.tile_px))
 
 
 def _run_all_paths(codec: Codec) -> None:

@@ -22,13 +22,8 @@ _INITIAL_TILES = 128  # tiles around the query's key that give the first upper b
 _LANES = 32  # scores compared at once
 _EMPTY = np.float32(1e30)  # score of an empty place; squared norms stay below 2e15
 _NO_LIMIT = 1e29
-_CENTRE = 128
-_QUERY_ROWS = 256
-_CHUNK_TILES = 256
-_POOL_TILES = 4096
 
 P = ParamSpec("P")
-Tiles = npt.NDArray[np.uint8]
 Indices = npt.NDArray[np.int64]
 Distances = npt.NDArray[np.float64]
 FloatMatrix = npt.NDArray[np.float32]
@@ -69,9 +64,9 @@ class NearestSearch:
         width = min(BLOCK_TILES, -(-count // _LANES) * _LANES)
         order = np.argsort(keys, kind="stable")
         vectors = vectors[order]
-        norms = _squared_norms(vectors)
-        blocks = _empty_blocks(-(-count // width), leading, width)
-        _fill_blocks(blocks, 0, vectors, norms)
+        norms = squared_norms(vectors)
+        blocks = empty_blocks(-(-count // width), leading, width)
+        fill_blocks(blocks, 0, vectors, norms)
         return cls(blocks, order, vectors, norms, keys[order])
 
     def nearest(self, queries: Distances, keys: Distances, count: int) -> tuple[Indices, Distances]:
@@ -121,11 +116,11 @@ class _SearchState:
         self.index = np.full((queries.shape[0], count), -1, dtype=np.int64)
         self.score = np.full((queries.shape[0], count), np.inf)
         self.limit = np.full(queries.shape[0], _NO_LIMIT)
-        self.query_norms = _squared_norms(queries)
+        self.query_norms = squared_norms(queries)
         leading = search.blocks.shape[1] - 2
         self.query_rows = np.ones((queries.shape[0], leading + 2), dtype=np.float32)
         self.query_rows[:, :-2] = queries[:, :leading]
-        self.query_rows[:, -2] = np.sqrt(_squared_norms(queries[:, leading:]))
+        self.query_rows[:, -2] = np.sqrt(squared_norms(queries[:, leading:]))
         self.query_rows[:, :-1] *= -2.0
         largest = float(np.sqrt(search.norms.max()))
         self._rounding = rounding_bound(np.sqrt(self.query_norms), largest, leading + 1)
@@ -240,150 +235,23 @@ def rounding_bound(norms: Distances, largest: float, dims: int) -> Distances:
     return np.asarray(1.01 * (dims + 4) * 2.0**-24 * (2.0 * norms * largest + largest * largest), dtype=np.float64)
 
 
-def _squared_norms(vectors: npt.NDArray[np.generic]) -> Distances:
+def squared_norms(vectors: npt.NDArray[np.generic]) -> Distances:
     """Return the exact squared norms of integer vectors, shape (n, dims)."""
     wide = vectors.astype(np.float64)
     return np.asarray(np.einsum("ij,ij->i", wide, wide), dtype=np.float64)
 
 
-def _empty_blocks(count: int, leading: int, width: int = BLOCK_TILES) -> FloatMatrix:
+def empty_blocks(count: int, leading: int, width: int = BLOCK_TILES) -> FloatMatrix:
     """Return blocks of `NearestSearch` with empty places."""
     blocks = np.zeros((count, leading + 2, width), dtype=np.float32)
     blocks[:, -1] = _EMPTY
     return blocks
 
 
-def _fill_blocks(blocks: FloatMatrix, start: int, vectors: Vectors, norms: Distances) -> None:
+def fill_blocks(blocks: FloatMatrix, start: int, vectors: Vectors, norms: Distances) -> None:
     """Write vectors, shape (m, dims), and their squared norms to the places from `start`."""
     block, column = np.divmod(np.arange(start, start + vectors.shape[0]), blocks.shape[2])
     leading = blocks.shape[1] - 2
     blocks[block, :-2, column] = vectors[:, :leading]
-    blocks[block, -2, column] = np.sqrt(_squared_norms(vectors[:, leading:]))
+    blocks[block, -2, column] = np.sqrt(squared_norms(vectors[:, leading:]))
     blocks[block, -1, column] = norms
-
-
-class IncrementalTileSet:
-    """A growing set of tiles with an exact nearest-neighbour search over all pixels.
-
-    Pixels are stored minus 128. Sums of products of two tiles of at most 32 x 32 px then never exceed 2^24 and are
-    exact in single precision, so the result does not depend on the machine.
-
-    Memory: 5 bytes a pixel of all tiles, three times that while the arrays grow, and 2 MiB for a search.
-    """
-
-    def __init__(self, tile_px: int, capacity: int) -> None:
-        self.tile_px = tile_px
-        self.capacity = capacity
-        self._count = 0
-        allocated = min(capacity, BLOCK_TILES)
-        self._vectors = np.zeros((allocated, tile_px * tile_px), dtype=np.int8)
-        self._norms = np.zeros(allocated)
-        self._keys = np.zeros(allocated)
-        self._blocks = _empty_blocks(1, tile_px * tile_px)
-
-    def __len__(self) -> int:
-        return self._count
-
-    @property
-    def full(self) -> bool:
-        """Whether the capacity is reached."""
-        return self._count >= self.capacity
-
-    def tiles(self) -> Tiles:
-        """Return the tiles, shape (n, pixels), in the order of their addition."""
-        return _uncentred(self._vectors[: self._count])
-
-    def tiles_at(self, index: Indices) -> Tiles:
-        """Return the tiles of these numbers, shape (m, pixels)."""
-        return _uncentred(self._vectors[index])
-
-    def append(self, tiles: Tiles) -> None:
-        """Add tiles, shape (m, pixels). The caller respects the capacity."""
-        end = self._count + tiles.shape[0]
-        self._grow(end)
-        part = slice(self._count, end)
-        self._vectors[part] = _centred(tiles)
-        self._norms[part] = _squared_norms(self._vectors[part])
-        self._keys[part] = _diagonal_coordinate(tiles, self.tile_px)
-        _fill_blocks(self._blocks, self._count, self._vectors[part], self._norms[part])
-        self._count = end
-
-    def nearest(self, tiles: Tiles) -> tuple[Indices, Distances]:
-        """Return number and squared distance of the nearest stored tile (the lowest of equals) for each of `tiles`."""
-        used = slice(self._count)
-        blocks = self._blocks[: -(-self._count // BLOCK_TILES)]
-        order = np.arange(self._count)
-        search = NearestSearch(blocks, order, self._vectors[used], self._norms[used], self._keys[used])
-        index = np.empty(tiles.shape[0], dtype=np.int64)
-        squared = np.empty(tiles.shape[0])
-        for start in range(0, tiles.shape[0], _QUERY_ROWS):
-            part = slice(start, start + _QUERY_ROWS)
-            queries = _centred(tiles[part]).astype(np.float64)
-            found, distances = search.nearest(queries, _diagonal_coordinate(tiles[part], self.tile_px), 1)
-            index[part], squared[part] = found[:, 0], distances[:, 0]
-        return index, squared
-
-    def add_far(self, tiles: Tiles, squared_distance: Distances, min_distance: float) -> Tiles:
-        """Add, in order, each tile farther than `min_distance` from all stored tiles, including those just added.
-
-        Args:
-            tiles: Shape (m, pixels).
-            squared_distance: Shape (m,): squared distance of each tile to its nearest stored tile.
-            min_distance: Distance that must be exceeded. 0 rejects only exact duplicates.
-
-        Returns:
-            The added tiles, shape (0..m, pixels).
-        """
-        far = np.flatnonzero(squared_distance > min_distance * min_distance)
-        free = self.capacity - self._count
-        chosen: list[int] = []
-        for start in range(0, far.size, _CHUNK_TILES):
-            chunk = far[start : start + _CHUNK_TILES]
-            least = squared_distance[chunk]
-            for first in range(0, len(chosen), _POOL_TILES):
-                pool = tiles[chosen[first : first + _POOL_TILES]]
-                np.minimum(least, _squared_distances(tiles[chunk], pool).min(axis=1), out=least)
-            between = _squared_distances(tiles[chunk], tiles[chunk])
-            for position in range(chunk.size):
-                if least[position] > min_distance * min_distance and len(chosen) < free:
-                    chosen.append(int(chunk[position]))
-                    np.minimum(least, between[position], out=least)
-            if len(chosen) == free:
-                break
-        added = np.ascontiguousarray(tiles[chosen])
-        self.append(added)
-        return added
-
-    def _grow(self, count: int) -> None:
-        allocated = self._vectors.shape[0]
-        if count <= allocated:
-            return
-        allocated = min(max(count, 2 * allocated), max(self.capacity, count))
-        for name in ("_vectors", "_norms", "_keys"):
-            old = getattr(self, name)
-            larger = np.zeros((allocated, *old.shape[1:]), dtype=old.dtype)
-            larger[: self._count] = old[: self._count]
-            setattr(self, name, larger)
-        blocks = _empty_blocks(-(-allocated // BLOCK_TILES), self._vectors.shape[1])
-        blocks[: self._blocks.shape[0]] = self._blocks
-        self._blocks = blocks
-
-
-def _centred(tiles: Tiles) -> npt.NDArray[np.int8]:
-    return (tiles ^ np.uint8(_CENTRE)).view(np.int8)  # subtracts 128 in one byte
-
-
-def _uncentred(vectors: npt.NDArray[np.int8]) -> Tiles:
-    return vectors.view(np.uint8) ^ np.uint8(_CENTRE)
-
-
-def _diagonal_coordinate(tiles: Tiles, tile_px: int) -> Distances:
-    """Return the coordinate along the diagonal of the pixel space, a key of `NearestSearch`."""
-    return np.asarray(tiles.sum(axis=1, dtype=np.int64) / tile_px, dtype=np.float64)
-
-
-def _squared_distances(tiles_a: Tiles, tiles_b: Tiles) -> Distances:
-    """Return exact squared distances, shape (m, n)."""
-    a, b = _centred(tiles_a), _centred(tiles_b)
-    products = (a.astype(np.float32) @ b.astype(np.float32).T).astype(np.float64)
-    return np.asarray(_squared_norms(a)[:, None] + _squared_norms(b) - 2.0 * products, dtype=np.float64)
