@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from abc import ABC, abstractmethod
 from enum import StrEnum
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Annotated
 
@@ -202,6 +203,15 @@ def test_keys_of_other_models_are_added_to_a_table(added):
     found = config.with_keys(*added)(Table)
     assert {*found.model_fields} == {*Table.model_fields}.union(*(model.model_fields for model in added))
     assert [*found.model_fields][: len(Table.model_fields)] == [*Table.model_fields]
+
+
+def test_service_of_a_plug_in_takes_no_name(monkeypatch, caplog):
+    names = ("c2", "platform", "modem", "all", "own", "own")
+    points = [EntryPoint(name, f"package_{number}", "") for number, name in enumerate(names)]
+    monkeypatch.setattr(config, "installed_points", lambda _: points)
+    found = config.service_packages.__wrapped__()
+    assert found == {name: f"sonarpost.services.{name}" for name in config.SERVICES} | {"own": "package_4"}
+    assert [record.args[0] for record in caplog.records] == ["c2", "platform", "modem", "all", "own"]
 
 
 def test_only_a_concrete_class_with_a_model_adds_keys():

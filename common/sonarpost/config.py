@@ -8,6 +8,7 @@ is parsed as a TOML value, or used as a string if it is not one. An empty variab
 from __future__ import annotations
 
 import inspect
+import logging
 import stat
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,6 +25,8 @@ from sonarpost.logs import LogFormat
 from sonarpost.messages import PlatformId
 from sonarpost.registry import installed_points
 from sonarpost.wire import expected_text
+
+log = logging.getLogger(__name__)
 
 ENVIRONMENT_PREFIX = "SONARPOST_"
 
@@ -55,7 +58,10 @@ def service_packages() -> Mapping[str, str]:
     """
     found = {name: f"sonarpost.services.{name}" for name in SERVICES}
     for point in installed_points(SERVICE_GROUP):
-        found.setdefault(point.name, point.value)
+        if point.name in (*found, "platform", "modem", "all"):
+            log.warning("Service ignored: its name is taken: %s = %s", point.name, point.value)
+        else:
+            found[point.name] = point.value
     return found
 
 

@@ -15,6 +15,7 @@ from sonarpost import registry
 from sonarpost.cli.main import COMMANDS, LOG_LEVEL_VARIABLE, exit_status, main, parser
 from sonarpost.cli.parsing.commands import GROUP, AddedCommand, added_commands, all_examples, all_extras
 from sonarpost.cli.parsing.parser import actions_of, all_parsers
+from sonarpost.codec.registry import BUILTINS, ENTRY_POINT_GROUP, CodecRegistry, codec_plug_ins
 
 EXAMPLES = all_examples()
 ADDED = {name: each.summary for name, each in added_commands().working().items() if " " not in name}
@@ -123,6 +124,17 @@ def test_broken_command_of_a_plug_in_stops_no_other(monkeypatch, capsys, caplog)
     assert "invalid choice: 'boom'" in capsys.readouterr().err
     assert "Command ignored: plug_in_that_is_absent:add_parser: ModuleNotFoundError" in caplog.text
     assert "sonarpost.commands:run" in caplog.text
+
+
+def test_list_of_codecs_has_the_error_of_a_broken_plug_in(monkeypatch, capsys):
+    broken = codec_plug_ins([EntryPoint("boom", "plug_in_that_is_absent:SPEC", ENTRY_POINT_GROUP)])
+    monkeypatch.setattr("sonarpost.codec.registry.default_registry", lambda: CodecRegistry(BUILTINS, broken))
+    with pytest.raises(SystemExit) as caught:
+        main(["encode", "--codec", "help"])
+    assert caught.value.code == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == sorted(["boom", *(spec.name for spec in BUILTINS)])
+    assert "entry point sonarpost.codecs:boom: value: got" in "".join(lines)
 
 
 def test_every_command_has_an_example_that_parses(whole):

@@ -120,6 +120,22 @@ def test_invalid_plug_in_stops_only_who_uses_it(name: str, value: str, match: st
         registry.spec_for_id(0xFE)
 
 
+@pytest.mark.usefixtures("registry")
+@pytest.mark.parametrize(
+    "find", [lambda registry: registry.spec("plugin"), lambda registry: registry.spec_for_id(0x81)]
+)
+def test_plug_in_that_another_thread_registers_meanwhile(find, monkeypatch) -> None:
+    plug_ins = codec_plug_ins([plugin("plugin", "PLUGIN")])
+    registry = CodecRegistry(BUILTINS, plug_ins)
+
+    def get(_: str) -> CodecSpec:
+        registry.register(PLUGIN)
+        return PLUGIN
+
+    monkeypatch.setattr(plug_ins, "get", get)
+    assert find(registry) is PLUGIN
+
+
 def test_prefixes_of_embedded_codecs_are_images(registry: CodecRegistry) -> None:
     assert {name for name in registry.names() if registry.is_embedded(name)} == {"emb", "spiht"}
     assert not registry.is_embedded("nothing")

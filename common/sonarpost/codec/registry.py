@@ -145,14 +145,14 @@ class CodecRegistry:
             self.register(spec)
 
     def register(self, spec: CodecSpec) -> None:
-        """Add a codec.
+        """Add a codec; to add it again changes nothing, so that two threads can do it at once.
 
         Raises:
             ConfigError: The name or a codec id is taken, a codec id is outside 0..255, there is none, or the codec
                 needs tiles and a codec id does not have a tag of two bytes.
         """
         where = f"codec {spec.name}"
-        if spec.name in self._by_name:
+        if self._by_name.get(spec.name, spec) is not spec:
             raise ConfigError("codec registry", "name", spec.name, "a name that is not taken")
         if not spec.codec_ids or len(set(spec.codec_ids)) != len(spec.codec_ids):
             raise ConfigError(where, "codec_ids", spec.codec_ids, "at least one id, none twice")
@@ -162,11 +162,12 @@ class CodecRegistry:
             if spec.needs_tiles and tag_length(codec_id) != CODEBOOK_TAG_BYTES:
                 expected = "0x10..0x1f or 0x80..0xff, which have a codebook tag of two bytes"
                 raise ConfigError(where, "codec_ids", f"{codec_id:#04x}", expected)
-            if codec_id in self._by_id:
-                owner = self._by_id[codec_id].name
-                raise ConfigError(where, "codec_ids", f"{codec_id:#04x}", f"an id that is not taken (it is {owner}'s)")
-        self._by_name[spec.name] = spec
+            owner = self._by_id.get(codec_id, spec)
+            if owner is not spec:
+                expected = f"an id that is not taken (it is {owner.name}'s)"
+                raise ConfigError(where, "codec_ids", f"{codec_id:#04x}", expected)
         self._by_id.update(dict.fromkeys(spec.codec_ids, spec))
+        self._by_name[spec.name] = spec  # last: a thread that finds the name finds the ids
 
     def names(self) -> tuple[str, ...]:
         """Return the names, sorted."""

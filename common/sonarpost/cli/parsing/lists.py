@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Final
 
+from sonarpost.errors import ConfigError
+
 # Imported lazily in every function: the codecs load numpy.
 
 
@@ -14,7 +16,14 @@ def _codecs() -> list[str]:
     from sonarpost.codec.registry import default_registry  # noqa: PLC0415
 
     registry = default_registry()
-    return [f"{name:16} {registry.spec(name).summary}" for name in registry.names()]
+
+    def summary(name: str) -> str:
+        try:
+            return registry.spec(name).summary
+        except ConfigError as error:  # a plug-in that cannot be used
+            return str(error)
+
+    return [f"{name:16} {summary(name)}" for name in registry.names()]
 
 
 def _codebooks() -> list[str]:
