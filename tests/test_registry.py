@@ -75,6 +75,21 @@ def test_invalid_entry_points_of_an_extension_are_reported_once(content, monkeyp
     assert str(tmp_path / "broken" / "entry_points.toml") in record.getMessage()
 
 
+def test_damaged_metadata_of_a_package_hides_no_extension(monkeypatch, tmp_path, caplog):
+    metadata = tmp_path / "damaged-1.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: damaged\nVersion: 1\n")
+    (metadata / "entry_points.txt").write_text("[sonarpost.commands]\nneither name nor value\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    registry.installed_points.cache_clear()
+    try:
+        found = registry.installed_points("sonarpost.commands")
+    finally:
+        registry.installed_points.cache_clear()
+    assert list(found) == registry._extension_points("sonarpost.commands")
+    assert caplog.text.count("Plug-ins of sonarpost.commands ignored: metadata of an installed package: TypeError") == 1
+
+
 def test_core_has_priority(numbers, caplog):
     assert numbers(zero="ONE").get("zero") == 0
     assert "its name is taken: sonarpost.numbers:zero = plug_in_numbers:ONE" in caplog.text

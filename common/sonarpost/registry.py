@@ -11,7 +11,7 @@ import logging
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
@@ -116,7 +116,12 @@ def load(point: EntryPoint) -> Any:  # noqa: ANN401 whatever the entry point nam
 @cache
 def installed_points(group: str) -> tuple[EntryPoint, ...]:
     """Return the entry points of the extensions, then those of plug-ins, each in the order of names and values."""
-    return (*_extension_points(group), *sorted(entry_points(group=group), key=lambda p: (p.name, p.value)))
+    try:
+        plug_ins = entry_points(group=group)
+    except Exception as error:  # noqa: BLE001 the damaged metadata of any package: one of many types
+        log.warning("Plug-ins of %s ignored: metadata of an installed package: %r", group, error)
+        plug_ins = EntryPoints()
+    return (*_extension_points(group), *sorted(plug_ins, key=lambda p: (p.name, p.value)))
 
 
 def _extension_points(group: str) -> list[EntryPoint]:

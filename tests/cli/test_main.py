@@ -126,6 +126,23 @@ def test_broken_command_of_a_plug_in_stops_no_other(monkeypatch, capsys, caplog)
     assert "sonarpost.commands:run" in caplog.text
 
 
+def test_help_has_no_command_without_examples_and_any_summary(monkeypatch, capsys, caplog):
+    module = sys.modules[__name__]
+    monkeypatch.setattr(module, "WHOLE", AddedCommand("100 % of it", "absent:add_parser", {}), raising=False)
+    monkeypatch.setattr(module, "WITHOUT", AddedCommand("without examples", "absent:add_parser", None), raising=False)
+    points = [EntryPoint(name, f"{__name__}:{name.upper()}", GROUP) for name in ("whole", "without")]
+    monkeypatch.setattr(registry, "installed_points", lambda group: points if group == GROUP else [])
+    added_commands.cache_clear()
+    try:
+        main([])
+    finally:
+        added_commands.cache_clear()
+    printed = capsys.readouterr().out
+    assert "100 % of it" in printed
+    assert "without examples" not in printed
+    assert "sonarpost.commands:without" in caplog.text
+
+
 def test_list_of_codecs_has_the_error_of_a_broken_plug_in(monkeypatch, capsys):
     broken = codec_plug_ins([EntryPoint("boom", "plug_in_that_is_absent:SPEC", ENTRY_POINT_GROUP)])
     monkeypatch.setattr("sonarpost.codec.registry.default_registry", lambda: CodecRegistry(BUILTINS, broken))

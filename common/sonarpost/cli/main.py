@@ -56,7 +56,7 @@ def parser(command: str | None = None) -> CommandParser:
             if command in (None, name):
                 each.add(subparsers)
             else:
-                subparsers.add_parser(name, help=each.summary)
+                subparsers.add_parser(name, help=each.summary.replace("%", "%%"))
     return whole
 
 

@@ -127,12 +127,15 @@ EXAMPLES: Final[Mapping[str, str]] = {
 @cache
 def added_commands() -> Registry[AddedCommand]:
     """Return the commands of extensions and plug-ins."""
-    return Registry(
-        GROUP,
-        "a sonarpost.cli.parsing.commands.AddedCommand with a name that no command of the core has",
-        lambda found, name: isinstance(found, AddedCommand) and name not in COMMANDS and name not in EXAMPLES,
-        {},
-    )
+    expected = "a sonarpost.cli.parsing.commands.AddedCommand with a name that no command of the core has"
+    return Registry(GROUP, expected, _is_command, {})
+
+
+def _is_command(found: object, name: str) -> bool:
+    if not isinstance(found, AddedCommand) or name in COMMANDS or name in EXAMPLES:
+        return False
+    types = (str, str, Mapping, Mapping)  # the help of every command uses them
+    return all(map(isinstance, (found.summary, found.parser, found.examples, found.extras), types))
 
 
 def add_actions(actions: argparse._SubParsersAction[Any], command: str) -> None:
