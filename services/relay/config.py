@@ -49,7 +49,7 @@ class UpstreamOptions(ServiceConfig):
 
     @model_validator(mode="after")
     def _check_keys(self) -> UpstreamOptions:
-        others = {key for bearer, keys in _BEARERS.items() if bearer != self.bearer for key in keys}
+        others = set().union(*_BEARERS.values()) - _BEARERS[self.bearer]
         if given := sorted(self.model_fields_set & others):
             raise ValueError(f"no {given[0]} with bearer {self.bearer}")
         return self

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.messages import ImagePart
+from sonarpost.services.relay import config
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions
 from sonarpost.services.relay.service import topic_of
 
@@ -29,6 +30,13 @@ def names(site):
         f"{record.i}v{record.n}" if isinstance(record, ImagePart) else msgpack.unpackb(record.payload)["decision_id"]
         for record in site.received
     ]
+
+
+def test_two_bearers_can_have_one_key(monkeypatch):
+    monkeypatch.setattr(config, "_BEARERS", {"radio": {"router", "max_bytes"}, "own": {"max_bytes"}})
+    assert UpstreamOptions(bearer="own", max_bytes=5).max_bytes == UpstreamOptions(max_bytes=5).max_bytes
+    with pytest.raises(ValidationError, match="no router with bearer own"):
+        UpstreamOptions(bearer="own", router=("tcp/127.0.0.1:7447",))
 
 
 def test_every_site_receives_everything_and_an_unreachable_one_delays_none(begin, runner, c2, source):
