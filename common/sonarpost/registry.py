@@ -53,7 +53,7 @@ class Registry(Generic[T]):
         self._core = tuple(core)
         self._objects = dict(core)
         self._points: dict[str, EntryPoint] = {}
-        self._reported: set[str] = set()
+        self._unusable: set[str] = set()
         for point in installed_points(group) if points is None else points:
             if point.name in self._objects or point.name in self._points:
                 log.warning("Plug-in ignored: its name is taken: %s:%s = %s", group, point.name, point.value)
@@ -78,18 +78,19 @@ class Registry(Generic[T]):
         return self._objects[name]
 
     def working(self) -> dict[str, T]:
-        """Return all objects that can be imported, by name; each of the others is reported in the log once.
+        """Return all objects that can be imported, by name; each of the others is tried and reported in the log once.
 
         Those of the core are first, in their order.
         """
         found = {}
         for name in (*self._core, *sorted(self._points)):
+            if name in self._unusable:
+                continue  # its import can take long
             try:
                 found[name] = self.get(name)
             except ConfigError as error:
-                if name not in self._reported:
-                    log.warning("Plug-in ignored: %s", error)
-                self._reported.add(name)
+                log.warning("Plug-in ignored: %s", error)
+                self._unusable.add(name)
         return found
 
     def _load(self, point: EntryPoint) -> T:
