@@ -20,7 +20,7 @@ from sonarpost.delivery.outbox import QueuePolicy
 from sonarpost.delivery.records import OutboxItem, Topic, consumer_of, queue_of
 from sonarpost.delivery.store import DiskReserve
 from sonarpost.delivery.transaction import Transaction
-from sonarpost.errors import MissingBaseError, PayloadError
+from sonarpost.errors import PayloadError
 from sonarpost.logs import kv, log_batch
 from sonarpost.messages import (
     CodedImage,
@@ -50,6 +50,8 @@ DETAIL_PRIORITY = 6
 LOGGED_COUNTS = ("coded_images_relayed", "decisions_relayed")
 VERSIONS = "version/"
 """Prefix of the states with the last version of an image that a site has acknowledged."""
+WHOLES = "whole/"
+"""Prefix of the states with the whole image of a queued difference."""
 
 
 class Upstream:
@@ -235,11 +237,14 @@ class RelayService(Service[RelayConfig]):
             if image.version > 1:
                 name = f"{VERSIONS}{queue}/{topic.name}"
                 known = image_parts.stored_version(self.store.get_state(name), name)
-            sent = payload
-            if known is not None:
-                sent = wire.encode(image_parts.difference(whole, known))
+            found = whole if known is None else image_parts.difference(whole, known)
+            is_difference = found is not whole
+            sent = wire.encode(found) if is_difference else payload
+            if is_difference:
+                # The site may have another version by then, and so may this relay.
+                effects.put_state(f"{WHOLES}{queue}/{topic.name}/{image.version}", payload)
             effects.send_payload(key, queue, sent, ImagePart, priority=priority, topic=replaces)
-            effects.count("image_differences", int(sent is not payload))
+            effects.count("image_differences", int(is_difference))
         effects.count("image_bytes_received", image.bytes_received)
         effects.count("coded_images_relayed")
         if log.isEnabledFor(logging.DEBUG):
@@ -251,21 +256,18 @@ class RelayService(Service[RelayConfig]):
             self._withdraw(item)
         if item.key != self._part_keys.get(item.queue):
             return False
-        part, whole = image_parts.head_of(item.payload), item.payload
+        part = image_parts.head_of(item.payload)
         name = f"{VERSIONS}{item.queue}/{part.subject}"
         if part.version == 1 and reason is None:
-            tx.add_state(name, whole)  # a stored one is the same version or a later one
+            tx.add_state(name, item.payload)  # a stored one is the same version or a later one
             self._prune_versions(tx, item.queue)
             return False
         known = image_parts.stored_version(tx.get_state(name), name)
-        if part.base:
-            try:
-                whole = wire.encode(image_parts.expand(wire.decode(ImagePart, whole, item.key), known, item.key))
-            except MissingBaseError as error:
-                # Only if the base was deleted for newer images: the site asks for the whole when it needs it.
-                fields = kv(site_queue=item.queue, reason=str(error))
-                log.warning("Image version not stored: the base of its difference was deleted", extra=fields)
-                return False
+        whole = self._take_whole(tx, item, part) if part.base else item.payload
+        if whole is None:
+            # Deleted for a later version that the site has, or for newer images.
+            log.warning("Image version not stored: its whole was deleted", extra=kv(site_queue=item.queue, name=name))
+            return reason is not None and known is not None and known.n > part.version
         if reason is None:
             if known is None or known.n < part.version:
                 tx.put_state(name, whole)
@@ -278,6 +280,16 @@ class RelayService(Service[RelayConfig]):
         self.count("image_differences_refused")
         return True
 
+    def _take_whole(self, tx: Transaction, item: OutboxItem, part: image_parts.PartHead) -> bytes | None:
+        """Remove and return the whole image of a difference; with `supersede`, remove those of earlier versions too."""
+        prefix = f"{WHOLES}{item.queue}/{part.subject}/"
+        whole = tx.get_state(f"{prefix}{part.version}")
+        for kept in tx.state_names(prefix):
+            version = int(kept.removeprefix(prefix))
+            if version == part.version or (self.config.supersede and version < part.version):
+                tx.delete_state(kept)
+        return whole
+
     def _prune_versions(self, tx: Transaction, queue: str) -> None:
         """Delete surplus versions, except those of images with a queued difference."""
         self._stored_versions[queue] += 1
@@ -285,6 +297,10 @@ class RelayService(Service[RelayConfig]):
             prefix = f"{VERSIONS}{queue}/"
             surplus = image_parts.surplus_names(tx.state_names(prefix))
             tx.delete_states(prefix, (name.removeprefix(prefix) for name in surplus), queue)
+            # Those of records that were dropped are never taken.
+            wholes = {kept: kept.rpartition("/")[0] for kept in tx.state_names(f"{WHOLES}{queue}/")}
+            dropped = set(image_parts.surplus_names(list(wholes.values())))
+            tx.delete_states("", (kept for kept, image in wholes.items() if image in dropped))
 
     def after_commit(self, handled: Sequence[UnitOfWork], superseded: int) -> None:
         """Log the queued records, and apply the quota of each site's queue."""

@@ -58,7 +58,7 @@ class Halving:
 
     def encode(self, image: np.ndarray, budget_bytes: int | None = None) -> bytes:
         if image.mean() < 20:
-            raise StreamError("halving", "pixels", "dark", "a bright one")
+            raise StreamError("halving", "image", "dark", "a bright one")
         header = StreamHeader(self.codec_id, 0xAB, *image.shape).pack()
         for block in (4, 8, 16, 32):
             rows, columns = -(-image.shape[0] // block), -(-image.shape[1] // block)

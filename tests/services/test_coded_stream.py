@@ -11,9 +11,11 @@ from builders.common import eventually
 from builders.vessel_frames import CONTACT
 
 from sonarpost import keys, wire
+from sonarpost.archive import image_parts
 from sonarpost.archive.image_parts import stream_of
 from sonarpost.codec.registry import default_registry
 from sonarpost.delivery.records import OutboxItem, Topic
+from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
@@ -234,6 +236,57 @@ def test_relay_keeps_the_later_version_if_the_first_is_acknowledged_after_it(pla
         found += relay.store.states("version/").values()
     relay.store.close()
     assert found == [payloads[0], payloads[1], payloads[1]]
+
+
+@pytest.mark.parametrize("supersede", [True, False])
+def test_refused_difference_is_sent_whole_after_another_version_was_acknowledged(platform, supersede):
+    """The site has applied version 3 to version 2, the relay has stored version 2: neither is its base."""
+    relay = RelayService(platform(VESSEL), RelayConfig(supersede=supersede))
+    queue, key = "c2", keys.shore_part(VESSEL)
+    streams = [np.random.default_rng(n).integers(0, 256, 300, np.uint8).tobytes() for n in (1, 2)]
+    first, second, third = (
+        CodedImage(**dict(update(data, version)), model="", codec="spiht", pixels_crc32=None)
+        for version, data in ((1, streams[0]), (2, streams[1]), (3, streams[0] + streams[1]))
+    )
+    wholes = [wire.encode(image_parts.whole_part(image)) for image in (first, second, third)]
+    items = [OutboxItem(queue, n, key, "", 5, payload, b"") for n, payload in enumerate(wholes, start=1)]
+    with relay.store.transaction() as tx:
+        relay.on_acknowledged(tx, items[0], None)
+    effects = UnitOfWork()
+    relay._queue_image(third, effects)
+    relay.commit(effects)
+    [difference] = relay.store.queued_items(queue, relay.store.queued_numbers(queue, 9))
+    assert image_parts.head_of(difference.payload).base == 1
+    with relay.store.transaction() as tx:
+        relay.on_acknowledged(tx, items[1], None)
+        assert relay.on_acknowledged(tx, difference, "k: send the whole image")
+        tx.remove_acknowledged(queue, [difference.seq])
+    [sent] = relay.store.queued_items(queue, relay.store.queued_numbers(queue, 9))
+    names = relay.store.state_names("whole/")
+    relay.store.close()
+    assert sent.payload == wholes[2]
+    assert names == ()
+
+
+def test_acknowledged_difference_is_stored_whole(platform, stream):
+    relay, queue, key = RelayService(platform(VESSEL), RelayConfig()), "c2", keys.shore_part(VESSEL)
+    first, second = (
+        CodedImage(**dict(update(stream[:length], version)), model="", codec="spiht", pixels_crc32=None)
+        for version, length in ((1, 200), (2, 300))
+    )
+    with relay.store.transaction() as tx:
+        payload = wire.encode(image_parts.whole_part(first))
+        relay.on_acknowledged(tx, OutboxItem(queue, 1, key, "", 5, payload, b""), None)
+    effects = UnitOfWork()
+    relay._queue_image(second, effects)
+    relay.commit(effects)
+    [difference] = relay.store.queued_items(queue, relay.store.queued_numbers(queue, 9))
+    with relay.store.transaction() as tx:
+        assert not relay.on_acknowledged(tx, difference, None)
+    found, left = relay.store.states("version/"), relay.store.state_names("whole/")
+    relay.store.close()
+    assert list(found.values()) == [wire.encode(image_parts.whole_part(second))]
+    assert left == ()
 
 
 def test_relay_deletes_surplus_versions_except_those_with_a_queued_record(platform, monkeypatch):
