@@ -243,7 +243,11 @@ class DeliveryFaults(RuleBasedStateMachine):
         """Send other bytes under the identity of a producer's record, on its own key."""
         seen = self.sent[number % len(self.sent)]
         fields = msgpack.unpackb(seen.attached)
-        seq, digest = (fields["seq"], fields["sha256"]) if fields["v"] == 1 else fields["records"][0][::2]
+        if fields["v"] == 1:
+            seq, digest = fields["seq"], fields["sha256"]
+        else:  # a batch has one digest of all its records
+            seq, size = fields["records"][0]
+            digest = hashlib.sha256(seen.content[:size]).digest()
         key = seen.key.removesuffix("/delivery/relay")
         windows, _, inbox = self.delivery.consumer_state_of_producers()
         self.delivery.receive([query_of(key, fields["origin"], [(seq, f"{key} valid own".encode(), digest)], 0)])
