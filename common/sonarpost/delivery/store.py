@@ -52,6 +52,8 @@ CACHE_KB = 8000
 """Page cache: records in flight are deleted without reading them from the disk."""
 BUSY_TIMEOUT_S = 10
 """Longest wait for another process that reads or copies the file."""
+TRUNCATE_TIMEOUT_MS = 200
+"""Longest wait for other processes that read the write-ahead log, before its space is returned to the disk."""
 CHECKPOINT_BYTES = 4_096_000
 """Size of the write-ahead log at which its pages are copied into the file."""
 HANDLING_RESERVE_BYTES = 8_388_608
@@ -324,8 +326,8 @@ class Store:
             DeliveryError: The log cannot be written to the file, for example because the disk is full.
         """
         with self._lock:
-            # Without waiting for a reader of another process: a transaction would wait too.
-            self._query("PRAGMA busy_timeout=0")
+            # Without a long wait for a reader of another process: a transaction would wait too.
+            self._query(f"PRAGMA busy_timeout={TRUNCATE_TIMEOUT_MS}")
             try:
                 self._query("PRAGMA wal_checkpoint(TRUNCATE)")
             finally:
