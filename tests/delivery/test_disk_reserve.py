@@ -90,3 +90,13 @@ def test_a_log_that_cannot_be_written_is_reported(store, disk, monkeypatch):
     disk[0] = 1000
     assert reserve.degraded_reason() == "database or disk is full"
     reserve.require()
+
+
+def test_a_rejection_is_reported_once_although_there_is_space_again(store, disk):
+    reserve = DiskReserve(store, 1000, "records wait")
+    disk[0] = 999
+    with pytest.raises(RetryLaterError):
+        reserve.require()
+    disk[0] = 1000
+    assert "999 bytes free" in reserve.degraded_reason()
+    assert reserve.degraded_reason() == ""

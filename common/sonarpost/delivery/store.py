@@ -451,6 +451,7 @@ class DiskReserve:
         self._reserve_bytes = reserve_bytes
         self._consequence = consequence
         self._reached = False
+        self._rejection = ""
 
     def free_bytes(self) -> int:
         """Return the usable space in bytes.
@@ -467,19 +468,21 @@ class DiskReserve:
             RetryLaterError: It is below the reserve.
         """
         if reason := self._check():
+            self._rejection = reason
             raise RetryLaterError(reason)
 
     def degraded_reason(self) -> str:
-        """Return why no records are accepted, empty if they are; checks again only after `require` has failed."""
+        """Return why a record was rejected since the last call, or why none are accepted; empty without a reason."""
+        rejection, self._rejection = self._rejection, ""
         if not self._reached:
-            return ""
+            return rejection
         failure = ""
         try:
             # Only new records would return this space, and none are accepted.
             self._store.truncate_log()
         except DeliveryError as error:
             failure = str(error)
-        return self._check() or failure
+        return self._check() or rejection or failure
 
     def _check(self) -> str:
         free_bytes = shutil.disk_usage(self._folder).free
