@@ -101,7 +101,7 @@ class Registry(Generic[T]):
         return found
 
 
-def load(point: EntryPoint) -> Any:  # noqa: ANN401 whatever the entry point names
+def load(point: EntryPoint) -> Any:  # noqa: ANN401 the entry point names it
     """Import the object of an entry point.
 
     Raises:

@@ -266,7 +266,7 @@ class RelayService(Service[RelayConfig]):
         whole = self._take_whole(tx, item, part) if part.base else item.payload
         if whole is None:
             # Deleted for a later version that the site has, or for newer images.
-            log.warning("Image version not stored: its whole was deleted", extra=kv(site_queue=item.queue, name=name))
+            log.warning("Image version not stored: its whole image was deleted", extra=kv(state=name))
             return reason is not None and known is not None and known.n > part.version
         if reason is None:
             if known is None or known.n < part.version:

@@ -284,6 +284,9 @@ def test_acknowledged_difference_is_stored_whole(platform, stream):
     with relay.store.transaction() as tx:
         assert not relay.on_acknowledged(tx, difference, None)
     found, left = relay.store.states("version/"), relay.store.state_names("whole/")
+    with relay.store.transaction() as tx:
+        # Its whole image is gone; the site has this version and no later one.
+        assert not relay.on_acknowledged(tx, difference, "k: send the whole image")
     relay.store.close()
     assert list(found.values()) == [wire.encode(image_parts.whole_part(second))]
     assert left == ()
