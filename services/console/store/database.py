@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import json
 import sqlite3
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from sonarpost.errors import DeliveryError
-from sonarpost.files import make_private
 from sonarpost.messages import Command, Comment, Decision
+from sonarpost.sqlite_file import SqliteFile
 
 UserRole = Literal["observer", "operator", "expert"]
 ConsoleSide = Literal["vessel", "shore"]
@@ -188,70 +186,6 @@ _CHANGED: Final = (
     " FROM changed n JOIN contact c ON c.id = n.id GROUP BY 1 ORDER BY 1"
 )
 """The changed contacts; an image that answers a request is a layer of its contact."""
-
-
-class SqliteFile:
-    """An SQLite file, shared by several threads, with one transaction at a time.
-
-    Args:
-        path: The file.
-        schema: SQL that creates the tables of a new file, also if another process does so at the same time.
-        version: Schema version.
-
-    Raises:
-        DeliveryError: The file cannot be opened, or has another schema version.
-    """
-
-    def __init__(self, path: Path, schema: str, version: int) -> None:
-        self.path = path
-        self._lock = threading.RLock()
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            make_private(path)
-            self._db = sqlite3.connect(path, check_same_thread=False, isolation_level=None, timeout=10)
-            self._db.row_factory = sqlite3.Row
-            self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA synchronous=FULL")
-            [is_new] = self._db.execute("SELECT COUNT(*) = 0 FROM sqlite_master").fetchone()
-            [found] = self._db.execute("PRAGMA user_version").fetchone()
-            if is_new:
-                self._db.executescript(f"BEGIN IMMEDIATE; {schema} PRAGMA user_version={version}; COMMIT;")
-            elif found != version:
-                self._db.close()
-                remedy = "written by another version of sonarpost; move it away to start with an empty file"
-                raise DeliveryError(f"{path}: schema version {found}, expected {version}: {remedy}")
-        except (OSError, sqlite3.Error) as error:
-            raise DeliveryError(f"{path}: cannot be opened as an SQLite file: {error}") from error
-
-    @contextmanager
-    def read(self) -> Iterator[sqlite3.Connection]:
-        """Return the connection for reading.
-
-        Raises:
-            DeliveryError: The database cannot be read.
-        """
-        with self._lock:
-            try:
-                yield self._db
-            except sqlite3.Error as error:
-                raise DeliveryError(f"{self.path}: {error}") from error
-
-    @contextmanager
-    def transaction(self) -> Iterator[sqlite3.Connection]:
-        """Run the block in a transaction: committed to disk at its end, rolled back after an exception.
-
-        Raises:
-            DeliveryError: The transaction failed, for example because of a full disk, and was rolled back.
-        """
-        # The connection commits at the end of its block, and rolls back after an exception.
-        with self.read() as db, db:
-            db.execute("BEGIN IMMEDIATE")
-            yield db
-
-    def close(self) -> None:
-        """Close the file."""
-        with self._lock:
-            self._db.close()
 
 
 class Database(SqliteFile):

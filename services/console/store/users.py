@@ -16,7 +16,8 @@ from typing import Literal
 
 from sonarpost.errors import BadInputError
 from sonarpost.limits import limit
-from sonarpost.services.console.store.database import ROLES, SqliteFile, UserRole
+from sonarpost.services.console.store.database import ROLES, UserRole
+from sonarpost.sqlite_file import SqliteFile
 
 FILE_NAME = "console-users.db"
 SCHEMA_VERSION = 1

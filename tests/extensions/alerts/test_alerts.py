@@ -24,7 +24,7 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 from sonarpost.cli.main import main
-from sonarpost.errors import PortError, StoredFileError
+from sonarpost.errors import DeliveryError, PortError
 from sonarpost.export.contacts import load_contacts
 from sonarpost.export.live import LiveContacts
 from sonarpost.extensions.alerts import command
@@ -212,7 +212,7 @@ def test_alert_that_fails_ends_no_batch(monkeypatch, tmp_path):
 def test_foreign_state_file_is_an_error(tmp_path):
     path = tmp_path / "state.db"
     path.write_bytes(b"not a database" * 100)
-    with pytest.raises(StoredFileError, match="state file"):
+    with pytest.raises(DeliveryError, match=r"state\.db: cannot be opened"):
         SentAlerts(path)
 
 

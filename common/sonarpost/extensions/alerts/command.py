@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import logging
 import math
-import sqlite3
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
@@ -17,7 +16,7 @@ from sonarpost import logs
 from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.c2.live import ContactStream, add_live_options
 from sonarpost.cli.shared import Subparsers, in_new_folder, log_level, router_of
-from sonarpost.errors import ConfigError, PortError, StoredFileError
+from sonarpost.errors import ConfigError, PortError
 from sonarpost.export.contacts import ExportContact
 from sonarpost.export.text import utc_text
 from sonarpost.extensions.alerts.document import alert_document, needs_alert
@@ -32,6 +31,7 @@ from sonarpost.extensions.alerts.senders import (
 from sonarpost.limits import Turns, limit
 from sonarpost.logs import kv
 from sonarpost.security.client_tls import TlsFiles
+from sonarpost.sqlite_file import SqliteFile
 from sonarpost.stop_signals import stop_on_signals
 
 log = logging.getLogger(__name__)
@@ -45,6 +45,7 @@ MAX_WAITING: Final = limit(
 )
 MAX_SENT: Final = 200_000
 """Identifiers in the state file; the oldest are deleted."""
+_SCHEMA: Final = "CREATE TABLE IF NOT EXISTS sent (number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE);"
 
 
 def add_parser(actions: Subparsers) -> None:
@@ -107,47 +108,33 @@ def run(parsed: argparse.Namespace) -> int:
     return 0
 
 
-class SentAlerts:
+class SentAlerts(SqliteFile):
     """Identifiers of sent alerts in a SQLite file, so that a restart does not repeat them.
 
     Args:
         path: The file; it is created if it does not exist.
 
     Raises:
-        StoredFileError: It cannot be opened, or is no such file.
+        DeliveryError: It cannot be opened, or is no such file.
     """
 
     def __init__(self, path: Path, max_rows: int = MAX_SENT) -> None:
-        self._path = path
+        super().__init__(path, _SCHEMA, version=1)
         self._max_rows = max_rows
-        try:
-            self._db = sqlite3.connect(path)
-            self._db.execute("PRAGMA synchronous = FULL")
-            self._db.execute(
-                "CREATE TABLE IF NOT EXISTS sent (number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE)"
-            )
-        except sqlite3.DatabaseError as error:
-            raise StoredFileError(str(path), "", str(error), "the state file of `sonarpost c2 alert`") from error
 
     def __contains__(self, alert_id: str) -> bool:
-        return self._db.execute("SELECT 1 FROM sent WHERE id = ?", (alert_id,)).fetchone() is not None
+        with self.read() as db:
+            return db.execute("SELECT 1 FROM sent WHERE id = ?", (alert_id,)).fetchone() is not None
 
     def add(self, alert_id: str) -> None:
         """Add an identifier, durably; delete the oldest above the limit.
 
         Raises:
-            StoredFileError: The file cannot be written.
+            DeliveryError: The file cannot be written.
         """
-        try:
-            with self._db:
-                cursor = self._db.execute("INSERT OR IGNORE INTO sent (id) VALUES (?)", (alert_id,))
-                self._db.execute("DELETE FROM sent WHERE number <= ?", ((cursor.lastrowid or 0) - self._max_rows,))
-        except sqlite3.DatabaseError as error:
-            raise StoredFileError(str(self._path), "", str(error), "a writable state file") from error
-
-    def close(self) -> None:
-        """Close the file."""
-        self._db.close()
+        with self.transaction() as db:
+            cursor = db.execute("INSERT OR IGNORE INTO sent (id) VALUES (?)", (alert_id,))
+            db.execute("DELETE FROM sent WHERE number <= ?", ((cursor.lastrowid or 0) - self._max_rows,))
 
 
 @dataclass(slots=True)
