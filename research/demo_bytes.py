@@ -28,6 +28,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import zenoh
+from typing_extensions import override
 
 from research.fleet import open_session
 from research.recording_relay import acknowledged
@@ -52,6 +53,7 @@ REPORT_AGE_S = 5.0
 class RecordedChain(Chain):
     """The chain of the demo with a relay that records acknowledgements."""
 
+    @override
     def module(self, name: str) -> tuple[str, ...]:
         """Return the module of a process and its arguments."""
         command = super().module(name)

@@ -54,6 +54,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import zenoh
+from typing_extensions import override
 
 from research.recording_relay import acknowledged
 from sonarpost import keys, wire
@@ -85,6 +86,7 @@ class Load(Service[ServiceConfig]):
     NAME = "load"
     PUBLISH = False
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """No records are consumed."""
         raise NotImplementedError

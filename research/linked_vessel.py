@@ -12,6 +12,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import zenoh
+from typing_extensions import override
 
 from research.common.link_emulator import LinkEmulator
 from research.fleet import open_session
@@ -63,10 +64,12 @@ class TimedSink(Sink):
         self._site = site
         self.arrivals_s: list[float] = []
 
+    @override
     def consumed_keys(self) -> dict[str, type[Record]]:
         """Return the records of the relays for this site."""
         return {keys.shore_inbox_all(self._site): Relayed, keys.shore_part_all(self._site): ImagePart}
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Note the time."""
         self.arrivals_s.append(time.monotonic())
@@ -92,6 +95,7 @@ class TimedRelay(RelayService):
         self.queued_s.append(time.monotonic())
         self.queue(keys.contact_decision(VESSEL), wire.encode(decision(len(self.queued_s))))
 
+    @override
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> bool:
         """Note the time of a decision."""
         if item.key == keys.shore_inbox(VESSEL):

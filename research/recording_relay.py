@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from typing_extensions import override
+
 from sonarpost import wire
 from sonarpost.archive.image_parts import TIME_STEPS
 from sonarpost.config import PlatformConfig
@@ -35,6 +37,7 @@ class RecordingRelay(RelayService):
         super().__init__(platform, config)
         self._file = (platform.state_dir / FILE_NAME).open("a", buffering=1, encoding="utf-8")
 
+    @override
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> bool:
         """Record the acknowledgement of an image, then react to it as the relay does."""
         fields = _image_fields(item)
@@ -43,6 +46,7 @@ class RecordingRelay(RelayService):
             print(json.dumps(entry | {"acknowledged_utc_s": time.time()}), file=self._file)
         return super().on_acknowledged(tx, item, reason)
 
+    @override
     def stop(self) -> None:
         """Stop the relay, then close the file."""
         super().stop()

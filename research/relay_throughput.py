@@ -46,6 +46,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import zenoh
+from typing_extensions import override
 
 from research.fleet import coded_image
 from research.peers import PEERS, AbsentError, Peer
@@ -91,10 +92,12 @@ class Sink(Service[ServiceConfig]):
     NAME = "c2"
     BATCH = 512
 
+    @override
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Return the records of the relays."""
         return {keys.shore_inbox_all(): Relayed, keys.shore_part_all(): ImagePart}
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Do nothing: the record is on disk already."""
 
@@ -192,16 +195,19 @@ class Relay(Peer):
     def __init__(self, relay: RelayService, key: str) -> None:
         self._relay, self._key = relay, key
 
+    @override
     def fill(self, payloads: Sequence[bytes]) -> None:
         """Store records in the inbox of the relay."""
         with self._relay.store.transaction() as tx:
             for payload in payloads:
                 tx.accept(self._key, payload)
 
+    @override
     def connect(self) -> None:
         """Start the relay."""
         self._relay.start()
 
+    @override
     def stored(self) -> int:
         """Return the number of records that c2 has acknowledged."""
         return self._relay.acknowledged_count("c2")

@@ -30,6 +30,7 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 import zenoh
+from typing_extensions import override
 
 from research.common.link_emulator import LinkEmulator
 from research.fleet import Processes, coded_image, open_session
@@ -104,10 +105,12 @@ class Shore(Service[ServiceConfig]):
         super().__init__(platform, config)
         self.images: set[str] = set()
 
+    @override
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Return the records of the relay."""
         return {keys.shore_inbox_all(): Relayed, keys.shore_part_all(): ImagePart}
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Count an image."""
         if isinstance(record, ImagePart):

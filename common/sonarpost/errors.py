@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import errno
 
+from typing_extensions import override
+
 
 class SonarpostError(Exception):
     """Base class of all exceptions of sonarpost."""
@@ -30,6 +32,7 @@ class BadInputError(SonarpostError):
         self.expected = expected
         super().__init__(where, field, value, expected)
 
+    @override
     def __str__(self) -> str:
         shown = repr(self.value)
         if len(shown) > 80:

@@ -19,6 +19,8 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from typing import Literal
 
+from typing_extensions import override
+
 from sonarpost.errors import PayloadError
 from sonarpost.messages import ImagePart, Relayed
 from sonarpost.wire import unpack_map
@@ -29,6 +31,7 @@ LogFormat = Literal["text", "json"]
 class Fields(dict[str, object]):
     """Fields of a line; as text, each with a space before it: ` image_id=0001 bytes=232`."""
 
+    @override
     def __str__(self) -> str:
         return "".join(f" {name}={_shown(value)}" for name, value in self.items())
 
@@ -208,6 +211,7 @@ class TextFormatter(logging.Formatter):
         super().__init__()
         self._service = service
 
+    @override
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
         message = record.getMessage()
@@ -227,6 +231,7 @@ class JsonFormatter(logging.Formatter):
         super().__init__()
         self._service = service
 
+    @override
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
         event: dict[str, object] = {

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from typing_extensions import override
+
 PACKET_BYTES: Final = 512
 SOCKET_BUFFER_BYTES: Final = 4096
 SEGMENT_BYTES: Final = 1400
@@ -87,6 +89,7 @@ class _End(asyncio.BufferedProtocol):
         self.is_done = False
         self.is_closed = False
 
+    @override
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         transport.set_write_buffer_limits(0)
@@ -94,26 +97,32 @@ class _End(asyncio.BufferedProtocol):
         if self.is_closed:
             self.reset()
 
+    @override
     def connection_lost(self, exc: Exception | None) -> None:
         self.transport = None
         self.is_closed = True
         if exc is not None:
             self.other.reset()
 
+    @override
     def get_buffer(self, sizehint: int) -> bytearray:
         return self._buffer
 
+    @override
     def buffer_updated(self, nbytes: int) -> None:
         self._send(bytes(self._buffer[:nbytes]))
 
+    @override
     def eof_received(self) -> bool:
         self._has_ended = True
         self._send(b"")
         return True
 
+    @override
     def pause_writing(self) -> None:
         self.is_blocked = True
 
+    @override
     def resume_writing(self) -> None:
         self.is_blocked = False
         self.other.update()

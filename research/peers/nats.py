@@ -15,6 +15,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+from typing_extensions import override
+
 from research.peers.base import POLL_S, START_TIMEOUT_S, Peer, StartError, program, server
 from sonarpost.extensions.simulation.demo.settings import free_ports
 
@@ -93,6 +95,7 @@ class Nats(Peer):
         )
         self._is_connected = False
 
+    @override
     def fill(self, payloads: Sequence[bytes]) -> None:
         """Remove the receiver's stream, empty the sender's, then add the records to it."""
         if self._is_connected:
@@ -101,6 +104,7 @@ class Nats(Peer):
         self._sender.request(f"$JS.API.STREAM.PURGE.{SENT}")
         self._sender.store(OUTBOX, payloads)
 
+    @override
     def connect(self) -> None:
         """Create the receiver's stream."""
         source = {"name": SENT, "external": {"api": "$JS.sender.API", "deliver": ""}}
@@ -109,6 +113,7 @@ class Nats(Peer):
         )
         self._is_connected = True
 
+    @override
     def stored(self) -> int:
         """Return the length of the receiver's stream."""
         return int(self._receiver.request(f"$JS.API.STREAM.INFO.{RECEIVED}")["state"]["messages"])

@@ -19,6 +19,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from typing_extensions import override
+
 from research.peers.base import START_TIMEOUT_S, AbsentError, Peer, StartError, program, server
 from sonarpost.extensions.simulation.demo.settings import free_ports
 
@@ -54,6 +56,7 @@ class RabbitMq(Peer):
     def _open(self, port: int) -> pika.BlockingConnection:
         return self._pika.BlockingConnection(self._pika.ConnectionParameters("127.0.0.1", port, heartbeat=0))
 
+    @override
     def fill(self, payloads: Sequence[bytes]) -> None:
         """Remove the shovel and empty both queues, then add the records to the sender's in one transaction."""
         if self._is_connected:
@@ -71,6 +74,7 @@ class RabbitMq(Peer):
         channel.tx_commit()
         connection.close()
 
+    @override
     def connect(self) -> None:
         """Create the shovel."""
         queues = {f"{side}-queue": QUEUE for side in self._uris}
@@ -99,6 +103,7 @@ class RabbitMq(Peer):
             else:
                 return
 
+    @override
     def stored(self) -> int:
         """Return the length of the receiver's queue."""
         return int(self._receiver.queue_declare(QUEUE, passive=True).method.message_count)

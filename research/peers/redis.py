@@ -15,6 +15,8 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+from typing_extensions import override
+
 from research.peers.base import Peer, StartError, program, server
 from sonarpost.extensions.simulation.demo.settings import free_ports
 
@@ -75,6 +77,7 @@ class Redis(Peer):
         self._forwarder: threading.Thread | None = None
         self._is_stopped = threading.Event()
 
+    @override
     def fill(self, payloads: Sequence[bytes]) -> None:
         """Empty both streams, then add the records to the sender's."""
         self._stop_forwarder()
@@ -83,12 +86,14 @@ class Redis(Peer):
         for start in range(0, len(payloads), BATCH):
             self._sender.request(*([b"XADD", STREAM, b"*", b"p", one] for one in payloads[start : start + BATCH]))
 
+    @override
     def connect(self) -> None:
         """Start the forwarder."""
         self._is_stopped.clear()
         self._forwarder = threading.Thread(target=self._run, daemon=True)
         self._forwarder.start()
 
+    @override
     def stored(self) -> int:
         """Return the length of the receiver's stream."""
         return int(self._receiver.request([b"XLEN", STREAM])[0])

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+from typing_extensions import override
 
 from sonarpost import keys
 from sonarpost.archive.retention import DAY_S, Stored, remove_files, select_for_removal
@@ -87,10 +88,12 @@ class AtdStubService(Service[AtdStubConfig]):
         self._status: VehicleStatus | None = None
         self._position_warning = ""
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Not called: this service consumes no records."""
         raise NotImplementedError("atd_stub consumes no records")
 
+    @override
     def on_start(self) -> None:
         """Check the classifier, subscribe to transmit queue and transmissions, and start to poll and to release.
 
@@ -105,6 +108,7 @@ class AtdStubService(Service[AtdStubConfig]):
         self.start_thread(self._poll, "poll")
         self.start_thread(lambda: self._release.run(self.stopping), "release")
 
+    @override
     def on_stop(self) -> None:
         """Wake the release thread, so that it ends, and store the transmissions."""
         self._release.wake()
@@ -119,6 +123,7 @@ class AtdStubService(Service[AtdStubConfig]):
     def _masks(self) -> bool:
         return self.config.mask_transmissions and self.config.mode == "survey"
 
+    @override
     def gauges(self) -> Mapping[str, float]:
         """Return how many files (-1 before the first poll) and contacts wait, and the difficulty of the seabed."""
         return {
@@ -131,10 +136,12 @@ class AtdStubService(Service[AtdStubConfig]):
             **self._seabed.gauges(time.monotonic()),
         }
 
+    @override
     def degraded_reason(self) -> str:
         """Return why contacts cannot be released."""
         return self._release.error
 
+    @override
     def warning(self) -> str:
         """Return what waits for release or a continuation file, whether Pd is low, and why positions may be wrong."""
         waiting = ""
@@ -144,6 +151,7 @@ class AtdStubService(Service[AtdStubConfig]):
         parts = (self._release.status, waiting, self._seabed.warning(), self._position_warning)
         return "; ".join(filter(None, parts))
 
+    @override
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Check for free credit after the compressor has accepted or refused a snippet."""
         self._release.wake()

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from pydantic import ValidationError
+from typing_extensions import override
 
 from sonarpost import wire
 from sonarpost.codec.interface import MIN_SIDE_PX
@@ -140,6 +141,7 @@ class _LimitedSource(MaskedSource):
     deadline_s: float
     coarse_count = 0
 
+    @override
     def pings(self) -> Iterator[Ping]:
         for ping in super().pings():
             if time.thread_time() > self.deadline_s:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
+from typing_extensions import override
 
 from sonarpost.archive.postgresql import DatabaseAddress
 from sonarpost.codec.vq.codebook import open_codebook
@@ -45,6 +46,7 @@ class C2Config(RetentionConfig):
     verify_days: Annotated[float, Field(ge=0, le=36500)] = 1.0
     json_mirror: bool = False
 
+    @override
     def check_with(self, platform: PlatformConfig) -> None:
         """Check that the codebooks can be read, and the address of the database.
 

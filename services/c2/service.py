@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 
+from typing_extensions import override
+
 from sonarpost import keys, wire
 from sonarpost.archive import image_parts
 from sonarpost.archive.codebook_transfer import CodebookFetcher
@@ -128,6 +130,7 @@ class C2Service(Service[C2Config]):
                 tx.put_state(OWNER, known.encode())
         return known
 
+    @override
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Relayed records of all vessels, and comments and commands for them."""
         site = self.config.site
@@ -140,6 +143,7 @@ class C2Service(Service[C2Config]):
 
     # Records of vessels
 
+    @override
     def validate(self, key: str, record: Record) -> Record | None:
         """Refuse records that cannot be handled later, so that their senders are informed; return a coded image."""
         if isinstance(record, Relayed):
@@ -157,6 +161,7 @@ class C2Service(Service[C2Config]):
         self._is_known(vessel, key, record)
         return None
 
+    @override
     def expand(self, tx: Transaction, key: str, payload: bytes, record: Record) -> bytes:
         """Return the whole image of a difference; store it, because the vessel sends later differences to it.
 
@@ -193,10 +198,12 @@ class C2Service(Service[C2Config]):
             surplus = image_parts.surplus_names(tx.state_names(prefix))
             tx.delete_states(prefix, (name.removeprefix(prefix) for name in surplus))
 
+    @override
     def before_accepting(self, records: Sequence[tuple[str, bytes]]) -> None:
         """Commit records to an archive that several c2 share, so that another one can handle them."""
         self._archive.accept(records)
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Store the record of a vessel, or queue comments and commands for one."""
         try:
@@ -298,6 +305,7 @@ class C2Service(Service[C2Config]):
         log.error("Image cannot be decoded", extra=kv(vessel=entry.vessel_id, reason=reason))
 
     @contextmanager
+    @override
     def handling(self, *, wait: bool = True) -> Iterator[bool]:
         """Hold the lock under which records are handled, committed and archived; forget what was not committed."""
         with super().handling(wait=wait) as is_held:
@@ -313,6 +321,7 @@ class C2Service(Service[C2Config]):
         effects.count("decisions_stored" if new else "decisions_repeated")
         self._to_publish.append(self._accepted.decision(decision))
 
+    @override
     def before_commit(self) -> None:
         """Write the files of all records to the disk and publish the records.
 
@@ -321,6 +330,7 @@ class C2Service(Service[C2Config]):
         """
         self._publish_stored(self._to_publish, self._accepted.flush(self._to_publish))
 
+    @override
     def after_commit(self, handled: Sequence[UnitOfWork], superseded: int) -> None:
         """Wake the decoder and the retention for new images."""
         super().after_commit(handled, superseded)
@@ -372,6 +382,7 @@ class C2Service(Service[C2Config]):
         self._mark_changed(item.name)
         log.info("Record queued for a vessel", extra=kv(vessel=vessel, kind=kind, record_id=record_id))
 
+    @override
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Store that a vessel has accepted or refused a record, in the transaction of its acknowledgement."""
         vessel = platform_of(item.queue)
@@ -463,10 +474,12 @@ class C2Service(Service[C2Config]):
 
     # Start and stop
 
+    @override
     def before_session(self) -> None:
         """Open the archive, so that a wrong database ends the start."""
         self._archive.open()
 
+    @override
     def on_start(self) -> None:
         """Start the retention and the publication of delivery states."""
         self.start_thread(self._retention.run, "retention")
@@ -482,6 +495,7 @@ class C2Service(Service[C2Config]):
             self.start_thread(partial(each.run, self.stopping), name)
         declare_presence(self.session, self.platform.id, self.NAME, self.config.site)
 
+    @override
     def on_stop(self) -> None:
         """Close the other inputs and wake the background threads."""
         for each in self._inputs.values():
@@ -491,6 +505,7 @@ class C2Service(Service[C2Config]):
         self.decoding.close()
         self._codebooks.wake()
 
+    @override
     def stop(self) -> None:
         """Stop, then close the archive."""
         super().stop()
@@ -519,6 +534,7 @@ class C2Service(Service[C2Config]):
             except Exception as error:  # noqa: BLE001 - reported
                 self._background_fault("verification", error)
 
+    @override
     def warning(self) -> str:
         """Return how many records are missing, changed or conflicting, and which codebooks are missing."""
         waiting = self.decoding.missing.warning()
@@ -529,6 +545,7 @@ class C2Service(Service[C2Config]):
         stored = f"{place}: stored records {', '.join(counts)}" if counts else ""
         return "; ".join(text for text in (stored, waiting) if text)
 
+    @override
     def degraded_reason(self) -> str:
         """Return the faults of the archive and of the background threads."""
         faults = (
@@ -540,6 +557,7 @@ class C2Service(Service[C2Config]):
         )
         return "; ".join(dict.fromkeys(fault for fault in faults if fault))
 
+    @override
     def gauges(self) -> Mapping[str, float]:
         """Return the size of the stored images and the number of records queued for vessels."""
         waiting = [q for q in self.store.queues() if q.startswith(CONSUMER)]

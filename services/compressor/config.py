@@ -3,6 +3,7 @@
 from typing import Annotated
 
 from pydantic import Field
+from typing_extensions import override
 
 from sonarpost.codec import emb
 from sonarpost.codec.registry import default_registry
@@ -38,6 +39,7 @@ class CompressorConfig(ServiceConfig):
     refine_bytes: Annotated[int, Field(ge=0, le=65535)] = 0
     cache_images: Annotated[int, Field(ge=0, le=10000)] = 200
 
+    @override
     def check_with(self, platform: PlatformConfig) -> None:
         """Check that codec, model and codebook exist.
 

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
+from typing_extensions import override
+
 from sonarpost import keys, wire
 from sonarpost.codec.interface import Codec
 from sonarpost.codec.jit import use_code_folder
@@ -65,11 +67,13 @@ class CompressorService(Service[CompressorConfig]):
         self._cache = EncodeCache(self.store, config.cache_images)
         log.info("Codec ready", extra=kv(codec=self._codec.name, model=self._codec.model_hash[:16]))
 
+    @override
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Return the keys of this vehicle's snippets, and of commands for its images."""
         commands = {keys.command(self.platform.id, kind): Command for kind in _KINDS}
         return {keys.contact_detected(self.platform.id): Snippet, **commands}
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Encode a snippet, or execute a command, and send the stream to uuv_modem."""
         if isinstance(record, Command):

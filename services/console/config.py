@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
+from typing_extensions import override
 
 from sonarpost.archive.postgresql import DatabaseAddress
 from sonarpost.archive.reader import ArchivePlace
@@ -135,6 +136,7 @@ class ConsoleConfig(RetentionConfig):
             return self.out_dir
         return DatabaseAddress.parse(self.database, self.database_password_file, "console")
 
+    @override
     def check_with(self, platform: PlatformConfig) -> None:
         """Check that the web server is installed, and that there is a certificate for `tls`.
 

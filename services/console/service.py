@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 import zenoh
+from typing_extensions import override
 
 from sonarpost import keys, wire
 from sonarpost.archive.reader import ArchivePlace, archive_parts
@@ -111,6 +112,7 @@ class ConsoleService(Service[ConsoleConfig]):
     def _on_vessel(self) -> bool:
         return self.config.role == "vessel"
 
+    @override
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """On a vessel: its images and comments. At a shore site: images and decisions published by c2."""
         if self._on_vessel:
@@ -119,6 +121,7 @@ class ConsoleService(Service[ConsoleConfig]):
         site = self.config.site
         return {keys.shore_image_all(site): ReconstructedImage, keys.shore_decision_all(site): Decision}
 
+    @override
     def validate(self, key: str, record: Record) -> None:
         """Refuse a record of another vessel."""
         if self._on_vessel and isinstance(record, (ReconstructedImage, Comment)):
@@ -130,6 +133,7 @@ class ConsoleService(Service[ConsoleConfig]):
             if key not in expected:
                 raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Store a record. A repeated record changes nothing."""
         if isinstance(record, ReconstructedImage):
@@ -202,6 +206,7 @@ class ConsoleService(Service[ConsoleConfig]):
         # After a crash here the record is queued again. Its consumers recognise its identifier.
         self.state.mark_sent(item)
 
+    @override
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Store an acknowledgement. The send loop applies it to the console's database after this transaction."""
         table, record_id = _table_and_id(item)
@@ -215,6 +220,7 @@ class ConsoleService(Service[ConsoleConfig]):
 
     # Subscriptions
 
+    @override
     def before_session(self) -> None:
         """Start the web server and the threads, so that the page is served without a router.
 
@@ -236,6 +242,7 @@ class ConsoleService(Service[ConsoleConfig]):
         if not self._on_vessel and self.config.archive() is not None:
             self.start_thread(self._catch_up, "catch-up")
 
+    @override
     def on_start(self) -> None:
         """Declare the subscriptions."""
         if self._on_vessel:
@@ -375,6 +382,7 @@ class ConsoleService(Service[ConsoleConfig]):
 
     # Stop and health
 
+    @override
     def stop(self) -> None:
         """Stop the web server, which runs also without a session, then the service; close the databases."""
         self.stopping.set()
@@ -388,16 +396,19 @@ class ConsoleService(Service[ConsoleConfig]):
         self._database.close()
         self._users.close()
 
+    @override
     def degraded_reason(self) -> str:
         """Return why records are not queued, received or shown, or old images not removed; empty if they are."""
         router = self.state.router
         no_router = "" if router is None or router.reached else f"router {router.detail} not reached"
         return self._send_error or no_router or self._fleet_error or self._retention.error
 
+    @override
     def warning(self) -> str:
         """Return a warning if there are no users."""
         return "" if self._users.all() else "no users"
 
+    @override
     def gauges(self) -> Mapping[str, float]:
         """Return the number of contacts, of contacts without a decision, and of open pages."""
         counts = self.state.counts()

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
+from typing_extensions import override
 
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.config import ConsumerName, PlatformConfig
@@ -27,6 +28,7 @@ class DecompressorConfig(RetentionConfig):
     codebooks: Annotated[tuple[str, ...], Field(min_length=1)] = ("nominal-10", "nominal-20")
     image_consumers: tuple[ConsumerName, ...] = ("relay",)
 
+    @override
     def check_with(self, platform: PlatformConfig) -> None:
         """Check that the codebooks can be read.
 

@@ -8,6 +8,7 @@ import uuid
 from collections.abc import Mapping
 
 import zenoh
+from typing_extensions import override
 
 from sonarpost import keys, wire
 from sonarpost.archive.codebook_transfer import declare_codebooks
@@ -49,15 +50,18 @@ class DecompressorService(Service[DecompressorConfig]):
         self._retention = Retention(self._apply_retention, self.stopping)
         self._copy_origin, self._copies = uuid.uuid4().bytes, 0
 
+    @override
     def on_start(self) -> None:
         """Start the retention, and reply to queries for codebooks."""
         declare_codebooks(self.session, self.platform.id, self._decoder)
         self.start_thread(self._retention.run, "retention")
 
+    @override
     def on_stop(self) -> None:
         """End the retention."""
         self._retention.wake()
 
+    @override
     def degraded_reason(self) -> str:
         """Return why old files cannot be removed."""
         return self._retention.error
@@ -69,16 +73,19 @@ class DecompressorService(Service[DecompressorConfig]):
             self.count("images_removed", len(removed))
             log.warning("Image files removed by retention", extra=kv(images=len(removed), first=removed[0]))
 
+    @override
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Return the coded images of this vessel."""
         return {keys.acoustic_image(self.platform.id): ReceivedImage}
 
+    @override
     def validate(self, key: str, record: Record) -> None:
         """Reject an image of another vessel."""
         assert isinstance(record, ReceivedImage)
         if record.vessel_id != self.platform.id:
             raise PayloadError(key, "vessel_id", record.vessel_id, self.platform.id)
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Decode an image, write its files and send it; quarantine the stream if it cannot be decoded."""
         assert isinstance(record, ReceivedImage)

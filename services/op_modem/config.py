@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
+from typing_extensions import override
 
 from sonarpost.config import ConsumerName, PlatformConfig
 from sonarpost.errors import ConfigError
@@ -112,6 +113,7 @@ class OpModemConfig(ModemServiceConfig):
             raise ValueError('ranging_period_s = 0 where link = "paper": such a vessel does not transmit')
         return self
 
+    @override
     def _check_modem(self, capabilities: ModemCapabilities) -> None:
         super()._check_modem(capabilities)
         for address in self.vehicles:
@@ -125,6 +127,7 @@ class OpModemConfig(ModemServiceConfig):
             expected = f"slot_s - guard_s of at least {packet_s} s, a packet of downlink_rate"
             raise ConfigError(self.TABLE, "slot_s", self.slot_s, expected)
 
+    @override
     def check_with(self, platform: PlatformConfig) -> None:
         """Check the port, the acoustic key and that a wire format can be authenticated.
 

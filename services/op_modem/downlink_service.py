@@ -8,6 +8,8 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
+from typing_extensions import override
+
 from sonarpost import keys
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem
@@ -108,12 +110,14 @@ class DownlinkService(ModemService[OpModemConfig]):
 
     # Commands
 
+    @override
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Return commands and decisions for vehicles; nothing if the vessel does not transmit."""
         if not self.config.transmits:
             return {}
         return {keys.command_all(self.platform.id): Command, keys.contact_decision(self.platform.id): Decision}
 
+    @override
     def validate(self, key: str, record: Record) -> None:
         """Reject a record that can never be sent."""
         assert isinstance(record, (Command, Decision))
@@ -124,6 +128,7 @@ class DownlinkService(ModemService[OpModemConfig]):
         # Without the lock: this runs inside a transaction, and the holder of the lock may be waiting for one.
         self._link.check(record, key)
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Add a command or a decision; a repeated one changes nothing."""
         assert isinstance(record, (Command, Decision))
@@ -136,6 +141,7 @@ class DownlinkService(ModemService[OpModemConfig]):
         self._save_state(effects)
         self._new_commands.append(command)
 
+    @override
     def _handle_item(self, item: InboxItem) -> None:
         with self._link_lock:
             self._new_commands.clear()
@@ -145,6 +151,7 @@ class DownlinkService(ModemService[OpModemConfig]):
 
     # State of the endpoint
 
+    @override
     def commit(self, effects: UnitOfWork, item: InboxItem | None = None) -> None:
         """Commit the effects and the state of the endpoint."""
         with self._link_lock:
@@ -353,6 +360,7 @@ class DownlinkService(ModemService[OpModemConfig]):
                 gauges |= {"frames_genuine": float(counts.genuine), "key_frames_left": float(authenticator.frames_left)}
             return gauges
 
+    @override
     def warning(self) -> str:
         """Return what concerns the key of the link, and which vehicles exceed their limits."""
         with self._link_lock:
@@ -361,6 +369,7 @@ class DownlinkService(ModemService[OpModemConfig]):
         parts = (super().warning(), key_warning(self._link.authenticator), limits)
         return "; ".join(text for text in parts if text)
 
+    @override
     def degraded_reason(self) -> str:
         """Return why the port, the modem or the transmission does not work."""
         return super().degraded_reason() or self._transmit_error

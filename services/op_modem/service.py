@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 from pydantic import ValidationError
+from typing_extensions import override
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
@@ -83,6 +84,7 @@ class OpModemService(DownlinkService):
         )
         self._limit_log = self.interval_log(log, logging.WARNING, "Image limit reached")
 
+    @override
     def on_start(self) -> None:
         """Process the unfinished packet of a killed process, then open the port."""
         if (interrupted := self.store.read_state(_PARTIAL_PACKET, unpack_partial, None)) is not None:
@@ -92,6 +94,7 @@ class OpModemService(DownlinkService):
         super().on_start()
         self.start_thread(self._run, "link")
 
+    @override
     def on_stop(self) -> None:
         """Close the port and process the packets in memory."""
         super().on_stop()
@@ -100,6 +103,7 @@ class OpModemService(DownlinkService):
         if self._unsaved:
             log.error("Packets lost: the disk rejected them until the stop", extra=kv(packets=len(self._unsaved)))
 
+    @override
     def on_modem_event(self, event: ModemEvent) -> None:
         """Process a received packet, store a frame of an unfinished one, or record the end of a transmission."""
         if isinstance(event, (PacketSent, PacketFailed)):
@@ -120,6 +124,7 @@ class OpModemService(DownlinkService):
             self._add_unsaved(event, time.time())
             self._process_received()
 
+    @override
     def gauges(self) -> Mapping[str, float]:
         """Return the state of modem, link and store, and the quality of the last measured packet."""
         measured = {"snr_in_db": self._quality.snr_in_db, "snr_out_db": self._quality.snr_out_db}
@@ -130,6 +135,7 @@ class OpModemService(DownlinkService):
             **{name: value for name, value in measured.items() if value is not None},
         }
 
+    @override
     def degraded_reason(self) -> str:
         """Return why the store, the port, the modem or the transmission does not work."""
         return self._storage_error or super().degraded_reason()
@@ -352,18 +358,22 @@ class OpModemService(DownlinkService):
 
     # Frames of other vessels
 
+    @override
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Return commands and decisions for vehicles, and the frames of other vessels."""
         return {**super().consumed_keys(), **dict.fromkeys(self.delivery_only_keys(), AcousticFrame)}
 
+    @override
     def delivery_only_keys(self) -> Collection[str]:
         """Return the keys of the frames of other vessels."""
         return [keys.vessel_frames(self.platform.id, vessel) for vessel in self.config.other_vessels]
 
+    @override
     def queue_policy(self, queue: str) -> QueuePolicy:
         """Return that frames for the lead vessel are not published."""
         return QueuePolicy(publish=self.PUBLISH and queue != self.NAME)
 
+    @override
     def validate(self, key: str, record: Record) -> None:
         """Reject a record that can never be sent, or a frame that the vessel in its key did not receive."""
         if not isinstance(record, AcousticFrame):
@@ -378,6 +388,7 @@ class OpModemService(DownlinkService):
         if not modem.min_address <= record.source <= modem.max_address:
             raise PayloadError(key, "source", record.source, f"{modem.min_address}..{modem.max_address}")
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Add a command or a decision, or process a frame of another vessel."""
         if not isinstance(record, AcousticFrame):
@@ -392,6 +403,7 @@ class OpModemService(DownlinkService):
         self._add_rejections(content.rejected)
         self._log_images(content.images)
 
+    @override
     def _handle_item(self, item: InboxItem) -> None:
         self._merged_messages = []
         super()._handle_item(item)

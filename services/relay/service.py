@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 
 import zenoh
+from typing_extensions import override
 
 from sonarpost import keys, wire
 from sonarpost.archive import image_parts
@@ -134,6 +135,7 @@ class RelayService(Service[RelayConfig]):
             return MonitoredSite(options.site, upstream.session, options.router)
         return MonitoredSite(options.site, lambda: self.session, self.platform.upstream)
 
+    @override
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Images, decisions and statuses of this vessel, comments and commands for it."""
         vessel = self.platform.id
@@ -146,16 +148,19 @@ class RelayService(Service[RelayConfig]):
             keys.command_all(vessel): Command,
         }
 
+    @override
     def delivery_only_keys(self) -> Collection[str]:
         """Plain publications on these keys are for the consumers on the vessel."""
         return (keys.comment(self.platform.id), keys.command_all(self.platform.id))
 
+    @override
     def check_capacity(self, key: str) -> None:
         """Reject images below `disk_reserve_bytes`; other records are small and are accepted for longer."""
         super().check_capacity(key)
         if key == keys.image_coded(self.platform.id):
             self._image_reserve.require()
 
+    @override
     def validate(self, key: str, record: Record) -> None:
         """Refuse records of other vessels, and records without a consumer."""
         vessel = self.platform.id
@@ -174,6 +179,7 @@ class RelayService(Service[RelayConfig]):
         if not consumers:
             raise PayloadError(key, "", f"no consumer on {self.platform.id}", f"a name in [relay] {option}")
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Queue the record for every site, or for every configured consumer on the vessel."""
         if isinstance(record, Comment):
@@ -250,6 +256,7 @@ class RelayService(Service[RelayConfig]):
         if log.isEnabledFor(logging.DEBUG):
             log.debug("Image queued for the shore", extra=kv(version=image.version, bytes=len(payload)))
 
+    @override
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> bool:
         """Store which version of an image a site has; send the whole image if the site has refused a difference."""
         if self._added and reason is None and item.queue in self._upstreams:
@@ -302,6 +309,7 @@ class RelayService(Service[RelayConfig]):
             dropped = set(image_parts.surplus_names(list(wholes.values())))
             tx.delete_states("", (kept for kept, image in wholes.items() if image in dropped))
 
+    @override
     def after_commit(self, handled: Sequence[UnitOfWork], superseded: int) -> None:
         """Log the queued records, and apply the quota of each site's queue."""
         super().after_commit(handled, superseded)
@@ -329,6 +337,7 @@ class RelayService(Service[RelayConfig]):
                 extra=kv(site=upstream.options.site, images=dropped, max_bytes=max_bytes),
             )
 
+    @override
     def queue_policy(self, queue: str) -> QueuePolicy:
         """Return the settings of the queue of a site or of a consumer on the vessel."""
         if not _is_site_queue(queue):
@@ -336,6 +345,7 @@ class RelayService(Service[RelayConfig]):
         upstream = self._upstreams.get(queue)
         return QueuePolicy(held=True) if upstream is None else upstream.queue_policy()
 
+    @override
     def on_start(self) -> None:
         """Connect to the sites' own routers; drop records of removed sites if configured."""
         for queue in self._removed_queues():
@@ -351,6 +361,7 @@ class RelayService(Service[RelayConfig]):
             self.start_thread(partial(added.run, self.stopping), f"{options.bearer}-{options.site}")
         self.start_thread(lambda: self._site_monitor.run(self.stopping), "site-monitor")
 
+    @override
     def on_stop(self) -> None:
         """Close the sites' own sessions and the other bearers."""
         for added in self._added:
@@ -361,15 +372,18 @@ class RelayService(Service[RelayConfig]):
     def _removed_queues(self) -> list[str]:
         return [queue for queue in self.store.queues() if _is_site_queue(queue) and queue not in self._upstreams]
 
+    @override
     def degraded_reason(self) -> str:
         """Return that no images are accepted, or which site denies this vessel."""
         return self._image_reserve.degraded_reason() or self._site_monitor.degraded_reason()
 
+    @override
     def warning(self) -> str:
         """Return which sites are not reached, and what prevents sending by other bearers."""
         warnings = (self._site_monitor.warning(), *(added.warning() for added in self._added))
         return "; ".join(warning for warning in warnings if warning)
 
+    @override
     def gauges(self) -> Mapping[str, float]:
         """Return queue depth, age of the oldest record and responsiveness of each site."""
         found: dict[str, float] = dict(self._site_monitor.gauges())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
+from typing_extensions import override
 
 from sonarpost.config import ConsumerName, PlatformConfig
 from sonarpost.errors import ConfigError
@@ -101,6 +102,7 @@ class UuvModemConfig(ModemServiceConfig):
             raise ValueError('status_period_s = 0 where link = "paper", which has no messages')
         return self
 
+    @override
     def _check_modem(self, capabilities: ModemCapabilities) -> None:
         super()._check_modem(capabilities)
         self._check_address("destination", self.destination)
@@ -113,6 +115,7 @@ class UuvModemConfig(ModemServiceConfig):
             expected = f"slot_s - guard_s of at least {longest_s} s, the longest packet"
             raise ConfigError(self.TABLE, "slot_s", self.slot_s, expected)
 
+    @override
     def check_with(self, platform: PlatformConfig) -> None:
         """Check the port, the acoustic key and that the wire format can be authenticated.
 

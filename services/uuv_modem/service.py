@@ -10,6 +10,7 @@ from functools import partial
 from typing import Final
 
 import zenoh
+from typing_extensions import override
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
@@ -91,6 +92,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
         self._published_at_s: float | None = None
         self._published_images = (0, 0)
 
+    @override
     def on_start(self) -> None:
         """Open the port and start the link's thread."""
         # Before the port is opened: a subscriber that starts later asks for the transmissions it has missed.
@@ -104,6 +106,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
 
     # Records of the vehicle's programs
 
+    @override
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         """Return encoded images of this vehicle, and with `v1` messages of its programs."""
         images: dict[str, type[Record]] = {keys.image_encoded(self.platform.id): EncodedImage}
@@ -111,17 +114,20 @@ class UuvModemService(ModemService[UuvModemConfig]):
             images[keys.message_outgoing(self.platform.id)] = OutgoingMessage
         return images
 
+    @override
     def validate(self, key: str, record: Record) -> None:
         """Refuse a record that the wire format cannot carry."""
         assert isinstance(record, (EncodedImage, OutgoingMessage))
         self._endpoint.check(record)
 
+    @override
     def check_capacity(self, key: str) -> None:
         """Leave records with their senders below the disk reserve, and messages while `max_messages` wait."""
         super().check_capacity(key)
         if key == keys.message_outgoing(self.platform.id) and not self._endpoint.queue.accepts_messages:
             raise RetryLaterError(f"{key}: {self.config.max_messages} messages wait")
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Add a record to the transmit queue."""
         assert isinstance(record, (EncodedImage, OutgoingMessage))
@@ -156,11 +162,13 @@ class UuvModemService(ModemService[UuvModemConfig]):
         self._beacon.queued(now)
         self.count("statuses_queued")
 
+    @override
     def _handle_batch(self, items: Sequence[InboxItem]) -> None:
         with self._endpoint.step():
             super()._handle_batch(items)
         self._events.put(None)
 
+    @override
     def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """Commit effects together with the changes of the endpoint."""
         with self._endpoint.step():
@@ -168,6 +176,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
 
     # Events of the modem
 
+    @override
     def on_modem_event(self, event: ModemEvent) -> None:
         """Publish the start or end of a transmission, and pass the event to the link's thread."""
         now_utc_s = time.time()
@@ -348,16 +357,19 @@ class UuvModemService(ModemService[UuvModemConfig]):
             self._published_at_s, self._published_images = now, images
             self.publish(keys.acoustic_queue(self.platform.id), self._endpoint.queue_state(now))
 
+    @override
     def gauges(self) -> Mapping[str, float]:
         """Return the state of the modem, of the transmit queue and of the key."""
         authenticator = self._endpoint.authenticator
         key = {} if authenticator is None else {"key_frames_left": float(authenticator.frames_left)}
         return {**super().gauges(), **self._endpoint.queue.gauges(), **key}
 
+    @override
     def warning(self) -> str:
         """Return what concerns the key of the link, and what the modem reports wrongly."""
         return "; ".join(text for text in (super().warning(), key_warning(self._endpoint.authenticator)) if text)
 
+    @override
     def degraded_reason(self) -> str:
         """Return why the port, the modem or the link does not work."""
         return super().degraded_reason() or self._link_error

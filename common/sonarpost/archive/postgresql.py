@@ -18,6 +18,8 @@ from types import ModuleType
 from typing import Protocol
 from urllib.parse import parse_qs, unquote, urlsplit
 
+from typing_extensions import override
+
 from sonarpost.errors import ConfigError, DatabaseUnavailableError, RejectedByDatabaseError
 
 SCHEME = "postgresql://"
@@ -58,6 +60,7 @@ class DatabaseAddress:
     use_tls: bool = True
     ca: Path | None = None
 
+    @override
     def __str__(self) -> str:
         """Return the address without the password."""
         return f"{SCHEME}{self.user}@{self.host}:{self.port}/{self.name}"

@@ -21,6 +21,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from typing_extensions import override
+
 from sonarpost.errors import StoredFileError
 from sonarpost.files import PRIVATE_FILE
 from sonarpost.logs import kv
@@ -103,6 +105,7 @@ class LostRecords:
     inbox: int = 0
     queues: Mapping[str, int] = field(default_factory=dict)
 
+    @override
     def __str__(self) -> str:
         counts = [f"{queue} {count}" for queue, count in sorted(self.queues.items())]
         return ", ".join([*counts, *([f"inbox {self.inbox}"] if self.inbox else [])])

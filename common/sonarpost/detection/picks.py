@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 import numpy as np
+from typing_extensions import override
 
 from sonarpost.detection.candidates import FilterScores, Measurement, measure
 from sonarpost.detection.detector import (
@@ -75,6 +76,7 @@ class Pick:
     sample: int
     by_index: bool = False
 
+    @override
     def __str__(self) -> str:
         return f"{_INDEX if self.by_index else ''}{self.ping},{self.side.value},{self.sample}"
 

@@ -13,6 +13,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
+from typing_extensions import override
+
 from sonarpost.sonar.source import SurveySource
 from sonarpost.sonar.survey import Ping
 
@@ -107,6 +109,7 @@ class MaskedSource(SurveySource):
         self._source = source
         self._intervals = intervals
 
+    @override
     def pings(self) -> Iterator[Ping]:
         """Yield the pings in the order of recording.
 

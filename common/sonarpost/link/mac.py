@@ -10,6 +10,8 @@ import random
 from abc import ABC, abstractmethod
 from typing import Final
 
+from typing_extensions import override
+
 from sonarpost.errors import ConfigError
 
 _WHERE: Final = "medium access"
@@ -71,6 +73,7 @@ class Continuous(MediumAccess):
         self._rx_window_s = rx_window_s
         self._burst_start_s: float | None = None
 
+    @override
     def wait_s(self, packet_s: float, now: float) -> float | None:
         """Return the rest of the pause or of the holdoff."""
         return max(self._pause_left_s(now), self._holdoff_left_s(now))
@@ -85,6 +88,7 @@ class Continuous(MediumAccess):
             return 0.0
         return self._rx_window_s - (now - self._ended_s)
 
+    @override
     def sent(self, started_s: float, ended_s: float) -> None:
         """Record a packet, which may start a new burst."""
         start_s = self._burst_start_s
@@ -116,6 +120,7 @@ class Tdma(MediumAccess):
         self._start_s = slot_start_s
         self._usable_s = slot_s - guard_s
 
+    @override
     def wait_s(self, packet_s: float, now: float) -> float | None:
         """Return the time to a slot with room for the packet, None if no slot is long enough."""
         if packet_s > self._usable_s:
@@ -127,6 +132,7 @@ class Tdma(MediumAccess):
 class Polled(MediumAccess):
     """Sends only when the other station requests a packet."""
 
+    @override
     def wait_s(self, packet_s: float, now: float) -> float | None:
         """Return None."""
         return None
@@ -151,12 +157,14 @@ class Csma(MediumAccess):
         self._random = random.Random(seed)  # noqa: S311 not for cryptography
         self._not_before_s: float | None = None
 
+    @override
     def wait_s(self, packet_s: float, now: float) -> float | None:
         """Return the rest of the random wait or of the holdoff."""
         if self._not_before_s is None or self._not_before_s - now > self._max_s:  # the latter: the clock was set back
             self._not_before_s = now + self._random.uniform(0, self._max_s)
         return max(0.0, self._not_before_s - now, self._holdoff_left_s(now))
 
+    @override
     def sent(self, started_s: float, ended_s: float) -> None:
         """Record a packet and draw the next wait."""
         self._not_before_s = ended_s + self._random.uniform(0, self._max_s)

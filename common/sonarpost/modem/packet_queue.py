@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, Protocol, TypeVar
 
+from typing_extensions import override
+
 from sonarpost.errors import SentenceError
 from sonarpost.modem.interface import (
     Modem,
@@ -148,20 +150,24 @@ class QueueingModem(Modem, Generic[S, M]):
         self._events_since_s = 0.0
 
     @property
+    @override
     def capabilities(self) -> ModemCapabilities:
         """Capabilities of the driver."""
         return self._capabilities
 
     @property
+    @override
     def queued(self) -> int:
         """Number of packets and requests that are queued or in progress."""
         return len(self._queue) + (self._sending is not None)
 
     @property
+    @override
     def receiving(self) -> bool:
         """False: the modem does not report the start of a reception."""
         return False
 
+    @override
     def port_opened(self, now: float) -> None:
         """Begin to send and receive; see `_begin`."""
         if self._is_open:
@@ -170,6 +176,7 @@ class QueueingModem(Modem, Generic[S, M]):
         self._begin(now)
         self._advance(now)
 
+    @override
     def port_lost(self, now: float) -> None:
         """Fail the packet or request in progress; see `_end`."""
         self._is_open = False
@@ -178,6 +185,7 @@ class QueueingModem(Modem, Generic[S, M]):
         self._assembler.reset()
         self._events_since_s = now
 
+    @override
     def send_packet(
         self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False, now: float
     ) -> int:
@@ -186,6 +194,7 @@ class QueueingModem(Modem, Generic[S, M]):
         ack = ack and destination != self._capabilities.broadcast
         return self._add(destination, rate, frames, ack=ack, now=now)
 
+    @override
     def receive(self, data: bytes, now: float) -> list[ModemEvent]:
         """Process received bytes; invalid ones are reported as events."""
         self._give_up_incomplete(now)
@@ -195,11 +204,13 @@ class QueueingModem(Modem, Generic[S, M]):
         self._advance(now)
         return self._take_events()
 
+    @override
     def poll(self, now: float) -> list[ModemEvent]:
         """Do what is due."""
         self._advance(now)
         return self._take_events()
 
+    @override
     def next_wakeup(self) -> float | None:
         """Return when `poll` has something to do, or None."""
         times_s = [*self._deadlines_s(), self._queue.deadline_s()]
@@ -209,6 +220,7 @@ class QueueingModem(Modem, Generic[S, M]):
             times_s.append(self._received_s + self._pause_s)
         return min((time_s for time_s in times_s if time_s is not None), default=None)
 
+    @override
     def bytes_to_send(self) -> bytes:
         """Remove and return the bytes of the next write to the port."""
         return self._out.pop(0) if self._out else b""

@@ -13,6 +13,7 @@ from typing import Final
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
+from typing_extensions import override
 
 from sonarpost.messages import Health
 from sonarpost.monitoring.fleet import FleetState, ServiceStatus
@@ -44,6 +45,7 @@ class FleetCollector(Collector):
         """Return nothing: the names are known after the first records."""
         return ()
 
+    @override
     def collect(self) -> Iterable[Metric]:
         """Return all metrics."""
         state = self._state()

@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, ClassVar, Final
 
+from typing_extensions import override
+
 from sonarpost.limits import limit
 from sonarpost.logs import IntervalLog, kv
 
@@ -201,6 +203,7 @@ class _Connection(socket.socket):
 
     on_close: Callable[[], None]
 
+    @override
     def close(self) -> None:
         self.on_close()
         super().close()
@@ -211,6 +214,7 @@ class LimitedListener(socket.socket):
 
     limits: ConnectionLimits
 
+    @override
     def accept(self) -> tuple[socket.socket, Any]:
         """Accept a connection.
 
@@ -251,6 +255,7 @@ class LimitedServer(ThreadingHTTPServer):
         self._refused: deque[socket.socket] = deque()
         super().__init__(address, handler)
 
+    @override
     def get_request(self) -> tuple[socket.socket, Any]:
         """Accept a connection.
 
@@ -270,23 +275,27 @@ class LimitedServer(ThreadingHTTPServer):
             self._refused.popleft().close()
         raise ConnectionAbortedError(f"{address[0]}: too many connections")
 
+    @override
     def service_actions(self) -> None:
         """Close the connections whose deadline has passed; called several times a second."""
         self.limits.close_overdue()
 
+    @override
     def server_close(self) -> None:
         """Close the sockets."""
         super().server_close()
         while self._refused:
             self._refused.popleft().close()
 
-    def process_request_thread(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 of the base class
+    @override
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Handle the requests of a connection."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self.limits.remove(client_address[:2], request)
 
+    @override
     def handle_error(self, request: object, client_address: object) -> None:
         """Log a lost connection, or a defect of the handler."""
         error = sys.exception()
@@ -303,10 +312,12 @@ class _LimitedReader(io.RawIOBase):
         self._connection = connection
         self._left_bytes = max_bytes
 
+    @override
     def readable(self) -> bool:
         return True
 
-    def readinto(self, buffer: Any) -> int:  # noqa: ANN401 of the base class
+    @override
+    def readinto(self, buffer: Any) -> int:
         count = self._connection.recv_into(memoryview(buffer)[: self._left_bytes]) if self._left_bytes else 0
         self._left_bytes -= count
         return count
@@ -322,6 +333,7 @@ class LimitedHandler(BaseHTTPRequestHandler):
     close_connection: bool
     max_request_bytes: ClassVar[int] = MAX_REQUEST_BYTES
 
+    @override
     def setup(self) -> None:
         """Limit the bytes that are read."""
         super().setup()
@@ -343,5 +355,6 @@ class LimitedHandler(BaseHTTPRequestHandler):
         self.wfile.write(data)
         self.close_connection = True
 
-    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 of the base class
+    @override
+    def log_message(self, format: str, *args: object) -> None:
         """Log nothing: an address can contain a token."""

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
+from typing_extensions import override
+
 from sonarpost.limits import limit
 
 if TYPE_CHECKING:
@@ -115,9 +117,11 @@ class _LimitedReader(io.RawIOBase):
         self._raw = raw
         self._left_bytes = MAX_REPLY_BYTES
 
+    @override
     def readable(self) -> bool:
         return True
 
+    @override
     def readinto(self, buffer: WriteableBuffer) -> int:
         if self._left_bytes <= 0:
             raise ConnectionError(f"reply of more than {MAX_REPLY_BYTES} bytes")
@@ -125,6 +129,7 @@ class _LimitedReader(io.RawIOBase):
         self._left_bytes -= count
         return int(count)
 
+    @override
     def close(self) -> None:
         self._raw.close()
         super().close()
@@ -145,6 +150,7 @@ class _Connection(http.client.HTTPConnection):
         self._connected: socket.socket | None = None
         self._is_ended = False
 
+    @override
     def connect(self) -> None:
         self.sock = socket.create_connection((self.host, self.port), self.timeout)
         self.sock.settimeout(None)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar, Self, TypeVar
 
 from pydantic import Field, PrivateAttr
+from typing_extensions import override
 
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.errors import ConfigError
@@ -52,6 +53,7 @@ class ModemServiceConfig(ServiceConfig):
     max_carrier_sense_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
     _capabilities: ModemCapabilities | None = PrivateAttr(default=None)
 
+    @override
     def check_with(self, platform: PlatformConfig) -> None:
         """Check the driver, the kind of the port and the acoustic key.
 
@@ -147,6 +149,7 @@ class ModemService(Service[M]):
     def on_modem_event(self, event: ModemEvent) -> None:
         """Handle an event of the driver; called in the modem's thread."""
 
+    @override
     def on_start(self) -> None:
         """Open the port, and log how acoustic frames are authenticated."""
         if self.key is None:
@@ -155,10 +158,12 @@ class ModemService(Service[M]):
             log.info("Acoustic frames are authenticated", extra=kv(key_fingerprint=self.key.fingerprint))
         self.modem.start()
 
+    @override
     def on_stop(self) -> None:
         """Close the port."""
         self.modem.stop()
 
+    @override
     def gauges(self) -> Mapping[str, float]:
         """Return whether the modem is ready, and whether the link is unauthenticated."""
         return {
@@ -167,6 +172,7 @@ class ModemService(Service[M]):
             "unauthenticated": float(self.key is None),
         }
 
+    @override
     def degraded_reason(self) -> str:
         """Return why the port or the modem does not work."""
         if not self._port.is_open:
@@ -175,6 +181,7 @@ class ModemService(Service[M]):
             return f"{self.config.port}: {self.modem.failure}"
         return self._transmit_failure or ("" if self.modem.ready else self._modem_error)
 
+    @override
     def warning(self) -> str:
         """Return what the modem reports wrongly. The gauge `unauthenticated` states that the link has no key."""
         return "; ".join(text for text in (self._carrier_warning, self._report_warning) if text)

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import serial
+from typing_extensions import override
 
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.logs import kv
@@ -160,6 +161,7 @@ class SerialPort(ModemPort):
         self._port: serial.Serial | None = None
         self._make_port()
 
+    @override
     def write(self, data: bytes) -> None:
         """See `ModemPort`."""
         with self._in_use:
@@ -173,6 +175,7 @@ class SerialPort(ModemPort):
                 self._port, self._error = None, _reason(error)
                 raise PortError(f"{self.url}: cannot be written: {_reason(error)}") from error
 
+    @override
     def _run(self, on_event: Callable[[PortEvent], None], closing: threading.Event) -> None:
         wait_s = self._first_retry_s
         while not closing.is_set():

@@ -16,6 +16,8 @@ from collections.abc import Callable
 from typing import ClassVar, Final
 from urllib.parse import parse_qsl, urlsplit
 
+from typing_extensions import override
+
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.logs import kv
 from sonarpost.runtime.serial_port import ModemPort, PortEvent, PortLost, PortOpened
@@ -47,6 +49,7 @@ class UdpPort(ModemPort):
         self._group, self._interface, self._ttl = _parse(url)
         self._port: socket.socket | None = None
 
+    @override
     def write(self, data: bytes) -> None:
         """Send one datagram to the group. See `ModemPort`."""
         opened = self._port
@@ -57,6 +60,7 @@ class UdpPort(ModemPort):
         except OSError as error:
             raise PortError(f"{self.url}: cannot be written: {error}") from error
 
+    @override
     def _run(self, on_event: Callable[[PortEvent], None], closing: threading.Event) -> None:
         while not closing.is_set():
             try:

@@ -12,6 +12,8 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Final
 
+from typing_extensions import override
+
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 
 _FREQUENCY_STEPS: Final = 24
@@ -47,6 +49,7 @@ class ChannelSet:
     range_m: float | None
     ping_count: int
 
+    @override
     def __str__(self) -> str:
         frequency = "unknown frequency" if self.frequency_hz is None else f"{self.frequency_hz / 1000:.4g} kHz"
         return frequency if self.range_m is None else f"{frequency}, {self.range_m:.4g} m"

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Self
 
+from typing_extensions import override
+
 from sonarpost.errors import SurveyFileError
 from sonarpost.limits import limit
 from sonarpost.sonar.channel_sets import ChannelChoice, ChannelSet
@@ -149,6 +151,7 @@ class StreamedSource(SurveySource):
         """Yield the pings of the chosen channel set, with its channels only."""
         return (selected for ping in pings if (selected := self._channel_choice.select(ping)) is not None)
 
+    @override
     def pings(self) -> Iterator[Ping]:
         """Yield the pings of one channel set, without implausible fixes, with heading and mounting applied."""
         jumps = PositionJumpFilter()
@@ -169,9 +172,11 @@ class InMemorySource(StreamedSource):
         self._survey = survey
         self._validate(survey.sonar_id, survey.line_name)
 
+    @override
     def _format_warnings(self) -> list[str]:
         return list(self._survey.warnings)
 
+    @override
     def _read_pings(self, *, first_pass: bool) -> Iterator[Ping]:
         return iter(self._survey.pings)
 

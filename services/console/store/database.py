@@ -14,6 +14,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, Literal
 
+from typing_extensions import override
+
 from sonarpost.messages import Command, Comment, Decision
 from sonarpost.sqlite_file import SqliteFile
 
@@ -202,6 +204,7 @@ class Database(SqliteFile):
         self._db.executescript(_TRACKING)
 
     @contextmanager
+    @override
     def transaction(self) -> Iterator[sqlite3.Connection]:
         """Run the block in a transaction, then call `on_change` if it has changed contacts.
 

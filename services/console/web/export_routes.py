@@ -17,6 +17,7 @@ from anyio import from_thread
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
+from typing_extensions import override
 
 from sonarpost.delivery.store import HANDLING_RESERVE_BYTES
 from sonarpost.errors import BadInputError
@@ -145,6 +146,7 @@ class _TemporaryFileResponse(StreamingResponse):
         self._file = file
         self._on_close = on_close
 
+    @override
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
             await super().__call__(scope, receive, send)

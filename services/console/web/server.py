@@ -20,6 +20,7 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Redire
 from starlette.routing import Mount, Route
 from starlette.staticfiles import PathLike, StaticFiles
 from starlette.types import ASGIApp, Scope
+from typing_extensions import override
 
 from sonarpost.config import TlsConfig
 from sonarpost.errors import ConfigError, PortError
@@ -129,6 +130,7 @@ def _index(call: Call) -> Response:
 class StaticFolder(StaticFiles):
     """Static files that browsers revalidate at each use."""
 
+    @override
     def file_response(
         self, full_path: PathLike, stat_result: os.stat_result, scope: Scope, status_code: int = 200
     ) -> Response:
@@ -158,6 +160,7 @@ async def defect_response(_request: Request, _error: Exception) -> Response:
 class _Server(uvicorn.Server):
     """A server that closes all connections when it ends, also those whose client does not read."""
 
+    @override
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Stop to accept, wait for running requests, then abort the connections that are left."""
         await super().shutdown(sockets)

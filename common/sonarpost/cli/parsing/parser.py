@@ -9,6 +9,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Never
 
+from typing_extensions import override
+
 from sonarpost.cli.parsing.commands import example_of
 from sonarpost.cli.parsing.lists import requested_list
 
@@ -40,6 +42,7 @@ class CommandParser(argparse.ArgumentParser):
                     *flags, dest="verbosity", action="store_const", const=const, default=argparse.SUPPRESS, help=text
                 )
 
+    @override
     def parse_known_args(  # type: ignore[override]  # the base class has overloads for the type of the namespace
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
@@ -56,6 +59,7 @@ class CommandParser(argparse.ArgumentParser):
             self.error(_UNKNOWN + " ".join(unknown))
         return parsed, unknown
 
+    @override
     def error(self, message: str) -> Never:
         """Print the usage and the message, with the most similar name for a misspelt one; exit with status 2."""
         given, choices = "", list[str]()
@@ -71,6 +75,7 @@ class CommandParser(argparse.ArgumentParser):
 class _Formatter(argparse.HelpFormatter):
     """Leaves an example in one line."""
 
+    @override
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         return f"{indent}{text}" if text.startswith("example: ") else super()._fill_text(text, width, indent)
 

@@ -8,6 +8,8 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from typing_extensions import override
+
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import Subparsers, add_survey_options, survey_options_of, utc_text
 from sonarpost.sonar.geometry import Position, offset_between_m
@@ -91,12 +93,14 @@ class _LongitudeRange(_Range):
     least_east: float = 180.0
     greatest_west: float = -180.0
 
+    @override
     def add(self, value: float | None) -> None:
         super().add(value)
         if value is not None:
             self.least_east = min(self.least_east, value if value >= 0 else 180.0)
             self.greatest_west = max(self.greatest_west, value if value < 0 else -180.0)
 
+    @override
     def pair(self) -> list[float] | None:
         is_across = self.greatest_west - self.least_east + 360 < self.high - self.low
         return [self.least_east, self.greatest_west] if is_across else super().pair()

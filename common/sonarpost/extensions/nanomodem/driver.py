@@ -14,6 +14,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
+from typing_extensions import override
+
 from sonarpost.extensions.nanomodem import messages
 from sonarpost.extensions.nanomodem.rates import CAPABILITIES, RATE, airtime_s
 from sonarpost.modem.interface import (
@@ -96,19 +98,23 @@ class NanoModem(QueueingModem[_Sending, messages.NanoMessage]):
         self._message_s: float | None = None
 
     @property
+    @override
     def ready(self) -> bool:
         """Whether the modem has the address of the settings and answers."""
         return self._is_ready
 
+    @override
     def ping(self, destination: int, now: float) -> int:
         """Queue a ping; see `Modem.ping`."""
         CAPABILITIES.check_packet(destination, RATE, [b""])
         return self._add(destination, RATE, (), ack=False, now=now)
 
+    @override
     def _begin(self, now: float) -> None:
         self._attempts = 0
         self._ask(_STATUS, now)
 
+    @override
     def _end(self) -> None:
         self._is_ready = self._is_unresponsive = False
         self._question = None
@@ -117,6 +123,7 @@ class NanoModem(QueueingModem[_Sending, messages.NanoMessage]):
 
     # Time
 
+    @override
     def _deadlines_s(self) -> Iterable[float | None]:
         if self._sending is not None:
             yield self._deadline_s(self._sending)
@@ -125,6 +132,7 @@ class NanoModem(QueueingModem[_Sending, messages.NanoMessage]):
         elif self._is_open:
             yield self._check_s()
 
+    @override
     def _advance(self, now: float) -> None:
         super()._advance(now)
         if self._sending is not None:
@@ -228,6 +236,7 @@ class NanoModem(QueueingModem[_Sending, messages.NanoMessage]):
 
     # Messages of the modem
 
+    @override
     def _on_message(self, message: messages.NanoMessage, now: float) -> None:
         self._message_s = now
         match message:
@@ -268,6 +277,7 @@ class NanoModem(QueueingModem[_Sending, messages.NanoMessage]):
         frame = FrameReceived(source, dest, received.source is None, 1, data, now, RATE, None)
         self._events += [frame, PacketReceived((frame,), 0, 1, source, dest, RATE, None, complete=True)]
 
+    @override
     def _result(self, failed: PacketFailed) -> ModemEvent:
         """Return the failure of a packet, or of a ping, which is a packet without frames in the queue."""
         return failed if failed.frames else RequestFailed(failed.packet_id, _PING, failed.dest, failed.reason)

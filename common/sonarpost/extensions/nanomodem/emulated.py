@@ -12,6 +12,8 @@ import math
 import re
 from typing import ClassVar, Final
 
+from typing_extensions import override
+
 from sonarpost.extensions.nanomodem.messages import TRAVEL_STEP_S
 from sonarpost.extensions.nanomodem.rates import MAX_PAYLOAD_BYTES, RATE, airtime_s
 from sonarpost.extensions.simulation.channel.events import AcousticPacket, ArrivalEnded, PacketKind
@@ -43,15 +45,18 @@ class EmulatedNanomodem(PacketModem):
         self._timeout_s = math.inf
 
     @property
+    @override
     def address(self) -> int:
         """The modem's address, as the host has set it."""
         return self._address
 
+    @override
     def _on_pause(self) -> None:
         if self._input:
             self._write(b"E\r\n")
         self._input.clear()
 
+    @override
     def _read_input(self, now: float) -> None:
         while (start := self._input.find(b"$")) >= 0:
             del self._input[:start]
@@ -92,10 +97,12 @@ class EmulatedNanomodem(PacketModem):
         kind, frames = (PacketKind.DATA, (data,)) if is_message else (PacketKind.PING, ())
         self._transmit(AcousticPacket(kind, self._address, address, RATE, airtime_s(len(data)), frames, ack))
 
+    @override
     def _on_sent(self, packet: AcousticPacket, now: float) -> None:
         if self._awaits is not None and packet.kind in (PacketKind.DATA, PacketKind.PING):
             self._timeout_s = now + ANSWER_TIMEOUT_S
 
+    @override
     def poll(self, now: float) -> None:
         """Also report an answer that has not come in time."""
         super().poll(now)
@@ -103,10 +110,12 @@ class EmulatedNanomodem(PacketModem):
             self._awaits, self._timeout_s = None, math.inf
             self._write(b"#TO\r\n")
 
+    @override
     def next_deadline_s(self) -> float:
         """Return the simulated time at which `poll` has something to do."""
         return min(super().next_deadline_s(), self._timeout_s)
 
+    @override
     def _on_packet(self, arrival: ArrivalEnded, now: float) -> bytes:
         packet = arrival.transmission.packet
         if packet.kind is PacketKind.DATA and packet.destination == _EVERYONE:

@@ -12,6 +12,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from typing_extensions import override
+
 from sonarpost.errors import FrameError, SentenceError
 from sonarpost.extensions.s2c.events import UsblPosition
 from sonarpost.extensions.s2c.messages import (
@@ -102,15 +104,18 @@ class S2cModem(QueueingModem[Sending, RawMessage]):
         self._receiving_since_s = 0.0
 
     @property
+    @override
     def ready(self) -> bool:
         """Whether the modem is configured and answers."""
         return self._ready
 
     @property
+    @override
     def receiving(self) -> bool:
         """Whether the modem has reported the start of a reception and not yet its end."""
         return self._receiving_until_s is not None
 
+    @override
     def send_packet(
         self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False, now: float
     ) -> int:
@@ -119,6 +124,7 @@ class S2cModem(QueueingModem[Sending, RawMessage]):
             raise FrameError("packet to send", "destination", destination, f"the address of one modem at rate {rate}")
         return super().send_packet(destination, rate, frames, ack=ack, now=now)
 
+    @override
     def ping(self, destination: int, now: float) -> int:
         """Queue an acknowledged message whose travel time is measured; see `Modem.ping`."""
         CAPABILITIES.check_packet(destination, INSTANT_RATE, (PING_DATA,))
@@ -127,16 +133,19 @@ class S2cModem(QueueingModem[Sending, RawMessage]):
         self._pings.add(self._next_id)
         return self._add(destination, INSTANT_RATE, (PING_DATA,), ack=True, now=now)
 
+    @override
     def _begin(self, now: float) -> None:
         self._line_end_known = self._escaped = False
         self._configure(now)
 
+    @override
     def _end(self) -> None:
         self._ready = False
         self._fail("the port was lost")
         self._steps.clear()
         self._command = self._receiving_until_s = None
 
+    @override
     def _deadlines_s(self) -> Iterable[float | None]:
         yield self._receiving_until_s
         if self._command is not None:
@@ -146,6 +155,7 @@ class S2cModem(QueueingModem[Sending, RawMessage]):
         if self._sending is not None and (self._sending.accepted or self._sending.refused):
             yield self._sending.deadline_s
 
+    @override
     def _advance(self, now: float) -> None:
         super()._advance(now)
         if self._receiving_until_s is not None and now >= self._receiving_until_s:
@@ -243,6 +253,7 @@ class S2cModem(QueueingModem[Sending, RawMessage]):
             self._configure(now)
             self._send_command(b"AT" + self._steps[0][0], now)
 
+    @override
     def _on_message(self, message: RawMessage, now: float) -> None:
         if message.command is None and self._escaped:
             # Bytes outside messages are data of another modem: it must not pass for a message.
@@ -391,6 +402,7 @@ class S2cModem(QueueingModem[Sending, RawMessage]):
         else:
             self._events.append(packet.failed(reason, maybe_sent=maybe_sent))
 
+    @override
     def _result(self, failed: PacketFailed) -> ModemEvent:
         """Return the failure of a packet or a ping that left the queue."""
         if failed.packet_id not in self._pings:

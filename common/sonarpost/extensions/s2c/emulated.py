@@ -12,6 +12,8 @@ import re
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
+from typing_extensions import override
+
 from sonarpost.extensions.s2c.emulated_burst import ANSWER_LIMIT_S, BurstLink
 from sonarpost.extensions.s2c.messages import MAX_DATA_BYTES
 from sonarpost.extensions.s2c.rates import (
@@ -85,10 +87,12 @@ class EmulatedS2c(PacketModem):
         self._input.clear()
 
     @property
+    @override
     def address(self) -> int:
         """The modem's address."""
         return self._settings["AL"]
 
+    @override
     def poll(self, now: float) -> None:
         """Do what is due: transmissions, and the end of the wait for an acknowledgement."""
         if now >= self._raw_due_s:
@@ -99,21 +103,25 @@ class EmulatedS2c(PacketModem):
             self._notify(f"FAILEDIM,{self._outstanding.destination}")
             self._outstanding = None
 
+    @override
     def next_deadline_s(self) -> float:
         """Return the simulated time at which `poll` has something to do."""
         waits_until_s = float("inf") if self._outstanding is None else self._outstanding.ack_until_s
         return min(super().next_deadline_s(), self._bursts.deadline_s(), waits_until_s, self._raw_due_s)
 
+    @override
     def arrival_started(self, arrival: ArrivalStarted) -> None:
         """Report the start of a reception."""
         self._notify_extended("RECVSTART")
 
+    @override
     def arrival_ended(self, arrival: ArrivalEnded) -> PacketReport:
         """Report the end of a reception, and its data."""
         if arrival.outcome is not PacketOutcome.ARRIVED and arrival.detected:
             self._notify_extended(f"RECVFAILED,0.0000,{_RSSI_DB},0")
         return super().arrival_ended(arrival)
 
+    @override
     def _on_packet(self, arrival: ArrivalEnded, now: float) -> bytes:
         packet = arrival.transmission.packet
         is_own = packet.destination == self.address
@@ -155,10 +163,12 @@ class EmulatedS2c(PacketModem):
         head = f"RECV,{len(data)},{packet.source},{packet.destination},{BURST_BIT_RATE_BPS},{_RSSI_DB}"
         return self._format("", f"{head},{_INTEGRITY},{travel_us},0.0000,".encode() + data)
 
+    @override
     def _on_started(self, packet: AcousticPacket, now: float) -> None:
         kind = _kind(packet)
         self._notify_extended(f"SENDSTART,{packet.destination},{kind},{round(packet.airtime_s * 1e6)},0")
 
+    @override
     def _on_sent(self, packet: AcousticPacket, now: float) -> None:
         kind = _kind(packet)
         duration_us = round(packet.airtime_s * 1e6)
@@ -171,6 +181,7 @@ class EmulatedS2c(PacketModem):
             else:
                 self._outstanding = None
 
+    @override
     def _read_input(self, now: float) -> None:
         while self._input and self._take_first(now):
             pass
@@ -226,6 +237,7 @@ class EmulatedS2c(PacketModem):
         for start in range(0, len(data), BURST_BYTES):
             self._bursts.add_raw(self.address, self._settings["AR"], data[start : start + BURST_BYTES])
 
+    @override
     def _on_pause(self) -> None:
         if not self._command_mode and not self._input.startswith(_ESCAPE):
             self._raw += self._input  # it looked like the beginning of an escape sequence

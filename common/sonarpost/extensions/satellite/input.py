@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, cast
 
+from typing_extensions import override
+
 from sonarpost import keys, wire
 from sonarpost.archive.decoder import Decoder
 from sonarpost.archive.image_files import PREVIEW_NOTE
@@ -88,11 +90,13 @@ class ShortMessages(Input):
         self._faults: dict[str, str] = {}
 
     @classmethod
+    @override
     def configured(cls, config: C2Config) -> Self | None:
         """Return the input for the table of c2; None without `short_messages`."""
         options = cast(ShortMessageKeys, config).short_messages
         return None if options is None else cls(config, options)
 
+    @override
     def faults(self) -> Iterable[str]:
         """Return whose messages are not acknowledged at present, and why."""
         return list(self._faults.values())
@@ -103,6 +107,7 @@ class ShortMessages(Input):
         assert self._webhook is not None
         return self._webhook.port
 
+    @override
     def open(self, service: Service[Any]) -> None:
         """Open the webhook for a c2."""
         self._store = service.store
@@ -113,6 +118,7 @@ class ShortMessages(Input):
         self._webhook = Webhook(self._config.host, self._config.port, self._access.token, self._receive)
         log.info("Webhook for short messages open", extra=kv(host=self._config.host, port=self._webhook.port))
 
+    @override
     def close(self) -> None:
         """Close the webhook."""
         if self._webhook is not None:
@@ -196,6 +202,7 @@ class ShortMessages(Input):
             decoded = self._decoder.decode(image.model_copy(update={"stream": b"", "missing": ()}))
         return decoded.model_copy(update={"notes": (PREVIEW_NOTE, *decoded.notes, *reason), "complete": False})
 
+    @override
     def run(self, stopping: threading.Event) -> None:
         """Send acknowledgements until `stopping` is set. A failure delays those of its vessel only."""
         retry_s: dict[str, float] = {}

@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 import msgpack
+from typing_extensions import override
 
 from sonarpost.errors import BadInputError, DeliveryError, PortError
 from sonarpost.extensions.satellite.config import SatelliteKeys
@@ -96,6 +97,7 @@ class SatelliteUpstream(Bearer):
 
     # Records
 
+    @override
     def queue(self, record: CodedImage | Decision, effects: UnitOfWork) -> None:
         """Queue a record with the other effects of its handling; `committed` has to follow."""
         now_s = time.time()
@@ -114,10 +116,12 @@ class SatelliteUpstream(Bearer):
         for item in items:
             effects.put_state(self._item_name(item.number), item.pack())
 
+    @override
     def committed(self) -> None:
         """Send what has been committed."""
         self._wake.set()
 
+    @override
     def delivered_by_radio(self, fields: Mapping[str, object]) -> None:
         """Withdraw a record that a radio upstream of this site has delivered.
 
@@ -132,6 +136,7 @@ class SatelliteUpstream(Bearer):
 
     # Sending
 
+    @override
     def run(self, stopping: threading.Event) -> None:
         """Send until `stopping` is set, then close the terminal."""
         try:
@@ -247,6 +252,7 @@ class SatelliteUpstream(Bearer):
     def _message_name(self, seq: int) -> str:
         return f"{self._prefix}message/{seq}"
 
+    @override
     def stop(self) -> None:
         """Stop the exchange in progress."""
         self._wake.set()
@@ -254,6 +260,7 @@ class SatelliteUpstream(Bearer):
 
     # Health
 
+    @override
     def warning(self) -> str:
         """Return the fault of the terminal, or that the budget of the day is used."""
         site = self.site
@@ -265,6 +272,7 @@ class SatelliteUpstream(Bearer):
             return f"{site} by satellite: {limit} bytes of the day are used; {self._sender.waiting} items wait"
         return ""
 
+    @override
     def gauges(self) -> dict[str, float]:
         """Return queue, budget and cost; those that wait for the radio first are included."""
         site, budget = self.site, self._budget

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from typing import Final
 from urllib.parse import urlsplit
 
+from typing_extensions import override
+
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.extensions.tak.cot_stream import SETTLE_S, RefusedError, deliver, reason_of
 from sonarpost.security.client_tls import TlsFiles
@@ -35,6 +37,7 @@ class TakEndpoint:
     host: str
     port: int
 
+    @override
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{self.scheme}://{host}:{self.port}"

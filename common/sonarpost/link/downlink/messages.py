@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated, Final, Literal
 
+from typing_extensions import override
+
 from sonarpost.codec.region import PACKED_BYTES, RegionBox
 from sonarpost.errors import BadInputError, FrameError
 from sonarpost.link.downlink.status_message import StatusMessage
@@ -159,6 +161,7 @@ class PrioritiseMessage(ImageCommandMessage):
 
     place: QueuePlace
 
+    @override
     def __post_init__(self) -> None:
         ImageCommandMessage.__post_init__(self)
         if self.place not in _PLACES:
@@ -194,6 +197,7 @@ class DecisionMessage(ImageCommandMessage):
     confidence: Annotated[float, Bounds(0, 1)] | None = None
     mlo_class: str = ""
 
+    @override
     def __post_init__(self) -> None:
         ImageCommandMessage.__post_init__(self)
         if self.verdict not in _VERDICTS:

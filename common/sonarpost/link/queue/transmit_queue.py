@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
+from typing_extensions import override
+
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.coding.blocks import OutgoingImage, SendBlock
 from sonarpost.link.coding.channel_capacity import LossChannel, RateSelector
@@ -98,11 +100,13 @@ class TransmitQueue(ImageSender):
         self._open_before_packet: set[int] = set()
 
     @property
+    @override
     def rate(self) -> int:
         """Number of the rate in use."""
         return self.rate_selector.current
 
     @property
+    @override
     def measured_loss(self) -> float | None:
         """Share of frames lost according to feedback."""
         return self.sender.state.tracker.loss
@@ -113,15 +117,18 @@ class TransmitQueue(ImageSender):
         return self.sender.config.worst.loss
 
     @property
+    @override
     def images_waiting(self) -> int:
         """Number of images of which something is still to be sent."""
         return len(self.open_numbers())
 
     @property
+    @override
     def is_idle(self) -> bool:
         """Whether there is nothing to send, and nothing that feedback can request."""
         return self.sender.is_idle and not self.messages.waiting and self.in_flight is None
 
+    @override
     def gauges(self) -> Mapping[str, float]:
         """Return figures for the health record."""
         return {
@@ -131,6 +138,7 @@ class TransmitQueue(ImageSender):
             "frame_loss": self.planned_loss,
         }
 
+    @override
     def add_image(self, image: ImageToSend, now: float) -> bool:
         """Add an image; return False if nothing has to be sent for it.
 
@@ -175,11 +183,13 @@ class TransmitQueue(ImageSender):
         known.stream = image.stream
         return self.sender.refine(RefineRequest(known.number, min(len(image.stream), MAX_STREAM_BYTES)), now)
 
+    @override
     def image_id_of(self, number: int) -> str | None:
         """Return the identifier of the image with a contact number, None if the queue does not have it."""
         image = self.sender.kept.get(number)
         return None if image is None else image.image_id
 
+    @override
     def refine(self, number: int, stream_bytes: int, now: float) -> bool:
         """Send more of an image, up to a length of its stream (0: all); return False if the queue has no more of it.
 
@@ -194,18 +204,22 @@ class TransmitQueue(ImageSender):
             return False
         return self.sender.refine(RefineRequest(number, goal), now) and self.prioritise(number, now, first=True)
 
+    @override
     def stop(self, number: int) -> bool:
         """Send nothing more of an image; see `ImageSender.stop`."""
         return self.sender.stop(number)
 
+    @override
     def resume(self, number: int, now: float) -> bool:
         """Queue the rest of a stopped image; see `ImageSender.resume`."""
         return self.sender.resume(number, now)
 
+    @override
     def prioritise(self, number: int, now: float, *, first: bool) -> bool:
         """Send the rest of an image before or after all others; see `ImageSender.prioritise`."""
         return self.sender.prioritise(number, now, first=first)
 
+    @override
     def add_message(
         self,
         message_id: str,
@@ -225,6 +239,7 @@ class TransmitQueue(ImageSender):
             message_id, source, priority, data, added_s=float(now), expires_s=float(now + lifetime_s), once=once
         )
 
+    @override
     def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int) -> None:
         """Process feedback or a request of a receiver.
 
@@ -240,6 +255,7 @@ class TransmitQueue(ImageSender):
             if abs(self.planned_loss - loss) >= _MIN_LOSS_CHANGE:
                 self.sender.plan_for((LossChannel(min(loss, _MAX_LOSS), self.config.burst_frames),))
 
+    @override
     def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int) -> None:
         """Process the feedback of a mini-packet."""
         self._feedback_arrived(now)
@@ -251,6 +267,7 @@ class TransmitQueue(ImageSender):
         if self.config.feedback == "auto":
             self.sender.expect_feedback(expected=True)
 
+    @override
     def _select_packet(self, now: float) -> OutgoingPacket | None:
         self._open_before_packet = self.open_numbers()
         self._update(now)
@@ -317,6 +334,7 @@ class TransmitQueue(ImageSender):
             )
             loaded += len(message.data)
 
+    @override
     def _packet_sent(self) -> tuple[SentImage, ...]:
         ended = sorted(self._open_before_packet - self.open_numbers())
         kept = [image for number in ended if (image := self.sender.kept.get(number)) is not None]
@@ -332,6 +350,7 @@ class TransmitQueue(ImageSender):
         kept = self.sender.kept
         return [n for n in block.contacts if n not in kept or not kept[n].stopped]
 
+    @override
     def expected(self, now: float) -> list[ExpectedDelivery]:
         """Return when each image is expected to be sent, the first to end first.
 
@@ -388,6 +407,7 @@ class TransmitQueue(ImageSender):
         planned_bytes = min(stream_bytes, config.stream_bytes) + 32
         return planned_bytes / self.sender.symbol_bytes / (1 - min(config.worst.loss, 0.9))
 
+    @override
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`."""
         state = TransmitState(
@@ -403,6 +423,7 @@ class TransmitQueue(ImageSender):
         parts = {"queue": pack_part(state), **self.messages.parts(), **self.sender.parts()}
         return parts if self.in_flight is None else {**parts, "packet": pack_part(self.in_flight)}
 
+    @override
     def restore(self, parts: Parts) -> Errors:
         """Replace the state of a new queue by saved parts; the configuration stays. Return why parts were skipped.
 

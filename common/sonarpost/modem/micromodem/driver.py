@@ -14,6 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from typing import ClassVar
 
+from typing_extensions import override
+
 from sonarpost.errors import SentenceError
 from sonarpost.modem.interface import (
     Modem,
@@ -99,6 +101,7 @@ class MicroModem(Modem):
         self._monitor = TransmitMonitor(config)
 
     @property
+    @override
     def capabilities(self) -> ModemCapabilities:
         """Capabilities of every Micro-Modem."""
         return CAPABILITIES
@@ -109,6 +112,7 @@ class MicroModem(Modem):
         return self._supervisor.phase
 
     @property
+    @override
     def ready(self) -> bool:
         """Whether the modem is configured and, as far as known, answers."""
         return self.phase in {Phase.CHECKING, Phase.READY}
@@ -124,11 +128,13 @@ class MicroModem(Modem):
         return self._supervisor.generation
 
     @property
+    @override
     def queued(self) -> int:
         """Number of packets and requests that are queued or in progress."""
         return len(self._queue) + (not self._idle)
 
     @property
+    @override
     def receiving(self) -> bool:
         """Whether a packet is being received, as far as known."""
         return self._reception.receiving
@@ -146,6 +152,7 @@ class MicroModem(Modem):
         """Configure the modem; the same as `port_opened`."""
         self.port_opened(now)
 
+    @override
     def port_opened(self, now: float) -> None:
         """Configure the modem: the port was opened, possibly again."""
         if self.phase is not Phase.CLOSED:
@@ -153,6 +160,7 @@ class MicroModem(Modem):
         self._supervisor.open(now)
         self._advance(now)
 
+    @override
     def port_lost(self, now: float) -> None:
         """Fail the exchange in progress and return received frames; queued packets wait for the next port."""
         self._supervisor.close()
@@ -161,6 +169,7 @@ class MicroModem(Modem):
         self._out.clear()
         self._events_since_s = now
 
+    @override
     def send_packet(
         self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False, now: float
     ) -> int:
@@ -181,6 +190,7 @@ class MicroModem(Modem):
         self._enqueue(packet, now)
         return packet.packet_id
 
+    @override
     def ping(self, destination: int, now: float) -> int:
         """Queue a ping; `PingAnswered` carries the travel time, `RequestDone` or `RequestFailed` the result.
 
@@ -207,6 +217,7 @@ class MicroModem(Modem):
         command = flexible_command(destination, rate, data)
         return self._enqueue_request(RequestKind.FLEXIBLE_DATA, destination, command, now, rate)
 
+    @override
     def request_packet(
         self, source: int, rate: int, frames: int | None = None, *, ack: bool = False, now: float
     ) -> int:
@@ -225,6 +236,7 @@ class MicroModem(Modem):
         command = poll_command(source, self.config.address, rate, frames, ack=ack)
         return self._enqueue_request(RequestKind.POLL, source, command, now, rate)
 
+    @override
     def set_poll_handler(self, handler: PollHandler | None) -> None:
         """Set the function that returns the frames when another modem polls this one.
 
@@ -244,6 +256,7 @@ class MicroModem(Modem):
         self._supervisor.set_clock(utc, now)
         return True
 
+    @override
     def receive(self, data: bytes, now: float) -> list[ModemEvent]:
         """Process bytes from the port, in parts of any size. Invalid bytes are reported as events."""
         if self.phase is Phase.CLOSED:
@@ -260,11 +273,13 @@ class MicroModem(Modem):
             self._advance(now)
         return self._take_events()
 
+    @override
     def poll(self, now: float) -> list[ModemEvent]:
         """Do what is due; call at `next_wakeup` or at any other time."""
         self._advance(now)
         return self._take_events()
 
+    @override
     def next_wakeup(self) -> float | None:
         """Return when `poll` has something to do, or None; a time in the past means immediately."""
         times_s = [self._events_since_s if self._events else None]
@@ -277,6 +292,7 @@ class MicroModem(Modem):
             times_s.append(self._supervisor.dump_ends_s)
         return min((time_s for time_s in times_s if time_s is not None), default=None)
 
+    @override
     def bytes_to_send(self) -> bytes:
         """Remove and return the bytes to be written to the port."""
         data = bytes(self._out)

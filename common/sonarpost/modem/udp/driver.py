@@ -10,6 +10,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+from typing_extensions import override
+
 from sonarpost.errors import SentenceError
 from sonarpost.modem.interface import (
     FrameReceived,
@@ -58,18 +60,22 @@ class UdpModem(QueueingModem[_Sending, Datagram]):
         self._seen: dict[Datagram, None] = {}
 
     @property
+    @override
     def ready(self) -> bool:
         """Whether the port is open."""
         return self._is_open
 
+    @override
     def _begin(self, now: float) -> None:
         self._events.append(ModemReady(self._settings.address, None))
 
+    @override
     def _end(self) -> None:
         if self._sending is not None:
             self._events.append(self._sending.packet.failed("the port was lost", maybe_sent=True))
         self._sending = None
 
+    @override
     def _divided(self, data: bytes) -> Sequence[Datagram | SentenceError]:
         if self._settings.stream:
             return self._assembler.feed(data)
@@ -79,10 +85,12 @@ class UdpModem(QueueingModem[_Sending, Datagram]):
         except SentenceError as error:
             return [error]
 
+    @override
     def _deadlines_s(self) -> Iterable[float | None]:
         if self._sending is not None:
             yield self._sending.ends_s if self._sending.on_air else self._sending.ack_s
 
+    @override
     def _advance(self, now: float) -> None:
         super()._advance(now)
         if self._sending is not None:
@@ -110,6 +118,7 @@ class UdpModem(QueueingModem[_Sending, Datagram]):
             self._events.append(sending.packet.sent(sorted(sending.acknowledged), sending.started_s, now))
             self._sending = None
 
+    @override
     def _on_message(self, message: Datagram, now: float) -> None:
         if message.source != self._settings.address:  # a multicast socket also receives its own datagrams
             self._on_datagram(message, now)

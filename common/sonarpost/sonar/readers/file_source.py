@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import ClassVar
 
+from typing_extensions import override
+
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.navigation import PingCounter
 from sonarpost.sonar.options import SurveyOptions
@@ -57,6 +59,7 @@ class FileSource(StreamedSource):
     def _file(self) -> CheckedFile:
         return self._files[0]
 
+    @override
     def close(self) -> None:
         """Close the files. Closing again has no effect."""
         for file in self._files:
@@ -77,9 +80,11 @@ class FileSource(StreamedSource):
     def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
         """Yield the pings as stored in the file, and note irregularities."""
 
+    @override
     def _grid(self) -> GridExtent | None:
         return self._extent
 
+    @override
     def _format_warnings(self) -> list[str]:
         """Return the notes, and how many pings have no position fix or heading."""
         texts = [(self._without_fix, "no position fix in")]
@@ -90,6 +95,7 @@ class FileSource(StreamedSource):
             missing[0] = "no positions: the file has projected metres; set the option projected_crs (--crs)"
         return [*self._notes.warnings(), *(missing if self.REPORTS_MISSING else ())]
 
+    @override
     def _read_pings(self, *, first_pass: bool) -> Iterator[Ping]:
         notes = self._notes if first_pass else Notes()
         row = 0

@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from typing_extensions import override
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position
@@ -79,6 +80,7 @@ class _PingFormat(RecordFormat):
     def __init__(self, file_name: str) -> None:
         self.name = f"ping of {file_name}"
 
+    @override
     def length(self, head: bytes, offset: int) -> int:
         fields, header_bytes = _header(head)
         return header_bytes + fields[_SAMPLES] if header_bytes else 0
@@ -99,6 +101,7 @@ class HumminbirdSource(FileSource):
         self._unpaired = 0
         super().__init__(path, options)
 
+    @override
     def _data_files(self) -> tuple[Path, ...]:
         self._started_s = _start_time(self.path)
         paths = {side: found for side, name in _SIDES.items() if (found := _channel_path(self.path, name)) is not None}
@@ -123,6 +126,7 @@ class HumminbirdSource(FileSource):
             others = []
         return (path, *sides, *others)
 
+    @override
     def _format_warnings(self) -> list[str]:
         warnings = []
         if self.options.humminbird_sample_spacing_m is None:
@@ -141,6 +145,7 @@ class HumminbirdSource(FileSource):
             depths.append(f"no depth under the transducer in {self._without_depth.summary(self._pings)}")
         return [*warnings, *super()._format_warnings(), *depths]
 
+    @override
     def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
         channels = [self._parts(side, file, notes) for side, file in zip(self._sides, self._files, strict=True)]
         parts = heapq.merge(*channels, key=lambda part: part.time_utc_s)

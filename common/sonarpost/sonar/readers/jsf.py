@@ -29,6 +29,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Final
 
 import numpy as np
+from typing_extensions import override
 
 from sonarpost.sonar.geometry import Position
 from sonarpost.sonar.navigation import KNOT_MPS, PingCounter, is_plausible, position_in_degrees
@@ -79,15 +80,18 @@ class _Message(RecordFormat):
     magic = MARKER.to_bytes(2, "little")
     head_bytes = MESSAGE_BYTES
 
+    @override
     def length(self, head: bytes, offset: int) -> int:
         marker, protocol, kind, size = struct.unpack("<HBxH6xi", head)
         least = SONAR_BYTES if kind == SONAR_MESSAGE else 0
         valid = marker == MARKER and 0 < protocol <= _MAX_PROTOCOL and 0 < kind <= _MAX_KIND
         return MESSAGE_BYTES + size if valid and least <= size <= MAX_MESSAGE_BYTES else 0
 
+    @override
     def candidates(self, data: bytes, offset: int) -> Iterator[int]:
         return (found.start() for found in _START.finditer(data))
 
+    @override
     def is_proved(self, raw: bytes) -> bool:
         """Return whether it is a sonar message with as many samples as its header states."""
         if _kind(raw) != SONAR_MESSAGE:
@@ -108,11 +112,13 @@ class JsfSource(FileSource):
 
     SONAR = "EdgeTech"
 
+    @override
     def _prepare(self) -> None:
         crs = self.options.projected_crs
         self._projection = None if crs is None else Projection(crs)
         self._fix_of_antenna = PingCounter()
 
+    @override
     def _format_warnings(self) -> list[str]:
         warnings = super()._format_warnings()
         if self._fix_of_antenna.count:
@@ -122,6 +128,7 @@ class JsfSource(FileSource):
             )
         return warnings
 
+    @override
     def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
         for row, part in enumerate(joined(self._parts(notes), max_gap_s=_SAME_PING_S, held_pings=_HELD_PINGS)):
             ping = self._ping(part)

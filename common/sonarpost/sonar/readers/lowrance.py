@@ -29,6 +29,7 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import override
 
 from sonarpost.sonar.geometry import Position
 from sonarpost.sonar.navigation import KNOT_MPS, is_plausible, position_in_degrees
@@ -108,10 +109,12 @@ class _Frames(RecordFormat):
         frame_bytes, channel, samples = np.frombuffer(head, self._layout.sizes, 1).item()
         return frame_bytes, channel, samples
 
+    @override
     def length(self, head: bytes, offset: int) -> int:
         sizes = self.sizes(head)
         return sizes[0] if self._agree(*sizes) else 0
 
+    @override
     def candidates(self, data: bytes, offset: int) -> Iterator[int]:
         size = self._file.size_bytes
         reach = min(len(data) + _MAX_FRAME_BYTES, size - offset)  # up to the frame after the last one in the data
@@ -147,6 +150,7 @@ class LowranceSource(FileSource):
 
     SONAR = "Lowrance"
 
+    @override
     def _prepare(self) -> None:
         (number,) = struct.unpack_from("<H", self._file.read_at(0, _FILE_HEADER_BYTES, "file header"))
         if number not in _LAYOUTS:
@@ -172,6 +176,7 @@ class LowranceSource(FileSource):
             )
         return float(dates.most_common(1)[0][0]) if dates else 0.0
 
+    @override
     def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
         for place, _, raw in records(self._file, self._frames, _FILE_HEADER_BYTES, notes):
             _, channel, samples = self._frames.sizes(raw)

@@ -33,6 +33,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 import numpy as np
+from typing_extensions import override
 
 from sonarpost.sonar.navigation import is_plausible, position_in_degrees
 from sonarpost.sonar.readers.file_source import FileSource
@@ -69,16 +70,19 @@ class _Page(RecordFormat):
     head_bytes = _HEADER_SIZE + 4
     min_head_bytes = _START.size
 
+    @override
     def length(self, head: bytes, offset: int) -> int:
         marker, size, version = _START.unpack_from(head)
         least = HEADER_BYTES if version in SIDE_SCAN_PAGES else _START.size - len(MARKER)
         valid = marker == MARKER and _VERSIONS[0] <= version <= _VERSIONS[1] and least <= size <= MAX_PAGE_BYTES
         return len(MARKER) + size if valid else 0
 
+    @override
     def candidates(self, data: bytes, offset: int) -> Iterator[int]:
         """Yield the indices of headers: samples may have the value of the marker, if they are saturated."""
         return (found.start() for found in _HEADER.finditer(data))
 
+    @override
     def is_proved(self, raw: bytes) -> bool:
         """Return whether it is a side-scan page with as many samples as its header states."""
         _, _, version = _START.unpack_from(raw)
@@ -104,6 +108,7 @@ class SdfSource(FileSource):
 
     SONAR = "Klein"
 
+    @override
     def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
         for part in joined(self._parts(notes), max_gap_s=_SAME_PING_S, held_pings=_HELD_PINGS):
             yield _ping(part)

@@ -28,6 +28,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import override
 
 from sonarpost.sonar.navigation import is_plausible
 from sonarpost.sonar.readers.file_source import FileSource
@@ -58,10 +59,12 @@ class _Packet(RecordFormat):
     head_bytes = _HEADER.size
     has_checksum = True
 
+    @override
     def length(self, head: bytes, offset: int) -> int:
         magic, length, kind, *_ = _HEADER.unpack(head)
         return _HEADER.size + length + _CHECKSUM_BYTES if magic == MAGIC and 0 < kind <= _MAX_KIND else 0
 
+    @override
     def is_proved(self, raw: bytes) -> bool:
         stored, calculated = _checksums(raw)
         return stored == calculated
@@ -79,6 +82,7 @@ class SvlogSource(FileSource):
 
     SONAR = "Omniscan"
 
+    @override
     def _prepare(self) -> None:
         self._transducers: Counter[tuple[Side, int]] = Counter()
         self._one_sided = 0
@@ -89,6 +93,7 @@ class SvlogSource(FileSource):
             if kind == PROFILE and len(payload) >= _PROFILE.size
         )
 
+    @override
     def _format_warnings(self) -> list[str]:
         warnings = super()._format_warnings()
         sides = {side for side, _ in self._transducers}
@@ -99,6 +104,7 @@ class SvlogSource(FileSource):
             warnings.append(f"only {count} transducer{'s' * (count > 1)}, to {min(sides)}")
         return warnings
 
+    @override
     def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
         timeline = Timeline(self._file, notes)
         for _, segment in groupby(self._profiles(notes), key=lambda profile: profile.segment):

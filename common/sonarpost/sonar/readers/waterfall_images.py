@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from typing_extensions import override
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position
@@ -90,6 +91,7 @@ class WaterfallSource(FileSource):
         SurveyFileError: A file is missing or damaged, or the files do not match.
     """
 
+    @override
     def _data_files(self) -> tuple[Path]:
         self._config = _read_description(self.path)
         if self._config.port is not None and self._config.port_order is None:
@@ -104,9 +106,11 @@ class WaterfallSource(FileSource):
         self._implausible: dict[str, PingCounter] = {}
         return (self.path.parent / self._config.navigation,)
 
+    @override
     def _sonar_name(self) -> str:
         return self._config.sonar_id
 
+    @override
     def _validate(self, sonar_id: str, line_name: str) -> None:
         super()._validate(sonar_id, line_name.removesuffix(".waterfall"))
 
@@ -129,6 +133,7 @@ class WaterfallSource(FileSource):
             images[Side.PORT] = images[Side.PORT][:, ::-1]
         return images
 
+    @override
     def _format_warnings(self) -> list[str]:
         missing = [f"no position fix in {self._without_fix.summary(self._pings)}"] if self._without_fix.count else []
         return missing + [
@@ -136,6 +141,7 @@ class WaterfallSource(FileSource):
             for name, counter in sorted(self._implausible.items())
         ]
 
+    @override
     def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
         count = -1
         for count, values in enumerate(self._lines()):

@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import override
 
 from sonarpost.sonar.readers.file_source import FileSource
 from sonarpost.sonar.readers.joining import PingPart, joined
@@ -46,6 +47,7 @@ class XtfSource(FileSource):
         SurveyFileError: Not an XTF file, without a valid sonar ping, or unreadable.
     """
 
+    @override
     def _prepare(self) -> None:
         self._header, channels, self._first_packet = read_header(self._file)
         self._numbering = Numbering(channels)
@@ -68,13 +70,16 @@ class XtfSource(FileSource):
         farthest_first = self.options.port_order == "farthest_first"
         return PacketParser(self._file, self._numbering, notes, port_farthest_first=farthest_first)
 
+    @override
     def _sonar_name(self) -> str:
         return decode_text(self._header.SonarName)
 
+    @override
     def _format_warnings(self) -> list[str]:
         navigation = self._navigation.warnings(self._pings)
         return [*super()._format_warnings(), *navigation, *self._port_order.warnings()]
 
+    @override
     def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
         by_number = self._numbering.repeats_pings
         pings = joined(self._parts(notes), max_gap_s=_MAX_GAP_S, by_number=by_number, held_pings=_HELD_PINGS)

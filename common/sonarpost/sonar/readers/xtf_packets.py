@@ -26,6 +26,7 @@ from typing import Final, TypeVar
 
 import numpy as np
 from pyxtf import XTFAttitudeData, XTFChanInfo, XTFFileHeader, XTFPingChanHeader, XTFPingHeader
+from typing_extensions import override
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import slant_to_ground_range_m
@@ -172,6 +173,7 @@ class PacketParser(RecordFormat):
         self._notes = notes
         self._reverse = {Side.PORT: port_farthest_first, Side.STARBOARD: False}
 
+    @override
     def length(self, head: bytes, offset: int) -> int:
         """Return NumBytesThisRecord; 0 if it, or NumChansToFollow of a sonar packet, is not possible."""
         magic, kind, _, channels, length = _START.unpack(head)
@@ -180,6 +182,7 @@ class PacketParser(RecordFormat):
             least = _PING_BYTES + channels * _PING_CHAN_BYTES if channels <= MAX_CHANNELS else MAX_PACKET_BYTES + 1
         return length if magic == self.magic and least <= length <= MAX_PACKET_BYTES else 0
 
+    @override
     def is_proved(self, raw: bytes) -> bool:
         """Return whether a packet is a sonar ping with a valid date, filled by its channels up to the padding."""
         if raw[2] != SONAR_PACKET:

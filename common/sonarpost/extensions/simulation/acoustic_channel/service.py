@@ -8,6 +8,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
+from typing_extensions import override
+
 from sonarpost.config import PlatformConfig
 from sonarpost.extensions.simulation.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
@@ -39,14 +41,17 @@ class AcousticChannelService(Service[AcousticChannelConfig]):
         for device in self._emulator.devices():
             log.info("Modem ready", extra=kv(modem=device.modem, address=device.address, device=device.device))
 
+    @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Reject any record: this service consumes none."""
         raise NotImplementedError(f"acoustic_channel consumes no records, got one on {key}")
 
+    @override
     def on_start(self) -> None:
         """Watch the emulator: the service fails when the emulator fails."""
         self.start_thread(self._watch, "watch")
 
+    @override
     def gauges(self) -> Mapping[str, float]:
         """Return the counts of packets and frames, and the number of connected hosts."""
         totals = self._emulator.totals()
@@ -58,6 +63,7 @@ class AcousticChannelService(Service[AcousticChannelConfig]):
             **{f"frames_{outcome}": float(count) for outcome, count in totals.frames.items()},
         }
 
+    @override
     def stop(self) -> None:
         """Stop the service, then the emulator, which writes its totals."""
         super().stop()

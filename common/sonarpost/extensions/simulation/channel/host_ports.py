@@ -15,6 +15,8 @@ import tty
 from abc import ABC, abstractmethod
 from pathlib import Path
 
+from typing_extensions import override
+
 from sonarpost.errors import PortError
 
 READ_BYTES = 65536
@@ -94,6 +96,7 @@ class PtyPort(HostPort):
         temporary.symlink_to(self._slave_name)
         temporary.replace(self._link)
 
+    @override
     def update_connection(self) -> None:
         """See `HostPort`."""
         masks = [mask for _, mask in self._poll.poll(0)]
@@ -104,6 +107,7 @@ class PtyPort(HostPort):
         elif not any(mask & select.POLLHUP for mask in masks):
             self.connected = True
 
+    @override
     def read(self) -> bytes:
         """See `HostPort`."""
         try:
@@ -112,6 +116,7 @@ class PtyPort(HostPort):
             self._check(error)
             return b""
 
+    @override
     def write(self, data: bytes) -> int:
         """See `HostPort`."""
         try:
@@ -142,6 +147,7 @@ class PtyPort(HostPort):
         finally:
             os.close(slave)
 
+    @override
     def poll_masks(self, *, writing: bool) -> list[tuple[int, int]]:
         """See `HostPort`; empty without a client, as the terminal then reports POLLHUP at once."""
         if not self.connected:
@@ -149,10 +155,12 @@ class PtyPort(HostPort):
         return [(self._master, select.POLLIN | (select.POLLOUT if writing else 0))]
 
     @property
+    @override
     def needs_polling(self) -> bool:
         """A terminal does not report that a client opens it."""
         return not self.connected
 
+    @override
     def close(self) -> None:
         """Remove the link unless another process has replaced it, then close the terminal.
 
@@ -182,6 +190,7 @@ class TcpPort(HostPort):
         self._next_client: socket.socket | None = None
         self.device = f"socket://{host}:{self._listener.getsockname()[1]}"
 
+    @override
     def update_connection(self) -> None:
         """Accept a new client; the previous one is reported as disconnected for one call first."""
         if self._next_client is None:
@@ -197,6 +206,7 @@ class TcpPort(HostPort):
         self._client, self._next_client = self._next_client, None
         self.connected = True
 
+    @override
     def read(self) -> bytes:
         """See `HostPort`."""
         if self._client is None:
@@ -211,6 +221,7 @@ class TcpPort(HostPort):
             self._disconnect()
         return data
 
+    @override
     def write(self, data: bytes) -> int:
         """See `HostPort`."""
         if self._client is None:
@@ -229,6 +240,7 @@ class TcpPort(HostPort):
         self._client = None
         self.connected = False
 
+    @override
     def poll_masks(self, *, writing: bool) -> list[tuple[int, int]]:
         """See `HostPort`."""
         masks = [(self._listener.fileno(), select.POLLIN)]
@@ -237,10 +249,12 @@ class TcpPort(HostPort):
         return masks
 
     @property
+    @override
     def needs_polling(self) -> bool:
         """Whether a new client waits for the next `update_connection`."""
         return self._next_client is not None
 
+    @override
     def close(self) -> None:
         """Close the listener and the clients."""
         for each in (self._listener, self._client, self._next_client):

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from typing_extensions import override
+
 from sonarpost.errors import SentenceError
 from sonarpost.extensions.simulation.channel.events import AcousticPacket, ArrivalEnded, PacketKind
 from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, PacketModemSettings, airtime_of, good_frames
@@ -26,13 +28,16 @@ class UdpRelay(PacketModem):
         super().__init__(settings)
         self._assembler = DatagramAssembler()
 
+    @override
     def host_disconnected(self) -> None:
         """Drop an unfinished datagram."""
         self._assembler.reset()
 
+    @override
     def _on_pause(self) -> None:
         self._assembler.reset()
 
+    @override
     def _read_input(self, now: float) -> None:
         """Transmit the datagrams of the host; other bytes are ignored, as a network has no answer for them."""
         data = bytes(self._input)
@@ -55,6 +60,7 @@ class UdpRelay(PacketModem):
             )
             self._transmit(packet)
 
+    @override
     def _on_packet(self, arrival: ArrivalEnded, now: float) -> bytes:
         packet = arrival.transmission.packet
         if packet.kind is PacketKind.ACK:

@@ -19,6 +19,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Final
 
+from typing_extensions import override
+
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.frames.contact_record import ContactSummary
@@ -95,20 +97,24 @@ class PaperSender(ImageSender):
         self._packets_sent = 0
 
     @property
+    @override
     def rate(self) -> int:
         """Number of the rate."""
         return self._rate.number
 
     @property
+    @override
     def is_idle(self) -> bool:
         """Whether there is nothing to send."""
         return not self.images
 
     @property
+    @override
     def images_waiting(self) -> int:
         """Number of images of which packets are still to be sent."""
         return len(self.images)
 
+    @override
     def add_image(self, image: ImageToSend, now: float) -> bool:
         """Add an image and return True: an image that arrives again is sent again.
 
@@ -127,11 +133,13 @@ class PaperSender(ImageSender):
         frames, frame_bytes = self._rate.frames, self._rate.frame_bytes
         return plan_packets(image.image_id, image.stream, image.contact, frames, frame_bytes)
 
+    @override
     def _select_packet(self, now: float) -> OutgoingPacket | None:
         if not self.images:
             return None
         return OutgoingPacket(self.rate, self._plan(self.images[0])[self._packets_sent])
 
+    @override
     def _packet_sent(self) -> tuple[SentImage, ...]:
         self._packets_sent += 1
         if self._packets_sent < len(self._plan(self.images[0])):
@@ -140,9 +148,11 @@ class PaperSender(ImageSender):
         image = self.images.pop(0)
         return (SentImage(image.image_id, image.contact_id),)
 
+    @override
     def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int) -> None:
         """Do nothing: the format has no feedback."""
 
+    @override
     def expected(self, now: float) -> list[ExpectedDelivery]:
         """Return when each image is expected to be sent, in the order of sending."""
         found: list[ExpectedDelivery] = []
@@ -157,6 +167,7 @@ class PaperSender(ImageSender):
             found.append(ExpectedDelivery(image.image_id, image.contact_id, frame_bytes, preview_s, done_s))
         return found
 
+    @override
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`: the images, and the progress of the first."""
         parts = {f"image/{image.order}": pack_part(image) for image in self.images}
@@ -164,6 +175,7 @@ class PaperSender(ImageSender):
         progress = PaperProgress(order, self.rate, self._packets_sent, self.packet_interval_s)
         return {**parts, "progress": pack_part(progress)}
 
+    @override
     def restore(self, parts: Parts) -> Errors:
         """Replace the state by saved parts; return why parts were skipped.
 
