@@ -55,7 +55,6 @@ class RecordedChain(Chain):
 
     @override
     def module(self, name: str) -> tuple[str, ...]:
-        """Return the module of a process and its arguments."""
         command = super().module(name)
         return ("research.recording_relay", *command[1:]) if name == "relay" else command
 

@@ -213,7 +213,6 @@ class TextFormatter(logging.Formatter):
 
     @override
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line."""
         message = record.getMessage()
         if not message.isprintable():
             message = json.dumps(message)[1:-1]
@@ -233,7 +232,6 @@ class JsonFormatter(logging.Formatter):
 
     @override
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line."""
         event: dict[str, object] = {
             "time": _time_text(record),
             "level": record.levelname.lower(),

@@ -111,11 +111,6 @@ class MaskedSource(SurveySource):
 
     @override
     def pings(self) -> Iterator[Ping]:
-        """Yield the pings in the order of recording.
-
-        Raises:
-            SurveyFileError: The file has changed since it was opened, or cannot be read.
-        """
         self.masked_count = 0
         for ping, masked in _with_mask(self._source.pings(), self._intervals):
             self.masked_count += masked is not ping

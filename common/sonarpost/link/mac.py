@@ -134,7 +134,6 @@ class Polled(MediumAccess):
 
     @override
     def wait_s(self, packet_s: float, now: float) -> float | None:
-        """Return None."""
         return None
 
 

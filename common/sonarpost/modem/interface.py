@@ -480,7 +480,7 @@ class Modem(Protocol):
         """Fail what is in progress and return received frames; queued packets wait for the next port."""
 
     def receive(self, data: bytes, now: float) -> list[ModemEvent]:
-        """Process bytes from the port, in parts of any size; a datagram is one part."""
+        """Process bytes from the port, in parts of any size; a datagram is one part. Invalid bytes give events."""
 
     def poll(self, now: float) -> list[ModemEvent]:
         """Do what is due; call at `next_wakeup` or at any other time."""

@@ -152,13 +152,11 @@ class QueueingModem(Modem, Generic[S, M]):
     @property
     @override
     def capabilities(self) -> ModemCapabilities:
-        """Capabilities of the driver."""
         return self._capabilities
 
     @property
     @override
     def queued(self) -> int:
-        """Number of packets and requests that are queued or in progress."""
         return len(self._queue) + (self._sending is not None)
 
     @property
@@ -169,7 +167,6 @@ class QueueingModem(Modem, Generic[S, M]):
 
     @override
     def port_opened(self, now: float) -> None:
-        """Begin to send and receive; see `_begin`."""
         if self._is_open:
             self.port_lost(now)
         self._is_open = True
@@ -178,7 +175,6 @@ class QueueingModem(Modem, Generic[S, M]):
 
     @override
     def port_lost(self, now: float) -> None:
-        """Fail the packet or request in progress; see `_end`."""
         self._is_open = False
         self._end()
         self._out.clear()
@@ -196,7 +192,6 @@ class QueueingModem(Modem, Generic[S, M]):
 
     @override
     def receive(self, data: bytes, now: float) -> list[ModemEvent]:
-        """Process received bytes; invalid ones are reported as events."""
         self._give_up_incomplete(now)
         self._received_s = now
         if self._is_open:
@@ -206,13 +201,11 @@ class QueueingModem(Modem, Generic[S, M]):
 
     @override
     def poll(self, now: float) -> list[ModemEvent]:
-        """Do what is due."""
         self._advance(now)
         return self._take_events()
 
     @override
     def next_wakeup(self) -> float | None:
-        """Return when `poll` has something to do, or None."""
         times_s = [*self._deadlines_s(), self._queue.deadline_s()]
         if self._events:
             times_s.append(self._events_since_s)
@@ -222,7 +215,6 @@ class QueueingModem(Modem, Generic[S, M]):
 
     @override
     def bytes_to_send(self) -> bytes:
-        """Remove and return the bytes of the next write to the port."""
         return self._out.pop(0) if self._out else b""
 
     def _begin(self, now: float) -> None:

@@ -47,7 +47,6 @@ class FleetCollector(Collector):
 
     @override
     def collect(self) -> Iterable[Metric]:
-        """Return all metrics."""
         state = self._state()
         connected = float(state.connected)
         yield GaugeMetricFamily(

@@ -282,14 +282,12 @@ class LimitedServer(ThreadingHTTPServer):
 
     @override
     def server_close(self) -> None:
-        """Close the sockets."""
         super().server_close()
         while self._refused:
             self._refused.popleft().close()
 
     @override
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Handle the requests of a connection."""
         try:
             super().process_request_thread(request, client_address)
         finally:

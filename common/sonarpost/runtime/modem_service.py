@@ -160,7 +160,6 @@ class ModemService(Service[M]):
 
     @override
     def on_stop(self) -> None:
-        """Close the port."""
         self.modem.stop()
 
     @override

@@ -163,7 +163,6 @@ class SerialPort(ModemPort):
 
     @override
     def write(self, data: bytes) -> None:
-        """See `ModemPort`."""
         with self._in_use:
             port = self._port
             if port is None:

@@ -112,7 +112,6 @@ class EmulatedNanomodem(PacketModem):
 
     @override
     def next_deadline_s(self) -> float:
-        """Return the simulated time at which `poll` has something to do."""
         return min(super().next_deadline_s(), self._timeout_s)
 
     @override

@@ -106,7 +106,6 @@ class S2cModem(QueueingModem[Sending, RawMessage]):
     @property
     @override
     def ready(self) -> bool:
-        """Whether the modem is configured and answers."""
         return self._ready
 
     @property

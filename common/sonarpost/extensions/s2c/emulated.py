@@ -89,7 +89,6 @@ class EmulatedS2c(PacketModem):
     @property
     @override
     def address(self) -> int:
-        """The modem's address."""
         return self._settings["AL"]
 
     @override
@@ -105,7 +104,6 @@ class EmulatedS2c(PacketModem):
 
     @override
     def next_deadline_s(self) -> float:
-        """Return the simulated time at which `poll` has something to do."""
         waits_until_s = float("inf") if self._outstanding is None else self._outstanding.ack_until_s
         return min(super().next_deadline_s(), self._bursts.deadline_s(), waits_until_s, self._raw_due_s)
 

@@ -109,7 +109,6 @@ class ShortMessages(Input):
 
     @override
     def open(self, service: Service[Any]) -> None:
-        """Open the webhook for a c2."""
         self._store = service.store
         self._count = service.count
         self._check_capacity = service.check_capacity
@@ -120,7 +119,6 @@ class ShortMessages(Input):
 
     @override
     def close(self) -> None:
-        """Close the webhook."""
         if self._webhook is not None:
             self._webhook.close()
 

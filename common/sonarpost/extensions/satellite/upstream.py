@@ -99,7 +99,6 @@ class SatelliteUpstream(Bearer):
 
     @override
     def queue(self, record: CodedImage | Decision, effects: UnitOfWork) -> None:
-        """Queue a record with the other effects of its handling; `committed` has to follow."""
         now_s = time.time()
         try:
             if isinstance(record, Decision):
@@ -118,7 +117,6 @@ class SatelliteUpstream(Bearer):
 
     @override
     def committed(self) -> None:
-        """Send what has been committed."""
         self._wake.set()
 
     @override

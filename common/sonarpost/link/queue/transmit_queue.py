@@ -102,13 +102,11 @@ class TransmitQueue(ImageSender):
     @property
     @override
     def rate(self) -> int:
-        """Number of the rate in use."""
         return self.rate_selector.current
 
     @property
     @override
     def measured_loss(self) -> float | None:
-        """Share of frames lost according to feedback."""
         return self.sender.state.tracker.loss
 
     @property
@@ -119,18 +117,15 @@ class TransmitQueue(ImageSender):
     @property
     @override
     def images_waiting(self) -> int:
-        """Number of images of which something is still to be sent."""
         return len(self.open_numbers())
 
     @property
     @override
     def is_idle(self) -> bool:
-        """Whether there is nothing to send, and nothing that feedback can request."""
         return self.sender.is_idle and not self.messages.waiting and self.in_flight is None
 
     @override
     def gauges(self) -> Mapping[str, float]:
-        """Return figures for the health record."""
         return {
             **super().gauges(),
             "messages_waiting": float(len(self.messages.waiting)),
@@ -185,17 +180,11 @@ class TransmitQueue(ImageSender):
 
     @override
     def image_id_of(self, number: int) -> str | None:
-        """Return the identifier of the image with a contact number, None if the queue does not have it."""
         image = self.sender.kept.get(number)
         return None if image is None else image.image_id
 
     @override
     def refine(self, number: int, stream_bytes: int, now: float) -> bool:
-        """Send more of an image, up to a length of its stream (0: all); return False if the queue has no more of it.
-
-        Raises:
-            FrameError: A value out of range.
-        """
         known = self.sender.kept.get(number)
         if known is None:
             return False
@@ -206,17 +195,14 @@ class TransmitQueue(ImageSender):
 
     @override
     def stop(self, number: int) -> bool:
-        """Send nothing more of an image; see `ImageSender.stop`."""
         return self.sender.stop(number)
 
     @override
     def resume(self, number: int, now: float) -> bool:
-        """Queue the rest of a stopped image; see `ImageSender.resume`."""
         return self.sender.resume(number, now)
 
     @override
     def prioritise(self, number: int, now: float, *, first: bool) -> bool:
-        """Send the rest of an image before or after all others; see `ImageSender.prioritise`."""
         return self.sender.prioritise(number, now, first=first)
 
     @override
@@ -231,7 +217,6 @@ class TransmitQueue(ImageSender):
         lifetime_s: float = 3600.0,
         once: bool = False,
     ) -> bool:
-        """Add a message; see `ImageSender.add_message`."""
         if lifetime_s <= 0:
             self.messages.expired += 1
             return False
@@ -257,7 +242,6 @@ class TransmitQueue(ImageSender):
 
     @override
     def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int) -> None:
-        """Process the feedback of a mini-packet."""
         self._feedback_arrived(now)
         self.sender.on_mini_feedback(block_number, missing_symbols, now, receiver)
 
@@ -409,7 +393,6 @@ class TransmitQueue(ImageSender):
 
     @override
     def parts(self) -> dict[str, bytes]:
-        """Return the state to save, see `sonarpost.link.state`."""
         state = TransmitState(
             rate=self.rate,
             losses=self.rate_selector.losses,

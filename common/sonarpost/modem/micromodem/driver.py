@@ -103,7 +103,6 @@ class MicroModem(Modem):
     @property
     @override
     def capabilities(self) -> ModemCapabilities:
-        """Capabilities of every Micro-Modem."""
         return CAPABILITIES
 
     @property
@@ -114,7 +113,6 @@ class MicroModem(Modem):
     @property
     @override
     def ready(self) -> bool:
-        """Whether the modem is configured and, as far as known, answers."""
         return self.phase in {Phase.CHECKING, Phase.READY}
 
     @property
@@ -130,13 +128,11 @@ class MicroModem(Modem):
     @property
     @override
     def queued(self) -> int:
-        """Number of packets and requests that are queued or in progress."""
         return len(self._queue) + (not self._idle)
 
     @property
     @override
     def receiving(self) -> bool:
-        """Whether a packet is being received, as far as known."""
         return self._reception.receiving
 
     @property
@@ -154,7 +150,6 @@ class MicroModem(Modem):
 
     @override
     def port_opened(self, now: float) -> None:
-        """Configure the modem: the port was opened, possibly again."""
         if self.phase is not Phase.CLOSED:
             self.port_lost(now)
         self._supervisor.open(now)
@@ -162,7 +157,6 @@ class MicroModem(Modem):
 
     @override
     def port_lost(self, now: float) -> None:
-        """Fail the exchange in progress and return received frames; queued packets wait for the next port."""
         self._supervisor.close()
         self._abort(FailureReason.PORT_LOST, now)
         self._lines.reset()
@@ -173,18 +167,6 @@ class MicroModem(Modem):
     def send_packet(
         self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False, now: float
     ) -> int:
-        """Queue a packet and return its number, which its `PacketSent` or `PacketFailed` carries.
-
-        Args:
-            destination: Destination address, 0..127.
-            rate: Rate number, 0..6.
-            frames: At least one, at most as many and as long as the rate allows; an empty frame is allowed.
-            ack: Request acoustic acknowledgements from the far modem, and wait for them.
-            now: Time on the driver's clock.
-
-        Raises:
-            FrameError: An address, a rate or frames that the modem cannot send.
-        """
         CAPABILITIES.check_packet(destination, rate, frames)
         packet = QueuedPacket(self._next_id, destination, rate, tuple(bytes(f) for f in frames), ack, now)
         self._enqueue(packet, now)
@@ -258,7 +240,6 @@ class MicroModem(Modem):
 
     @override
     def receive(self, data: bytes, now: float) -> list[ModemEvent]:
-        """Process bytes from the port, in parts of any size. Invalid bytes are reported as events."""
         if self.phase is Phase.CLOSED:
             return self._take_events()
         for item in self._lines.feed(data):
@@ -275,13 +256,11 @@ class MicroModem(Modem):
 
     @override
     def poll(self, now: float) -> list[ModemEvent]:
-        """Do what is due; call at `next_wakeup` or at any other time."""
         self._advance(now)
         return self._take_events()
 
     @override
     def next_wakeup(self) -> float | None:
-        """Return when `poll` has something to do, or None; a time in the past means immediately."""
         times_s = [self._events_since_s if self._events else None]
         times_s += [packet.queued_s + self.config.max_defer_s for packet in self._queue]
         if self.phase is not Phase.CLOSED:
@@ -294,7 +273,6 @@ class MicroModem(Modem):
 
     @override
     def bytes_to_send(self) -> bytes:
-        """Remove and return the bytes to be written to the port."""
         data = bytes(self._out)
         self._out.clear()
         return data

@@ -61,7 +61,6 @@ class FileSource(StreamedSource):
 
     @override
     def close(self) -> None:
-        """Close the files. Closing again has no effect."""
         for file in self._files:
             file.close()
 

@@ -98,7 +98,6 @@ class PtyPort(HostPort):
 
     @override
     def update_connection(self) -> None:
-        """See `HostPort`."""
         masks = [mask for _, mask in self._poll.poll(0)]
         # Bytes that the client wrote before it left are read first: the flush in `_disconnect` would drop them.
         hung_up = any(mask & select.POLLHUP and not mask & select.POLLIN for mask in masks)
@@ -109,7 +108,6 @@ class PtyPort(HostPort):
 
     @override
     def read(self) -> bytes:
-        """See `HostPort`."""
         try:
             return os.read(self._master, READ_BYTES)
         except OSError as error:
@@ -118,7 +116,6 @@ class PtyPort(HostPort):
 
     @override
     def write(self, data: bytes) -> int:
-        """See `HostPort`."""
         try:
             return os.write(self._master, data)
         except OSError as error:
@@ -208,7 +205,6 @@ class TcpPort(HostPort):
 
     @override
     def read(self) -> bytes:
-        """See `HostPort`."""
         if self._client is None:
             return b""
         try:
@@ -223,7 +219,6 @@ class TcpPort(HostPort):
 
     @override
     def write(self, data: bytes) -> int:
-        """See `HostPort`."""
         if self._client is None:
             return 0
         try:
@@ -242,7 +237,6 @@ class TcpPort(HostPort):
 
     @override
     def poll_masks(self, *, writing: bool) -> list[tuple[int, int]]:
-        """See `HostPort`."""
         masks = [(self._listener.fileno(), select.POLLIN)]
         if self._client is not None:
             masks.append((self._client.fileno(), select.POLLIN | (select.POLLOUT if writing else 0)))

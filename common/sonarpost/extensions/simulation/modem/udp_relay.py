@@ -30,7 +30,6 @@ class UdpRelay(PacketModem):
 
     @override
     def host_disconnected(self) -> None:
-        """Drop an unfinished datagram."""
         self._assembler.reset()
 
     @override

@@ -99,7 +99,6 @@ class PaperSender(ImageSender):
     @property
     @override
     def rate(self) -> int:
-        """Number of the rate."""
         return self._rate.number
 
     @property
@@ -111,7 +110,6 @@ class PaperSender(ImageSender):
     @property
     @override
     def images_waiting(self) -> int:
-        """Number of images of which packets are still to be sent."""
         return len(self.images)
 
     @override
