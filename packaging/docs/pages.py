@@ -16,7 +16,8 @@ from mkdocs.utils import get_relative_url
 
 sys.path.insert(0, str(Path(__file__).parent))
 import glossary
-import rates  # noqa: F401 `reference` imports it later, when MkDocs has restored the path
+import packages  # noqa: F401 `reference` imports it and `rates` later, when MkDocs has restored the path
+import rates  # noqa: F401
 import reference
 
 from sonarpost.config import service_packages

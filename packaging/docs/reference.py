@@ -1,4 +1,4 @@
-"""Tables of the reference pages, made from code: records, keys, configuration, command line and modem rates."""
+"""Tables of the reference pages, made from code: records, keys, configuration, commands, modem rates and packages."""
 
 from __future__ import annotations
 
@@ -259,6 +259,13 @@ def extension_table(_: str = "") -> str:
     return table(("extension", "what it adds", "needs"), rows)
 
 
+def package_drawing(_: str = "") -> str:
+    """Return the drawing of the packages and their imports."""
+    import packages  # noqa: PLC0415 it needs import-linter's package grimp
+
+    return packages.drawing()
+
+
 GENERATORS: Mapping[str, Callable[[str], str]] = {
     "records": records,
     "keys": key_table,
@@ -270,6 +277,7 @@ GENERATORS: Mapping[str, Callable[[str], str]] = {
     "metrics": metrics,
     "limits": limit_table,
     "extensions": extension_table,
+    "packages": package_drawing,
 }
 
 

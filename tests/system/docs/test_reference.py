@@ -68,6 +68,7 @@ def test_rows_have_type_unit_range_and_default():
                 "| `sonarpost_exporter_records_rejected_total` | counter |  |",
             ),
         ),
+        (reference.package_drawing(), ("<title>link imports codec, errors,", ">monitoring</text>")),
         (reference.rate_table(), ("| 1 | PSK BCH 128:8 | 3 x 64 | 192 | 6.1 | 31 | -7.1 | 145 |",)),
         # 3 frames with 54 bytes of payload in 6.1 s, for images of 200 B with a contact record of 25 B.
         (reference.image_table(), ("| 1 | 27 | 17.9 | 10.4 | 7.1 | 3.0 |",)),
