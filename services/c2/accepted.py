@@ -14,9 +14,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import msgpack
-import numpy as np
 
 from sonarpost import keys
+from sonarpost.archive.image_files import stored_image
 from sonarpost.archive.journal import Accepted, Journal, JournalEntry, JournalRecord, JournalRow
 from sonarpost.archive.shared_journal import SharedJournal
 from sonarpost.archive.shore_database import ShoreDatabase
@@ -24,14 +24,13 @@ from sonarpost.archive.shore_files import decision_path
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex
 from sonarpost.delivery.store import UNREADABLE
 from sonarpost.errors import BadInputError, RejectedByDatabaseError, StoredFileError
-from sonarpost.export.contacts import ImageSideCar
 from sonarpost.files import read_regular
 from sonarpost.logs import kv
 from sonarpost.messages import CodedImage, Decision, Pixels, ReconstructedImage
 from sonarpost.services.c2.archive import Archive, Storage
 from sonarpost.services.c2.shared_archive import SharedArchive
 from sonarpost.services.c2.tasking import Tasking
-from sonarpost.sonar.image_decoding import MAX_FILE_BYTES, GreyImage
+from sonarpost.sonar.image_decoding import MAX_FILE_BYTES
 from sonarpost.sonar.image_files import read_image
 
 log = logging.getLogger(__name__)
@@ -278,34 +277,6 @@ class AcceptedRecords:
 def _records(entries: Iterable[JournalEntry]) -> list[JournalRecord]:
     now_utc_s = time.time()
     return [JournalRecord.of(entry, now_utc_s) for entry in entries]
-
-
-def stored_image(content: bytes, pixels: GreyImage, where: str) -> ReconstructedImage:
-    """Return the record of stored files.
-
-    The side-car has the number of missing pixels and their rows. Missing pixels are black, which identifies them unless
-    a received one in these rows is black as well.
-
-    Args:
-        content: Content of the side-car.
-        pixels: Pixels of the TIFF file, shape (rows, columns), uint8 or uint16.
-        where: Name of the side-car for errors.
-
-    Raises:
-        BadInputError: The missing pixels cannot be identified, or the files do not match.
-        ValidationError: The side-car is invalid.
-    """
-    side_car = ImageSideCar.model_validate_json(content)
-    missing = np.zeros(pixels.shape, np.bool_)
-    if side_car.missing_rows:
-        first, end = side_car.missing_rows
-        missing[first:end] = pixels[first:end] == 0
-    count = side_car.missing_pixels
-    if int(missing.sum()) != count:
-        raise BadInputError(where, "missing_pixels", count, f"{int(missing.sum())}, the black pixels of these rows")
-    fields = side_car.model_dump(exclude={"type", "v", "height_px", "width_px", "missing_rows", "missing_pixels"})
-    mask = np.packbits(missing).tobytes() if count else b""
-    return ReconstructedImage(**fields, pixels=Pixels.from_array(pixels), missing_mask=mask)
 
 
 def accepted_fields(fields: Mapping[str, object], accepted: Accepted) -> dict[str, object]:

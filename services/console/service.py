@@ -6,20 +6,19 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
-from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
 import zenoh
 from typing_extensions import override
 
 from sonarpost import keys, wire
+from sonarpost.archive.image_files import stored_image
 from sonarpost.archive.reader import ArchivePlace, archive_parts
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import BadInputError, DeliveryError, PayloadError
-from sonarpost.export.contacts import ImageSideCar, read_stored_records
+from sonarpost.export.contacts import read_stored_records
 from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import (
     AcousticFrame,
@@ -27,7 +26,6 @@ from sonarpost.messages import (
     Decision,
     DownlinkState,
     Health,
-    Pixels,
     QueueState,
     ReceivedStatus,
     ReconstructedImage,
@@ -449,8 +447,6 @@ def _table_and_id(item: OutboxItem) -> tuple[Table, str]:
 def stored_records(place: ArchivePlace) -> Iterator[ReconstructedImage | Decision]:
     """Yield the images and decisions in the archive of c2, images first. Invalid files are logged and skipped.
 
-    The side-car states rows with missing pixels, not the pixels. Whole rows are marked as missing.
-
     Args:
         place: Folder or database of c2.
     """
@@ -459,21 +455,11 @@ def stored_records(place: ArchivePlace) -> Iterator[ReconstructedImage | Decisio
             stored = read_stored_records(folder)
             for problem in stored.problems:
                 log.warning("Stored file skipped", extra=kv(reason=str(problem)))
-            for side_car, path in stored.images:
+            for _, path in stored.images:
                 try:
-                    yield _stored_image(side_car, path)
+                    yield stored_image(path.read_bytes(), read_image(path.with_suffix(".tiff")), str(path))
                 except (BadInputError, OSError) as error:
                     log.warning("Stored image skipped", extra=kv(file=path, reason=str(error)))
             yield from stored.decisions
     except BadInputError as error:
         log.error("Archive of c2 not readable", extra=kv(reason=str(error)))
-
-
-def _stored_image(side_car: ImageSideCar, path: Path) -> ReconstructedImage:
-    pixels = Pixels.from_array(read_image(path.with_suffix(".tiff")))
-    mask = np.zeros((pixels.height_px, pixels.width_px), np.bool_)
-    if side_car.missing_rows:
-        mask[side_car.missing_rows[0] : side_car.missing_rows[-1]] = True
-    fields = side_car.model_dump(exclude={"type", "v", "height_px", "width_px", "contact", "missing_rows"})
-    missing_mask = np.packbits(mask).tobytes() if mask.any() else b""
-    return ReconstructedImage(**fields, contact=side_car.contact, pixels=pixels, missing_mask=missing_mask)

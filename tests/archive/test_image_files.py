@@ -1,5 +1,6 @@
 """Files of reconstructed images: three consistent files with reproducible bytes."""
 
+import base64
 import errno
 import hashlib
 import json
@@ -12,7 +13,8 @@ from builders.record_samples import COMPLETE_IMAGE, DAMAGED_IMAGE
 from builders.record_strategies import images
 from hypothesis import given
 
-from sonarpost.archive.image_files import add_image, image_file_name, write_image
+from sonarpost.archive.image_files import add_image, image_file_name, stored_image, write_image
+from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import side_car
 from sonarpost.files import AtomicFiles
 from sonarpost.messages import Pixels, ReconstructedImage
@@ -67,20 +69,24 @@ def test_tiff_and_png_hold_16_bits(tmp_path):
         np.testing.assert_array_equal(back, pixels)
 
 
-@pytest.mark.parametrize(
-    ("mask", "pixels", "rows"),
-    [
-        ([[0, 0], [0, 0], [0, 0]], 0, []),
-        ([[1, 0], [0, 0], [0, 0]], 1, [0, 1]),
-        ([[0, 0], [0, 1], [1, 1]], 3, [1, 3]),
-        ([[1, 0], [0, 0], [0, 1]], 2, [0, 3]),
-    ],
-)
-def test_side_car_holds_the_missing_pixels_and_rows(mask, pixels, rows):
-    missing = np.array(mask, np.bool_)
-    stored = side_car(with_pixels(np.zeros((3, 2), np.uint8), missing_mask=np.packbits(missing).tobytes()))
-    assert (stored["missing_pixels"], stored["missing_rows"]) == (pixels, rows)
-    assert "missing_mask" not in stored
+@given(images())
+def test_stored_image_is_the_record_that_was_written(tmp_path_factory, image):
+    tiff, _, _ = write_image(tmp_path_factory.mktemp("out"), image)
+    assert stored_image(tiff.with_suffix(".json").read_bytes(), read_image(tiff), "stored") == image
+
+
+def test_damaged_files_are_named(tmp_path):
+    tiff, _, _ = write_image(tmp_path, DAMAGED_IMAGE)
+    content, pixels = tiff.with_suffix(".json").read_bytes(), read_image(tiff)
+    mask = base64.b64encode(DAMAGED_IMAGE.missing_mask)
+    for replaced, other, expected in (
+        (content[:-9], pixels, "a.json: got "),
+        (content.replace(mask, b"?"), pixels, "a.json: missing_mask: got '\\?', expected base64"),
+        (content.replace(mask, b"AAAA"), pixels, "a.json: missing_mask: got .* expected 0 or 1 bytes"),
+        (content, pixels + 1, "a.json: pixels_sha256: got "),
+    ):
+        with pytest.raises(StoredFileError, match=expected):
+            stored_image(replaced, other, "a.json")
 
 
 @given(images())

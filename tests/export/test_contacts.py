@@ -80,7 +80,7 @@ INVALID_FILES = {
     "an array": (b"[]", "", "object"),
     "missing field": (b'{"type": "reconstructed_image", "v": 1}', "vessel_id", "a value"),
     "later schema version": (None, "v", "1"),
-    "too large": (b" " * (1 << 20) + b"  ", "", "larger than 1048576 bytes"),
+    "too large": (b" " * (1 << 22) + b"  ", "", "larger than 4194304 bytes"),
 }
 
 

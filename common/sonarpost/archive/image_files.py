@@ -7,6 +7,8 @@ another.
 
 from __future__ import annotations
 
+import base64
+import binascii
 import hashlib
 import json
 from collections.abc import Set
@@ -14,11 +16,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
+from pydantic import ValidationError
+
 from sonarpost.archive.retention import remove_files, vehicle_source
+from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import ImageSideCar, side_car
 from sonarpost.files import AtomicFiles
-from sonarpost.messages import ReconstructedImage
+from sonarpost.messages import Pixels, ReconstructedImage
+from sonarpost.sonar.image_decoding import GreyImage
 from sonarpost.sonar.image_files import png_bytes, tiff_bytes
+from sonarpost.wire import first_error
 
 DIGEST_CHARACTERS = 16
 
@@ -82,6 +89,28 @@ def remove_old_images(folder: Path, now_utc_s: float, retain_days: float, max_by
 def side_car_text(image: ReconstructedImage) -> bytes:
     """Return the content of the JSON file as bytes."""
     return (json.dumps(side_car(image), indent=1) + "\n").encode()
+
+
+def stored_image(content: bytes, pixels: GreyImage, where: str) -> ReconstructedImage:
+    """Return the record of stored files, which is the record that they were written from.
+
+    Args:
+        content: Content of the JSON file.
+        pixels: Pixels of the TIFF file, shape (rows, columns), uint8 or uint16.
+        where: Name of the JSON file for errors.
+
+    Raises:
+        StoredFileError: The JSON file is invalid, or the files do not match.
+    """
+    try:
+        stored = ImageSideCar.model_validate_json(content)
+        mask = base64.b64decode(stored.missing_mask, validate=True)
+        fields = stored.model_dump(exclude={"type", "v", "height_px", "width_px", "missing_mask"})
+        return ReconstructedImage(**fields, pixels=Pixels.from_array(pixels), missing_mask=mask)
+    except ValidationError as error:
+        raise StoredFileError(where, *first_error(error)) from error
+    except binascii.Error as error:
+        raise StoredFileError(where, "missing_mask", stored.missing_mask, f"base64 ({error})") from error
 
 
 def other_name(name: str, text: bytes) -> str:

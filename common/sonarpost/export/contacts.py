@@ -7,6 +7,7 @@ and the decision of `sonarpost.review.decisions`.
 
 from __future__ import annotations
 
+import base64
 import os
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -15,7 +16,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Final, Literal, TypeVar
 
-import numpy as np
 from pydantic import Field, ValidationError
 
 from sonarpost.errors import BadInputError, StoredFileError
@@ -38,8 +38,8 @@ from sonarpost.review.decisions import ReviewResult, ReviewState, review_result
 from sonarpost.review.measured_size import MeasuredSize
 from sonarpost.wire import first_error
 
-MAX_FILE_BYTES: Final = 1 << 20
-"""Larger JSON files are rejected. A side-car with 64 notes of 2000 characters is far smaller."""
+MAX_FILE_BYTES: Final = 1 << 22
+"""Larger JSON files are rejected. The side-car of an image of 4096 x 4096 pixels is smaller."""
 
 DECISIONS: Final = "decisions"
 
@@ -48,7 +48,11 @@ N = TypeVar("N", int, float)
 
 
 class ImageSideCar(Record):
-    """JSON file beside a stored image: the `reconstructed_image` record without its pixels."""
+    """JSON file beside a stored image: the `reconstructed_image` record without its pixels.
+
+    Attributes:
+        missing_mask: `missing_mask` of the record in base64.
+    """
 
     TYPE = "reconstructed_image"
 
@@ -65,8 +69,7 @@ class ImageSideCar(Record):
     complete: bool
     missing_fraction: Fraction
     missing_halves: tuple[Literal["top", "bottom"], ...]
-    missing_rows: Annotated[tuple[Count, ...], Field(strict=False)]
-    missing_pixels: Count
+    missing_mask: str
     bytes_received: Count
     bytes_total: Count
     frames_received: Count
@@ -80,18 +83,15 @@ class ImageSideCar(Record):
 
 
 def side_car(image: ReconstructedImage) -> dict[str, object]:
-    """Return the content of a side-car: all fields but the pixels, missing areas as a count and a range of rows."""
-    fields = image.model_dump(exclude={"pixels", "missing_mask"})
-    rows = np.flatnonzero(image.missing().any(axis=1))
+    """Return the content of a side-car: all fields but the pixels; see `ImageSideCar`."""
     return {
         "type": image.TYPE,
         "v": image.VERSION,
-        **fields,
+        **image.model_dump(exclude={"pixels"}),
+        "missing_mask": base64.b64encode(image.missing_mask).decode(),
         "height_px": image.pixels.height_px,
         "width_px": image.pixels.width_px,
         "bits": image.pixels.bits,
-        "missing_pixels": int(image.missing().sum()),
-        "missing_rows": [int(rows[0]), int(rows[-1]) + 1] if rows.size else [],
     }
 
 
