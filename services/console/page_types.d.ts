@@ -146,6 +146,7 @@ interface VehicleRequest {
 interface ContactDetail {
   contact: Contact;
   record: Record<string, any> | null;
+  further: Record<string, string | number | boolean>;
   versions: Version[];
   related: any[];
   decisions: Decision[];

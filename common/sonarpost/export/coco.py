@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import ExportContact
+from sonarpost.export.tables import FURTHER_FIELDS
 from sonarpost.export.text import utc_text
 from sonarpost.messages import Decision, Pixels
 from sonarpost.sonar.image_files import read_image
@@ -178,6 +179,7 @@ def _image(number: int, labelled: LabelledImage, group_of: Mapping[str, str]) ->
         "pixel_across_m",
         "atd_class",
         "atd_confidence",
+        *FURTHER_FIELDS,
     )
     height, width = labelled.pixels.shape
     return {

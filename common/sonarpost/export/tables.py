@@ -12,6 +12,7 @@ from typing import IO, Any, Final
 from sonarpost.export.contacts import ExportContact
 from sonarpost.export.source import ExportSource
 from sonarpost.export.text import csv_text, utc_text, xml_text
+from sonarpost.messages import Contact
 from sonarpost.review.measured_size import SIZE_FIELDS
 
 Value = str | int | float | bool | None
@@ -48,7 +49,34 @@ def _from_size(name: str) -> Callable[[ExportContact], Value]:
     return read
 
 
-_PROPERTIES: Final[Mapping[str, Callable[[ExportContact], Value]]] = {
+_RECORD_FIELDS: Final = (
+    "depth_m",
+    "altitude_m",
+    "heading_deg",
+    "channel",
+    "ground_range_m",
+    "atd_class",
+    "atd_confidence",
+    "length_m",
+    "width_m",
+    "shadow_m",
+    "height_m",
+    "pixel_along_m",
+    "pixel_across_m",
+)
+_OMITTED: Final = (
+    "contact_id",
+    "sonar_id",
+    "line_name",
+    "ping_number",
+    "position_note",
+    "time_utc_s",
+    "speed_mps",
+    "slant_range_m",
+)
+"""Fields of `Contact` that the tables do not have, or have under another name."""
+
+_PLACED: Final[Mapping[str, Callable[[ExportContact], Value]]] = {
     "uid": lambda c: c.uid,
     "name": lambda c: c.name,
     "vessel_id": lambda c: c.image.vessel_id,
@@ -69,19 +97,7 @@ _PROPERTIES: Final[Mapping[str, Callable[[ExportContact], Value]]] = {
     "seen_utc": lambda c: _utc(c.image.contact.time_utc_s if c.image.contact else None),
     "first_frame_utc": lambda c: utc_text(c.image.first_frame_utc_s),
     "last_frame_utc": lambda c: utc_text(c.image.last_frame_utc_s),
-    "depth_m": _from_record("depth_m"),
-    "altitude_m": _from_record("altitude_m"),
-    "heading_deg": _from_record("heading_deg"),
-    "channel": _from_record("channel"),
-    "ground_range_m": _from_record("ground_range_m"),
-    "atd_class": _from_record("atd_class"),
-    "atd_confidence": _from_record("atd_confidence"),
-    "length_m": _from_record("length_m"),
-    "width_m": _from_record("width_m"),
-    "shadow_m": _from_record("shadow_m"),
-    "height_m": _from_record("height_m"),
-    "pixel_along_m": _from_record("pixel_along_m"),
-    "pixel_across_m": _from_record("pixel_across_m"),
+    **{name: _from_record(name) for name in _RECORD_FIELDS},
     "image_height_px": lambda c: c.image.height_px,
     "image_width_px": lambda c: c.image.width_px,
     "image_complete": lambda c: c.image.complete,
@@ -90,11 +106,15 @@ _PROPERTIES: Final[Mapping[str, Callable[[ExportContact], Value]]] = {
     "image_file": lambda c: f"{c.image.vessel_id}/{c.image_path.name}" if c.image_path else None,
     "notes": lambda c: "; ".join(c.image.notes),
     "authenticated": lambda c: c.image.authenticated,
-    "p_mine_like": _from_record("p_mine_like"),
-    "p_other_object": _from_record("p_other_object"),
+    **{name: _from_record(name) for name in ("p_mine_like", "p_other_object")},
     "withdrawn_by": lambda c: c.withdrawn_by,
     **{f"measured_{name}": _from_size(name) for name in SIZE_FIELDS},
 }
+
+FURTHER_FIELDS: Final = tuple(name for name in Contact.model_fields if name not in {*_PLACED, *_OMITTED})
+"""Fields of `Contact` that have no place of their own: tables, report, page and other exports append them by name."""
+
+_PROPERTIES: Final = {**_PLACED, **{name: _from_record(name) for name in FURTHER_FIELDS}}
 
 COLUMNS: Final = tuple(_PROPERTIES)
 """Names of the properties in their order. `docs/reference/exports.md` describes them."""
@@ -103,6 +123,12 @@ COLUMNS: Final = tuple(_PROPERTIES)
 def contact_properties(contact: ExportContact) -> dict[str, Value]:
     """Return the properties of a contact, one for each of `COLUMNS`; None means unknown."""
     return {name: read(contact) for name, read in _PROPERTIES.items()}
+
+
+def further_values(record: Contact | None) -> dict[str, Value]:
+    """Return the known values of `FURTHER_FIELDS` by their name as text for people."""
+    values = {name.replace("_", " "): getattr(record, name, None) for name in FURTHER_FIELDS}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def write_csv(file: IO[bytes], source: ExportSource) -> None:

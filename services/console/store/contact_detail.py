@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Mapping
 
+from sonarpost.export.tables import further_values
 from sonarpost.modem.interface import RateInfo
 from sonarpost.review.measurement import summary
 from sonarpost.review.objects import AssociationRule
@@ -43,6 +44,7 @@ def contact_detail_json(
     return {
         "contact": contact_json(row),
         "record": record and record.model_dump(),
+        "further": further_values(record),
         "versions": versions_json(db, contact_id, rates, row["refine_base"]),
         "related": related_images_json(db, contact_id, rates),
         "decisions": list_records(db, "decision", contact_id),

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from sonarpost.export.contacts import ExportContact
+from sonarpost.export.tables import further_values
 from sonarpost.export.text import VERDICT_WORDS, class_text, probabilities_text
 from sonarpost.messages import Contact, ReconstructedImage
 from sonarpost.review import rendering
@@ -188,6 +189,7 @@ def _detector_facts(contact: ExportContact) -> list[Fact]:
         ("Class of the detector", class_text(record.atd_class or "")),
         ("Probabilities of the detector", probabilities_text(record.p_mine_like, record.p_other_object)),
         ("Confidence of the detector", confidence),
+        *((name.capitalize(), value) for name, value in further_values(record).items()),
     ]
 
 

@@ -22,6 +22,7 @@ from sonarpost.export.geo.kml import COLOURS
 from sonarpost.export.source import ExportSource
 from sonarpost.export.tables import COLUMNS, Value, contact_properties
 from sonarpost.export.text import utc_text
+from sonarpost.messages import Contact
 
 _APPLICATION_ID: Final = 0x47504B47
 _USER_VERSION: Final = 10300
@@ -48,15 +49,16 @@ CREATE TABLE layer_styles (id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, f_tabl
 _CONTENTS: Final = "INSERT INTO gpkg_contents VALUES (?, ?, ?, '', ?, ?, ?, ?, ?, ?)"
 _INTEGERS: Final = ("version", "decided_version", "decisions", "image_height_px", "image_width_px")
 _BOOLEANS: Final = ("image_complete", "authenticated")
-_REALS: Final = ("_m", "_deg", "_confidence", "_fraction", "_mine_like", "_other_object")
+_REALS: Final = ("_m", "_deg", "_confidence", "_fraction")
 
 
 def _column_type(name: str) -> str:
-    if name in _BOOLEANS:
+    of_contact = str(Contact.model_fields[name].annotation) if name in Contact.model_fields else ""
+    if name in _BOOLEANS or "bool" in of_contact:
         return "BOOLEAN"
-    if name in _INTEGERS:
+    if name in _INTEGERS or "int" in of_contact:
         return "INTEGER"
-    return "REAL" if name.endswith(_REALS) else "TEXT"
+    return "REAL" if name.endswith(_REALS) or "float" in of_contact else "TEXT"
 
 
 def _point(contact: ExportContact) -> bytes | None:

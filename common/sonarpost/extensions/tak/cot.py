@@ -16,7 +16,7 @@ from xml.etree import ElementTree as ET
 from sonarpost.export.contacts import ExportContact
 from sonarpost.export.formats import Format
 from sonarpost.export.source import ExportSource
-from sonarpost.export.tables import DEGREE_DECIMALS
+from sonarpost.export.tables import DEGREE_DECIMALS, further_values
 from sonarpost.export.text import VERDICT_WORDS, class_text, probabilities_text, utc_text, xml_text
 from sonarpost.review.decisions import ReviewState
 
@@ -202,6 +202,7 @@ def _remarks(contact: ExportContact) -> str:
             parts.append(f"Detector: {probabilities}.")
         if record.atd_confidence is not None:
             parts.append(f"Detector's confidence {record.atd_confidence:.2f} of 2.")
+        parts += [f"{name.capitalize()} {value}." for name, value in further_values(record).items()]
     if image.missing_fraction > 0:
         parts.append(f"{100 * image.missing_fraction:.0f} % of the image is missing.")
     if contact.size.text:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -26,17 +26,18 @@ SAMPLES: Final = 1024
 MATCH_M: Final = 1.0
 """Maximum distance of a detection from its object, along and across the track, beyond half the object's length."""
 
-_DETECTOR_VALUES: Final = (
-    "slant_range_m",
-    "ground_range_m",
-    "atd_class",
-    "length_m",
-    "width_m",
-    "shadow_m",
-    "height_m",
-    "p_mine_like",
-    "p_other_object",
+_OF_REFERENCE: Final = (
+    "depth_m",
+    "altitude_m",
+    "heading_deg",
+    "speed_mps",
+    "position_sigma_m",
+    "position_note",
+    "pixel_along_m",
+    "pixel_across_m",
 )
+_DETECTED: Final = Contact.model_fields.keys() & {field.name for field in fields(Detection)} - {*_OF_REFERENCE}
+"""Fields of a contact that the detector finds; navigation, position and pixel size are those of the reference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +104,7 @@ def sealed_record(
     """
     detected, real = known.detection, reference.contact
     assert real is not None
-    values = {name: getattr(detected, name) for name in _DETECTOR_VALUES}
+    values = {name: getattr(detected, name) for name in _DETECTED}
     offset_s = first_utc_s - reference.first_frame_utc_s
     contact = real.model_copy(
         update={

@@ -49,7 +49,7 @@ function decisionList(decisions) {
   }))));
 }
 
-function recordFacts(/** @type {Contact} */ contact, record) {
+function recordFacts(/** @type {Contact} */ contact, record, further) {
   const r = record ?? {};
   const rows = [
     ["position", position(contact.lat_deg, contact.lon_deg)], ["detected", time(contact.seen_utc_s, { date: true })],
@@ -59,7 +59,8 @@ function recordFacts(/** @type {Contact} */ contact, record) {
     ["heading", `${quantity(r.heading_deg, "°", 0)}, ${quantity(r.speed_mps, "m/s")}`], ["side", r.channel ?? DASH], ["pixel", `${quantity(r.pixel_along_m, "m", 3)} × ${quantity(r.pixel_across_m, "m", 3)}`],
     ["line", `${r.line_name ?? DASH}, ${r.ping_number ?? DASH}`], ["sonar", r.sonar_id ?? DASH], ["frames", authentication(contact) ?? DASH], ["id", contact.id],
   ];
-  return h("dl", { class: "facts number" }, rows.map(([name, value]) => [h("dt", { text: t(`contact_details.fact.${name}`) }), h("dd", { text: value })]));
+  return h("dl", { class: "facts number" }, rows.map(([name, value]) => [h("dt", { text: t(`contact_details.fact.${name}`) }), h("dd", { text: value })]),
+    Object.entries(further).map(([name, value]) => [h("dt", { text: name }), h("dd", { text: String(value) })]));
 }
 
 function auditList(audit) {
@@ -81,7 +82,7 @@ export class ContactDetails {
     if (focused) this.element.querySelector(`details[data-name="${CSS.escape(focused)}"] > summary`)?.focus();
   }
 
-  #render({ contact, record, comments, requests, measurements, group, earlier, audit, decisions }) {
+  #render({ contact, record, further, comments, requests, measurements, group, earlier, audit, decisions }) {
     const part = (name, title, count, make, open = true) => (count > 0 ? section(name, title, count, make(), this.open.get(name) ?? open) : null);
     fill(this.element,
       // Before a decision on the vessel, comments are folded, so that they do not influence it.
@@ -91,7 +92,7 @@ export class ContactDetails {
       part("looks", t("contact_details.looks"), contact.looks - 1, () => lookList(group, contact.id)),
       part("earlier", t("object.earlier"), earlier.length, () => lookList(earlier, contact.id)),
       decisions.length > 1 ? section("decisions", t("contact_details.decisions"), decisions.length, decisionList(decisions), this.open.get("decisions") ?? false) : null,
-      section("record", t("contact_details.record"), 0, recordFacts(contact, record), this.open.get("record")),
+      section("record", t("contact_details.record"), 0, recordFacts(contact, record, further), this.open.get("record")),
       section("audit", t("contact_details.audit"), audit.length, auditList(audit), this.open.get("audit")),
       contact.object === null ? null : h("p", {}, h("button", { type: "button", class: "open-object", text: t("object.key"), on: { click: () => openObject(contact) } })),
       h("p", {}, h("a", { href: api.reportUrl(contact.id), target: "_blank", rel: "noopener" }, t("contact_details.report"))));
