@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
-import math
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from research.codebook.build_journal import MAGIC, BuildEntry, BuildJournal, EntryKind
 from research.codebook.builder import (
@@ -20,17 +17,14 @@ from research.codebook.builder import (
     TrainingImage,
     build,
     build_fingerprint,
-    evenly_spaced,
     figure_of_merit,
     refine_once,
     rms_distance,
     without_duplicates,
 )
 from research.codebook.tile_set import IncrementalTileSet
-from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.codec.quality import ssim
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
-from sonarpost.errors import CodebookError, ConfigError, StreamError
+from sonarpost.errors import CodebookError
 
 ALWAYS, NEVER = 1e9, -1e9
 
@@ -83,18 +77,6 @@ def test_build_matches_table_iv_tile_by_tile(fom_below: float, rms: float) -> No
     assert [tile.tobytes() for tile in database.tiles] == table_iv(images, 8, fom_below, above, figure_of_merit)
 
 
-def test_image_with_a_high_figure_of_merit_adds_nothing() -> None:
-    compared = []
-
-    def merit(original: np.ndarray, reconstructed: np.ndarray) -> float:
-        compared.append((int(original[0, 0]), int(reconstructed[0, 0])))
-        return 39.0 if original[0, 0] == 100 else 38.9
-
-    database = build(training(flat(0), flat(100), flat(200)), 8, [Round(39.0, 0.0)], merit=merit)
-    assert levels(database) == [0, 200]
-    assert compared == [(100, 0), (200, 0)]
-
-
 def test_tiles_beyond_the_distance_are_added_one_by_one() -> None:
     # 8 x 8 tiles that differ by d grey levels are 8 d apart.
     database = build(training(flat(0), flat(16, 17, 30, 33, 34)), 8, [Round(ALWAYS, rms_distance(16, 8))])
@@ -125,12 +107,6 @@ def test_core_is_extended_and_keeps_its_indices() -> None:
     core = TileDatabase.from_tiles(8, cut_tiles(flat(5, 150), 8))
     database = build(training(flat(6), flat(151, 250)), 8, [Round(ALWAYS, rms_distance(16, 8))], core=core)
     assert levels(database) == [5, 150, 250]
-
-
-def test_images_of_a_round_are_evenly_spaced_from_the_first() -> None:
-    assert list(evenly_spaced(5, None)) == list(evenly_spaced(5, 9)) == [0, 1, 2, 3, 4]
-    assert evenly_spaced(10, 5) == (0, 2, 4, 6, 8)
-    assert evenly_spaced(7, 3) == (0, 2, 4)
 
 
 def test_truncated_or_damaged_journal_keeps_complete_records(tmp_path: Path) -> None:
@@ -171,26 +147,6 @@ def test_journal_of_another_build_and_other_files_are_rejected(tmp_path: Path) -
     assert journal.read_bytes() == b"some other file of the user"
     with pytest.raises(CodebookError, match="read and written"):
         build(images, 8, [Round(ALWAYS, 100.0)], journal_path=tmp_path / "absent" / "journal")
-
-
-@pytest.mark.parametrize(
-    ("field", "changes"),
-    [
-        ("images", {"images": []}),
-        ("rounds", {"rounds": []}),
-        ("tile_px", {"tile_px": 3}),
-        ("rounds[0].distance_above", {"rounds": [Round(1, -1.0)]}),
-        ("rounds[0].distance_above", {"rounds": [Round(1, math.nan)]}),
-        ("rounds[1].max_images", {"rounds": [Round(1, 1.0), Round(1, 1.0, 0)]}),
-        ("max_tiles", {"max_tiles": 0}),
-        ("core.tile_px", {"core": TileDatabase.from_tiles(9, np.zeros((1, 81), np.uint8))}),
-    ],
-)
-def test_invalid_arguments_are_rejected(field: str, changes: dict[str, object]) -> None:
-    arguments = {"images": training(image(0)), "tile_px": 8, "rounds": [Round(1, 1.0)]} | changes
-    with pytest.raises(ConfigError) as caught:
-        build(**arguments)
-    assert caught.value.field == field
 
 
 @pytest.mark.parametrize("tile_px", [4, 20])
@@ -329,25 +285,6 @@ def test_images_changed_since_a_pass_are_rejected(tmp_path: Path) -> None:
         build(folder.images(), 8, rounds, passes=2, journal_path=journal)
 
 
-def test_image_changed_between_rounds_is_rejected() -> None:
-    folder = Folder(4)
-
-    def on_progress(progress: BuildProgress | RefinementProgress) -> None:
-        if isinstance(progress, BuildProgress) and (progress.round_number, progress.image_number) == (0, 3):
-            folder.pixels[1] = image(79)
-
-    with pytest.raises(CodebookError, match="image 1"):
-        build(folder.images(), 8, ROUNDS, progress=on_progress)
-
-
-def test_journal_with_an_unknown_image_number_is_rejected(tmp_path: Path) -> None:
-    folder = Folder(2)
-    with BuildJournal(tmp_path / "journal", build_fingerprint(folder.images(), 8, ROUNDS, 15_992, None), 64) as journal:
-        journal.append(BuildEntry(EntryKind.IMAGE, 0, 2, bytes(32), np.zeros((1, 64), np.uint8)))
-    with pytest.raises(CodebookError, match="number of images"):
-        build(folder.images(), 8, ROUNDS, journal_path=tmp_path / "journal")
-
-
 def test_damaged_tile_count_does_not_allocate_memory(tmp_path: Path) -> None:
     path = tmp_path / "journal"
     BuildJournal(path, "fingerprint", 64).__exit__(None, None, None)
@@ -366,15 +303,6 @@ def peak_of(function: Callable[[], object]) -> int:
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-
-
-def test_large_image_is_searched_in_parts() -> None:
-    tile_set = IncrementalTileSet(8, 1024)
-    rng = np.random.default_rng(0)
-    tile_set.append(rng.integers(0, 256, (1024, 64), dtype=np.uint8))
-    queries = rng.integers(0, 256, (12_000, 64), dtype=np.uint8)
-    tile_set.nearest(queries[:300])
-    assert peak_of(lambda: tile_set.nearest(queries)) < 12_000_000  # all scores at once would be 49 MB
 
 
 def test_image_of_several_chunks_is_added_tile_by_tile() -> None:
@@ -410,20 +338,3 @@ def test_memory_depends_on_tiles_not_on_images_and_is_within_the_documented_limi
     images = [TrainingImage("small", lambda: large[:100, :100]), TrainingImage("large", lambda: large)]
     peak = peak_of(lambda: build(images, 10, [Round(1e9, 300.0)], max_tiles=300, passes=1))
     assert peak < 16_000_000 + 40 * 300 * 100 + 100 * large.size
-
-
-def test_progress_is_shown_with_its_step() -> None:
-    out = io.StringIO()
-    display = ProgressDisplay(Console(file=out, width=200), clock=lambda: 0.0)
-    BuildProgress(0, 2, 11, 11, 100, 110).show_on(display)
-    assert display.state() == "round 1 of 2: 11 of 100, 110 tiles, 0 s"
-    RefinementProgress(1, 3, 50, 100, math.nan).show_on(display)
-    assert display.state() == "refining 1 of 3: 50 of 100, 0 s"
-    RefinementProgress(1, 3, 100, 100, 12.345).show_on(display)
-    assert out.getvalue() == "refining 1 of 3: the error was 12.35 grey levels RMS before\n"
-
-
-def test_figure_of_merit_is_the_mean_ssim_in_percent() -> None:
-    assert figure_of_merit(image(1), image(2)) == 100 * ssim(image(1), image(2))
-    with pytest.raises(StreamError):
-        figure_of_merit(image(1), image(1, 41))

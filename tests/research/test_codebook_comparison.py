@@ -44,19 +44,6 @@ def test_tiles_of_one_codebook_only_are_counted_and_measured() -> None:
     assert difference.same_numbers == 0
 
 
-def test_principal_angles_of_known_spaces() -> None:
-    def basis(*rows: tuple[float, ...]) -> np.ndarray:
-        return np.round(4096 * np.array(rows)).astype(np.int16)
-
-    x, y, z = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)
-    for angle in (0.0, 0.05, 1.0, 30.0, 60.0, 89.0, 90.0):
-        rotated = (0, float(np.cos(np.radians(angle))), float(np.sin(np.radians(angle))), 0)
-        angles = principal_angles_deg(basis(x, y), basis(x, rotated))
-        assert sorted(angles) == pytest.approx([0.0, angle], abs=0.02)  # the basis is rounded to 1/4096: 0.014 deg
-    assert principal_angles_deg(basis(x, y, z), basis(y)) == pytest.approx([0.0], abs=1e-6)
-    assert principal_angles_deg(basis(z), basis(x, y)) == pytest.approx([90.0])
-
-
 def test_variance_fraction_of_a_basis() -> None:
     rng = np.random.default_rng(3)
     grey = rng.integers(20, 236, (50, 1)).astype(np.uint8)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import json
 import math
 from functools import cache
@@ -13,7 +12,6 @@ import pytest
 from PIL import Image
 
 from research.codecs import __main__ as command
-from research.codecs.report import RateDifference, json_line
 from research.common import measurement as measuring
 from research.common.images import SampleImage, read_image_folder, sdvd_crops, simulated_images, survey_line
 from research.common.measurement import CodecUnderTest, code_image, measure_codec
@@ -24,7 +22,7 @@ from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.registry import CodecRegistry, CodecSpec, default_registry
 from sonarpost.codec.vq.codebook import Codebook, save
 from sonarpost.codec.vq.tiles import TileDatabase
-from sonarpost.errors import CodebookError, ConfigError, SonarpostError, StreamError, SurveyFileError
+from sonarpost.errors import CodebookError, ConfigError, SonarpostError, StreamError
 from sonarpost.sonar.image_files import write_png, write_tiff
 
 
@@ -192,19 +190,6 @@ def test_bd_rate_compares_emb_with_every_other_codec(folder, tmp_path, capsys, m
     assert len(details["natural_sizes"]) == 8
 
 
-def test_output_folder_that_cannot_be_created_is_an_error_before_the_measurement(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("research.codecs.__main__.measure_codec", lambda *_: pytest.fail("measured"))
-    (tmp_path / "file").touch()
-    for option in ("--plot", "--sheet", "--details"):
-        with pytest.raises(ConfigError, match="expected a folder to write into"):
-            run("--images", folder, "--codecs", "huffman", option, tmp_path / "file" / "file.png")
-
-
-def test_incomparable_codecs_have_a_null_bd_rate() -> None:
-    found = json.loads(json_line([], 0, {"emb": {"vq": RateDifference(None, None, None, 0)}}))
-    assert found == {"images": 0, "results": [], "bd_rate": {"emb": {"vq": None}}}
-
-
 def test_misses_are_counted_and_excluded_from_means() -> None:
     dark = np.zeros((40, 48), np.uint8)
     arrays = [snippet(0), dark, snippet(1), dark]
@@ -298,40 +283,6 @@ def test_folder_is_read_recursively_and_rejections_are_listed(folder: Path) -> N
     assert any("too_wide.png: centre of 513 × 20 px cropped to 512 × 20 px" in line for line in fitted.notes)
 
 
-def test_invalid_folder_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(SurveyFileError, match="no such folder"):
-        run("--images", tmp_path / "absent")
-    with pytest.raises(SurveyFileError, match="images: got 0"):
-        run("--images", tmp_path)
-    write_png(tmp_path / "small.png", np.zeros((8, 8), np.uint8))
-    with pytest.raises(SurveyFileError, match=r"none, 1 rejected.*small\.png: size"):
-        run("--images", tmp_path)
-    with pytest.raises(SurveyFileError, match=r"index\.csv"):
-        run("--sdvd", tmp_path)
-
-
-def test_invalid_option_is_an_error() -> None:
-    budgets = [["--budgets", text] for text in ("64,", "0", "1e3", "٣")]
-    ranges = [["--count", "0"], ["--crop", "15"], ["--crop", "501"], ["--seed", "-1"]]
-    strengths = [["--codecs", "emb", "--strength", text] for text in ("1.1", "nan")]
-    for options in (*budgets, *ranges, *strengths, ["--codecs", "spiht,nothing"], ["--codecs", ""]):
-        with pytest.raises(ConfigError):
-            run(*options)
-
-
-def test_plot_without_matplotlib_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    real = builtins.__import__
-
-    def without(name: str, *rest: object, **more: object) -> object:
-        if name.startswith("matplotlib"):
-            raise ImportError(name)
-        return real(name, *rest, **more)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ConfigError, match=r"sonarpost\[research\]"):
-        run("--images", tmp_path / "absent", "--plot", tmp_path / "plot.png")
-
-
 def test_plot_is_written(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is an optional extra")
     run("--images", folder, "--codecs", "spiht", "--budgets", "40,300", "--plot", tmp_path / "plot.png")
@@ -344,29 +295,6 @@ def test_survey_line_of_a_tile_name() -> None:
     assert survey_line("left_20240430052854L_tile_4.png") == "202404300528"
     assert survey_line("right_20240430052859H_sample_2_tile_8.png") == "202404300528"
     assert survey_line("3_143.jpg") == "3"
-
-
-INDEX = "split,image,w,h,target_px,x0,y0,x1,y1\n"
-
-
-def test_invalid_data_set_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "test" / "images").mkdir(parents=True)
-    write_png(tmp_path / "test" / "images" / "small.png", np.zeros((64, 64), np.uint8))
-    for text, message in (
-        ("", "header"),
-        ("split,image\ntest,a.png\n", "header"),
-        (f"{INDEX}other,a.png,256,256,0,,,,\n", "split"),
-        (f"{INDEX}test,../a.png,256,256,0,,,,\n", "image"),
-        (f"{INDEX}test,a.png,256,256,9,1,2\n", "target_px"),
-        (f"{INDEX}test,a.png,256,256,many,,,,\n", "target_px"),
-        (f"{INDEX}train,a.png,256,256,0,,,,\n", "no tile of 'test'"),
-        (f"{INDEX}test,absent.png,256,256,0,,,,\n", r"absent\.png"),
-        (f"{INDEX}test,small.png,256,256,0,,,,\n", "256 × 256 px"),
-        (f'{INDEX}test,"a\n', "text"),
-    ):
-        (tmp_path / "index.csv").write_text(text)
-        with pytest.raises(SurveyFileError, match=message):
-            sdvd_crops(tmp_path)
 
 
 @pytest.mark.realdata

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -40,12 +38,6 @@ def test_examples_are_grey_patches_with_a_cleaner_target(examples: Examples) -> 
     assert np.mean(noisier) > 0.9
 
 
-def test_simulated_examples_have_the_shape(examples: Examples) -> None:
-    for shape in ((80, 80), (140, 80)):
-        noisy, clean = examples.simulated(shape)
-        assert noisy.shape == clean.shape == shape
-
-
 def test_speckle_has_mean_one_and_averaging_reduces_it() -> None:
     for product in (True, False):
         assert speckle((64, 64), np.random.default_rng(2), product=product).mean() == pytest.approx(1, abs=1e-3)
@@ -54,7 +46,3 @@ def test_speckle_has_mean_one_and_averaging_reduces_it() -> None:
     assert mean.shape == (100, 100)
     assert np.median(mean) == pytest.approx(1)
     assert mean.std() < 0.4 * (sheet**2).std()
-
-
-def test_data_folder_without_recordings_is_rejected(tmp_path: Path) -> None:
-    assert scenes.main(["--data", str(tmp_path), "--out", str(tmp_path / "scenes.npz")]) == 2

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from research.common import images as image_sets
 from research.common.speckle import SpecklePair, speckle_pairs
 from research.despeckling import __main__ as command
 from research.despeckling.measurement import create_filters, measure_pairs
-from sonarpost.errors import ConfigError, SurveyFileError
 
 
 @pytest.fixture(scope="module")
@@ -79,15 +77,6 @@ def test_tables_and_sheet_of_the_command(pairs, tmp_path, capsys):
     first = chosen[0].clean.repeat(2, 0).repeat(2, 1)
     assert np.array_equal(drawn[56 : 56 + first.shape[0], 20 : 20 + first.shape[1]], first)
     assert command.sheet_pairs(pairs) == sorted(pairs, key=lambda pair: pair.seabed)
-
-
-def test_invalid_option_is_an_error(tmp_path: Path) -> None:
-    filters = (["--filters", "lee,other"], ["--filters", ""])
-    for options in (*filters, ["--budgets", "0"], ["--count", "0"], ["--seed", "-1"]):
-        with pytest.raises(ConfigError):
-            run(*options)
-    with pytest.raises(SurveyFileError, match=r"research/README\.md#data"):
-        run("--sdvd", tmp_path)
 
 
 @pytest.mark.realdata

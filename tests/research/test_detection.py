@@ -12,13 +12,12 @@ from PIL import Image
 from research.common.measurement import create_codecs
 from research.detection import __main__ as command
 from research.detection import simulated
-from research.detection.__main__ import plot_all
 from research.detection.codec_effect import codec_effects, confidence_with, contact_snippet
 from research.detection.simulated import EvaluatedContact, EvaluatedFile
-from research.detection.tiles import TileScore, tile_auc, tile_scores
+from research.detection.tiles import tile_auc, tile_scores
 from sonarpost.codec.registry import default_registry
 from sonarpost.detection.detector import detect
-from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.errors import SurveyFileError
 from sonarpost.extensions.simulation.seabed.survey import TruthObject
 from sonarpost.extensions.simulation.seabed.targets import ObjectKind
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
@@ -59,9 +58,6 @@ def test_each_object_counts_once_and_contacts_without_object_are_false_alarms():
     assert [(b.contacts, b.true_share) for b in bins] == [(2, 0.5), (3, pytest.approx(1 / 3))]
 
 
-COLUMNS = "split,image,target_px,x0,y0,x1,y1"
-
-
 def write_tile(folder, split, name, target):
     rng = np.random.default_rng(len(name))
     image = rng.rayleigh(60, (256, 256))
@@ -81,14 +77,6 @@ def test_tiles_are_scored_and_their_auc_is_computed(tmp_path):
     assert tile_auc(tiles)[0] == 1.0
     with pytest.raises(SurveyFileError, match="targets and others"):
         tile_auc(tiles[:1])
-
-
-def test_invalid_index_is_a_survey_file_error(tmp_path):
-    rows = ("test,../x.png,1,0,0,9,9", "other,x.png,1,0,0,9,9", "test,x.png,many,0,0,9,9", "test,absent.png,1,0,0,9,9")
-    for text in ("", "split,image\n", *(f"{COLUMNS}\n{row}\n" for row in rows)):
-        (tmp_path / "index.csv").write_text(text)
-        with pytest.raises(SurveyFileError):
-            tile_scores(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -118,22 +106,8 @@ def test_image_without_the_object_has_no_confidence(contact):
     assert confidence_with(contact.survey, contact.detection, contact.snippet, seabed) < 0.5 < contact.confidence
 
 
-def test_plots_are_written_for_available_data(tmp_path):
-    pytest.importorskip("matplotlib")
-    one = judged(EvaluatedContact(1.8, target(), True), EvaluatedContact(0.4, None, True), truth=(target(),))
-    tiles = [TileScore("test", f"{i}_a.png", i < 2, 1.0 - i / 10) for i in range(4)]
-    plot_all(tmp_path / "out", [one], tiles, [])
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["reliability.png", "roc.png", "tiles.png"]
-
-
 def bench(*arguments):
     return command.run(command.new_parser().parse_args([*map(str, arguments)]))
-
-
-def test_error_names_the_option_out_of_range():
-    for options in (("--files", 0), ("--seed", -1), ("--contacts", 0), ("--budgets", "x")):
-        with pytest.raises(ConfigError):
-            bench(*options)
 
 
 def test_last_line_is_the_json_object(monkeypatch, capsys):

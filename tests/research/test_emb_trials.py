@@ -10,7 +10,7 @@ from research.training.emb.trials import contact_contexts, learned_lifting, tile
 from research.training.emb.trials.contact_contexts import BUDGETS, EXTRAS, Contact
 from sonarpost.codec.emb import contexts, transform
 from sonarpost.codec.emb.model import shipped_model
-from sonarpost.codec.emb.transform import HL, LL, layout_of
+from sonarpost.codec.emb.transform import layout_of
 
 
 def scene(seed: int = 1) -> npt.NDArray[np.uint8]:
@@ -46,32 +46,6 @@ def test_listed_decisions_are_those_of_the_stream(budget: int) -> None:
     assert bits_of_decisions(rows) + 0.95 * len(signs) == pytest.approx(8 * budget, rel=0.15)
 
 
-def test_contact_features_state_side_place_and_altitude() -> None:
-    band = [0] * 15
-    band[transform.HEIGHT] = band[transform.WIDTH] = 10
-    band[transform.ORIENT] = HL
-    contact = Contact(scene(), side=-1, has_object=True, altitude_px=50, nearest_px=100, pixel_m=0.04)
-    y, x = np.array([5, 5]), np.array([0, 9])
-    rows = contact_contexts.contact_features(contact, band, y, x)
-    assert rows[0, 1] == -rows[1, 1] == -36  # place across
-    assert rows[0, 2] == -rows[1, 2] == 36  # away from the sonar, which is to the right
-    assert rows[1, 6] > rows[0, 6] > 0  # steeper towards the sonar
-    assert rows[:, 7:].tolist() == [[40, -40, 0]] * 2
-    band[transform.ORIENT] = LL
-    assert not contact_contexts.contact_features(contact, band, y, x)[:, :7].any()
-
-
-def test_rare_ones_and_likely_zeros_are_all_kept() -> None:
-    rows = np.zeros((8000, contexts.FEATURES + EXTRAS + 2), np.int16)
-    rows[:10, -2] = 1
-    rows[10:30, 14] = 8
-    kept, weights = contact_contexts.thinned(rows, np.random.default_rng(0))
-    assert kept[:, -2].sum() == 10
-    assert (kept[:, 14] != 0).sum() == 20
-    assert (weights == 1).sum() == 30
-    assert weights.sum() == pytest.approx(len(rows), rel=0.1)
-
-
 @pytest.mark.parametrize("shape", [(80, 80), (33, 17)])
 def test_learned_steps_are_inverted(shape: tuple[int, int]) -> None:
     rng, layout = np.random.default_rng(0), layout_of(*shape)
@@ -84,15 +58,6 @@ def test_learned_steps_are_inverted(shape: tuple[int, int]) -> None:
     assert np.abs(own - plain).max() > transform.UNIT
     assert np.abs(decoded - image).max() < transform.UNIT / 2
     assert np.array_equal(transform.forward(image, layout), plain)
-
-
-def test_steps_are_found_by_least_squares() -> None:
-    parts = learned_lifting.examples([scene(1), scene(2)])
-    assert sorted(parts) == [(level, orient) for level in range(1, 5) for orient in range(1, 4)]
-    cells, _ = parts[2, HL]
-    weights = np.linspace(-1, 1, 36)
-    assert learned_lifting.least_squares(cells, cells @ weights) == pytest.approx(weights, abs=0.1)
-    assert learned_lifting.with_rectified(cells).shape[0] == len(cells)
 
 
 def test_best_corrections_remove_the_stated_error() -> None:
@@ -111,10 +76,3 @@ def test_best_corrections_remove_the_stated_error() -> None:
     changed = tile_predictors.corrected(np.zeros_like(residual), correction, gain, 3)
     assert (changed.any(1)).sum() == 3
     assert tile_predictors.bytes_of(4, 64, 16384) == 11
-
-
-def test_tiles_leave_a_decodable_image() -> None:
-    units = np.random.default_rng(5).normal(size=(40, 400)).astype(np.float32)
-    units /= np.linalg.norm(units, axis=1, keepdims=True)
-    for use in ("before", "after", "nearest"):
-        assert 10 < tile_predictors.psnr_with_tiles(scene(), 64, units, use, 2) < 40

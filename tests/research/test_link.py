@@ -91,10 +91,3 @@ def test_command_prints_one_json_object(tmp_path: Path, capsys: pytest.CaptureFi
     assert {by_scheme[s]["bytes"] for s in ("paper", "sequential", "v1-broadcast", "bound")} == {320}
     assert main(command) == 0
     assert capsys.readouterr().out == first
-
-
-def test_invalid_option_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
-    ranges = (["--loss", "2"], ["--loss", "x"], ["--burst", "0"], ["--frames", "1"], ["--frame-bytes", "20"])
-    for options in (*ranges, ["--images", "/nix"]):
-        assert main(options) == 2
-        assert capsys.readouterr().err.startswith("python -m research.link: ")

@@ -12,18 +12,14 @@ import pytest
 from PIL import Image
 
 from research.common.images import SampleImage
-from research.common.measurement import CodecUnderTest
 from research.common.statistics import auc
 from research.paper import __main__ as paper
-from research.paper.dimensions import RotatedTiles, sensitivity
-from research.paper.figures import FIG2, contact_images, reproduce
+from research.paper.dimensions import sensitivity
+from research.paper.figures import contact_images
 from research.recognition import __main__ as recognition
-from research.recognition.classifier import FOLDS, TargetClassifier, codec_with_grain, features, with_grain
+from research.recognition.classifier import FOLDS, TargetClassifier, codec_with_grain, with_grain
 from sonarpost.codec.baselines.spiht import SpihtCodec
-from sonarpost.codec.emb import DEFAULT_STRENGTH
 from sonarpost.codec.emb.codec import EmbCodec
-from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.vq.tiles import cut_tiles
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.image_files import write_png
@@ -73,14 +69,6 @@ def test_classifier_separates_targets_from_clutter_but_not_in_noise(classifier: 
     assert areas[2] < 0.8
 
 
-def test_classifier_is_deterministic_and_learns_from_simulated_images(classifier: TargetClassifier) -> None:
-    images, groups = [p.pixels for p in labelled(10, 500)], [p.group for p in labelled(10, 500)]
-    simulated = [SampleImage("s", "s", scene(9000 + i, target=i % 2 == 1), "sim", i % 2 == 0) for i in range(30)]
-    again, other = TargetClassifier(labelled(120), [], []), TargetClassifier(labelled(120), simulated, [])
-    assert np.array_equal(classifier.scores(images, groups), again.scores(images, groups))
-    assert not np.allclose(classifier.scores(images, groups), other.scores(images, groups))
-
-
 def test_no_survey_line_is_classified_by_a_model_trained_on_it() -> None:
     # All labels of one line are inverted. A classifier that was not trained on this line gets all of them wrong.
     training = labelled(160)
@@ -97,15 +85,6 @@ def test_classifier_requires_lines_with_and_without_targets() -> None:
     same_line = [SampleImage(str(i), str(i), scene(i, target=i % 2 == 0), "one", i % 2 == 0) for i in range(10)]
     with pytest.raises(ConfigError, match="two survey lines each"):
         TargetClassifier(same_line, [], [])
-
-
-def test_features_are_invariant_to_brightness_and_require_a_minimum_size() -> None:
-    image = (scene(1, target=True) // 2).astype(np.uint8)
-    brighter = image + np.uint8(60)
-    assert np.allclose(features([image]), features([brighter]), atol=1e-9)
-    assert features([image, scene(2, target=False, side_px=50)]).shape[0] == 2
-    with pytest.raises(ConfigError, match="at least"):
-        features([np.zeros((35, 80), np.uint8)])
 
 
 @pytest.fixture
@@ -151,23 +130,6 @@ def test_recognition_results_of_decoded_images(data_set: Path, capsys: pytest.Ca
     assert "original" in capsys.readouterr().out
 
 
-def test_strength_of_despeckling_is_that_of_the_option(data_set, capsys, monkeypatch):
-    strengths: list[float] = []
-
-    def record(_: object, tested: CodecUnderTest, *rest: object) -> list[object]:
-        assert isinstance(tested.codec, EmbCodec)
-        strengths.append(tested.codec.strength)
-        return []
-
-    monkeypatch.setattr(recognition, "_codec_results", record)
-    options = ["--sdvd", data_set, "--codecs", "emb", "--budgets", "64", "--simulated", "0"]
-    for more in (["--strength", "0"], ["--strength", "0.5"], []):
-        assert run(recognition, *options, *more) == 0
-    assert strengths == [0.0, 0.5, DEFAULT_STRENGTH]
-    with pytest.raises(ConfigError, match="strength"):
-        run(recognition, *options, "--strength", "-0.5")
-
-
 def test_streams_with_grain_keep_the_budget(data_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--sdvd", data_set, "--codecs", "emb", "--budgets", "64", "--simulated", "0", "--crop", "40"]
     assert run(recognition, *options, "--grain-strength", "0,1", "--least-auc", "0", "--json") == 0
@@ -203,22 +165,6 @@ def test_poor_classifier_gives_status_1(data_set, capsys, monkeypatch):
     assert "the results are not valid" in capsys.readouterr().err
 
 
-def test_invalid_folder_or_threshold_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(SurveyFileError, match=r"index\.csv"):
-        run(recognition, "--sdvd", tmp_path)
-    with pytest.raises(ConfigError, match="least-auc"):
-        run(recognition, "--sdvd", tmp_path, "--least-auc", "1.5")
-    for strength in ("-1", "2.5", "half", "0.5,", "nan"):
-        with pytest.raises(ConfigError, match="grain-strength"):
-            run(recognition, "--sdvd", tmp_path, f"--grain-strength={strength}")
-
-
-def test_figure_without_its_codec_has_a_reason() -> None:
-    (found, *_) = reproduce(FIG2, [], [np.zeros((49, 113), np.uint8)])
-    assert found.psnr is None
-    assert "not in this run" in found.reason
-
-
 @pytest.fixture(scope="module")
 def survey() -> Survey:
     return simulate_survey(SurveySpec(seed=11, pings=200, samples=512, targets=3, clutter=0)).survey
@@ -245,24 +191,6 @@ def test_more_dimensions_increase_size_and_quality() -> None:
     assert many.psnr > few.psnr
     assert few.build_s > 0
     assert few.encode_ms > 0
-
-
-def test_rotated_search_finds_the_nearest_tile_and_adds_it_once() -> None:
-    training = [scene(i, target=True, side_px=60) for i in range(6)]
-    tiles = np.concatenate([cut_tiles(p, 20) for p in training])
-    database = RotatedTiles(tiles, 40)
-    for image in training:
-        database.add_tiles_of(image)
-    before = len(database)
-    rotated = database.rotate(tiles)
-    index, squared = database.nearest(rotated)
-    expected = np.square(rotated[:, None] - rotated[None]).sum(2)
-    assert (squared >= expected.min(axis=1) - 1e-6).all()
-    assert len(np.unique(index)) == before
-    for image in training:
-        database.add_tiles_of(image)
-    assert len(database) == before
-    assert psnr_db(training[0], database.encode_and_decode(training[0])) > 25
 
 
 def test_page_contains_the_figures_of_the_run(survey, tmp_path, capsys, monkeypatch):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from builders.images import speckle_line
 
-from research.common.patches import PatchPlan, ToneMapping, cut_around, cut_line, reduce_line, shuffled, stretch
+from research.common.patches import PatchPlan, ToneMapping, cut_around, cut_line, reduce_line, stretch
 
 
 def test_tone_table_is_its_curve_and_reduction_averages_blocks() -> None:
@@ -63,9 +63,3 @@ def test_windows_around_an_object_contain_it() -> None:
     assert all((image.load() > 100).sum() > 40 for image in images)
     corner = list(cut_around("x", values, [(0, 0), (299, 259)], PatchPlan(reductions=((1, 1),))))
     assert [image.load().shape for image in corner] == [(80, 80), (80, 80)]
-
-
-def test_shuffled_order_depends_on_names_only() -> None:
-    images = list(cut_line("x", speckle_line(), PatchPlan()))
-    assert [i.name for i in shuffled(images)] == [i.name for i in shuffled(images[::-1])]
-    assert [i.name for i in shuffled(images)] != [i.name for i in images]

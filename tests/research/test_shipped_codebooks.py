@@ -15,7 +15,7 @@ from research.codebook.shipped import Recipe, build_nominal, humminbird_images, 
 from research.common.patches import PatchPlan, cut_line
 from sonarpost.codec.vq.codebook import load, to_bytes
 from sonarpost.codec.vq.tiles import cut_tiles
-from sonarpost.errors import CodebookError, SonarpostError
+from sonarpost.errors import SonarpostError
 from sonarpost.sonar.image_files import write_png
 
 
@@ -71,42 +71,6 @@ def test_recording_and_images_of_it_give_the_same_lines(tmp_path: Path) -> None:
         assert np.isnan(values).any()
 
 
-def test_damaged_recording_is_a_codebook_error(tmp_path: Path) -> None:
-    ping = np.arange(1, 30, dtype=np.uint8)
-    recording(tmp_path, "B002", [ping] * 3)
-    son, idx = tmp_path / "B002.SON", tmp_path / "B002.IDX"
-    data, index = son.read_bytes(), idx.read_bytes()
-    for position in (0, 61, 62, 66):
-        son.write_bytes(data[:96] + data[96 : 96 + position] + b"\x77" + data[97 + position :])
-        with pytest.raises(CodebookError, match="ping 1"):
-            read_channel(son)
-    for length in range(0, len(data), 5):
-        son.write_bytes(data[:length])
-        with pytest.raises(CodebookError):
-            read_channel(son)
-    son.write_bytes(data)
-    for bad in (b"", index[:-1], struct.pack(">II", 0, 0xFFFFFFFF)):
-        idx.write_bytes(bad)
-        with pytest.raises(CodebookError):
-            read_channel(son)
-    idx.unlink()
-    with pytest.raises(CodebookError, match="IDX"):
-        read_channel(son)
-
-
-def test_error_names_the_missing_or_ambiguous_channel(tmp_path: Path) -> None:
-    with pytest.raises(CodebookError, match="B002"):
-        humminbird_lines(tmp_path)
-    for name in ("a_B002.png", "b_B002.png"):
-        write_png(tmp_path / name, np.ones((4, 4), np.uint8))
-    with pytest.raises(CodebookError, match="b_B002"):
-        humminbird_lines(tmp_path)
-    (tmp_path / "a_B002.png").write_bytes(b"no image")
-    (tmp_path / "b_B002.png").unlink()
-    with pytest.raises(SonarpostError, match="a_B002"):
-        humminbird_lines(tmp_path)
-
-
 def test_codebook_bytes_do_not_depend_on_the_order_of_images() -> None:
     images = list(cut_line("x", speckle_line(170, 170), PatchPlan(copies=2)))
     recipe = Recipe(10, 200, (Round(39.0, 400.0, 10), Round(100.0, 60.0)), 2)
@@ -126,10 +90,3 @@ def test_real_recording_and_its_images_give_the_same_lines_and_training_images(d
     images = humminbird_images(data_dir / "surveys" / "derived")
     assert len(images) > 2000
     assert all(image.load().shape == (80, 80) for image in images[::100])
-
-
-@pytest.mark.parametrize("options", [(), ("--refine", -1)])
-def test_folder_without_recording_and_negative_passes_are_errors(tmp_path: Path, options: tuple[object, ...]) -> None:
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(SonarpostError):
-        run("--humminbird", tmp_path / "empty", "--out", tmp_path, *options)

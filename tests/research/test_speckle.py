@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
-
 import numpy as np
 import pytest
 
 from research.common import images as image_sets
 from research.common import speckle
-from research.common.images import grey_on_scale, simulated_images
-from research.common.nonlocal_means import nonlocal_means, reference_filtered
+from research.common.images import simulated_images
+from research.common.nonlocal_means import reference_filtered
 from research.common.scene_measures import (
     ObjectPlace,
     count_dots,
-    finite_median,
     measure_object,
     object_errors,
-    place_in_window,
 )
 from research.common.speckle import SpecklePair, speckle_pairs
 from research.despeckling.filters import FILTERS
 from sonarpost.codec.quality import psnr_db
-from sonarpost.detection.snippets import to_grey
 from sonarpost.errors import ConfigError
-from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.extensions.simulation.seabed.targets import ObjectKind
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 
 PLACE = ObjectPlace(row=40, column=30, half_rows=5, half_columns=6, sample_m=0.03, first_slant_m=10.0, altitude_m=5.0)
@@ -76,20 +68,6 @@ def test_pairs_are_reproducible_and_their_number_and_seed_limited(pairs: list[Sp
             speckle_pairs(count, seed)
 
 
-def test_grey_scale_of_a_pair_and_of_a_scene() -> None:
-    amplitude = np.linspace(0, 100, 1001, dtype=np.float32)[None]
-    assert speckle.grey_gain(amplitude) == pytest.approx(255 / 99.5)
-    assert speckle.grey_gain(np.full((4, 4), 2.0, np.float32)) == 8.0
-    assert speckle.grey_gain(np.zeros((4, 4), np.float32)) == 8.0
-    assert speckle.scaled_grey(amplitude, 3.0)[0, [0, 100, 1000]].tolist() == [0, 30, 255]
-    raw = np.random.default_rng(0).integers(0, 200, (20, 30)).astype(np.float32)
-    known = np.ones(raw.shape, np.bool_)
-    assert np.array_equal(grey_on_scale(raw, raw), to_grey(raw.astype(np.uint32), known))
-    assert grey_on_scale(raw[:, :10], raw).shape == (20, 10)
-    assert np.array_equal(grey_on_scale(raw[:, :10], raw), grey_on_scale(raw, raw)[:, :10])
-    assert (grey_on_scale(raw, np.full((3, 3), 9, np.float32)) == 128).all()
-
-
 def test_dots_are_small_groups_that_differ_from_their_surroundings() -> None:
     image = np.full((40, 40), 100, np.uint8)
     assert count_dots(image) == 0
@@ -124,40 +102,6 @@ def test_shadow_survives_speckle_and_short_gaps() -> None:
     assert errors.highlight < 0.25
 
 
-def test_shadow_to_the_end_of_the_image_is_cut_and_not_compared() -> None:
-    cut = measure_object(scene(shadow_end=140), PLACE)
-    assert cut.shadow_is_cut
-    errors = object_errors(measure_object(scene(), PLACE), cut)
-    assert math.isnan(errors.shadow_px)
-    assert math.isnan(errors.height)
-    assert errors.highlight == 0
-
-
-def test_object_without_highlight_or_shadow_is_not_compared() -> None:
-    flat = measure_object(np.full((80, 140), 80, np.uint8), PLACE)
-    assert flat.shadow_px == 0
-    assert flat.height_m == 0
-    errors = object_errors(measure_object(scene(), PLACE), flat)
-    assert all(math.isnan(value) for value in dataclasses.astuple(errors))
-    lost = object_errors(flat, measure_object(scene(), PLACE))
-    assert lost.highlight == pytest.approx(170 / 250)
-    assert lost.shadow_px == pytest.approx(40, abs=1)
-    assert lost.height == 1
-    assert math.isnan(finite_median([math.nan]))
-    assert finite_median([3.0, math.nan, 1.0]) == 2.0
-
-
-def test_place_of_an_object_in_a_window() -> None:
-    spec = SurveySpec(seed=8, pings=100, targets=(ObjectKind.CYLINDER,), clutter=0)
-    (item,) = simulate_survey(spec).truth
-    across = place_in_window(dataclasses.replace(item, orientation_deg=90.0), spec, 5.0, item.ping - 7, 100)
-    along = place_in_window(dataclasses.replace(item, orientation_deg=0.0), spec, 5.0, item.ping - 7, 100)
-    assert (along.row, along.column) == (7, item.sample_index - 100)
-    assert along.half_rows == round(item.length_m / 2 / spec.ping_spacing_m)
-    assert across.half_columns == round((item.length_m + item.height_m) / 2 / spec.sample_m)
-    assert along.first_slant_m == pytest.approx(100 * spec.sample_m)
-
-
 @pytest.mark.parametrize("name", FILTERS)
 def test_filter_reduces_speckle_and_preserves_the_scene(name: str) -> None:
     clean = scene()[:60, :90]
@@ -169,27 +113,6 @@ def test_filter_reduces_speckle_and_preserves_the_scene(name: str) -> None:
     assert filtered[5:30, 50:80].std() < 0.6 * noisy[5:30, 50:80].std()
     assert filtered[5:30, 50:80].mean() == pytest.approx(80, rel=0.1)
     assert np.array_equal(filtered, FILTERS[name](noisy))
-
-
-@pytest.mark.parametrize("name", FILTERS)
-def test_filter_preserves_constant_images_and_areas_without_echo(name: str) -> None:
-    for level in (0, 77, 255):
-        image = np.full((24, 30), level, np.uint8)
-        assert np.abs(FILTERS[name](image).astype(int) - level).max() <= 1
-    image = with_speckle(np.full((40, 60), 251, np.uint8))
-    image[:, 20:45] = 0
-    filtered = FILTERS[name](image)
-    assert filtered[10:30, 28:37].max() <= 1
-    assert filtered[:, :10].mean() > 200
-
-
-def test_nonlocal_means_of_additive_noise() -> None:
-    clean = np.where(np.arange(60) < 30, 50.0, 150.0) * np.ones((40, 1))
-    noisy = clean + np.random.default_rng(1).normal(0, 10, clean.shape)
-    filtered = nonlocal_means(noisy, strength=1.0, patch_px=2, search_px=5)
-    assert np.abs(filtered - clean).mean() < 0.5 * np.abs(noisy - clean).mean()
-    assert filtered[:, 29].mean() < 60  # the edge stays
-    assert filtered[:, 30].mean() > 140
 
 
 def test_reference_filter_does_not_change() -> None:
