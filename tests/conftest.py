@@ -20,7 +20,7 @@ from sonarpost.config import PlatformConfig
 
 __all__ = ["database", "database_url", "postgresql_server"]
 
-pytest_plugins = ["builders.skips", "builders.times"]
+pytest_plugins = ["builders.skips"]
 
 # SIGINT is ignored in a suite started in the background, and child processes would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

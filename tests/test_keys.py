@@ -7,7 +7,7 @@ import string
 
 import pytest
 import zenoh
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sonarpost import keys
@@ -99,33 +99,9 @@ def test_every_key_function_rejects_a_name_that_would_change_the_key():
             make(**valid | {name: "a/b"})
 
 
-NO_NAMES = [
-    "",
-    "a/b",
-    "*",
-    "**",
-    "$*",
-    "a$*",
-    "UUV",
-    "-a",
-    "_a",
-    "a b",
-    "a\n",
-    "a#",
-    "a?b",
-    "ü",
-    "a" * 41,
-    "@a",
-    "1\x00",
-]
-
-
-@pytest.mark.parametrize("name", NO_NAMES)
-def test_name_that_would_change_the_key_is_rejected(name):
-    with pytest.raises(BadInputError, match="expected 1 to 40 of a-z, 0-9"):
-        keys.health("vessel-1", name)
-
-
+@example("a/b")
+@example("a\n")
+@example("a" * 41)
 @given(st.text(max_size=45))
 def test_arbitrary_text_is_a_name_or_rejected(name):
     allowed = set(string.ascii_lowercase + string.digits + "-_")

@@ -16,7 +16,7 @@ from sonarpost import wire
 from sonarpost.delivery.protocol import AckReply, attachment, pack_replies, parse_query, unpack_replies
 from sonarpost.delivery.records import OutboxItem, ReceivedChunk
 from sonarpost.errors import PayloadError
-from sonarpost.messages import Contact, Health, Pixels
+from sonarpost.messages import Contact, Pixels
 
 KEY = "sonarpost/v1/uuv-1/somewhere"
 
@@ -262,11 +262,3 @@ def test_integers_and_single_precision_are_valid_for_floats():
     short = msgpack.packb(msgpack.unpackb(of("contact-unclassified", lat_deg=0.5)), use_single_float=True)
     assert b"\xca" in short
     assert wire.decode(Contact, short, KEY).lat_deg == 0.5
-
-
-def test_last_of_repeated_fields_is_used():
-    assert wire.unpack_map(b"\x82\xa1a\x01\xa1a\x02", KEY) == {"a": 2}
-
-
-def test_counters_of_any_name_round_trip():
-    assert wire.decode(Health, of("health", counters={"": 2**63 - 1}), KEY).counters == {"": 2**63 - 1}
