@@ -1,7 +1,7 @@
 """Replies of c2 to queries of subscribers for records that it has accepted.
 
 A query is checked in Zenoh's callback and answered by a small pool of threads, over a session of its own: a slow or
-hostile client delays other queries, and not the records of vessels. `docs/specifications/zenoh.md` specifies queries.
+hostile client delays other queries, and not the records of vessels. `docs/specifications/queries.md` specifies them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The examples about queries: in docs/specifications/zenoh.md and docs/how-to/catch-up.md."""
+"""The examples about queries: in docs/specifications/queries.md and docs/how-to/catch-up.md."""
 
 import json
 import re
@@ -23,7 +23,7 @@ from sonarpost.services.c2.service import C2Service
 
 __all__ = ["run_program"]
 
-SPECIFICATION = (REPOSITORY / "docs" / "specifications" / "zenoh.md").read_text(encoding="utf-8")
+SPECIFICATION = (REPOSITORY / "docs" / "specifications" / "queries.md").read_text(encoding="utf-8")
 HOW_TO = (REPOSITORY / "docs" / "how-to" / "catch-up.md").read_text(encoding="utf-8")
 
 

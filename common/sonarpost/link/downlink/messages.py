@@ -1,7 +1,7 @@
 """Contents of `v1` messages: commands, decisions, their confirmations, the vehicle's status, data of its programs.
 
 The first byte of a message is its kind. Everything but data fits the 27 bytes that a message has in a frame of 32.
-docs/specifications/acoustic-v1.md specifies the bytes.
+docs/specifications/link-messages.md specifies the bytes.
 
 A command (or decision) has a token of 32 bits. The vehicle deduplicates commands by token and content, and confirms
 every copy. So a lost command or confirmation does not change the outcome.

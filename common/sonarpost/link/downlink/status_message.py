@@ -1,6 +1,6 @@
 """The vehicle's status as a `v1` message: 22 bytes with its kind, so that it fits a frame of 32 bytes with a tag.
 
-docs/specifications/acoustic-v1.md specifies the bytes. Values are rounded to the step of their field, and limited to
+docs/specifications/link-messages.md specifies the bytes. Values are rounded to the step of their field, and limited to
 its range.
 """
 
