@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from typing_extensions import override
@@ -142,21 +142,24 @@ class DownlinkService(ModemService[OpModemConfig]):
         self._new_commands.append(command)
 
     @override
-    def _handle_item(self, item: InboxItem) -> None:
-        with self._link_lock:
+    @contextmanager
+    def handling(self, *, wait: bool = True) -> Iterator[bool]:
+        """Hold the lock of the endpoint too; then publish the states of the commands."""
+        with self._link_lock, super().handling(wait=wait) as is_held:
             self._new_commands.clear()
-            super()._handle_item(item)
+            yield is_held
             added = tuple(self._new_commands)
         self._publish_states(added)
 
     # State of the endpoint
 
     @override
-    def commit(self, effects: UnitOfWork, item: InboxItem | None = None) -> None:
-        """Commit the effects and the state of the endpoint."""
+    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
+        """Commit effects; then the endpoint has the committed state."""
         with self._link_lock:
-            super().commit(effects, item)
+            superseded = super().commit_batch(handled)
             self._is_committed = True
+        return superseded
 
     @contextmanager
     def _link_step(self) -> Iterator[VesselLink]:

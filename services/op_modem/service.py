@@ -6,7 +6,8 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 from pydantic import ValidationError
@@ -15,7 +16,6 @@ from typing_extensions import override
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.outbox import QueuePolicy
-from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import DeliveryError, FrameError, PayloadError
 from sonarpost.limits import limit, oldest_of_largest
 from sonarpost.link.downlink.vessel_endpoint import ReceivedContent
@@ -404,9 +404,12 @@ class OpModemService(DownlinkService):
         self._log_images(content.images)
 
     @override
-    def _handle_item(self, item: InboxItem) -> None:
+    @contextmanager
+    def handling(self, *, wait: bool = True) -> Iterator[bool]:
+        """As `DownlinkService`; then publish the messages in frames of other vessels."""
         self._merged_messages = []
-        super()._handle_item(item)
+        with super().handling(wait=wait) as is_held:
+            yield is_held
         for message in self._merged_messages if not self.config.message_consumers else ():
             self.publish(keys.message_received(self.platform.id), message)
 

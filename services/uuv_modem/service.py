@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import queue
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Final
 
@@ -28,8 +29,9 @@ from sonarpost.modem.interface import (
     PollReceived,
     ShortMessageReceived,
 )
+from sonarpost.runtime.health import disk_gauges
 from sonarpost.runtime.modem_service import ModemService, sent_frames
-from sonarpost.runtime.service import UnitOfWork, disk_gauges
+from sonarpost.runtime.service import UnitOfWork
 from sonarpost.security.acoustic_key import key_warning
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.status_beacon import StatusBeacon
@@ -163,9 +165,11 @@ class UuvModemService(ModemService[UuvModemConfig]):
         self.count("statuses_queued")
 
     @override
-    def _handle_batch(self, items: Sequence[InboxItem]) -> None:
-        with self._endpoint.step():
-            super()._handle_batch(items)
+    @contextmanager
+    def handling(self, *, wait: bool = True) -> Iterator[bool]:
+        """Enclose the handling in a step of the endpoint, and wake the link's thread."""
+        with self._endpoint.step(), super().handling(wait=wait) as is_held:
+            yield is_held
         self._events.put(None)
 
     @override

@@ -62,7 +62,7 @@ class PeerService(Service[ServiceConfig]):
 @pytest.fixture(autouse=True)
 def short_retry_delays(monkeypatch):
     """Shorten the delays before retries; these tests count retries, not seconds."""
-    monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.05)
+    monkeypatch.setattr("sonarpost.runtime.record_handler.RETRY_AFTER_S", 0.05)
     monkeypatch.setattr("sonarpost.services.atd_stub.release.RELEASE_INTERVAL_S", 0.05)
     monkeypatch.setattr("sonarpost.services.op_modem.service.SAVE_RETRY_S", 0.05)
     monkeypatch.setattr("sonarpost.services.op_modem.service.TICK_S", 0.03)

@@ -159,7 +159,7 @@ def test_plain_publication_of_a_third_party_is_accepted(consumer, publish):
 
 
 def test_temporary_errors_are_retried_and_permanent_ones_quarantined(send, consumer, monkeypatch):
-    monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.05)
+    monkeypatch.setattr("sonarpost.runtime.record_handler.RETRY_AFTER_S", 0.05)
     consumer.fail_on = {
         "d1": OSError(28, "No space left on device"),
         "d2": BadInputError("here", "field", 1, "2"),
@@ -173,17 +173,18 @@ def test_temporary_errors_are_retried_and_permanent_ones_quarantined(send, consu
 
 
 def test_record_that_fails_while_others_are_handled_delays_and_harms_none(send, consumer, monkeypatch):
-    monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.0)
+    monkeypatch.setattr("sonarpost.runtime.record_handler.RETRY_AFTER_S", 0.0)
     failing = {"d1": RejectedByDatabaseError("rejected"), "d2": OSError(28, "No space left on device")}
-    commit = consumer.commit
+    commit = consumer.commit_batch
 
-    def refuse(effects, item=None):
+    def refuse(handled):
+        [(_, item)] = handled
         name = str(wire.decode(Decision, item.payload, "").decision_id)
         if name in failing:
             raise failing[name]
-        commit(effects, item)
+        return commit(handled)
 
-    monkeypatch.setattr(consumer, "commit", refuse)
+    monkeypatch.setattr(consumer, "commit_batch", refuse)
     send(1, 2)
     eventually(lambda: consumer.health().state == "degraded")
     for number in range(3, 9):
@@ -198,7 +199,7 @@ def test_record_that_fails_while_others_are_handled_delays_and_harms_none(send, 
 
 
 def test_lack_of_memory_quarantines_no_record(send, consumer, monkeypatch):
-    monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.0)
+    monkeypatch.setattr("sonarpost.runtime.record_handler.RETRY_AFTER_S", 0.0)
     consumer.fail_on = {"d1": MemoryError()}
     send(1, 2)
     eventually(lambda: consumer.got == ["d2"])
@@ -449,7 +450,7 @@ def test_unexpected_exceptions_do_not_stop_delivery(producer, send, consumer, mo
 
 @pytest.fixture
 def consumer_at_once(begin, monkeypatch):
-    monkeypatch.setattr("sonarpost.runtime.service.RETRY_AFTER_S", 0.0)
+    monkeypatch.setattr("sonarpost.runtime.record_handler.RETRY_AFTER_S", 0.0)
     monkeypatch.setattr(Consumer, "MAX_AT_ONCE", 2)
     return begin()
 

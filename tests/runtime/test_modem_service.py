@@ -143,7 +143,7 @@ def test_log_lines_on_garbage_are_limited(connected, caplog):
             connected.service._on_event(event)
     rejected = connected.service.health().counters["sentences_rejected"]
     assert rejected >= 5000
-    connected.service._flush_interval_logs(stopping=True)
+    connected.service._health.flush_logs(stopping=True)
     written = lines(caplog, "Line from the modem rejected")
     assert len(written) <= 10
     assert len(written) + sum(vars(r)["fields"].get("suppressed", 0) for r in written) == rejected

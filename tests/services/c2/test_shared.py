@@ -56,7 +56,7 @@ def archive(database):
 def deaf(begin, monkeypatch):
     """A c2 that acknowledges records and does not handle them."""
     host = begin("shore-1")
-    monkeypatch.setattr(host, "_handle_batch", lambda _: host.stopping.wait(0.05))
+    monkeypatch.setattr(host._handler, "handle_batch", lambda _: host.stopping.wait(0.05))
     return host
 
 
