@@ -1,7 +1,5 @@
 """Operation log of a test run, and the checker that decides exactly-once delivery, order and integrity from it.
 
-    python -m tests.builders.history RUN.jsonl [RUN.jsonl …]
-
 The log holds one operation a line, as JSON, as the test harness observed it: which records a source has queued durably,
 which records are in the durable output of each consumer, and which faults were injected. A `consumer` line declares a
 process to which the rules apply. The command prints the verdict of each log; its exit status is 1 after a violation.
@@ -20,14 +18,12 @@ Rules, for each declared consumer and the keys that it declares:
 from __future__ import annotations
 
 import json
-import sys
 import threading
 import time
 from collections import Counter, defaultdict
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 Kind = Literal["consumer", "queued", "acknowledged", "accepted", "handled", "seen", "fault"]
 SHOWN = 5
@@ -115,24 +111,6 @@ class History:
     def close(self):
         with self._lock:
             self._file.close()
-
-
-def read_log(path):
-    """Read a log.
-
-    Raises:
-        ValueError: A line is not an operation.
-    """
-    operations = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-        try:
-            done = Operation(**json.loads(line))
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{path}:{number}: got {line[:80]!r}, expected an operation: {error}") from error
-        if done.operation not in get_args(Kind):
-            raise ValueError(f"{path}:{number}: got operation {done.operation!r}, expected one of {get_args(Kind)}")
-        operations.append(done)
-    return operations
 
 
 @dataclass(frozen=True)
@@ -288,24 +266,3 @@ def check(operations):
         dict(Counter(d.process for d in checker.operations if d.operation == "handled")),
         dict(Counter(d.process for d in checker.faults)),
     )
-
-
-def main(arguments):
-    """Print the verdict of each log; return 0 if no run violates a rule, 1 if one does, 2 for unreadable logs."""
-    if not arguments:
-        print("usage: python -m tests.builders.history RUN.jsonl [RUN.jsonl …]", file=sys.stderr)
-        return 2
-    status = 0
-    for argument in arguments:
-        try:
-            verdict = check(read_log(Path(argument)))
-        except (OSError, ValueError) as error:
-            print(error, file=sys.stderr)
-            return 2
-        print(f"{argument}: {verdict}")
-        status |= not verdict.ok
-    return status
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

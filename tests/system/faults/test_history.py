@@ -1,9 +1,9 @@
 """The checker of operation logs: it names each violation with its operations, and accepts correct runs."""
 
-from dataclasses import asdict
+import json
 
 import pytest
-from builders.history import History, Operation, check, main, read_log
+from builders.history import History, Operation, check
 
 KEY = "sonarpost/v1/vessel-1/image/reconstructed"
 DIGEST = {name: name * 64 for name in "abc"}
@@ -107,26 +107,10 @@ def test_log_without_a_consumer_is_no_proof():
         check([handled("a")])
 
 
-def write(path, run):
-    history = History(path)
-    for done in run:
-        fields = {name: value for name, value in asdict(done).items() if name != "time_s"}
-        history.add(fields.pop("operation"), fields.pop("process"), **fields)
+def test_log_has_every_operation(tmp_path):
+    history = History(tmp_path / "run.jsonl")
+    history.add("handled", "c2", "a", key=KEY)
+    history.fault("c2", "SIGKILL")
     history.close()
-    assert str(check(read_log(path))) == str(history.verdict())
-    return path
-
-
-def test_command_decides_saved_logs(tmp_path, capsys):
-    good, bad = write(tmp_path / "good.jsonl", run_with()), write(tmp_path / "bad.jsonl", run_with(handled("a")))
-    for logs, status, text in (([good], 0, "PASS: 3 records"), ([good, bad], 1, "DOUBLED at c2: a is handled 2 times")):
-        assert main([*map(str, logs)]) == status
-        assert text in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("line", ["{", '{"operation": "queued"}', '{"operation": "eaten", "process": "c2"}', "[1]"])
-def test_unreadable_log_is_refused_by_line(line, tmp_path, capsys):
-    log = tmp_path / "run.jsonl"
-    log.write_text(Operation("consumer", "c2").as_json() + "\n" + line + "\n")
-    assert main([str(log)]) == 2
-    assert f"{log}:2: got " in capsys.readouterr().err
+    lines = [json.loads(line) for line in history.path.read_text().splitlines()]
+    assert [Operation(**line) for line in lines] == [*history.operations]
