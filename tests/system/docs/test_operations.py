@@ -44,6 +44,7 @@ def test_documented_commands_find_the_lines_of_one_contact(log_format, tmp_path)
 
 def test_alert_rules_and_dashboard_use_published_metrics():
     pages = "".join(path.read_text(encoding="utf-8") for path in REPOSITORY.glob("services/*/README.md"))
+    pages += (DOCS / "operations.md").read_text(encoding="utf-8")
     published = set(re.findall(r"`(\w+)`", pages))
     fixed = set(re.findall(r"`(sonarpost_\w+)`", reference.metrics()))
     rules = (DOCS / "operations" / "alerts.yml").read_text(encoding="utf-8")
