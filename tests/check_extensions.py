@@ -4,8 +4,6 @@
 without a name, every one in turn, then all. A test whose module imports a removed extension is of that extension.
 """
 
-from __future__ import annotations
-
 import ast
 import os
 import shutil

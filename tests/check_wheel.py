@@ -1,7 +1,5 @@
 """Builds the wheel and checks what is in it: everything that runs, nothing that does not."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

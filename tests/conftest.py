@@ -1,7 +1,5 @@
 """Fixtures of many tests (in-process Zenoh router, platforms in a temporary folder), tiers and order of the suite."""
 
-from __future__ import annotations
-
 import logging
 import os
 import shutil

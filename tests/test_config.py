@@ -1,7 +1,5 @@
 """Configuration files: errors name file, line and key; environment variables override values."""
 
-from __future__ import annotations
-
 import tomllib
 from abc import ABC, abstractmethod
 from enum import StrEnum

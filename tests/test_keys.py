@@ -1,7 +1,5 @@
 """Key expressions, and rejection of names that would change a key."""
 
-from __future__ import annotations
-
 import inspect
 import string
 

@@ -1,7 +1,5 @@
 """Logs: one line for each event, and the log context."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math

@@ -1,7 +1,5 @@
 """Records: valid and invalid values of each field, and conversion of images to and from arrays."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

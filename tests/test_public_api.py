@@ -1,7 +1,5 @@
 """The public names of the package: complete, few, imported on first use."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

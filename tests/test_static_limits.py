@@ -4,8 +4,6 @@ Those of an extension are in `reviewed.toml` beside its tests: a table for each 
 with paths from the folder of the extension.
 """
 
-from __future__ import annotations
-
 import ast
 import builtins
 import re

@@ -1,7 +1,5 @@
 """Encoding of records: golden vectors, arbitrary bytes, error messages."""
 
-from __future__ import annotations
-
 import math
 
 import msgpack

@@ -4,8 +4,6 @@ Runs the set-up commands of docs/how-to/certificates.md in a temporary folder, a
 Frames without the key, and replays of genuine frames, must change nothing. The exit status is 1 if one is accepted.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

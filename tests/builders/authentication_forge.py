@@ -4,8 +4,6 @@ The receiver has a window of the vehicle, so far before the end of the key's lif
 for each frame. Forged are changed payloads with recorded tags, guessed tags, and recorded tags with other counters.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import random

@@ -1,7 +1,5 @@
 """Authenticators of a vehicle and a vessel with one key."""
 
-from __future__ import annotations
-
 import hashlib
 
 from sonarpost.link.auth.authentication import FrameAuthenticator

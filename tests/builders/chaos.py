@@ -8,8 +8,6 @@ own number as a pattern of blocks, so that it is identified by its pixels at the
 the relay from a durable outbox.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import signal

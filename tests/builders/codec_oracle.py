@@ -3,8 +3,6 @@
 Used by the coverage-guided fuzzer (`run_atheris.py`) and by the bounded tests of the default suite.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache

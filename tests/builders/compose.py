@@ -1,7 +1,5 @@
 """The chain in containers: a compose project of its own, asked and disturbed by its users' means."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A console without a network, its users, and clients like a browser."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import ssl

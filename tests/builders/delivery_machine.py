@@ -4,8 +4,6 @@ Each step of `Delivery` is one event: a record is queued, queries are sent, some
 lost, a process is killed, a store is restored from a backup. A kill keeps only the files of the store.
 """
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from collections import Counter

@@ -1,7 +1,5 @@
 """Emulated modems and their channel on simulated time, with the output of each modem."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 from sonarpost.extensions.simulation.channel.acoustics import LocalPosition

@@ -1,7 +1,5 @@
 """Write missing golden files of the exports: `PYTHONPATH=tests python -m builders.export_vectors`."""
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from pathlib import Path

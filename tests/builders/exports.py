@@ -1,7 +1,5 @@
 """Records in the c2 service's folder, for the tests of exports."""
 
-from __future__ import annotations
-
 import io
 import json
 import tempfile

@@ -1,7 +1,5 @@
 """What the tests of extensions add to suites of the core."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from types import ModuleType
 

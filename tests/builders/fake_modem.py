@@ -1,7 +1,5 @@
 """A scripted modem for tests of the driver, independent of the emulator; it drops selected sentences."""
 
-from __future__ import annotations
-
 import heapq
 from collections import Counter
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Health records of a fleet as `sonarpost status` shows them, and platforms that publish health."""
 
-from __future__ import annotations
-
 import io
 import threading
 from typing import Any

@@ -1,7 +1,5 @@
 """A fleet with certificates, and router processes whose logs tests read."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """GDAL as an independent reader in `make test-system`: its programs and its bindings, of the system's Python."""
 
-from __future__ import annotations
-
 import functools
 import json
 import shutil

@@ -15,8 +15,6 @@ Rules, for each declared consumer and the keys that it declares:
 - **miscounted**: the consumer committed another number of records than were queued for it.
 """
 
-from __future__ import annotations
-
 import json
 import threading
 import time

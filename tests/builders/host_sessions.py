@@ -1,7 +1,5 @@
 """Sessions of hosts with emulated modems, and what the suite of all emulated modems sends to each."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

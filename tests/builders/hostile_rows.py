@@ -4,8 +4,6 @@
 `tests/security/test_surfaces.py` checks that each surface of the product has a row.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

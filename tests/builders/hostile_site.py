@@ -5,8 +5,6 @@ containers with a memory limit if SONARPOST_HOSTILE_CONTAINER names an image, wi
 processes (docs/research/faults.md).
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

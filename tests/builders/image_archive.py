@@ -1,7 +1,5 @@
 """Images in the archive of c2, read as an operator's program does, and entered into an operation log."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

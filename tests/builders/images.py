@@ -1,7 +1,5 @@
 """Images for the tests of several codecs."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An installation that its user cannot write, and a user without a home folder."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

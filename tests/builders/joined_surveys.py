@@ -1,7 +1,5 @@
 """Recordings split into files: a simulated seabed with boxes, and the contacts that atd_stub detects in it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 An input is a list of steps. Every step begins with one byte for its kind and one for its length.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from itertools import islice

@@ -4,8 +4,6 @@ A query passes the link (rate, delay, jitter, in order), waits for a commit of t
 link in the other direction. The buffer of the link has no limit, as the buffers of hosts and routers in practice.
 """
 
-from __future__ import annotations
-
 import heapq
 import itertools
 

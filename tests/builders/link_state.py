@@ -1,7 +1,5 @@
 """Saved parts of the link's state, changed for tests."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any

@@ -8,8 +8,6 @@ lines.
 
 # ruff: noqa: SIM905 - lists of this length are harder to read
 
-from __future__ import annotations
-
 import argparse
 import random
 import time

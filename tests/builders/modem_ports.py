@@ -1,7 +1,5 @@
 """Drivers on emulated modems over TCP and pseudo-terminals, in accelerated time."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager

@@ -1,7 +1,5 @@
 """Snippets that show a number as a pattern of blocks, which survives the codec at 200 bytes."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

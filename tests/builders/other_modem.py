@@ -1,7 +1,5 @@
 """A driver of another distribution, and an object that is none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from sonarpost.modem.micromodem.driver import DRIVER

@@ -1,7 +1,5 @@
 """Updates of images in the terms of the paper's format: stream header, body, and received ranges of the body."""
 
-from __future__ import annotations
-
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.link.coding.byte_ranges import Ranges, gaps_within
 from sonarpost.link.receiver import ImageUpdate

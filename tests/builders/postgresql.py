@@ -1,7 +1,5 @@
 """A PostgreSQL server with PostGIS in a temporary folder, as Debian's packages install it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Memory, descriptors, threads and files of a running chain, sampled over a run."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path

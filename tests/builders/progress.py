@@ -1,7 +1,5 @@
 """Waits that depend on progress and not on the speed of the machine."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

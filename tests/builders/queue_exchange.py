@@ -1,7 +1,5 @@
 """A transmit queue, a receiver, and a channel between them that loses frames."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

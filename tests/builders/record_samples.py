@@ -1,7 +1,5 @@
 """Samples of every record type: the golden vectors of `tests/golden/zenoh`."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Hypothesis strategies for all records, from the types and limits of their fields, with all values of the wire."""
 
-from __future__ import annotations
-
 import hashlib
 from functools import cache
 from types import NoneType, UnionType

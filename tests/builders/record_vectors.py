@@ -5,8 +5,6 @@ never changed or removed. This script adds those of `record_samples.NEW_SAMPLES`
 an existing one would change. A record that gains a field needs a new sample, with a new name.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 

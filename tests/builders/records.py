@@ -1,7 +1,5 @@
 """Records for the tests of several services: images, a message, a decision, a command."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -6,8 +6,6 @@ all replies of a key are returned only with a valid `_time`, and only values of 
 `text/plain` are inserted as they are.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import queue

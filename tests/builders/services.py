@@ -1,7 +1,5 @@
 """Shared by the tests of services: peer services, start and stop, monitoring, serial cables and emulated modems."""
 
-from __future__ import annotations
-
 import os
 import select
 import threading

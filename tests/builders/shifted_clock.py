@@ -4,8 +4,6 @@
 not affected, as if the system clock were set.
 """
 
-from __future__ import annotations
-
 import runpy
 import sys
 import time

@@ -1,7 +1,5 @@
 """Records of a vessel as c2 receives them, and a subscriber that reads its archive."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 

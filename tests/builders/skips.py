@@ -1,7 +1,5 @@
 """`pytest --no-skips`: a test that is skipped for a reason that is not listed here fails the run."""
 
-from __future__ import annotations
-
 import pytest
 
 ALLOWED = (

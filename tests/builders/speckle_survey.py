@@ -1,7 +1,5 @@
 """Survey of a seabed of speckle with rectangular highlights and shadows; independent of the simulator."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ Names: `zenoh:KEY` for each record that a service receives; `queryable:MODULE`, 
 console; `folder:TABLE.FIELD` for each path of the configuration.
 """
 
-from __future__ import annotations
-
 import ast
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Lines over an even bottom with a bright echo at a known place, recordings with a turn, places in their images."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 The coverage-guided fuzzer (`run_atheris_survey.py`) and the tests of the default suite use it.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Collection

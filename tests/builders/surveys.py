@@ -1,7 +1,5 @@
 """Survey files of every format with the content of a `Survey`."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

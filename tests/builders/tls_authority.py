@@ -1,7 +1,5 @@
 """A certificate authority for tests of TLS with servers and clients that are not of a fleet."""
 
-from __future__ import annotations
-
 import ssl
 from datetime import UTC, datetime, timedelta
 from pathlib import Path

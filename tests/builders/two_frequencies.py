@@ -1,7 +1,5 @@
 """Surveys of dual-frequency sonars: a second channel on each side, of a lower frequency, that shows only speckle."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Checks that a command prints why it does not reach its router."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -3,8 +3,6 @@
 PYTHONPATH=tests python -m builders.v1_fuzz FRAMES [SEED]
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections import Counter

@@ -4,8 +4,6 @@ Both routers, relay and c2 are processes with their own stores. The test replace
 `image/coded` to the relay.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

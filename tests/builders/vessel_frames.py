@@ -1,7 +1,5 @@
 """Frames that a vessel receives, for the tests of its services."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sonarpost.link.frames.contact_record import ContactSummary

@@ -1,7 +1,5 @@
 """XTF files in the layouts of different recorders: the channels of a ping in one packet or in several."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The public functions of `sonarpost.codec`."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Storage of machine code: damaged files, a full disk, and the order of the folders."""
 
-from __future__ import annotations
-
 import errno
 import importlib.util
 import logging

@@ -1,7 +1,5 @@
 """Compiled functions of the codecs without numba, as in the container image."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

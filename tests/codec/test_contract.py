@@ -1,7 +1,5 @@
 """The contract of all registered codecs."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fitting images of any size into the sides that the codecs accept."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

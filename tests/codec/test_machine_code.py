@@ -1,7 +1,5 @@
 """Preparation of machine code, and the message when a codec compiles in a running process."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

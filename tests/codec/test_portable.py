@@ -5,8 +5,6 @@ generic x86-64 (or aarch64) without vector extensions, compiled into a separate 
 same on an emulated aarch64, for all codecs.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

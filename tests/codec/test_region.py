@@ -1,7 +1,5 @@
 """Box of a region command: bytes, place in an image, invalid values."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """The codec registry and its plug-ins."""
 
-from __future__ import annotations
-
 import sys
 import types
 from importlib.metadata import EntryPoint

@@ -1,7 +1,5 @@
 """The stream header: golden bytes, every size, every kind of tag, invalid input."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Fixtures of these tests: surveys of speckle, the detection of one object, and fewer candidates."""
 
-from __future__ import annotations
-
 from contextlib import contextmanager
 
 import pytest

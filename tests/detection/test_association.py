@@ -1,7 +1,5 @@
 """Association of detections from overlapping parts of a recording."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Candidates: classification, non-maximum suppression, measurement of highlight and shadow."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

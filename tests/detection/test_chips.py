@@ -1,7 +1,5 @@
 """Chips: projection to the seabed, windows, coarse plane, geometry values."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Classifier: arithmetic of the network, calibration, identity, files."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 

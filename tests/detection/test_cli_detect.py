@@ -1,7 +1,5 @@
 """`sonarpost detect`."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

@@ -1,7 +1,5 @@
 """`sonarpost detect --images`."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

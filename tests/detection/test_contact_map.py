@@ -1,7 +1,5 @@
 """Georeferenced images of contacts: position of the object."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

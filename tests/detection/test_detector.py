@@ -1,7 +1,5 @@
 """The detector with surveys of speckle, simulated surveys and recordings."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path

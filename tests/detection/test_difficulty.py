@@ -1,7 +1,5 @@
 """Difficulty of the seabed: features on synthetic grids, the model of the expected Pd, search, strips and files."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Detection in an image of known scale."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

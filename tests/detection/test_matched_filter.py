@@ -1,7 +1,5 @@
 """Matched filter: response to objects, noise units, peaks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

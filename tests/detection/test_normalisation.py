@@ -1,7 +1,5 @@
 """Normalisation of a side: cells, water column, seabed level."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Picks of a person: syntax, place in the recording, measurement, and `sonarpost detect --pick`."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

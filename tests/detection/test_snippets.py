@@ -1,7 +1,5 @@
 """Snippets in samples, at half the scale, and in ground range."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The streaming detector: each object is one contact at any boundary of strips and of files."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Large structures: by their shadow, and by their echo in the water column."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Masking of pings that were recorded while the vehicle's own modem transmitted."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

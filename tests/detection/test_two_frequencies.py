@@ -1,7 +1,5 @@
 """Detection in dual-frequency surveys gives the results of the first frequency alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The confidence of a contact does not depend on whether positions are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

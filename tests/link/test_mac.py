@@ -1,7 +1,5 @@
 """Medium access: when a station may send, on simulated time."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest

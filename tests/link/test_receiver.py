@@ -1,7 +1,5 @@
 """Contract of every `FrameReceiver`: the same events in every wire format."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Contract of every `ImageSender`: the same behaviour in every wire format."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Saved parts: dataclasses become msgpack and come back; anything malformed is a FrameError that names the field."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Annotated

@@ -5,8 +5,6 @@ station has sent. Soon after the condition ends, packets travel in both directio
 check of the Micro-Modem driver against hostile modems; a driver declares those that make no sense for it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """Fuzzed input: the driver raises nothing, keeps its memory bounded and recovers."""
 
-from __future__ import annotations
-
 import pytest
 from builders.modem_fuzz import Fuzz, parse_alone
 

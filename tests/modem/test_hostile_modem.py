@@ -1,7 +1,5 @@
 """Modems that hide transmissions, report a busy channel for ever, reject commands, or answer late."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

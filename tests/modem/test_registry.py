@@ -1,7 +1,5 @@
 """Registry of modem drivers, and what the interface checks for all of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 

@@ -1,7 +1,5 @@
 """Requests of the driver: pings, mini-packets, flexible data, polls, and the clock of both generations."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime, timedelta
 
 import pytest

@@ -4,8 +4,6 @@ Two drivers run on two emulated modems. A fault may fail its own exchange. It ne
 changes a byte of a frame, and its delay is bounded.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """Typed sentences and statistics: known sentences, wrong fields, arbitrary fields."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta, timezone

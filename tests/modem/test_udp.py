@@ -1,7 +1,5 @@
 """The UDP driver: its datagrams, acknowledgements and pace."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

@@ -1,7 +1,5 @@
 """One HTTP request to a server that replies slowly, without end, or not at all."""
 
-from __future__ import annotations
-
 import socket
 import ssl
 import threading

@@ -1,7 +1,5 @@
 """Fixtures of these tests, from `builders.speckle_survey`."""
 
-from __future__ import annotations
-
 from builders.speckle_survey import make_survey
 
 __all__ = ["make_survey"]

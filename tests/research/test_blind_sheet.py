@@ -1,7 +1,5 @@
 """`python -m research.recognition.blind_sheet`: choice of the crops, the sheet, evaluation of judgements."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

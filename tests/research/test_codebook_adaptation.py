@@ -1,7 +1,5 @@
 """Adaptation of a codebook to a seabed: replaced tiles, new tiles, and the gain."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

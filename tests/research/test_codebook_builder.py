@@ -1,7 +1,5 @@
 """The codebook builder: Table IV, refinement, incremental search, interrupted builds, memory."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path

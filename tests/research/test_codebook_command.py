@@ -1,7 +1,5 @@
 """`python -m research.codebook`: build, info, diff, adapt."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from builders import image_folders

@@ -1,7 +1,5 @@
 """How two codebooks differ."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.linalg import subspace_angles

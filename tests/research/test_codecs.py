@@ -1,7 +1,5 @@
 """`python -m research.codecs`: images, misses, the JSON object, sheets and plots."""
 
-from __future__ import annotations
-
 import json
 import math
 from functools import cache

@@ -1,7 +1,5 @@
 """Recordings that are not part of the repository: what is derived from them, and the error without them."""
 
-from __future__ import annotations
-
 import importlib
 import subprocess
 import sys

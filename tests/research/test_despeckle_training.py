@@ -1,7 +1,5 @@
 """The examples that train the despeckling network."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """`python -m research.despeckling`: figures, tables, the JSON object and the sheet."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """`python -m research.detection`: assignment of contacts, figures, tiles, effect of codecs."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

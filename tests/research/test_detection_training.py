@@ -1,7 +1,5 @@
 """Training of the classifier: specifications, labels, pasted objects, calibration."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Fit and calibration of the expected probability of detection."""
 
-from __future__ import annotations
-
 import json
 import math
 

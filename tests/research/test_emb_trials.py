@@ -1,7 +1,5 @@
 """The core functions of the trials of changes to `emb`."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 import pytest

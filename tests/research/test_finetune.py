@@ -1,7 +1,5 @@
 """A new classifier from verdicts: the data set, its division, its examples, and errors."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil

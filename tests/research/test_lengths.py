@@ -1,7 +1,5 @@
 """Measured lengths of simulated objects against their stated standard deviation."""
 
-from __future__ import annotations
-
 import pytest
 
 from research.lengths import BYTES, known_objects, main, measure, summarise

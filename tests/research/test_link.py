@@ -1,7 +1,5 @@
 """`python -m research.link`: the schemes over the same channel, and its one JSON line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

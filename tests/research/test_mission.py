@@ -1,7 +1,5 @@
 """A day of eight vehicles: all images arrive, no traffic is starved, memory stays bounded."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

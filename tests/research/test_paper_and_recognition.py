@@ -1,7 +1,5 @@
 """`python -m research.paper` and `python -m research.recognition` with small data sets."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

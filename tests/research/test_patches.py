@@ -1,7 +1,5 @@
 """Training windows cut from side-scan lines."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from builders.images import speckle_line

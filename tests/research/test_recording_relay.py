@@ -1,7 +1,5 @@
 """The relay of the benchmarks: which image, which size and which time an acknowledgement is recorded with."""
 
-from __future__ import annotations
-
 import hashlib
 
 import pytest

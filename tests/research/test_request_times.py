@@ -1,7 +1,5 @@
 """Time from a request to its answer, with both ends of the link on simulated time."""
 
-from __future__ import annotations
-
 import statistics
 
 import pytest

@@ -1,7 +1,5 @@
 """`python -m research.sea_trial`: counts of the rig, claims, and the command."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

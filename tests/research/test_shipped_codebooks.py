@@ -1,7 +1,5 @@
 """The shipped codebooks: the Humminbird recording, the recipes, `python -m research.codebook.shipped`."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Simulated pairs, measures against the scene, and classical filters."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

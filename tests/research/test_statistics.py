@@ -1,7 +1,5 @@
 """BD-rate against analytic cases, bootstrap, AUC, MS-SSIM."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from builders.images import ssim_windows

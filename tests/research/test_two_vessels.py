@@ -1,7 +1,5 @@
 """Two vessels that receive one vehicle: merged frames make images complete, with less air time."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

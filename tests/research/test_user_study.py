@@ -1,7 +1,5 @@
 """User study: blind trials in an order of each participant, one answer a question, results with intervals."""
 
-from __future__ import annotations
-
 import io
 import json
 

@@ -1,7 +1,5 @@
 """Share of the time in which a vehicle transmits, with feedback from the vessel."""
 
-from __future__ import annotations
-
 from research.utilisation import UtilisationSpec, measure_utilisation
 
 

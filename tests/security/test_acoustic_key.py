@@ -1,7 +1,5 @@
 """`sonarpost pki acoustic`, and the key that a platform's configuration names."""
 
-from __future__ import annotations
-
 import stat
 
 import pytest

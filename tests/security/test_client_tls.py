@@ -1,7 +1,5 @@
 """TLS files of a client: PEM and PKCS#12, encrypted keys."""
 
-from __future__ import annotations
-
 import pytest
 from builders.tls_authority import Authority
 

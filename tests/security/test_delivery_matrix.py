@@ -4,8 +4,6 @@ Each peer knows the origins of all producers, which real peers do not, and claim
 producers deliver all their records nevertheless.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """Certificate authority: names, files, file modes, rejected requests, and the pki commands."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Authorised traffic between a vessel and its shore passes their routers; obstacles are reported."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

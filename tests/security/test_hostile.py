@@ -1,7 +1,5 @@
 """One vessel, file, user or client harms only itself: the table of attacks, with what other sources measure."""
 
-from __future__ import annotations
-
 import os
 import time
 

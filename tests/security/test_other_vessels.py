@@ -1,7 +1,5 @@
 """A vessel delivers acoustic frames to its own inbox at the lead vessel, and has no other right there."""
 
-from __future__ import annotations
-
 import time
 from pathlib import PurePosixPath
 

@@ -1,7 +1,5 @@
 """Names prepared in advance: a new vessel is admitted by a router that runs, in this process."""
 
-from __future__ import annotations
-
 import time
 from pathlib import PurePosixPath
 

@@ -1,7 +1,5 @@
 """Which certificate may query the records that c2 has accepted."""
 
-from __future__ import annotations
-
 import msgpack
 import pytest
 import zenoh

@@ -1,7 +1,5 @@
 """A router that restarts with the new list denies a revoked certificate (docs/explanation/security.md)."""
 
-from __future__ import annotations
-
 import pytest
 import zenoh
 from builders.common import eventually

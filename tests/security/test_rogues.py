@@ -1,7 +1,5 @@
 """Unauthorised peers neither send nor receive anything, and the router logs them."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

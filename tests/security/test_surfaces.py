@@ -1,7 +1,5 @@
 """Each surface of the product has an attack: a row of `builders.hostile_rows`."""
 
-from __future__ import annotations
-
 from fnmatch import fnmatchcase
 
 from builders.common import REPOSITORY

@@ -1,7 +1,5 @@
 """`--thin-link`: the shore receives fewer health reports; records and their acknowledgements all pass."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """TLS files of a host: errors are reported at the start, without the content of the files."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 import subprocess

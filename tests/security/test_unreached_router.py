@@ -1,7 +1,5 @@
 """Reason of a router that is not reached, for each cause that Zenoh itself reports as a time-out."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

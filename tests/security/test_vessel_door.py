@@ -1,7 +1,5 @@
 """Rights at a vessel's router: a compromised shore can send comments and commands only; consoles."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

@@ -1,7 +1,5 @@
 """`sonarpost status` with TLS and access control: an observer sees the shore and the vessels linked to it."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Fixture: a small survey."""
 
-from __future__ import annotations
-
 import pytest
 from builders import surveys
 

@@ -1,7 +1,5 @@
 """Bottom tracking: altitude from the first return."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

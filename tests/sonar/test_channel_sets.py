@@ -1,7 +1,5 @@
 """Choice of the channels of a sonar with several frequencies, ranges or heads."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """`sonarpost survey` with surveys of known content."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

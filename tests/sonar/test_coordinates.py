@@ -1,7 +1,5 @@
 """Positions as recorders store them: projected in feet, longitudes from 0 to 360, and across the 180th meridian."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

@@ -1,7 +1,5 @@
 """Damage of a recording is local: the pings beside a damaged span are read, and no ping is invented."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

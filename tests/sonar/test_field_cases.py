@@ -1,7 +1,5 @@
 """Recordings with conditions met in the field: each has one bright target to starboard of a track to the east."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from datetime import UTC, datetime

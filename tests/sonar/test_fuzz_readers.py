@@ -1,7 +1,5 @@
 """The check of the fuzzer for survey readers, on a fixed set of damaged recordings of every format."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Positions, distances, and the error ellipse of positions of samples."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

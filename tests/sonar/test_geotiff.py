@@ -1,7 +1,5 @@
 """GeoTIFF: cloud-optimised layout, overviews, sizes; UTM zones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tifffile

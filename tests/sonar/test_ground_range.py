@@ -1,7 +1,5 @@
 """Ground-range images, beam and range normalisation."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

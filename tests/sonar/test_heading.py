@@ -1,7 +1,5 @@
 """Heading from gyro and course, and recorded layback."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Humminbird recordings: headers of other models, one side, damage, a recording."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

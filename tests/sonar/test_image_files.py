@@ -1,7 +1,5 @@
 """TIFF and PNG files of grey images."""
 
-from __future__ import annotations
-
 import io
 import logging
 import os

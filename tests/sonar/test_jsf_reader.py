@@ -1,7 +1,5 @@
 """EdgeTech JSF: subsystems, data formats, versions, validity, damage."""
 
-from __future__ import annotations
-
 import math
 import struct
 

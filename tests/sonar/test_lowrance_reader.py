@@ -1,7 +1,5 @@
 """Lowrance SL2 and SL3 files: damage, missing values, recordings."""
 
-from __future__ import annotations
-
 import math
 import struct
 

@@ -1,7 +1,5 @@
 """One scene recorded in every format: the contact has the same place, side and time in all of them."""
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import replace

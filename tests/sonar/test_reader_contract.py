@@ -1,7 +1,5 @@
 """The contract of survey readers, for every file format."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import tracemalloc

@@ -1,7 +1,5 @@
 """Registry of readers, plug-in readers, options."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import sys
 import types

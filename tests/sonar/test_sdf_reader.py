@@ -1,7 +1,5 @@
 """Klein SDF: page versions, frequencies, sides, navigation, time, damage."""
 
-from __future__ import annotations
-
 import math
 import struct
 

@@ -1,7 +1,5 @@
 """Surveys read in strips, with bounded memory."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

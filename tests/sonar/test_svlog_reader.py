@@ -1,7 +1,5 @@
 """Cerulean SVLOG: pairing, clock, navigation messages, scale, damage."""
 
-from __future__ import annotations
-
 import json
 import math
 

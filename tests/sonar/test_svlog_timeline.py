@@ -1,7 +1,5 @@
 """Cerulean SVLOG: sessions, clocks of sonars and computer, counters of the transducers, batches."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise

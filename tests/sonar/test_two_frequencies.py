@@ -1,7 +1,5 @@
 """Dual-frequency surveys: images are of the highest frequency, or of the one that is chosen."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Surveys as waterfall images with a navigation table."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from builders.surveys import make_waterfall

@@ -1,7 +1,5 @@
 """Georeferenced waterfall: position of echoes and objects, orientation, lines, memory."""
 
-from __future__ import annotations
-
 import math
 import tracemalloc
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """XTF recordings whose pings are spread over packets, and their damage."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 from itertools import pairwise

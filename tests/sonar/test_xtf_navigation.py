@@ -1,7 +1,5 @@
 """Positions of sensor and ship, recorded layback and headings in XTF recordings."""
 
-from __future__ import annotations
-
 import math
 import struct
 from dataclasses import replace

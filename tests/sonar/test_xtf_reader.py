@@ -1,7 +1,5 @@
 """XTF files: damage, missing values, variants of different recorders."""
 
-from __future__ import annotations
-
 import csv
 import struct
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """XTF files that this package writes, read back and by pyxtf."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Print the table of all configurations and removed rules."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Invariants of `docs/specifications/delivery.md`, checked in every state and at every transition."""
 
-from __future__ import annotations
-
 from builders.delivery_model.machine import Query, State, Step, World, react
 
 

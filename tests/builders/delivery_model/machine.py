@@ -4,8 +4,6 @@ The network keeps every query for ever and delivers any of them at any time: thi
 reordering. A record is a name; its digest is the name, and its chunks are (name, index). All states are hashable.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property

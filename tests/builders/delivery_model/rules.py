@@ -1,7 +1,5 @@
 """Rules of the hand-over that can be switched one by one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -4,8 +4,6 @@ Two or three records in each queue are enough for the known defects: one record 
 records only repeat the same steps under other numbers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Breadth-first search over all states, with the shortest trace to a violation."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The codec emb: prefixes, damage, models, transform."""
 
-from __future__ import annotations
-
 import hashlib
 from importlib.resources import files
 

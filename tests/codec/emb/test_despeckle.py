@@ -1,7 +1,5 @@
 """Despeckling: the estimate, its strength in the stream, and the same result on all machines."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The encoder of emb: optimised targets, extension of streams, choice of the start step."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from builders.images import contact

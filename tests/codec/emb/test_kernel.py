@@ -1,7 +1,5 @@
 """Parts of the compiled coding loop, compared with independent arithmetic in Python integers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import example, given

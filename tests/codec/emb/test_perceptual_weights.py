@@ -1,7 +1,5 @@
 """The structure model of emb: perceptual weights, similarity, and the quality of its images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Side information, region of interest, speckle, and the golden streams of emb."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The codebook file: round trip, damage, the shipped ones."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The vector-quantisation codec: packings, reserved index, damage, golden streams."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

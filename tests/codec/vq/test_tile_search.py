@@ -1,7 +1,5 @@
 """The exact tile search, compared with distances in Python integers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

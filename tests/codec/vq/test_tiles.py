@@ -1,7 +1,5 @@
 """The tile database and its exact nearest search."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Authentication of frames: accepted and rejected frames, restarts, the lifetime of a key, the complete link."""
 
-from __future__ import annotations
-
 import itertools
 import random
 import re

@@ -1,7 +1,5 @@
 """Golden authenticated frames, checked with an independent HKDF and CCM from hashes and AES blocks."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import json

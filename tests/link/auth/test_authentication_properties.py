@@ -1,7 +1,5 @@
 """Recorded, changed and lost frames in any order: no frame is accepted twice, and no forged frame once."""
 
-from __future__ import annotations
-
 from builders.authentication_world import VEHICLE, key, vehicle_authenticator, vessel_authenticator
 from builders.link_state import group
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Key files of the acoustic link."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

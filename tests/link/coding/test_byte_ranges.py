@@ -1,7 +1,5 @@
 """Byte ranges and partial bytes, compared with sets and maps of positions."""
 
-from __future__ import annotations
-
 import re
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """The loss model, compared with the binomial distribution and with simulated chains."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The erasure code: equal to reedsolo, and recovery from any k symbols."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import reedsolo

@@ -1,7 +1,5 @@
 """The redundancy plan, compared with brute force, and its properties."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bytes inside messages: golden vectors, round trips, hostile bytes."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 

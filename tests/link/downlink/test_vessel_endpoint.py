@@ -1,7 +1,5 @@
 """The vessel's end of the link: commands until they are confirmed, feedback when it is useful, restarts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The contact record: values round trip within the step of their field, or become unknown."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import struct

@@ -1,7 +1,5 @@
 """Repair of images: sent without feedback, in blocks that left the window or have another frame length, restarts."""
 
-from __future__ import annotations
-
 import pytest
 from builders.queue_exchange import Exchange, all_delivered
 

@@ -1,7 +1,5 @@
 """Images stopped by a verdict, resumed, and moved in the transmit queue."""
 
-from __future__ import annotations
-
 import pytest
 from builders.queue_exchange import VESSEL, Exchange
 from builders.v1_world import VEHICLE

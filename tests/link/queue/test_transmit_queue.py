@@ -1,7 +1,5 @@
 """The transmit queue on simulated time: order, fairness, airtime shares, lifetimes, restarts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from builders.link_state import group, with_fields

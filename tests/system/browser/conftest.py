@@ -1,7 +1,5 @@
 """A console page in Chromium and in Firefox, driven by Playwright. Requests to other hosts fail the test."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterator

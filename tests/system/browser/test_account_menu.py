@@ -1,7 +1,5 @@
 """The menu of the header in a real browser: password, log-out, session that has ended."""
 
-from __future__ import annotations
-
 from builders.console import PASSWORD, image_record
 
 NEW = "another fine one"

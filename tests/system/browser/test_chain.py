@@ -1,7 +1,5 @@
 """From the vehicle to the operator's page and back, with the real services in this process."""
 
-from __future__ import annotations
-
 import io
 import json
 import threading

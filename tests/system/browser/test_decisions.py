@@ -1,7 +1,5 @@
 """Decisions on the page: change of contact, one-key verdicts, undo, disputes, drafts."""
 
-from __future__ import annotations
-
 import pytest
 from builders.common import eventually
 from builders.console import contact_ids, image_record, session_cookie

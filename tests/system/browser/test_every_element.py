@@ -1,7 +1,5 @@
 """Every element at seven sizes, in three languages and two browsers, with scroll bars; numbers of the language."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """The chain of places, its banners, and the alerts, in a real browser."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import asdict

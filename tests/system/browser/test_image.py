@@ -1,7 +1,5 @@
 """The image in a real browser: size, mark, axes, orientation, ground range, gain, loupe, measuring by dragging."""
 
-from __future__ import annotations
-
 import json
 import math
 

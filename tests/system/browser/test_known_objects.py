@@ -1,7 +1,5 @@
 """Training and calibrated watch in the page: object after the decision, score, comments folded before the decision."""
 
-from __future__ import annotations
-
 import re
 import time
 

@@ -1,7 +1,5 @@
 """Answers that are lost, late or out of order: the page repeats the request, or discards the answer."""
 
-from __future__ import annotations
-
 import pytest
 from builders.common import eventually
 from builders.console import contact_ids, image_record

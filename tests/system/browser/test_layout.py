@@ -1,7 +1,5 @@
 """The page at all sizes: nothing cut off, film strip, drawer, menus, swipe, and axe-core."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The page of link and fleet, and the empty page, in a real browser."""
 
-from __future__ import annotations
-
 import re
 import time
 

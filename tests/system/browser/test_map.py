@@ -1,7 +1,5 @@
 """The map in a real browser: symbols, clusters, position of the cursor, keys, tiles, 13,380 contacts."""
 
-from __future__ import annotations
-
 import math
 import re
 from operator import itemgetter

@@ -1,7 +1,5 @@
 """The object panel: looks north-up side by side, one verdict, split and join; marks and filter of the queue."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from builders.console import FIRST_UTC_S, contact_ids, image_record, with_pixels

@@ -1,7 +1,5 @@
 """The page in a real browser: keyboard review, two operators, lost connection, hostile text, accessibility."""
 
-from __future__ import annotations
-
 import pytest
 from builders.common import REPOSITORY, eventually
 from builders.console import FIRST_UTC_S, PASSWORD, contact_ids, downlink_state, image_record

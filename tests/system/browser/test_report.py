@@ -1,7 +1,5 @@
 """Report, target sheets and exports in Chromium: one A4 page, true metres, progress, cancel."""
 
-from __future__ import annotations
-
 import base64
 import io
 import os

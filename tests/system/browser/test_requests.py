@@ -1,7 +1,5 @@
 """The integrity line, version buttons, requests and layers of a contact, in Chromium."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """Settings and keys of the user, the page without its server, and the first use by a log-in link."""
 
-from __future__ import annotations
-
 import pytest
 from builders.common import eventually
 from builders.console import image_record, session_cookie

@@ -1,7 +1,5 @@
 """The page of the user study in a browser: from the name to the results, with the keyboard."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from PIL import Image

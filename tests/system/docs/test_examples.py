@@ -10,8 +10,6 @@ to a file of that name instead. The line before a block may hold a mark:
 A page with the mark `<!-- extension: NAME -->` is read only if there is this extension.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

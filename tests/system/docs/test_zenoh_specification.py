@@ -1,7 +1,5 @@
 """The examples of docs/specifications/zenoh.md: bytes, programs and observable delivery."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import sys

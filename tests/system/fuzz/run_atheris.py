@@ -12,8 +12,6 @@ The machine code of emb is compiled with bounds checks, so that an index outside
 instrumented, nor are the libraries of the other codecs. libFuzzer limits each input to 10 s and the process to 2 GiB.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

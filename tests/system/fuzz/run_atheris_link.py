@@ -10,8 +10,6 @@ Options with one dash are those of libFuzzer. The seeds are genuine traffic. Int
 repeats it.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -10,8 +10,6 @@ Interesting inputs are stored in `build/fuzz/survey`. An input that fails is wri
 `run_atheris_survey.py crash-…` with the same formats repeats it.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Frames of the paper format: golden bytes, round trips, hostile input."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from typing import Any

@@ -1,7 +1,5 @@
 """The receiver of the paper format: golden scenarios, and each rule."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """The paper receiver with any frames in any order: correct bytes, each version once, restarts without effect."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Packet plans: golden plans, and the rules for any image at any rate."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

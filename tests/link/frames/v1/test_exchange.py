@@ -1,7 +1,5 @@
 """The v1 sender and receiver over a simulated channel."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -3,8 +3,6 @@
 Bytes of a wire format can be added to the files, never changed.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from typing import Any

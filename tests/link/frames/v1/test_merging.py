@@ -1,7 +1,5 @@
 """Frames that two vessels received: any split over them gives what one vessel receives from all of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import product
 

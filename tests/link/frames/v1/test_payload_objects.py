@@ -1,7 +1,5 @@
 """Payloads of the v1 format: previews, pieces, messages, layers and feedback."""
 
-from __future__ import annotations
-
 import zlib
 from itertools import pairwise
 

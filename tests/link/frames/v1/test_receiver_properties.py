@@ -1,7 +1,5 @@
 """The v1 receiver with any frames in any order: correct images, no exceptions, restarts without effect."""
 
-from __future__ import annotations
-
 import msgpack
 import pytest
 from builders import v1_fuzz
