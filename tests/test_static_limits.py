@@ -70,8 +70,7 @@ READS = {
     "common/sonarpost/sonar/options.py": "its size is compared with 64 KiB first",
     "services/c2/archive.py": "decision of the archive",
     "common/sonarpost/cli/console.py": "keyboard",
-    "services/console/service.py: stored_records": "side-car of the archive",
-    "services/console/web/installation_routes.py": SHIPPED,
+    "services/console/web/server.py": SHIPPED,
 }
 QUEUES = {
     "common/sonarpost/bus/catch_up.py": "MAX_BUFFERED; c2 is queried again after an overflow",
@@ -126,7 +125,6 @@ def packages(*names):
 CALLERS = ("services/", *packages("archive", "cli", "delivery", "extensions", "monitoring", "runtime"))
 MAPPED = "its caller `main` reports it"
 RAISES = {
-    "common/sonarpost/archive/image_files.py: stored_image: from_array": "a grey image of 8 or 16 bits was read",
     "common/sonarpost/cli/c2/migrate.py: Migration._stored_images: read_image_files": "a folder, not a database",
     "common/sonarpost/cli/dataset.py: _load: load_labelled_image": "the states of the contacts were selected before",
     "common/sonarpost/cli/pki.py: run_acoustic: create_key": MAPPED,

@@ -18,7 +18,8 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import BadInputError, DeliveryError, PayloadError
-from sonarpost.export.contacts import read_stored_records
+from sonarpost.export.contacts import MAX_FILE_BYTES, read_stored_records
+from sonarpost.files import read_regular
 from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import (
     AcousticFrame,
@@ -41,8 +42,14 @@ from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.known_objects import Watch, watches
 from sonarpost.services.console.state import ConsoleState
-from sonarpost.services.console.store.database import DATABASE_NAME, ID_COLUMN, RECORD_TYPES, Database, Table
-from sonarpost.services.console.store.unsent import UnsentRecord
+from sonarpost.services.console.store.database import (
+    DATABASE_NAME,
+    ID_COLUMN,
+    RECORD_TYPES,
+    Database,
+    Table,
+    UnsentRecord,
+)
 from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 from sonarpost.sonar.image_files import read_image
@@ -457,7 +464,9 @@ def stored_records(place: ArchivePlace) -> Iterator[ReconstructedImage | Decisio
                 log.warning("Stored file skipped", extra=kv(reason=str(problem)))
             for _, path in stored.images:
                 try:
-                    yield stored_image(path.read_bytes(), read_image(path.with_suffix(".tiff")), str(path))
+                    yield stored_image(
+                        read_regular(path, MAX_FILE_BYTES), read_image(path.with_suffix(".tiff")), str(path)
+                    )
                 except (BadInputError, OSError) as error:
                     log.warning("Stored image skipped", extra=kv(file=path, reason=str(error)))
             yield from stored.decisions

@@ -28,24 +28,34 @@ from sonarpost.services.console.store import (
     association,
     contacts,
     decisions,
-    measurements,
     objects,
     request_results,
     requests,
     tracks,
-    unsent,
 )
 from sonarpost.services.console.store import truth as known_truth
-from sonarpost.services.console.store.contact_detail import contact_detail_json
+from sonarpost.services.console.store.contact_detail import (
+    NOT_WITHDRAWN,
+    add_measurement,
+    contact_detail_json,
+    withdraw_measurement,
+)
 from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter, NotFoundError
-from sonarpost.services.console.store.database import Actor, Database, DisplayedImage, Table, find_record
+from sonarpost.services.console.store.database import (
+    Actor,
+    Database,
+    DisplayedImage,
+    Table,
+    UnsentRecord,
+    find_record,
+    mark_sent,
+    unsent_records,
+)
 from sonarpost.services.console.store.decisions import DecisionInput, DeliveryStates
-from sonarpost.services.console.store.measurements import NOT_WITHDRAWN
-from sonarpost.services.console.store.request_costs import VehicleLink, costs_json, estimate_request
+from sonarpost.services.console.store.requests import VehicleLink, costs_json, estimate_request
 from sonarpost.services.console.store.retention import remove_images
 from sonarpost.services.console.store.serialisers import RECORD_JSON, Json, contact_json, decode_image
 from sonarpost.services.console.store.truth import Truth
-from sonarpost.services.console.store.unsent import UnsentRecord
 
 LAST_DECISION_S = 12 * 3600.0
 """Age of the oldest decision that an operator undoes without naming it: one watch."""
@@ -403,7 +413,7 @@ class ConsoleState:
             return {"id": None, **body, **NOT_WITHDRAWN}
         displayed = DisplayedImage(line.version, image.pixels_sha256, line.layer)
         with self.database.transaction() as db:
-            measurement_id = measurements.add_measurement(db, contact_id, body, displayed, actor, now)
+            measurement_id = add_measurement(db, contact_id, body, displayed, actor, now)
         return {"id": measurement_id, **body, **NOT_WITHDRAWN}
 
     def withdraw_measurement(self, contact_id: str, measurement_id: int, actor: Actor) -> Json:
@@ -413,7 +423,7 @@ class ConsoleState:
             NotFoundError: The contact has no such measurement, or it is withdrawn.
         """
         with self.database.transaction() as db:
-            return measurements.withdraw_measurement(db, contact_id, measurement_id, actor, self.clock())
+            return withdraw_measurement(db, contact_id, measurement_id, actor, self.clock())
 
     # Sending
 
@@ -425,9 +435,9 @@ class ConsoleState:
         with self.database.transaction() as db:
             decisions.release_decisions(db, self.clock(), self.config.take_back_s)
             known_truth.withhold_sealed(db)
-            return unsent.unsent_records(db)
+            return unsent_records(db)
 
     def mark_sent(self, item: UnsentRecord) -> None:
         """Mark a record as queued in the outbox."""
         with self.database.transaction() as db:
-            unsent.mark_sent(db, item)
+            mark_sent(db, item)

@@ -100,7 +100,7 @@ def stored_image(content: bytes, pixels: GreyImage, where: str) -> Reconstructed
         where: Name of the JSON file for errors.
 
     Raises:
-        StoredFileError: The JSON file is invalid, or the files do not match.
+        BadInputError: The JSON file is invalid, or the files do not match.
     """
     try:
         stored = ImageSideCar.model_validate_json(content)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -11,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sonarpost import wire
 from sonarpost.errors import BadInputError
-from sonarpost.export.contacts import contact_uid, match_start_time
+from sonarpost.export.contacts import contact_uid, match_start_time, side_car
 from sonarpost.messages import ReconstructedImage
 from sonarpost.review.objects import AssociationRule
 from sonarpost.review.positions import vehicle_position
@@ -40,27 +41,15 @@ SORT_COLUMNS: Final[Mapping[Sort, str]] = {
 _RECORD_COLUMNS: Final = (
     "atd_class",
     "atd_confidence",
-    "p_mine_like",
-    "p_other_object",
     "lat_deg",
     "lon_deg",
     "position_sigma_m",
+    "heading_deg",
     "length_m",
     "width_m",
     "height_m",
-    "heading_deg",
 )
 _PLACE_COLUMNS: Final = "group_id, parent, lat_deg, lon_deg, position_sigma_m, seen_utc_s, length_m, width_m, height_m"
-_IMAGE_COLUMNS: Final = (
-    "version",
-    "codec",
-    "despeckle_strength",
-    "bytes_received",
-    "bytes_total",
-    "first_frame_utc_s",
-    "last_frame_utc_s",
-)
-
 _UNDELIVERED: Final = (
     f"FROM decision d WHERE {UNDELIVERED} AND {COUNTS} AND elsewhere = 0"  # noqa: S608
     f" AND seq = (SELECT MAX(seq) FROM decision WHERE contact_id = d.contact_id AND {COUNTS})"
@@ -215,7 +204,8 @@ def _update_contact(db: sqlite3.Connection, contact_id: str, image: Reconstructe
     }
     variable = {
         **{name: getattr(record, name, None) for name in _RECORD_COLUMNS},
-        **{name: getattr(image, name) for name in _IMAGE_COLUMNS},
+        **{name: getattr(image, name) for name in ("version", "first_frame_utc_s", "bytes_received")},
+        "image": json.dumps({**side_car(image), "missing_mask": ""}),
         "range_m": record and record.ground_range_m,
         "vehicle_lat_deg": vehicle and vehicle[0],
         "vehicle_lon_deg": vehicle and vehicle[1],

@@ -7,6 +7,7 @@ record, and triggers reject changes to the audit.
 from __future__ import annotations
 
 import json
+import logging
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,6 +17,9 @@ from typing import Final, Literal
 
 from typing_extensions import override
 
+from sonarpost import wire
+from sonarpost.errors import BadInputError
+from sonarpost.logs import IntervalLog
 from sonarpost.messages import Command, Comment, Decision
 from sonarpost.sqlite_file import SqliteFile
 
@@ -35,7 +39,7 @@ RECORD_TYPES: Final[dict[Table, type[Decision] | type[Command] | type[Comment]]]
 }
 
 DATABASE_NAME: Final = "console-review.db"
-SCHEMA_VERSION: Final = 4
+SCHEMA_VERSION: Final = 1
 
 CONTRADICTORY: Final = (
     "COALESCE(MAX(g.review = 'disputed') OR (MAX(g.review = 'mine_like') AND MAX(g.review = 'not_mine_like')), 0)"
@@ -54,18 +58,16 @@ LATITUDE_BAND: Final = f"CAST(ROUND(lat_deg * {LATITUDE_BANDS_PER_DEGREE}) AS IN
 _SCHEMA: Final = f"""
 CREATE TABLE IF NOT EXISTS contact (
     id TEXT PRIMARY KEY, vessel_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL,
-    first_s INTEGER NOT NULL, name TEXT NOT NULL, revision INTEGER NOT NULL DEFAULT 0,
-    version INTEGER NOT NULL, review TEXT NOT NULL DEFAULT 'unreviewed', mlo_class TEXT, confidence REAL,
-    decided_by TEXT, decided_utc_s REAL,
+    first_s INTEGER NOT NULL, name TEXT NOT NULL, revision INTEGER NOT NULL DEFAULT 0, image TEXT NOT NULL,
+    version INTEGER NOT NULL, first_frame_utc_s REAL NOT NULL, bytes_received INTEGER NOT NULL, percent REAL NOT NULL,
+    complete INTEGER NOT NULL, has_image INTEGER NOT NULL, authenticated INTEGER,
+    height_px INTEGER NOT NULL, width_px INTEGER NOT NULL, arrived_utc_s REAL NOT NULL,
+    updated_utc_s REAL NOT NULL,
+    atd_class TEXT, atd_confidence REAL, lat_deg REAL, lon_deg REAL, position_sigma_m REAL, heading_deg REAL,
+    length_m REAL, width_m REAL, height_m REAL, range_m REAL, seen_utc_s REAL, vehicle_lat_deg REAL,
+    vehicle_lon_deg REAL, group_id TEXT, parent TEXT, relation TEXT, sealed INTEGER NOT NULL DEFAULT 0,
+    review TEXT NOT NULL DEFAULT 'unreviewed', mlo_class TEXT, confidence REAL, decided_by TEXT, decided_utc_s REAL,
     effective TEXT, last_decision TEXT, remark TEXT NOT NULL DEFAULT '', commented INTEGER NOT NULL DEFAULT 0,
-    atd_class TEXT, atd_confidence REAL, lat_deg REAL, lon_deg REAL, position_sigma_m REAL, range_m REAL,
-    vehicle_lat_deg REAL, vehicle_lon_deg REAL, seen_utc_s REAL, first_frame_utc_s REAL NOT NULL,
-    last_frame_utc_s REAL NOT NULL, arrived_utc_s REAL NOT NULL, updated_utc_s REAL NOT NULL,
-    complete INTEGER NOT NULL, percent REAL NOT NULL, bytes_received INTEGER NOT NULL, bytes_total INTEGER NOT NULL,
-    codec TEXT NOT NULL, has_image INTEGER NOT NULL, height_px INTEGER NOT NULL, width_px INTEGER NOT NULL,
-    group_id TEXT, authenticated INTEGER, despeckle_strength REAL, p_mine_like REAL, p_other_object REAL,
-    parent TEXT, relation TEXT, sealed INTEGER NOT NULL DEFAULT 0, length_m REAL, width_m REAL, height_m REAL,
-    heading_deg REAL,
     contradictory INTEGER NOT NULL DEFAULT 0, decided_version INTEGER, decided_bytes INTEGER
 ) WITHOUT ROWID;
 CREATE UNIQUE INDEX IF NOT EXISTS contact_image ON contact (vessel_id, vehicle_id, image_id, first_s);
@@ -153,7 +155,8 @@ CREATE TABLE IF NOT EXISTS look_pair (
     a TEXT NOT NULL, b TEXT NOT NULL, joined INTEGER NOT NULL, PRIMARY KEY (a, b)) WITHOUT ROWID;
 CREATE INDEX IF NOT EXISTS look_pair_b ON look_pair (b);
 """
-"""`object` only issues identifiers. `look_pair`: looks that a person joined or separated. `decision.batch` is common to
+"""`contact.image`: newest version of the image with its contact, as in a side-car; columns repeat what queries use.
+`object` only issues identifiers. `look_pair`: looks that a person joined or separated. `decision.batch` is common to
 the decisions that one verdict on an object made."""
 
 _TRACKING: Final = """
@@ -278,3 +281,47 @@ def add_audit_entry(
     """Add an entry to the audit, in the transaction of the action."""
     values = {"contact_id": contact_id, "utc_s": utc_s, "action": action, "detail": json.dumps(dict(detail))}
     insert_row(db, "audit", {**values, **asdict(actor), **asdict(displayed)})
+
+
+_unreadable_log = IntervalLog(logging.getLogger(__name__), logging.ERROR, "Stored record not readable, not sent")
+
+
+@dataclass(frozen=True, slots=True)
+class UnsentRecord:
+    """A stored record that is not yet in the service's outbox.
+
+    Attributes:
+        to_vehicle: Whether a decision is sent to the vehicle; false for one that a disputed contact does not follow.
+    """
+
+    table: Table
+    record_id: str
+    vessel_id: str
+    record: Decision | Command | Comment
+    to_vehicle: bool = True
+
+
+def unsent_records(db: sqlite3.Connection) -> list[UnsentRecord]:
+    """Return the records that are not yet in the outbox, without decisions in their take-back time, oldest first.
+
+    One that cannot be decoded is logged and left where it is.
+    """
+    found: list[UnsentRecord] = []
+    for table, record_type in RECORD_TYPES.items():
+        condition = "sent = 0 AND send_after_utc_s IS NULL" if table == "decision" else "sent = 0"
+        for row in db.execute(f"SELECT * FROM {table} WHERE {condition} ORDER BY seq"):  # noqa: S608  constants only
+            record_id = row[ID_COLUMN[table]]
+            try:
+                record = wire.decode(record_type, bytes(row["payload"]), f"{table} {record_id}")
+            except BadInputError as error:
+                _unreadable_log.log(table=table, record=record_id, reason=str(error)[:300])
+                continue
+            to_vehicle = table != "decision" or row["vehicle"] != "disputed"
+            found.append(UnsentRecord(table, record_id, row["vessel_id"], record, to_vehicle))
+    return found
+
+
+def mark_sent(db: sqlite3.Connection, item: UnsentRecord) -> None:
+    """Mark a record as queued in the outbox."""
+    sql = f"UPDATE {item.table} SET sent = 1 WHERE {ID_COLUMN[item.table]} = ?"  # noqa: S608  constants only
+    db.execute(sql, (item.record_id,))

@@ -10,7 +10,7 @@ from sonarpost import wire
 from sonarpost.codec.region import RegionBox
 from sonarpost.messages import Command
 from sonarpost.review.costs import NEW_IMAGE_KINDS, LinkRecord, RequestEstimate
-from sonarpost.services.console.store.serialisers import Json
+from sonarpost.services.console.store.serialisers import Json, newest_image
 
 RECENT_RESULTS: Final = 20
 """Latest requests of a vehicle from which the next one is estimated."""
@@ -43,7 +43,7 @@ def request_columns(contact: sqlite3.Row, kind: str, estimate: RequestEstimate, 
     return {
         "base_version": contact["version"],
         "base_bytes": contact["bytes_received"],
-        "base_total": contact["bytes_total"],
+        "base_total": newest_image(contact)["bytes_total"],
         "bytes_wanted": estimate.cost.bytes_wanted,
         "expected_utc_s": arrival and now_utc_s + arrival.median_s,
         "probable_utc_s": arrival and now_utc_s + arrival.most_s,

@@ -6,7 +6,7 @@ import json
 import sqlite3
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from sonarpost import wire
 from sonarpost.limits import limit
@@ -51,9 +51,10 @@ LISTED: Final = "c.parent IS NULL AND c.sealed < 2"
 
 _CONTACT_COLUMNS: Final = (
     "id name vessel_id vehicle_id image_id revision version review mlo_class confidence decided_by decided_utc_s"
-    " atd_class atd_confidence p_mine_like p_other_object lat_deg lon_deg position_sigma_m range_m seen_utc_s"
-    " first_frame_utc_s bytes_received bytes_total height_px width_px"
+    " range_m seen_utc_s first_frame_utc_s bytes_received height_px width_px"
 )
+_IMAGE_FIELDS: Final = "bytes_total complete authenticated"
+_RECORD_FIELDS: Final = "atd_class atd_confidence p_mine_like p_other_object lat_deg lon_deg position_sigma_m"
 _DELIVERY_COLUMNS: Final = "shore vehicle reason times_sent changed_utc_s"
 _DECISION_COLUMNS: Final = (
     "decision_id verdict confidence mlo_class remark operator decided_utc_s version sha256 layer undoes"
@@ -74,18 +75,27 @@ def _select(row: sqlite3.Row, columns: str, prefix: str = "") -> Json:
     return {name: row[prefix + name] for name in columns.split()}
 
 
+def newest_image(row: sqlite3.Row) -> dict[str, Any]:
+    """Return the newest image version of a contact without pixels, with its contact record, as in a side-car."""
+    found: dict[str, Any] = json.loads(row["image"])
+    return found
+
+
 def contact_json(row: sqlite3.Row) -> Json:
     """Return a contact as in lists."""
     decided_on, bytes_decided = row["decided_version"], row["decided_bytes"]
+    image = newest_image(row)
+    record = image["contact"] or {}
     return {
         **_select(row, _CONTACT_COLUMNS),
-        "complete": bool(row["complete"]),
-        "percent_received": row["percent"] if row["complete"] or row["bytes_total"] else None,
+        **{name: image[name] for name in _IMAGE_FIELDS.split()},
+        **{name: record.get(name) for name in _RECORD_FIELDS.split()},
+        "percent_received": row["percent"] if image["complete"] or image["bytes_total"] else None,
         "stage": stage_of(
-            complete=bool(row["complete"]),
+            complete=image["complete"],
             has_image=bool(row["has_image"]),
             bytes_received=row["bytes_received"],
-            bytes_total=row["bytes_total"],
+            bytes_total=image["bytes_total"],
             refine_base=row["refine_base"],
         ),
         "has_image": bool(row["has_image"]),
@@ -97,7 +107,6 @@ def contact_json(row: sqlite3.Row) -> Json:
         "commented": bool(row["commented"]),
         "delivery": None if row["d_shore"] is None else _select(row, _DELIVERY_COLUMNS, "d_"),
         "open_requests": row["asking"],
-        "authenticated": None if row["authenticated"] is None else bool(row["authenticated"]),
         "known": None if row["label"] is None else {"label": row["label"], "is_mine_like": bool(row["is_mine_like"])},
     }
 

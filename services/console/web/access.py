@@ -1,4 +1,4 @@
-"""Access control of the HTTP interface: sessions, CSRF tokens, roles, host names, security headers, errors."""
+"""Access control of the HTTP interface: sessions, CSRF tokens, roles, host names, headers, errors, shares of users."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import logging
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Final, Literal, TypeVar
+from typing import Final, Literal, ParamSpec, TypeVar
+from weakref import WeakValueDictionary
 
+from anyio import CapacityLimiter, to_thread
 from pydantic import BaseModel, ConfigDict, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.convertors import IntegerConvertor, register_url_convertor
@@ -25,7 +27,6 @@ from sonarpost.services.console.store.contacts import NotFoundError
 from sonarpost.services.console.store.database import Actor, ConsoleSide, Permission
 from sonarpost.services.console.store.decisions import ConflictError
 from sonarpost.services.console.store.users import Session, Users, is_equal_secret
-from sonarpost.services.console.web.shares import ThreadShares, TooManyRequestsError
 from sonarpost.wire import first_error
 
 log = logging.getLogger(__name__)
@@ -97,8 +98,14 @@ class RequestBody(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
 
+_SURFACE: Final = "HTTP interface of the console"
+MAX_THREADS: Final = limit(16, "requests", "shares", _SURFACE, "all users", "handled in total", "others wait")
+MAX_THREADS_OF_USER: Final = limit(2, "requests", "shares", _SURFACE, "user", "handled at a time", "others wait")
+MAX_WAITING_OF_USER: Final = limit(64, "requests", "shares", _SURFACE, "user", "waiting", "429 with Retry-After")
+
 A = TypeVar("A")
 R = TypeVar("R")
+P = ParamSpec("P")
 B = TypeVar("B", bound=RequestBody)
 M = TypeVar("M", bound=BaseModel)
 
@@ -319,3 +326,28 @@ def _without_port(host: str) -> str:
     if host.startswith("["):
         return host.partition("]")[0] + "]"
     return host.partition(":")[0]
+
+
+class TooManyRequestsError(Exception):
+    """Too many requests of one user are waiting."""
+
+
+class ThreadShares:
+    """Runs functions in threads, with a share for each user. Used in the event loop."""
+
+    def __init__(self) -> None:
+        self._threads = CapacityLimiter(MAX_THREADS)
+        self._shares: WeakValueDictionary[str, CapacityLimiter] = WeakValueDictionary()
+
+    async def run(self, user: str, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+        """Run a function in a thread; return its result.
+
+        Raises:
+            TooManyRequestsError: The limit of waiting requests is reached.
+        """
+        # Requests hold the share of their user; without any it is deleted.
+        share = self._shares.setdefault(user, CapacityLimiter(MAX_THREADS_OF_USER))
+        if share.statistics().tasks_waiting >= MAX_WAITING_OF_USER:
+            raise TooManyRequestsError
+        async with share:
+            return await to_thread.run_sync(lambda: function(*args, **kwargs), limiter=self._threads)

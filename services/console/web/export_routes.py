@@ -28,9 +28,9 @@ from sonarpost.limits import limit
 from sonarpost.logs import IntervalLog
 from sonarpost.review import rendering
 from sonarpost.services.console.state import ConsoleState
+from sonarpost.services.console.store.contact_detail import StoredContact, find_stored_contact
 from sonarpost.services.console.store.contacts import ContactFilter, list_versions
 from sonarpost.services.console.store.database import Database
-from sonarpost.services.console.store.exports import StoredContact, find_stored_contact
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call
 from sonarpost.sonar.image_files import png_bytes
 

@@ -1,10 +1,10 @@
-"""Routes of sessions: log-in, log-out, password."""
+"""Routes of sessions and users: log-in, log-out, password, settings."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import Final
+from typing import Annotated, Final
 
 from pydantic import Field
 from starlette.responses import JSONResponse, Response
@@ -148,4 +148,41 @@ class SessionRoutes:
             refund()
             self._users.set_password(name, body.new, keep=call.session.token)
         log.info("Password changed", extra=kv(user=name, address=call.address))
+        return Response(status_code=204)
+
+
+SETTINGS: Final = ("keys", "language", "map", "review", "sort", "theme", "type")
+"""Names of the settings that are stored. The page keeps all others in the browser alone."""
+MAX_VALUE: Final = 100
+"""Characters of a value."""
+
+
+class _SettingsBody(RequestBody):
+    settings: Annotated[dict[str, Annotated[str, Field(max_length=MAX_VALUE)]], Field(max_length=len(SETTINGS))]
+
+
+class SettingsRoutes:
+    """Routes of settings. Every user reads and writes the own ones."""
+
+    def __init__(self, users: Users) -> None:
+        self._users = users
+
+    def routes(self, access: AccessControl) -> list[Route]:
+        """Return the routes."""
+        return [
+            Route("/api/settings", access.endpoint(self._read), methods=["GET"]),
+            Route("/api/settings", access.endpoint(self._write), methods=["POST"]),
+        ]
+
+    def _read(self, call: Call) -> Response:
+        assert call.session is not None
+        return JSONResponse({"names": list(SETTINGS), "settings": self._users.settings(call.session.name)})
+
+    def _write(self, call: Call) -> Response:
+        assert call.session is not None
+        values = call.parse_body(_SettingsBody).settings
+        for name in values:
+            if name not in SETTINGS:
+                raise ApiError(400, "bad_request", f"unknown setting; known: {', '.join(SETTINGS)}", f"settings.{name}")
+        self._users.store_settings(call.session.name, values)
         return Response(status_code=204)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 
-from sonarpost.services.console.web.installation_routes import imported_scripts
-from sonarpost.services.console.web.server import STATIC
+from sonarpost.services.console.web.server import STATIC, imported_scripts
 
 SCRIPTS = STATIC / "js"
 PAGES = [SCRIPTS / name for name in ("app.js", "login.js", "offline.js")]

@@ -6,7 +6,7 @@ import pytest
 from builders.console import contact_id, image_record
 from starlette.testclient import TestClient
 
-from sonarpost.services.console.web import report_routes
+from sonarpost.services.console.web import report
 from sonarpost.services.console.web.access import COOKIE
 from sonarpost.services.console.web.report import degrees_minutes
 from sonarpost.services.console.web.server import ConsoleApp
@@ -62,7 +62,7 @@ def test_target_sheets_are_those_of_the_filter_and_limited(console, monkeypatch)
     watch = console.browser("watch")
     assert watch.get("/report").text.count("class='sheet'") == 3
     assert watch.get("/report", q="0001").text.count("class='sheet'") == 1
-    monkeypatch.setattr(report_routes, "MAX_SHEETS", 2)
+    monkeypatch.setattr(report, "MAX_SHEETS", 2)
     answer = watch.get("/report")
     assert (answer.status_code, answer.json()["error"]["code"]) == (413, "too_large")
     assert "more than 2 contacts" in answer.json()["error"]["message"]

@@ -8,8 +8,7 @@ from builders.console import FIRST_UTC_S, Clock, contact_id, downlink_state, ima
 from sonarpost.messages import Command, Pixels
 from sonarpost.modem.registry import modem_driver
 from sonarpost.review.costs import LinkRecord, RequestCost, expected_arrival
-from sonarpost.services.console.store.request_costs import FRAME_HEADER_BYTES
-from sonarpost.services.console.store.requests import REFUSAL_VALID_S
+from sonarpost.services.console.store.requests import FRAME_HEADER_BYTES, REFUSAL_VALID_S
 
 ID = contact_id()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sonarpost.services.console.web.settings_routes import MAX_VALUE, SETTINGS
+from sonarpost.services.console.web.session_routes import MAX_VALUE, SETTINGS
 
 
 def test_settings_follow_the_user_and_no_other(console):

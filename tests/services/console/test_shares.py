@@ -11,14 +11,14 @@ import pytest
 from builders.console import image_record, session_cookie, web_server
 
 from sonarpost.services.console.web import export_routes
-from sonarpost.services.console.web.export_routes import _ExportQueue
-from sonarpost.services.console.web.shares import (
+from sonarpost.services.console.web.access import (
     MAX_THREADS,
     MAX_THREADS_OF_USER,
     MAX_WAITING_OF_USER,
     ThreadShares,
     TooManyRequestsError,
 )
+from sonarpost.services.console.web.export_routes import _ExportQueue
 
 
 def test_further_requests_of_a_user_wait_and_are_limited():
