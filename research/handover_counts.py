@@ -9,9 +9,9 @@ and its processes count, for each contact:
 - unpacked: records of which only some fields are read, for a log line or an acknowledgement;
 - commits: transactions of SQLite that change rows; fsyncs: calls of `os.fsync` and `os.fdatasync`.
 
-Health, states and frames for watchers are left out. The images of the second chain are snippets of 80 x 140 px, as
-many as `--contacts`. From their arrival until c2 has stored all, the processor time of each service is measured,
-without the codec (coding_ms) and without what the idle chain needs in the same time.
+Health, states, frames for watchers and the start of the services are left out. The images of the second chain are
+snippets of 80 x 140 px, as many as `--contacts`. From their arrival until c2 has stored all, the processor time of each
+service is measured, without the codec (coding_ms) and without what the idle chain needs in the same time.
 
 With `--old`, the sources of another checkout are measured in turn with these, and the ratios are printed.
 """
@@ -34,6 +34,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 import zenoh
+from typing_extensions import override
 
 from sonarpost import keys
 from sonarpost.extensions.simulation.demo.chain import Chain
@@ -62,6 +63,7 @@ TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 class ShoreWatcher(Watcher):
     """Watches the chain without a subscription to the vessel's pixels, which would be encoded for it alone."""
 
+    @override
     def _subscribe(self, session: zenoh.Session, key: str, record_type: type[R], take: Callable[[R], None]) -> None:
         if key != keys.image_reconstructed(VESSEL):
             super()._subscribe(session, key, record_type, take)
@@ -151,10 +153,11 @@ def measure(folder: Path, contacts: int) -> dict[str, dict[str, float]]:
         with Chain(settings) as chain, ShoreWatcher(settings, chain.check) as watcher:
             watcher.wait_until_started()
             if not contacts:
+                before = counted(counts)
                 deposit_survey(settings)
                 wait_until_idle(chain, watcher, 1)
-                found = len(watcher.shore)
-                totals = {service: {k: float(n) for k, n in of.items()} for service, of in counted(counts).items()}
+                found, after = len(watcher.shore), counted(counts)
+                totals = {name: {k: float(after[name][k] - before[name][k]) for k in COUNTERS} for name in SERVICES}
             else:
                 totals, found = _times(chain, watcher, settings, counts, contacts), contacts
             if not watcher.all_complete or not found:

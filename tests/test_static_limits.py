@@ -130,6 +130,7 @@ RAISES = {
     "common/sonarpost/cli/pki.py: run_acoustic: create_key": MAPPED,
     "common/sonarpost/cli/pki.py: run_router_config: write_new": MAPPED,
     "services/atd_stub/service.py: AtdStubService._process: _content_of": "its caller tries the file again",
+    "services/atd_stub/service.py: AtdStubService._process: _identities": "its caller tries the file again",
     "services/atd_stub/service.py: _known_parts: recording_parts": "the listing of the folder reports the recording",
 }
 

@@ -21,6 +21,7 @@ from types import ModuleType
 from typing import Any
 
 import msgpack
+from typing_extensions import override
 
 COUNTERS = ("encodes", "decodes", "unpacked", "commits", "fsyncs", "coding_ns")
 """Records packed; unpacked and validated; unpacked for a log line or some fields; commits of changed rows; `os.fsync`
@@ -134,6 +135,7 @@ class CodingFinder(importlib.abc.MetaPathFinder):
     def __init__(self, on_import: Callable[[ModuleType], None]) -> None:
         self._on_import = on_import
 
+    @override
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:

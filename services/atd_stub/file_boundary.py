@@ -13,6 +13,7 @@ from typing import Any, Final
 import msgpack
 import numpy as np
 
+from sonarpost import wire
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.detection.association import DetectionPlace
@@ -48,7 +49,7 @@ class FileEndStore:
     """
 
     def __init__(self, store: Store) -> None:
-        self._ends = store.read_states(_STATE_PREFIX, _checked)
+        self._ends = store.read_states(_STATE_PREFIX, _of_sonar)
         self._uncommitted = dict(self._ends)
         self.held_count = self._count_held()
 
@@ -100,14 +101,9 @@ class FileEndStore:
         return sum(len(stored.end.held) for stored in self._ends.values())
 
 
-def _checked(sonar_id: str, packed: bytes) -> StoredEnd:
-    """Return a stored end with the name of its sonar.
-
-    Raises:
-        ValueError: It is damaged, or a held contact is.
-    """
+def _of_sonar(sonar_id: str, packed: bytes) -> StoredEnd:
+    """Return a stored end with the name of its sonar."""
     stored = unpack(packed)
-    snippets_of(stored.end.held)
     return replace(stored, end=replace(stored.end, sonar_id=sonar_id))
 
 
@@ -125,7 +121,7 @@ def pack(stored: StoredEnd) -> bytes:
             "pings": [_packed_ping(ping) for ping in end.pings],
             "open_row": end.open_row,
             "reported": [_packed_place(place) for place in end.reported],
-            "held": [[_packed_place(contact.place), contact.content] for contact in end.held],
+            "held": [[_packed_place(contact.place), wire.encode(contact.content)] for contact in end.held],
         }
     )
     return packed
@@ -136,6 +132,7 @@ def unpack(packed: bytes) -> StoredEnd:
 
     Raises:
         ValueError: It has another format, or is damaged.
+        PayloadError: A held contact is damaged.
     """
     try:
         fields = msgpack.unpackb(packed)
@@ -149,7 +146,7 @@ def unpack(packed: bytes) -> StoredEnd:
 def _end(fields: Mapping[str, Any]) -> SurveyEnd:
     files = [FileOrigin(*each) for each in fields["files"]]
     origins = tuple(PingOrigin(files[number], row) for number, row in fields["origins"])
-    held = ((_place(place), content) for place, content in fields["held"])
+    held = ((_place(place), wire.decode(Snippet, payload, "file end")) for place, payload in fields["held"])
     return StreamEnd(
         sonar_id=fields["sonar_id"],
         pings=tuple(_unpacked_ping(each) for each in fields["pings"]),

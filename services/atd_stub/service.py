@@ -51,6 +51,7 @@ from sonarpost.sonar.readers import recording_parts, supported_suffixes
 log = logging.getLogger(__name__)
 
 _FILE = "file:"
+_Identities = tuple[tuple[int, ...], ...]
 MAX_REASONS = 5
 """Number of faults in the health record."""
 
@@ -327,22 +328,23 @@ class AtdStubService(Service[AtdStubConfig]):
     def _process(self, file: InputFile) -> str:
         """Process a file; return its digest, empty if it was removed or changed and has to be tried again."""
         try:
+            before = _identities(file)
             content = _content_of(file)
         except FileNotFoundError:
             return ""
         if (entry := self.store.read_state(_state_name(content), _entry, None)) is not None:
             self._skip_known(file, content, entry)
             return content
-        return content if self._detect(file, content) else ""
+        return content if self._detect(file, content, before) else ""
 
-    def _detect(self, file: InputFile, content: str) -> bool:
+    def _detect(self, file: InputFile, content: str, before: _Identities) -> bool:
         path = file.path
         started = time.perf_counter()
         try:
             result = self._contacts_of(path, content)
         except SurveyFileError as error:
             # If the file was removed or changed during the search, the error is not about this content.
-            if not _is_unchanged(file, content):
+            if not _is_unchanged(file, before):
                 return False
             self._quarantine(file, content, str(error))
             return True
@@ -353,7 +355,7 @@ class AtdStubService(Service[AtdStubConfig]):
             log.exception("File not processed", extra=kv(file=path.name))
             self._quarantine(file, content, f"{type(error).__name__}: {error}")
             return True
-        if not _is_unchanged(file, content):
+        if not _is_unchanged(file, before):
             log.warning("File changed while it was read; trying again", extra=kv(file=path.name))
             return False
         self._commit_result(path, content, result, round(time.perf_counter() - started, 2))
@@ -539,14 +541,24 @@ def _remove_empty_folders(file: InputFile) -> None:
             folder.rmdir()
 
 
-def _is_unchanged(file: InputFile, content: str) -> bool:
-    """Return whether the files exist and have the content that was read.
+def _identities(file: InputFile) -> _Identities:
+    """Return what changes if a file is replaced or written.
 
     Raises:
-        OSError: A file cannot be read.
+        OSError: A file cannot be examined.
+    """
+    found = (part.stat() for part in file.parts)
+    return tuple((of.st_dev, of.st_ino, of.st_size, of.st_mtime_ns, of.st_ctime_ns) for of in found)
+
+
+def _is_unchanged(file: InputFile, before: _Identities) -> bool:
+    """Return whether the files exist and have not been replaced or written.
+
+    Raises:
+        OSError: A file cannot be examined.
     """
     try:
-        return _content_of(file) == content
+        return _identities(file) == before
     except FileNotFoundError:
         return False
 

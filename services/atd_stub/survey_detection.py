@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -13,7 +13,6 @@ from typing import Final
 from pydantic import ValidationError
 from typing_extensions import override
 
-from sonarpost import wire
 from sonarpost.codec.interface import MIN_SIDE_PX
 from sonarpost.detection.detector import Detection
 from sonarpost.detection.difficulty import Difficulty
@@ -43,8 +42,8 @@ MAX_SEARCH_S: Final = limit(
 MAX_SEARCH_S_PER_MB: Final = limit(
     100.0, "s of processor time a MB", "deadlines", "input folder", "recording", "search, by its size", "quarantine"
 )
-SurveyEnd = StreamEnd[bytes]
-"""The end of a recording; its contacts are encoded snippets, as they are stored."""
+SurveyEnd = StreamEnd[Snippet]
+"""The end of a recording."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,8 +162,8 @@ def _detect(
 ) -> DetectionResult:
     """As `detect_in_survey`."""
 
-    def describe(survey: Survey, detection: Detection, origin: PingOrigin) -> bytes:
-        return wire.encode(snippet_of(survey, detection, origin.file, vehicle_id, config))
+    def describe(survey: Survey, detection: Detection, origin: PingOrigin) -> Snippet:
+        return snippet_of(survey, detection, origin.file, vehicle_id, config)
 
     settings = config.detector_settings()
     settings = settings.model_copy(update={"max_contacts": min(settings.max_contacts or MAX_CONTACTS, MAX_CONTACTS)})
@@ -223,13 +222,9 @@ def _descending_confidence(snippet: Snippet) -> float:
     return -(snippet.contact.atd_confidence or 0.0)
 
 
-def snippets_of(contacts: tuple[StreamContact[bytes], ...]) -> tuple[Snippet, ...]:
-    """Decode the snippets of contacts.
-
-    Raises:
-        PayloadError: A stored one is damaged.
-    """
-    return tuple(wire.decode(Snippet, contact.content, "file end") for contact in contacts)
+def snippets_of(contacts: Iterable[StreamContact[Snippet]]) -> tuple[Snippet, ...]:
+    """Return the snippets of contacts."""
+    return tuple(contact.content for contact in contacts)
 
 
 def snippet_of(

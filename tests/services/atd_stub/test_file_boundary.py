@@ -19,11 +19,13 @@ from builders.joined_surveys import (
     survey_of,
 )
 
+from sonarpost import wire
 from sonarpost.detection.association import DetectionPlace
 from sonarpost.detection.settings import DetectorTuning
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamEnd
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
+from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import StoredEnd, pack, unpack
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey
@@ -160,7 +162,11 @@ FIRST, SECOND = FileOrigin("0a" * 32, "line-0.xtf", "line-0"), FileOrigin("1b" *
 
 
 def test_a_stored_file_end_is_read_and_written_unchanged():
-    packed = bytes.fromhex((GOLDEN / "seam-format-2.hex").read_text())
+    contact = Contact(contact_id="line-1-1b1b1b1b-99-starboard-3", vehicle_id="uuv-1")
+    snippet = Snippet(contact=contact, pixels=Pixels.from_array(np.zeros((16, 16), np.uint8)), source="line-1.xtf")
+    fields = msgpack.unpackb(bytes.fromhex((GOLDEN / "seam-format-2.hex").read_text()))
+    fields["held"][0][1] = wire.encode(snippet)
+    packed = msgpack.packb(fields)
     stored = unpack(packed)
     held = DetectionPlace(Side.STARBOARD, 1, 0, 3, 12.5, 12.0, 14.25, 0.125)
     assert stored.hold_until_utc_s == 1.0e9 + 30.0
@@ -170,7 +176,7 @@ def test_a_stored_file_end_is_read_and_written_unchanged():
         origins=(PingOrigin(FIRST, 98), PingOrigin(FIRST, 99), PingOrigin(SECOND, 0)),
         open_row=1,
         reported=(DetectionPlace(Side.PORT, -2, -5, 1, 11.25, 11.0, 13.5, 0.2),),
-        held=(StreamContact(PingOrigin(FIRST, 99), held, b"\x81a snippet's payload"),),
+        held=(StreamContact(PingOrigin(FIRST, 99), held, snippet),),
     )
     pings = stored.end.pings
     assert [ping.number for ping in pings] == [98, 99, 100]
