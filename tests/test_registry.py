@@ -46,13 +46,18 @@ def test_broken_plug_in_is_left_out_and_reported_once(numbers, caplog):
     assert "sonarpost.numbers:broken" in caplog.text
 
 
-def test_plug_in_that_exits_is_left_out(monkeypatch, tmp_path, caplog, capsys):
-    (tmp_path / "plug_in_that_exits.py").write_text("import sys\nprint('tried')\nsys.exit(7)\n")
+@pytest.mark.parametrize("last_line", ["sys.exit(7)", "raise KeyError(7)", "ONE = 1"])
+def test_plug_in_that_prints_exits_or_raises_disturbs_no_output(last_line, monkeypatch, tmp_path, caplog, capsys):
+    (tmp_path / "plug_in_that_prints.py").write_text(f"import sys\nprint('tried')\n{last_line}\n")
     monkeypatch.syspath_prepend(tmp_path)
-    found = Registry(GROUP, "a number", lambda *_: True, {}, [EntryPoint("exits", "plug_in_that_exits:ONE", GROUP)])
-    assert found.working() == found.working() == {}
-    assert capsys.readouterr().out == "tried\n", "its import can take long"
-    assert "entry point sonarpost.numbers:exits: value: got 'plug_in_that_exits:ONE (SystemExit(7))'" in caplog.text
+    monkeypatch.delitem(sys.modules, "plug_in_that_prints", raising=False)
+    found = Registry(GROUP, "a number", lambda *_: True, {}, [EntryPoint("prints", "plug_in_that_prints:ONE", GROUP)])
+    expected = {"prints": 1} if last_line == "ONE = 1" else {}
+    assert found.working() == found.working() == expected
+    assert capsys.readouterr() == ("", "")
+    assert caplog.text.count("Output at import of entry point sonarpost.numbers:prints: 'tried") == 1
+    failure = "entry point sonarpost.numbers:prints: value: got 'plug_in_that_prints:ONE ("
+    assert caplog.text.count(failure) == (0 if expected else 1)
 
 
 def test_name_of_an_empty_registry():
@@ -76,19 +81,25 @@ def test_invalid_entry_points_of_an_extension_are_reported_once(content, monkeyp
     assert str(tmp_path / "broken" / "entry_points.toml") in record.getMessage()
 
 
-def test_damaged_metadata_of_a_package_hides_no_extension(monkeypatch, tmp_path, caplog):
-    metadata = tmp_path / "damaged-1.dist-info"
-    metadata.mkdir()
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: damaged\nVersion: 1\n")
-    (metadata / "entry_points.txt").write_text("[sonarpost.commands]\nneither name nor value\n")
+def test_damaged_metadata_of_a_package_hides_no_other(monkeypatch, tmp_path, caplog):
+    contents = {"damaged": b"[sonarpost.commands]\nneither name nor value\n", "binary": b"\xff\xfe"}
+    for name, content in {**contents, "whole": b"[sonarpost.commands]\nwhole = a:ONE\n"}.items():
+        metadata = tmp_path / f"{name}-1.dist-info"
+        metadata.mkdir()
+        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n")
+        (metadata / "entry_points.txt").write_bytes(content)
     monkeypatch.syspath_prepend(tmp_path)
     registry.installed_points.cache_clear()
+    registry._plug_in_points.cache_clear()
     try:
         found = registry.installed_points("sonarpost.commands")
+        assert registry.installed_points("sonarpost.others") == ()
     finally:
         registry.installed_points.cache_clear()
-    assert list(found) == registry._extension_points("sonarpost.commands")
-    assert caplog.text.count("Plug-ins of sonarpost.commands ignored: metadata of an installed package: TypeError") == 1
+        registry._plug_in_points.cache_clear()
+    assert [point for point in found if point.name != "whole"] == registry._extension_points("sonarpost.commands")
+    assert [point.value for point in found if point.name == "whole"] == ["a:ONE"]
+    assert caplog.text.count("Plug-ins ignored: metadata of an installed package: ") == len(contents)
 
 
 def test_core_has_priority(numbers, caplog):
@@ -103,7 +114,7 @@ def test_extension_is_found_by_its_folder_and_has_priority(monkeypatch, tmp_path
     (tmp_path / "empty").mkdir()
     installed = EntryPoint("a", "plug_in:A", GROUP)
     monkeypatch.setattr(registry, "EXTENSIONS", tmp_path)
-    monkeypatch.setattr(registry, "entry_points", lambda group: [installed] if group == GROUP else [])
+    monkeypatch.setattr(registry, "_plug_in_points", lambda: (installed,))
     registry.installed_points.cache_clear()
     try:
         found = registry.installed_points(GROUP)

@@ -10,8 +10,10 @@ from __future__ import annotations
 import logging
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import redirect_stdout
 from functools import cache
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from importlib.metadata import EntryPoint, distributions
+from io import StringIO
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
@@ -77,13 +79,16 @@ class Registry(Generic[T]):
             self._objects[name] = self._load(self._points[name])
         return self._objects[name]
 
-    def working(self) -> dict[str, T]:
+    def working(self, is_wanted: Callable[[str], bool] = lambda name: True) -> dict[str, T]:
         """Return all objects that can be imported, by name; each of the others is tried and reported in the log once.
 
         Those of the core are first, in their order.
+
+        Args:
+            is_wanted: Whether the object of a name is returned; others are not imported.
         """
         found = {}
-        for name in (*self._core, *sorted(self._points)):
+        for name in filter(is_wanted, (*self._core, *sorted(self._points))):
             if name in self._unusable:
                 continue  # its import can take long
             try:
@@ -102,27 +107,40 @@ class Registry(Generic[T]):
 
 
 def load(point: EntryPoint) -> Any:  # noqa: ANN401 the entry point names it
-    """Import the object of an entry point.
+    """Import the object of an entry point. What its module prints is logged: it belongs to no output of a command.
 
     Raises:
         ConfigError: It cannot be imported.
     """
+    where, printed = f"entry point {point.group}:{point.name}", StringIO()
     try:
-        return point.load()
+        with redirect_stdout(printed):
+            return point.load()
     except (Exception, SystemExit) as error:  # foreign code can raise any exception, and call `sys.exit`
-        where, value = f"entry point {point.group}:{point.name}", f"{point.value} ({error!r})"
-        raise ConfigError(where, "value", value, "an object that imports") from error
+        raise ConfigError(where, "value", f"{point.value} ({error!r})", "an object that imports") from error
+    finally:
+        if printed.getvalue():
+            log.warning("Output at import of %s: %r", where, printed.getvalue()[:200])
 
 
 @cache
 def installed_points(group: str) -> tuple[EntryPoint, ...]:
     """Return the entry points of the extensions, then those of plug-ins, each in the order of names and values."""
-    try:
-        plug_ins = entry_points(group=group)
-    except Exception as error:  # noqa: BLE001 the damaged metadata of any package: one of many types
-        log.warning("Plug-ins of %s ignored: metadata of an installed package: %r", group, error)
-        plug_ins = EntryPoints()
+    plug_ins = [point for point in _plug_in_points() if point.group == group]
     return (*_extension_points(group), *sorted(plug_ins, key=lambda p: (p.name, p.value)))
+
+
+@cache
+def _plug_in_points() -> tuple[EntryPoint, ...]:
+    """Return the entry points of all installed packages; one whose metadata are damaged is reported in the log."""
+    found: list[EntryPoint] = []
+    for package in distributions():
+        try:
+            if "sonarpost." in (package.read_text("entry_points.txt") or ""):  # few have: parsing all takes long
+                found += package.entry_points
+        except Exception as error:  # noqa: BLE001 damaged metadata: one of many types
+            log.warning("Plug-ins ignored: metadata of an installed package: %r", error)
+    return tuple(dict.fromkeys(found))  # a package can be on the path twice
 
 
 def _extension_points(group: str) -> list[EntryPoint]:

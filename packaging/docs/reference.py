@@ -7,7 +7,7 @@ import inspect
 import json
 import pkgutil
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from importlib import import_module
@@ -21,6 +21,7 @@ import sonarpost
 from sonarpost import keys, limits, messages
 from sonarpost.cli.deployment import config_files
 from sonarpost.cli.main import parser
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.config import ModemTable, PlatformConfig, ServiceConfig, table_names
 from sonarpost.messages import Record
 from sonarpost.monitoring.fleet import FleetState
@@ -70,20 +71,6 @@ class KeyRow:
     source: str
     to: str
     delivery: str
-
-
-@dataclass(frozen=True, slots=True)
-class Command:
-    """One command of the command line, with its full name and its description."""
-
-    name: str
-    description: str
-    parser: argparse.ArgumentParser
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether this is `sonarpost` itself, which describes the options that every command has."""
-        return " " not in self.name
 
 
 def generate(name: str, argument: str) -> str:
@@ -190,13 +177,7 @@ def configuration_type(service: str) -> type[ServiceConfig]:
 
 def commands(_: str = "") -> str:
     """Return a section for every command of `sonarpost`."""
-    return "\n\n".join(_command_section(command) for command in command_list())
-
-
-def command_list() -> list[Command]:
-    """Return every command, parents before their subcommands."""
-    whole = parser()
-    return list(_walk(Command("sonarpost", whole.description or "", whole)))
+    return "\n\n".join(_command_section(command) for command in parser().tree().values())
 
 
 def rate_table(_: str = "") -> str:
@@ -450,30 +431,20 @@ def _toml(value: object) -> str:
     return json.dumps(str(value))
 
 
-def _walk(command: Command) -> Iterator[Command]:
-    yield command
-    for action in command.parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for choice in action._choices_actions:
-                below = action.choices[choice.dest]
-                yield from _walk(
-                    Command(f"{command.name} {choice.dest}", below.description or choice.help or "", below)
-                )
-
-
-def _command_section(command: Command) -> str:
-    usage = " ".join(command.parser.format_usage().removeprefix("usage: ").split())
-    if not command.is_whole:
+def _command_section(command: CommandParser) -> str:
+    is_whole = command.prog == "sonarpost"  # it describes the options that every command has
+    usage = " ".join(command.format_usage().removeprefix("usage: ").split())
+    if not is_whole:
         usage = usage.replace(" [-h] [-v | -q]", "")
-    heading = "#" * (len(command.name.split()) + 1)
-    example = f"\n{command.parser.epilog}" if command.parser.epilog and not command.is_whole else ""
-    text = f"{heading} {command.name}\n\n{command.description}\n\n```text\n{usage}{example}\n```"
+    heading = "#" * (len(command.prog.split()) + 1)
+    example = f"\n{command.epilog}" if command.epilog and not is_whole else ""
+    text = f"{heading} {command.prog}\n\n{command.description}\n\n```text\n{usage}{example}\n```"
     rows = []
-    for action in command.parser._actions:
+    for action in command._actions:
         if isinstance(action, argparse._SubParsersAction):
             rows += [(f"`{choice.dest}`", choice.help or "", "") for choice in action._choices_actions]
-        elif action.help != argparse.SUPPRESS and (action.dest not in ("help", "verbosity") or command.is_whole):
-            meaning = argument_help(action, command.parser)
+        elif action.help != argparse.SUPPRESS and (action.dest not in ("help", "verbosity") or is_whole):
+            meaning = argument_help(action, command)
             rows.append(
                 (f"`{argument_name(action)}`", meaning, "" if "default" in meaning else _argument_default(action))
             )

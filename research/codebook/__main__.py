@@ -17,7 +17,7 @@ from research.codebook.comparison import UnmatchedTiles, compare
 from sonarpost.cli.main import apply_verbosity, exit_status
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers, in_new_folder
+from sonarpost.cli.shared import in_new_folder
 from sonarpost.codec.interface import Image, to_uint8
 from sonarpost.codec.vq.codebook import Codebook, open_codebook, save
 from sonarpost.codec.vq.codec import codebook_tag
@@ -40,17 +40,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return exit_status(lambda: run(parsed), parser.prog)
 
 
-def new_parser() -> argparse.ArgumentParser:
+def new_parser() -> CommandParser:
     """Return the parser of this command."""
     # Not that of `research.common.command`: it loads all codecs and what they are compared with.
-    parser: argparse.ArgumentParser = CommandParser(
-        prog="python -m research.codebook", description="Build, compare and adapt tile codebooks."
-    )
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    _add_build(actions)
-    _add_info(actions)
-    _add_diff(actions)
-    _add_adapt(actions)
+    parser = CommandParser(prog="python -m research.codebook", description="Build, compare and adapt tile codebooks.")
+    for add in (_add_build, _add_info, _add_diff, _add_adapt):
+        add(parser)
     return parser
 
 
@@ -64,8 +59,8 @@ def run(args: argparse.Namespace) -> int:
     return status
 
 
-def _add_build(actions: Subparsers) -> None:
-    parser = actions.add_parser("build", help="build a codebook from images (the paper's Table IV)")
+def _add_build(whole: CommandParser) -> None:
+    parser = whole.add_action("build", "build a codebook from images (the paper's Table IV)", run_build)
     _add_images_and_output(parser)
     parser.add_argument("--tile", type=int, default=10, metavar="PX", help="side of a tile (default: 10)")
     parser.add_argument(
@@ -83,28 +78,26 @@ def _add_build(actions: Subparsers) -> None:
     )
     parser.add_argument("--core", metavar="NAME_OR_FILE", help="a codebook to extend")
     parser.add_argument("--resume", action="store_true", help="resume an interrupted build")
-    parser.set_defaults(run=run_build)
 
 
-def _add_info(actions: Subparsers) -> None:
-    parser = actions.add_parser("info", help="show the content of a codebook")
+def _add_info(whole: CommandParser) -> None:
+    parser = whole.add_action("info", "show the content of a codebook", run_info)
     parser.add_argument("codebook", metavar="NAME_OR_FILE", help="nominal-10, nominal-20 or a file")
-    parser.set_defaults(run=run_info)
 
 
-def _add_diff(actions: Subparsers) -> None:
-    parser = actions.add_parser(
-        "diff", help="compare two codebooks", description="Compare two codebooks. Exit status 1: they differ."
+def _add_diff(whole: CommandParser) -> None:
+    parser = whole.add_action(
+        "diff", "compare two codebooks", run_diff, description="Compare two codebooks. Exit status 1: they differ."
     )
     parser.add_argument("first", metavar="A", help="nominal-10, nominal-20 or a file")
     parser.add_argument("second", metavar="B", help="the other codebook")
-    parser.set_defaults(run=run_diff)
 
 
-def _add_adapt(actions: Subparsers) -> None:
-    parser = actions.add_parser(
+def _add_adapt(whole: CommandParser) -> None:
+    parser = whole.add_action(
         "adapt",
-        help="adapt a codebook to a type of seabed",
+        "adapt a codebook to a type of seabed",
+        run_adapt,
         description="Replaces the least used tiles by tiles from the images. The last quarter of the images is used to "
         "measure the gain, not for training.",
     )
@@ -113,7 +106,6 @@ def _add_adapt(actions: Subparsers) -> None:
     parser.add_argument(
         "--keep", type=int, metavar="N", help="minimum number of base tiles that stay (default: half of them)"
     )
-    parser.set_defaults(run=run_adapt)
 
 
 def _add_images_and_output(parser: argparse.ArgumentParser) -> None:

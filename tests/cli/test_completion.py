@@ -7,7 +7,8 @@ import subprocess
 
 import pytest
 
-from sonarpost.cli.main import COMMANDS, main
+from sonarpost.cli.main import main
+from sonarpost.cli.parsing.commands import COMMANDS
 
 
 def script(shell, capsys):

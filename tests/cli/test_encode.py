@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import io
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,7 @@ from builders import image_folders
 from builders.image_folders import snippet
 from rich.console import Console
 
-from sonarpost.cli import encode
+from sonarpost.cli.main import parser
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import SonarpostError, StreamError
@@ -24,12 +23,8 @@ Run = Callable[..., int]
 
 @pytest.fixture
 def run():
-    parser = argparse.ArgumentParser()
-    subparsers = parser.add_subparsers()
-    encode.add_parser(subparsers)
-
     def run_command(*arguments):
-        parsed = parser.parse_args([str(argument) for argument in arguments])
+        parsed = parser(arguments[0]).parse_args([str(argument) for argument in arguments])
         status: int = parsed.run(parsed)
         return status
 

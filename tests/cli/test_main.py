@@ -12,24 +12,23 @@ from importlib.metadata import EntryPoint
 import pytest
 
 from sonarpost import registry
-from sonarpost.cli.main import COMMANDS, LOG_LEVEL_VARIABLE, exit_status, main, parser
-from sonarpost.cli.parsing.commands import GROUP, AddedCommand, added_commands, all_examples, all_extras
-from sonarpost.cli.parsing.parser import actions_of, all_parsers
+from sonarpost.cli.main import LOG_LEVEL_VARIABLE, exit_status, main, parser
+from sonarpost.cli.parsing.commands import COMMANDS, GROUP, CommandSpec, all_extras, commands
 from sonarpost.codec.registry import BUILTINS, ENTRY_POINT_GROUP, CodecRegistry, codec_plug_ins
 
-EXAMPLES = all_examples()
-ADDED = {name: each.summary for name, each in added_commands().working().items() if " " not in name}
 LIGHT = "numpy scipy rich pydantic numba zenoh PIL cryptography"
-
-
-def summaries_of(whole):
-    [group] = whole._subparsers._group_actions
-    return {each.dest: each.help for each in group._choices_actions}
 
 
 @pytest.fixture(scope="module")
 def whole():
     return parser()
+
+
+@pytest.fixture(scope="module")
+def examples(whole):
+    """Returns the example of each command, by its name."""
+    found = {name: each.epilog for name, each in whole.tree().items() if (each.epilog or "").startswith("example: ")}
+    return {name: text.removeprefix("example: sonarpost ") for name, text in found.items()}
 
 
 @pytest.fixture
@@ -38,13 +37,12 @@ def verbosity(monkeypatch):
     monkeypatch.setenv(LOG_LEVEL_VARIABLE, "info")
 
 
-def test_every_command_is_where_the_table_says():
+def test_one_command_has_its_options_and_the_others_have_none():
     for command in COMMANDS:
-        assert len(actions_of(parser(command))[command]._actions) > 2 or command == "prepare"
-
-
-def test_the_table_has_the_summary_of_every_command(whole):
-    assert summaries_of(whole) == {name: summary for name, (_, summary) in COMMANDS.items()} | ADDED
+        actions = parser(command).actions
+        assert set(actions) == {*COMMANDS}
+        assert {name for name, each in actions.items() if len(each._actions) > 3} <= {command}
+        assert len(actions[command]._actions) > 2 or command == "prepare"
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["help"]])
@@ -52,17 +50,16 @@ def test_help_lists_every_command(arguments, capsys):
     with pytest.raises(SystemExit, match="0"):
         sys.exit(main(arguments))
     listed = capsys.readouterr().out
-    assert {line.split()[0] for line in listed.splitlines() if line.startswith("    ") and line[4] != " "} >= set(
-        {*COMMANDS, *ADDED}
-    )
+    found = {line.split()[0] for line in listed.splitlines() if line.startswith("    ") and line[4] != " "}
+    assert found >= {name for name in commands().names() if " " not in name}
 
 
-def test_help_of_a_command(capsys):
+def test_help_of_a_command(capsys, examples):
     with pytest.raises(SystemExit, match="0"):
         main(["help", "store", "salvage"])
     printed = capsys.readouterr().out
     assert printed.startswith("usage: sonarpost store salvage")
-    assert printed.endswith(f"\nexample: sonarpost {EXAMPLES['store salvage']}\n")
+    assert printed.endswith(f"\nexample: sonarpost {examples['store salvage']}\n")
 
 
 @pytest.mark.parametrize(
@@ -106,40 +103,55 @@ def test_no_library_is_loaded_without_a_command_and_none_of_the_other_commands()
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
-def test_broken_command_of_a_plug_in_stops_no_other(monkeypatch, capsys, caplog):
-    added = AddedCommand("of a plug-in", "plug_in_that_is_absent:add_parser", {})
-    monkeypatch.setattr(sys.modules[__name__], "ABSENT", added, raising=False)
-    names = ("boom", "survey boom", "run", "c2 ls")
-    points = [EntryPoint(name, f"{__name__}:ABSENT", GROUP) for name in names]
-    monkeypatch.setattr(registry, "installed_points", lambda group: points if group == GROUP else [])
-    added_commands.cache_clear()
-    try:
-        assert set(all_parsers(parser())) >= {"run", "survey info", "c2 ls", "encode"}
-        for command in ("survey info", "run", "c2 ls", "boom"):
-            with pytest.raises(SystemExit) as caught:
-                main([*command.split(), "--help"])
-            assert caught.value.code == (2 if command == "boom" else 0)
-    finally:
-        added_commands.cache_clear()
-    assert "invalid choice: 'boom'" in capsys.readouterr().err
-    assert "Command ignored: plug_in_that_is_absent:add_parser: ModuleNotFoundError" in caplog.text
-    assert "sonarpost.commands:run" in caplog.text
+@pytest.fixture
+def plug_ins(monkeypatch):
+    """Replaces the commands of extensions and plug-ins by those of this module, by name."""
+
+    def replace(**found):
+        points = []
+        for number, (name, command) in enumerate(found.items()):
+            monkeypatch.setattr(sys.modules[__name__], f"PLUG_IN_{number}", command, raising=False)
+            points.append(EntryPoint(name.replace("_", " "), f"{__name__}:PLUG_IN_{number}", GROUP))
+        monkeypatch.setattr(registry, "installed_points", lambda group: points if group == GROUP else [])
+        commands.cache_clear()
+
+    yield replace
+    commands.cache_clear()
 
 
-def test_help_has_no_command_without_examples_and_any_summary(monkeypatch, capsys, caplog):
-    module = sys.modules[__name__]
-    monkeypatch.setattr(module, "WHOLE", AddedCommand("100 % of it", "absent:add_parser", {}), raising=False)
-    monkeypatch.setattr(module, "WITHOUT", AddedCommand("without examples", "absent:add_parser", None), raising=False)
-    points = [EntryPoint(name, f"{__name__}:{name.upper()}", GROUP) for name in ("whole", "without")]
-    monkeypatch.setattr(registry, "installed_points", lambda group: points if group == GROUP else [])
-    added_commands.cache_clear()
-    try:
-        main([])
-    finally:
-        added_commands.cache_clear()
+def print_and_fail(_parser):
+    print("printed")
+    raise KeyError("no option")
+
+
+def test_broken_command_of_a_plug_in_stops_no_other(plug_ins, capsys, caplog):
+    absent = CommandSpec("of a plug-in", "plug_in_that_is_absent:add_options")
+    fails = CommandSpec("of a plug-in", f"{__name__}:print_and_fail")
+    plug_ins(boom=absent, survey_boom=absent, run=absent, c2_ls=absent, no_parent=absent, fails=fails)
+    assert {*parser().tree()} >= {"run", "survey info", "c2 ls", "encode"}
+    for command in ("survey info", "run", "c2 ls"):
+        with pytest.raises(SystemExit, match="0"):
+            main([*command.split(), "--help"])
+    assert [main([command, "--help"]) for command in ("boom", "fails")] == [2, 2]
+    printed = capsys.readouterr()
+    assert "entry point sonarpost.commands:boom: options: got 'plug_in_that_is_absent:" in printed.err
+    assert "entry point sonarpost.commands:fails: options: got " in printed.err
+    for name in ("survey boom", "run", "c2 ls", "no parent"):
+        assert f"{name}" in caplog.text
+    caplog.clear()
+    assert main(["encode", "absent.png"]) == 2
+    assert caplog.text == "", "other plug-ins are not imported"
+
+
+def test_help_has_no_command_with_invalid_fields_and_any_summary(plug_ins, capsys, caplog):
+    plug_ins(
+        whole=CommandSpec("100 % of it", "absent:add_options"),
+        without=CommandSpec("without extras", "absent:add", "", None),
+    )
+    main([])
     printed = capsys.readouterr().out
     assert "100 % of it" in printed
-    assert "without examples" not in printed
+    assert "without extras" not in printed
     assert "sonarpost.commands:without" in caplog.text
 
 
@@ -154,23 +166,17 @@ def test_list_of_codecs_has_the_error_of_a_broken_plug_in(monkeypatch, capsys):
     assert "entry point sonarpost.codecs:boom: value: got" in "".join(lines)
 
 
-def test_every_command_has_an_example_that_parses(whole):
-    parsers = all_parsers(whole)
-    assert {name for name, each in parsers.items() if not actions_of(each)} <= set(EXAMPLES)
-    for name in EXAMPLES:
-        words = shlex.split(EXAMPLES[name].partition(" > ")[0])
+def test_every_command_has_an_example_that_parses(whole, examples):
+    parsers = whole.tree()
+    assert {name for name, each in parsers.items() if not each.actions} <= {*examples, "prepare"}
+    for name, example in examples.items():
+        words = shlex.split(example.partition(" > ")[0])
         assert words[: len(name.split())] == name.split()
-        assert hasattr(whole.parse_args(words), "run")
-        assert parsers[name].format_help().endswith(f"\nexample: sonarpost {EXAMPLES[name]}\n")
-
-
-def test_every_command_accepts_verbose_and_quiet_before_and_after_it(whole):
-    for name in EXAMPLES:
-        words = shlex.split(EXAMPLES[name].partition(" > ")[0])
         assert not hasattr(whole.parse_args(words), "verbosity")
         assert whole.parse_args(["-v", *words]).verbosity == "verbose"
         assert whole.parse_args([*words, "--quiet"]).verbosity == "quiet"
-    assert all("--verbose" in each.format_help() for each in all_parsers(whole).values())
+        assert parsers[name].format_help().endswith(f"\nexample: sonarpost {example}\n")
+    assert all("--verbose" in each.format_help() for each in parsers.values())
 
 
 @pytest.mark.usefixtures("verbosity")

@@ -1,6 +1,5 @@
 """`sonarpost detect`."""
 
-import argparse
 import json
 import re
 from dataclasses import replace
@@ -12,6 +11,7 @@ from PIL import Image
 
 from sonarpost.cli.detection import command
 from sonarpost.cli.detection.command import annotated_waterfall
+from sonarpost.cli.main import parser
 from sonarpost.detection import candidates
 from sonarpost.detection.detector import CLUTTER, MINE_LIKE, STRUCTURE, detect
 from sonarpost.errors import ConfigError, SurveyFileError
@@ -28,9 +28,7 @@ pytestmark = pytest.mark.usefixtures("few_candidates")
 
 
 def run(*arguments):
-    parser = argparse.ArgumentParser()
-    command.add_parser(parser.add_subparsers())
-    parsed = parser.parse_args(["detect", *map(str, arguments)])
+    parsed = parser("detect").parse_args(["detect", *map(str, arguments)])
     return parsed.run(parsed)
 
 

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 
 from sonarpost.archive.reader import place_of
 from sonarpost.archive.shore_index import FILE_NAME as FILE_NAME_OF_INDEX
-from sonarpost.cli.parsing.commands import add_actions
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import flag, option
 from sonarpost.config import load
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.keys import SHORE
@@ -31,42 +32,37 @@ if TYPE_CHECKING:
     from sonarpost.services.console.web.server import ConsoleApp, WebServer
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command and its actions."""
-    summary = "manage the users of the console; serve the contacts of a folder"
-    parser = subparsers.add_parser("console", help=summary, description=f"{summary.capitalize()}.")
-    parser.set_defaults(run=run)
-    parser.add_argument("--view", metavar="DIR", help="serve the contacts in a folder or database of c2, read only")
+def add_options(parser: CommandParser) -> None:
+    """Add the options and actions."""
+    option(parser, "--view DIR", "serve the contacts in a folder or database of c2, read only")
     add_page_options(parser)
-    actions = parser.add_subparsers(metavar="ACTION", required=False)
-    add_actions(actions, "console")
-    user = actions.add_parser("user", help="manage the users of a console")
-    user_actions = user.add_subparsers(metavar="ACTION", required=True)
-    for name, run_action, summary in (
-        ("add", _add, "add a user, or change the role of a user"),
-        ("passwd", _set_password, "change a password"),
-        ("link", _link, "print a link that logs a user in once, within 10 minutes"),
-        ("rm", _remove, "remove a user"),
-        ("ls", _list, "list the users"),
+    parser.set_defaults(run=run)
+    user = parser.add_action("user", "manage the users of a console")
+    for name, run_action, text, example in (
+        ("add", _add, "add a user, or change the role of a user", "anna --role operator"),
+        ("passwd", _set_password, "change a password", "anna"),
+        ("link", _link, "print a link that logs a user in once, within 10 minutes", "anna"),
+        ("rm", _remove, "remove a user", "anna"),
+        ("ls", _list, "list the users", ""),
     ):
-        action = user_actions.add_parser(name, help=summary)
+        action = user.add_action(name, text, run, f"{example} --state-dir state".lstrip())
         if name != "ls":
-            action.add_argument("name", metavar="NAME", help="name of the user")
+            option(action, "name NAME", "name of the user")
         if name == "add":
-            action.add_argument("--role", choices=ROLES, default="observer", help="role of the user")
+            option(action, "--role", "role of the user", default="observer", choices=ROLES)
         if name in ("add", "passwd"):
-            action.add_argument("--password-stdin", action="store_true", help="read the password from standard input")
+            flag(action, "--password-stdin", "read the password from standard input")
         where = action.add_mutually_exclusive_group(required=True)
-        where.add_argument("--config", type=Path, metavar="FILE", help="TOML file of the platform")
-        where.add_argument("--state-dir", type=Path, metavar="DIR", help="state folder of the services")
+        option(where, "--config FILE", "TOML file of the platform", Path)
+        option(where, "--state-dir DIR", "state folder of the services", Path)
         action.set_defaults(run_action=run_action)
 
 
 def add_page_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `serve_page`."""
-    parser.add_argument("--port", type=int, help="port of the page (default: 8470, or any if it is in use; 0: any)")
-    parser.add_argument("--open", action="store_true", help="open the log-in link in the default browser")
-    parser.add_argument("--password", help="password of the users of the page (default: random)")
+    option(parser, "--port", "port of the page (default: 8470, or any if it is in use; 0: any)", int)
+    flag(parser, "--open", "open the log-in link in the default browser")
+    option(parser, "--password", "password of the users of the page (default: random)")
 
 
 def run(parsed: argparse.Namespace) -> int:

@@ -12,8 +12,9 @@ from typing import Final
 
 from sonarpost.archive.reader import as_folder
 from sonarpost.cli.c2.stored import EXIT_INCOMPLETE, RecordFilter, add_filters, archive_of
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers, add_command, make_output_folder, printable
+from sonarpost.cli.shared import flag, make_output_folder, option, print_rejected
 from sonarpost.errors import BadInputError
 from sonarpost.export.coco import (
     ANNOTATIONS_FILE,
@@ -32,25 +33,21 @@ from sonarpost.sonar.image_files import write_png
 _COUNTED: Final[tuple[LabelState, ...]] = ("disputed", "unsure", "unreviewed", "without_image")
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_actions(parser: CommandParser) -> None:
     """Add the command and its action."""
-    actions = add_command(subparsers, "dataset", "training data from the verdicts of operators")
-    export = actions.add_parser(
+    export = parser.add_action(
         "export",
-        help="write images with verdicts in COCO format",
-        description="Write every contact of a shore site that an operator has judged as mine-like or not: its image as "
+        "write images with verdicts in COCO format",
+        run_export,
+        "--archive demo-out/shore/images --out dataset",
+        "Write every contact of a shore site that an operator has judged as mine-like or not: its image as "
         f"{IMAGES_FOLDER}/*.png, boxes and labels as {ANNOTATIONS_FILE}. Exit status 1: there is no such contact, and "
         "nothing is written, or a stored file was rejected.",
     )
     add_filters(export)
-    export.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the data set")
-    export.add_argument(
-        "--include-disputed",
-        action="store_true",
-        help="also contacts about which operators disagree; the latest verdict is the label",
-    )
-    export.add_argument("--json", action="store_true", help="print the counts as one JSON object")
-    export.set_defaults(run=run_export)
+    option(export, "--out DIR", "folder of the data set", Path, required=True)
+    flag(export, "--include-disputed", "also contacts about which operators disagree; the latest verdict is the label")
+    flag(export, "--json", "print the counts as one JSON object")
 
 
 def run_export(parsed: argparse.Namespace) -> int:
@@ -75,8 +72,7 @@ def run_export(parsed: argparse.Namespace) -> int:
     counts: dict[str, int] = {"images": len(images)}
     counts |= {name: states[name] for name in _COUNTED} | {"rejected": len(problems)}
     _print_counts(parsed, counts, images)
-    for problem in problems:
-        print(f"rejected: {printable(str(problem))}", file=sys.stderr)
+    print_rejected(problems)
     if not images:
         reasons = ", ".join(f"{name.replace('_', ' ')} {states[name]}" for name in _COUNTED)
         print(

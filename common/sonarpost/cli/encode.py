@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers, add_fit_option, in_new_folder, printable
+from sonarpost.cli.shared import add_fit_option, flag, in_new_folder, option, printable
 from sonarpost.codec import Codec, StreamHeader, codec_names, decode_image, get_codec
 from sonarpost.codec.api import CodecOptions
 from sonarpost.codec.fitting import fit_image
@@ -31,52 +32,42 @@ MAX_STREAM_FILE_BYTES = 1 << 18  # header and the longest body, twice for hexade
 EXIT_SOME_FAILED = 1
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add both commands."""
-    encode = subparsers.add_parser("encode", help="encode an image or a folder of images")
-    encode.add_argument("input", type=Path, metavar="IMAGE_OR_DIR", help="JPEG, PNG or TIFF of any depth and colour")
-    encode.add_argument(
-        "--codec", default="emb", help="name of a codec; `--codec help` lists them (default: %(default)s)"
-    )
-    encode.add_argument("--model", help="model of emb: standard (default) or structure")
-    encode.add_argument(
-        "--codebook",
+def add_encode(parser: CommandParser) -> None:
+    """Add the options of `encode`."""
+    option(parser, "input IMAGE_OR_DIR", "JPEG, PNG or TIFF of any depth and colour", Path)
+    option(parser, "--codec", "name of a codec; `--codec help` lists them", default="emb")
+    option(parser, "--model", "model of emb: standard (default) or structure")
+    option(
+        parser,
+        "--codebook NAME_OR_FILE",
+        "codebook of vq: nominal-10 (default), nominal-20 or a file",
         default="nominal-10",
-        metavar="NAME_OR_FILE",
-        help="codebook of vq: nominal-10 (default), nominal-20 or a file",
     )
-    encode.add_argument(
+    option(
+        parser,
         "--packing",
-        choices=[packing.value for packing in IndexPacking],
+        "index format of vq (default: 14bit)",
         default=IndexPacking.BITS14.value,
-        help="index format of vq (default: 14bit)",
+        choices=[packing.value for packing in IndexPacking],
     )
-    encode.add_argument(
-        "--budget", type=int, metavar="BYTES", help="maximum length of a stream, header included (default: the codec's)"
-    )
-    encode.add_argument("--text", action="store_true", help="write hexadecimal text (.txt), as the paper does")
-    add_fit_option(encode)
-    encode.add_argument(
-        "--out", type=Path, metavar="DIR", help=f"folder for the streams (default: {STREAM_FOLDER}/ beside the image)"
-    )
-    encode.set_defaults(run=run_encode)
-    decode = subparsers.add_parser("decode", help="decode a stream or a folder of streams to TIFF and PNG")
-    decode.add_argument(
-        "input", type=Path, metavar="FILE_OR_DIR", help="a stream, or a folder of streams or of encoded images"
-    )
-    decode.add_argument(
-        "--codebook",
-        metavar="NAME_OR_FILE",
-        help="codebook of the streams (default: found by the tag in the stream, among the shipped codebooks and the "
+    option(parser, "--budget BYTES", "maximum length of a stream, header included (default: the codec's)", int)
+    flag(parser, "--text", "write hexadecimal text (.txt), as the paper does")
+    add_fit_option(parser)
+    option(parser, "--out DIR", f"folder for the streams (default: {STREAM_FOLDER}/ beside the image)", Path)
+    parser.set_defaults(run=run_encode)
+
+
+def add_decode(parser: CommandParser) -> None:
+    """Add the options of `decode`."""
+    option(parser, "input FILE_OR_DIR", "a stream, or a folder of streams or of encoded images", Path)
+    option(
+        parser,
+        "--codebook NAME_OR_FILE",
+        "codebook of the streams (default: found by the tag in the stream, among the shipped codebooks and the "
         "files and folders in the environment variable SONARPOST_CODEBOOKS)",
     )
-    decode.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help=f"folder for the images (default: {DECODED_FOLDER}/ in that folder)",
-    )
-    decode.set_defaults(run=run_decode)
+    option(parser, "--out DIR", f"folder for the images (default: {DECODED_FOLDER}/ in that folder)", Path)
+    parser.set_defaults(run=run_decode)
 
 
 def run_encode(args: argparse.Namespace) -> int:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
+from importlib.metadata import EntryPoint
 from typing import NoReturn
 
 from sonarpost import __version__
-from sonarpost.cli.parsing.commands import COMMANDS, added_commands, all_extras
+from sonarpost.cli.parsing.commands import COMMANDS, GROUP, CommandSpec, all_extras, commands
 from sonarpost.cli.parsing.parser import CommandParser
-from sonarpost.errors import SonarpostError
+from sonarpost.errors import ConfigError, SonarpostError
 from sonarpost.stop_signals import exit_process
+
+log = logging.getLogger(__name__)
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
@@ -34,7 +36,11 @@ def run_command() -> NoReturn:
 def parser(command: str | None = None) -> CommandParser:
     """Return the parser with the options of one command, or of all commands for None.
 
-    All other commands, and every command for another name, have a summary but no options.
+    All other commands, and every command for another name, have a summary but no options. If the core or an extension
+    has the command, the modules of plug-ins with other commands are not imported, and these are not listed.
+
+    Raises:
+        ConfigError: The command is that of a plug-in that cannot be used.
     """
     whole = CommandParser(
         prog="sonarpost",
@@ -42,22 +48,37 @@ def parser(command: str | None = None) -> CommandParser:
         epilog=_STATUS,
     )
     whole.add_argument("--version", action="version", version=f"sonarpost {__version__}")
-    subparsers = whole.add_subparsers(metavar="COMMAND", required=False)
-    wanted = dict.fromkeys(module for name, (module, _) in COMMANDS.items() if command in (None, name))
-    added = set[str]()
-    for name, (module, summary) in COMMANDS.items():
-        if module not in wanted:
-            subparsers.add_parser(name, help=summary)
-        elif module not in added:  # a module adds all its commands
-            importlib.import_module(f"sonarpost.{module}").add_parser(subparsers)
-            added.add(module)
-    for name, each in added_commands().working().items():
-        if " " not in name:
-            if command in (None, name):
-                each.add(subparsers)
-            else:
-                subparsers.add_parser(name, help=each.summary.replace("%", "%%"))
+    first_words = {name: name.partition(" ")[0] for name in commands().names()}
+    is_known = command in first_words
+    for name, each in commands().working(lambda n: n in COMMANDS or not is_known or first_words[n] == command).items():
+        is_wanted = command in (None, first_words[name])
+        parent, _, last = name.rpartition(" ")
+        above = whole.tree().get(parent)
+        if above is None or last in above.actions:
+            log.warning(
+                "Command ignored: %s = %s: its name is taken, or it is an action of no command", name, each.options
+            )
+        elif is_wanted or not parent:
+            action = above.add_action(
+                last, each.summary, example=each.example, metavar="COMMAND" if above is whole else "ACTION"
+            )
+            if is_wanted:
+                _add_options(action, name, each, is_required=name == command)
     return whole
+
+
+def _add_options(action: CommandParser, name: str, command: CommandSpec, *, is_required: bool) -> None:
+    """Import a command and add its options; one of a plug-in that cannot be used is reported in the log."""
+    try:
+        EntryPoint(name, command.options, GROUP).load()(action)
+    except (Exception, SystemExit) as error:  # foreign code can raise any exception, and call `sys.exit`
+        if name in COMMANDS:
+            raise
+        value, expected = f"{command.options} ({error!r})", "a function that adds options"
+        failure = ConfigError(f"entry point {GROUP}:{name}", "options", value, expected)
+        if is_required:
+            raise failure from error
+        log.warning("Command ignored: %s", failure)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -124,7 +145,7 @@ def exit_status(run: Callable[[], int], prog: str = "sonarpost", needed_by: str 
 
 
 def _failed(prog: str, error: Exception, text: str = "") -> int:
-    logging.getLogger(__name__).debug("Command failed", exc_info=error)
+    log.debug("Command failed", exc_info=error)
     print(f"{prog}: {text or error}", file=sys.stderr)
     return EXIT_ERROR
 

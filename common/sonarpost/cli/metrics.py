@@ -9,7 +9,8 @@ import threading
 from prometheus_client import MetricsHandler
 
 from sonarpost import logs
-from sonarpost.cli.shared import Subparsers, add_router_options, log_level, router_of
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import add_router_options, log_level, option, router_of
 from sonarpost.errors import PortError
 from sonarpost.monitoring.fleet import FleetTracker, FleetWatcher
 from sonarpost.monitoring.metrics import FleetCollector, registry_of
@@ -21,31 +22,17 @@ log = logging.getLogger(__name__)
 DEFAULT_PORT = 9464
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser(
-        "metrics",
-        help="serve the health of all platforms to Prometheus",
-        description="Serve http://ADDRESS:PORT/metrics with the health of all services of all platforms at a router.",
+    parser.description = (
+        "Serve http://ADDRESS:PORT/metrics with the health of all services of all platforms at a router."
     )
     add_router_options(parser)
-    parser.add_argument("--address", default="127.0.0.1", help="address to listen on (default: %(default)s)")
-    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="port to listen on (default: %(default)s)")
-    parser.add_argument(
-        "--stale-after",
-        type=float,
-        default=30.0,
-        metavar="S",
-        help="age of a health record at which its values are removed (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--forget-after",
-        type=float,
-        default=3600.0,
-        metavar="S",
-        help="time after which all metrics of a stopped service are removed (default: %(default)s)",
-    )
-    parser.add_argument("--log-format", choices=("text", "json"), default="text", help="format of log lines")
+    option(parser, "--address", "address to listen on", default="127.0.0.1")
+    option(parser, "--port", "port to listen on", int, DEFAULT_PORT)
+    option(parser, "--stale-after S", "age of a health record at which its values are removed", float, 30.0)
+    option(parser, "--forget-after S", "time after which all metrics of a stopped service are removed", float, 3600.0)
+    option(parser, "--log-format", "format of log lines", default="text", choices=("text", "json"))
     parser.set_defaults(run=run)
 
 

@@ -13,7 +13,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
-from sonarpost.cli.shared import Subparsers, add_command, aligned, in_new_folder
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import flag, in_new_folder, option, print_table
 from sonarpost.config import read_passphrase
 from sonarpost.files import PUBLIC_FILE, write_atomically, write_new
 from sonarpost.keys import SHORE
@@ -36,140 +37,146 @@ EXIT_ENDING = 1
 UPDATE_ROUTERS = "write the routers' configurations again (`sonarpost pki router-config`) and restart them"
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the command and its actions."""
-    actions = add_command(
-        subparsers, "pki", "certificates of the fleet, access control of its routers, key of its acoustic link"
+def add_actions(parser: CommandParser) -> None:
+    """Add the actions."""
+    init = _add_action(
+        parser, "init", "create the fleet's authority in a new folder", run_init, "--dir fleet --fleet north"
     )
-
-    init = _add_action(actions, "init", run_init, "create the fleet's authority in a new folder")
-    init.add_argument("--fleet", default="sonarpost", metavar="NAME", help="name of the fleet")
-    init.add_argument("--days", type=int, default=AUTHORITY_DAYS, help=f"validity in days (default: {AUTHORITY_DAYS})")
+    option(init, "--fleet NAME", "name of the fleet", default="sonarpost")
+    option(init, "--days", "validity in days", int, AUTHORITY_DAYS)
     _add_passphrase_file(init)
-    init.add_argument("--ask-passphrase", action="store_true", help="ask for a passphrase at the terminal")
+    flag(init, "--ask-passphrase", "ask for a passphrase at the terminal")
 
-    issue = _add_action(actions, "issue", run_issue, "issue a platform's certificate")
-    issue.add_argument("platform", help="name of the platform, `id` in its [platform] table")
-    issue.add_argument("--role", choices=ROLES, required=True, help="role, which determines the rights at routers")
+    issue = _add_action(
+        parser,
+        "issue",
+        "issue a platform's certificate",
+        run_issue,
+        "vessel-1 --dir fleet --role vessel --host 192.0.2.1",
+    )
+    option(issue, "platform", "name of the platform, `id` in its [platform] table")
+    option(issue, "--role", "role, which determines the rights at routers", choices=ROLES, required=True)
     _add_certificate_options(issue)
 
-    prepare = _add_action(actions, "prepare", run_prepare, "let routers admit platforms that get certificates later")
-    prepare.add_argument("platforms", nargs="+", metavar="PLATFORM", help="names of the platforms")
-    prepare.add_argument("--role", choices=ROLES, required=True, help="role that their certificates will have")
+    prepare = _add_action(
+        parser,
+        "prepare",
+        "let routers admit platforms that get certificates later",
+        run_prepare,
+        "uuv-8 uuv-9 --dir fleet --role uuv",
+    )
+    option(prepare, "platforms PLATFORM", "names of the platforms", nargs="+")
+    option(prepare, "--role", "role that their certificates will have", choices=ROLES, required=True)
 
-    renew = _add_action(actions, "renew", run_renew, "issue a new key and certificate under the present name")
-    renew.add_argument("platform", help="name of the platform")
+    renew = _add_action(
+        parser,
+        "renew",
+        "issue a new key and certificate under the present name",
+        run_renew,
+        "vessel-1 --dir fleet --out vessel-1-2027",
+    )
+    option(renew, "platform", "name of the platform")
     _add_certificate_options(renew)
 
-    revoke = _add_action(actions, "revoke", run_revoke, "remove a platform's name from access control permanently")
-    revoke.add_argument("platform", help="name of the platform")
-    revoke.add_argument("--reason", default="", help="reason of the revocation, for `list`")
-
-    listing = _add_action(actions, "list", run_list, "list all certificates; exit status 1 if one in use ends soon")
-    listing.add_argument("--json", action="store_true", help="print one JSON object for each certificate")
-    listing.add_argument(
-        "--warn-days", type=float, default=WARN_DAYS, metavar="DAYS", help="a certificate ends soon within DAYS (30)"
+    revoke = _add_action(
+        parser,
+        "revoke",
+        "remove a platform's name from access control permanently",
+        run_revoke,
+        "vessel-1 --dir fleet --reason 'computer lost'",
     )
+    option(revoke, "platform", "name of the platform")
+    option(revoke, "--reason", "reason of the revocation, for `list`", default="")
 
-    router = _add_action(actions, "router-config", run_router_config, "write a router's configuration (JSON5)")
+    listing = _add_action(
+        parser, "list", "list all certificates; exit status 1 if one in use ends soon", run_list, "--dir fleet"
+    )
+    flag(listing, "--json", "print one JSON object for each certificate")
+    option(listing, "--warn-days DAYS", "a certificate ends soon within DAYS", float, WARN_DAYS)
+
+    router = _add_action(
+        parser,
+        "router-config",
+        "write a router's configuration (JSON5)",
+        run_router_config,
+        "--dir fleet --platform vessel-1 --out vessel-1.json5",
+    )
     _add_router_options(router)
 
-    acoustic = _add_action(actions, "acoustic", run_acoustic, "create the key of the acoustic link")
-    acoustic.add_argument("--out", type=Path, metavar="FILE", help=f"key file (default: DIR/{KEY_NAME})")
-    acoustic.add_argument(
-        "--replace", action="store_true", help="overwrite an existing key, which every vehicle and vessel must replace"
-    )
+    acoustic = _add_action(parser, "acoustic", "create the key of the acoustic link", run_acoustic, "--dir fleet")
+    option(acoustic, "--out FILE", f"key file (default: DIR/{KEY_NAME})", Path)
+    flag(acoustic, "--replace", "overwrite an existing key, which every vehicle and vessel must replace")
 
 
 def _add_action(
-    actions: Subparsers,
-    name: str,
-    run: Callable[[argparse.Namespace], int],
-    text: str,
-) -> argparse.ArgumentParser:
-    parser = actions.add_parser(name, allow_abbrev=False, help=text)
-    parser.add_argument(
-        "--dir",
-        type=Path,
-        default=DEFAULT_FOLDER,
-        dest="folder",
-        metavar="DIR",
-        help="authority's folder (default: pki)",
-    )
-    parser.set_defaults(run=run)
-    return parser
+    parser: CommandParser, name: str, text: str, run: Callable[[argparse.Namespace], int], example: str
+) -> CommandParser:
+    action = parser.add_action(name, text, run, example)
+    action.allow_abbrev = False
+    option(action, "--dir DIR", "authority's folder", Path, DEFAULT_FOLDER, dest="folder")
+    return action
 
 
 def _add_certificate_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--host",
+    option(
+        parser,
+        "--host NAME_OR_ADDRESS",
+        "DNS name or IP address of its router; can be repeated",
         action="append",
         dest="hosts",
-        metavar="NAME_OR_ADDRESS",
-        help="DNS name or IP address of its router; can be repeated",
     )
-    parser.add_argument(
-        "--days", type=float, default=CERTIFICATE_DAYS, help=f"days of validity (default: {CERTIFICATE_DAYS:g})"
-    )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="new folder for its files (default: DIR/issued/NAME)")
+    option(parser, "--days", "days of validity", float, CERTIFICATE_DAYS)
+    option(parser, "--out DIR", "new folder for its files (default: DIR/issued/NAME)", Path)
     _add_passphrase_file(parser)
 
 
 def _add_passphrase_file(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--passphrase-file", type=Path, metavar="FILE", help="file with the passphrase of the key in its first line"
-    )
+    option(parser, "--passphrase-file FILE", "file with the passphrase of the key in its first line", Path)
 
 
 def _add_router_options(parser: argparse.ArgumentParser) -> None:
     default = RouterOptions("")
-    parser.add_argument("--platform", required=True, help="platform of the router")
-    parser.add_argument(
-        "--listen", nargs="*", default=[], metavar="ENDPOINT", help="endpoint for other platforms: tls/ADDRESS:PORT"
-    )
-    parser.add_argument(
-        "--local",
-        nargs="*",
+    option(parser, "--platform", "platform of the router", required=True)
+    option(parser, "--listen ENDPOINT", "endpoint for other platforms: tls/ADDRESS:PORT", default=[], nargs="*")
+    option(
+        parser,
+        "--local ENDPOINT",
+        f"endpoint of the platform's own services, no certificates (default: {', '.join(default.local)})",
         default=list(default.local),
-        metavar="ENDPOINT",
-        help=f"endpoint of the platform's own services, no certificates (default: {', '.join(default.local)})",
+        nargs="*",
     )
-    parser.add_argument(
+    flag(
+        parser,
         "--open-local",
-        action="store_true",
-        help="accept other addresses than loopback in --local, for a network that no other program can reach",
+        "accept other addresses than loopback in --local, for a network that no other program can reach",
     )
-    parser.add_argument(
-        "--connect", nargs="*", default=[], metavar="ENDPOINT", help="routers to link to: tls/HOST:PORT"
+    option(parser, "--connect ENDPOINT", "routers to link to: tls/HOST:PORT", default=[], nargs="*")
+    option(
+        parser,
+        "--files DIR",
+        "folder of ca.pem, certificate.pem and key.pem on the router's host",
+        PurePosixPath,
+        TLS_FOLDER,
     )
-    parser.add_argument(
-        "--files",
-        type=PurePosixPath,
-        default=TLS_FOLDER,
-        metavar="DIR",
-        help=f"folder of ca.pem, certificate.pem and key.pem on the router's host ({TLS_FOLDER})",
-    )
-    parser.add_argument(
-        "--site", action="append", dest="sites", metavar="NAME", help=f"name of the shore site in keys ({SHORE})"
-    )
-    parser.add_argument(
-        "--other-vessel",
+    option(parser, "--site NAME", f"name of the shore site in keys ({SHORE})", action="append", dest="sites")
+    option(
+        parser,
+        "--other-vessel NAME",
+        "vessel whose acoustic frames this lead vessel merges; can be repeated",
         action="append",
         dest="other_vessels",
-        metavar="NAME",
-        help="vessel whose acoustic frames this lead vessel merges; can be repeated",
     )
-    parser.add_argument("--lead-vessel", default="", metavar="NAME", help="lead vessel that merges the acoustic frames")
-    parser.add_argument(
+    option(parser, "--lead-vessel NAME", "lead vessel that merges the acoustic frames", default="")
+    flag(
+        parser,
         "--thin-link",
-        action="store_true",
-        help="for a link of a few kB/s, at both routers: compress it; a vessel's router also sends other platforms "
+        "for a link of a few kB/s, at both routers: compress it; a vessel's router also sends other platforms "
         "only every second health report of a service, one in 10 s with the default health_interval_s of 5 s. "
         "Console and `sonarpost status` show a service as silent or stale after 15 s without one. Images, decisions "
         "and commands are all sent",
     )
-    parser.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: standard output)")
-    parser.add_argument("--replace", action="store_true", help="overwrite an existing file")
+    option(parser, "--out FILE", "file to write (default: standard output)", Path)
+    flag(parser, "--replace", "overwrite an existing file")
 
 
 def run_init(args: argparse.Namespace) -> int:
@@ -301,11 +308,10 @@ def _state(entry: CertificateEntry, warn_days: float, now_utc_s: float, *, in_us
 
 
 def _print_table(rows: Sequence[tuple[CertificateEntry, str]]) -> None:
-    lines = [("name", "role", "state", "valid to", "serial", "hosts")] + [
+    lines = [
         (e.common_name, e.role, state, f"{e.not_after:%Y-%m-%d}", e.serial[:16], " ".join(e.hosts)) for e, state in rows
     ]
-    for line in aligned(lines):
-        print(line)
+    print_table([("name", "role", "state", "valid to", "serial", "hosts"), *lines])
 
 
 def _show(bundle: Bundle) -> None:

@@ -7,19 +7,17 @@ import logging
 import sys
 import time
 
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers
 from sonarpost.codec.jit import NO_FOLDER, compilation_log
 from sonarpost.codec.machine_code import prepare_machine_code
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        "prepare",
-        help="compile the machine code of the codecs in advance",
-        description="Compiles the machine code of the codecs emb and vq and stores it on disk, so that the first image "
-        "does not wait for the compiler. Run it once for each installation.",
+    parser.description = (
+        "Compiles the machine code of the codecs emb and vq and stores it on disk, so that the first image "
+        "does not wait for the compiler. Run it once for each installation."
     )
     parser.set_defaults(run=run)
 

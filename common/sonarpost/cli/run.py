@@ -12,7 +12,8 @@ from pathlib import Path
 from sonarpost import logs
 from sonarpost.bus import router
 from sonarpost.cli.deployment import run_all
-from sonarpost.cli.shared import Subparsers, add_survey_options, log_level, survey_options_of
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import add_survey_options, log_level, option, survey_options_of
 from sonarpost.config import ENVIRONMENT_PREFIX, service_packages
 from sonarpost.errors import ConfigError
 
@@ -23,19 +24,21 @@ restarted after 1, 2, 4, ... 60 s; one that ends with status 2, an invalid confi
 systemd (`sonarpost install-units`)."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the subcommands."""
-    run = subparsers.add_parser(
-        "run", help="run one service of the chain, or all services of a platform", description=_DESCRIPTION
-    )
-    run.add_argument("service", choices=("all", *service_packages()), help="name of the service, or all")
-    run.add_argument("--config", type=Path, required=True, help="TOML file of the platform")
-    add_survey_options(run)
-    run_all.add_options(run)
-    run.set_defaults(run=run_service)
-    route = subparsers.add_parser("router", help="run an embedded Zenoh router", description=router.__doc__)
-    router.add_arguments(route)
-    route.set_defaults(run=run_router)
+def add_run(parser: CommandParser) -> None:
+    """Add the options of `run`."""
+    parser.description = _DESCRIPTION
+    option(parser, "service", "name of the service, or all", choices=("all", *service_packages()))
+    option(parser, "--config FILE", "TOML file of the platform", Path, required=True)
+    add_survey_options(parser)
+    run_all.add_options(parser)
+    parser.set_defaults(run=run_service)
+
+
+def add_router(parser: CommandParser) -> None:
+    """Add the options of `router`."""
+    parser.description = router.__doc__
+    router.add_arguments(parser)
+    parser.set_defaults(run=run_router)
 
 
 def run_service(parsed: argparse.Namespace) -> int:

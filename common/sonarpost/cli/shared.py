@@ -6,10 +6,10 @@ import argparse
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from sonarpost.errors import ConfigError
 from sonarpost.keys import SHORE
@@ -19,28 +19,60 @@ if TYPE_CHECKING:
     from sonarpost.sonar.options import SurveyOptions
     from sonarpost.sonar.source import SurveyInfo
 
-Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # noqa: SLF001  argparse names it so
-"""Group of the parsers of commands or actions."""
-
 DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
 
 
-def add_command(subparsers: Subparsers, name: str, help_text: str) -> Subparsers:
-    """Add a command that consists of actions; return the group of its actions. Without an action it prints its help."""
-    parser = subparsers.add_parser(name, help=help_text)
+def option(
+    container: argparse._ActionsContainer,
+    name: str,
+    text: str,
+    kind: Callable[[str], object] = str,
+    default: object = None,
+    **others: Any,  # noqa: ANN401 those of `add_argument`
+) -> None:
+    """Add an option or a positional argument.
 
-    def show_help(_: argparse.Namespace) -> int:
-        parser.print_help()
-        return 0
+    Args:
+        container: Parser, or group of options.
+        name: `--out FILE`: the option, and what stands for its value in the help; without the latter, its choices.
+        text: Its help; the default is appended unless the text has it.
+        kind: Converts the value.
+        default: Value without the option.
+        others: See `argparse.ArgumentParser.add_argument`.
+    """
+    word, *metavars = name.split(" ")
+    if metavars:
+        others["metavar"] = metavars[0] if len(metavars) == 1 else tuple(metavars)
+    if default not in (None, "", []) and "(default" not in text:
+        text += f" (default: {default:g})" if isinstance(default, float) else " (default: %(default)s)"
+    if kind is not str:
+        others["type"] = kind
+    container.add_argument(word, help=text, default=default, **others)
 
-    parser.set_defaults(run=show_help)
-    return parser.add_subparsers(metavar="ACTION")
+
+def flag(container: argparse._ActionsContainer, name: str, text: str) -> None:
+    """Add an option without a value, False unless it is given."""
+    container.add_argument(name, help=text, action="store_true")
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     """Return the rows as lines with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def print_table(rows: Sequence[Sequence[str]]) -> None:
+    """Print the rows with aligned columns; non-printable characters are replaced by `?`."""
+    for line in aligned(rows):
+        print(printable(line))
+
+
+def print_rejected(problems: Iterable[object]) -> bool:
+    """Print what was rejected on standard error; return whether there is anything."""
+    lines = [f"rejected: {printable(str(problem))}" for problem in problems]
+    for line in lines:
+        print(line, file=sys.stderr)
+    return bool(lines)
 
 
 def in_new_folder(path: Path) -> Path:
@@ -51,21 +83,16 @@ def in_new_folder(path: Path) -> Path:
 
 def add_router_options(parser: argparse.ArgumentParser) -> None:
     """Add --config, --router and the three TLS options."""
-    parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="TOML file of a platform; its router and tls keys are used"
-    )
-    parser.add_argument(
-        "--router",
+    option(parser, "--config FILE", "TOML file of a platform; its router and tls keys are used", Path)
+    option(
+        parser,
+        "--router ENDPOINT",
+        f"router endpoint; several are tried in turn (default: {DEFAULT_ROUTER})",
         action="append",
-        metavar="ENDPOINT",
-        help=f"router endpoint; several are tried in turn (default: {DEFAULT_ROUTER})",
     )
-    for name, help_text in (
-        ("tls-ca", "certificate of the fleet's authority, for tls/… endpoints"),
-        ("tls-certificate", "certificate of this client"),
-        ("tls-key", "private key of this client"),
-    ):
-        parser.add_argument(f"--{name}", type=Path, metavar="PEM", help=help_text)
+    option(parser, "--tls-ca PEM", "certificate of the fleet's authority, for tls/… endpoints", Path)
+    option(parser, "--tls-certificate PEM", "certificate of this client", Path)
+    option(parser, "--tls-key PEM", "private key of this client", Path)
 
 
 def router_of(parsed: argparse.Namespace) -> tuple[tuple[str, ...], TlsConfig | None]:
@@ -100,20 +127,14 @@ def log_level(parsed: argparse.Namespace) -> str:
 
 def add_site_option(parser: argparse.ArgumentParser) -> None:
     """Add --site, the name of the shore site."""
-    parser.add_argument("--site", default=SHORE, metavar="NAME", help=f"name of the shore site (default: {SHORE})")
+    option(parser, "--site NAME", "name of the shore site", default=SHORE)
 
 
 def add_survey_options(parser: argparse.ArgumentParser) -> None:
     """Add --options, --crs and --frequency: what survey files do not contain, and the choice of their channels."""
-    parser.add_argument(
-        "--options", type=Path, metavar="FILE.toml", help="survey options: projection, mounting of the sonar, errors"
-    )
-    parser.add_argument(
-        "--crs", metavar="EPSG:N", help="coordinate system of projected positions; replaces the one in --options"
-    )
-    parser.add_argument(
-        "--frequency", metavar="KHZ", help="frequency of a sonar with several, the nearest one (default: the highest)"
-    )
+    option(parser, "--options FILE.toml", "survey options: projection, mounting of the sonar, errors", Path)
+    option(parser, "--crs EPSG:N", "coordinate system of projected positions; replaces the one in --options")
+    option(parser, "--frequency KHZ", "frequency of a sonar with several, the nearest one (default: the highest)")
 
 
 def survey_options_of(parsed: argparse.Namespace) -> SurveyOptions:
@@ -177,12 +198,12 @@ def utc_text(time_utc_s: float) -> str:
 
 def add_fit_option(parser: argparse.ArgumentParser) -> None:
     """Add --fit, for images of a size that codecs do not accept."""
-    parser.add_argument(
+    option(
+        parser,
         "--fit",
-        choices=("refuse", "crop", "resize"),
+        "images outside 16 to 512 px a side: cut the centre (crop), change the resolution (resize), or report an error",
         default="refuse",
-        help="images outside 16 to 512 px a side: cut the centre (crop), change the resolution (resize), or report an "
-        "error (default: %(default)s)",
+        choices=("refuse", "crop", "resize"),
     )
 
 

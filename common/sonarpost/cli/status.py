@@ -19,7 +19,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sonarpost.cli.shared import Subparsers, add_router_options, aligned, printable, router_of
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import add_router_options, aligned, flag, option, printable, router_of
 from sonarpost.errors import ConfigError
 from sonarpost.monitoring.fleet import FleetState, FleetWatcher, ServiceStatus, VehicleState
 from sonarpost.stop_signals import stop_on_signals
@@ -35,28 +36,24 @@ Severity = Literal["ok", "error", "stale", "gone"]
 _STYLES: dict[Severity, str] = {"ok": "", "error": "bold red", "stale": "yellow", "gone": "dim"}
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser(
-        "status",
-        help="show the services of all platforms, live",
-        description="Show the services of all platforms at a router: state, queues, link, disk; and the position of "
-        "each vehicle that reports its status. Ctrl-C ends it.",
+    parser.description = (
+        "Show the services of all platforms at a router: state, queues, link, disk; and the position of "
+        "each vehicle that reports its status. Ctrl-C ends it."
     )
     add_router_options(parser)
-    parser.add_argument("--once", action="store_true", help="print once; exit status 0 if all services are ok, else 1")
-    parser.add_argument("--json", action="store_true", help="print JSON lines instead of the table")
-    parser.add_argument("--interval", type=float, default=1.0, metavar="S", help="time between updates (default: 1)")
-    parser.add_argument(
-        "--wait",
-        type=float,
-        default=6.0,
-        metavar="S",
-        help="with --once: time limit for health records (default: 6; services publish every 5 s)",
+    flag(parser, "--once", "print once; exit status 0 if all services are ok, else 1")
+    flag(parser, "--json", "print JSON lines instead of the table")
+    option(parser, "--interval S", "time between updates", float, 1.0)
+    option(
+        parser,
+        "--wait S",
+        "with --once: time limit for health records (default: 6; services publish every 5 s)",
+        float,
+        6.0,
     )
-    parser.add_argument(
-        "--stale-after", type=float, default=15.0, metavar="S", help="age at which health is stale (default: 15)"
-    )
+    option(parser, "--stale-after S", "age at which health is stale", float, 15.0)
     parser.set_defaults(run=run)
 
 

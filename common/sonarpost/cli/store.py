@@ -7,7 +7,8 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-from sonarpost.cli.shared import Subparsers, add_command, aligned, in_new_folder, printable, time_text
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import flag, in_new_folder, option, print_table, time_text
 from sonarpost.delivery.inspection import StoreState, inspect
 from sonarpost.delivery.salvage import SalvageResult, TableResult, salvage
 from sonarpost.delivery.schema import VERSION
@@ -28,25 +29,29 @@ reason. --requeue moves received records to the inbox; the service handles them 
 1 if one of the named records cannot be queued, because it is cut, was refused by a consumer, or is no record."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_actions(parser: CommandParser) -> None:
     """Add the command and its actions."""
-    actions = add_command(subparsers, "store", "check the store of a stopped service, and recover a damaged one")
-    check = actions.add_parser("check", help="check a store, and report lost commits", description=_CHECK)
-    check.add_argument("store", type=Path, metavar="STORE", help="store of a service, for example relay.db")
-    check.add_argument(
-        "--clear", action="store_true", help="clear the report of lost commits; the service is no longer degraded"
+    check = parser.add_action("check", "check a store, and report lost commits", run_check, "state/relay.db", _CHECK)
+    option(check, "store STORE", "store of a service, for example relay.db", Path)
+    flag(check, "--clear", "clear the report of lost commits; the service is no longer degraded")
+    copy = parser.add_action(
+        "salvage",
+        "copy the readable rows of a damaged store",
+        run_salvage,
+        "state/relay.db --out relay-new.db",
+        _SALVAGE,
     )
-    check.set_defaults(run=run_check)
-    copy = actions.add_parser("salvage", help="copy the readable rows of a damaged store", description=_SALVAGE)
-    copy.add_argument("store", type=Path, metavar="STORE", help="the damaged store")
-    copy.add_argument("--out", type=Path, required=True, metavar="NEW", help="new store; the file must not exist")
-    copy.set_defaults(run=run_salvage)
-    kept = actions.add_parser("quarantine", help="list quarantined records, queue them again", description=_QUARANTINE)
-    kept.add_argument("store", type=Path, metavar="STORE", help="store of a service, for example c2.db")
-    kept.add_argument(
-        "--requeue", type=int, nargs="*", metavar="ID", help="queue these received records again; all without an ID"
+    option(copy, "store STORE", "the damaged store", Path)
+    option(copy, "--out NEW", "new store; the file must not exist", Path, required=True)
+    kept = parser.add_action(
+        "quarantine",
+        "list quarantined records, queue them again",
+        run_quarantine,
+        "state/c2.db --requeue",
+        _QUARANTINE,
     )
-    kept.set_defaults(run=run_quarantine)
+    option(kept, "store STORE", "store of a service, for example c2.db", Path)
+    option(kept, "--requeue ID", "queue these received records again; all without an ID", int, nargs="*")
 
 
 def run_check(parsed: argparse.Namespace) -> int:
@@ -81,8 +86,7 @@ def _print_state(path: Path, state: StoreState) -> None:
         lines.append(
             ("lost commits", f"records possibly lost: {state.lost}; found {found} UTC; --clear ends the report")
         )
-    for line in aligned(lines):
-        print(printable(line))
+    print_table(lines)
     print()
     rows = [("queue", "records", "bytes", "oldest (UTC)", "age", "last number")]
     now_utc_s = time.time()
@@ -90,8 +94,7 @@ def _print_state(path: Path, state: StoreState) -> None:
         age = "" if queue.oldest_utc_s is None else f"{max(0.0, now_utc_s - queue.oldest_utc_s):.0f} s"
         counts = (str(queue.records), str(queue.size_bytes))
         rows.append((queue.name, *counts, time_text(queue.oldest_utc_s), age, str(queue.last)))
-    for line in aligned(rows):
-        print(printable(line))
+    print_table(rows)
     if state.problems:
         print(f"\nRecover the readable records: sonarpost store salvage {path} --out NEW")
 
@@ -106,8 +109,7 @@ def run_quarantine(parsed: argparse.Namespace) -> int:
         if parsed.requeue is None:
             rows = [("number", "time (UTC)", "direction", "key", "bytes", "reason")]
             rows += [(str(r.id), time_text(r.at_utc_s), r.direction, r.key, str(r.size_bytes), r.reason) for r in found]
-            for line in aligned(rows):
-                print(printable(line))
+            print_table(rows)
             return 0
         wanted = set(parsed.requeue or (record.id for record in found if record.can_be_queued))
         queued = [record.id for record in found if record.id in wanted and record.can_be_queued]
@@ -138,8 +140,7 @@ Replace the damaged store while the service is stopped; leave {path}.watermark w
 def _print_result(result: SalvageResult) -> None:
     rows = [("table", "recovered", "wrong digest", "unreadable")]
     rows += [(t.name, str(t.recovered), str(t.wrong_digest), _unreadable(t)) for t in result.tables]
-    for line in aligned(rows):
-        print(printable(line))
+    print_table(rows)
     if result.first_page:
         part = "header of the first page" if result.first_page == "header" else "first page"
         print(f"The {part} was unreadable and was replaced by that of a new store.")

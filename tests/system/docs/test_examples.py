@@ -25,7 +25,6 @@ import pytest
 from builders.common import REPOSITORY
 
 from sonarpost.cli.main import parser
-from sonarpost.cli.parsing.commands import all_examples
 
 EXTENSIONS = REPOSITORY / "common/sonarpost/extensions"
 
@@ -123,7 +122,7 @@ def usage_error(arguments, capsys):
 
 
 def test_commands_have_valid_arguments(capsys):
-    names = "|".join({name.split()[0] for name in all_examples()})
+    names = "|".join(parser().actions)
     span = re.compile(rf"`(sonarpost (?:{names})\b[^`\[…|{{]*|python -m research\.[^`\[…|{{]*)`")
     for page in PAGES:
         text = (REPOSITORY / page).read_text(encoding="utf-8")

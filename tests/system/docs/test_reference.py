@@ -6,6 +6,7 @@ import re
 import pytest
 import reference
 
+from sonarpost.cli.main import parser
 from sonarpost.config import SERVICES, table_names
 
 
@@ -28,11 +29,11 @@ def test_every_record_key_configuration_key_and_argument_is_described():
         rows = [re.split(r"(?<!\\)\|", line)[1:-1] for line in page.splitlines() if line.startswith("| `")]
         assert all(cells[0].strip() and cells[-1].strip() for cells in rows), name
         assert {cells[0].strip("` ") for cells in rows} >= set(reference.configuration_type(name).model_fields)
-    for command in reference.command_list():
-        assert command.description, command.name
-        for action in command.parser._actions:
+    for name, command in parser().tree().items():
+        assert command.description, name
+        for action in command._actions:
             if not isinstance(action, argparse._SubParsersAction):
-                assert reference.argument_help(action, command.parser), (command.name, action)
+                assert reference.argument_help(action, command), (name, action)
 
 
 @pytest.mark.parametrize("name", SERVICES)

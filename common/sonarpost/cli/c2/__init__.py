@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 from sonarpost.cli.c2 import migrate, stored, tasking, watch
-from sonarpost.cli.parsing.commands import add_actions
-from sonarpost.cli.shared import Subparsers, add_command
-
-__all__ = ["add_parser"]
+from sonarpost.cli.parsing.parser import CommandParser
 
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the command and its actions."""
-    actions = add_command(subparsers, "c2", "list, export and watch the contacts of a shore site; send commands")
+def add_actions(parser: CommandParser) -> None:
+    """Add the actions."""
     for module in (watch, stored, tasking, migrate):
-        module.add_actions(actions)
-    add_actions(actions, "c2")
+        module.add_actions(parser)

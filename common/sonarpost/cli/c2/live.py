@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import zenoh
 
 from sonarpost.cli.c2.watch import RecordSubscription
-from sonarpost.cli.shared import add_router_options, add_site_option
+from sonarpost.cli.shared import add_router_options, add_site_option, option, print_rejected
 from sonarpost.export.contacts import ExportContact, load_contacts
 from sonarpost.export.live import LiveContacts
 from sonarpost.export.source import StoredImages
@@ -34,12 +33,12 @@ def add_live_options(parser: argparse.ArgumentParser) -> None:
     """Add --site, --vessel, --archive and the options of the router."""
     add_site_option(parser)
     add_router_options(parser)
-    parser.add_argument("--vessel", metavar="NAME", help="only this vessel")
-    parser.add_argument(
-        "--archive",
-        type=Path,
-        metavar="DIR",
-        help="folder of c2; its contacts are read at the start and after an interruption, so that none is missed",
+    option(parser, "--vessel NAME", "only this vessel")
+    option(
+        parser,
+        "--archive DIR",
+        "folder of c2; its contacts are read at the start and after an interruption, so that none is missed",
+        Path,
     )
 
 
@@ -91,8 +90,7 @@ class ContactStream:
             ContactChange(replace(contact, image_path=None), images.png(contact))
             for contact in self._contacts.restore(chosen)
         ]
-        for problem in (*stored.problems, *images.problems):
-            print(f"rejected: {problem}", file=sys.stderr)
+        print_rejected((*stored.problems, *images.problems))
         return changes
 
 

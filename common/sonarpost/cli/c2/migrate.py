@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -24,8 +23,9 @@ from sonarpost.archive.shore_database import ShoreDatabase, StoredImage
 from sonarpost.archive.shore_files import decision_path, index_missing_files
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex
 from sonarpost.cli.c2.stored import EXIT_INCOMPLETE, SHORE_CONFIG
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers
+from sonarpost.cli.shared import option, print_rejected
 from sonarpost.config import load
 from sonarpost.errors import ConfigError, StoredFileError
 from sonarpost.services.c2.config import C2Config
@@ -36,20 +36,16 @@ BATCH = 32
 T = TypeVar("T")
 
 
-def add_actions(actions: Subparsers) -> None:
+def add_actions(parser: CommandParser) -> None:
     """Add the action `migrate`."""
-    parser = actions.add_parser(
-        "migrate", help="copy the archive of c2 from its folder into the PostgreSQL database of the configuration"
+    parser = parser.add_action(
+        "migrate",
+        "copy the archive of c2 from its folder into the PostgreSQL database of the configuration",
+        run,
+        "--config shore.toml --archive out",
     )
-    parser.add_argument(
-        "--config",
-        type=Path,
-        default=SHORE_CONFIG,
-        metavar="FILE",
-        help=f"TOML file of the shore site, with `database` in [c2] (default: {SHORE_CONFIG})",
-    )
-    parser.add_argument("--archive", type=Path, metavar="DIR", help="folder of c2 (default: out_dir of the file)")
-    parser.set_defaults(run=run)
+    option(parser, "--config FILE", "TOML file of the shore site, with `database` in [c2]", Path, SHORE_CONFIG)
+    option(parser, "--archive DIR", "folder of c2 (default: out_dir of the file)", Path)
 
 
 def run(parsed: argparse.Namespace) -> int:
@@ -81,9 +77,7 @@ def run(parsed: argparse.Namespace) -> int:
         f" {counts['tasking']}; numbers for queries {counts['numbered']}; compared {counts['compared']};"
         f" rejected {len(migration.problems)}"
     )
-    for problem in migration.problems:
-        print(f"rejected: {problem}", file=sys.stderr)
-    return EXIT_INCOMPLETE if migration.problems else 0
+    return EXIT_INCOMPLETE if print_rejected(migration.problems) else 0
 
 
 class Migration:

@@ -23,8 +23,9 @@ from rich.text import Text
 from sonarpost.archive.reader import ArchivePlace, as_folder, open_reader, place_of, read_image_files
 from sonarpost.archive.shore_files import find_image
 from sonarpost.archive.shore_index import DecisionRow, ImageRow, TaskingRow
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers, in_new_folder, make_output_folder, printable, time_text
+from sonarpost.cli.shared import flag, in_new_folder, make_output_folder, option, print_rejected, printable, time_text
 from sonarpost.config import load
 from sonarpost.errors import BadInputError, ConfigError, DeliveryError
 from sonarpost.export.contacts import ContactSet, ExportContact, load_contacts, match_start_time
@@ -76,48 +77,50 @@ class ListedImage:
     decision: DecisionRow | None
 
 
-def add_actions(actions: Subparsers) -> None:
+def add_actions(parser: CommandParser) -> None:
     """Add the actions `ls`, `get` and `export`."""
-    ls = actions.add_parser("ls", help="list images with their decisions, or commands and comments")
+    ls = parser.add_action(
+        "ls", "list images with their decisions, or commands and comments", run_ls, "--since 24h --json"
+    )
     add_filters(ls)
-    ls.add_argument("--undecided", action="store_true", help="only images without a decision")
-    ls.add_argument("--all-versions", action="store_true", help="all versions of an image, not only the newest")
-    ls.add_argument("--tasking", action="store_true", help="commands and comments, with their delivery state")
-    ls.add_argument("--json", action="store_true", help="print one JSON object for each line")
-    ls.set_defaults(run=run_ls)
+    flag(ls, "--undecided", "only images without a decision")
+    flag(ls, "--all-versions", "all versions of an image, not only the newest")
+    flag(ls, "--tasking", "commands and comments, with their delivery state")
+    flag(ls, "--json", "print one JSON object for each line")
 
-    get = actions.add_parser("get", help="copy the TIFF, PNG and JSON files of one image")
-    get.add_argument("image", metavar="VEHICLE/IMAGE", help="name from `ls`, or the name of the files")
-    get.add_argument("--vessel", metavar="NAME", help="vessel, if two vessels have an image of this name")
-    get.add_argument("--version", type=int, metavar="N", help="version (default: the newest)")
-    get.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="destination (default: current folder)")
+    get = parser.add_action("get", "copy the TIFF, PNG and JSON files of one image", run_get, "uuv-1/0001")
+    option(get, "image VEHICLE/IMAGE", "name from `ls`, or the name of the files")
+    option(get, "--vessel NAME", "vessel, if two vessels have an image of this name")
+    option(get, "--version N", "version (default: the newest)", int)
+    option(get, "--out DIR", "destination (default: current folder)", Path, Path())
     _add_archive(get)
-    get.set_defaults(run=run_get)
 
-    export = actions.add_parser("export", help="write the contacts as GeoJSON, KML, GeoPackage or in another format")
+    export = parser.add_action(
+        "export",
+        "write the contacts as GeoJSON, KML, GeoPackage or in another format",
+        run_export,
+        "--out contacts.geojson --out contacts.kmz",
+    )
     add_filters(export)
-    export.add_argument(
-        "--out",
-        type=Path,
+    option(
+        export,
+        "--out FILE",
+        "file to write, named *." + ", *.".join(exporters().names()) + "; can be repeated",
+        Path,
         action="append",
         required=True,
-        metavar="FILE",
-        help="file to write, named *." + ", *.".join(exporters().names()) + "; can be repeated",
     )
-    export.set_defaults(run=run_export)
 
 
 def _add_archive(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
-    where.add_argument(
-        "--archive",
-        metavar="DIR",
-        help=f"folder of c2, or address of its database, postgresql://USER@HOST/NAME (default: {DEMO_IMAGES} if there"
+    option(
+        where,
+        "--archive DIR",
+        f"folder of c2, or address of its database, postgresql://USER@HOST/NAME (default: {DEMO_IMAGES} if there"
         f" is one, else that of {SHORE_CONFIG}, else out)",
     )
-    where.add_argument(
-        "--config", type=Path, metavar="FILE", help="TOML file of the shore site; its database or out_dir is used"
-    )
+    option(where, "--config FILE", "TOML file of the shore site; its database or out_dir is used", Path)
 
 
 def archive_of(parsed: argparse.Namespace) -> ArchivePlace:
@@ -144,10 +147,10 @@ def archive_of(parsed: argparse.Namespace) -> ArchivePlace:
 def add_filters(parser: argparse.ArgumentParser) -> None:
     """Add the options of `archive_of` and of `RecordFilter`."""
     _add_archive(parser)
-    parser.add_argument("--vessel", metavar="NAME", help="only this vessel")
-    parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle")
-    parser.add_argument("--since", metavar="TIME", help="first received since 90m, 2h or 3d ago, or since a UTC time")
-    parser.add_argument("--until", metavar="TIME", help="first received before such a time")
+    option(parser, "--vessel NAME", "only this vessel")
+    option(parser, "--vehicle NAME", "only this vehicle")
+    option(parser, "--since TIME", "first received since 90m, 2h or 3d ago, or since a UTC time")
+    option(parser, "--until TIME", "first received before such a time")
 
 
 def time_of(option: str, text: str, now_utc_s: float | None = None) -> float:
@@ -342,9 +345,7 @@ def _write_contacts(
             problems += write_export(name, in_new_folder(path), contacts)
         print(f"{path}: {len(contacts.contacts)} contacts, {len(contacts.unlocated)} of them without a position")
     _mark_exported(place, contacts.contacts)
-    for problem in problems:
-        print(f"rejected: {problem}", file=sys.stderr)
-    return EXIT_INCOMPLETE if problems else 0
+    return EXIT_INCOMPLETE if print_rejected(problems) else 0
 
 
 def _export_files(parsed: argparse.Namespace) -> list[tuple[str, Path]]:

@@ -13,7 +13,8 @@ from pydantic import ValidationError
 
 from sonarpost import keys
 from sonarpost.bus.session import open_with_retry
-from sonarpost.cli.shared import Subparsers, add_router_options, add_site_option, router_of
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import add_router_options, add_site_option, option, router_of
 from sonarpost.delivery.client import deliver
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import Command, CommandKind, Comment, QueuePlace, Record, Verdict
@@ -22,48 +23,50 @@ from sonarpost.wire import first_error
 CONSUMER = "c2"
 
 
-def add_actions(actions: Subparsers) -> None:
+def add_actions(parser: CommandParser) -> None:
     """Add the actions `command` and `comment`."""
-    command = actions.add_parser(
-        "command", help="request more detail, a lost image part, more seabed, the unfiltered image or a revisit"
+    command = parser.add_action(
+        "command",
+        "request more detail, a lost image part, more seabed, the unfiltered image or a revisit",
+        run_command,
+        "uuv-1/0001 --vessel vessel-1 --kind refine",
     )
     _add_common_options(command)
-    command.add_argument(
-        "--kind",
+    option(
+        command,
+        "--kind KIND",
+        "refine (more detail), resend (lost parts), expand (more seabed around the contact), original (the image"
+        " without despeckling), region (a part of the image), prioritise (move it in the transmit queue) or revisit",
         required=True,
         choices=get_args(CommandKind),
-        metavar="KIND",
-        help="refine (more detail), resend (lost parts), expand (more seabed around the contact), original (the image"
-        " without despeckling), region (a part of the image), prioritise (move it in the transmit queue) or revisit",
     )
-    command.add_argument("--lat", type=float, metavar="DEG", help="latitude to revisit")
-    command.add_argument("--lon", type=float, metavar="DEG", help="longitude to revisit")
-    command.add_argument(
-        "--box",
-        type=int,
-        nargs=4,
-        metavar=("TOP", "LEFT", "BOTTOM", "RIGHT"),
-        help="edges of the region in 1/32 of the sides of the image",
+    option(command, "--lat DEG", "latitude to revisit", float)
+    option(command, "--lon DEG", "longitude to revisit", float)
+    option(
+        command, "--box TOP LEFT BOTTOM RIGHT", "edges of the region in 1/32 of the sides of the image", int, nargs=4
     )
-    command.add_argument("--bytes", type=int, metavar="N", help="length of the stream of the region")
-    command.add_argument("--place", choices=get_args(QueuePlace), help="place in the transmit queue")
-    command.set_defaults(run=run_command)
-    comment = actions.add_parser("comment", help="send an expert's comment on an image to the operator of a vessel")
+    option(command, "--bytes N", "length of the stream of the region", int)
+    option(command, "--place", "place in the transmit queue", choices=get_args(QueuePlace))
+    comment = parser.add_action(
+        "comment",
+        "send an expert's comment on an image to the operator of a vessel",
+        run_comment,
+        "uuv-1/0001 --vessel vessel-1 --verdict mine_like --remark 'same as last year'",
+    )
     _add_common_options(comment)
-    comment.add_argument("--version", type=int, default=1, metavar="N", help="version of the image (default: 1)")
-    comment.add_argument("--verdict", choices=get_args(Verdict), help="verdict of the expert")
-    comment.add_argument("--confidence", type=float, metavar="P", help="0 to 1")
-    comment.add_argument("--class", dest="mlo_class", metavar="TEXT", help="class of mine-like object")
-    comment.add_argument("--remark", default="", metavar="TEXT", help="free text")
-    comment.set_defaults(run=run_comment)
+    option(comment, "--version N", "version of the image", int, 1)
+    option(comment, "--verdict", "verdict of the expert", choices=get_args(Verdict))
+    option(comment, "--confidence P", "0 to 1", float)
+    option(comment, "--class TEXT", "class of mine-like object", dest="mlo_class")
+    option(comment, "--remark TEXT", "free text", default="")
 
 
 def _add_common_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("image", metavar="VEHICLE[/IMAGE]", help="name from `ls`")
-    parser.add_argument("--vessel", required=True, metavar="NAME", help="vessel to send to")
-    parser.add_argument("--author", default=None, metavar="NAME", help="author (default: login name)")
-    parser.add_argument("--id", metavar="TEXT", help="identifier; c2 accepts a record with one identifier once")
-    parser.add_argument("--timeout", type=float, default=10.0, metavar="S", help="time limit to reach c2 (default: 10)")
+    option(parser, "image VEHICLE[/IMAGE]", "name from `ls`")
+    option(parser, "--vessel NAME", "vessel to send to", required=True)
+    option(parser, "--author NAME", "author (default: login name)", default=None)
+    option(parser, "--id TEXT", "identifier; c2 accepts a record with one identifier once")
+    option(parser, "--timeout S", "time limit to reach c2", float, 10.0)
     add_site_option(parser)
     add_router_options(parser)
 

@@ -15,7 +15,16 @@ import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import lost_reason, open_with_retry
-from sonarpost.cli.shared import Subparsers, add_router_options, add_site_option, printable, router_of, time_text
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import (
+    add_router_options,
+    add_site_option,
+    flag,
+    option,
+    printable,
+    router_of,
+    time_text,
+)
 from sonarpost.errors import PayloadError
 from sonarpost.limits import Turns, limit
 from sonarpost.messages import Decision, ReconstructedImage, Record, TaskingState
@@ -27,15 +36,19 @@ MAX_WAITING: Final = limit(
 DISCONNECTED_AFTER_S = 1.0
 
 
-def add_actions(actions: Subparsers) -> None:
+def add_actions(parser: CommandParser) -> None:
     """Add the action `watch`."""
-    parser = actions.add_parser("watch", help="print a line for each accepted record, live; Ctrl-C ends it")
+    parser = parser.add_action(
+        "watch",
+        "print a line for each accepted record, live; Ctrl-C ends it",
+        run,
+        "--router tcp/127.0.0.1:7447 --count 1",
+    )
     add_site_option(parser)
     add_router_options(parser)
-    parser.add_argument("--vessel", metavar="NAME", help="only this vessel")
-    parser.add_argument("--json", action="store_true", help="print one JSON object for each line")
-    parser.add_argument("--count", type=int, metavar="N", help="end after N lines")
-    parser.set_defaults(run=run)
+    option(parser, "--vessel NAME", "only this vessel")
+    flag(parser, "--json", "print one JSON object for each line")
+    option(parser, "--count N", "end after N lines", int)
 
 
 def run(parsed: argparse.Namespace) -> int:

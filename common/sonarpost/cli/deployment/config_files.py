@@ -12,7 +12,8 @@ from importlib.metadata import EntryPoint
 from importlib.resources import files
 from pathlib import Path
 
-from sonarpost.cli.shared import Subparsers, add_command
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import flag, option
 from sonarpost.config import SERVICE_GROUP, ConfigFile, PlatformConfig, ServiceConfig, service_packages
 from sonarpost.errors import BadInputError, ConfigError
 from sonarpost.files import PUBLIC_FILE, write_atomically
@@ -31,17 +32,18 @@ sonarpost config check FILE`. Exit status: 0 if all services accept the file, 2 
 absent serial device, does not change the status."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_actions(parser: CommandParser) -> None:
     """Add the command and its actions."""
-    actions = add_command(subparsers, "config", "print an example configuration; check a configuration file")
-    example = actions.add_parser("example", help="print an example configuration", description=_EXAMPLE)
-    example.add_argument("name", choices=sorted(example_files()), help="name of the example")
-    example.add_argument("--out", type=Path, metavar="FILE", help="write it to a file instead")
-    example.add_argument("--force", action="store_true", help="replace an existing file")
-    example.set_defaults(run=run_example)
-    check = actions.add_parser("check", help="check a configuration file, and print all errors", description=_CHECK)
-    check.add_argument("config", type=Path, metavar="FILE", help="TOML file of a platform")
-    check.set_defaults(run=run_check)
+    example = parser.add_action(
+        "example", "print an example configuration", run_example, "uuv --out uuv.toml", _EXAMPLE
+    )
+    option(example, "name", "name of the example", choices=sorted(example_files()))
+    option(example, "--out FILE", "write it to a file instead", Path)
+    flag(example, "--force", "replace an existing file")
+    check = parser.add_action(
+        "check", "check a configuration file, and print all errors", run_check, "uuv.toml", _CHECK
+    )
+    option(check, "config FILE", "TOML file of a platform", Path)
 
 
 def example_files() -> Mapping[str, str]:

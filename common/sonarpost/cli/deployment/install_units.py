@@ -14,7 +14,8 @@ from importlib.resources import files
 from pathlib import Path
 
 from sonarpost.cli.deployment.config_files import PLATFORMS, example_files
-from sonarpost.cli.shared import Subparsers
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import flag, option
 from sonarpost.config import ConfigFile
 from sonarpost.errors import ConfigError
 from sonarpost.files import PUBLIC_FILE, write_atomically
@@ -30,33 +31,22 @@ _CHECKSUM = "# written by sonarpost install-units, SHA-256 of the lines above: "
 _DROP_INS = {"uuv_modem": "modem", "op_modem": "modem", "compressor": "codec", "decompressor": "codec"}
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the command."""
-    parser = subparsers.add_parser(
-        "install-units", help="write the systemd units of a platform", description=_DESCRIPTION
+    parser.description = _DESCRIPTION
+    option(parser, "platform", "kind of the platform", choices=PLATFORMS)
+    option(parser, "--config FILE", f"TOML file of the platform (default: {CONFIG_FOLDER}/PLATFORM.toml)", Path)
+    option(
+        parser,
+        "--router-config FILE",
+        f"JSON5 file of the router (default: {CONFIG_FOLDER}/router-PLATFORM.json5)",
+        Path,
     )
-    parser.add_argument("platform", choices=PLATFORMS, help="kind of the platform")
-    parser.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help=f"TOML file of the platform (default: {CONFIG_FOLDER}/PLATFORM.toml)",
-    )
-    parser.add_argument(
-        "--router-config",
-        type=Path,
-        metavar="FILE",
-        help=f"JSON5 file of the router (default: {CONFIG_FOLDER}/router-PLATFORM.json5)",
-    )
-    parser.add_argument("--user", default="sonarpost", metavar="NAME", help="user of the services (default: sonarpost)")
-    parser.add_argument(
-        "--executable", type=Path, metavar="PATH", help="the sonarpost command (default: the one that is running)"
-    )
-    parser.add_argument(
-        "--root", type=Path, default=Path("/"), metavar="DIR", help="root of the file system to write to (default: /)"
-    )
-    parser.add_argument("--force", action="store_true", help="replace edited files")
-    parser.add_argument("--dry-run", action="store_true", help="print the files instead of writing them")
+    option(parser, "--user NAME", "user of the services", default="sonarpost")
+    option(parser, "--executable PATH", "the sonarpost command (default: the one that is running)", Path)
+    option(parser, "--root DIR", "root of the file system to write to", Path, Path("/"))
+    flag(parser, "--force", "replace edited files")
+    flag(parser, "--dry-run", "print the files instead of writing them")
     parser.set_defaults(run=run)
 
 
@@ -71,8 +61,8 @@ def run(parsed: argparse.Namespace) -> int:
     router_config = (parsed.router_config or CONFIG_FOLDER / f"router-{platform}.json5").absolute()
     if not re.fullmatch(r"[a-z_][a-z0-9_-]{0,30}", parsed.user):
         raise ConfigError("command line", "--user", parsed.user, "the name of a user: a-z, 0-9, _ and -")
-    for option, path in (("--config", config), ("--router-config", router_config)):
-        _require_visible(option, path)
+    for name, path in (("--config", config), ("--router-config", router_config)):
+        _require_visible(name, path)
     root: Path = parsed.root.absolute()
     executable = _executable(parsed.executable, root)
     units = unit_files(
@@ -182,12 +172,12 @@ def _executable(given: Path | None, root: Path) -> Path:
     return path
 
 
-def _require_visible(option: str, path: Path) -> None:
+def _require_visible(name: str, path: Path) -> None:
     if path.parts[1] in HIDDEN_FOLDERS:
         expected = (
             "a path that services can read, for example in /opt or /etc: the units hide /home, /root and /run/user"
         )
-        raise ConfigError("command line", option, str(path), expected)
+        raise ConfigError("command line", name, str(path), expected)
 
 
 def _quoted(path: Path) -> str:

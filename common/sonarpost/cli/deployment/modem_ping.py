@@ -6,7 +6,8 @@ import argparse
 import queue
 import time
 
-from sonarpost.cli.shared import Subparsers, add_command
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import option
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.modem import interface as ev
 from sonarpost.modem.interface import ModemEvent, RangeMeasured
@@ -27,18 +28,22 @@ the port first. Exit status: 0 if every ping was answered, 1 if one was not, 2 i
 in use or the modem itself does not reply."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_actions(parser: CommandParser) -> None:
     """Add the command and its action."""
-    actions = add_command(subparsers, "modem", "test a modem without services")
-    ping = actions.add_parser("ping", help="measure the travel time to another modem", description=_PING)
-    ping.add_argument("--port", required=True, metavar="URL", help="as in the configuration, for example /dev/ttyUSB0")
-    ping.add_argument("--baud", type=int, default=19200, metavar="B", help="of the serial line (default: 19200)")
-    ping.add_argument("--address", type=int, required=True, metavar="N", help="address to give to this modem")
-    ping.add_argument("--driver", default=DEFAULT_DRIVER, metavar="NAME", help="of the modem (default: %(default)s)")
-    ping.add_argument("--destination", type=int, required=True, metavar="N", help="address of the other modem")
-    ping.add_argument("--count", type=int, default=3, metavar="N", help="number of pings (default: 3)")
-    ping.add_argument("--wait", type=float, default=30.0, metavar="S", help="maximum wait for this modem (default: 30)")
-    ping.set_defaults(run=run)
+    ping = parser.add_action(
+        "ping",
+        "measure the travel time to another modem",
+        run,
+        "--port /dev/ttyUSB0 --address 3 --destination 1",
+        _PING,
+    )
+    option(ping, "--port URL", "as in the configuration, for example /dev/ttyUSB0", required=True)
+    option(ping, "--baud B", "of the serial line", int, 19200)
+    option(ping, "--address N", "address to give to this modem", int, required=True)
+    option(ping, "--driver NAME", "of the modem", default=DEFAULT_DRIVER)
+    option(ping, "--destination N", "address of the other modem", int, required=True)
+    option(ping, "--count N", "number of pings", int, 3)
+    option(ping, "--wait S", "maximum wait for this modem", float, 30.0)
 
 
 def run(parsed: argparse.Namespace) -> int:

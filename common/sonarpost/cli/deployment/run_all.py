@@ -16,6 +16,7 @@ from typing import IO
 from sonarpost.bus.connectivity import ConnectivityState, probe_endpoint
 from sonarpost.cli.deployment.config_files import EXIT_INVALID, check_file, print_problems
 from sonarpost.cli.deployment.processes import STOP_S, Processes
+from sonarpost.cli.shared import option
 from sonarpost.config import PlatformConfig, service_packages
 from sonarpost.errors import ConfigError
 from sonarpost.monitoring.heartbeat import VARIABLE as HEARTBEAT_VARIABLE
@@ -34,19 +35,19 @@ _LOOPBACK = re.compile(r"tcp/(127\.[0-9.]+|localhost|\[::1\]):[0-9]+")
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `run all`."""
-    parser.add_argument(
-        "--router-config",
-        type=Path,
-        metavar="FILE",
-        help="with all: JSON5 file of the router (default: it listens on the endpoints of `router` and connects to "
+    option(
+        parser,
+        "--router-config FILE",
+        "with all: JSON5 file of the router (default: it listens on the endpoints of `router` and connects to "
         "those of `upstream`)",
+        Path,
     )
-    parser.add_argument(
-        "--listen",
-        action="append",
+    option(
+        parser,
+        "--listen ENDPOINT",
+        "with all: another endpoint of the router, for example tcp/0.0.0.0:7448 for the vessels of a shore site",
         default=[],
-        metavar="ENDPOINT",
-        help="with all: another endpoint of the router, for example tcp/0.0.0.0:7448 for the vessels of a shore site",
+        action="append",
     )
 
 

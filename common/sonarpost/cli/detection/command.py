@@ -24,12 +24,14 @@ from sonarpost.cli.detection.images import add_image_options, check_image_option
 from sonarpost.cli.detection.picks import add_pick_option, contacts_of_picks, located_picks
 from sonarpost.cli.detection.seabed import seabed_json, seabed_text
 from sonarpost.cli.detection.transmissions import add_transmission_options, transmissions_of
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import (
-    Subparsers,
     add_survey_options,
+    flag,
     in_new_folder,
     make_output_folder,
+    option,
     survey_options_of,
 )
 from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
@@ -64,48 +66,37 @@ _GROUND_PIXEL_M = 0.1
 _MAP_SIDE_M = 20
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser(
-        "detect",
-        help="detect contacts in survey files, or in a folder of images",
-        description="Detect highlights with shadows in side-scan surveys and list them, most confident first. Files "
+    parser.description = (
+        "Detect highlights with shadows in side-scan surveys and list them, most confident first. Files "
         "that continue each other are one line: an object at a file boundary is listed once. With --images, "
-        "score every image of a folder.",
+        "score every image of a folder."
     )
-    parser.add_argument("files", nargs="*", type=Path, metavar="FILE", help="survey file")
+    option(parser, "files FILE", "survey file", Path, nargs="*")
     add_image_options(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON object with all contacts or scores")
-    parser.add_argument(
-        "--plot",
-        type=Path,
-        metavar="FILE.png",
-        help="draw the contacts into the waterfall; with several survey files, the name of each precedes the suffix",
+    flag(parser, "--json", "print one JSON object with all contacts or scores")
+    option(
+        parser,
+        "--plot FILE.png",
+        "draw the contacts into the waterfall; with several survey files, the name of each precedes the suffix",
+        Path,
     )
-    parser.add_argument(
-        "--snippets", type=Path, metavar="DIR", help="write the snippets of each contact into this folder"
-    )
-    parser.add_argument(
+    option(parser, "--snippets DIR", "write the snippets of each contact into this folder", Path)
+    flag(
+        parser,
         "--geotiff",
-        action="store_true",
-        help=f"with --snippets: also write the seabed around each contact as GeoTIFF, {_MAP_SIDE_M} m a side, north up",
+        f"with --snippets: also write the seabed around each contact as GeoTIFF, {_MAP_SIDE_M} m a side, north up",
     )
-    parser.add_argument(
-        "--threshold",
-        type=float,
-        metavar="CONFIDENCE",
-        help="minimum confidence, 0 to 2 (default: that of --settings, else 0.3)",
+    option(
+        parser, "--threshold CONFIDENCE", "minimum confidence, 0 to 2 (default: that of --settings, else 0.3)", float
     )
-    parser.add_argument(
-        "--max-contacts", type=int, metavar="N", help="list at most the N most confident contacts of a file"
-    )
-    parser.add_argument(
-        "--settings", type=Path, metavar="FILE.toml", help="settings of the detector, as in [atd_stub.detector]"
-    )
+    option(parser, "--max-contacts N", "list at most the N most confident contacts of a file", int)
+    option(parser, "--settings FILE.toml", "settings of the detector, as in [atd_stub.detector]", Path)
     add_pick_option(parser)
     add_transmission_options(parser)
     add_survey_options(parser)
-    parser.add_argument("--vehicle", default="uuv", metavar="ID", help="vehicle_id of the records (default: uuv)")
+    option(parser, "--vehicle ID", "vehicle_id of the records", default="uuv")
     parser.set_defaults(run=run)
 
 

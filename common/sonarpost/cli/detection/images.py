@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import aligned, printable
+from sonarpost.cli.shared import aligned, option, printable
 from sonarpost.detection.images import ScaledImage, detect_in_image
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.errors import ConfigError, SurveyFileError
@@ -46,19 +46,14 @@ class ImageScore:
 
 def add_image_options(parser: argparse.ArgumentParser) -> None:
     """Add --images and --pixel-m."""
-    parser.add_argument(
-        "--images",
-        type=Path,
-        metavar="DIR",
-        help="score every JPEG, PNG and TIFF image of this folder instead of survey files; exit status 2 if any of "
+    option(
+        parser,
+        "--images DIR",
+        "score every JPEG, PNG and TIFF image of this folder instead of survey files; exit status 2 if any of "
         f"them cannot be read or has a side below {MIN_SIDE_PX} px",
+        Path,
     )
-    parser.add_argument(
-        "--pixel-m",
-        type=float,
-        metavar="METRES",
-        help=f"size of a pixel of the images of --images (default: {DEFAULT_PIXEL_M})",
-    )
+    option(parser, "--pixel-m METRES", f"size of a pixel of the images of --images (default: {DEFAULT_PIXEL_M})", float)
 
 
 def check_image_options(parsed: argparse.Namespace) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
+from sonarpost.cli.shared import option
 from sonarpost.detection.detector import Detection
 from sonarpost.detection.picks import (
     DescribePick,
@@ -29,13 +30,13 @@ _WHERE = "--pick"
 
 def add_pick_option(parser: argparse.ArgumentParser) -> None:
     """Add --pick."""
-    parser.add_argument(
-        "--pick",
-        action="append",
-        default=[],
-        metavar="PING,SIDE,SAMPLE",
-        help="also list the contact at this place, given as in columns ping, side and sample of the table (index:N,… "
+    option(
+        parser,
+        "--pick PING,SIDE,SAMPLE",
+        "also list the contact at this place, given as in columns ping, side and sample of the table (index:N,… "
         "is the ping with index N in the file, from 0); repeatable, for one survey file",
+        default=[],
+        action="append",
     )
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from sonarpost.cli.shared import option
 from sonarpost.detection.transmissions import MARGIN_AFTER_S, MARGIN_BEFORE_S, TransmitIntervals
 from sonarpost.errors import ConfigError
 from sonarpost.messages import Transmission
@@ -17,20 +18,20 @@ from sonarpost.wire import first_error
 
 def add_transmission_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that mask transmissions of the vehicle's modem."""
-    parser.add_argument(
-        "--transmissions",
-        type=Path,
-        metavar="FILE",
-        help="mask the pings during the transmissions of the vehicle's modem in this JSON or CSV file, as the vehicle "
+    option(
+        parser,
+        "--transmissions FILE",
+        "mask the pings during the transmissions of the vehicle's modem in this JSON or CSV file, as the vehicle "
         "writes with transmissions_file",
+        Path,
     )
-    parser.add_argument(
-        "--transmission-margins",
-        type=float,
+    option(
+        parser,
+        "--transmission-margins BEFORE_S AFTER_S",
+        f"seconds masked before and after each transmission (default: {MARGIN_BEFORE_S} {MARGIN_AFTER_S})",
+        float,
+        (MARGIN_BEFORE_S, MARGIN_AFTER_S),
         nargs=2,
-        metavar=("BEFORE_S", "AFTER_S"),
-        default=(MARGIN_BEFORE_S, MARGIN_AFTER_S),
-        help=f"seconds masked before and after each transmission (default: {MARGIN_BEFORE_S} {MARGIN_AFTER_S})",
     )
 
 

@@ -7,7 +7,8 @@ import shlex
 from collections.abc import Mapping
 
 from sonarpost.cli import main
-from sonarpost.cli.parsing.parser import actions_of, all_parsers
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import option
 
 SHELLS = ("bash", "zsh", "fish")
 
@@ -26,24 +27,22 @@ complete -o default -F _sonarpost sonarpost
 """
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command."""
-    summary = "print the completion script of a shell"
-    parser = subparsers.add_parser("completion", help=summary, description=f"{summary.capitalize()}.")
-    parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help="bash, zsh or fish")
+def add_options(parser: CommandParser) -> None:
+    """Add the options of the command."""
+    option(parser, "shell SHELL", "bash, zsh or fish", choices=SHELLS)
     parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:
     """Print the script; return 0."""
-    words = {name: completions(parser) for name, parser in all_parsers(main.parser()).items()}
+    words = {name: completions(parser) for name, parser in main.parser().tree().items()}
     print(fish_script(words) if parsed.shell == "fish" else bash_script(words, zsh=parsed.shell == "zsh"), end="")
     return 0
 
 
-def completions(parser: argparse.ArgumentParser) -> list[str]:
+def completions(parser: CommandParser) -> list[str]:
     """Return what can follow the name of a command: its actions, its options, the values of its choices."""
-    words = list(actions_of(parser))
+    words = list(parser.actions)
     for action in parser._actions:  # noqa: SLF001 argparse has no public way to list them
         if action.help != argparse.SUPPRESS:
             words += action.option_strings

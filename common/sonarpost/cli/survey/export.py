@@ -11,11 +11,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import (
-    Subparsers,
     add_survey_options,
     in_new_folder,
+    option,
     print_notes,
     survey_options_of,
     utc_text,
@@ -37,14 +38,18 @@ _FIELDS = (
 )
 
 
-def add_action(actions: Subparsers) -> None:
+def add_actions(parser: CommandParser) -> None:
     """Add the action."""
-    parser = actions.add_parser("export", help="write the track of a recording as CSV or GeoJSON")
-    parser.add_argument("file", type=Path, metavar="FILE", help="survey file")
-    parser.add_argument("--format", choices=("csv", "geojson"), default="csv", help="output format (default: csv)")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="output file (default: standard output)")
+    parser = parser.add_action(
+        "export",
+        "write the track of a recording as CSV or GeoJSON",
+        run,
+        "line.xtf --format geojson --out track.geojson",
+    )
+    option(parser, "file FILE", "survey file", Path)
+    option(parser, "--format", "output format", default="csv", choices=("csv", "geojson"))
+    option(parser, "--out FILE", "output file (default: standard output)", Path)
     add_survey_options(parser)
-    parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:

@@ -10,8 +10,9 @@ from pathlib import Path
 
 from typing_extensions import override
 
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers, add_survey_options, survey_options_of, utc_text
+from sonarpost.cli.shared import add_survey_options, flag, option, survey_options_of, utc_text
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.projection import GridExtent, Projection
 from sonarpost.sonar.readers import open_survey
@@ -27,13 +28,12 @@ _STEP_M = 5.0
 """Step of the track length: fixes are often coarse and repeated over many pings."""
 
 
-def add_action(actions: Subparsers) -> None:
+def add_actions(parser: CommandParser) -> None:
     """Add the action."""
-    parser = actions.add_parser("info", help="list contents and irregularities of recordings")
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="survey file")
-    parser.add_argument("--json", action="store_true", help="print one JSON object for each file, one per line")
+    parser = parser.add_action("info", "list contents and irregularities of recordings", run, "line.xtf --json")
+    option(parser, "files FILE", "survey file", Path, nargs="+")
+    flag(parser, "--json", "print one JSON object for each file, one per line")
     add_survey_options(parser)
-    parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:

@@ -13,11 +13,13 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import (
-    Subparsers,
     add_survey_options,
+    flag,
     make_output_folder,
+    option,
     print_notes,
     survey_options_of,
     utc_text,
@@ -46,26 +48,21 @@ _INK, _PAPER, _BOTTOM_COLOUR = (20, 20, 20), (245, 245, 245), (255, 190, 0)
 _LINE, _START, _END = (20, 70, 160), (0, 140, 60), (200, 30, 30)
 
 
-def add_action(actions: Subparsers) -> None:
+def add_actions(parser: CommandParser) -> None:
     """Add the action."""
-    parser = actions.add_parser(
+    parser = parser.add_action(
         "plot",
-        help="draw waterfalls and tracks",
-        description="Write NAME-waterfall.png and NAME-track.png for every survey file NAME.",
+        "draw waterfalls and tracks",
+        run,
+        "line.xtf --ground --out plots",
+        "Write NAME-waterfall.png and NAME-track.png for every survey file NAME.",
     )
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="survey file")
-    parser.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="output folder (default: .)")
-    parser.add_argument("--ground", action="store_true", help="ground range, without the water column")
-    parser.add_argument("--even", action="store_true", help="with --ground: divide by the mean echo at each angle")
-    parser.add_argument(
-        "--rows",
-        type=int,
-        default=MAX_ROWS,
-        metavar="N",
-        help="maximum rows, by averaging pings (default: %(default)s)",
-    )
+    option(parser, "files FILE", "survey file", Path, nargs="+")
+    option(parser, "--out DIR", "output folder", Path, Path())
+    flag(parser, "--ground", "ground range, without the water column")
+    flag(parser, "--even", "with --ground: divide by the mean echo at each angle")
+    option(parser, "--rows N", "maximum rows, by averaging pings", int, MAX_ROWS)
     add_survey_options(parser)
-    parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:

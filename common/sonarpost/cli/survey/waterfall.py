@@ -5,28 +5,28 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers, add_survey_options, make_output_folder, survey_options_of
+from sonarpost.cli.shared import add_survey_options, make_output_folder, option, survey_options_of
 from sonarpost.errors import ConfigError
 from sonarpost.sonar.maps.ground_canvas import MIN_RESOLUTION_M
 from sonarpost.sonar.maps.waterfall import write_waterfalls
 
 
-def add_action(actions: Subparsers) -> None:
+def add_actions(parser: CommandParser) -> None:
     """Add the action."""
-    parser = actions.add_parser(
+    parser = parser.add_action(
         "waterfall",
-        help="write the waterfall of each straight line as cloud-optimised GeoTIFF",
-        description="Write LINE-waterfall-N.tif for each straight line of every survey file: over ground, along-track "
+        "write the waterfall of each straight line as cloud-optimised GeoTIFF",
+        run,
+        "line.xtf --out waterfalls",
+        "Write LINE-waterfall-N.tif for each straight line of every survey file: over ground, along-track "
         "upwards, port on the left.",
     )
-    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="survey file")
-    parser.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="output folder (default: .)")
-    parser.add_argument(
-        "--resolution-m", type=float, default=0.1, metavar="M", help="side of a pixel in metres (default: %(default)s)"
-    )
+    option(parser, "files FILE", "survey file", Path, nargs="+")
+    option(parser, "--out DIR", "output folder", Path, Path())
+    option(parser, "--resolution-m M", "side of a pixel in metres", float, 0.1)
     add_survey_options(parser)
-    parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:

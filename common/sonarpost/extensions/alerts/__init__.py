@@ -2,11 +2,11 @@
 
 from typing import Final
 
-from sonarpost.cli.parsing.commands import AddedCommand
+from sonarpost.cli.parsing.commands import CommandSpec
 
-ALERT: Final = AddedCommand(
-    "send an alert for each contact above a threshold",
-    "sonarpost.extensions.alerts.command:add_parser",
-    {"c2 alert": "c2 alert --webhook https://hooks.example/mines --threshold 0.7 --state alerts.db --archive out"},
+ALERT: Final = CommandSpec(
+    "send an alert for each contact above a threshold to a webhook or an MQTT broker; Ctrl-C ends it",
+    "sonarpost.extensions.alerts.command:add_options",
+    "--webhook https://hooks.example/mines --threshold 0.7 --state alerts.db --archive out",
     {"paho": "mqtt"},
 )

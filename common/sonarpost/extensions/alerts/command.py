@@ -15,7 +15,8 @@ from typing import Final
 from sonarpost import logs
 from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.c2.live import ContactStream, add_live_options
-from sonarpost.cli.shared import Subparsers, in_new_folder, log_level, router_of
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import in_new_folder, log_level, option, router_of
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.export.contacts import ExportContact
 from sonarpost.export.text import utc_text
@@ -48,31 +49,20 @@ MAX_SENT: Final = 200_000
 _SCHEMA: Final = "CREATE TABLE IF NOT EXISTS sent (number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE);"
 
 
-def add_parser(actions: Subparsers) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the action `alert`."""
-    parser = actions.add_parser(
-        "alert", help="send an alert for each contact above a threshold to a webhook or an MQTT broker; Ctrl-C ends it"
-    )
     where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument("--webhook", metavar="URL", help="address that receives an HTTP POST of JSON")
-    where.add_argument("--mqtt", metavar="URL", help="broker and topic, mqtts://[user@]host[:port]/topic or mqtt://…")
-    parser.add_argument(
-        "--threshold",
-        type=float,
-        default=0.5,
-        metavar="P",
-        help="probability of a mine-like object, 0 to 1, or half the confidence of the detector (default: 0.5)",
+    option(where, "--webhook URL", "address that receives an HTTP POST of JSON")
+    option(where, "--mqtt URL", "broker and topic, mqtts://[user@]host[:port]/topic or mqtt://…")
+    option(
+        parser,
+        "--threshold P",
+        "probability of a mine-like object, 0 to 1, or half the confidence of the detector",
+        float,
+        0.5,
     )
-    parser.add_argument(
-        "--state",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help="file with the identifiers of the alerts that were sent",
-    )
-    parser.add_argument(
-        "--secret-file", type=Path, metavar="FILE", help="key of the webhook's signature, or password of the MQTT user"
-    )
+    option(parser, "--state FILE", "file with the identifiers of the alerts that were sent", Path, required=True)
+    option(parser, "--secret-file FILE", "key of the webhook's signature, or password of the MQTT user", Path)
     for name in ("ca", "certificate", "key"):
         parser.add_argument(f"--alert-{name}", type=Path, metavar="PEM", help=f"{name} for https://… and mqtts://…")
     add_live_options(parser)

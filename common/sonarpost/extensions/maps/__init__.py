@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Final
 
-from sonarpost.cli.parsing.commands import AddedCommand
+from sonarpost.cli.parsing.commands import CommandSpec
 
-MOSAIC: Final = AddedCommand(
+MOSAIC: Final = CommandSpec(
     "write a mosaic of the seabed as cloud-optimised GeoTIFF",
-    "sonarpost.extensions.maps.mosaic_command:add_action",
-    {"survey mosaic": "survey mosaic line.xtf --out mosaic.tif --coverage coverage.geojson"},
+    "sonarpost.extensions.maps.mosaic_command:add_options",
+    "line.xtf --out mosaic.tif --coverage coverage.geojson",
 )
-COVERAGE: Final = AddedCommand(
+COVERAGE: Final = CommandSpec(
     "write the covered seabed as polygons",
-    "sonarpost.extensions.maps.coverage_command:add_action",
-    {"survey coverage": "survey coverage line.xtf --out coverage.gpkg"},
+    "sonarpost.extensions.maps.coverage_command:add_options",
+    "line.xtf --out coverage.gpkg",
 )

@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers, add_survey_options, in_new_folder, survey_options_of
+from sonarpost.cli.shared import add_survey_options, in_new_folder, option, survey_options_of
 from sonarpost.errors import ConfigError
 from sonarpost.extensions.maps.coverage import CoveragePolygon, survey_coverage
 from sonarpost.extensions.maps.coverage_files import write_coverage_geojson, write_coverage_geopackage
@@ -20,17 +21,11 @@ WRITERS: Final[Mapping[str, Callable[[Path, Sequence[CoveragePolygon]], None]]] 
 """Suffix -> function that writes the file."""
 
 
-def add_action(actions: Subparsers) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the action."""
-    parser = actions.add_parser(
-        "coverage",
-        help="write the covered seabed as polygons",
-        description="Write the outline of the swath, a polygon for each part of a line without gap, in WGS 84.",
-    )
-    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="survey file")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="FILE", help="file to write, named *.gpkg or *.geojson"
-    )
+    parser.description = "Write the outline of the swath, a polygon for each part of a line without gap, in WGS 84."
+    option(parser, "files FILE", "survey file", Path, nargs="+")
+    option(parser, "--out FILE", "file to write, named *.gpkg or *.geojson", Path, required=True)
     add_survey_options(parser)
     parser.set_defaults(run=run)
 

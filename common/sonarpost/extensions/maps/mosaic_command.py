@@ -5,24 +5,20 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers, add_survey_options, in_new_folder, survey_options_of
+from sonarpost.cli.shared import add_survey_options, in_new_folder, option, survey_options_of
 from sonarpost.cli.survey.waterfall import check_resolution
 from sonarpost.extensions.maps.coverage_command import coverage_writer, print_left_out
 from sonarpost.extensions.maps.mosaic import write_mosaic
 
 
-def add_action(actions: Subparsers) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the action."""
-    parser = actions.add_parser("mosaic", help="write a mosaic of the seabed as cloud-optimised GeoTIFF")
-    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="survey file")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.tif", help="the GeoTIFF to write")
-    parser.add_argument(
-        "--resolution-m", type=float, default=0.1, metavar="M", help="side of a pixel in metres (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--coverage", type=Path, metavar="FILE", help="also write the covered area as polygons, *.gpkg or *.geojson"
-    )
+    option(parser, "files FILE", "survey file", Path, nargs="+")
+    option(parser, "--out FILE.tif", "the GeoTIFF to write", Path, required=True)
+    option(parser, "--resolution-m M", "side of a pixel in metres", float, 0.1)
+    option(parser, "--coverage FILE", "also write the covered area as polygons, *.gpkg or *.geojson", Path)
     add_survey_options(parser)
     parser.set_defaults(run=run)
 

@@ -18,7 +18,8 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.archive.image_parts import whole_part
 from sonarpost.bus.session import open_with_retry
-from sonarpost.cli.shared import Subparsers, add_router_options, add_site_option, in_new_folder, router_of
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import add_router_options, add_site_option, flag, in_new_folder, option, router_of
 from sonarpost.delivery.client import deliver
 from sonarpost.delivery.protocol import attachment, watcher_origin
 from sonarpost.delivery.records import OutboxItem
@@ -47,49 +48,39 @@ POLL_S: Final = 0.2
 EXIT_INCOMPLETE: Final = 1
 
 
-def add_record(subparsers: Subparsers) -> None:
+def add_record(parser: CommandParser) -> None:
     """Add the command `record`."""
-    record = subparsers.add_parser(
-        "record",
-        help="record the keys of a router into an MCAP file",
-        description="Record the publications of a router into an MCAP file, with image, position and map of the "
-        "contacts for Foxglove. Ctrl-C ends it. Exit status 1: records were dropped.",
+    parser.description = (
+        "Record the publications of a router into an MCAP file, with image, position and map of the "
+        "contacts for Foxglove. Ctrl-C ends it. Exit status 1: records were dropped."
     )
-    record.add_argument("out", type=Path, metavar="OUT.mcap", help="file to write; it must not exist")
-    add_router_options(record)
-    record.add_argument(
-        "--key",
+    option(parser, "out OUT.mcap", "file to write; it must not exist", Path)
+    add_router_options(parser)
+    option(
+        parser,
+        "--key EXPR",
+        f"key expression to record; can be repeated (default: {keys.everything()})",
         action="append",
-        metavar="EXPR",
-        help=f"key expression to record; can be repeated (default: {keys.everything()})",
     )
-    record.add_argument("--duration", type=float, metavar="S", help="end after this time")
-    record.set_defaults(run=run_record)
+    option(parser, "--duration S", "end after this time", float)
+    parser.set_defaults(run=run_record)
 
 
-def add_replay(subparsers: Subparsers) -> None:
+def add_replay(parser: CommandParser) -> None:
     """Add the command `replay`."""
-    replay = subparsers.add_parser(
-        "replay",
-        help="publish the records of an MCAP file again, or send them to a c2",
-        description="Publish the records of an MCAP file for watchers, or send images, coded images and "
+    parser.description = (
+        "Publish the records of an MCAP file for watchers, or send images, coded images and "
         "decisions to a running c2. "
-        "Exit status 1: c2 has refused records.",
+        "Exit status 1: c2 has refused records."
     )
-    replay.add_argument("file", type=Path, metavar="FILE.mcap", help="file to read")
-    add_router_options(replay)
-    replay.add_argument(
-        "--speed", type=float, default=1.0, metavar="X", help="factor of the original speed; 0: no pauses (default: 1)"
-    )
-    replay.add_argument("--key", metavar="EXPR", help="only keys that this key expression includes")
-    replay.add_argument(
-        "--to-c2", action="store_true", help="deliver images and decisions durably to the c2 of --site; publish nothing"
-    )
-    add_site_option(replay)
-    replay.add_argument(
-        "--timeout", type=float, default=30.0, metavar="S", help="time limit of each delivery (default: 30)"
-    )
-    replay.set_defaults(run=run_replay)
+    option(parser, "file FILE.mcap", "file to read", Path)
+    add_router_options(parser)
+    option(parser, "--speed X", "factor of the original speed; 0: no pauses", float, 1.0)
+    option(parser, "--key EXPR", "only keys that this key expression includes")
+    flag(parser, "--to-c2", "deliver images and decisions durably to the c2 of --site; publish nothing")
+    add_site_option(parser)
+    option(parser, "--timeout S", "time limit of each delivery", float, 30.0)
+    parser.set_defaults(run=run_replay)
 
 
 # record

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from typing import Final
 
-from sonarpost.cli.parsing.commands import AddedCommand
+from sonarpost.cli.parsing.commands import CommandSpec
 
-DEMO: Final = AddedCommand(
+DEMO: Final = CommandSpec(
     "run the whole chain on this host, from a survey file to the shore",
-    "sonarpost.extensions.simulation.demo.command:add_parser",
-    {"demo": "demo --loss 0.3 --seed 3"},
+    "sonarpost.extensions.simulation.demo.command:add_options",
+    "--loss 0.3 --seed 3",
 )
-SIMULATE: Final = AddedCommand(
+SIMULATE: Final = CommandSpec(
     "write a simulated side-scan survey as XTF",
-    "sonarpost.extensions.simulation.simulate:add_parser",
-    {"simulate": "simulate line.xtf --seabed ripples --truth truth.json"},
+    "sonarpost.extensions.simulation.simulate:add_options",
+    "line.xtf --seabed ripples --truth truth.json",
 )
-MODEM_EMULATOR: Final = AddedCommand(
+MODEM_EMULATOR: Final = CommandSpec(
     "emulated acoustic modems on pseudo-terminals or TCP ports",
-    "sonarpost.extensions.simulation.modem_emulator:add_parser",
-    {"modem-emulator": "modem-emulator --modems 2 --tcp --loss 0.1"},
+    "sonarpost.extensions.simulation.modem_emulator:add_options",
+    "--modems 2 --tcp --loss 0.1",
 )

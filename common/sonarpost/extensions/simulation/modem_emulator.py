@@ -11,7 +11,8 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from sonarpost.cli.shared import Subparsers, in_new_folder
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import flag, in_new_folder, option
 from sonarpost.errors import ConfigError
 from sonarpost.extensions.simulation.channel.config import EmulatorConfig
 from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
@@ -24,34 +25,21 @@ EXIT_FAILED = 1
 MAX_MODEMS = 64
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser(
-        "modem-emulator",
-        help="emulated acoustic modems on pseudo-terminals or TCP ports",
-        description="Emulates Micro-Modems and the channel between them until SIGINT or SIGTERM. The first line of the "
+    parser.description = (
+        "Emulates Micro-Modems and the channel between them until SIGINT or SIGTERM. The first line of the "
         'output is a JSON object, {"modems":[{"address":1,"device":"…"},…]}. Open the devices with any serial program '
-        "or, for TCP, with a socket:// URL.",
+        "or, for TCP, with a socket:// URL."
     )
-    parser.add_argument("--modems", type=int, default=2, metavar="N", help="number of modems (default: 2)")
+    option(parser, "--modems N", "number of modems", int, 2)
     ports = parser.add_mutually_exclusive_group()
-    ports.add_argument(
-        "--pty",
-        type=Path,
-        nargs="?",
-        const=Path("modems"),
-        metavar="DIR",
-        help="links modem-1, … in DIR (default: modems)",
-    )
-    ports.add_argument(
-        "--tcp", type=int, nargs="*", metavar="PORT", help="a TCP port for each modem; default: free ports"
-    )
-    parser.add_argument("--mm", type=int, choices=(1, 2), default=2, help="Micro-Modem generation (default: 2)")
-    parser.add_argument(
-        "--spacing", type=float, default=100.0, metavar="M", help="metres between modems (default: 100)"
-    )
-    parser.add_argument("--preset", choices=list(PRESETS), help="set of channel parameters (default: still)")
-    parser.add_argument("--channel", type=Path, metavar="FILE", help="TOML file with parameters; overrides the preset")
+    option(ports, "--pty DIR", "links modem-1, … in DIR (default: modems)", Path, nargs="?", const=Path("modems"))
+    option(ports, "--tcp PORT", "a TCP port for each modem; default: free ports", int, nargs="*")
+    option(parser, "--mm", "Micro-Modem generation", int, 2, choices=(1, 2))
+    option(parser, "--spacing M", "metres between modems", float, 100.0)
+    option(parser, "--preset", "set of channel parameters (default: still)", choices=list(PRESETS))
+    option(parser, "--channel FILE", "TOML file with parameters; overrides the preset", Path)
     for name, metavar, text in (
         ("loss", "P", "probability that a frame is lost (default: 0)"),
         ("packet-loss", "P", "probability that a packet is lost (default: 0)"),
@@ -66,11 +54,11 @@ def add_parser(subparsers: Subparsers) -> None:
         ("airtime", "RATE=S", "air time of a rate in seconds, instead of the nominal one"),
     ):
         parser.add_argument(f"--{name}", action="append", default=[], metavar=metavar, help=text)
-    parser.add_argument("--range-loss", action="store_true", help="lose frames also by signal-to-noise ratio")
-    parser.add_argument("--seed", type=int, metavar="N", help="seed of every random draw (default: 0)")
-    parser.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="simulated seconds per second")
-    parser.add_argument("--log", type=Path, metavar="FILE", help="append the result of every packet, as JSON lines")
-    parser.add_argument("--json", action="store_true", help="print the outcome of every packet, as JSON lines")
+    flag(parser, "--range-loss", "lose frames also by signal-to-noise ratio")
+    option(parser, "--seed N", "seed of every random draw (default: 0)", int)
+    option(parser, "--time-scale X", "simulated seconds per second", float, 1.0)
+    option(parser, "--log FILE", "append the result of every packet, as JSON lines", Path)
+    flag(parser, "--json", "print the outcome of every packet, as JSON lines")
     parser.set_defaults(run=run)
 
 

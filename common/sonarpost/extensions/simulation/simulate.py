@@ -7,8 +7,9 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers, in_new_folder, projected_crs_of
+from sonarpost.cli.shared import flag, in_new_folder, option, projected_crs_of
 from sonarpost.errors import ConfigError
 from sonarpost.extensions.simulation.seabed.survey import SimulatedSurvey, SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
@@ -18,15 +19,11 @@ from sonarpost.sonar.xtf_writer import write_xtf
 TRUTH_SCHEMA = 1
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the `simulate` command."""
     default = SurveySpec()
-    parser = subparsers.add_parser(
-        "simulate",
-        help="write a simulated side-scan survey as XTF",
-        description="Write a simulated side-scan survey as XTF. The same options give the same file.",
-    )
-    parser.add_argument("out", type=Path, metavar="OUT.xtf", help="the file to create")
+    parser.description = "Write a simulated side-scan survey as XTF. The same options give the same file."
+    option(parser, "out OUT.xtf", "the file to create", Path)
     for name, text in (
         ("seed", "seed of every random draw"),
         ("pings", "number of pings"),
@@ -39,20 +36,13 @@ def add_parser(subparsers: Subparsers) -> None:
         ("scour", "depth of the pits around objects: 0 none, 1 typical"),
     ):
         value = getattr(default, name)
-        option = f"--{name.replace('_', '-')}"
-        parser.add_argument(option, type=type(value), default=value, help=f"{text} (default: %(default)s)")
+        option(parser, f"--{name.replace('_', '-')}", text, type(value), value)
     kinds = [kind.value for kind in SeabedKind]
-    parser.add_argument(
-        "--seabed", choices=kinds, default=default.seabed.value, help="type of seabed (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--bits", type=int, choices=(8, 16), default=default.bits, help="bits per sample (default: %(default)s)"
-    )
-    parser.add_argument("--truth", type=Path, metavar="FILE.json", help="write the ground truth as JSON")
-    parser.add_argument(
-        "--crs", metavar="EPSG:N", help="write positions of this projected coordinate system, in place of degrees"
-    )
-    parser.add_argument("--force", action="store_true", help="replace existing files")
+    option(parser, "--seabed", "type of seabed", default=default.seabed.value, choices=kinds)
+    option(parser, "--bits", "bits per sample", int, default.bits, choices=(8, 16))
+    option(parser, "--truth FILE.json", "write the ground truth as JSON", Path)
+    option(parser, "--crs EPSG:N", "write positions of this projected coordinate system, in place of degrees")
+    flag(parser, "--force", "replace existing files")
     parser.set_defaults(run=run_simulate)
 
 

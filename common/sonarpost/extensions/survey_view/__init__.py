@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from sonarpost.cli.parsing.commands import AddedCommand
+from sonarpost.cli.parsing.commands import CommandSpec
 
-VIEW: Final = AddedCommand(
+VIEW: Final = CommandSpec(
     "show a recording on a web page, and pick contacts in it",
-    "sonarpost.extensions.survey_view.command:add_action",
-    {"survey view": "survey view line.xtf --out line.xtf.picks"},
+    "sonarpost.extensions.survey_view.command:add_options",
+    "line.xtf --out line.xtf.picks",
 )

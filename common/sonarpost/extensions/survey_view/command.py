@@ -10,8 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import Subparsers, add_survey_options, in_new_folder, print_notes, survey_options_of
+from sonarpost.cli.shared import add_survey_options, in_new_folder, option, print_notes, survey_options_of
 from sonarpost.detection.detector import Detection
 from sonarpost.detection.picks import Pick, locate_picks, parse_picks, picks_path
 from sonarpost.detection.settings import DetectorSettings, checked_settings, load_settings
@@ -28,25 +29,17 @@ HOST: Final = "127.0.0.1"
 _WAIT_S: Final = 0.5
 
 
-def add_action(actions: Subparsers) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the action."""
-    parser = actions.add_parser(
-        "view",
-        help="show a recording on a web page, and pick contacts in it",
-        description="Serve a page on this host with the waterfall and its contacts. A click picks a contact that the "
-        "detector has missed; Save writes the picks for the vehicle and shows the command that lists them.",
+    parser.description = (
+        "Serve a page on this host with the waterfall and its contacts. A click picks a contact that the "
+        "detector has missed; Save writes the picks for the vehicle and shows the command that lists them."
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help="survey file")
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE.picks", help="file of picks (default: the survey file's name and .picks)"
-    )
-    parser.add_argument("--port", type=int, default=0, help=f"port on {HOST} (default: any free port)")
-    parser.add_argument(
-        "--threshold", type=float, metavar="CONFIDENCE", help="as for `sonarpost detect` (default: 1.0)"
-    )
-    parser.add_argument(
-        "--settings", type=Path, metavar="FILE.toml", help="settings of the detector, as for `sonarpost detect`"
-    )
+    option(parser, "file FILE", "survey file", Path)
+    option(parser, "--out FILE.picks", "file of picks (default: the survey file's name and .picks)", Path)
+    option(parser, "--port", f"port on {HOST} (default: any free port)", int, 0)
+    option(parser, "--threshold CONFIDENCE", "as for `sonarpost detect` (default: 1.0)", float)
+    option(parser, "--settings FILE.toml", "settings of the detector, as for `sonarpost detect`", Path)
     add_survey_options(parser)
     parser.set_defaults(run=run)
 

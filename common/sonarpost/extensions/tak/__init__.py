@@ -2,10 +2,10 @@
 
 from typing import Final
 
-from sonarpost.cli.parsing.commands import AddedCommand
+from sonarpost.cli.parsing.commands import CommandSpec
 
-COT: Final = AddedCommand(
-    "send the contacts of a shore site to a TAK endpoint",
-    "sonarpost.extensions.tak.command:add_parser",
-    {"c2 cot": "c2 cot tls://tak.example:8089 --tak-api https://tak.example:8443 --archive out"},
+COT: Final = CommandSpec(
+    "send the contacts of a shore site to a TAK endpoint, live, until Ctrl-C, or once",
+    "sonarpost.extensions.tak.command:add_options",
+    "tls://tak.example:8089 --tak-api https://tak.example:8443 --archive out",
 )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import logging
 import os
-import sys
 import time
 from collections import OrderedDict
 from collections.abc import Callable
@@ -16,7 +15,8 @@ from typing import Final
 from sonarpost import keys, logs, wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.cli.c2.live import ContactChange, ContactStream, add_live_options
-from sonarpost.cli.shared import Subparsers, log_level, router_of
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import flag, log_level, option, print_rejected, router_of
 from sonarpost.config import PlatformConfig, load
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.export.contacts import ExportContact, load_contacts
@@ -69,12 +69,9 @@ class _Marker:
     transfers_left: int = 0
 
 
-def add_parser(actions: Subparsers) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the action `cot`."""
-    parser = actions.add_parser(
-        "cot", help="send the contacts of a shore site to a TAK endpoint, live, until Ctrl-C, or once"
-    )
-    parser.add_argument("url", metavar="URL", help="endpoint: tcp://host:port, tls://… or udp://…")
+    option(parser, "url URL", "endpoint: tcp://host:port, tls://… or udp://…")
     for name, help_text in (
         ("ca", "trusted authorities, PEM or PKCS#12 (*.p12)"),
         ("certificate", "client certificate, PEM, or PKCS#12 with its key (*.p12)"),
@@ -82,17 +79,17 @@ def add_parser(actions: Subparsers) -> None:
         ("passphrase-file", "passphrase of an encrypted key and of PKCS#12 files; mode 0600"),
     ):
         parser.add_argument(f"--cot-{name}", type=Path, metavar="FILE", help=f"{help_text}; for tls://… and https://…")
-    parser.add_argument(
-        "--cot-server-name",
-        metavar="NAME",
-        help="name in the server's certificate (default: the host); for tls://… and https://…",
+    option(
+        parser,
+        "--cot-server-name NAME",
+        "name in the server's certificate (default: the host); for tls://… and https://…",
     )
-    parser.add_argument(
-        "--tak-api",
-        metavar="URL",
-        help="HTTP interface of the TAK server, for example https://host:8443, for the images of contacts",
+    option(
+        parser,
+        "--tak-api URL",
+        "HTTP interface of the TAK server, for example https://host:8443, for the images of contacts",
     )
-    parser.add_argument("--once", action="store_true", help="send the contacts of --archive, without images, and end")
+    flag(parser, "--once", "send the contacts of --archive, without images, and end")
     add_live_options(parser)
     parser.set_defaults(run=run)
 
@@ -144,9 +141,7 @@ def _send_once(sender: CotSender, archive: Path | None, vessel: str | None) -> i
     evidence = sender.send(events, GIVE_UP_S)
     omitted = len(chosen) - len(events)
     print(f"{sender.endpoint}: {len(events)} events, {omitted} contacts without a position omitted; {evidence}")
-    for problem in stored.problems:
-        print(f"rejected: {problem}", file=sys.stderr)
-    return EXIT_INCOMPLETE if stored.problems else 0
+    return EXIT_INCOMPLETE if print_rejected(stored.problems) else 0
 
 
 class CotService:

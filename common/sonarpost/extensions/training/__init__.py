@@ -2,10 +2,10 @@
 
 from typing import Final
 
-from sonarpost.cli.parsing.commands import AddedCommand
+from sonarpost.cli.parsing.commands import CommandSpec
 
-TRAINING: Final = AddedCommand(
+TRAINING: Final = CommandSpec(
     "serve simulated contacts for training",
-    "sonarpost.extensions.training.command:add_parser",
-    {"console training": "console training 40"},
+    "sonarpost.extensions.training.command:add_options",
+    "40",
 )

@@ -6,28 +6,24 @@ import argparse
 import tempfile
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from sonarpost.cli.console import add_page_options, serve_page
+from sonarpost.cli.parsing.parser import CommandParser
+from sonarpost.cli.shared import option
 from sonarpost.errors import ConfigError
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.database import DATABASE_NAME, Database
-
-if TYPE_CHECKING:
-    from sonarpost.cli.shared import Subparsers
 
 USERS = (("watch", "observer"), ("op", "operator"), ("expert", "expert"))
 MAX_CONTACTS = 100_000
 
 
-def add_parser(actions: Subparsers) -> None:
-    """Add the action."""
-    summary = "serve simulated contacts for training"
-    parser = actions.add_parser("training", help=summary, description=f"{summary.capitalize()}.")
-    parser.add_argument("contacts", type=int, metavar="N", help="number of simulated contacts")
-    parser.add_argument("--state", type=Path, metavar="DIR", help="folder for the training data (default: none)")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the simulation (default: 1)")
-    parser.add_argument("--interval", type=float, default=6.0, metavar="S", help="time between packets (default: 6)")
+def add_options(parser: CommandParser) -> None:
+    """Add the options."""
+    option(parser, "contacts N", "number of simulated contacts", int)
+    option(parser, "--state DIR", "folder for the training data (default: none)", Path)
+    option(parser, "--seed", "seed of the simulation", int, 1)
+    option(parser, "--interval S", "time between packets", float, 6.0)
     add_page_options(parser)
     parser.set_defaults(run=run)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import random
@@ -23,9 +22,8 @@ from pydantic import ValidationError
 
 from sonarpost import keys, wire
 from sonarpost.cli.deployment.config_files import example_text
-from sonarpost.cli.main import main
+from sonarpost.cli.main import main, parser
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.extensions.simulation import modem_emulator
 from sonarpost.extensions.simulation.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.extensions.simulation.acoustic_channel.service import AcousticChannelService
 from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
@@ -332,9 +330,8 @@ def test_invalid_configuration_is_rejected(config, tmp_path):
 
 def run_command(*arguments):
     code = (
-        "import argparse, sys; from sonarpost.extensions.simulation import modem_emulator as m;"
-        "p = argparse.ArgumentParser();"
-        "m.add_parser(p.add_subparsers()); a = p.parse_args(sys.argv[1:]); sys.exit(a.run(a))"
+        "import sys; from sonarpost.cli.main import parser;"
+        "a = parser('modem-emulator').parse_args(sys.argv[1:]); sys.exit(a.run(a))"
     )
     return subprocess.Popen(
         [sys.executable, "-c", code, "modem-emulator", *arguments],
@@ -401,9 +398,7 @@ def test_command_with_tcp_ports_continues_when_its_output_is_closed(arguments):
     ],
 )
 def test_command_rejects_invalid_options(arguments, named):
-    parser = argparse.ArgumentParser()
-    modem_emulator.add_parser(parser.add_subparsers())
-    parsed = parser.parse_args(["modem-emulator", *arguments.split()])
+    parsed = parser("modem-emulator").parse_args(["modem-emulator", *arguments.split()])
     with pytest.raises(ConfigError, match=named):
         parsed.run(parsed)
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import math
@@ -9,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter
 
+from sonarpost.cli.main import parser
 from sonarpost.errors import ConfigError
 from sonarpost.extensions.simulation.seabed import survey as simulator
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.targets import MINE_LIKE_KINDS
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
-from sonarpost.extensions.simulation.simulate import add_parser
 from sonarpost.sonar.geometry import Position, georeference, offset_between_m, ping_spacing_m
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import read_survey
@@ -152,9 +151,7 @@ def test_specification_error_names_the_field(field, value):
 
 
 def run(*words: str) -> int:
-    parser = argparse.ArgumentParser()
-    add_parser(parser.add_subparsers())
-    args = parser.parse_args(["simulate", *words])
+    args = parser("simulate").parse_args(["simulate", *words])
     return args.run(args)
 
 

@@ -14,8 +14,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import progress_console
-from sonarpost.cli.shared import add_fit_option, add_survey_options, print_notes, survey_options_of
+from sonarpost.cli.shared import add_fit_option, add_survey_options, flag, option, print_notes, survey_options_of
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.extensions.simulation.demo.chain import Chain
 from sonarpost.extensions.simulation.demo.next_steps import commands, folder_lines, routers_line
@@ -43,55 +44,44 @@ MAX_FEEDBACK_INTERVALS = 60
 """Feedback intervals without a change, on top of `STALLED_S`, while the vessel still repeats feedback."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_options(parser: CommandParser) -> None:
     """Add the subcommand."""
-    parser = subparsers.add_parser(
-        "demo",
-        help="run the whole chain on this host, from a survey file to the shore",
-        description="Run every service as a process, with emulated acoustic modems on pseudo-terminals, three Zenoh "
+    parser.description = (
+        "Run every service as a process, with emulated acoustic modems on pseudo-terminals, three Zenoh "
         "routers, and a simulated or given survey. Ends with a table and a contact sheet. The exit status is 1 if an "
-        "image that the channel can deliver is missing or incomplete at the shore site, or if there is no contact.",
+        "image that the channel can deliver is missing or incomplete at the shore site, or if there is no contact."
     )
     source = parser.add_mutually_exclusive_group()
-    source.add_argument("--survey", type=Path, metavar="FILE_OR_DIR", help="survey file, or a folder of them")
-    source.add_argument("--images", type=Path, metavar="DIR", help="send your own images instead: a file or a folder")
+    option(source, "--survey FILE_OR_DIR", "survey file, or a folder of them", Path)
+    option(source, "--images DIR", "send your own images instead: a file or a folder", Path)
     add_fit_option(parser)
-    parser.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="output (default: demo-out)")
+    option(parser, "--out DIR", "output", Path, Path("demo-out"))
     link = parser.add_mutually_exclusive_group()
-    link.add_argument(
+    option(
+        link,
         "--link",
-        choices=("v1", "paper"),
+        "wire format: v1 with the codec emb, or the paper's with its tile codec",
         default="v1",
-        help="wire format: v1 with the codec emb, or the paper's with its tile codec (default: %(default)s)",
+        choices=("v1", "paper"),
     )
-    link.add_argument("--paper", action="store_const", const="paper", dest="link", help="short for --link paper")
-    parser.add_argument(
+    option(link, "--paper", "short for --link paper", action="store_const", const="paper", dest="link")
+    option(
+        parser,
         "--rate",
-        type=int,
-        help="rate of the modem (default: that of its driver; Micro-Modem: 1, packets of 192 B in 6.1 s, see "
+        "rate of the modem (default: that of its driver; Micro-Modem: 1, packets of 192 B in 6.1 s, see "
         "docs/reference/modem-rates.md)",
+        int,
     )
-    parser.add_argument(
-        "--modem",
-        choices=emulated_drivers(),
-        default=DEFAULT_DRIVER,
-        help="driver whose modems are emulated (default: %(default)s)",
-    )
-    parser.add_argument("--loss", type=_probability, default=0.0, metavar="P", help="probability that a frame is lost")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the survey and channel simulators")
-    parser.add_argument(
-        "--time-scale", type=_positive, default=20.0, metavar="X", help="simulated seconds per second (default: 20)"
-    )
-    parser.add_argument("--keep", action="store_true", help="keep services and routers running until Ctrl-C")
-    parser.add_argument(
-        "--console", action="store_true", help="like --keep, and serve the operator's page: a log-in link is shown"
-    )
-    parser.add_argument("--open", action="store_true", help="with --console: open the page in the default browser")
-    parser.add_argument(
-        "--threshold", type=float, metavar="CONFIDENCE", help="minimum confidence of a contact, 0 to 2 (default: 0.3)"
-    )
+    option(parser, "--modem", "driver whose modems are emulated", default=DEFAULT_DRIVER, choices=emulated_drivers())
+    option(parser, "--loss P", "probability that a frame is lost", _probability, 0.0)
+    option(parser, "--seed N", "seed of the survey and channel simulators", int, 1)
+    option(parser, "--time-scale X", "simulated seconds per second", _positive, 20.0)
+    flag(parser, "--keep", "keep services and routers running until Ctrl-C")
+    flag(parser, "--console", "like --keep, and serve the operator's page: a log-in link is shown")
+    flag(parser, "--open", "with --console: open the page in the default browser")
+    option(parser, "--threshold CONFIDENCE", "minimum confidence of a contact, 0 to 2 (default: 0.3)", float)
     add_survey_options(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
+    flag(parser, "--json", "print one JSON object as the last line")
     parser.set_defaults(run=run)
 
 
