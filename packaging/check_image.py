@@ -17,7 +17,7 @@ from sonarpost.cli.parsing.commands import all_extras
 from sonarpost.codec import codec_names, decode, encode
 from sonarpost.codec.jit import COMPILE_S
 
-OPTIONAL = ("matplotlib", "numba", "pillow_jxl", *all_extras())
+OPTIONAL = ("matplotlib", "numba", *all_extras())
 """Packages that the image need not have."""
 
 

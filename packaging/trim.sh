@@ -30,6 +30,6 @@ for _ in 1 2; do
         grep -rqF --include='*.so*' --exclude="$name" "$name" "$packages/scipy" "$packages/scipy.libs" || rm "$library"
     done
 done
-# Rich needs pygments and markdown-it for source code and Markdown, Pillow libavif for a codec of comparisons.
+# Rich needs pygments and markdown-it for source code and Markdown, Pillow libavif for AVIF files.
 rm -rf "$packages"/pygments* "$packages"/markdown_it* "$packages"/mdurl* "$packages"/PIL/_avif.* "$packages"/pillow.libs/libavif*
 rm -rf "$packages"/pip "$packages"/pip-*.dist-info "$environment"/bin/pip* "$environment"/include

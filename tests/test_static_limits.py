@@ -92,7 +92,6 @@ SENT = "the sender's own data"
 ALLOCATIONS = {
     "common/sonarpost/archive/decoder.py: Decoder.decode": "MAX_SIDE_PX of a record",
     "common/sonarpost/archive/image_parts.py": "MAX_STREAM_BYTES: `z` and the ends of the pieces are checked",
-    "common/sonarpost/codec/baselines/": "MAX_SIDE_PX of a stream header",
     "common/sonarpost/codec/emb/": "MAX_SIDE_PX of a stream header; levels of the shipped models",
     "common/sonarpost/codec/interface.py: DecodedImage.all_missing": "MAX_SIDE_PX of a stream header",
     "common/sonarpost/codec/vq/codec.py: _padded_body": "one index for each tile of MAX_SIDE_PX",

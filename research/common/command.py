@@ -7,12 +7,12 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from research.codecs.baselines import comparison_registry
 from research.common.measurement import SHIPPED_CODEBOOKS, CodecUnderTest, create_codecs
 from sonarpost.cli.main import apply_verbosity, exit_status
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec import emb
-from sonarpost.codec.registry import default_registry
 from sonarpost.errors import ConfigError
 
 DEFAULT_BUDGETS: Final = "22,44,64,88,128,192,256,384,512"
@@ -97,7 +97,7 @@ def selected_codecs(
     strength: float | None = getattr(args, "strength", None)
     names = None if args.codecs is None else [name.strip() for name in args.codecs.split(",")]
     found, unavailable = create_codecs(
-        default_registry(), names, all_packings=all_packings, cut=cut, codebooks=codebooks, strength=strength
+        comparison_registry(), names, all_packings=all_packings, cut=cut, codebooks=codebooks, strength=strength
     )
     for line in unavailable:
         warn(f"left out: {line}")

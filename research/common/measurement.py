@@ -12,6 +12,7 @@ from typing import Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from research.codecs.baselines import comparison_registry
 from research.common.images import SampleImage
 from research.common.nonlocal_means import reference_filtered
 from research.common.quality import ms_ssim
@@ -25,7 +26,7 @@ from research.common.scene_measures import (
 from sonarpost.codec import emb
 from sonarpost.codec.interface import Codec, Image
 from sonarpost.codec.quality import ssim
-from sonarpost.codec.registry import CodecRegistry, CodecResources, default_registry
+from sonarpost.codec.registry import CodecRegistry, CodecResources
 from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, open_codebook
 from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.errors import ConfigError, StreamError
@@ -175,7 +176,7 @@ def create_codec(name: str, registry: CodecRegistry | None = None, strength: flo
 
     Args:
         name: Name of the codec, with its model if that is not the default.
-        registry: Registry of the codecs; None for that of the package.
+        registry: Registry of the codecs; None for `comparison_registry`.
         strength: Strength of despeckling of emb, 0..1; None for the default.
 
     Raises:
@@ -183,7 +184,7 @@ def create_codec(name: str, registry: CodecRegistry | None = None, strength: flo
     """
     codec_name, _, model = name.partition(":")
     resources = CodecResources(model=model or None, strength=strength)
-    return (registry or default_registry()).create(codec_name, resources)
+    return (registry or comparison_registry()).create(codec_name, resources)
 
 
 def _names_with_models(registry: CodecRegistry) -> list[str]:

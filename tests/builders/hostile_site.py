@@ -47,9 +47,9 @@ MEMORY_BYTES = 512 * 1024 * 1024
 
 
 def coded_part(number: int, side_px: int = 48) -> ImagePart:
-    """Return a coded image of spiht, which needs no compilation; each number gives other pixels."""
+    """Return a coded image; each number gives other pixels."""
     pixels = np.random.default_rng(number).integers(0, 256, (side_px, side_px), dtype=np.uint8)
-    stream = default_registry().create("spiht").encode(pixels, 200)
+    stream = default_registry().create("emb").encode(pixels, 200)
     return ImagePart(u="uuv-1", i=f"{number:04d}", n=1, t=1_700_000_000.0 + number, p=stream)
 
 
@@ -396,7 +396,7 @@ def running_site(folder: Path, world: World, decode_workers: int) -> Iterator[Si
             f'out_dir = "{folder / "out"}"\ndecode_workers = {decode_workers}\njson_mirror = true\n{added}',
         )
         site.start("console", "shore-1", f'role = "shore"\nport = {site.console_port}\n')
-        site.start("compressor", "uuv-1", 'codec = "spiht"\n')  # needs no compilation
+        site.start("compressor", "uuv-1", "")
         site.start(
             "atd_stub",
             "uuv-2",

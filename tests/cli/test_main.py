@@ -220,8 +220,8 @@ def test_another_missing_module_is_a_defect():
 @pytest.mark.parametrize(
     ("arguments", "first", "another"),
     [
-        ("encode --codec help", "avif", "vector quantisation with a shared tile codebook (the paper's codec)"),
-        ("encode --codec=help", "avif", "vector quantisation"),
+        ("encode --codec help", "emb", "vector quantisation with a shared tile codebook (the paper's codec)"),
+        ("encode --codec=help", "emb", "vector quantisation"),
         ("decode --codebook help", "nominal-10", "FILE"),
         ("encode --model help", "standard (default)", "structure"),
         ("encode --packing help", "14bit", "ascii5"),

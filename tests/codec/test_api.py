@@ -60,7 +60,6 @@ def test_options_select_model_codebook_and_packing(codebook: Path) -> None:
     [
         ("vq", {"model": "structure"}, "codebook or packing"),
         ("emb", {"codebook": "nominal-10"}, "expected model"),
-        ("spiht", {"model": "standard"}, "no options"),
         ("emb", {"model": "texture"}, "standard or structure"),
         ("vq", {"packing": "13bit"}, "14bit"),
         ("zip", {}, "one of"),

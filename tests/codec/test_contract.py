@@ -28,10 +28,7 @@ def codecs() -> dict[str, Codec]:
 
 
 CODECS = codecs()
-# The library of JPEG XL is an optional extra.
-EACH = pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.system] if name == "jpegxl" else []) for name in CODECS]
-)
+EACH = pytest.mark.parametrize("name", CODECS)
 
 
 @cache
@@ -179,9 +176,8 @@ def test_stream_of_another_codec_is_rejected(name: str) -> None:
                 codec.decode(stream_of(other_name, 20, 20))
 
 
-@pytest.mark.parametrize("name", ["emb", "huffman", "spiht"])
-def test_bytes_after_a_lost_byte_are_not_used(name: str) -> None:
-    codec, stream = CODECS[name], stream_of(name, 40, 40)
+def test_bytes_after_a_lost_byte_are_not_used() -> None:
+    codec, stream = CODECS["emb"], stream_of("emb", 40, 40)
     size = StreamHeader.unpack(stream).size
     received = np.ones(len(stream) - size, np.bool_)
     received[40] = False

@@ -108,8 +108,8 @@ def test_plug_in_is_registered_by_name_and_by_codec_id() -> None:
 )
 def test_invalid_plug_in_stops_only_who_uses_it(name: str, value: str, match: str) -> None:
     registry = with_plug_ins(plugin(name, value))
-    assert registry.create("spiht").codec_id == registry.spec_for_id(0x04).codec_ids[0]
-    assert not registry.spec("huffman").needs_tiles
+    assert registry.create("emb").codec_id in registry.spec_for_id(0x20).codec_ids
+    assert registry.spec("vq").needs_tiles
     with pytest.raises(ConfigError, match=match) as caught:
         registry.create(name)
     assert name in caught.value.where
@@ -135,11 +135,10 @@ def test_plug_in_that_another_thread_registers_meanwhile(find, monkeypatch) -> N
 
 
 def test_prefixes_of_embedded_codecs_are_images(registry: CodecRegistry) -> None:
-    assert {name for name in registry.names() if registry.is_embedded(name)} == {"emb", "spiht"}
+    assert {name for name in registry.names() if registry.is_embedded(name)} == {"emb"}
     assert not registry.is_embedded("nothing")
     image = np.random.default_rng(1).integers(0, 256, (32, 40), dtype=np.uint8)
-    for name in ("emb", "spiht"):
-        codec = registry.create(name)
-        stream = codec.encode(image, 120)
-        errors = [np.abs(codec.decode(stream[:n]).image.astype(int) - image).mean() for n in (30, 120)]
-        assert errors[1] < errors[0]
+    codec = registry.create("emb")
+    stream = codec.encode(image, 120)
+    errors = [np.abs(codec.decode(stream[:n]).image.astype(int) - image).mean() for n in (30, 120)]
+    assert errors[1] < errors[0]

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from research.codecs import __main__ as command
+from research.codecs.baselines import comparison_registry
 from research.common import measurement as measuring
 from research.common.images import SampleImage, read_image_folder, sdvd_crops, simulated_images, survey_line
 from research.common.measurement import CodecUnderTest, code_image, measure_codec
@@ -17,7 +18,7 @@ from research.common.scene_measures import PSNR_LIMIT_DB
 from sonarpost.codec.emb import DEFAULT_STRENGTH
 from sonarpost.codec.interface import DecodedImage, StreamHeader
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.registry import CodecRegistry, CodecSpec, default_registry
+from sonarpost.codec.registry import CodecRegistry, CodecSpec
 from sonarpost.codec.vq.codebook import Codebook, save
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CodebookError, ConfigError, SonarpostError, StreamError
@@ -137,7 +138,7 @@ def test_row_with_many_misses_is_null_and_details_have_the_figures(folder, tmp_p
 
 
 def test_vq_row_is_the_best_codebook_within_the_budget(folder: Path, tmp_path: Path) -> None:
-    subjects, _ = measuring.create_codecs(default_registry(), ["vq"])
+    subjects, _ = measuring.create_codecs(comparison_registry(), ["vq"])
     images = read_image_folder(folder).images
     variants = [measure_codec(subject, images, [])[0] for subject in subjects]
     coarse = next(p for p in variants if p.tested.variant == "nominal-20 14bit")
@@ -167,7 +168,7 @@ def test_vq_uses_the_given_codebooks(folder: Path, tmp_path: Path, capsys: pytes
 
 
 def test_bd_rate_compares_emb_with_every_other_codec(folder, tmp_path, capsys, monkeypatch):
-    subjects = [CodecUnderTest(Halving()), *measuring.create_codecs(default_registry(), ["spiht", "vq"])[0]]
+    subjects = [CodecUnderTest(Halving()), *measuring.create_codecs(comparison_registry(), ["spiht", "vq"])[0]]
     monkeypatch.setattr("research.common.command.create_codecs", lambda *_, **__: (subjects, []))
     file = tmp_path / "details.json"
     assert run("--images", folder, "--budgets", "24,44,88,192", "--json", "--details", file) == 0
@@ -321,7 +322,7 @@ def test_unavailable_codecs_are_listed_unless_requested_by_name(monkeypatch: pyt
 
 
 def test_models_of_emb_are_measured_under_their_own_names_and_with_its_strength() -> None:
-    registry = default_registry()
+    registry = comparison_registry()
     found, _ = measuring.create_codecs(registry, ["emb", "emb:structure"])
     assert [(one.name, one.label, one.codec.codec_id) for one in found] == [
         ("emb", "emb", 0x22),
@@ -331,5 +332,5 @@ def test_models_of_emb_are_measured_under_their_own_names_and_with_its_strength(
     assert [one.name for one in everything if one.codec.name == "emb"] == ["emb", "emb:structure"]
     assert command.new_parser().parse_args([]).strength == DEFAULT_STRENGTH
     for options, strength in (({}, DEFAULT_STRENGTH), ({"strength": 0.0}, 0)):
-        ((tested,), _) = measuring.create_codecs(default_registry(), ["emb"], **options)
+        ((tested,), _) = measuring.create_codecs(comparison_registry(), ["emb"], **options)
         assert tested.codec.strength == strength

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from research.codecs.baselines import comparison_registry
 from research.common.measurement import create_codecs
 from research.detection import __main__ as command
 from research.detection import simulated
 from research.detection.codec_effect import codec_effects, confidence_with, contact_snippet
 from research.detection.simulated import EvaluatedContact, EvaluatedFile
 from research.detection.tiles import tile_auc, tile_scores
-from sonarpost.codec.registry import default_registry
 from sonarpost.detection.detector import detect
 from sonarpost.errors import SurveyFileError
 from sonarpost.extensions.simulation.seabed.survey import TruthObject
@@ -87,7 +87,7 @@ def contact(make_survey):
 
 
 def test_codec_effect_has_one_result_a_budget_and_a_large_budget_keeps_the_confidence(contact):
-    ((codec,), _) = create_codecs(default_registry(), ["spiht"])
+    ((codec,), _) = create_codecs(comparison_registry(), ["spiht"])
     small, large = codec_effects([contact], codec, [16, 11_000])
     found = [(e.label, e.budget_bytes, e.coded, e.misses) for e in (small, large)]
     assert found == [("spiht", 16, 1, 0), ("spiht", 11_000, 1, 0)]

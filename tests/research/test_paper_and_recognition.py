@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from research.codecs.baselines.spiht import SpihtCodec
 from research.common.images import SampleImage
 from research.common.statistics import auc
 from research.paper import __main__ as paper
@@ -16,7 +17,6 @@ from research.paper.dimensions import sensitivity
 from research.paper.figures import contact_images
 from research.recognition import __main__ as recognition
 from research.recognition.classifier import FOLDS, TargetClassifier, codec_with_grain, with_grain
-from sonarpost.codec.baselines.spiht import SpihtCodec
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey

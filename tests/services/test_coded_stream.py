@@ -33,8 +33,8 @@ VESSEL = "vessel-1"
 
 @pytest.fixture
 def stream(texture):
-    """A stream of spiht, whose prefixes are coarser images and which needs no compilation."""
-    return default_registry().create("spiht").encode(texture(), 600)
+    """A stream whose prefixes are coarser images."""
+    return default_registry().create("emb").encode(texture(), 600)
 
 
 def update(stream, version=1, number=1, missing=()):
@@ -86,7 +86,7 @@ def test_shore_has_the_same_image_as_the_vessel(op_modem, start_relay, start_c2,
     eventually(lambda: on_vessel and at_shore and coded)
     assert images(at_shore) == images(on_vessel)
     record = wire.decode(CodedImage, coded[0].payload.to_bytes(), "")
-    assert (record.codec, record.bytes_received, record.missing) == ("spiht", 180, ((100, 120),))
+    assert (record.codec, record.bytes_received, record.missing) == ("emb", 180, ((100, 120),))
     [vessel_tiff], [shore_tiff] = (list((tmp_path / name).rglob("*.tiff")) for name in ("vessel", "shore"))
     np.testing.assert_array_equal(read_image(shore_tiff), read_image(vessel_tiff))
     assert shore_tiff.with_suffix(".json").read_bytes() == vessel_tiff.with_suffix(".json").read_bytes()
@@ -174,7 +174,7 @@ def test_stream_that_cannot_be_decoded_costs_that_image_only_and_other_pixels_ar
         return CodedImage(**dict(update(data, 1, number)), model="", **fields)
 
     undecodable = coded(b"\x7f" + bytes(50), 1, codec="", pixels_crc32=None)
-    peer.send(keys.image_coded(VESSEL), "relay", undecodable, coded(stream, 2, codec="spiht", pixels_crc32=1))
+    peer.send(keys.image_coded(VESSEL), "relay", undecodable, coded(stream, 2, codec="emb", pixels_crc32=1))
     eventually(lambda: at_shore)
     [(key, reason)] = refused(c2)
     assert key == keys.shore_part(VESSEL)
@@ -245,7 +245,7 @@ def test_refused_difference_is_sent_whole_after_another_version_was_acknowledged
     queue, key = "c2", keys.shore_part(VESSEL)
     streams = [np.random.default_rng(n).integers(0, 256, 300, np.uint8).tobytes() for n in (1, 2)]
     first, second, third = (
-        CodedImage(**dict(update(data, version)), model="", codec="spiht", pixels_crc32=None)
+        CodedImage(**dict(update(data, version)), model="", codec="emb", pixels_crc32=None)
         for version, data in ((1, streams[0]), (2, streams[1]), (3, streams[0] + streams[1]))
     )
     wholes = [wire.encode(image_parts.whole_part(image)) for image in (first, second, third)]
@@ -271,7 +271,7 @@ def test_refused_difference_is_sent_whole_after_another_version_was_acknowledged
 def test_acknowledged_difference_is_stored_whole(platform, stream):
     relay, queue, key = RelayService(platform(VESSEL), RelayConfig()), "c2", keys.shore_part(VESSEL)
     first, second = (
-        CodedImage(**dict(update(stream[:length], version)), model="", codec="spiht", pixels_crc32=None)
+        CodedImage(**dict(update(stream[:length], version)), model="", codec="emb", pixels_crc32=None)
         for version, length in ((1, 200), (2, 300))
     )
     with relay.store.transaction() as tx:

@@ -3,8 +3,9 @@
 `BUILTINS` lists the codecs of the core; for others see `sonarpost.registry`. The group of entry points is
 `sonarpost.codecs`: an entry point loads a `CodecSpec` with its name.
 
-Codec ids are never reused. 0x01..0x0F have no model, 0x10..0x13 belong to vq (one for each packing), 0x20 to 0x23 to
-emb (one for each kind of model, with and without despeckling). 0x80 and above are for other distributions.
+Codec ids are never reused. 0x01..0x0F have no model; 0x01..0x07 are those of `research.codecs.baselines`. 0x10..0x13
+belong to vq (one for each packing), 0x20 to 0x23 to emb (one for each kind of model, with and without despeckling).
+0x80 and above are for other distributions.
 """
 
 from __future__ import annotations
@@ -15,10 +16,6 @@ from functools import cache
 from importlib.metadata import EntryPoint
 
 from sonarpost.codec import emb
-from sonarpost.codec.baselines.huffman import HuffmanCodec
-from sonarpost.codec.baselines.jpeg2000 import Jpeg2000Codec
-from sonarpost.codec.baselines.spiht import SpihtCodec
-from sonarpost.codec.baselines.still_images import StillImageCodec, StillImageFormat
 from sonarpost.codec.interface import Codec, StreamHeader, tag_length
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.codec.vq.tiles import TileDatabase
@@ -93,12 +90,6 @@ def _create_emb(resources: CodecResources) -> Codec:
     return EmbCodec(resources.model or emb.DEFAULT_MODEL, strength)
 
 
-def _still_image_spec(image_format: StillImageFormat) -> CodecSpec:
-    summary = f"{image_format.name} at the best quality that fits, for comparison"
-    codec_ids = (image_format.codec_id,)
-    return CodecSpec(image_format.value, codec_ids, lambda _: StillImageCodec(image_format), summary)
-
-
 BUILTINS = (
     CodecSpec(
         emb.NAME,
@@ -115,17 +106,6 @@ BUILTINS = (
         "vector quantisation with a shared tile codebook (the paper's codec)",
         needs_tiles=True,
     ),
-    CodecSpec("huffman", (0x01,), lambda _: HuffmanCodec(), "quantised grey levels in a Huffman code (in the paper)"),
-    CodecSpec("jpeg2000", (0x02,), lambda _: Jpeg2000Codec(), "JPEG 2000, raw codestream (in the paper)"),
-    CodecSpec("jpeg2000-packets", (0x03,), lambda _: Jpeg2000Codec(packets_only=True), "JPEG 2000 without its headers"),
-    CodecSpec(
-        "spiht",
-        (0x04,),
-        lambda _: SpihtCodec(),
-        "set partitioning of a 9/7 wavelet, embedded (in the paper)",
-        is_embedded=True,
-    ),
-    *(_still_image_spec(image_format) for image_format in StillImageFormat if image_format.available),
 )
 
 
@@ -186,7 +166,7 @@ class CodecRegistry:
         if name not in self._by_name and name in self._plug_ins.names():
             self.register(self._plug_ins.get(name))
         if name not in self._by_name:
-            raise ConfigError("codec registry", "name", name, "one of " + ", ".join(self.names()) + _requirement(name))
+            raise ConfigError("codec registry", "name", name, "one of " + ", ".join(self.names()))
         return self._by_name[name]
 
     def create(self, name: str, resources: CodecResources | None = None) -> Codec:
@@ -206,7 +186,7 @@ class CodecRegistry:
         unusable = [] if codec_id in self._by_id else self._register_plug_ins()
         if codec_id not in self._by_id:
             known = ", ".join(f"{number:#04x} ({self._by_id[number].name})" for number in sorted(self._by_id))
-            expected = "; ".join([f"one of {known}{_requirement(codec_id)}", *map(str, unusable)])
+            expected = "; ".join([f"one of {known}", *map(str, unusable)])
             raise StreamError("stream", "codec_id", f"{codec_id:#04x}", expected)
         return self._by_id[codec_id]
 
@@ -232,12 +212,6 @@ class CodecRegistry:
         header = StreamHeader.unpack(stream)
         resources = resources or CodecResources()
         return self.spec_for_id(header.codec_id).create(replace(resources, codec_id=header.codec_id))
-
-
-def _requirement(name_or_id: str | int) -> str:
-    """Return the software to install for a codec that is not available, as the end of a message."""
-    missing = (one for one in StillImageFormat if name_or_id in (one.value, one.codec_id) and not one.available)
-    return "".join(f" ({one.value} needs {one.requirement})" for one in missing)
 
 
 def codec_plug_ins(points: Iterable[EntryPoint]) -> Registry[CodecSpec]:

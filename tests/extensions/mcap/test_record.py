@@ -93,9 +93,9 @@ def test_replay_to_c2_stores_every_record_once(platform, router, tmp_path, capsy
 
 
 def coded(number):
-    """A coded image of spiht and its decoded form, the first one with a contact and a range that has not arrived."""
+    """A coded image and its decoded form, the first one with a contact and a range that has not arrived."""
     pixels = (np.arange(48 * 40).reshape(48, 40) * (number + 1) % 251).astype(np.uint8)
-    stream = default_registry().create("spiht").encode(pixels, 300)
+    stream = default_registry().create("emb").encode(pixels, 300)
     missing = ((200, len(stream)),) if number == 0 else ()
     received = ReceivedImage(
         vessel_id="vessel-1",

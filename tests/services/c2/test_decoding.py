@@ -259,7 +259,7 @@ def worker(tmp_path):
 
 @pytest.fixture
 def coded(texture):
-    stream = default_registry().create("spiht").encode(texture(), 200)
+    stream = default_registry().create("emb").encode(texture(), 200)
     part = ImagePart(u="uuv-1", i="0001", n=1, t=1.7e9, p=stream)
     return AcceptedImage("", "vessel-1", wire.encode(part)).coded_image()
 
@@ -279,7 +279,7 @@ def test_end_of_a_decoder_is_blamed_on_the_machine_unless_it_ends_by_itself(work
 @pytest.mark.system
 def test_decoder_that_does_not_finish_is_ended_after_its_processor_time(worker, texture):
     # The kernel counts processor time in ticks: the decoding must last longer than one.
-    stream = default_registry().create("spiht").encode(texture(512, 512), 20_000)
+    stream = default_registry().create("emb").encode(texture(512, 512), 20_000)
     part = ImagePart(u="uuv-1", i="0001", n=1, t=1.7e9, p=stream)
     coded = AcceptedImage("", "vessel-1", wire.encode(part)).coded_image()
     before = signal.signal(signal.SIGPROF, signal.SIG_IGN)  # children inherit it

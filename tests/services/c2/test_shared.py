@@ -224,8 +224,8 @@ def test_owner_is_the_same_after_a_restart(begin, runner):
 
 @pytest.fixture
 def parts(texture):
-    """Coded images of spiht, which needs no compilation."""
-    streams = [default_registry().create("spiht").encode(texture(seed=seed), 200) for seed in range(4)]
+    """Coded images."""
+    streams = [default_registry().create("emb").encode(texture(seed=seed), 200) for seed in range(4)]
     return [
         ImagePart(u="uuv-1", i=f"{number:04d}", n=1, t=1000.0 + number, p=stream)
         for number, stream in enumerate(streams)

@@ -135,7 +135,7 @@ class Traffic:
         self.states = {}
         self.health = {}
         self._noise = np.random.default_rng(1).integers(0, 256, (40, 60), dtype=np.uint8)
-        self._stream = default_registry().create("spiht").encode(self._noise, 200)
+        self._stream = default_registry().create("emb").encode(self._noise, 200)
         platforms = {
             name: PlatformConfig(id=name, router=(shore.endpoint,), state_dir=shore.folder / name, acoustic_auth="none")
             for name in (*VESSELS, "shore-console")

@@ -9,8 +9,8 @@ from builders.images import snippet
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.codec.baselines import spiht
-from sonarpost.codec.baselines.spiht import MAX_PLANES, SpihtCodec, forward_transform, wavelet_trees
+from research.codecs.baselines import spiht
+from research.codecs.baselines.spiht import MAX_PLANES, SpihtCodec, forward_transform, wavelet_trees
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import StreamError

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image as Pillow
 
-from sonarpost.codec.baselines import jpeg2000
-from sonarpost.codec.baselines.jpeg2000 import Jpeg2000Codec, codestream, main_header, packets_of
+from research.codecs.baselines import jpeg2000
+from research.codecs.baselines.jpeg2000 import Jpeg2000Codec, codestream, main_header, packets_of
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError, StreamError

@@ -12,7 +12,7 @@ from builders.images import snippet
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.codec.baselines.huffman import MAX_CODE_BITS, HuffmanCodec, canonical_codes, code_lengths
+from research.codecs.baselines.huffman import MAX_CODE_BITS, HuffmanCodec, canonical_codes, code_lengths
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError, StreamError

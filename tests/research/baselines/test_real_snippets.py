@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from builders.images import sdvd_crops
 
-from sonarpost.codec.baselines.huffman import HuffmanCodec
-from sonarpost.codec.baselines.jpeg2000 import Jpeg2000Codec
-from sonarpost.codec.baselines.spiht import SpihtCodec
+from research.codecs.baselines.huffman import HuffmanCodec
+from research.codecs.baselines.jpeg2000 import Jpeg2000Codec
+from research.codecs.baselines.spiht import SpihtCodec
 from sonarpost.codec.interface import Codec
 from sonarpost.codec.quality import psnr_db
 
