@@ -162,7 +162,7 @@ class C2Service(Service[C2Config]):
         return None
 
     @override
-    def expand(self, tx: Transaction, key: str, payload: bytes, record: Record) -> bytes:
+    def expand(self, tx: Transaction, key: str, payload: bytes, record: Record) -> tuple[bytes, Record]:
         """Return the whole image of a difference; store it, because the vessel sends later differences to it.
 
         Raises:
@@ -174,23 +174,23 @@ class C2Service(Service[C2Config]):
         elif isinstance(record, ImagePart):
             vehicle, image, first_frame_utc_s, version = record.u, record.i, record.t, record.n
         else:
-            return payload
+            return payload, record
         vessel = keys.part_vessel(key)
         prefix = f"{VERSIONS}{vessel}/"
         name = prefix + image_parts.subject(vehicle, image, first_frame_utc_s)
         if version == 1:
             tx.add_state(name, payload)  # a stored one is the same version or a later one
             self._prune_versions(tx, prefix)
-            return payload
+            return payload, record
         known = image_parts.stored_version(tx.get_state(name), name)
         if isinstance(record, ImagePart):
             whole = image_parts.expand(record, known, key)
-            image_parts.coded_image(whole, vessel, key)
+            record = image_parts.coded_image(whole, vessel, key)
             payload = wire.encode(whole)
         if known is None or known.n < version:
             tx.put_state(name, payload)
             self._prune_versions(tx, prefix)
-        return payload
+        return payload, record
 
     def _prune_versions(self, tx: Transaction, prefix: str) -> None:
         self._stored_versions[prefix] += 1

@@ -10,7 +10,7 @@ import msgpack
 from sonarpost import wire
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
-from sonarpost.messages import EncodedImage, Snippet
+from sonarpost.messages import Snippet
 
 _INDEX = "kept"
 _ENTRY = "kept/"
@@ -21,14 +21,20 @@ class CachedImage:
     """A cache entry.
 
     Attributes:
-        image: The `encoded_image` record, encoded, with the complete stream.
-        snippet: The `snippet` record it was made of, encoded.
+        codec: Name of the codec.
+        model: Identity of its model or codebook.
+        stream: The complete stream.
+        payload: The `snippet` record that it was made of, encoded.
+        snippet: The same, decoded.
         expanded_id: Identifier of the image that shows more seabed around it; empty where none was made.
         original_id: Identifier of the image without despeckling; empty where none was made.
     """
 
-    image: bytes
-    snippet: bytes
+    codec: str
+    model: str
+    stream: bytes
+    payload: bytes
+    snippet: Snippet
     expanded_id: str = ""
     original_id: str = ""
 
@@ -66,12 +72,11 @@ class EncodeCache:
         effects.put_state(_INDEX, msgpack.packb(index))
         for image_id, cached in images.items():
             if image_id in index:
-                entry = msgpack.packb([cached.image, cached.snippet, cached.expanded_id, cached.original_id])
-                effects.put_state(_ENTRY + image_id, entry)
+                effects.put_state(_ENTRY + image_id, _packed(cached))
 
     def get(self, image_id: str) -> CachedImage | None:
         """Return the entry of an image, None if there is none."""
-        return self._store.read_state(_ENTRY + image_id, _entry, None)
+        return self._store.read_state(_ENTRY + image_id, lambda packed: _entry(packed, image_id), None)
 
 
 def _index(packed: bytes) -> list[str]:
@@ -82,14 +87,15 @@ def _index(packed: bytes) -> list[str]:
     return names
 
 
-def _entry(packed: bytes) -> CachedImage:
-    image, snippet, expanded_id, original_id = msgpack.unpackb(packed)
-    # A damaged record is discarded with its entry.
-    wire.decode(EncodedImage, image, "cached image")
-    wire.decode(Snippet, snippet, "cached snippet")
-    return CachedImage(image, snippet, str(expanded_id), str(original_id))
+def _packed(cached: CachedImage) -> bytes:
+    ids = (cached.expanded_id, cached.original_id)
+    packed: bytes = msgpack.packb((cached.codec, cached.model, cached.stream, cached.payload, *ids))
+    return packed
 
 
-def entry_location(image_id: str) -> str:
-    """Return where an entry is stored, for error messages."""
-    return f"compressor.db: {_ENTRY}{image_id}"
+def _entry(packed: bytes, image_id: str) -> CachedImage:
+    codec, model, stream, payload, *ids = msgpack.unpackb(packed)
+    where = f"compressor.db: {_ENTRY}{image_id}"
+    if not isinstance(stream, bytes) or not all(isinstance(text, str) for text in (codec, model, *ids)):
+        raise TypeError(f"{where}: got another type, expected texts and a stream")
+    return CachedImage(codec, model, stream, payload, wire.decode(Snippet, payload, where), *ids)

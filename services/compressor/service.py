@@ -23,7 +23,7 @@ from sonarpost.logs import kv
 from sonarpost.messages import Command, CommandKind, EncodedImage, Record, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.compressor.config import CompressorConfig
-from sonarpost.services.compressor.encode_cache import CachedImage, EncodeCache, entry_location
+from sonarpost.services.compressor.encode_cache import CachedImage, EncodeCache
 from sonarpost.services.compressor.encoding import (
     cut_region,
     encode,
@@ -53,6 +53,7 @@ class CompressorService(Service[CompressorConfig]):
     """
 
     NAME = "compressor"
+    MAX_AT_ONCE = 1
 
     def __init__(self, platform: PlatformConfig, config: CompressorConfig) -> None:
         use_code_folder(platform.state_dir)
@@ -111,17 +112,8 @@ class CompressorService(Service[CompressorConfig]):
         stream = transmit_part(codec, complete)
         number = self._next_number()
         effects.put_state(_NEXT_IMAGE, str(number % IMAGE_IDS + 1).encode())
-        image = EncodedImage(
-            vehicle_id=self.platform.id,
-            image_id=format_image_id(number),
-            contact=snippet.contact,
-            codec=codec.name,
-            model=codec.model_hash,
-            height_px=snippet.pixels.height_px,
-            width_px=snippet.pixels.width_px,
-            stream=stream,
-            original_sha256=snippet.pixels.sha256,
-        )
+        cached = CachedImage(codec.name, codec.model_hash, complete, payload, snippet)
+        image = self._image(format_image_id(number), cached, stream)
         effects.send(keys.image_encoded(self.platform.id), _CONSUMER, image, priority=priority)
         effects.count("images_encoded")
         effects.count("bytes_encoded", len(stream))
@@ -138,7 +130,22 @@ class CompressorService(Service[CompressorConfig]):
                 encode_ms=round(1000 * (time.perf_counter() - started), 1),
             ),
         )
-        return image.image_id, CachedImage(wire.encode(image.model_copy(update={"stream": complete})), payload)
+        return image.image_id, cached
+
+    def _image(self, image_id: str, cached: CachedImage, stream: bytes) -> EncodedImage:
+        """Return the record of an image with a part of its stream."""
+        snippet = cached.snippet
+        return EncodedImage(
+            vehicle_id=self.platform.id,
+            image_id=image_id,
+            contact=snippet.contact,
+            codec=cached.codec,
+            model=cached.model,
+            height_px=snippet.pixels.height_px,
+            width_px=snippet.pixels.width_px,
+            stream=stream,
+            original_sha256=snippet.pixels.sha256,
+        )
 
     def _execute(self, command: Command, effects: UnitOfWork) -> None:
         image_id = command.image_id or ""
@@ -161,7 +168,7 @@ class CompressorService(Service[CompressorConfig]):
         if expanded is not None:
             self._resend("resend", cached.expanded_id, expanded, effects)
             return
-        snippet = expand(wire.decode(Snippet, cached.snippet, entry_location(image_id)))
+        snippet = expand(cached.snippet)
         if snippet is None:
             effects.count("commands_without_expanded_image")
             log.warning("Snippet has no expanded image", extra=kv(image_id=image_id))
@@ -179,14 +186,12 @@ class CompressorService(Service[CompressorConfig]):
         if original is not None:
             self._resend("resend", cached.original_id, original, effects)
             return
-        image = wire.decode(EncodedImage, cached.image, entry_location(image_id))
-        if not is_despeckled(image.stream):
+        if not is_despeckled(cached.stream):
             effects.count("commands_without_despeckling")
-            log.warning("Image is not despeckled", extra=kv(image_id=image_id, codec=image.codec))
+            log.warning("Image is not despeckled", extra=kv(image_id=image_id, codec=cached.codec))
             return
-        snippet = wire.decode(Snippet, cached.snippet, entry_location(image_id))
         original_id, entry = self._encode(
-            snippet, effects, cached.snippet, self._codec_without_despeckling, priority=_COMMAND_PRIORITY
+            cached.snippet, effects, cached.payload, self._codec_without_despeckling, priority=_COMMAND_PRIORITY
         )
         self._cache.put(effects, {image_id: replace(cached, original_id=original_id), original_id: entry})
         effects.count("images_original")
@@ -197,13 +202,12 @@ class CompressorService(Service[CompressorConfig]):
         assert command.box is not None
         assert command.stream_bytes is not None
         image_id = command.image_id or ""
-        snippet = wire.decode(Snippet, cached.snippet, entry_location(image_id))
-        region = cut_region(snippet, RegionBox(*command.box))
+        region = cut_region(cached.snippet, RegionBox(*command.box))
         region_id, entry = self._encode(
             region,
             effects,
             wire.encode(region),
-            self._codec_without_despeckling if not self._is_despeckled(image_id, cached) else self._codec,
+            self._codec if is_despeckled(cached.stream) else self._codec_without_despeckling,
             priority=_COMMAND_PRIORITY,
             budget_bytes=command.stream_bytes,
         )
@@ -211,41 +215,35 @@ class CompressorService(Service[CompressorConfig]):
         effects.count("images_region")
         log.info("Region sent", extra=kv(image_id=image_id, region_id=region_id, bytes=command.stream_bytes))
 
-    def _is_despeckled(self, image_id: str, cached: CachedImage) -> bool:
-        return is_despeckled(wire.decode(EncodedImage, cached.image, entry_location(image_id)).stream)
-
     def _resend(self, kind: CommandKind, image_id: str, cached: CachedImage, effects: UnitOfWork) -> None:
         """Send an image again, with a longer stream for a refine command if the codec can extend it.
 
         The link itself sends the rest of a stream that it has; a command arrives here only when it has no more.
         """
-        image = wire.decode(EncodedImage, cached.image, entry_location(image_id))
         # An image that was encoded with another codec is sent unchanged.
-        codec = self._codec_of(image)
+        codec = self._codec_of(cached)
         if kind == "refine" and codec is not None:
-            snippet = wire.decode(Snippet, cached.snippet, entry_location(image_id))
-            longer = refine(codec, image.stream, snippet.pixels.to_array())
-            if longer != image.stream:
-                image = image.model_copy(update={"stream": longer})
-                self._cache.put(effects, {image_id: replace(cached, image=wire.encode(image))})
+            longer = refine(codec, cached.stream, cached.snippet.pixels.to_array())
+            if longer != cached.stream:
+                cached = replace(cached, stream=longer)
+                self._cache.put(effects, {image_id: cached})
                 effects.count("images_refined")
-        if codec is not None:
-            stream = transmit_part(codec, image.stream)
-            image = image.model_copy(update={"codec": codec.name, "stream": stream})
+        stream = cached.stream if codec is None else transmit_part(codec, cached.stream)
+        image = self._image(image_id, cached, stream)
         effects.send(keys.image_encoded(self.platform.id), _CONSUMER, image, priority=_COMMAND_PRIORITY)
         effects.count("images_resent")
         log.info("Image sent again", extra=kv(image_id=image_id, kind=kind, bytes=len(image.stream)))
 
-    def _codec_of(self, image: EncodedImage) -> Codec | None:
+    def _codec_of(self, cached: CachedImage) -> Codec | None:
         """Return the codec that continues the stream of a cached image, with the model that began it.
 
         The configuration may have changed since: model and strength of despeckling are those of the stream. None for
         an image of another codec than the configured one, or of a model or codebook that this installation lacks.
         """
-        if image.codec != self._codec.name:
+        if cached.codec != self._codec.name:
             return None
-        codec = default_registry().create_for_stream(image.stream, CodecResources(self._tiles))
-        return codec if codec.model_hash == image.model else None
+        codec = default_registry().create_for_stream(cached.stream, CodecResources(self._tiles))
+        return codec if codec.model_hash == cached.model else None
 
     def _next_number(self) -> int:
         """Return the next image number.

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
+import time
 import uuid
 from collections.abc import Mapping
+from typing import Any
 
 import zenoh
 from typing_extensions import override
@@ -30,6 +33,8 @@ log = logging.getLogger(__name__)
 STREAM_CONSUMER = "relay"
 """The consumer that gets the coded stream: the link to the shore site carries no pixels."""
 WATCHERS = "watchers"
+SUBSCRIBERS_UNKNOWN_S = 1.0
+"""Time after the start in which the router may not have reported all subscribers: pixels are published."""
 
 
 class DecompressorService(Service[DecompressorConfig]):
@@ -41,6 +46,7 @@ class DecompressorService(Service[DecompressorConfig]):
 
     NAME = "decompressor"
     PAGE_BYTES = 512
+    MAX_AT_ONCE = 1
 
     def __init__(self, platform: PlatformConfig, config: DecompressorConfig) -> None:
         use_code_folder(platform.state_dir)
@@ -49,10 +55,15 @@ class DecompressorService(Service[DecompressorConfig]):
         super().__init__(platform, config)
         self._retention = Retention(self._apply_retention, self.stopping)
         self._copy_origin, self._copies = uuid.uuid4().bytes, 0
+        self._publisher: zenoh.Publisher | None = None
+        self._subscribers_known_s = math.inf
 
     @override
     def on_start(self) -> None:
         """Start the retention, and reply to queries for codebooks."""
+        key, encoding = keys.image_reconstructed(self.platform.id), wire.encoding_of(ReconstructedImage)
+        self._publisher = self.session.declare_publisher(key, encoding=encoding)
+        self._subscribers_known_s = time.monotonic() + SUBSCRIBERS_UNKNOWN_S
         declare_codebooks(self.session, self.platform.id, self._decoder)
         self.start_thread(self._retention.run, "retention")
 
@@ -127,7 +138,12 @@ class DecompressorService(Service[DecompressorConfig]):
         )
 
     def _publish_copy(self, image: ReconstructedImage) -> None:
-        """Publish the pixels for watchers; the attachment marks them as a copy, which no consumer accepts."""
+        """Publish the pixels if there is a subscriber; the attachment marks a copy, which no consumer accepts."""
+        if time.monotonic() > self._subscribers_known_s:
+            assert self._publisher is not None
+            status: Any = self._publisher.matching_status  # the stub of Zenoh says bool
+            if not status.matching:
+                return
         payload, key = wire.encode(image), keys.image_reconstructed(self.platform.id)
         encoding = wire.encoding_of(ReconstructedImage)
         self._copies += 1

@@ -191,7 +191,7 @@ class Delivery:
     def _accepting(self):
         handled = []
 
-        def handle(key, payload):
+        def handle(key, payload, _record):
             if may_handle:
                 handled.append((key, payload))
             return may_handle

@@ -515,7 +515,7 @@ def test_error_of_the_database_quarantines_no_record(begin, ask, monkeypatch):
     def expand(tx, key, payload, record):
         if fails.pop() if fails else False:
             raise sqlite3.OperationalError("database or disk is full")
-        return payload
+        return payload, record
 
     monkeypatch.setattr(consumer._inbox, "_expand", expand)
     assert ask([item(1, decision(1))]).status == "later"

@@ -14,7 +14,7 @@ from sonarpost import keys, wire
 from sonarpost.archive import image_parts
 from sonarpost.archive.image_parts import stream_of
 from sonarpost.codec.registry import default_registry
-from sonarpost.delivery.records import OutboxItem, Topic
+from sonarpost.delivery.records import InboxItem, OutboxItem, Topic
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.received_image import received_image
@@ -312,9 +312,9 @@ def test_accepted_image_is_decoded_once_or_again_if_it_is_read_from_the_store(pl
     decoded: list[bytes] = []
     decode = wire.decode
     monkeypatch.setattr(wire, "decode", lambda kind, data, where: decoded.append(data) or decode(kind, data, where))
-    c2._handler.check(key, payload)
+    c2._handler.keep_decoded(key, payload, c2._handler.check(key, payload))
     for times in (1, 2):
-        c2._handler._call_handle(key, bytes(bytearray(payload)))
+        c2._handler._effects_of(InboxItem(times, key, bytes(bytearray(payload))))
         assert len(decoded) == times
     first, second = (entry.record for entry in c2._to_publish)
     assert first == second
@@ -322,12 +322,13 @@ def test_accepted_image_is_decoded_once_or_again_if_it_is_read_from_the_store(pl
 
 
 def test_number_of_accepted_images_in_memory_is_limited(platform, tmp_path, monkeypatch):
-    monkeypatch.setattr("sonarpost.runtime.record_handler.MAX_CHECKED", 3)
+    monkeypatch.setattr("sonarpost.runtime.record_handler.MAX_DECODED", 3)
     c2, key = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "shore")), keys.shore_part(VESSEL)
     for number in range(1, 6):
         part = ImagePart(u="uuv-1", i=image_of_number(number), n=1, t=1.0, p=b"\x04\x30" + bytes(5000 * (number == 1)))
-        c2._handler.check(key, wire.encode(part))
-    kept = {record.image_id for record in c2._handler._checked.values()}
+        payload = wire.encode(part)
+        c2._handler.keep_decoded(key, payload, c2._handler.check(key, payload))
+    kept = {record.image_id for record in c2._handler._decoded.values()}
     assert kept == {image_of_number(number) for number in (2, 3, 4)}
     c2.store.close()
 

@@ -51,9 +51,10 @@ MAX_REASON = 200
 
 Replies = AckReply | list[AckReply]
 """Reply to a query; for a batch, one for each record."""
-Handle = Callable[[str, bytes], bool]
-"""Handles an accepted record, as key and payload, in the open transaction; False if it has to wait in the inbox."""
-Accepting = Callable[[], AbstractContextManager[tuple[Transaction, Handle]]]
+Handle = Callable[[str, bytes, T], bool]
+"""Handles an accepted record, as key, payload and what `validate` or `expand` has returned, in the open transaction;
+False if it has to wait in the inbox."""
+Accepting = Callable[[], AbstractContextManager[tuple[Transaction, Handle[T]]]]
 """Opens a transaction that accepts records and can handle them."""
 
 
@@ -67,7 +68,7 @@ class _Message:
     query: zenoh.Query | None
 
 
-def _wait(_key: str, _payload: bytes) -> bool:
+def _wait(_key: str, _payload: bytes, _record: object) -> bool:
     return False
 
 
@@ -87,13 +88,14 @@ class Inbox(Generic[T]):
             BadInputError to refuse it.
         on_refused: Called with each error that caused a record to be refused.
         expand: Called with (transaction, key, payload, record) in the transaction that accepts a valid record; returns
-            the payload to store in its place. Raises MissingBaseError to refuse a difference, which its producer then
-            sends as a whole.
+            the payload to store in its place, and its record. Raises MissingBaseError to refuse a difference, which
+            its producer then sends as a whole.
         check_capacity: Called with the key before a record is stored; raises RetryLaterError if there is no space.
         delivery_only_keys: Key expressions on which plain publications are ignored.
         before_commit: Called with the accepted records, as key and payload, before they are committed and acknowledged;
             raises DeliveryError to leave them with their senders.
-        accepting: Opens the transactions that accept records, which also handle them; by default none is handled.
+        handle: Called with each record that is accepted; by default all wait in the inbox.
+        accepting: Opens the transactions that accept records, with what is called in place of `handle`.
 
     Attributes:
         storage_failing: Whether records cannot be stored at present, for example because of a full disk.
@@ -108,11 +110,12 @@ class Inbox(Generic[T]):
         validate: Callable[[str, bytes], T],
         on_refused: Callable[[BadInputError], None],
         *,
-        expand: Callable[[Transaction, str, bytes, T], bytes] = lambda _tx, _key, payload, _record: payload,
+        expand: Callable[[Transaction, str, bytes, T], tuple[bytes, T]] = lambda _tx, _key, *stored: stored,
         check_capacity: Callable[[str], None] = lambda _: None,
         delivery_only_keys: Collection[str] = (),
         before_commit: Callable[[Sequence[tuple[str, bytes]]], None] = lambda _: None,
-        accepting: Accepting | None = None,
+        handle: Handle[T] = _wait,
+        accepting: Accepting[T] | None = None,
     ) -> None:
         self._store = store
         self._key_suffix = "/delivery/" + consumer
@@ -122,7 +125,7 @@ class Inbox(Generic[T]):
         self._check_capacity = check_capacity
         self._before_commit = before_commit
         self._accepting = accepting
-        self._handle: Handle = _wait
+        self._own_handle = self._handle = handle
         self._accepted: list[tuple[str, bytes]] = []
         self._messages: queue.Queue[_Message | None] = queue.Queue(QUEUE_LIMIT)
         self._stop = threading.Event()
@@ -253,7 +256,7 @@ class Inbox(Generic[T]):
                 # A record can be the cause: without handling it, it is accepted, and handled as others are.
                 log.debug("Records not handled when accepted", extra=kv(error=str(error)))
             finally:
-                self._handle = _wait
+                self._handle = self._own_handle
         with self._store.transaction() as tx:
             return self._store_messages(tx, messages)
 
@@ -332,7 +335,7 @@ class Inbox(Generic[T]):
         with log_context(payload):
             try:
                 record = self._validate(key, payload)
-                stored = self._expand(tx, key, payload, record)
+                stored, record = self._expand(tx, key, payload, record)
             except (DeliveryError, sqlite3.Error):
                 raise
             except MissingBaseError as error:
@@ -346,7 +349,7 @@ class Inbox(Generic[T]):
                 # An unexpected exception must neither block later records nor lose this one.
                 log.exception("Record quarantined after an unexpected exception", extra=kv(key=key))
                 return self._quarantine(tx, key, payload, f"{type(error).__name__}: {error}")
-        tx.accept(key, stored, chunk, is_handled=self._handle(key, stored))
+        tx.accept(key, stored, chunk, is_handled=self._handle(key, stored, record))
         self._accepted.append((key, stored))
         return STORED
 

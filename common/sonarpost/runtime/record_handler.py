@@ -37,8 +37,8 @@ ALONE_AFTER: Final = limit(
 FAILURES_ALONE: Final = limit(
     3, "failures", "blame", "all services", "sender", "failures alone while others are handled", "it is quarantined"
 )
-MAX_CHECKED, MAX_CHECKED_BYTES = 2048, 4096
-"""Maximum number and size of accepted records that are kept in memory to save the decoding in `handle`."""
+MAX_DECODED, MAX_DECODED_BYTES = 2048, 4096
+"""Maximum number and size of the accepted records that are kept decoded until they are handled."""
 TYPES_KEPT = 1000
 """Maximum number of keys in the cache of record types."""
 MAX_REFUSAL_LOGS = 64
@@ -97,7 +97,7 @@ class RecordHandler:
         self._stopping = stopping
         self._lock = threading.Lock()
         self._record_type = lru_cache(TYPES_KEPT)(self._find_record_type)
-        self._checked: dict[tuple[str, bytes], Record] = {}  # accepted records that are not handled yet
+        self._decoded: dict[tuple[str, bytes], Record] = {}  # accepted records that are not handled yet
         self._refusal_logs: dict[str, IntervalLog] = {}
         self._failed_alone: dict[int, int] = {}
 
@@ -114,10 +114,13 @@ class RecordHandler:
             BadInputError: The record is refused.
         """
         record = wire.decode(self._record_type(key), payload, key)
-        record = self._service.validate(key, record) or record
-        if len(self._checked) < MAX_CHECKED and len(payload) <= MAX_CHECKED_BYTES:
-            self._checked[key, payload] = record
-        return record
+        return self._service.validate(key, record) or record
+
+    def keep_decoded(self, key: str, payload: bytes, record: Record) -> bool:
+        """Keep an accepted record until it is handled in its turn; return False."""
+        if len(self._decoded) < MAX_DECODED and len(payload) <= MAX_DECODED_BYTES:
+            self._decoded[key, payload] = record
+        return False
 
     def refused(self, error: BadInputError) -> None:
         """Count and log a refused record."""
@@ -164,7 +167,7 @@ class RecordHandler:
             failures = 0
             self._health.set_degraded("")
             if not found:
-                self._checked.clear()  # of records that were not accepted
+                self._decoded.clear()  # of records that were not accepted
                 self._store.inbox_changed.wait()
 
     def _handle_in_batches(self) -> bool:
@@ -216,20 +219,20 @@ class RecordHandler:
         return bool(items)
 
     @contextmanager
-    def accepting(self) -> Iterator[tuple[Transaction, Handle]]:
+    def accepting(self) -> Iterator[tuple[Transaction, Handle[Record]]]:
         """Open a transaction that accepts records, and handles the first ones unless earlier ones wait."""
         handled: list[UnitOfWork] = []
         with self._service.handling(wait=False) as is_held:
             with self._store.transaction() as tx:
                 limit = self._service.MAX_AT_ONCE if is_held and tx.is_inbox_empty() else 0
 
-                def handle(key: str, payload: bytes) -> bool:
+                def handle(key: str, payload: bytes, record: Record) -> bool:
                     nonlocal limit
                     if len(handled) >= limit:
-                        return False
+                        return self.keep_decoded(key, payload, record)
                     try:
                         with log_context(payload):
-                            handled.append(self._call_handle(key, payload))
+                            handled.append(self._call_handle(key, payload, record))
                     except (DeliveryError, sqlite3.Error):
                         raise  # the transaction can have ended
                     except Exception as error:  # noqa: BLE001 - raised again when it is handled in its turn
@@ -244,7 +247,7 @@ class RecordHandler:
                 for effects in handled:
                     effects.write(tx)
             if is_held and not tx.wrote_inbox:
-                self._checked.clear()  # of records that were not accepted
+                self._decoded.clear()  # of records that were not accepted
             if handled:
                 try:
                     self._service.after_commit(handled, tx.superseded)
@@ -282,7 +285,10 @@ class RecordHandler:
         """Handle a record; return its effects, or None if it was quarantined."""
         with log_context(item.payload):
             try:
-                return self._call_handle(item.key, item.payload)
+                record = self._decoded.pop((item.key, item.payload), None)
+                if record is None:
+                    record = wire.decode(self._record_type(item.key), item.payload, item.key)
+                return self._call_handle(item.key, item.payload, record)
             except (OSError, DeliveryError, MemoryError, ServiceStoppingError):
                 raise
             except BadInputError as error:
@@ -296,11 +302,8 @@ class RecordHandler:
                 self._quarantine_record(item, f"{type(error).__name__}: {error}")
                 return None
 
-    def _call_handle(self, key: str, payload: bytes) -> UnitOfWork:
+    def _call_handle(self, key: str, payload: bytes, record: Record) -> UnitOfWork:
         effects = UnitOfWork(payload)
-        record = self._checked.pop((key, payload), None)
-        if record is None:
-            record = wire.decode(self._record_type(key), payload, key)
         self._service.handle(key, record, effects)
         effects.count("records_handled")
         return effects

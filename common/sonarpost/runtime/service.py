@@ -49,8 +49,8 @@ class Service(ABC, Generic[C]):
         BATCH: Maximum number of records that are committed in one transaction. Above 1, a power cut can repeat the
             side effects of `handle` outside the `UnitOfWork` for a whole batch.
         MAX_AT_ONCE: Maximum number of records that are handled in the transaction that accepts them, while no earlier
-            record waits; 0 if `handle` is slow, opens a transaction, or has effects outside the `UnitOfWork`, which
-            stay if the transaction fails.
+            record waits; 1 if `handle` is slow, 0 if it opens a transaction, or must not be repeated because it has
+            effects outside the `UnitOfWork`, which stay if the transaction fails.
         BATCH_BYTES: Maximum size of the records of one batch; it bounds the write-ahead log.
         PAGE_BYTES: Page size of the store; small pages for a service whose transactions change few bytes.
     """
@@ -145,8 +145,10 @@ class Service(ABC, Generic[C]):
         """Return the settings with which an outbox queue is sent."""
         return QueuePolicy(publish=self.PUBLISH)
 
-    def expand(self, tx: Transaction, key: str, payload: bytes, record: Record) -> bytes:
-        """Return the payload to store for a valid record, in the transaction that accepts it; by default its own.
+    def expand(self, tx: Transaction, key: str, payload: bytes, record: Record) -> tuple[bytes, Record]:
+        """Return the payload to store for a valid record, and what `handle` receives; by default the given ones.
+
+        Called in the transaction that accepts the record.
 
         Args:
             tx: The open transaction.
@@ -157,7 +159,7 @@ class Service(ABC, Generic[C]):
         Raises:
             MissingBaseError: The record is a difference to a version that is not known; its producer sends the whole.
         """
-        return payload
+        return payload, record
 
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> bool | None:
         """React to a consumer's acknowledgement, in the transaction that removes the record from the outbox.
@@ -238,6 +240,7 @@ class Service(ABC, Generic[C]):
                 check_capacity=self.check_capacity,
                 delivery_only_keys=self.delivery_only_keys(),
                 before_commit=self.before_accepting,
+                handle=self._handler.keep_decoded,
                 accepting=self._handler.accepting if self.MAX_AT_ONCE else None,
             )
             self.start_thread(self._handler.run, "work")
