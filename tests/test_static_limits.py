@@ -78,7 +78,6 @@ QUEUES = {
     "common/sonarpost/cli/deployment/modem_ping.py": "a command for a modem at this computer; it ends after its pings",
     "common/sonarpost/delivery/outbox.py": "queries that have ended, at most WINDOW",
     "common/sonarpost/delivery/scheduler.py": "records of the store, at most `lookahead`",
-    "common/sonarpost/modem/micromodem/driver.py": "packets to send; more fail with QUEUE_FULL",
     "common/sonarpost/modem/micromodem/supervisor.py": "commands of the configuration",
     "common/sonarpost/modem/packet_queue.py": "its `limit`",
     "common/sonarpost/network/connections.py": "MAX_REFUSED",

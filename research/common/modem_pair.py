@@ -45,7 +45,7 @@ class ModemPair:
         self.transmissions: list[TransmittedPacket] = []
         self.now = 0.0
         for driver in self.drivers.values():
-            driver.start(0.0)
+            driver.port_opened(0.0)
 
     @property
     def ready(self) -> bool:

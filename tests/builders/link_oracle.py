@@ -87,7 +87,7 @@ def check_driver(data: bytes) -> int:
     fuzz = Fuzz.__new__(Fuzz)  # for its checks only: the lines come from the input
     driver, parser = MicroModem(MicroModemConfig(1)), nmea.LineAssembler()
     now, taken, asked, ended = 0.0, 0, [], []
-    driver.start(now)
+    driver.port_opened(now)
     fuzz._make_ready(driver)
     for kind, body in _steps(data):
         now += (0.0, 0.01, 0.5, 7.0)[kind >> 3 & 3]

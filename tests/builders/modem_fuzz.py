@@ -64,7 +64,7 @@ class Fuzz:
         driver.set_poll_handler(lambda polled: [b"x" * min(3, polled.frame_bytes)] * (polled.frames // 2))
         parser = nmea.LineAssembler()
         now, requested, ended = 0.0, [], []
-        driver.start(now)
+        driver.port_opened(now)
         if self.rng.random() < 0.8:
             self._make_ready(driver)
         for _ in range(count):
@@ -158,15 +158,13 @@ class Fuzz:
 
 
 def send_request(driver: MicroModem, kind: int, data: bytes, rate: int, now: float, *, ack: bool) -> int:
-    """Send a request of one of five kinds; return its number."""
+    """Send a request of one of four kinds; return its number."""
     match kind:
         case 0:
             return driver.ping(2, now)
         case 1:
             return driver.send_mini(2, 5, now)
         case 2:
-            return driver.send_flexible(2, 1, b"flexible", now)
-        case 3:
             return driver.request_packet(2, rate, now=now)
         case _:
             return driver.send_packet(2, rate, [data], ack=ack, now=now)
@@ -183,7 +181,6 @@ def real_lines() -> list[bytes]:
         rig.drivers[2].send_packet(1, rate, [b"back"], now=rig.now)
     rig.drivers[1].ping(2, rig.now)
     rig.drivers[2].send_mini(1, 77, rig.now)
-    rig.drivers[2].send_flexible(1, 1, b"flexible", rig.now)
     rig.drivers[2].request_packet(1, 1, now=rig.now)
     rig.run(150.0)
     return [passed.line for passed in rig.transferred if passed.host == 1 and not passed.to_modem]

@@ -73,7 +73,7 @@ class TwoDrivers:
         self.now = 0.0
         self.reopening_ports: list[tuple[float, int]] = []
         for driver in self.drivers.values():
-            driver.start(0.0)
+            driver.port_opened(0.0)
 
     def start_counting(self) -> None:
         """Count sentences from now on; the fault applies to the one with the given number."""

@@ -27,7 +27,7 @@ HOUR_S = 3600.0
 
 def ready(config: MicroModemConfig = CONFIG, drops: DropRule = drop_nothing) -> FakeModem:
     modem = FakeModem(MicroModem(config), drops)
-    modem.driver.start(0.0)
+    modem.driver.port_opened(0.0)
     modem.run(5.0)
     assert isinstance(modem.events[-1], ModemReady)
     modem.events.clear()
@@ -80,7 +80,7 @@ def test_packet_is_sent_once_by_a_modem_that_does_not_report_transmissions(fixed
     modem.fixed_settings = fixed
     if not echoes:
         modem.drops = lambda sentence, _: sentence.kind == "CACFG" and sentence.fields[0] in fixed
-    modem.driver.start(0.0)
+    modem.driver.port_opened(0.0)
     modem.run(60.0)
     sender = Sender(modem, 3)
     sender.run(600.0)
@@ -292,8 +292,8 @@ def test_backoff_of_restarts_is_short_again_after_the_modem_has_worked() -> None
 def test_rejected_requests_that_the_modem_may_not_support_do_not_restart_it() -> None:
     modem = ready()
     for _ in range(5):
-        modem._on_cctdp = lambda *_: modem.send("CAERR", "000000", "NMEA", 2, "unknown")  # type: ignore[attr-defined]
-        modem.driver.send_flexible(1, 1, b"x", modem.now)
+        modem._on_ccmpc = lambda *_: modem.send("CAERR", "000000", "NMEA", 2, "unknown")  # type: ignore[attr-defined]
+        modem.driver.ping(1, modem.now)
         modem.run(modem.now + 30.0)
     assert [event.reason for event in modem.events_of(RequestFailed)] == [FailureReason.REFUSED] * 5
     assert modem.restarts == 0
@@ -402,7 +402,7 @@ def test_rejected_optional_settings_do_not_delay_the_start() -> None:
             accept(name, value)
 
     modem._on_cccfg = configure  # type: ignore[method-assign]
-    modem.driver.start(0.0)
+    modem.driver.port_opened(0.0)
     modem.run(10.0)
     assert len(modem.events_of(SettingUnconfirmed)) == 4
     assert modem.driver.ready

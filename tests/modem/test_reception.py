@@ -27,7 +27,7 @@ FRAMES = (b"first frame", b"second")
 
 def ready() -> FakeModem:
     modem = FakeModem(MicroModem(CONFIG))
-    modem.driver.start(0.0)
+    modem.driver.port_opened(0.0)
     modem.run(5.0)
     assert modem.events == [ModemReady(1, None)]
     modem.events.clear()
@@ -239,7 +239,7 @@ def test_revision_during_a_packet_has_no_effect() -> None:
         modem = ready() if configured else FakeModem(MicroModem(CONFIG))
         if not configured:
             modem.silent_kinds.add("CACFG")
-            modem.driver.start(0.0)
+            modem.driver.port_opened(0.0)
         for step in packet_steps(modem):
             modem.send("CAREV", "181807", "AUV", "2.0.27087")
             modem.send("CACFG", "X", 1)

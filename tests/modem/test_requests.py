@@ -1,6 +1,4 @@
-"""Requests of the driver: pings, mini-packets, flexible data, polls, and the clock of both generations."""
-
-from datetime import UTC, datetime, timedelta
+"""Requests of the driver: pings, mini-packets and polls."""
 
 import pytest
 
@@ -14,15 +12,12 @@ from sonarpost.modem.interface import (
     RequestDone,
     RequestFailed,
     SentenceRejected,
-    SettingUnconfirmed,
     TransmissionEnded,
     TransmissionStarted,
 )
 from sonarpost.modem.micromodem import (
     RATES,
-    ClockConfirmed,
     FailureReason,
-    FlexibleDataReceived,
     MicroModem,
     MicroModemConfig,
     MiniPacketAnswered,
@@ -39,11 +34,9 @@ def sentence(text: str) -> nmea.Sentence:
     return nmea.Sentence(kind, tuple(fields))
 
 
-def ready(firmware: str = "") -> MicroModem:
+def ready() -> MicroModem:
     driver = MicroModem(MicroModemConfig(1, settings=()))
-    driver.start(0.0)
-    if firmware:
-        driver.receive(nmea.format("CAREV", "120000", "AUV", firmware), 0.0)
+    driver.port_opened(0.0)
     for name in ("SRC", "CST") * 2:
         driver.receive(nmea.format("CACFG", name, 1), 0.0)
     assert driver.ready
@@ -57,15 +50,13 @@ def receive(driver: MicroModem, *texts: str, now: float = 1.0) -> list[object]:
 
 def test_unsolicited_short_packets_are_reported() -> None:
     driver = ready()
-    events = receive(driver, "CAMPA,2,1", "CAMUA,2,1,1ABC", "CAMPR,2,1,0.1000", "CAMUR,2,1", "CARDP,2,1,1,0,0,1;1;AA,")
-    assert events[:4] == [
+    events = receive(driver, "CAMPA,2,1", "CAMUA,2,1,1ABC", "CAMPR,2,1,0.1000", "CAMUR,2,1")
+    assert events == [
         PingReceived(2, 1),
         MiniPacketReceived(2, 1, 0x1ABC),
         PingAnswered(2, 1, 0.1),
         MiniPacketAnswered(2, 1),
     ]
-    assert isinstance(events[4], FlexibleDataReceived)
-    assert (events[4].packet.data, events[4].received_s) == (b"\xaa", 1.0)
     (rejected,) = receive(driver, "CAMUA,2,1,FFFF")
     assert isinstance(rejected, SentenceRejected)
 
@@ -81,10 +72,6 @@ def test_bytes_and_events_of_each_request() -> None:
     driver.send_mini(2, 5, 2.0)
     assert driver.bytes_to_send().startswith(b"$CCMUC,1,2,0005*")
     assert receive(driver, "CAMUR,2,1") == [MiniPacketAnswered(2, 1), RequestDone(2, "mini-packet", 2)]
-    driver.send_flexible(2, 1, b"\x01\xff", 3.0)
-    assert driver.bytes_to_send().startswith(b"$CCTDP,2,1,0,0,01FF*")
-    events = receive(driver, "CATDP,0,1,2,1,0,0,2", "CATXP,2", "CATXF,2")
-    assert events == [*on_air, RequestDone(3, "flexible data", 2)]
     driver.request_packet(2, 4, now=4.0)
     assert driver.bytes_to_send().startswith(b"$CCCYC,0,2,1,4,0,2*")
     assert receive(driver, "CACYC,0,2,1,4,0,2", "CATXP,0", "CATXF,0") == on_air
@@ -105,16 +92,15 @@ def test_request_fails_without_an_answer() -> None:
 
 
 def test_unknown_command_fails_after_its_tries() -> None:
-    driver = ready("0.93.0.09")
-    assert driver.generation == 1
-    driver.send_flexible(2, 1, b"x", 1.0)
+    driver = ready()
+    driver.ping(2, 1.0)
     events: list[object] = []
     for second in range(1, 4):
-        assert driver.bytes_to_send().startswith(b"$CCTDP")
-        events += receive(driver, "CAERR,120000,NMEA,2,unknown CCTDP", now=float(second))
+        assert driver.bytes_to_send().startswith(b"$CCMPC")
+        events += receive(driver, "CAERR,120000,NMEA,2,unknown CCMPC", now=float(second))
         assert driver.bytes_to_send() == b"", "the command is sent again after a pause"
         events += driver.poll(second + 1.0)
-    assert RequestFailed(1, "flexible data", 2, FailureReason.REFUSED) in events
+    assert RequestFailed(1, "ping", 2, FailureReason.REFUSED) in events
     assert driver.queued == 0
 
 
@@ -133,8 +119,6 @@ def test_reboot_or_lost_port_ends_a_request() -> None:
     [
         (lambda d: d.ping(128, 0.0), "address"),
         (lambda d: d.send_mini(2, 0x2000, 0.0), "bits"),
-        (lambda d: d.send_flexible(2, 2, b"x", 0.0), "rate"),
-        (lambda d: d.send_flexible(2, 1, b"", 0.0), "length"),
         (lambda d: d.request_packet(2, 9, now=0.0), "rate"),
         (lambda d: d.request_packet(2, 1, 4, now=0.0), "frames"),
         (lambda d: d.request_packet(-1, 1, now=0.0), "address"),
@@ -188,22 +172,3 @@ def test_polled_packet_that_is_not_requested_fails() -> None:
 def test_text_frame_is_received() -> None:
     events = receive(ready(), "CARXP,1", "CACYC,0,2,1,1,0,1", "CARXA,2,1,0,1,hello, sea", "CACST,6,0")
     assert [e.data for e in events if isinstance(e, FrameReceived)] == [b"hello, sea"]
-
-
-@pytest.mark.parametrize(
-    ("firmware", "command", "answer"),
-    [
-        ("", "CCCLK,2025,6,6,23,1,23", "CACLK,2025,6,6,23,1,23"),
-        ("0.93.0.09", "CCCLK,2025,6,6,23,1,23", "CACLK,2025,6,6,23,1,23"),
-        ("2.0.27087", "CCTMS,2025-06-06T23:01:23Z,0", "CATMS,0,2025-06-06T23:01:23Z"),
-    ],
-)
-def test_clock_is_set_with_the_command_of_the_generation(firmware: str, command: str, answer: str) -> None:
-    driver = ready(firmware)
-    utc = datetime(2025, 6, 6, 23, 1, 23, tzinfo=UTC)
-    assert driver.set_clock(utc, 1.0)
-    assert driver.bytes_to_send() == sentence(command).encode()
-    assert receive(driver, answer) == [ClockConfirmed(utc)]
-    assert driver.set_clock(utc + timedelta(seconds=9), 2.0)
-    receive(driver, answer, now=2.0)
-    assert [type(e) for e in driver.poll(8.0)] == [SettingUnconfirmed], "the echo of another time is not accepted"

@@ -23,7 +23,7 @@ from sonarpost.modem.interface import (
     RequestFailed,
     SentenceRejected,
 )
-from sonarpost.modem.micromodem import RATES, FlexibleDataReceived, MiniPacketReceived, PingAnswered, nmea
+from sonarpost.modem.micromodem import RATES, MiniPacketReceived, PingAnswered, nmea
 
 READY_S = 30.0
 RECOVERY_S = 150.0
@@ -48,7 +48,6 @@ EXCHANGES: dict[str, Exchange] = {
     "rate 4 with acknowledgement": _packet(4, ack=True),
     "ping": lambda rig: rig.drivers[1].ping(2, rig.now) and None,
     "mini-packet": lambda rig: rig.drivers[1].send_mini(2, 0x1ABC, rig.now) and None,
-    "flexible data": lambda rig: rig.drivers[1].send_flexible(2, 1, b"\x00" + b"flexible" * 4, rig.now) and None,
     "poll at rate 0": lambda rig: rig.drivers[1].request_packet(2, 0, now=rig.now) and None,
     "poll at rate 4": lambda rig: rig.drivers[1].request_packet(2, 4, ack=True, now=rig.now) and None,
 }
@@ -116,10 +115,6 @@ def test_exchange_succeeds_without_a_fault(name: str) -> None:
         assert rig.events_of(1, PingAnswered) == [PingAnswered(2, 1, 0.1)]
     if name == "mini-packet":
         assert rig.events_of(2, MiniPacketReceived) == [MiniPacketReceived(1, 2, 0x1ABC)]
-    if name == "flexible data":
-        (got,) = rig.events_of(2, FlexibleDataReceived)
-        assert isinstance(got, FlexibleDataReceived)
-        assert got.packet.data == b"\x00" + b"flexible" * 4
 
 
 FAULTS = {fault.__name__: fault for fault in (drop, corrupt, truncate, duplicate)}

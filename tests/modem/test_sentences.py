@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta, timezone
 
 import pytest
 from hypothesis import given
@@ -19,26 +18,22 @@ from sonarpost.modem.micromodem import (
     nmea,
 )
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.requests import flexible_command, mini_command, ping_command
+from sonarpost.modem.micromodem.requests import mini_command, ping_command
 from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
     ConfigurationSetting,
     Cycle,
     DataRequest,
     ErrorReport,
-    FlexiblePart,
     ModemMessage,
     ReceivedData,
-    ReceivedFlexibleData,
     Revision,
     TransmitMark,
     accepted_bytes,
-    parse_clock,
     transmit_data,
 )
-from sonarpost.modem.micromodem.supervisor import clock_command, query_command, set_command
+from sonarpost.modem.micromodem.supervisor import query_command, set_command
 
-NINE_O_CLOCK = datetime(2016, 10, 12, 9, 0, 5, tzinfo=UTC)
 PARSED = [
     (b"$CACYC,0,3,1,4,0,2", Cycle(3, 1, 4, False, 2)),
     (b"$CADRQ,181807,3,1,0,256,2", DataRequest(3, 1, False, 256, 2)),
@@ -63,7 +58,6 @@ PARSED = [
     (b"$CAMPR,2,1", PingAnswered(2, 1, None)),
     (b"$CAMUA,1,2,1ABC", MiniPacketReceived(1, 2, 0x1ABC)),
     (b"$CAMUR,2,1", MiniPacketAnswered(2, 1)),
-    (b"$CARDP,2,1,1,0,0,,", ReceivedFlexibleData(2, 1, 1, False, ())),
 ]
 
 
@@ -80,11 +74,8 @@ def test_sentence_of_the_modem_is_parsed(line: bytes, record) -> None:
         (transmit_data(2, 1, b"\x00\xff\x80", ack=False), b"$CCTXD,2,1,0,00FF80"),
         (set_command("SRC", 1).sentence, b"$CCCFG,SRC,1"),
         (query_command("SRC", 1).sentence, b"$CCCFQ,SRC"),
-        (clock_command(NINE_O_CLOCK, 1).sentence, b"$CCCLK,2016,10,12,9,0,5"),
-        (clock_command(NINE_O_CLOCK, 2).sentence, b"$CCTMS,2016-10-12T09:00:05Z,0"),
         (ping_command(1, 2), b"$CCMPC,1,2"),
         (mini_command(1, 2, 0xABC), b"$CCMUC,1,2,0ABC"),
-        (flexible_command(2, 5, b"\x01\xff"), b"$CCTDP,2,5,0,0,01FF"),
     ],
 )
 def test_bytes_of_each_command(sentence: Sentence, line: bytes) -> None:
@@ -97,10 +88,6 @@ def test_accepted_bytes() -> None:
 
 def test_echo_has_the_fields_of_the_command() -> None:
     assert Cycle(3, 1, 4, True, 2).sentence("CACYC") == Sentence("CACYC", ("0", "3", "1", "4", "1", "2"))
-    local = NINE_O_CLOCK.astimezone(timezone(timedelta(hours=2)))
-    for generation, answer in ((1, b"$CACLK,2016,10,12,9,0,5"), (2, b"$CATMS,0,2016-10-12T09:00:05Z")):
-        assert clock_command(local, generation).answer == nmea.parse(answer)
-        assert parse_clock(nmea.parse(answer)) == NINE_O_CLOCK
 
 
 @pytest.mark.parametrize(
@@ -123,10 +110,6 @@ def test_echo_has_the_fields_of_the_command() -> None:
         (b"$CAMSG,", ModemMessage.parse, "text"),
         (b"$CACFG,,1", ConfigurationSetting.parse, "name"),
         (b"$CAREV,000052,", Revision.parse, "role"),
-        (b"$CACLK,2016,2,30,0,0,0", parse_clock, "day"),
-        (b"$CACLK,2016,13,1,0,0,0", parse_clock, "month"),
-        (b"$CACLK,2016,12,1,0,0,60", parse_clock, "second"),
-        (b"$CATMS,0,2019-12-02 03:02:59", parse_clock, "time"),
         (b"$CACST,8,x", LinkStatistics.parse, "mode"),
         (b"$CACST,8,0,,,one", LinkStatistics.parse, "mfd_peak"),
         (b"$CACST,8,0" + b"," * 19 + b",nan", LinkStatistics.parse, "snr_in_db"),
@@ -139,10 +122,6 @@ def test_echo_has_the_fields_of_the_command() -> None:
         (b"$CAMPR,1,2,-1", PingAnswered.parse, "travel time"),
         (b"$CAMUA,1,2,2000", MiniPacketReceived.parse, "bits"),
         (b"$CAMUA,1,2,", MiniPacketReceived.parse, "bits"),
-        (b"$CARDP,1,2,1,0,0,1;2", ReceivedFlexibleData.parse, "frames"),
-        (b"$CARDP,1,2,1,0,0,1;3;AABB", ReceivedFlexibleData.parse, "nbytes"),
-        (b"$CARDP,1,2,1,0,0,2;2;AABB", ReceivedFlexibleData.parse, "crc"),
-        (b"$CARDP,1,2,1,0,0,1;2;AABG", ReceivedFlexibleData.parse, "data"),
     ],
 )
 def test_error_names_the_invalid_field(line: bytes, parse: Callable[[Sentence], object], field: str) -> None:
@@ -156,9 +135,9 @@ PARSERS: dict[str, Callable[[Sentence], object]] = {
     "CACYC": Cycle.parse, "CADRQ": DataRequest.parse, "CATXD": accepted_bytes, "CATXP": TransmitMark.parse,
     "CARXD": ReceivedData.parse, "CAACK": Acknowledgement.parse,
     "CAMSG": ModemMessage.parse, "CACFG": ConfigurationSetting.parse, "CAREV": Revision.parse,
-    "CAERR": ErrorReport.parse, "CACLK": parse_clock, "CATMS": parse_clock, "CAMPA": PingReceived.parse,
+    "CAERR": ErrorReport.parse, "CAMPA": PingReceived.parse,
     "CAMPR": PingAnswered.parse, "CAMUA": MiniPacketReceived.parse, "CAMUR": MiniPacketAnswered.parse,
-    "CARDP": ReceivedFlexibleData.parse, "CACST": LinkStatistics.parse, "CAXST": TransmitStatistics.parse,
+    "CACST": LinkStatistics.parse, "CAXST": TransmitStatistics.parse,
 }  # fmt: skip
 awkward = st.sampled_from(
     ["", " ", "0", "1", "-1", "1_0", "0x1", "1e5", "nan", "inf", "-", ".", "AB", "9" * 30, "\u0661", "1;2;AABB"]
@@ -170,21 +149,6 @@ any_fields = st.lists(awkward | st.integers(-200, 99999).map(str) | st.text(max_
 def test_any_fields_parse_or_raise_sentence_error(kind: str, fields: tuple[str, ...]) -> None:
     with contextlib.suppress(SentenceError):
         assert PARSERS[kind](Sentence(kind, fields)) is not None
-
-
-@given(st.lists(st.binary(max_size=90), max_size=4))
-def test_flexible_data_is_joined_over_its_parts(parts: list[bytes]) -> None:
-    group = ";".join(f"1;{len(part)};{part.hex()}" for part in parts)
-    read = ReceivedFlexibleData.parse(Sentence("CARDP", ("1", "2", "1", "0", "0", group, "")))
-    assert read.parts == tuple(FlexiblePart(True, len(part), part) for part in parts)
-    assert (read.data, read.complete) == (b"".join(parts), bool(parts))
-
-
-def test_flexible_data_in_both_groups_is_joined() -> None:
-    read = ReceivedFlexibleData.parse(nmea.parse(b"$CARDP,1,2,1,0,0,1;2;AABB,1;1;CC;1;1;DD"))
-    assert (read.data, read.complete) == (b"\xaa\xbb\xcc\xdd", True)
-    damaged = ReceivedFlexibleData.parse(nmea.parse(b"$CARDP,1,2,1,0,0,1;2;AABB,0;1;00"))
-    assert (damaged.data, damaged.complete) == (b"", False), "the remaining bytes would be misplaced"
 
 
 GOLDEN_CST = nmea.parse(

@@ -1,5 +1,4 @@
 import itertools
-from datetime import UTC, datetime
 
 import pytest
 from builders.fake_modem import FakeModem, drop_nth
@@ -14,7 +13,7 @@ from sonarpost.modem.interface import (
     SentenceRejected,
     SettingUnconfirmed,
 )
-from sonarpost.modem.micromodem import ClockConfirmed, FailureReason, MicroModem, MicroModemConfig, UnhandledSentence
+from sonarpost.modem.micromodem import FailureReason, MicroModem, MicroModemConfig, UnhandledSentence
 from sonarpost.modem.micromodem.supervisor import Phase
 
 CONFIG = MicroModemConfig(address=3)
@@ -23,14 +22,14 @@ SETTINGS = {"SRC": "3", "CST": "1", "RXP": "1", "TXP": "1", "TXF": "1", "XST": "
 
 def started(config: MicroModemConfig = CONFIG, **options) -> FakeModem:
     modem = FakeModem(MicroModem(config), **options)
-    modem.driver.start(0.0)
+    modem.driver.port_opened(0.0)
     return modem
 
 
 def test_first_bytes_of_the_configuration() -> None:
     driver = MicroModem(MicroModemConfig(address=1))
     assert driver.next_wakeup() is None
-    driver.start(10.0)
+    driver.port_opened(10.0)
     assert driver.bytes_to_send() == b"$CCCFG,SRC,1*31\r\n"
     assert driver.next_wakeup() == 15.0
     driver.receive(b"$CACFG,SRC,1*33\r\n", 10.1)
@@ -56,7 +55,7 @@ def test_unconfirmed_optional_setting_does_not_block_the_start() -> None:
 
 def test_wrong_echo_is_not_accepted_and_one_with_leading_zeros_and_more_fields_is() -> None:
     driver = MicroModem(CONFIG)
-    driver.start(0.0)
+    driver.port_opened(0.0)
     driver.bytes_to_send()
     for wrong in (b"$CACFG,SRC,4\r\n", b"$CACFG,CST,3\r\n", b"$CACFG,SRC\r\n", b"$CACLK,2016,1,1,0,0,0\r\n"):
         driver.receive(wrong, 0.1)
@@ -105,7 +104,7 @@ def test_silent_modem_is_reported_once_and_retried() -> None:
 
 def test_retry_waits_double_up_to_the_limit() -> None:
     driver = MicroModem(MicroModemConfig(address=3, reply_timeout_s=1.0, retry_cap_s=10.0))
-    driver.start(0.0)
+    driver.port_opened(0.0)
     sent_s, now = [], 0.0
     while len(sent_s) < 8:
         if data := driver.bytes_to_send():
@@ -186,23 +185,6 @@ def test_packet_fails_when_the_modem_is_not_ready_in_time() -> None:
     assert [event.frames for event in modem.events_of(PacketSent)] == [(b"y",)]
 
 
-def test_clock_command_is_sent_once() -> None:
-    modem = started()
-    utc = datetime(2016, 10, 12, 9, 0, 5, tzinfo=UTC)
-    assert not modem.driver.set_clock(utc, modem.now), "the modem is not ready yet"
-    modem.run(5.0)
-    assert modem.driver.set_clock(utc, modem.now)
-    modem.run(6.0)
-    assert modem.commands("CCCLK") == [("2016", "10", "12", "9", "0", "5")]
-    assert modem.events[1:] == [ClockConfirmed(utc)]
-    modem.drops = lambda sentence, _: sentence.kind == "CACLK"
-    assert modem.driver.set_clock(utc, modem.now)
-    modem.run(40.0)
-    assert len(modem.commands("CCCLK")) == 2, "a past time is not sent again"
-    assert modem.events[2:] == [SettingUnconfirmed("CCCLK,2016,10,12,9,0,5")]
-    assert modem.driver.phase is Phase.READY
-
-
 def test_unhandled_and_invalid_sentences_are_reported() -> None:
     modem = started()
     modem.run(5.0)
@@ -218,7 +200,7 @@ def test_closed_port_has_no_activity() -> None:
     driver = MicroModem(CONFIG)
     assert driver.receive(b"$CAREV,000001,INIT,1\r\n", 0.0) == []
     assert driver.poll(100.0) == []
-    driver.start(100.0)
+    driver.port_opened(100.0)
     driver.port_lost(101.0)
     assert driver.bytes_to_send() == b""
     assert driver.next_wakeup() is None
@@ -227,7 +209,7 @@ def test_closed_port_has_no_activity() -> None:
 
 def test_unfinished_line_is_dropped_when_the_port_reopens() -> None:
     driver = MicroModem(CONFIG)
-    driver.start(0.0)
+    driver.port_opened(0.0)
     driver.receive(b"$CACFG,SRC", 0.1)
     driver.port_lost(1.0)
     driver.port_opened(2.0)

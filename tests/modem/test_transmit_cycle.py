@@ -33,7 +33,7 @@ SECOND = [b"c" * 256, b"d"]
 
 def ready(drops: DropRule = drop_nothing, config: MicroModemConfig = CONFIG) -> FakeModem:
     modem = FakeModem(MicroModem(config), drops)
-    modem.driver.start(0.0)
+    modem.driver.port_opened(0.0)
     modem.run(5.0)
     assert modem.events == [ModemReady(3, None)]
     modem.events.clear()
@@ -47,7 +47,7 @@ def send(modem: FakeModem, frames: list[bytes], rate: int = 4, **options) -> int
 
 def test_bytes_of_a_complete_cycle() -> None:
     driver = MicroModem(MicroModemConfig(address=2, settings=()))
-    driver.start(0.0)
+    driver.port_opened(0.0)
     for answer in (b"$CACFG,SRC,2\r\n", b"$CACFG,CST,1\r\n") * 2:
         driver.bytes_to_send()
         driver.receive(answer, 0.0)
@@ -264,7 +264,7 @@ def test_no_cycle_starts_during_another_transmission() -> None:
 
 def test_rate_0_header_does_not_end_the_cycle() -> None:
     driver = MicroModem(MicroModemConfig(address=3, settings=()))
-    driver.start(0.0)
+    driver.port_opened(0.0)
     for answer in (b"$CACFG,SRC,3\r\n", b"$CACFG,CST,1\r\n") * 2:
         driver.receive(answer, 0.0)
     driver.send_packet(1, 0, [b"x"], now=0.0)

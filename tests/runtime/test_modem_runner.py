@@ -24,7 +24,6 @@ from sonarpost.modem.interface import (
 )
 from sonarpost.modem.micromodem import (
     FailureReason,
-    FlexibleDataReceived,
     MicroModem,
     MicroModemConfig,
     MiniPacketReceived,
@@ -258,7 +257,6 @@ def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path):
         requests = [
             runners[1].request(lambda driver, now: driver.ping(2, now)),
             runners[1].request(lambda driver, now: driver.send_mini(2, 0x123, now)),
-            runners[1].request(lambda driver, now: driver.send_flexible(2, 1, b"flexible", now)),
             runners[1].request_packet(2, 1),
         ]
         eventually(lambda: len([e for e in events[1] if isinstance(e, RequestDone)]) == len(requests))
@@ -266,7 +264,6 @@ def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path):
         assert [e.travel_s for e in events[1] if isinstance(e, PingAnswered)] == [0.1]
         assert [e.data for e in events[1] if isinstance(e, FrameReceived)] == [b"polled"]
         assert [e.bits for e in events[2] if isinstance(e, MiniPacketReceived)] == [0x123]
-        assert [e.packet.data for e in events[2] if isinstance(e, FlexibleDataReceived)] == [b"flexible"]
         with pytest.raises(FrameError):
             runners[1].request(lambda driver, now: driver.send_mini(2, 0x2000, now))
     finally:

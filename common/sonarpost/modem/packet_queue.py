@@ -22,6 +22,8 @@ from sonarpost.modem.registry import ModemSettings
 
 QUEUED_PACKETS: Final = 8
 MAX_DEFER_S: Final = 120.0
+_FULL: Final = "the driver's queue is full"
+_EXPIRED: Final = "the modem or the channel was busy for too long"
 S = TypeVar("S")
 M = TypeVar("M")
 M_co = TypeVar("M_co", covariant=True)
@@ -55,43 +57,53 @@ class WaitingPacket:
         return PacketSent(*which, tuple(acknowledged), started_s, finished_s, end_reported)
 
 
-class PacketQueue:
-    """Packets in the order of their arrival.
+class Waiting(Protocol):
+    """A packet or request in a queue; `queued_s` is when it was queued."""
+
+    @property
+    def queued_s(self) -> float: ...  # noqa: D102
+
+
+W = TypeVar("W", bound=Waiting)
+
+
+class PacketQueue(Generic[W]):
+    """Packets and requests in the order of their arrival.
 
     Args:
-        limit: Greatest number of packets.
-        max_age_s: Longest wait; a packet that is older has failed.
+        limit: Greatest number of them.
+        max_age_s: Longest wait; one that is older has failed.
     """
 
     def __init__(self, limit: int = QUEUED_PACKETS, max_age_s: float = MAX_DEFER_S) -> None:
         self._limit = limit
         self._max_age_s = max_age_s
-        self._packets: deque[WaitingPacket] = deque()
+        self._waiting: deque[W] = deque()
 
     def __len__(self) -> int:
-        return len(self._packets)
+        return len(self._waiting)
 
-    def add(self, packet: WaitingPacket) -> PacketFailed | None:
-        """Add a packet; return its failure when the queue is full."""
-        if len(self._packets) >= self._limit:
-            return packet.failed("the driver's queue is full")
-        self._packets.append(packet)
-        return None
+    def add(self, item: W) -> bool:
+        """Add a packet or request; return False when the queue is full."""
+        if len(self._waiting) >= self._limit:
+            return False
+        self._waiting.append(item)
+        return True
 
-    def take(self) -> WaitingPacket | None:
-        """Remove and return the next packet, None without one."""
-        return self._packets.popleft() if self._packets else None
+    def take(self) -> W | None:
+        """Remove and return the next one, None without one."""
+        return self._waiting.popleft() if self._waiting else None
 
-    def expire(self, now: float) -> list[PacketFailed]:
-        """Remove the packets that have waited too long; return their failures."""
-        failed: list[PacketFailed] = []
-        while self._packets and now >= self._packets[0].queued_s + self._max_age_s:
-            failed.append(self._packets.popleft().failed("the modem or the channel was busy for too long"))
-        return failed
+    def expire(self, now: float) -> list[W]:
+        """Remove and return those that have waited too long."""
+        expired = []
+        while self._waiting and now >= self._waiting[0].queued_s + self._max_age_s:
+            expired.append(self._waiting.popleft())
+        return expired
 
     def deadline_s(self) -> float | None:
-        """Return when the next packet has waited too long, None without one."""
-        return self._packets[0].queued_s + self._max_age_s if self._packets else None
+        """Return when the next one has waited too long, None without one."""
+        return self._waiting[0].queued_s + self._max_age_s if self._waiting else None
 
 
 class Assembler(Protocol[M_co]):
@@ -140,7 +152,7 @@ class QueueingModem(Modem, Generic[S, M]):
         self._settings = settings
         self._assembler = assembler
         self._pause_s = pause_s
-        self._queue = PacketQueue()
+        self._queue: PacketQueue[WaitingPacket] = PacketQueue()
         self._sending: S | None = None
         self._next_id = 1
         self._is_open = False
@@ -234,7 +246,7 @@ class QueueingModem(Modem, Generic[S, M]):
         """Do what is due; subclasses extend it."""
         self._give_up_incomplete(now)
         self._events_since_s = now
-        self._events += map(self._result, self._queue.expire(now))
+        self._events += [self._result(packet.failed(_EXPIRED)) for packet in self._queue.expire(now)]
 
     def _divided(self, data: bytes) -> Sequence[M | SentenceError]:
         return self._assembler.feed(data)
@@ -252,9 +264,9 @@ class QueueingModem(Modem, Generic[S, M]):
 
     def _add(self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool, now: float) -> int:
         number, self._next_id = self._next_id, self._next_id + 1
-        failed = self._queue.add(WaitingPacket(number, destination, rate, tuple(map(bytes, frames)), ack, now))
-        if failed is not None:
-            self._events.append(self._result(failed))
+        packet = WaitingPacket(number, destination, rate, tuple(map(bytes, frames)), ack, now)
+        if not self._queue.add(packet):
+            self._events.append(self._result(packet.failed(_FULL)))
         self._advance(now)
         return number
 

@@ -8,9 +8,7 @@ clock.
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.driver import MicroModem
 from sonarpost.modem.micromodem.events import (
-    ClockConfirmed,
     FailureReason,
-    FlexibleDataReceived,
     FrameAcknowledged,
     MicroModemError,
     MicroModemPacketSent,
@@ -30,9 +28,7 @@ from sonarpost.modem.micromodem.statistics import LinkStatistics, TransmitStatis
 __all__ = [
     "CAPABILITIES",
     "RATES",
-    "ClockConfirmed",
     "FailureReason",
-    "FlexibleDataReceived",
     "FrameAcknowledged",
     "LinkStatistics",
     "MicroModem",

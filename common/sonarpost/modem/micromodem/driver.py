@@ -9,70 +9,26 @@ packet the modem is queried before the next one is sent.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from datetime import datetime
-from typing import ClassVar
+from collections.abc import Sequence
 
 from typing_extensions import override
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.interface import (
-    Modem,
-    ModemCapabilities,
-    ModemEvent,
-    PacketFailed,
-    PacketReceived,
-    PollHandler,
-    PollReceived,
-    RequestFailed,
-    SentenceRejected,
-    TransmissionEnded,
-    TransmissionStarted,
-)
-from sonarpost.modem.micromodem.carrier_sense import CarrierSense
+from sonarpost.modem.interface import Modem, ModemCapabilities, ModemEvent, PollHandler, SentenceRejected
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import (
-    FailureReason,
-    FlexibleDataReceived,
-    FrameAcknowledged,
-    MicroModemError,
-    UnhandledSentence,
-)
-from sonarpost.modem.micromodem.nmea import FieldReader, LineAssembler, Sentence
-from sonarpost.modem.micromodem.rates import CAPABILITIES, RATES
-from sonarpost.modem.micromodem.reception import ReceptionTracker
+from sonarpost.modem.micromodem.dialogue import Dialogue
+from sonarpost.modem.micromodem.events import FailureReason
+from sonarpost.modem.micromodem.nmea import LineAssembler, Sentence
+from sonarpost.modem.micromodem.rates import CAPABILITIES
 from sonarpost.modem.micromodem.requests import (
     ModemRequest,
-    RequestExchange,
     RequestKind,
-    flexible_command,
     mini_command,
     ping_command,
     poll_command,
 )
-from sonarpost.modem.micromodem.sentences import (
-    Acknowledgement,
-    ConfigurationSetting,
-    Cycle,
-    DataRequest,
-    ErrorReport,
-    MiniPacketAnswered,
-    MiniPacketReceived,
-    ModemMessage,
-    PingAnswered,
-    PingReceived,
-    ReceivedData,
-    ReceivedFlexibleData,
-    Revision,
-    TransmitMark,
-    accepted_bytes,
-    transmit_data,
-)
-from sonarpost.modem.micromodem.statistics import TransmitStatistics
-from sonarpost.modem.micromodem.supervisor import ModemSupervisor, Phase
-from sonarpost.modem.micromodem.transmit_cycle import QueuedPacket, TransmitCycle
-from sonarpost.modem.micromodem.transmit_monitor import TransmitMonitor
+from sonarpost.modem.micromodem.supervisor import Phase
+from sonarpost.modem.packet_queue import PacketQueue, WaitingPacket
 from sonarpost.modem.registry import ModemDriver, ModemSettings
 
 
@@ -87,18 +43,11 @@ class MicroModem(Modem):
     def __init__(self, config: MicroModemConfig, where: str = "modem port") -> None:
         self.config = config
         self._lines = LineAssembler(where, learn_checksums=True)
-        self._supervisor = ModemSupervisor(config, self._send)
-        self._reception = ReceptionTracker(config)
-        self._cycle: TransmitCycle | None = None
-        self._request: RequestExchange | None = None
-        self._queue: deque[QueuedPacket | ModemRequest] = deque()
-        self._poll_handler: PollHandler | None = None
-        self._next_id = 1
+        self._queue: PacketQueue[WaitingPacket | ModemRequest] = PacketQueue(config.queued_packets, config.max_defer_s)
+        self._last_number = 0
         self._out = bytearray()
-        self._events: list[ModemEvent] = []
+        self._dialogue = Dialogue(config, self._send, self._next_number)
         self._events_since_s = 0.0
-        self._carrier = CarrierSense(config)
-        self._monitor = TransmitMonitor(config)
 
     @property
     @override
@@ -108,57 +57,39 @@ class MicroModem(Modem):
     @property
     def phase(self) -> Phase:
         """State towards the modem."""
-        return self._supervisor.phase
+        return self._dialogue.supervisor.phase
 
     @property
     @override
     def ready(self) -> bool:
-        return self.phase in {Phase.CHECKING, Phase.READY}
+        return self._dialogue.supervisor.ready
 
     @property
     def firmware(self) -> str | None:
         """Firmware version reported by the modem, or None."""
-        return self._supervisor.firmware
-
-    @property
-    def generation(self) -> int | None:
-        """1 or 2, None until the modem has reported its version."""
-        return self._supervisor.generation
+        return self._dialogue.supervisor.firmware
 
     @property
     @override
     def queued(self) -> int:
-        return len(self._queue) + (not self._idle)
+        return len(self._queue) + (self._dialogue.exchange is not None)
 
     @property
     @override
     def receiving(self) -> bool:
-        return self._reception.receiving
-
-    @property
-    def _exchange(self) -> TransmitCycle | RequestExchange | None:
-        """The exchange in progress. The cycle of a poll takes precedence over the request during which it came."""
-        return self._cycle or self._request
-
-    @property
-    def _idle(self) -> bool:
-        return self._exchange is None
-
-    def start(self, now: float) -> None:
-        """Configure the modem; the same as `port_opened`."""
-        self.port_opened(now)
+        return self._dialogue.reception.receiving
 
     @override
     def port_opened(self, now: float) -> None:
         if self.phase is not Phase.CLOSED:
             self.port_lost(now)
-        self._supervisor.open(now)
+        self._dialogue.supervisor.open(now)
         self._advance(now)
 
     @override
     def port_lost(self, now: float) -> None:
-        self._supervisor.close()
-        self._abort(FailureReason.PORT_LOST, now)
+        self._dialogue.supervisor.close()
+        self._dialogue.abort(FailureReason.PORT_LOST, now)
         self._lines.reset()
         self._out.clear()
         self._events_since_s = now
@@ -168,9 +99,9 @@ class MicroModem(Modem):
         self, destination: int, rate: int, frames: Sequence[bytes], *, ack: bool = False, now: float
     ) -> int:
         CAPABILITIES.check_packet(destination, rate, frames)
-        packet = QueuedPacket(self._next_id, destination, rate, tuple(bytes(f) for f in frames), ack, now)
+        packet = WaitingPacket(self._next_number(), destination, rate, tuple(map(bytes, frames)), ack, now)
         self._enqueue(packet, now)
-        return packet.packet_id
+        return packet.number
 
     @override
     def ping(self, destination: int, now: float) -> int:
@@ -189,15 +120,6 @@ class MicroModem(Modem):
         """
         command = mini_command(self.config.address, destination, bits)
         return self._enqueue_request(RequestKind.MINI_PACKET, destination, command, now)
-
-    def send_flexible(self, destination: int, rate: int, data: bytes, now: float) -> int:
-        """Queue flexible data (Micro-Modem 2); `RequestDone` or `RequestFailed` carries the result.
-
-        Raises:
-            FrameError: An address outside 0..127, a rate other than 1, 3 or 5, no data or more than 2048 bytes.
-        """
-        command = flexible_command(destination, rate, data)
-        return self._enqueue_request(RequestKind.FLEXIBLE_DATA, destination, command, now, rate)
 
     @override
     def request_packet(
@@ -225,18 +147,7 @@ class MicroModem(Modem):
         It is called inside `receive` and must not call the driver. It may return no frames. Frames that do not fit the
         poll raise `FrameError` from `receive`.
         """
-        self._poll_handler = handler
-
-    def set_clock(self, utc: datetime, now: float) -> bool:
-        """Set the modem's clock if the modem is free; return whether the command was sent.
-
-        The command is not queued, as its time must be correct when it is sent: on False, call again later. The result
-        is a `ClockConfirmed` or, without an answer, a `SettingUnconfirmed`.
-        """
-        if self.phase is not Phase.READY or self._cycle is not None:
-            return False
-        self._supervisor.set_clock(utc, now)
-        return True
+        self._dialogue.poll_handler = handler
 
     @override
     def receive(self, data: bytes, now: float) -> list[ModemEvent]:
@@ -244,13 +155,9 @@ class MicroModem(Modem):
             return self._take_events()
         for item in self._lines.feed(data):
             if isinstance(item, SentenceError):
-                self._events.append(SentenceRejected(item))
+                self._dialogue.events.append(SentenceRejected(item))
                 continue
-            self._supervisor.note_sentence(now)
-            try:
-                self._HANDLERS.get(item.kind, MicroModem._on_other)(self, item, now)
-            except SentenceError as error:
-                self._events.append(SentenceRejected(error))
+            self._dialogue.handle(item, now)
             self._advance(now)
         return self._take_events()
 
@@ -261,14 +168,9 @@ class MicroModem(Modem):
 
     @override
     def next_wakeup(self) -> float | None:
-        times_s = [self._events_since_s if self._events else None]
-        times_s += [packet.queued_s + self.config.max_defer_s for packet in self._queue]
+        times_s = [self._events_since_s if self._dialogue.events else None, self._queue.deadline_s()]
         if self.phase is not Phase.CLOSED:
-            exchange_s = None if self._exchange is None else self._exchange.deadline_s
-            # The modem is not queried during an exchange, which shows by itself whether the modem answers.
-            check_s = None if not self._idle and self.phase is Phase.READY else self._supervisor.deadline_s
-            times_s += [exchange_s, check_s, self._reception.deadline_s, self._carrier.deadline_s]
-            times_s.append(self._supervisor.dump_ends_s)
+            times_s += self._dialogue.deadlines_s()
         return min((time_s for time_s in times_s if time_s is not None), default=None)
 
     @override
@@ -279,247 +181,33 @@ class MicroModem(Modem):
 
     def _advance(self, now: float) -> None:
         self._events_since_s = now
-        while self._queue and now >= self._queue[0].queued_s + self.config.max_defer_s:
-            self._events.append(self._queue.popleft().failed(FailureReason.DEFERRED_TOO_LONG))
+        self._dialogue.events += [item.failed(FailureReason.DEFERRED_TOO_LONG) for item in self._queue.expire(now)]
         if self.phase is Phase.CLOSED:
             return
-        self._on_reception(self._reception.poll(now))
-        self._events += self._carrier.update(now, receiving=self._reception.receiving)
-        self._advance_exchanges(now)
-        self._events += self._supervisor.poll(now, may_check=self._idle)
-        self._start_next(now)
-
-    def _advance_exchanges(self, now: float) -> None:
-        for exchange in (self._cycle, self._request):
-            if exchange is None:
-                continue
-            exchange.poll(now)
-            result = exchange.result
-            if result is None:
-                continue
-            self._events += [result, *self._monitor.on_result(result, now)]
-            if exchange is self._cycle:
-                self._cycle = None
-            else:
-                self._request = None
-            # A request that failed after its echo shows that the modem itself works.
-            no_echo = isinstance(result, RequestFailed) and result.reason is FailureReason.NO_ECHO
-            if self._monitor.take_restart(now):
-                self._events += self._supervisor.restart(now)
-            elif isinstance(result, PacketFailed) or no_echo:
-                self._supervisor.check(now)
-
-    def _start_next(self, now: float) -> None:
-        modem_free = self._idle and self.phase is Phase.READY and self._supervisor.dump_ends_s is None
-        if not (self._queue and modem_free and self._carrier.channel_free):
-            return
-        item = self._queue.popleft()
-        if isinstance(item, QueuedPacket):
-            self._cycle = TransmitCycle(item, self.config, self._send, now)
-        else:
-            self._request = RequestExchange(item, self.config, self._send, now)
+        self._dialogue.advance(now)
+        if self._dialogue.may_start and (item := self._queue.take()) is not None:
+            self._dialogue.start(item, now)
 
     def _enqueue_request(self, kind: RequestKind, peer: int, command: Sentence, now: float, rate: int = 0) -> int:
-        request = ModemRequest(self._next_id, kind, peer, command, rate, now)
+        request = ModemRequest(self._next_number(), kind, peer, command, rate, now)
         self._enqueue(request, now)
         return request.request_id
 
-    def _enqueue(self, item: QueuedPacket | ModemRequest, now: float) -> None:
-        self._next_id += 1
-        if len(self._queue) >= self.config.queued_packets:
-            self._events.append(item.failed(FailureReason.QUEUE_FULL))
-        else:
-            self._queue.append(item)
+    def _enqueue(self, item: WaitingPacket | ModemRequest, now: float) -> None:
+        if not self._queue.add(item):
+            self._dialogue.events.append(item.failed(FailureReason.QUEUE_FULL))
         self._advance(now)
 
-    def _on_reception(self, events: list[ModemEvent]) -> None:
-        self._events += events
-        if self._request is not None:
-            for event in events:
-                if isinstance(event, PacketReceived):
-                    self._request.on_answer(RequestKind.POLL, event.src)
-
-    def _abort(self, reason: FailureReason, now: float) -> None:
-        """Fail the exchange in progress and return the received frames: the modem has lost its state."""
-        for exchange in (self._cycle, self._request):
-            if exchange is not None:
-                result = exchange.abort(reason)
-                self._events += [result, *self._monitor.on_result(result, now)]
-        self._cycle = self._request = None
-        self._events += [*self._reception.flush(), *self._carrier.reset(now)]
+    def _next_number(self) -> int:
+        self._last_number += 1
+        return self._last_number
 
     def _send(self, sentence: Sentence) -> None:
         self._out += sentence.encode()
 
     def _take_events(self) -> list[ModemEvent]:
-        events, self._events = self._events, []
+        events, self._dialogue.events = self._dialogue.events, []
         return events
-
-    # Handlers of the modem's sentences
-
-    def _on_other(self, sentence: Sentence, now: float) -> None:
-        self._events.append(UnhandledSentence(sentence))
-
-    def _on_revision(self, sentence: Sentence, now: float) -> None:
-        revision = Revision.parse(sentence)
-        if revision.rebooted:
-            self._abort(FailureReason.REBOOTED, now)
-        self._events += self._supervisor.on_revision(revision, now)
-
-    def _on_setting(self, sentence: Sentence, now: float) -> None:
-        was_ready = self.ready
-        if self._cycle is not None and self._cycle.on_setting(ConfigurationSetting.parse(sentence), now):
-            return
-        if self._request is not None:
-            self._request.on_setting(now)
-        self._events += self._supervisor.on_setting(sentence, now)
-        if was_ready and not self.ready:
-            self._abort(FailureReason.REBOOTED, now)
-
-    def _on_clock(self, sentence: Sentence, now: float) -> None:
-        self._events += self._supervisor.on_clock(sentence, now)
-
-    def _on_cycle(self, sentence: Sentence, now: float) -> None:
-        cycle = Cycle.parse(sentence)
-        if self._cycle is not None and self._cycle.owns(cycle):
-            self._cycle.on_echo(now)
-        elif self._request is not None and self._request.owns(cycle):
-            self._request.on_echo("CYC", now)
-        elif cycle.src != self.config.address:
-            self._on_reception(self._reception.on_cycle(cycle, now))
-        elif not self._start_polled(cycle, now):
-            self._events.append(UnhandledSentence(sentence))
-
-    def _start_polled(self, cycle: Cycle, now: float) -> bool:
-        """Start the cycle that answers a poll; return whether the poll can be answered."""
-        if self._poll_handler is None or self._cycle is not None or cycle.rate not in RATES or cycle.nframes < 1:
-            return False
-        rate = RATES[cycle.rate]
-        poll = PollReceived(cycle.dest, cycle.rate, min(cycle.nframes, rate.frames), rate.frame_bytes, cycle.ack)
-        self._events.append(poll)
-        frames = tuple(bytes(frame) for frame in self._poll_handler(poll))
-        if not frames:
-            return True
-        CAPABILITIES.check_packet(poll.dest, poll.rate, frames)
-        packet = QueuedPacket(self._next_id, poll.dest, poll.rate, frames, poll.ack, now)
-        self._next_id += 1
-        self._cycle = TransmitCycle(packet, self.config, self._send, now, polled=cycle)
-        return True
-
-    def _on_request(self, sentence: Sentence, now: float) -> None:
-        request = DataRequest.parse(sentence)
-        if self._cycle is not None and request.dest == self._cycle.packet.dest:
-            self._cycle.on_request(request, now)
-        else:
-            # An ended cycle, or a poll without frames: the modem would wait for the data.
-            self._send(transmit_data(request.src, request.dest, b"", ack=request.ack))
-
-    def _on_data_accepted(self, sentence: Sentence, now: float) -> None:
-        nbytes = accepted_bytes(sentence)
-        if self._cycle is not None:
-            self._cycle.on_data_accepted(nbytes, now)
-
-    def _on_transmission(self, sentence: Sentence, now: float) -> None:
-        mark = TransmitMark.parse(sentence)
-        # The nominal duration of a request and of an automatic reply is that of a packet of rate 0.
-        airtime_s = RATES[self._cycle.packet.rate if self._cycle is not None else 0].airtime_s
-        self._events.append(TransmissionEnded(airtime_s) if mark.ends else TransmissionStarted(airtime_s))
-        if self._exchange is not None:
-            self._exchange.on_transmission(mark, now)
-        else:
-            self._carrier.on_transmission(mark, now)
-
-    def _on_transmit_statistics(self, sentence: Sentence, now: float) -> None:
-        statistics: TransmitStatistics | None = None
-        try:
-            statistics = TransmitStatistics.parse(sentence)
-        except SentenceError as error:
-            # Invalid statistics still mark the end of the transmission.
-            self._events.append(SentenceRejected(error))
-        if self._exchange is not None:
-            self._exchange.on_statistics(statistics, now)
-        else:
-            self._events.append(UnhandledSentence(sentence))
-
-    def _on_reception_started(self, sentence: Sentence, now: float) -> None:
-        FieldReader(sentence).optional_integer(0, "type", 0, 255)
-        self._on_reception(self._reception.on_start(now))
-
-    def _on_frame(self, sentence: Sentence, now: float) -> None:
-        self._on_reception(self._reception.on_frame(ReceivedData.parse(sentence), now))
-
-    def _on_message(self, sentence: Sentence, now: float) -> None:
-        message = ModemMessage.parse(sentence)
-        self._on_reception(self._reception.on_message(message, now))
-        if message.text == "PACKET_TIMEOUT" and self._request is not None:
-            self._request.on_no_answer()
-
-    def _on_link_statistics(self, sentence: Sentence, now: float) -> None:
-        self._on_reception(self._reception.on_statistics(sentence, now))
-
-    def _on_request_echo(self, sentence: Sentence, now: float) -> None:
-        if self._request is not None:
-            self._request.on_echo(sentence.kind[2:], now)
-
-    def _on_ping_received(self, sentence: Sentence, now: float) -> None:
-        self._events.append(PingReceived.parse(sentence))
-
-    def _on_answer(self, sentence: Sentence, now: float) -> None:
-        is_ping = sentence.kind == "CAMPR"
-        answer = PingAnswered.parse(sentence) if is_ping else MiniPacketAnswered.parse(sentence)
-        if self._request is not None:
-            self._request.on_answer(RequestKind.PING if is_ping else RequestKind.MINI_PACKET, answer.src)
-        self._events.append(answer)
-
-    def _on_mini_received(self, sentence: Sentence, now: float) -> None:
-        self._events.append(MiniPacketReceived.parse(sentence))
-
-    def _on_flexible_data(self, sentence: Sentence, now: float) -> None:
-        self._events.append(FlexibleDataReceived(ReceivedFlexibleData.parse(sentence), now))
-
-    def _on_acknowledgement(self, sentence: Sentence, now: float) -> None:
-        acknowledgement = Acknowledgement.parse(sentence)
-        self._reception.on_acknowledgement(now)
-        if self._cycle is not None:
-            self._cycle.on_acknowledgement(acknowledgement, now)
-        if acknowledgement.good:
-            a = acknowledgement
-            self._events.append(FrameAcknowledged(a.src, a.dest, a.frame_number))
-
-    def _on_error(self, sentence: Sentence, now: float) -> None:
-        report = ErrorReport.parse(sentence)
-        self._events.append(MicroModemError(report.text, report))
-        self._supervisor.on_error(report, now)
-        if self._exchange is not None:
-            self._exchange.on_error(report, now)
-
-    _HANDLERS: ClassVar[Mapping[str, Callable[[MicroModem, Sentence, float], None]]] = {
-        "CAREV": _on_revision,
-        "CACFG": _on_setting,
-        "CACLK": _on_clock,
-        "CATMS": _on_clock,
-        "CACYC": _on_cycle,
-        "CADRQ": _on_request,
-        "CATXD": _on_data_accepted,
-        "CATXP": _on_transmission,
-        "CATXF": _on_transmission,
-        "CAXST": _on_transmit_statistics,
-        "CARXP": _on_reception_started,
-        "CARXD": _on_frame,
-        "CARXA": _on_frame,
-        "CAMSG": _on_message,
-        "CACST": _on_link_statistics,
-        "CAACK": _on_acknowledgement,
-        "CAERR": _on_error,
-        "CAMPC": _on_request_echo,
-        "CAMUC": _on_request_echo,
-        "CATDP": _on_request_echo,
-        "CAMPA": _on_ping_received,
-        "CAMPR": _on_answer,
-        "CAMUA": _on_mini_received,
-        "CAMUR": _on_answer,
-        "CARDP": _on_flexible_data,
-    }
 
 
 def _create(settings: ModemSettings, where: str) -> MicroModem:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import datetime
 from enum import StrEnum
 
 from sonarpost.modem.interface import ModemError, ModemEvent, PacketSent
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.sentences import ErrorReport, ModemMessage, ReceivedFlexibleData
+from sonarpost.modem.micromodem.sentences import ErrorReport, ModemMessage
 from sonarpost.modem.micromodem.statistics import LinkStatistics, TransmitStatistics
 
 
@@ -28,13 +27,6 @@ class FailureReason(StrEnum):
     NO_ANSWER = "no answer from the far modem"
     REFUSED = "the modem rejected the command"
     DEFERRED_TOO_LONG = "the modem or the channel was busy for too long"
-
-
-@dataclass(frozen=True, slots=True)
-class ClockConfirmed(ModemEvent):
-    """The modem has confirmed the time that was set."""
-
-    utc: datetime
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,14 +57,6 @@ class StatisticsReceived(ModemEvent):
     """Link quality of an acknowledgement, a ping, a mini-packet or the header of a rate 0 packet."""
 
     statistics: LinkStatistics
-
-
-@dataclass(frozen=True, slots=True)
-class FlexibleDataReceived(ModemEvent):
-    """A packet of the flexible data protocol."""
-
-    packet: ReceivedFlexibleData
-    received_s: float
 
 
 @dataclass(frozen=True, slots=True)

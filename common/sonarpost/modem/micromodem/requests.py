@@ -1,4 +1,4 @@
-"""Requests other than data packets: pings, mini-packets, flexible data, and polls of other modems.
+"""Requests other than data packets: pings, mini-packets, and polls of other modems.
 
 A request waits for the modem's echo, for the end of the transmission and for the answer of the far modem. Every wait is
 limited, and a later sentence implies the earlier ones that were lost. The functions that build commands raise
@@ -17,10 +17,8 @@ from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.events import FailureReason
 from sonarpost.modem.micromodem.nmea import MAX_ADDRESS, Sentence
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.modem.micromodem.sentences import FLEXIBLE_RATES, MAX_MINI_BITS, Cycle, ErrorReport, TransmitMark
+from sonarpost.modem.micromodem.sentences import MAX_MINI_BITS, Cycle, ErrorReport, TransmitMark
 from sonarpost.modem.micromodem.statistics import TransmitStatistics
-
-MAX_FLEXIBLE_BYTES = 2048
 
 
 class RequestKind(Enum):
@@ -28,7 +26,6 @@ class RequestKind(Enum):
 
     PING = "ping"
     MINI_PACKET = "mini-packet"
-    FLEXIBLE_DATA = "flexible data"
     POLL = "poll"
 
 
@@ -47,7 +44,7 @@ class ModemRequest:
     rate: int
     queued_s: float
 
-    def failed(self, reason: FailureReason) -> RequestFailed:
+    def failed(self, reason: str) -> RequestFailed:
         """Return the event of a failed request."""
         return RequestFailed(self.request_id, self.kind.value, self.peer, reason)
 
@@ -64,16 +61,6 @@ def mini_command(src: int, dest: int, bits: int) -> Sentence:
     if not 0 <= bits <= MAX_MINI_BITS:
         raise FrameError("mini-packet", "bits", bits, f"0..{MAX_MINI_BITS}")
     return Sentence("CCMUC", (str(src), str(dest), f"{bits:04X}"))
-
-
-def flexible_command(dest: int, rate: int, data: bytes) -> Sentence:
-    """Return `CCTDP,dest,rate,ack,reserved,hex`, without acknowledgement."""
-    _check_address("flexible data", dest)
-    if rate not in FLEXIBLE_RATES:
-        raise FrameError("flexible data", "rate", rate, f"one of {FLEXIBLE_RATES}")
-    if not 1 <= len(data) <= MAX_FLEXIBLE_BYTES:
-        raise FrameError("flexible data", "length", len(data), f"1..{MAX_FLEXIBLE_BYTES} bytes")
-    return Sentence("CCTDP", (str(dest), str(rate), "0", "0", data.hex().upper()))
 
 
 def poll_command(src: int, dest: int, rate: int, frames: int | None, *, ack: bool) -> Sentence:
@@ -191,13 +178,9 @@ class RequestExchange:
 
     def _wait_on_air(self, now: float) -> None:
         self._stage = _Stage.ON_AIR
-        flexible = self.request.kind is RequestKind.FLEXIBLE_DATA
-        self.deadline_s = now + self._config.on_air_limit_s(self.request.rate if flexible else 0)
+        self.deadline_s = now + self._config.on_air_limit_s(0)
 
     def _transmitted(self, now: float) -> None:
-        if self.request.kind is RequestKind.FLEXIBLE_DATA:
-            self._finish()
-            return
         self._stage = _Stage.ANSWER
         wait_s = self._config.ack_wait_s
         if self.request.kind is RequestKind.POLL:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.interface import ModemEvent, RangeMeasured, ShortMessageReceived
@@ -16,10 +15,6 @@ from sonarpost.modem.micromodem.nmea import FieldReader, Sentence
 
 MAX_MINI_BITS = 0x1FFF
 """A user mini-packet carries 13 bits."""
-FLEXIBLE_RATES = (1, 3, 5)
-"""Rates of the flexible data protocol."""
-ISO_SECONDS = "%Y-%m-%dT%H:%M:%SZ"
-"""Format of the time in `CCTMS` and `CATMS`."""
 
 _MAX_FRAME_NUMBER = 255
 _MAX_BYTES = 65535
@@ -254,29 +249,6 @@ class ErrorReport:
         return self.module == "DATA_TIMEOUT"
 
 
-def parse_clock(sentence: Sentence) -> datetime:
-    """Return the UTC time of `CACLK,Y,M,D,h,m,s` or, from a Micro-Modem 2, `CATMS,timedout,ISO8601Z`.
-
-    Raises:
-        SentenceError: A wrong field.
-    """
-    if sentence.kind == "CATMS":
-        text = FieldReader(sentence, ("CATMS",), 2).text(1).strip()
-        try:
-            return datetime.strptime(text, ISO_SECONDS).replace(tzinfo=UTC)
-        except ValueError as error:
-            raise SentenceError(sentence.kind, "time", text, "YYYY-MM-DDThh:mm:ssZ") from error
-    read = FieldReader(sentence, ("CACLK",), 6)
-    limits = (
-        ("year", 1970, 9999), ("month", 1, 12), ("day", 1, 31), ("hour", 0, 23), ("minute", 0, 59), ("second", 0, 59)
-    )  # fmt: skip
-    year, month, day, hour, minute, second = (read.integer(i, *limit) for i, limit in enumerate(limits))
-    try:
-        return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
-    except ValueError as error:
-        raise SentenceError(sentence.kind, "day", day, "a day of that month") from error
-
-
 @dataclass(frozen=True, slots=True)
 class PingReceived(ModemEvent):
     """`CAMPA,src,dest`: a ping from `src` to `dest`, whose modem replies automatically."""
@@ -331,54 +303,3 @@ class MiniPacketAnswered(ModemEvent):
         """Read `CAMUR`."""
         read = FieldReader(sentence, ("CAMUR",), 2)
         return cls(read.address(0, "src"), read.address(1, "dest"))
-
-
-@dataclass(frozen=True, slots=True)
-class FlexiblePart:
-    """One frame of received flexible data: whether its CRC is good, its size, and its bytes."""
-
-    good: bool
-    nbytes: int
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class ReceivedFlexibleData:
-    """`CARDP,src,dest,rate,ack,reserved,minis,datas`; each group holds `crc;nbytes;hex` any number of times.
-
-    Attributes:
-        parts: Mini-frames first, then data frames.
-    """
-
-    src: int
-    dest: int
-    rate: int
-    ack: bool
-    parts: tuple[FlexiblePart, ...]
-
-    @classmethod
-    def parse(cls, sentence: Sentence) -> ReceivedFlexibleData:
-        """Read `CARDP`."""
-        read = FieldReader(sentence, ("CARDP",), 6)
-        texts = [text for index in (5, 6) if read.text(index) for text in read.text(index).split(";")]
-        if len(texts) % 3:
-            raise SentenceError(sentence.kind, "frames", ";".join(texts)[:60], "groups of crc;nbytes;hex")
-        parts = []
-        for at in range(0, len(texts), 3):
-            group = FieldReader(Sentence("CARDP", tuple(texts[at : at + 3])))
-            part = FlexiblePart(group.flag(0, "crc"), group.integer(1, "nbytes", 0, _MAX_BYTES), group.data(2, "data"))
-            if part.good and len(part.data) != part.nbytes:
-                raise SentenceError(sentence.kind, "nbytes", part.nbytes, f"the number of bytes, {len(part.data)}")
-            parts.append(part)
-        rate = read.integer(2, "rate", 0, _MAX_RATE)
-        return cls(read.address(0, "src"), read.address(1, "dest"), rate, read.flag(3, "ack"), tuple(parts))
-
-    @property
-    def complete(self) -> bool:
-        """Whether there is at least one frame and every frame is good."""
-        return bool(self.parts) and all(part.good for part in self.parts)
-
-    @property
-    def data(self) -> bytes:
-        """The bytes of all frames, or none when a frame is bad: the remaining bytes would be misplaced."""
-        return b"".join(part.data for part in self.parts) if self.complete else b""

@@ -1,4 +1,4 @@
-"""Supervision of the modem: configures it, checks that it answers, and recovers it after a restart or a failure.
+"""Supervision of the modem: configures it, checks that it answers and transmits, and recovers it after a failure.
 
 Configuration commands are sent one after the other. Each is repeated without an answer, and finally given up.
 """
@@ -9,7 +9,6 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from enum import Enum, auto
 
 from sonarpost.modem.interface import (
@@ -17,13 +16,20 @@ from sonarpost.modem.interface import (
     ModemReady,
     ModemRebooted,
     ModemUnresponsive,
+    PacketFailed,
+    PacketSent,
+    RequestDone,
+    RequestFailed,
     RestartRequested,
     SettingUnconfirmed,
+    TransmissionFailing,
+    TransmissionRecovered,
 )
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import ClockConfirmed, UnhandledSentence
+from sonarpost.modem.micromodem.events import FailureReason, UnhandledSentence
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.sentences import ISO_SECONDS, ConfigurationSetting, ErrorReport, Revision, parse_clock
+from sonarpost.modem.micromodem.requests import RequestKind
+from sonarpost.modem.micromodem.sentences import ConfigurationSetting, ErrorReport, Revision
 
 _OPTIONAL_TRIES = 2
 
@@ -60,22 +66,6 @@ def set_command(name: str, value: int, *, required: bool = True) -> ModemCommand
 def query_command(name: str, value: int) -> ModemCommand:
     """Return the command that queries a value, and expects this one."""
     return ModemCommand(Sentence("CCCFQ", (name,)), Sentence("CACFG", (name, str(value))))
-
-
-def clock_command(utc: datetime, generation: int | None) -> ModemCommand:
-    """Return the command that sets the modem's clock; the modem echoes the time.
-
-    It is sent only once, as its time is past at the second try. A modem of unknown generation gets the command of the
-    first.
-    """
-    utc = utc.astimezone(UTC)
-    if generation == 2:
-        text = utc.strftime(ISO_SECONDS)
-        command, answer = Sentence("CCTMS", (text, "0")), Sentence("CATMS", ("0", text))
-    else:
-        fields = tuple(str(value) for value in utc.timetuple()[:6])
-        command, answer = Sentence("CCCLK", fields), Sentence("CACLK", fields)
-    return ModemCommand(command, answer, required=False, tries=1)
 
 
 class Phase(Enum):
@@ -118,10 +108,9 @@ class ModemSupervisor:
         return self._alive_s + self._config.keepalive_s if self.phase is Phase.READY else self._due_s
 
     @property
-    def generation(self) -> int | None:
-        """1 or 2, from the parts of the version (four or three); None while it is unknown."""
-        parts = len(self.firmware.split(".")) if self.firmware else 0
-        return {3: 2, 4: 1}.get(parts)
+    def ready(self) -> bool:
+        """Whether the modem is configured and, as far as known, answers."""
+        return self.phase in {Phase.CHECKING, Phase.READY}
 
     def open(self, now: float) -> None:
         """Configure the modem: the port was opened."""
@@ -148,14 +137,10 @@ class ModemSupervisor:
         self._configure(now + self._config.restart_wait_s)
         return [RestartRequested()]
 
-    def check(self, now: float, command: ModemCommand | None = None) -> None:
-        """Require the answer to a command, by default the query of the address, before anything else is sent."""
-        self._begin(Phase.CHECKING, [command or query_command("SRC", self._config.address)], now)
+    def check(self, now: float) -> None:
+        """Query the address, and require the answer before anything else is sent."""
+        self._begin(Phase.CHECKING, [query_command("SRC", self._config.address)], now)
         self.poll(now, may_check=False)
-
-    def set_clock(self, utc: datetime, now: float) -> None:
-        """Send the time."""
-        self.check(now, clock_command(utc, self.generation))
 
     def on_revision(self, revision: Revision, now: float) -> list[ModemEvent]:
         """Store the firmware version; configure the modem if it has restarted."""
@@ -182,15 +167,6 @@ class ModemSupervisor:
             self._configure(now)
             return []
         return [UnhandledSentence(sentence)]
-
-    def on_clock(self, sentence: Sentence, now: float) -> list[ModemEvent]:
-        """Process `CACLK` or `CATMS`, the echo of the time.
-
-        Raises:
-            SentenceError: A wrong field.
-        """
-        utc = parse_clock(sentence)
-        return [ClockConfirmed(utc) if self._is_answered(sentence, now) else UnhandledSentence(sentence)]
 
     def on_error(self, report: ErrorReport, now: float) -> None:
         """Process an error of the modem: it may have rejected an optional command, which is sent again soon."""
@@ -295,3 +271,76 @@ def _answers(sentence: Sentence, expected: Sentence) -> bool:
 def _normalised(text: str) -> str:
     text = text.strip()
     return (text.lstrip("0") or "0") if text.isdigit() else text
+
+
+CycleResult = PacketSent | PacketFailed | RequestDone | RequestFailed
+
+_OTHER_CAUSES = frozenset({FailureReason.PORT_LOST, FailureReason.QUEUE_FULL, FailureReason.DEFERRED_TOO_LONG})
+_REFUSALS = frozenset({FailureReason.NO_ECHO, FailureReason.REFUSED})
+
+
+class TransmitMonitor:
+    """Counts failed packets and polls in a row.
+
+    After `failures_before_restart` of them the modem is due to be restarted. The wait before the next restart doubles
+    up to `restart_backoff_cap_s`. It is short again if the modem has transmitted since, and twice the wait has passed.
+    """
+
+    def __init__(self, config: MicroModemConfig) -> None:
+        self._config = config
+        self._failures = 0
+        self._first_failure_s = 0.0
+        self._transmitted = False  # since the last restart
+        self._restarted_s: float | None = None
+        self._backoff_s = config.restart_backoff_s
+
+    @property
+    def _failing(self) -> bool:
+        return self._failures >= self._config.failures_before_restart
+
+    def on_result(self, result: CycleResult, now: float) -> list[ModemEvent]:
+        """Process the result of an exchange; report the beginning and the end of a failure."""
+        reason = _failure(result)
+        was_failing = self._failing
+        if reason is not None:
+            self._failures += 1
+            if self._failures == 1:
+                self._first_failure_s = now
+            return [TransmissionFailing(self._failures, reason)] if self._failing and not was_failing else []
+        if _transmitted(result):
+            failures, self._failures = self._failures, 0
+            self._transmitted = True
+            if was_failing:
+                return [TransmissionRecovered(failures, now - self._first_failure_s)]
+        return []
+
+    def take_restart(self, now: float) -> bool:
+        """Return whether the modem is to be restarted now; a True starts the wait before the next restart."""
+        if not self._failing:
+            return False
+        if self._restarted_s is not None:
+            since_s = now - self._restarted_s
+            if since_s < self._backoff_s:
+                return False
+            has_worked = self._transmitted and since_s >= 2 * self._backoff_s
+            doubled_s = min(2 * self._backoff_s, self._config.restart_backoff_cap_s)
+            self._backoff_s = self._config.restart_backoff_s if has_worked else doubled_s
+        self._restarted_s = now
+        self._transmitted = False
+        return True
+
+
+def _transmitted(result: CycleResult) -> bool:
+    """Return whether a result shows that the modem transmits."""
+    no_answer = isinstance(result, RequestFailed) and result.reason is FailureReason.NO_ANSWER
+    return isinstance(result, (PacketSent, RequestDone)) or no_answer
+
+
+def _failure(result: CycleResult) -> str | None:
+    """Return why the modem did not transmit; None if the result has another cause or does not show it."""
+    if isinstance(result, PacketFailed):
+        return None if result.reason in _OTHER_CAUSES else result.reason
+    if isinstance(result, RequestFailed) and result.kind == RequestKind.POLL.value and result.reason in _REFUSALS:
+        return result.reason
+    # The modem may not support requests of other kinds than polls.
+    return None

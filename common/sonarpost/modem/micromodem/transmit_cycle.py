@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum, auto
 
 from sonarpost.modem.interface import PacketFailed, PacketSent
@@ -21,22 +20,7 @@ from sonarpost.modem.micromodem.sentences import (
     transmit_data,
 )
 from sonarpost.modem.micromodem.statistics import TransmitStatistics
-
-
-@dataclass(frozen=True, slots=True)
-class QueuedPacket:
-    """A queued packet."""
-
-    packet_id: int
-    dest: int
-    rate: int
-    frames: tuple[bytes, ...]
-    ack: bool
-    queued_s: float
-
-    def failed(self, reason: FailureReason, *, maybe_sent: bool = False) -> PacketFailed:
-        """Return the event of a failed packet."""
-        return PacketFailed(self.packet_id, self.dest, self.rate, self.frames, reason, maybe_sent)
+from sonarpost.modem.packet_queue import WaitingPacket
 
 
 class TransmitStage(Enum):
@@ -69,7 +53,7 @@ class TransmitCycle:
 
     def __init__(
         self,
-        packet: QueuedPacket,
+        packet: WaitingPacket,
         config: MicroModemConfig,
         send: Callable[[Sentence], None],
         now: float,
@@ -81,7 +65,7 @@ class TransmitCycle:
         self.deadline_s = now
         self._config = config
         self._send = send
-        self._cycle = polled or Cycle(config.address, packet.dest, packet.rate, packet.ack, len(packet.frames))
+        self._cycle = polled or Cycle(config.address, packet.destination, packet.rate, packet.ack, len(packet.frames))
         self._started_s = self._stage_s = now
         self._attempt = 0
         self._refused = False  # the last attempt
@@ -166,7 +150,7 @@ class TransmitCycle:
     def on_acknowledgement(self, acknowledgement: Acknowledgement, now: float) -> None:
         """Process `CAACK`."""
         number = acknowledgement.frame_number
-        if acknowledgement.src != self.packet.dest or not self._on_air or not acknowledgement.good:
+        if acknowledgement.src != self.packet.destination or not self._on_air or not acknowledgement.good:
             return
         if 1 <= number <= len(self.packet.frames):
             self._acknowledged.add(number)
@@ -248,8 +232,8 @@ class TransmitCycle:
         p = self.packet
         acknowledged = tuple(sorted(self._acknowledged))
         self.result = MicroModemPacketSent(
-            p.packet_id,
-            p.dest,
+            p.number,
+            p.destination,
             p.rate,
             p.frames,
             acknowledged,

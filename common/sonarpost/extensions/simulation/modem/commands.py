@@ -12,11 +12,13 @@ from datetime import UTC, datetime, timedelta
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem import RATES
 from sonarpost.modem.micromodem.nmea import FieldReader, Sentence
-from sonarpost.modem.micromodem.sentences import FLEXIBLE_RATES, ISO_SECONDS, MAX_MINI_BITS, Cycle
+from sonarpost.modem.micromodem.sentences import MAX_MINI_BITS, Cycle
 
 FLEXIBLE_MINI_BYTES = 90
 """Capacity of the mini-frame of a flexible data packet; data frames of the rate's size hold the rest."""
 
+_FLEXIBLE_RATES = (1, 3, 5)
+_ISO_SECONDS = "%Y-%m-%dT%H:%M:%SZ"
 _MINI = re.compile(r"[0-9A-Fa-f]{1,4}")
 
 
@@ -92,8 +94,8 @@ def flexible_data(sentence: Sentence) -> FlexibleData:
     """Read `CCTDP,destination,rate,ack,reserved,hex`, with at most the data that the rate can carry."""
     read = FieldReader(sentence, strict=True)
     rate = read.integer(1, "rate", 0, max(RATES))
-    if rate not in FLEXIBLE_RATES:
-        raise SentenceError(sentence.kind, "rate", rate, f"one of {FLEXIBLE_RATES}")
+    if rate not in _FLEXIBLE_RATES:
+        raise SentenceError(sentence.kind, "rate", rate, f"one of {_FLEXIBLE_RATES}")
     data = read.data(4, "data")
     capacity = FLEXIBLE_MINI_BYTES + RATES[rate].packet_bytes
     if not 1 <= len(data) <= capacity:
@@ -155,6 +157,6 @@ def iso_time(sentence: Sentence) -> datetime:
     text = text[:-1] if text.endswith("ZZ") else text
     read.integer(1, "mode", 0, 0)
     try:
-        return datetime.strptime(text, ISO_SECONDS).replace(tzinfo=UTC)
+        return datetime.strptime(text, _ISO_SECONDS).replace(tzinfo=UTC)
     except ValueError as error:
         raise SentenceError(sentence.kind, "time", text, "YYYY-MM-DDThh:mm:ssZ") from error
