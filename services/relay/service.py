@@ -244,8 +244,8 @@ class RelayService(Service[RelayConfig]):
                 name = f"{VERSIONS}{queue}/{topic.name}"
                 known = image_parts.stored_version(self.store.get_state(name), name)
             found = whole if known is None else image_parts.difference(whole, known)
-            is_difference = found is not whole
-            sent = wire.encode(found) if is_difference else payload
+            sent = payload if found is whole else min(payload, wire.encode(found), key=len)
+            is_difference = sent is not payload
             if is_difference:
                 # The site may have another version by then, and so may this relay.
                 effects.put_state(f"{WHOLES}{queue}/{topic.name}/{image.version}", payload)

@@ -87,8 +87,8 @@ def whole_part(image: CodedImage) -> ImagePart:
 def difference(image: ImagePart, base: ImagePart) -> ImagePart:
     """Return the difference between a whole image and an earlier whole version of it.
 
-    It is the image itself if the difference would not be shorter, or if the later version lacks the contact or the
-    codebook of the earlier one.
+    It can be longer than the image. It is the image itself if the later version lacks the contact or the codebook of the
+    earlier one.
     """
     lacks = (base.c and not image.c) or (base.a and not image.a)
     stream, earlier = np.frombuffer(stream_of(image), np.uint8), np.frombuffer(stream_of(base), np.uint8)
@@ -99,7 +99,7 @@ def difference(image: ImagePart, base: ImagePart) -> ImagePart:
     common = min(stream.size, earlier.size)
     same[:common] = _mask(earlier.size, base.m)[:common] & (stream[:common] == earlier[:common])
     unchanged_contact = (image.c, image.h, image.w) == (base.c, base.h, base.w)
-    found = image.model_copy(
+    return image.model_copy(
         update={
             "b": base.n,
             **_pieces(stream.tobytes(), _merged(known & ~same, known)),
@@ -110,7 +110,6 @@ def difference(image: ImagePart, base: ImagePart) -> ImagePart:
             "a": b"" if image.a == base.a else image.a,
         }
     )
-    return found if len(wire.encode(found)) < len(wire.encode(image)) else image
 
 
 def expand(part: ImagePart, base: ImagePart | None, where: str) -> ImagePart:
