@@ -144,7 +144,7 @@ class AtomicFiles:
         Args:
             path: The file to create or replace; its folder must exist.
             data: Content of the file.
-            last: The file marks the others as complete: it is renamed after they are on the disk.
+            last: The file marks the others as complete: it is renamed last, with the content of all on the disk.
 
         Raises:
             OSError: It cannot be written; the files added before are not affected.
@@ -173,7 +173,7 @@ class AtomicFiles:
 
         Raises:
             OSError: They cannot be written. Each file is complete or unchanged; files added with `last` are only
-                renamed after all others.
+                renamed after all others, and deleted if a folder cannot be written.
         """
         try:
             for staged in self._staged:
@@ -181,12 +181,17 @@ class AtomicFiles:
                 os.posix_fadvise(staged.descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
             for staged in self._staged:
                 os.fsync(staged.descriptor)
-            for last in (False, True):
-                moved = [staged for staged in self._staged if staged.last == last]
-                for staged in moved:
-                    staged.temporary.replace(staged.path)
-                for folder in sorted({staged.path.parent for staged in moved}):
+            # A file system with a journal keeps the order of the renames.
+            for staged in sorted(self._staged, key=lambda staged: staged.last):
+                staged.temporary.replace(staged.path)
+            try:
+                for folder in sorted({staged.path.parent for staged in self._staged}):
                     sync_folder(folder)
+            except OSError:
+                for staged in self._staged:
+                    if staged.last:
+                        staged.path.unlink(missing_ok=True)  # the others may not be on the disk
+                raise
         finally:
             self.drop_from(0)
 

@@ -87,8 +87,8 @@ def whole_part(image: CodedImage) -> ImagePart:
 def difference(image: ImagePart, base: ImagePart) -> ImagePart:
     """Return the difference between a whole image and an earlier whole version of it.
 
-    It can be longer than the image. It is the image itself if the later version lacks the contact or the codebook of the
-    earlier one.
+    It can be longer than the image. It is the image itself if the later version lacks the contact or the codebook of
+    the earlier one.
     """
     lacks = (base.c and not image.c) or (base.a and not image.a)
     stream, earlier = np.frombuffer(stream_of(image), np.uint8), np.frombuffer(stream_of(base), np.uint8)

@@ -10,7 +10,7 @@ from pathlib import Path
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.shared import flag, in_new_folder, option, print_table, time_text
 from sonarpost.delivery.inspection import StoreState, inspect
-from sonarpost.delivery.salvage import SalvageResult, TableResult, salvage
+from sonarpost.delivery.salvage import TableResult, salvage
 from sonarpost.delivery.schema import VERSION
 from sonarpost.delivery.store import Store, lock_exclusively
 from sonarpost.errors import StoredFileError
@@ -20,9 +20,8 @@ EXIT_UNSOUND = 1
 _CHECK = """Check the store of a stopped service: integrity, schema version, queues, and lost commits by the side-car
 STORE.watermark. Nothing is changed without --clear. Exit status: 0 if the store is sound, 1 if it is damaged, has
 another version or has lost commits, 2 if it cannot be checked, for example because the service is running."""
-_SALVAGE = """Copy every readable row of a damaged store into a new file, and print what was recovered. Queued records
-with a wrong digest are quarantined in the new store. Exit status: 0 if every row was copied, 1 if rows are missing, 2
-if nothing was written, for example because the service is running."""
+_SALVAGE = """Copy every readable row of a damaged store into a new file, and print what was recovered. Exit status: 0
+if every row was copied, 1 if rows are missing, 2 if nothing was written, for example because the service is running."""
 
 _QUARANTINE = """List the quarantined records of a stopped service, oldest first: number, time, direction, key, bytes,
 reason. --requeue moves received records to the inbox; the service handles them after its next start. Exit status: 0, or
@@ -126,24 +125,16 @@ def run_quarantine(parsed: argparse.Namespace) -> int:
 def run_salvage(parsed: argparse.Namespace) -> int:
     """Copy a store and print the result; return 0 if every row was copied, otherwise 1."""
     path, out = parsed.store, in_new_folder(parsed.out)
-    result = salvage(path, out)
-    _print_result(result)
+    results = salvage(path, out)
+    rows = [("table", "recovered", "unreadable")]
+    print_table([*rows, *((table.name, str(table.recovered), _unreadable(table)) for table in results)])
     print(f"""
 Replace the damaged store while the service is stopped; leave {path}.watermark where it is:
   mv {path} {path}.damaged
   [ ! -e {path}-wal ] || mv {path}-wal {path}.damaged-wal
   rm -f {path}-shm
   mv {out} {path}""")
-    return 0 if result.is_complete else EXIT_UNSOUND
-
-
-def _print_result(result: SalvageResult) -> None:
-    rows = [("table", "recovered", "wrong digest", "unreadable")]
-    rows += [(t.name, str(t.recovered), str(t.wrong_digest), _unreadable(t)) for t in result.tables]
-    print_table(rows)
-    if result.first_page:
-        part = "header of the first page" if result.first_page == "header" else "first page"
-        print(f"The {part} was unreadable and was replaced by that of a new store.")
+    return 0 if all(table.is_complete for table in results) else EXIT_UNSOUND
 
 
 def _unreadable(table: TableResult) -> str:

@@ -56,7 +56,7 @@ def test_a_batch_is_one_line_and_each_record_has_its_own_at_level_debug(platform
                 tx.accept(DECISIONS, wire.encode(decision_record(name)))
         logs.configure_logging("relay", level)
         items = service.store.inbox_items(2)
-        service._handle_batch(items)
+        service._handler.handle_batch(items)
         service.store.close()
         lines = [line for line in capsys.readouterr().err.splitlines() if "queued for the shore" in line]
         assert [line.split()[1] for line in lines] == (["DEBUG"] * 2 if level == "debug" else []) + ["INFO"]
