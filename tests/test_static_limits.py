@@ -59,7 +59,6 @@ READS = {
     "common/sonarpost/codec/emb/model.py": SHIPPED,
     "common/sonarpost/codec/vq/codebook.py": SHIPPED,
     "common/sonarpost/config.py": OWN_SETTINGS,
-    "common/sonarpost/delivery/salvage.py": "database of this function",
     "common/sonarpost/detection/difficulty.py": SHIPPED,
     "common/sonarpost/monitoring/healthcheck.py": "heartbeat of a service on this computer",
     "common/sonarpost/network/http_client.py": "the connection delivers at most MAX_REPLY_BYTES",
