@@ -23,11 +23,11 @@ from pathlib import Path
 
 import zenoh
 
+from research.common.ports import free_ports
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.config import PlatformConfig
-from sonarpost.extensions.simulation.demo.settings import free_ports
 from sonarpost.extensions.training.contacts import simulated_contacts
 from sonarpost.extensions.training.simulator import VESSEL, TrainingSimulator
 from sonarpost.services.console.config import ConsoleConfig

@@ -21,10 +21,10 @@ from urllib.parse import urlsplit
 import zenoh
 from playwright.sync_api import Page, sync_playwright
 
+from research.common.ports import free_ports
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.config import PlatformConfig
-from sonarpost.extensions.simulation.demo.settings import free_ports
 from sonarpost.extensions.training.contacts import simulated_contacts
 from sonarpost.extensions.training.simulator import VESSEL, TrainingSimulator
 from sonarpost.messages import ReconstructedImage

@@ -56,6 +56,7 @@ import numpy as np
 import zenoh
 from typing_extensions import override
 
+from research.common.ports import free_ports
 from research.recording_relay import acknowledged
 from sonarpost import keys, wire
 from sonarpost.archive.shore_index import ShoreIndex
@@ -64,7 +65,6 @@ from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.registry import default_registry
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.store import Store
-from sonarpost.extensions.simulation.demo.settings import free_ports
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.frames.contact_record import ContactSummary, contact_of
 from sonarpost.messages import CodedImage, ReconstructedImage, Record

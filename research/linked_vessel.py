@@ -15,6 +15,7 @@ import zenoh
 from typing_extensions import override
 
 from research.common.link_emulator import LinkEmulator
+from research.common.ports import free_ports
 from research.fleet import open_session
 from research.relay_throughput import VESSEL, Sink, decision, platform
 from sonarpost import keys, wire
@@ -22,7 +23,6 @@ from sonarpost.bus.session import router_config
 from sonarpost.config import ServiceConfig
 from sonarpost.delivery.records import OutboxItem, ReceivedChunk
 from sonarpost.delivery.transaction import Transaction
-from sonarpost.extensions.simulation.demo.settings import free_ports
 from sonarpost.messages import CodedImage, ImagePart, Record, Relayed
 from sonarpost.runtime.service import UnitOfWork
 from sonarpost.services.relay.config import RelayConfig, UpstreamOptions

@@ -48,6 +48,7 @@ from unittest.mock import patch
 import zenoh
 from typing_extensions import override
 
+from research.common.ports import free_ports
 from research.fleet import coded_image
 from research.peers import PEERS, AbsentError, Peer
 from research.peers.base import StartError
@@ -59,7 +60,6 @@ from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.congestion import MAX_WINDOW_BYTES
 from sonarpost.delivery.protocol import CHUNK_BYTES
 from sonarpost.delivery.scheduler import WINDOW
-from sonarpost.extensions.simulation.demo.settings import free_ports
 from sonarpost.logs import configure_logging
 from sonarpost.messages import Decision, ImagePart, Record, Relayed
 from sonarpost.runtime.process import tune_interpreter

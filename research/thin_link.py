@@ -33,13 +33,13 @@ import zenoh
 from typing_extensions import override
 
 from research.common.link_emulator import LinkEmulator
+from research.common.ports import free_ports
 from research.fleet import Processes, coded_image, open_session
 from sonarpost import keys
 from sonarpost.bus import router
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.client import deliver
-from sonarpost.extensions.simulation.demo.settings import free_ports
 from sonarpost.messages import ImagePart, Record, Relayed
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.security.fleet import Fleet

@@ -43,6 +43,7 @@ from contextlib import ExitStack
 from itertools import product
 from pathlib import Path
 
+from research.common.ports import free_ports
 from research.fleet import coded_image
 from research.linked_vessel import Drain, Link, passed, vessel
 from research.peers import PEERS, AbsentError
@@ -50,7 +51,6 @@ from research.relay_throughput import VESSEL
 from sonarpost import keys, wire
 from sonarpost.archive.image_parts import whole_part
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.extensions.simulation.demo.settings import free_ports
 from sonarpost.messages import CodedImage
 
 RATES = (2000, 8000, 16_000, 32_000, 128_000)

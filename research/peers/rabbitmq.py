@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING
 
 from typing_extensions import override
 
+from research.common.ports import free_ports
 from research.peers.base import START_TIMEOUT_S, AbsentError, Peer, StartError, program, server
-from sonarpost.extensions.simulation.demo.settings import free_ports
 
 if TYPE_CHECKING:
     import pika

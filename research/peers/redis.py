@@ -17,8 +17,8 @@ from typing import Any
 
 from typing_extensions import override
 
+from research.common.ports import free_ports
 from research.peers.base import Peer, StartError, program, server
-from sonarpost.extensions.simulation.demo.settings import free_ports
 
 BATCH = 512
 RECONNECT_S = 1.0

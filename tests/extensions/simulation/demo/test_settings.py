@@ -7,7 +7,7 @@ from itertools import islice
 
 from builders.common import PORTS, free_port, worker_ports
 
-from sonarpost.extensions.simulation.demo.settings import free_ports, reserved_ports
+from sonarpost.extensions.simulation.demo.settings import reserved_ports
 
 
 def test_free_port_is_reserved_and_can_be_listened_on():
@@ -28,12 +28,6 @@ def test_port_of_another_program_is_skipped():
         with reserved_ports(taken, taken) as ports:
             assert len({taken, *ports}) == 3
             assert all(port > taken for port in ports)
-
-
-def test_free_ports_are_below_those_of_outgoing_connections():
-    ports = free_ports(3)
-    assert len(set(ports)) == 3
-    assert all(port < 32_768 for port in ports)  # the first one of Linux
 
 
 def test_workers_of_the_tests_use_different_ports(monkeypatch):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from PIL import Image
 
-from sonarpost.extensions.simulation.demo.sheet import MARGIN, SheetCell, SheetContact, write_sheet
+from sonarpost.extensions.simulation.demo.report import MARGIN, SheetCell, SheetContact, write_sheet
 
 
 def test_small_images_are_drawn_twice_as_large_and_large_ones_as_they_are(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import IO
 
 from sonarpost.cli.deployment.processes import Processes
@@ -30,8 +31,7 @@ class Chain(Processes):
         for folder in (self.settings.folder / "logs", self.settings.incoming, self.settings.channel_log.parent):
             folder.mkdir(parents=True, exist_ok=True)
         try:
-            page = () if self.settings.console_port is None else ("console",)
-            for name in (*ROUTERS, *PLATFORM_OF, *page):
+            for name in (*ROUTERS, *PLATFORM_OF, *(("console",) if self.settings.console_port is not None else ())):
                 self.start(name)
         except BaseException:
             self.stop()
@@ -43,13 +43,23 @@ class Chain(Processes):
 
     def start(self, name: str) -> None:
         """Start a router or a service; its output goes to logs/NAME.log."""
-        log = (self.settings.folder / "logs" / f"{name}.log").open("ab")
+        log = self._log(name).open("ab")
         self._logs.append(log)
         self.spawn(name, self.command(name), log)
 
     def command(self, name: str) -> list[str]:
         """Return the command of a process."""
         return [sys.executable, "-m", *self.module(name)]
+
+    def module(self, name: str) -> tuple[str, ...]:
+        """Return the module of a process and its arguments."""
+        if name not in ROUTERS:
+            return (service_packages()[name], "--config", str(self.settings.config_file(name)))
+        ports = self.settings.router_ports
+        listen: tuple[str, ...] = ("--listen", f"tcp/127.0.0.1:{ports[ROUTERS.index(name)]}")
+        if name == "router-vessel":
+            listen += ("--connect", f"tcp/127.0.0.1:{self.settings.shore_port_for_vessel or ports[2]}")
+        return ("sonarpost.bus.router", *listen)
 
     def check(self) -> None:
         """Check that all processes run.
@@ -63,25 +73,14 @@ class Chain(Processes):
 
     def log_tail(self, name: str, lines: int = 5) -> str:
         """Return the last lines of the log of a process."""
-        path = self.settings.folder / "logs" / f"{name}.log"
-        text = path.read_text(encoding="utf-8", errors="replace")
+        text = self._log(name).read_text(encoding="utf-8", errors="replace")
         return "\n".join(text.splitlines()[-lines:])
+
+    def _log(self, name: str) -> Path:
+        return self.settings.folder / "logs" / f"{name}.log"
 
     def stop(self) -> None:
         """Stop all processes: services first, then routers; one that does not stop within 5 s is killed."""
         self.stop_in_order(last=ROUTERS)
-        for log in self._logs:
-            log.close()
-        self._logs.clear()
-
-    def module(self, name: str) -> tuple[str, ...]:
-        """Return the module of a process and its arguments."""
-        if name not in ROUTERS:
-            return (service_packages()[name], "--config", str(self.settings.config_file(name)))
-        uuv, vessel, shore = (f"tcp/127.0.0.1:{port}" for port in self.settings.router_ports)
-        listen = {"router-uuv": uuv, "router-vessel": vessel, "router-shore": shore}[name]
-        link: tuple[str, ...] = ()
-        if name == "router-vessel":
-            port = self.settings.shore_port_for_vessel or self.settings.router_ports[2]
-            link = ("--connect", f"tcp/127.0.0.1:{port}")
-        return ("sonarpost.bus.router", "--listen", listen, *link)
+        while self._logs:
+            self._logs.pop().close()

@@ -4,34 +4,41 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import importlib.util
 import json
 import logging
 import re
+import secrets
+import shlex
 import shutil
+import sys
 import time
+import webbrowser
+from contextlib import closing
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from sonarpost.cli.parsing.parser import CommandParser
-from sonarpost.cli.progress import progress_console
+from sonarpost.cli.progress import ProgressDisplay, progress_console
 from sonarpost.cli.shared import add_fit_option, add_survey_options, flag, option, print_notes, survey_options_of
-from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.errors import ConfigError
 from sonarpost.extensions.simulation.demo.chain import Chain
-from sonarpost.extensions.simulation.demo.next_steps import commands, folder_lines, routers_line
-from sonarpost.extensions.simulation.demo.operator_page import OperatorPage
+from sonarpost.extensions.simulation.demo.inputs import deposit, simulated_survey, survey_files, usable_images
 from sonarpost.extensions.simulation.demo.outcome import evaluate
-from sonarpost.extensions.simulation.demo.own_images import usable_images
-from sonarpost.extensions.simulation.demo.report import show
-from sonarpost.extensions.simulation.demo.settings import CONSOLE_PORT, ROUTER_PORTS, ChainSettings, reserved_ports
+from sonarpost.extensions.simulation.demo.report import show, shown
+from sonarpost.extensions.simulation.demo.settings import (
+    CONSOLE_PORT,
+    ROUTER_PORTS,
+    VESSEL,
+    ChainSettings,
+    reserved_ports,
+)
 from sonarpost.extensions.simulation.demo.watch import Watcher
 from sonarpost.extensions.simulation.modem.emulated import emulated_drivers
-from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.modem.registry import DEFAULT_DRIVER, modem_driver
-from sonarpost.sonar.image_files import SIDE_CAR_SUFFIX
-from sonarpost.sonar.readers import open_survey, recording_parts, supported_suffixes
+from sonarpost.services.console.store.users import FILE_NAME, LINK_S, Users, login_link
+from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.survey import Survey
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -42,6 +49,8 @@ STALLED_S = 300.0
 """Real time without a change after which the demo ends although the chain is busy."""
 MAX_FEEDBACK_INTERVALS = 60
 """Feedback intervals without a change, on top of `STALLED_S`, while the vessel still repeats feedback."""
+SUBSCRIBER = Path("examples/shore_subscriber.py")
+USER = "op"
 
 
 def add_options(parser: CommandParser) -> None:
@@ -86,30 +95,15 @@ def add_options(parser: CommandParser) -> None:
 
 
 def _probability(text: str) -> float:
-    value = float(text)
-    if not 0 <= value <= 1:
+    if not 0 <= (value := float(text)) <= 1:
         raise argparse.ArgumentTypeError(f"{text}: expected 0 to 1")
     return value
 
 
 def _positive(text: str) -> float:
-    value = float(text)
-    if not 0.1 <= value <= 1000:
+    if not 0.1 <= (value := float(text)) <= 1000:
         raise argparse.ArgumentTypeError(f"{text}: expected 0.1 to 1000")
     return value
-
-
-def _rate(parsed: argparse.Namespace) -> int:
-    """Return the rate of the demo.
-
-    Raises:
-        ConfigError: The modem does not have it.
-    """
-    modem = modem_driver(parsed.modem).capabilities
-    rate = modem.uplink_rate if parsed.rate is None else int(parsed.rate)
-    if rate not in modem.rates:
-        raise ConfigError("command line", "--rate", rate, f"one of {sorted(modem.rates)}")
-    return rate
 
 
 def run(parsed: argparse.Namespace) -> int:
@@ -119,15 +113,22 @@ def run(parsed: argparse.Namespace) -> int:
         importlib.import_module("uvicorn")  # a missing extra is reported before the services start
     # Routers and services start together: failed first attempts to connect are expected.
     logging.getLogger("sonarpost.bus.session").setLevel(logging.ERROR)
-    started = time.monotonic()
-    rate = _rate(parsed)
-    detection_settings, inputs = _detection_settings(parsed), _inputs(parsed, console)
-    if inputs is not None and inputs[0] == parsed.survey:
-        # A single file that cannot be read is reported before the services start.
-        with open_survey(parsed.survey, survey_options_of(parsed)) as source:
-            print_notes(source.info)
+    started_s = time.monotonic()
+    modem = modem_driver(parsed.modem).capabilities
+    rate = modem.uplink_rate if parsed.rate is None else int(parsed.rate)
+    if rate not in modem.rates:
+        raise ConfigError("command line", "--rate", rate, f"one of {sorted(modem.rates)}")
+    detection_settings = _detection_settings(parsed)
+    files: tuple[Path, ...] = ()
+    if parsed.images is not None:
+        files = usable_images(parsed.images, parsed.fit, console)
+    elif parsed.survey is not None:
+        files = survey_files(parsed.survey)
+        if files == (parsed.survey,):
+            # A single file that cannot be read is reported before the services start.
+            with open_survey(parsed.survey, survey_options_of(parsed)) as source:
+                print_notes(source.info)
     folder = _fresh_folder(parsed.out)
-    simulated = _simulate(parsed.seed, console) if inputs is None else None
     with reserved_ports(*ROUTER_PORTS, *((CONSOLE_PORT,) if parsed.console else ())) as ports:
         settings = ChainSettings(
             folder=folder,
@@ -142,27 +143,35 @@ def run(parsed: argparse.Namespace) -> int:
             console_port=ports[3] if parsed.console else None,
             extra=(*detection_settings, ("atd_stub", f'fit = "{parsed.fit}"')),
         )
-        return _run_chain(parsed, settings, (inputs, simulated), started, console)
+        source_of = files or simulated_survey(parsed.seed, console)
+        return _run_chain(parsed, settings, source_of, started_s, console)
 
 
 def _run_chain(
     parsed: argparse.Namespace,
     settings: ChainSettings,
-    sources: tuple[tuple[Path, ...] | None, Survey | None],
+    inputs: tuple[Path, ...] | Survey,
     started_s: float,
     console: Console,
 ) -> int:
     """Run the chain with the given files or the simulated survey; return the exit status."""
-    page = OperatorPage(settings) if parsed.console else None
+    password = secrets.token_urlsafe(9)
+    if parsed.console:
+        with _users(settings) as users:
+            users.add(USER, "operator", password)
     with Chain(settings) as chain, Watcher(settings, chain.check) as watcher:
         # During the start of the services: the vehicle processes files when it is ready.
-        files = _deposit(*sources, settings, console)
+        if isinstance(inputs, Survey):
+            write_xtf(inputs, settings.incoming / f"simulated-{settings.seed}.xtf")
+        else:
+            deposit(inputs, settings, console)
+        count = 1 if isinstance(inputs, Survey) else len(inputs)
         with console.status("starting three routers and eight services"):
             watcher.wait_until_started()
-        console.print(routers_line(settings), highlight=False, soft_wrap=True)
-        if page is not None:
-            page.show(console, opened=parsed.open)
-        _follow(chain, watcher, files, console)
+        console.print(settings.routers_line, highlight=False, soft_wrap=True)
+        if parsed.console:
+            _print_page(settings, password, console, opened=parsed.open)
+        _follow(chain, watcher, count, console)
         outcome = evaluate(settings, watcher.snippets, watcher.contact_of_image, time.monotonic() - started_s)
         results = Console(stderr=True)  # printed with --quiet as well
         refused = _print_refused(settings, results)
@@ -175,22 +184,61 @@ def _run_chain(
         if parsed.json:
             print(outcome.as_json(), flush=True)
         if keep:
-            if page is not None:
-                page.show(console)
+            if parsed.console:
+                _print_page(settings, password, console)
             _keep_running(chain)
-    return 0 if watcher.snippets and outcome.succeeded and refused < files else 1
+    return 0 if watcher.snippets and outcome.succeeded and refused < count else 1
+
+
+def _users(settings: ChainSettings) -> closing[Users]:
+    return closing(Users(settings.folder / "state" / VESSEL / FILE_NAME))
+
+
+def _print_page(settings: ChainSettings, password: str, console: Console, *, opened: bool = False) -> None:
+    """Print address, user, password and a log-in link of the operator's page; open another link if `opened`."""
+    address = f"http://127.0.0.1:{settings.console_port}/"
+    with _users(settings) as users:
+        links = [login_link(address, users.make_login_link(USER)) for _ in range(2 if opened else 1)]
+    for line in (
+        f"operator's page: {address}  user: {USER}  password: {password}",
+        f"log-in link, valid once, for {LINK_S / 60:.0f} minutes: {links[0]}",
+    ):
+        console.print(line, highlight=False, soft_wrap=True)
+    if opened:
+        webbrowser.open(links[1])
 
 
 def _print_next_steps(settings: ChainSettings, console: Console, *, running: bool) -> None:
-    """Print where the images are, and commands to paste."""
+    """Print where the images are, and commands to paste into a terminal in the same folder."""
+    images = settings.shore_images.parent
+    sonarpost, endpoint = shown(Path(sys.executable).parent / "sonarpost"), f"tcp/127.0.0.1:{settings.router_ports[2]}"
+    # `c2 ls` finds the folder of a demo in the current folder.
+    is_default = images == Path("demo-out/shore/images").absolute()
+    found = [
+        (
+            [sonarpost, "c2", "ls", *([] if is_default else ["--archive", shown(images)])],
+            "list the contacts at the shore site",
+        )
+    ]
+    if importlib.util.find_spec("uvicorn") is not None:  # the extra `console` is installed
+        found.append(([sonarpost, "console", "--view", shown(images)], "show them in a browser; Ctrl-C ends it"))
+    watch = [sonarpost, "c2", "watch", "--router", endpoint]
+    if SUBSCRIBER.is_file():
+        watch = [shown(Path(sys.executable)), str(SUBSCRIBER), endpoint, shown(settings.folder)]
+    found.append((watch, "print contacts as they arrive" + ("" if running else ": start it, then another demo")))
+    if running and settings.mode == "survey":
+        survey = shown(settings.incoming / "next.xtf")
+        found.append(([sonarpost, "simulate", survey, "--seed", str(settings.seed + 1)], "send another survey"))
     state = "services and routers run until Ctrl-C" if running else "stopped; `--keep` leaves them running"
-    for line in (*folder_lines(settings), f"{routers_line(settings)} ({state})"):
-        console.print(line, highlight=False, soft_wrap=True)
-    console.print("\nNext, in this folder" + (" in another terminal:" if running else ":"), highlight=False)
-    for command, purpose in commands(settings, running=running):
+    for line in (
+        f"images at the vessel: {shown(settings.vessel_images)}",
+        f"images at the shore site: {shown(settings.shore_images)}",
+        f"{settings.routers_line} ({state})",
+        "\nNext, in this folder" + (" in another terminal:" if running else ":"),
         # Lines to paste: never wrapped.
-        console.print(f"  {command}", style="bold", highlight=False, markup=False, soft_wrap=True)
-        console.print(f"      {purpose}", highlight=False)
+        *(f"  {shlex.join(words)}\n      {purpose}" for words, purpose in found),
+    ):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _keep_running(chain: Chain) -> None:
@@ -205,30 +253,6 @@ def _keep_running(chain: Chain) -> None:
             time.sleep(0.5)
     except KeyboardInterrupt:
         return
-
-
-def _inputs(parsed: argparse.Namespace, console: Console) -> tuple[Path, ...] | None:
-    """Return the files to process, None for a simulated survey.
-
-    Raises:
-        SurveyFileError: There is no such file or folder, or no suitable file in it.
-    """
-    if parsed.images is not None:
-        return usable_images(parsed.images, parsed.fit, console)
-    given: Path | None = parsed.survey
-    if given is None:
-        return None
-    suffixes = supported_suffixes()
-    if given.is_file():
-        if not given.name.lower().endswith(suffixes):
-            raise SurveyFileError(str(given), "suffix", given.suffix, "one of " + ", ".join(suffixes))
-        return (given,)
-    if not given.is_dir():
-        raise SurveyFileError(str(given), "", "no such file or folder", "a file or folder that exists")
-    found = tuple(sorted(p for p in given.iterdir() if p.name.lower().endswith(suffixes) and p.is_file()))
-    if not found:
-        raise SurveyFileError(str(given), "", "no such file in it", "files named *" + ", *".join(suffixes))
-    return found
 
 
 def _detection_settings(parsed: argparse.Namespace) -> tuple[tuple[str, str], ...]:
@@ -292,73 +316,17 @@ def _print_refused(settings: ChainSettings, console: Console) -> int:
     return len(reasons)
 
 
-def _simulate(seed: int, console: Console) -> Survey:
-    """Return a simulated survey; print what it holds."""
-    with console.status("simulating a survey of 1000 pings"):
-        simulated = simulate_survey(SurveySpec(seed=seed, seabed=SeabedKind.SAND, targets=6, clutter=6))
-    mines = sum(truth.is_mine_like for truth in simulated.truth)
-    console.print(
-        f"simulated survey of {len(simulated.survey.pings)} pings over sand: "
-        f"{mines} mine-like objects, {len(simulated.truth) - mines} others"
-    )
-    return simulated.survey
-
-
-def _deposit(
-    inputs: tuple[Path, ...] | None, simulated: Survey | None, settings: ChainSettings, console: Console
-) -> int:
-    """Put the input files into the folder that the vehicle polls; return their number."""
-    if simulated is not None:
-        write_xtf(simulated, settings.incoming / f"simulated-{settings.seed}.xtf")
-        return 1
-    assert inputs is not None
-    side_cars = 0
-    for path in inputs:
-        side_car = path.with_suffix(SIDE_CAR_SUFFIX)
-        if settings.mode == "snippets" and side_car.is_file():
-            shutil.copyfile(side_car, settings.incoming / side_car.name)
-            side_cars += 1
-        if settings.mode != "snippets":
-            _copy_other_parts(path, settings.incoming)
-        partial = settings.incoming / f".{path.name}"
-        shutil.copyfile(path, partial)
-        partial.rename(settings.incoming / path.name)
-    if settings.mode == "snippets":
-        console.print(f"{side_cars} of {len(inputs)} images have a side-car with their position")
-    console.print(f"{len(inputs)} input file{'s' if len(inputs) != 1 else ''}")
-    return len(inputs)
-
-
-def _copy_other_parts(path: Path, folder: Path) -> None:
-    """Copy the other files of a recording that exist beside it or below its folder."""
-    for part in recording_parts(path):
-        if part != path and part.is_relative_to(path.parent) and part.is_file():
-            target = folder / part.relative_to(path.parent)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(part, target)
-
-
 def _follow(chain: Chain, watcher: Watcher, files: int, console: Console) -> None:
     """Show progress until the chain has finished, or nothing has changed for too long."""
     settings = chain.settings
-    airtime_s = settings.rate_info.airtime_s
     stalled_s = STALLED_S + 10 * settings.packet_s + MAX_FEEDBACK_INTERVALS * settings.feedback_interval_s
-    columns = (
-        TextColumn("{task.description:<24}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[unit]}"),
-    )
-    with Progress(*columns, TimeElapsedColumn(), console=console) as progress:
-        air = progress.add_task("acoustic air time", total=None, unit="s")
-        shore = progress.add_task("images at the shore site", total=None, unit="")
-        changes, changed_at, idle_since_utc_s = -1, time.monotonic(), 0.0
+    changes, changed_at, idle_since_utc_s = -1, time.monotonic(), 0.0
+    with ProgressDisplay(console) as display:
         while True:
             chain.check()
             now = time.monotonic()
-            planned, sent = watcher.packets_planned, watcher.packets_sent
-            progress.update(air, total=round(planned * airtime_s) or None, completed=round(sent * airtime_s))
-            progress.update(shore, total=len(watcher.encoded) or None, completed=watcher.images_at_shore)
+            air = f"{watcher.packets_sent * settings.rate_info.airtime_s:.0f} s of air time"
+            display.show("images at the shore site", len(watcher.shore), len(watcher.encoded) or None, air)
             busy = watcher.busy(files, time.time() - 5.0)
             if watcher.changes != changes:
                 changes, changed_at, idle_since_utc_s = watcher.changes, now, 0.0

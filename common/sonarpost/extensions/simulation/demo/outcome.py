@@ -6,12 +6,13 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sonarpost.errors import FrameError
 from sonarpost.extensions.simulation.demo.settings import UUV_ADDRESS, ChainSettings
-from sonarpost.link.frames.paper.frame import ContactFrame, HalfFrame, parse_frame
+from sonarpost.link.frames.paper.frame import HalfFrame, parse_frame
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.receiver import ImageUpdate
 
@@ -26,8 +27,8 @@ class ChannelDelivery:
     Attributes:
         frames_sent: Frames with content that the vehicle sent.
         frames_lost: Of these, frames that the vessel's modem did not deliver intact.
-        acoustic_s: Airtime in simulated seconds.
         packets: Packets that the vehicle sent.
+        acoustic_s: Airtime in simulated seconds.
         delivered_images: Images that can be shown: with the paper's format, one frame was delivered; with v1, an
             independent receiver reports them.
         delivered_frames: Delivered frames of the paper's format, by image and half.
@@ -44,29 +45,22 @@ class ChannelDelivery:
     def add_frame(self, data: bytes, *, delivered: bool) -> None:
         """Count one frame; `data` is what the vessel's modem received."""
         self.frames_sent += 1
+        self.frames_lost += not delivered
         if not delivered:
-            self.frames_lost += 1
             return
         for event in self._v1.accept(UUV_ADDRESS, data, 0.0):
             if isinstance(event, ImageUpdate):
                 self.delivered_images.add(event.image_id)
-        try:
+        with suppress(FrameError):
             frame = parse_frame(data)
-        except FrameError:
-            return
-        self.delivered_images.add(frame.image_id)
-        part = frame.half if isinstance(frame, HalfFrame) else "contact"
-        assert isinstance(frame, (HalfFrame, ContactFrame))
-        self.delivered_frames[frame.image_id, part] += 1
+            self.delivered_images.add(frame.image_id)
+            self.delivered_frames[frame.image_id, frame.half if isinstance(frame, HalfFrame) else "contact"] += 1
 
 
 def read_channel_log(path: Path) -> ChannelDelivery:
     """Read the log of the simulated channel; only frames of the vehicle count."""
-    delivery = ChannelDelivery()
-    if not path.is_file():
-        return delivery
-    seen_packets: set[int] = set()
-    for line in path.read_text(encoding="utf-8").splitlines():
+    delivery, seen_packets = ChannelDelivery(), set[int]()
+    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
         entry = json.loads(line)
         if entry.get("event") == "start":
             seen_packets.clear()  # a restarted emulator counts from 1 again
@@ -148,6 +142,16 @@ class Outcome:
     def succeeded(self) -> bool:
         """Whether everything that the channel can deliver is at the shore site, unchanged."""
         return self.sha256_match and not (self.missing or self.incomplete or self.not_sent)
+
+    @property
+    def failures(self) -> list[str]:
+        """Lines with the contacts and images that should be at the shore site."""
+        found = {
+            "contacts without an encoded image": self.not_sent,
+            "images missing at the shore site": self.missing,
+            "images incomplete at the shore site": self.incomplete,
+        }
+        return [f"[red]FAILED: {len(names)} {text}: {', '.join(names)}" for text, names in found.items() if names]
 
     def as_json(self) -> str:
         """Return the JSON object of the last line."""

@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TypeVar
 
 import zenoh
@@ -15,9 +16,7 @@ from sonarpost.bus.session import open_with_retry
 from sonarpost.errors import PayloadError, PortError
 from sonarpost.extensions.simulation.demo.settings import PLATFORM_OF, SHORE, UUV, VESSEL, WATER, ChainSettings
 from sonarpost.link.downlink.messages import image_of_number, number_of_image
-from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.frames.paper.sender import plan_packets
-from sonarpost.messages import AcousticFrame, EncodedImage, Health, QueueState, ReconstructedImage, Record, Snippet
+from sonarpost.messages import AcousticFrame, EncodedImage, Health, ReconstructedImage, Record, Snippet
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +48,6 @@ class Watcher:
         vessel: Latest version of each image on the vessel, by image identifier.
         shore: The same, as published at the shore site.
         health: Latest health report by service.
-        queue: Latest state of the vehicle's transmit queue.
         packets_sent: Packets that the vehicle sent.
         changes: Number of changes so far.
     """
@@ -62,7 +60,6 @@ class Watcher:
         self.vessel: dict[str, ReconstructedImage] = {}
         self.shore: dict[str, ReconstructedImage] = {}
         self.health: dict[str, Health] = {}
-        self.queue: QueueState | None = None
         self.packets_sent = 0
         self.changes = 0
         self._packets: set[tuple[float, int]] = set()
@@ -74,9 +71,10 @@ class Watcher:
         self._subscribe(uuv, keys.contact_detected(UUV), Snippet, self._on_snippet)
         self._subscribe(uuv, keys.image_encoded(UUV), EncodedImage, self._on_encoded)
         self._subscribe(uuv, keys.acoustic_tx(UUV), AcousticFrame, self._on_sent)
-        self._subscribe(uuv, keys.acoustic_queue(UUV), QueueState, self._on_queue)
-        self._subscribe(vessel, keys.image_reconstructed(VESSEL), ReconstructedImage, self._on_vessel)
-        self._subscribe(shore, keys.shore_image(VESSEL), ReconstructedImage, self._on_shore)
+        self._subscribe(
+            vessel, keys.image_reconstructed(VESSEL), ReconstructedImage, partial(self._latest, self.vessel)
+        )
+        self._subscribe(shore, keys.shore_image(VESSEL), ReconstructedImage, partial(self._latest, self.shore))
         for session, platform in ((uuv, UUV), (uuv, WATER), (vessel, VESSEL), (shore, SHORE)):
             self._subscribe(session, keys.health_all(platform), Health, self._on_health)
         return self
@@ -122,21 +120,12 @@ class Watcher:
         self.changes += image_id not in self.encoded
         self.encoded[image_id] = image
 
-    def _on_queue(self, state: QueueState) -> None:
-        self.queue = state
-
     def _on_sent(self, frame: AcousticFrame) -> None:
         packet = (frame.time_utc_s, frame.packet)
         if packet not in self._packets:
             self._packets.add(packet)
             self.packets_sent += 1
             self.changes += 1
-
-    def _on_vessel(self, image: ReconstructedImage) -> None:
-        self._latest(self.vessel, image)
-
-    def _on_shore(self, image: ReconstructedImage) -> None:
-        self._latest(self.shore, image)
 
     def _latest(self, known: dict[str, ReconstructedImage], image: ReconstructedImage) -> None:
         before = known.get(image.image_id)
@@ -146,18 +135,6 @@ class Watcher:
 
     def _on_health(self, health: Health) -> None:
         self.health[health.service] = health
-
-    @property
-    def packets_planned(self) -> int:
-        """Packets that the images encoded so far need: computed for the paper's format, from the queue for v1."""
-        rate = self.settings.rate_info
-        with self._lock:
-            images, queue = tuple(self.encoded.values()), self.queue
-        if self.settings.link == "v1":
-            left_bytes = sum(image.bytes_left for image in queue.images) if queue is not None else 0
-            return self.packets_sent + -(-left_bytes // rate.packet_bytes)
-        contact = ContactSummary()
-        return sum(len(plan_packets(i.image_id, i.stream, contact, rate.frames, rate.frame_bytes)) for i in images)
 
     @property
     def contact_of_image(self) -> dict[str, str]:
@@ -170,12 +147,6 @@ class Watcher:
         """Whether every encoded image is complete at the shore site."""
         with self._lock:
             return all(i in self.shore and self.shore[i].complete for i in self.encoded)
-
-    @property
-    def images_at_shore(self) -> int:
-        """Number of images at the shore site of which at least one pixel was received."""
-        with self._lock:
-            return sum(image.missing_fraction < 1 for image in self.shore.values())
 
     def busy(self, files_expected: int, since_utc_s: float) -> str:
         """Return what still keeps the chain busy, an empty text if nothing does.
