@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -26,7 +27,6 @@ _FULL: Final = "the driver's queue is full"
 _EXPIRED: Final = "the modem or the channel was busy for too long"
 S = TypeVar("S")
 M = TypeVar("M")
-M_co = TypeVar("M_co", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,21 +106,34 @@ class PacketQueue(Generic[W]):
         return self._waiting[0].queued_s + self._max_age_s if self._waiting else None
 
 
-class Assembler(Protocol[M_co]):
-    """Divides received bytes into messages. What is not a message is an error."""
+class Assembler(ABC, Generic[M]):
+    """Divides the bytes of a stream into messages. Its buffer holds at most one incomplete message."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
 
     @property
     def incomplete(self) -> bool:
         """Whether the beginning of a message waits for its end."""
+        return bool(self._buffer)
 
-    def feed(self, data: bytes) -> Sequence[M_co | SentenceError]:
-        """Return the messages that are complete with these bytes."""
+    def feed(self, data: bytes) -> list[M | SentenceError]:
+        """Return the messages that are complete now, and an error for each run of bytes that is none."""
+        self._buffer += data
+        return self._messages()
 
-    def abandon(self) -> Sequence[M_co | SentenceError]:
-        """Give up the incomplete message; return what its bytes come to."""
+    def abandon(self) -> list[M | SentenceError]:
+        """Give up the incomplete message; return what its bytes contain."""
+        self.reset()
+        return []
 
     def reset(self) -> None:
-        """Forget the incomplete message."""
+        """Drop an incomplete message."""
+        self._buffer.clear()
+
+    @abstractmethod
+    def _messages(self) -> list[M | SentenceError]:
+        """Remove and return the messages that are complete, and errors."""
 
 
 class QueueingModem(Modem, Generic[S, M]):

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from sonarpost.errors import FrameError, SentenceError
 from sonarpost.extensions.s2c.driver import S2cModem
 from sonarpost.extensions.s2c.emulated import EmulatedS2c
-from sonarpost.extensions.s2c.events import UsblPosition
 from sonarpost.extensions.s2c.messages import (
     MAX_DATA_BYTES,
     MAX_TEXT_BYTES,
@@ -25,6 +24,7 @@ from sonarpost.extensions.s2c.messages import (
     S2cReply,
     SendEnd,
     SendStart,
+    UsblPosition,
     parse,
     parse_travel_time_s,
 )

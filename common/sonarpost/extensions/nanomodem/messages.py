@@ -19,8 +19,11 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
+from typing_extensions import override
+
 from sonarpost.errors import SentenceError
 from sonarpost.extensions.nanomodem.rates import MAX_PAYLOAD_BYTES
+from sonarpost.modem.packet_queue import Assembler
 
 TRAVEL_STEP_S: Final = 31.25e-6
 """Unit of the travel time."""
@@ -194,37 +197,21 @@ def _parse(cursor: _Cursor) -> NanoMessage:
     return message
 
 
-class NanoMessageAssembler:
+class NanoMessageAssembler(Assembler[NanoMessage]):
     """Divides the bytes of the modem into messages. It keeps less than the longest message."""
 
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-
-    @property
-    def incomplete(self) -> bool:
-        """Whether the bytes so far end within a message."""
-        return bool(self._buffer)
-
-    def reset(self) -> None:
-        """Drop an incomplete message."""
-        self._buffer.clear()
-
-    def feed(self, data: bytes) -> list[NanoMessage | SentenceError]:
-        """Return the messages that are complete now, and an error for each run of other bytes."""
-        self._buffer += data
-        return self._take()
-
+    @override
     def abandon(self) -> list[NanoMessage | SentenceError]:
-        """Give up the incomplete message: its rest was lost. Return what its bytes contain."""
         found: list[NanoMessage | SentenceError] = []
         if self._buffer:
             found.append(SentenceError(_WHERE, "end", bytes(self._buffer[:20]), "a complete message"))
         while self._buffer:
             del self._buffer[0]
-            found += (item for item in self._take() if not isinstance(item, SentenceError))
+            found += (item for item in self._messages() if not isinstance(item, SentenceError))
         return found
 
-    def _take(self) -> list[NanoMessage | SentenceError]:
+    @override
+    def _messages(self) -> list[NanoMessage | SentenceError]:
         found: list[NanoMessage | SentenceError] = []
         at, skipping = 0, False
         while at < len(self._buffer):

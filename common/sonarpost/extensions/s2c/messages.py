@@ -12,8 +12,11 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
+from typing_extensions import override
+
 from sonarpost.errors import SentenceError
-from sonarpost.extensions.s2c.events import UsblPosition
+from sonarpost.modem.interface import ModemEvent
+from sonarpost.modem.packet_queue import Assembler
 
 MAX_TEXT_BYTES: Final = 4096
 """Greatest length of a message."""
@@ -123,6 +126,27 @@ class ReceptionEnd:
 
 
 @dataclass(frozen=True, slots=True)
+class UsblPosition(ModemEvent):
+    """A USBL modem has measured the position of another modem.
+
+    Attributes:
+        address: Address of the other modem.
+        east_m: Distance east of the USBL modem.
+        north_m: Distance north of it.
+        up_m: Distance above it.
+        travel_s: One-way travel time.
+        accuracy_m: Accuracy as the modem estimates it.
+    """
+
+    address: int
+    east_m: float
+    north_m: float
+    up_m: float
+    travel_s: float
+    accuracy_m: float
+
+
+@dataclass(frozen=True, slots=True)
 class Ignored:
     """A notification that the driver does not use."""
 
@@ -134,26 +158,10 @@ S2cMessage = (
 )
 
 
-class S2cMessageAssembler:
-    """Divides the stream of bytes into messages of either mode. Its buffer holds at most one incomplete message."""
+class S2cMessageAssembler(Assembler[RawMessage]):
+    """Divides the stream of bytes into messages of either mode."""
 
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-
-    @property
-    def incomplete(self) -> bool:
-        """Whether the buffer holds the beginning of a message."""
-        return bool(self._buffer)
-
-    def reset(self) -> None:
-        """Drop an incomplete message."""
-        self._buffer.clear()
-
-    def feed(self, data: bytes) -> list[RawMessage | SentenceError]:
-        """Return the messages that are complete now, and an error for each run of bytes that is none."""
-        self._buffer += data
-        return self._messages()
-
+    @override
     def abandon(self) -> list[RawMessage | SentenceError]:
         """Give up the incomplete message; return its error, and the messages that its length field had hidden."""
         found: list[RawMessage | SentenceError] = []
@@ -162,6 +170,7 @@ class S2cMessageAssembler:
             found += self._messages()
         return found
 
+    @override
     def _messages(self) -> list[RawMessage | SentenceError]:
         found: list[RawMessage | SentenceError] = []
         while (item := self._next()) is not None:

@@ -27,7 +27,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
+from typing_extensions import override
+
 from sonarpost.errors import SentenceError
+from sonarpost.modem.packet_queue import Assembler
 
 MAGIC: Final = b"SPM1"
 MAX_DATAGRAM_BYTES: Final = 4096
@@ -98,30 +101,12 @@ def parse(data: bytes) -> Datagram:
     return Datagram(DatagramKind(kind), source, destination, rate, number, tuple(frames))
 
 
-class DatagramAssembler:
+class DatagramAssembler(Assembler[Datagram]):
     """Divides the bytes of a stream into datagrams."""
 
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-
-    @property
-    def incomplete(self) -> bool:
-        """Whether the beginning of a datagram waits for its end."""
-        return bool(self._buffer)
-
-    def abandon(self) -> list[Datagram | SentenceError]:
-        """Drop an incomplete datagram."""
-        self.reset()
-        return []
-
-    def reset(self) -> None:
-        """Drop an incomplete datagram."""
-        self._buffer.clear()
-
-    def feed(self, data: bytes) -> list[Datagram | SentenceError]:
-        """Return the datagrams that are complete now, and an error for each run of bytes that is none."""
+    @override
+    def _messages(self) -> list[Datagram | SentenceError]:
         found: list[Datagram | SentenceError] = []
-        self._buffer += data
         while (item := self._next()) is not None:
             found.append(item)
         return found
