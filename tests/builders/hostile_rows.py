@@ -397,12 +397,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(("folder:atd_stub.input_dir",), "a file", "crash", hostile_recordings, "recording_of_sonar"),
     # Rows of other tests
-    Row(
-        ("exchange:network.http_client",),
-        "server",
-        "endless",
-        "tests/network/test_http_client.py",
-    ),
+    Row(("exchange:network.http_client",), "server", "endless", "tests/network/test_http_client.py"),
     Row(("exchange:bus.connectivity",), "router", "slow", "tests/bus/test_connectivity.py"),
     Row(("zenoh:*/inbox/{vessel}/frame",), "another vessel", "junk", "tests/security/test_other_vessels.py"),
     Row(("zenoh:*/status/{vessel}",), "vessel", "junk", "tests/services/console/test_service.py"),
@@ -457,11 +452,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(("folder:console.tiles_dir",), "a file", "junk", "tests/services/console/test_security.py"),
     Row(
-        (
-            "folder:atd_stub.survey_options",
-            "folder:atd_stub.snippet_dir",
-            "folder:atd_stub.quarantine_dir",
-        ),
+        ("folder:atd_stub.survey_options", "folder:atd_stub.snippet_dir", "folder:atd_stub.quarantine_dir"),
         "a file",
         "junk",
         "tests/services/atd_stub/test_input_files.py",

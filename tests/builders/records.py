@@ -5,15 +5,7 @@ import time
 import numpy as np
 
 from sonarpost.link.frames.paper.frame import format_image_id
-from sonarpost.messages import (
-    Command,
-    Contact,
-    Decision,
-    EncodedImage,
-    OutgoingMessage,
-    Pixels,
-    ReconstructedImage,
-)
+from sonarpost.messages import Command, Contact, Decision, EncodedImage, OutgoingMessage, Pixels, ReconstructedImage
 
 FIRST_S = 1_700_000_000.0
 

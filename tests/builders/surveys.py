@@ -108,10 +108,9 @@ def lowrance_frame(version: int, offset: int, samples: bytes, channel: int = 5, 
     """
     head = bytearray(int(values.get("header_bytes", 168 if version == 3 else 144)))
     size = len(head) + len(samples)
-    places = {
-        2: (28, 32, 34, 36, 40, 60, 100, 108, 120, 128, 140),
-        3: (8, 12, 44, 16, 20, 40, 84, 92, 104, 112, 124),
-    }[version]
+    places = {2: (28, 32, 34, 36, 40, 60, 100, 108, 120, 128, 140), 3: (8, 12, 44, 16, 20, 40, 84, 92, 104, 112, 124)}[
+        version
+    ]
     fields: tuple[tuple[str, tuple[float, ...]], ...] = (
         ("H", (size,)),
         ("H", (channel,)),

@@ -97,11 +97,7 @@ def apply(valid, header, edit):
     first = header + round(place * (len(valid) - header))
     count = max(1, round(share * (len(valid) - header)))
     end = min(first + count, len(valid))
-    new = {
-        "random": np.random.default_rng(seed).bytes(count),
-        "zeros": bytes(count),
-        "ones": b"\xff" * count,
-    }[filling]
+    new = {"random": np.random.default_rng(seed).bytes(count), "zeros": bytes(count), "ones": b"\xff" * count}[filling]
     match kind:
         case "cut":
             return valid[:first], first, len(valid)

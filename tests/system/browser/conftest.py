@@ -19,15 +19,7 @@ from builders.console import (
     session_cookie,
     users_file,
 )
-from playwright.sync_api import (
-    Browser,
-    BrowserContext,
-    ConsoleMessage,
-    Page,
-    Playwright,
-    Request,
-    sync_playwright,
-)
+from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Playwright, Request, sync_playwright
 
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
 

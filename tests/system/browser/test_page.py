@@ -318,13 +318,7 @@ def test_contrast_and_accessible_names(served, theme):
     visit.page.select_option("#review", "all")
     visit.page.locator("[data-tool=more]").click()
     assert visit.page.evaluate("document.documentElement.dataset.theme") == ("night" if theme == "dark" else "day")
-    views = {
-        "review": [],
-        "ask": ["r"],
-        "keys": ["Escape", "?"],
-        "map": ["Escape", "p", "j"],
-        "fleet": ["f"],
-    }
+    views = {"review": [], "ask": ["r"], "keys": ["Escape", "?"], "map": ["Escape", "p", "j"], "fleet": ["f"]}
     marks = {"ask": "[data-request]:focus", "keys": "dialog .keys", "map": ".map .card"}
     for name, keystrokes in views.items():
         for key in keystrokes:

@@ -188,12 +188,7 @@ def compose_config(command, folder, *options):
     """Return the configuration that Compose reads from files in a folder, and that it gives no warning about."""
     environment = {"PATH": os.environ["PATH"], "HOME": str(folder)}
     done = subprocess.run(
-        [*command, *options, "config"],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
+        [*command, *options, "config"], cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     assert "level=warning" not in done.stderr
