@@ -1,13 +1,14 @@
 """Exhaustive search of the delivery model: invariants of `docs/specifications/delivery.md`.
 
-`PYTHONPATH=tests python -m builders.delivery_model` prints all configurations with the number of states.
+`python -m research.delivery_model` prints all configurations with the number of states.
 """
 
 from dataclasses import fields, replace
 
 import pytest
-from builders.delivery_model.rules import NEW, OLD, Rules
-from builders.delivery_model.scenarios import (
+
+from research.delivery_model.rules import NEW, OLD, Rules
+from research.delivery_model.scenarios import (
     DEPTH_RULES,
     HOSTILE,
     HOSTILE_WITH_ORIGIN,
@@ -19,7 +20,7 @@ from builders.delivery_model.scenarios import (
     SCENARIOS,
     WITH_SHARED_ORIGIN,
 )
-from builders.delivery_model.search import explore
+from research.delivery_model.search import explore
 
 
 @pytest.mark.timeout(1800)

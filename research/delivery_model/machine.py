@@ -10,7 +10,7 @@ from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
-from builders.delivery_model.rules import Rules
+from research.delivery_model.rules import Rules
 
 FAR = 99
 """A number far above those that a producer assigns."""

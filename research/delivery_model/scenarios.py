@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
-from builders.delivery_model.machine import Record, World
-from builders.delivery_model.rules import NEW
+from research.delivery_model.machine import Record, World
+from research.delivery_model.rules import NEW
 
 A1, A2, A3 = (Record(f"a{number}", "A") for number in range(1, 4))
 B1 = Record("b1", "B")

@@ -4,8 +4,10 @@ import time
 from collections import deque
 from dataclasses import dataclass
 
-from builders.delivery_model.invariants import violations_by, violations_in
-from builders.delivery_model.machine import State, World, cooperative_step, initial, steps
+from typing_extensions import override
+
+from research.delivery_model.invariants import violations_by, violations_in
+from research.delivery_model.machine import State, World, cooperative_step, initial, steps
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,7 @@ class Result:
     trace: tuple[str, ...]
     duration_s: float
 
+    @override
     def __str__(self) -> str:
         head = f"{self.states} states, {self.steps} transitions, depth {self.depth}, {self.duration_s:.1f} s: "
         if not self.violation:

@@ -1,6 +1,6 @@
 """Invariants of `docs/specifications/delivery.md`, checked in every state and at every transition."""
 
-from builders.delivery_model.machine import Query, State, Step, World, react
+from research.delivery_model.machine import Query, State, Step, World, react
 
 
 def violations_in(world: World, state: State) -> list[str]:

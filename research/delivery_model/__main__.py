@@ -3,9 +3,9 @@
 import sys
 from dataclasses import replace
 
-from builders.delivery_model.rules import OLD
-from builders.delivery_model.scenarios import HOSTILE, LARGE_SCENARIOS, REMOVALS, RESTORE, SCENARIOS
-from builders.delivery_model.search import Result, explore
+from research.delivery_model.rules import OLD
+from research.delivery_model.scenarios import HOSTILE, LARGE_SCENARIOS, REMOVALS, RESTORE, SCENARIOS
+from research.delivery_model.search import Result, explore
 
 
 def _print(name: str, result: Result) -> None:
