@@ -10,17 +10,14 @@ import pytest
 from PIL import Image
 
 from sonarpost.cli.detection import command
-from sonarpost.cli.detection.command import annotated_waterfall
 from sonarpost.cli.main import parser
 from sonarpost.detection import candidates
-from sonarpost.detection.detector import CLUTTER, MINE_LIKE, STRUCTURE, detect
+from sonarpost.detection.detector import CLUTTER, MINE_LIKE, STRUCTURE
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.messages import AtdClass, Contact
-from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.side_car import read_side_car
-from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import Side
 from sonarpost.sonar.xtf_writer import write_xtf
 
@@ -136,17 +133,6 @@ def test_plot_marks_contact_on_its_side_and_has_scales(file, tmp_path, capsys):
     assert ink[-34:, 150:-30].any(), "ranges"
 
 
-def test_plot_of_a_long_recording_is_reduced_and_may_have_one_side(make_survey):
-    survey = make_survey({"ping": 120})
-    long = replace(survey, pings=survey.pings * 8)
-    image = np.asarray(annotated_waterfall(InMemorySource(long, SurveyOptions()), detect(survey))).astype(int)
-    assert image.shape[0] == 22 + 800 + 34  # 1600 pings, 2 in a row
-    rows, _ = np.nonzero((image[..., 0] == 255) & (image[..., 1] == 80) & (image[..., 2] == 60))
-    assert rows.min() == pytest.approx(22 + 120 / 2 - 6, abs=4)
-    one_side = InMemorySource(make_survey(sides=(Side.STARBOARD,)), SurveyOptions())
-    assert annotated_waterfall(one_side, ()).size == (150 + 2 * 512 + 30, 22 + 200 + 34)
-
-
 def test_thresholds_and_number_of_contacts(tmp_path, capsys, monkeypatch):
     """A file with no contact above the threshold says what lower thresholds give."""
     monkeypatch.setattr(candidates, "_MAX_PER_1000_PINGS", 60)
@@ -220,36 +206,5 @@ def test_invalid_options_file_and_output_are_reported_before_the_work(file, tmp_
             run(file, option, tmp_path / "bad.xtf" / "out.png")
 
 
-def test_file_cut_by_a_power_failure_has_a_note(make_survey, tmp_path, capsys):
-    survey = make_survey()
-    write_xtf(replace(survey, pings=survey.pings[:30]), tmp_path / "whole.xtf")
-    (tmp_path / "cut.xtf").write_bytes((tmp_path / "whole.xtf").read_bytes()[:-658])
-    assert run(tmp_path / "cut.xtf") == 0
-    assert "note: the file ends inside its last packet" in capsys.readouterr().out
-    (found,) = listed(capsys, tmp_path / "cut.xtf")
-    assert found["pings"] == 29
-    assert "the file ends inside its last packet" in found["warnings"][0]
-
-
 def test_classes_of_the_detector_are_those_of_the_contact_record():
     assert set(get_args(AtdClass)) == {MINE_LIKE, CLUTTER, STRUCTURE}
-
-
-@pytest.mark.parametrize(
-    ("p_mine_like", "p_other_object", "cells"), [(0.83, 0.12, ["0.83", "0.12"]), (None, None, ["-", "-"])]
-)
-def test_table_and_json_state_class_and_probabilities(p_mine_like, p_other_object, cells, file, capsys, monkeypatch):
-    describe = command._Detection._describe
-    fields = {"atd_class": "structure", "p_mine_like": p_mine_like, "p_other_object": p_other_object}
-    monkeypatch.setattr(
-        command._Detection,
-        "_describe",
-        lambda self, survey, detection, origin: describe(self, survey, replace(detection, **fields), origin),
-    )
-    contacts = listed(capsys, file)[0]["contacts"]
-    assert {name: contacts[0][name] for name in fields} == fields
-    assert run(file) == 0
-    lines = capsys.readouterr().out.splitlines()
-    heading = next(number for number, line in enumerate(lines) if line.split()[:1] == ["n"])
-    columns = dict(zip(lines[heading].split(), lines[heading + 1].split(), strict=True))
-    assert [columns[name] for name in ("class", "p_mine", "p_other")] == ["structure", *cells]

@@ -201,15 +201,6 @@ def test_command_lists_picks_with_the_detected_contacts(file, capsys):
     assert (picked["atd_class"], picked["atd_confidence"], picked["length_m"]) == (PICKED, None, None)
 
 
-def test_table_marks_picks_and_unknown_values(file, capsys):
-    assert main(["detect", str(file), "--pick", "1030,port,10"]) == 0
-    _, _, columns, _, line, note = capsys.readouterr().out.splitlines()
-    assert len(columns.split()) == len(line.split())
-    assert line.split()[1:8] == ["-", "picked", "-", "-", "port", "1030", "10"]
-    assert line.split()[9:13] == ["-"] * 4
-    assert note == "picked: 2"
-
-
 def test_snippets_of_picks_can_be_sent_as_images(file, tmp_path, capsys):
     arguments = ["--pick", "1030,port,10", "--snippets", tmp_path / "s", "--plot", tmp_path / "p.png"]
     listed(capsys, file, *arguments)

@@ -18,7 +18,6 @@ from research.codebook.builder import (
     figure_of_merit,
     refine_once,
     rms_distance,
-    without_duplicates,
 )
 from research.codebook.tile_set import IncrementalTileSet
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
@@ -75,13 +74,6 @@ def test_build_matches_table_iv_tile_by_tile(fom_below: float, rms: float) -> No
     assert [tile.tobytes() for tile in database.tiles] == table_iv(images, 8, fom_below, above, figure_of_merit)
 
 
-def test_tiles_beyond_the_distance_are_added_one_by_one() -> None:
-    # 8 x 8 tiles that differ by d grey levels are 8 d apart.
-    database = build(training(flat(0), flat(16, 17, 30, 33, 34)), 8, [Round(ALWAYS, rms_distance(16, 8))])
-    assert levels(database) == [0, 17, 34]  # 16 is not farther than 16; 30 and 33 are near the 17 just added
-    assert rms_distance(16, 20) == 320  # the value of the paper
-
-
 def test_rounds_with_fewer_images() -> None:
     reported: list[BuildProgress] = []
     images = [flat(level) for level in (0, 20, 40, 60)]
@@ -91,14 +83,6 @@ def test_rounds_with_fewer_images() -> None:
     found = [(p.round_number, p.image_number, p.tiles) for p in reported]
     assert found == [(0, 0, 1), (0, 1, 1), (0, 2, 1), (0, 3, 2), (1, 0, 2), (1, 2, 3)]
     assert reported[4].images_in_round == 2
-
-
-def test_build_stops_at_the_maximum_number_of_tiles() -> None:
-    reported: list[BuildProgress] = []
-    images = training(flat(0, 30), flat(60, 90, 120), flat(200))
-    database = build(images, 8, [Round(ALWAYS, 0.0)], max_tiles=4, progress=reported.append)
-    assert levels(database) == [0, 30, 60, 90]
-    assert len(reported) == 2
 
 
 def test_core_is_extended_and_keeps_its_indices() -> None:
@@ -165,21 +149,6 @@ def test_incremental_search_is_exact(tile_px: int) -> None:
         assert found == np.argmin(distances)
 
 
-def test_refinement_lowers_the_training_error_and_keeps_the_size() -> None:
-    images = training(*[image(seed, 64) for seed in range(4)])
-    database = build(images, 8, [Round(ALWAYS, rms_distance(10, 8))], max_tiles=60)
-    tiles, errors = database.tiles, []
-    for _ in range(4):
-        refined = refine_once(tiles, 8, images)
-        tiles = refined.tiles
-        errors.append(refined.rms)
-    assert errors == sorted(errors, reverse=True)
-    assert errors[0] > errors[-1]
-    assert len(without_duplicates(tiles)) <= len(tiles) == len(database)
-    rounds = [Round(ALWAYS, rms_distance(10, 8))]
-    assert np.array_equal(build(images, 8, rounds, max_tiles=60, passes=4).tiles, without_duplicates(tiles))
-
-
 def test_refinement_uses_the_rounded_mean_and_keeps_unused_tiles() -> None:
     database = TileDatabase.from_tiles(8, cut_tiles(flat(10, 100, 250), 8))
     refined = refine_once(database.tiles, 8, training(flat(8, 9, 12, 101, 102)))
@@ -239,19 +208,6 @@ def test_interrupted_rounds_and_refinement_resume_to_the_same_codebook(tmp_path:
         assert len({p.pass_number for p in reported if isinstance(p, RefinementProgress)}) == 3 - max(0, left - 10)
 
 
-def test_finished_journal_allows_more_passes(tmp_path: Path) -> None:
-    folder = Folder(4)
-    journal = tmp_path / "journal"
-    build(folder.images(), 8, ROUNDS, passes=1, journal_path=journal)
-    again: list[BuildProgress | RefinementProgress] = []
-    build(folder.images(), 8, ROUNDS, passes=1, journal_path=journal, progress=again.append)
-    assert again == []
-    more = build(folder.images(), 8, ROUNDS, passes=2, journal_path=journal)
-    assert more.identity == build(folder.images(), 8, ROUNDS, passes=2).identity
-    fewer = build(folder.images(), 8, ROUNDS, passes=0, journal_path=journal)
-    assert fewer.identity == build(folder.images(), 8, ROUNDS).identity
-
-
 def test_error_names_an_image_changed_since_it_was_processed(tmp_path: Path) -> None:
     folder = Folder(6)
     journal = tmp_path / "journal"
@@ -273,16 +229,6 @@ def test_error_names_an_image_changed_since_it_was_processed(tmp_path: Path) -> 
     assert len(build(folder.images(), 8, ROUNDS, journal_path=journal)) > 0
 
 
-def test_images_changed_since_a_pass_are_rejected(tmp_path: Path) -> None:
-    folder = Folder(6)
-    rounds = (Round(1e9, rms_distance(45, 8), 2),)  # image 5 takes part in the refinement only
-    journal = tmp_path / "journal"
-    build(folder.images(), 8, rounds, passes=1, journal_path=journal)
-    folder.pixels[5] = image(78)
-    with pytest.raises(CodebookError, match="pass"):
-        build(folder.images(), 8, rounds, passes=2, journal_path=journal)
-
-
 def test_damaged_tile_count_does_not_allocate_memory(tmp_path: Path) -> None:
     path = tmp_path / "journal"
     BuildJournal(path, "fingerprint", 64).__exit__(None, None, None)
@@ -301,20 +247,6 @@ def peak_of(function: Callable[[], object]) -> int:
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-
-
-def test_image_of_several_chunks_is_added_tile_by_tile() -> None:
-    rng = np.random.default_rng(1)
-    tiles = rng.integers(0, 24, (1500, 16), dtype=np.uint8)
-    tile_set = IncrementalTileSet(4, 10_000)
-    added = tile_set.add_far(tiles, np.full(1500, np.inf), 24.0)
-    expected: list[np.ndarray] = []
-    for tile in tiles.astype(np.int64):
-        if all(((tile - other) ** 2).sum() > 24 * 24 for other in expected):
-            expected.append(tile)
-    assert 300 < len(expected) < 1400
-    assert np.array_equal(added, np.array(expected))
-    assert np.array_equal(tile_set.tiles(), added)
 
 
 def peak_bytes(count: int, max_tiles: int, journal: Path | None = None) -> int:

@@ -12,16 +12,14 @@ from PIL import Image
 from research.codecs import __main__ as command
 from research.codecs.baselines import comparison_registry
 from research.common import measurement as measuring
-from research.common.images import SampleImage, read_image_folder, sdvd_crops, simulated_images, survey_line
+from research.common.images import SampleImage, read_image_folder, sdvd_crops, simulated_images
 from research.common.measurement import CodecUnderTest, code_image, measure_codec
 from research.common.scene_measures import PSNR_LIMIT_DB
-from sonarpost.codec.emb import DEFAULT_STRENGTH
 from sonarpost.codec.interface import DecodedImage, StreamHeader
 from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.registry import CodecRegistry, CodecSpec
 from sonarpost.codec.vq.codebook import Codebook, save
 from sonarpost.codec.vq.tiles import TileDatabase
-from sonarpost.errors import CodebookError, ConfigError, SonarpostError, StreamError
+from sonarpost.errors import CodebookError, StreamError
 from sonarpost.sonar.image_files import write_png, write_tiff
 
 
@@ -122,36 +120,6 @@ def test_rows_of_simulated_images_are_compared_with_their_scenes(capsys, monkeyp
     assert others[0] == others[1] == others[2]  # the strength affects emb only
 
 
-def test_row_with_many_misses_is_null_and_details_have_the_figures(folder, tmp_path, capsys, monkeypatch):
-    write_png(folder / "dark.png", np.zeros((40, 48), np.uint8))
-    monkeypatch.setattr("research.common.command.create_codecs", lambda *_, **__: ([CodecUnderTest(Halving())], []))
-    file = tmp_path / "details.json"
-    assert run("--images", folder, "--budgets", "60,900", "--json", "--details", file) == 0
-    said = capsys.readouterr()
-    rows = json.loads(said.out)["results"]
-    assert [row["psnr"] for row in rows] == [None, None]  # 3 of 4 images are fewer than nine tenths
-    assert "emb at 900 B: 1 x image: expected a bright one" in said.err
-    found = json.loads(file.read_text())
-    assert [(row["n"], row["misses"]) for row in found["results"]] == [(3, 1), (3, 1)]
-    assert all(row["psnr"] > 0 and len(row["ci"]["psnr"]) == 2 for row in found["results"])
-    assert found["images"] == 4
-
-
-def test_vq_row_is_the_best_codebook_within_the_budget(folder: Path, tmp_path: Path) -> None:
-    subjects, _ = measuring.create_codecs(comparison_registry(), ["vq"])
-    images = read_image_folder(folder).images
-    variants = [measure_codec(subject, images, [])[0] for subject in subjects]
-    coarse = next(p for p in variants if p.tested.variant == "nominal-20 14bit")
-    fine = next(p for p in variants if p.tested.variant == "nominal-10 14bit")
-    budgets = [int(coarse.stream_bytes.min()) - 1, int(coarse.stream_bytes.max()), 4096]
-    none, small, large = measuring.best_within_budgets(variants, budgets)
-    assert none.misses == len(images)
-    assert np.array_equal(small.stream_bytes, coarse.stream_bytes)
-    assert np.array_equal(large.psnr, np.maximum(coarse.psnr, fine.psnr))
-    assert (large.stream_bytes <= fine.stream_bytes).all()  # the most compact packing
-    assert sum(none.reasons.values()) == len(images)
-
-
 def test_vq_uses_the_given_codebooks(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tiles = np.random.default_rng(3).integers(0, 256, (9, 400), np.uint8)
     own = tmp_path / "own.tiles"
@@ -239,27 +207,6 @@ def test_table_lists_misses_and_rejected_files_and_the_sheet_shows_originals(fol
     assert "rejected:" not in output.err
 
 
-def test_embedded_stream_is_encoded_once_and_truncated() -> None:
-    budgets: list[int | None] = []
-
-    class Cut(Halving):
-        def encode(self, image: np.ndarray, budget_bytes: int | None = None) -> bytes:
-            budgets.append(budget_bytes)
-            return StreamHeader(self.codec_id, 0xAB, *image.shape).pack() + bytes(range(100))
-
-        def decode(self, stream: bytes, received: np.ndarray | None = None) -> DecodedImage:
-            header = StreamHeader.unpack(stream)
-            level = np.full((header.height_px, header.width_px), len(stream) - header.size, np.uint8)
-            return DecodedImage(level, np.zeros((1, 1), np.bool_))
-
-    coded = code_image(CodecUnderTest(Cut(), is_embedded=True), snippet(0), [3, 30, 60])
-    assert budgets == [60]
-    assert isinstance(coded[0], str)  # not even the header fits
-    assert [len(c.stream) for c in coded[1:] if not isinstance(c, str)] == [30, 60]
-    levels = [int(c.decoded[0, 0]) for c in coded[1:] if not isinstance(c, str)]
-    assert levels[1] - levels[0] == 30
-
-
 def test_folder_is_read_recursively_and_rejections_are_listed(folder: Path) -> None:
     write_png(folder / "too_small.png", snippet(0)[:15])
     write_png(folder / "too_wide.png", np.zeros((20, 513), np.uint8))
@@ -282,20 +229,6 @@ def test_folder_is_read_recursively_and_rejections_are_listed(folder: Path) -> N
     assert any("too_wide.png: centre of 513 × 20 px cropped to 512 × 20 px" in line for line in fitted.notes)
 
 
-def test_plot_is_written(folder: Path, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib", reason="matplotlib is an optional extra")
-    run("--images", folder, "--codecs", "spiht", "--budgets", "40,300", "--plot", tmp_path / "plot.png")
-    with Image.open(tmp_path / "plot.png") as image:
-        assert image.width > 1000
-        assert len(set(image.convert("L").tobytes())) > 50
-
-
-def test_survey_line_of_a_tile_name() -> None:
-    assert survey_line("left_20240430052854L_tile_4.png") == "202404300528"
-    assert survey_line("right_20240430052859H_sample_2_tile_8.png") == "202404300528"
-    assert survey_line("3_143.jpg") == "3"
-
-
 @pytest.mark.realdata
 def test_crops_equal_those_of_the_published_table(data_dir: Path) -> None:
     found = sdvd_crops(data_dir / "snippets" / "sdvd")
@@ -303,34 +236,3 @@ def test_crops_equal_those_of_the_published_table(data_dir: Path) -> None:
     assert sum(bool(p.is_target) for p in found.images) == 92
     assert {p.pixels.shape for p in found.images} == {(80, 80)}
     assert np.stack([p.pixels for p in found.images]).mean() == pytest.approx(79.2210661, abs=1e-6)
-
-
-def test_unavailable_codecs_are_listed_unless_requested_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(_: object) -> Halving:
-        raise ConfigError("codec rare", "library", "absent", "pip install rare")
-
-    registry = CodecRegistry(
-        [CodecSpec("rare", (0x90,), absent), CodecSpec("halving", (0x91,), lambda _: Halving(), is_embedded=True)]
-    )
-    found, left_out = measuring.create_codecs(registry, None)
-    assert [subject.codec.codec_id for subject in found] == [0x7E]
-    assert "pip install rare" in left_out[0]
-    embedded = [measuring.create_codecs(registry, ["halving"], cut=cut)[0][0].is_embedded for cut in (False, True)]
-    assert embedded == [False, True]
-    with pytest.raises(SonarpostError, match="pip install rare"):
-        measuring.create_codecs(registry, ["rare"])
-
-
-def test_models_of_emb_are_measured_under_their_own_names_and_with_its_strength() -> None:
-    registry = comparison_registry()
-    found, _ = measuring.create_codecs(registry, ["emb", "emb:structure"])
-    assert [(one.name, one.label, one.codec.codec_id) for one in found] == [
-        ("emb", "emb", 0x22),
-        ("emb:structure", "emb:structure", 0x23),
-    ]
-    everything, _ = measuring.create_codecs(registry, None, all_packings=False)
-    assert [one.name for one in everything if one.codec.name == "emb"] == ["emb", "emb:structure"]
-    assert command.new_parser().parse_args([]).strength == DEFAULT_STRENGTH
-    for options, strength in (({}, DEFAULT_STRENGTH), ({"strength": 0.0}, 0)):
-        ((tested,), _) = measuring.create_codecs(comparison_registry(), ["emb"], **options)
-        assert tested.codec.strength == strength

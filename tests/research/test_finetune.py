@@ -9,11 +9,10 @@ import pytest
 from builders.exports import decision, image
 
 from research.detection import finetune
-from research.detection.finetune import LabelledContact, contact_examples, load_dataset, scores, split_by_group
+from research.detection.finetune import LabelledContact, contact_examples, load_dataset, split_by_group
 from sonarpost.cli.main import main
-from sonarpost.detection.classifier import MINE_LIKE_OBJECT, OTHER_OBJECT, default_classifier
+from sonarpost.detection.classifier import MINE_LIKE_OBJECT, OTHER_OBJECT
 from sonarpost.detection.images import ScaledImage
-from sonarpost.detection.settings import DetectorSettings
 from sonarpost.errors import ConfigError
 from sonarpost.messages import Pixels
 from sonarpost.services.c2.archive import Archive
@@ -72,13 +71,6 @@ def test_examples_are_the_candidates_at_the_centre(dataset):
         contact_examples([empty])
 
 
-def test_object_has_a_higher_score_than_seabed():
-    images = [object_pixels(1), object_pixels(1, with_object=False)]
-    contacts = [LabelledContact(ScaledImage(p, 0.1, 0.06), MINE_LIKE_OBJECT, "a") for p in images]
-    with_object, without = scores(contacts, DetectorSettings())
-    assert with_object > without
-
-
 def test_error_names_what_is_invalid(dataset, tmp_path):
     with pytest.raises(ConfigError, match="a data set of dataset export"):
         load_dataset(tmp_path)
@@ -104,12 +96,3 @@ def test_without_pytorch_the_error_names_it(dataset, tmp_path, capsys):
     assert finetune.main(["--dataset", str(dataset), "--out", str(tmp_path / "new.npz")]) == 2
     assert "PyTorch" in capsys.readouterr().err
     assert not (tmp_path / "new.npz").exists()
-
-
-def test_classifiers_are_compared_on_the_same_contacts(dataset, tmp_path):
-    path = tmp_path / "classifier.npz"
-    with path.open("wb") as file:
-        finetune.write_classifier(default_classifier(), file)
-    figures = finetune.compared(path, load_dataset(dataset), 0)
-    assert 0 <= figures.auc <= 1
-    assert figures.pd_at_one_false_alarm == {}

@@ -9,15 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from research.codecs.baselines.spiht import SpihtCodec
 from research.common.images import SampleImage
 from research.common.statistics import auc
 from research.paper import __main__ as paper
-from research.paper.dimensions import sensitivity
-from research.paper.figures import contact_images
 from research.recognition import __main__ as recognition
-from research.recognition.classifier import FOLDS, TargetClassifier, codec_with_grain, with_grain
-from sonarpost.codec.emb.codec import EmbCodec
+from research.recognition.classifier import FOLDS, TargetClassifier
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.image_files import write_png
@@ -79,12 +75,6 @@ def test_no_survey_line_is_classified_by_a_model_trained_on_it() -> None:
     assert auc(scores, np.array([bool(p.is_target) for p in inverted]))[0] < 0.1
 
 
-def test_classifier_requires_lines_with_and_without_targets() -> None:
-    same_line = [SampleImage(str(i), str(i), scene(i, target=i % 2 == 0), "one", i % 2 == 0) for i in range(10)]
-    with pytest.raises(ConfigError, match="two survey lines each"):
-        TargetClassifier(same_line, [], [])
-
-
 @pytest.fixture
 def data_set(tmp_path: Path) -> Path:
     """Return a data set in the layout of SDVD: dated targets as PNG, numbered clutter as JPEG."""
@@ -128,67 +118,9 @@ def test_recognition_results_of_decoded_images(data_set: Path, capsys: pytest.Ca
     assert "original" in capsys.readouterr().out
 
 
-def test_streams_with_grain_keep_the_budget(data_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--sdvd", data_set, "--codecs", "emb", "--budgets", "64", "--simulated", "0", "--crop", "40"]
-    assert run(recognition, *options, "--grain-strength", "0,1", "--least-auc", "0", "--json") == 0
-    rows = json.loads(capsys.readouterr().out)["results"]
-    assert [row["grain"] for row in rows] == [None, 0.0, 1.0]
-    assert all(0 < row["bytes"] <= 64 for row in rows)
-    assert rows[1]["auc"] is not None
-    assert all(row["of_original_ci"][0] <= row["of_original"] <= row["of_original_ci"][1] for row in rows)
-
-
-def test_grain_is_added_with_the_given_strength() -> None:
-    plain, textured = EmbCodec(), codec_with_grain(EmbCodec())
-    assert isinstance(textured, EmbCodec)
-    assert textured.send_texture
-    assert codec_with_grain(SpihtCodec()) is None
-    image = np.clip(45 * np.random.default_rng(0).rayleigh(1.0, (48, 48)), 0, 255).astype(np.uint8)
-    stream = textured.encode(image, 64)
-    decoded = textured.decode(stream).image
-    outputs = [with_grain(textured, stream, decoded, strength) for strength in (0.0, 0.5, 1.0)]
-    assert all(output is not None for output in outputs)
-    assert np.array_equal(outputs[0], decoded)
-    assert np.array_equal(outputs[1], np.clip(decoded + (textured.speckle_layer(stream) >> 1), 0, 255))
-    spreads = [float(np.std(output)) for output in outputs]
-    assert spreads[0] < spreads[1] < spreads[2]
-    assert with_grain(plain, plain.encode(image, 64), decoded) is None
-    assert with_grain(SpihtCodec(), stream, decoded) is None
-
-
-def test_poor_classifier_gives_status_1(data_set, capsys, monkeypatch):
-    monkeypatch.setattr(TargetClassifier, "scores", lambda _self, images, _groups: np.zeros(len(images)))
-    options = ["--sdvd", data_set, "--codecs", "spiht", "--budgets", "64", "--simulated", "0"]
-    assert run(recognition, *options) == 1
-    assert "the results are not valid" in capsys.readouterr().err
-
-
 @pytest.fixture(scope="module")
 def survey() -> Survey:
     return simulate_survey(SurveySpec(seed=11, pings=200, samples=512, targets=3, clutter=0)).survey
-
-
-def test_contacts_are_cut_to_the_size_of_the_paper(survey: Survey) -> None:
-    images = contact_images(survey, 2)
-    assert 1 <= len(images) <= 2
-    assert all(p.shape == (49, 113) for p in images)
-    empty = simulate_survey(SurveySpec(seed=11, pings=20, samples=128, targets=0, clutter=0)).survey
-    with pytest.raises(SurveyFileError, match="a survey with a contact"):
-        contact_images(empty)
-
-
-def test_more_dimensions_increase_size_and_quality() -> None:
-    training = [scene(i, target=i % 2 == 0, side_px=80) for i in range(12)]
-    test = [scene(100 + i, target=True, side_px=80) for i in range(3)]
-    few, many = sensitivity(training, test, [5, 80])
-    assert few.rotation_bytes == 5 * 400 * 8
-    assert many.rotation_bytes == 80 * 400 * 8
-    assert many.tiles >= few.tiles > 0
-    assert few.database_bytes == few.tiles * (5 * 8 + 400)
-    assert many.database_bytes > few.database_bytes
-    assert many.psnr > few.psnr
-    assert few.build_s > 0
-    assert few.encode_ms > 0
 
 
 def test_page_contains_the_figures_of_the_run(survey, tmp_path, capsys, monkeypatch):

@@ -13,8 +13,6 @@ from research.sea_trial.__main__ import SIZES_PX, Cell, claims, measure, table
 from research.sea_trial.rig import CodedSnippet, DeliveryCounts, send_images
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
-from sonarpost.extensions.simulation.channel.events import ArrivalEnded, ArrivalStarted, FrameOutcome
-from sonarpost.extensions.simulation.channel.model import ChannelModel
 from sonarpost.extensions.simulation.channel.parameters import ChannelParameters, build_parameters
 from sonarpost.link.frames.contact_record import ContactSummary
 
@@ -35,31 +33,6 @@ def test_everything_arrives_in_a_channel_without_fading_and_nothing_beyond_the_r
         assert found == DeliveryCounts(12, 12, 0, frames, frames, 6, 6, 0, 0)
     found = send_images(build_parameters({"preset": "sea-trial"}, "test"), 300.0, 1, samples)
     assert found == DeliveryCounts(12, 0, 0, 36, 0, 6, 0, 0, 0)
-
-
-def test_counts_agree_with_the_events_of_the_channel(samples, monkeypatch):
-    """The events of the channel agree with the frames received by the driver of the vessel."""
-    resolved: list[ArrivalEnded] = []
-    inner = ChannelModel.poll
-
-    def poll(self: ChannelModel, now: float) -> list[ArrivalStarted | ArrivalEnded]:
-        events = inner(self, now)
-        resolved.extend(event for event in events if isinstance(event, ArrivalEnded))
-        return events
-
-    monkeypatch.setattr(ChannelModel, "poll", poll)
-    found = send_images(build_parameters({"frame_loss": 0.3, "packet_loss": 0.1, "seed": 4}, "test"), 50.0, 1, samples)
-    outcomes = [[frame.outcome for frame in event.frames] for event in resolved if event.frames]
-    assert len(outcomes) == found.packets == 12
-    assert sum(outcome is FrameOutcome.DELIVERED for packet in outcomes for outcome in packet) == found.good_frames
-    whole = [all(outcome is FrameOutcome.DELIVERED for outcome in packet) for packet in outcomes]
-    assert sum(whole) == found.whole_packets
-    assert 0 < found.good_frames < found.frames == 36
-    pairs = zip(outcomes[::2], outcomes[1::2], strict=True)
-    lost = [FrameOutcome.LOST in second for first, second in pairs if FrameOutcome.LOST not in first]
-    assert sum(lost) == found.second_lost
-    assert found.whole_images + found.partial_images + found.contacts_only <= found.images == 6
-    assert found.partial_images > 0
 
 
 def test_boundary_is_that_of_the_paper_and_results_are_reproducible() -> None:

@@ -116,17 +116,6 @@ def test_error_names_the_invalid_field(panel):
         assert (answer.status_code, answer.json()["error"]["field"]) == (400, field)
 
 
-def test_right_choice_is_unique_and_at_a_random_position():
-    decoded = [Decoded("", name) for name in NAMES]
-    places = [0, 0, 0]
-    for person in range(200):
-        for trial in trials_for(str(person), 1, NAMES, decoded, 3):
-            assert len(set(trial.choices)) == 3
-            places[trial.right] += 1
-    # 1200 in three places: each within five standard deviations of 400.
-    assert all(abs(number - 400) < 5 * 16.4 for number in places)
-
-
 def test_results_are_available_on_this_host_only(folders, tmp_path):
     answers = Answers(tmp_path / "panel.db")
     app = StudyApp(Folders.read(*folders), answers, "Which?", choices=3, seed=1)

@@ -44,14 +44,6 @@ def test_transform_of_any_size_is_invertible_and_nearly_orthonormal(size, seed, 
     assert 0.7 < ((flat / 2**spiht.FRACTION_BITS) ** 2).sum() / energy < limit
 
 
-def test_smooth_slope_has_coarse_coefficients_only() -> None:
-    rows, columns = np.mgrid[:64, :64]
-    trees = wavelet_trees(64, 64)
-    flat = np.abs(forward_transform((rows + 2 * columns + 20).astype(np.uint8), 100, trees))
-    fine = sum(h * w for _, h, w in trees.bands[-6:])  # the two finest levels, 94 % of all coefficients
-    assert flat[-fine:].max() < flat.max() / 100
-
-
 @given(size=SIZES)
 def test_every_coefficient_belongs_to_one_tree(size: tuple[int, int]) -> None:
     trees = wavelet_trees(*size)
@@ -62,19 +54,6 @@ def test_every_coefficient_belongs_to_one_tree(size: tuple[int, int]) -> None:
         assert all(trees.parents[child] == node and child > node for child in children)
         assert len(children) <= 9
     assert (trees.parents[: trees.roots] == -1).all()
-
-
-def test_children_have_the_position_of_their_parent() -> None:
-    trees = wavelet_trees(80, 80)
-    band = {}
-    for number, (start, h, w) in enumerate(trees.bands):
-        for i in range(h * w):
-            band[start + i] = (number, i // w / h, i % w / w)
-    for node in range(trees.roots, trees.size):
-        for child in trees.children[node]:
-            assert band[child][0] == band[node][0] + 3  # the same orientation, one level finer
-            assert abs(band[child][1] - band[node][1]) <= 0.5
-            assert abs(band[child][2] - band[node][2]) <= 0.5
 
 
 @given(size=SIZES, seed=st.integers(0, 999), phase=st.integers(0, 3), loops=st.integers(1, 14))
@@ -119,53 +98,6 @@ def test_budget_is_used_completely_until_the_error_is_one_grey_level() -> None:
     exact = codec.encode(image, 100_000)
     assert len(exact) < 3000
     assert np.abs(codec.decode(exact).image.astype(int) - image).max() <= 1
-
-
-def test_phase_with_the_smallest_error_is_sent() -> None:
-    image, trees = snippet(80, 80), wavelet_trees(80, 80)
-    codec = SpihtCodec()
-    stream = codec.encode(image, 66)
-    flat = forward_transform(image, 8 * (stream[2] >> 3) + 4, trees)
-    bodies = [spiht._write_body(flat, stream[2] >> 3, phase, trees, MAX_PLANES, 64) for phase in range(4)]
-    errors = [-psnr_db(image, spiht._read_body(body, trees)) for body in bodies]
-    assert stream[2:] == bodies[int(np.argmin(errors))]
-    assert max(errors) > min(errors)
-
-
-@pytest.mark.parametrize("grey", [0, 103, 255])
-def test_flat_image_decodes_within_one_grey_level(grey: int) -> None:
-    codec = SpihtCodec()
-    stream = codec.encode(np.full((40, 40), grey, np.uint8), 64)
-    assert np.abs(codec.decode(stream).image.astype(int) - grey).max() <= 1
-
-
-def test_largest_possible_coefficients_are_coded() -> None:
-    rows, columns = np.indices((512, 512))
-    for image in (rows < 256, (rows < 256) ^ (columns < 256)):
-        black_and_white = (image * 255).astype(np.uint8)
-        decoded = SpihtCodec().decode(SpihtCodec().encode(black_and_white, 1000))
-        assert psnr_db(black_and_white, decoded.image) > 25
-
-
-@pytest.mark.parametrize("length", [2, 3])
-def test_incomplete_prefix_makes_all_pixels_missing(length: int) -> None:
-    codec = SpihtCodec()
-    decoded = codec.decode(codec.encode(snippet(80, 80), 64)[:length])
-    assert decoded.missing.all()
-    assert not decoded.image.any()
-    assert "at least 2" in decoded.notes[0]
-
-
-def test_budget_below_the_prefix_and_invalid_planes_are_rejected() -> None:
-    for size in ((80, 80), (81, 80)):
-        least = StreamHeader(0x04, 0, *size).size + 2
-        assert len(SpihtCodec().encode(snippet(*size), least)) == least
-        with pytest.raises(StreamError, match=f"at least {least} B"):
-            SpihtCodec().encode(snippet(*size), least - 1)
-    header = StreamHeader(0x04, 0, 80, 80).pack()
-    for top in range(MAX_PLANES, 32):
-        with pytest.raises(StreamError, match="highest plane"):
-            SpihtCodec().decode(header + bytes([top >> 4, (top & 15) << 4, 0, 0]))
 
 
 @given(body=st.binary(min_size=2, max_size=400), size=SIZES)
