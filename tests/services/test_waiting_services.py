@@ -6,12 +6,10 @@ import importlib
 import inspect
 
 import pytest
-from builders.common import REPOSITORY
 
+from sonarpost.cli.deployment.config_files import example_files
 from sonarpost.config import ServiceConfig, load, service_packages
 from sonarpost.runtime.service import Service
-
-FILES = ("uuv", "vessel", "shore", "sim")
 
 
 def class_of(service, module_name, base):
@@ -23,7 +21,7 @@ def class_of(service, module_name, base):
 
 @pytest.mark.parametrize("name", service_packages())
 def test_health_has_the_reason_for_which_the_router_is_not_reached(name, tmp_path, capsys):
-    text = next(t for f in FILES if f"[{name}]" in (t := (REPOSITORY / "config" / f"{f}.toml").read_text()))
+    text = next(t for path in example_files().values() if f"[{name}]" in (t := path.read_text()))
     text = text.replace("/var/lib/sonarpost", str(tmp_path)).replace('"key"', '"none"').replace("acoustic_key", "# ")
     path = tmp_path / "platform.toml"
     path.write_text(text)

@@ -24,7 +24,7 @@ def _no_overrides(monkeypatch):
 def example(tmp_path, name):
     """Write an example whose folders are in `tmp_path`, and the acoustic key that it names."""
     path = tmp_path / f"{name}.toml"
-    path.write_text(config_files.example_text(name).replace("/var/lib/sonarpost", str(tmp_path)))
+    path.write_text(config_files.example_files()[name].read_text().replace("/var/lib/sonarpost", str(tmp_path)))
     (tmp_path / "acoustic").mkdir(exist_ok=True)
     create_key(tmp_path / "acoustic" / "acoustic.key", replace=True)
     return path

@@ -12,7 +12,7 @@ import yaml
 from builders.common import REPOSITORY
 from builders.compose import PUBLISHED
 
-from sonarpost.cli.deployment.config_files import configuration_type
+from sonarpost.cli.deployment.config_files import configuration_type, example_files
 from sonarpost.config import load, overridden_keys, service_packages
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.compressor.config import CompressorConfig
@@ -30,7 +30,7 @@ def variables(text):
 
 
 def configured(platform):
-    return tomllib.loads((REPOSITORY / "config" / f"{platform}.toml").read_text())
+    return tomllib.loads(example_files()[platform].read_text())
 
 
 def test_every_service_of_the_chain_runs_with_its_platforms_file():
@@ -114,7 +114,7 @@ def test_every_variable_is_in_the_example_with_its_default():
         if (found := re.fullmatch(r"\$\{(\w+):-\}", value)) and table != "router":
             overriding.add(found[1])
             platform, name = BLOCKS[service]["command"]
-            tables = load(REPOSITORY / "config" / f"{platform}.toml", name, configuration_type(name), {})
+            tables = load(example_files()[platform], name, configuration_type(name), {})
             default = getattr(tables[table != "platform"], key)
             shown = json.dumps(list(default)) if isinstance(default, tuple) else str(default)
             assert shown == known[found[1]].strip(), found[1]

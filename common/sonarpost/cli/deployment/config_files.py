@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
-from importlib.resources import files
 from pathlib import Path
 
 from sonarpost.cli.parsing.parser import CommandParser
@@ -17,7 +16,7 @@ from sonarpost.cli.shared import flag, option
 from sonarpost.config import SERVICE_GROUP, ConfigFile, PlatformConfig, ServiceConfig, service_packages
 from sonarpost.errors import BadInputError, ConfigError
 from sonarpost.files import PUBLIC_FILE, write_atomically
-from sonarpost.registry import load
+from sonarpost.registry import EXTENSIONS, load
 from sonarpost.security.tls_files import check_tls_files
 
 EXIT_INVALID = 2
@@ -46,16 +45,10 @@ def add_actions(parser: CommandParser) -> None:
     option(check, "config FILE", "TOML file of a platform", Path)
 
 
-def example_files() -> Mapping[str, str]:
-    """Return the file name of each example configuration, by its name on the command line."""
-    names = (entry.name for entry in files("sonarpost.cli.deployment").joinpath("examples").iterdir())
-    return {name.partition(".")[0]: name for name in names if name.endswith((".toml", ".json5"))}
-
-
-def example_text(name: str) -> str:
-    """Return the text of an example configuration."""
-    examples = files("sonarpost.cli.deployment").joinpath("examples")
-    return examples.joinpath(example_files()[name]).read_text(encoding="utf-8")
+def example_files() -> Mapping[str, Path]:
+    """Return the example configurations of the core and of extensions, by their names on the command line."""
+    found = [path for folder in (Path(__file__).parent, *EXTENSIONS.iterdir()) for path in folder.glob("examples/*")]
+    return {path.name.partition(".")[0]: path for path in found if path.suffix in (".toml", ".json5")}
 
 
 def run_example(parsed: argparse.Namespace) -> int:
@@ -64,7 +57,7 @@ def run_example(parsed: argparse.Namespace) -> int:
     Raises:
         ConfigError: The file exists, without --force.
     """
-    text = example_text(parsed.name)
+    text = example_files()[parsed.name].read_text(encoding="utf-8")
     if parsed.out is None:
         print(text, end="")
         return 0

@@ -146,8 +146,7 @@ def _services(platform: str, config: Path) -> tuple[str, ...]:
     """Return the services with a table in the configuration, or in the example if the file does not exist yet."""
     if config.exists():
         return ConfigFile(config, {}).services
-    example = files("sonarpost.cli.deployment").joinpath("examples", example_files()[platform])
-    return ConfigFile(Path(str(example)), {}).services
+    return ConfigFile(example_files()[platform], {}).services
 
 
 def _executable(given: Path | None, root: Path) -> Path:

@@ -21,7 +21,7 @@ from builders.common import WAIT_S, eventually, free_port
 from pydantic import ValidationError
 
 from sonarpost import keys, wire
-from sonarpost.cli.deployment.config_files import example_text
+from sonarpost.cli.deployment.config_files import example_files
 from sonarpost.cli.main import main, parser
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.extensions.simulation.acoustic_channel.config import AcousticChannelConfig
@@ -408,7 +408,7 @@ def test_command_rejects_invalid_options(arguments, named):
 
 def test_the_example_configuration_is_valid(tmp_path, capsys):
     path = tmp_path / "sim.toml"
-    path.write_text(example_text("sim").replace("/var/lib/sonarpost", str(tmp_path)))
+    path.write_text(example_files()["sim"].read_text().replace("/var/lib/sonarpost", str(tmp_path)))
     assert main(["config", "check", str(path)]) == 0
     assert "[acoustic_channel]: valid" in capsys.readouterr().out
 
