@@ -370,8 +370,9 @@ class OpModemService(DownlinkService):
 
     @override
     def queue_policy(self, queue: str) -> QueuePolicy:
-        """Return that frames for the lead vessel are not published."""
-        return QueuePolicy(publish=self.PUBLISH and queue != self.NAME)
+        """Return that frames for the lead vessel are not published, and leave the platform."""
+        is_local = queue != self.NAME
+        return QueuePolicy(publish=self.PUBLISH and is_local, is_local=is_local)
 
     @override
     def validate(self, key: str, record: Record) -> None:

@@ -13,6 +13,8 @@ from sonarpost.delivery.protocol import CHUNK_BYTES
 
 START_BYTES = 2048
 """Window before the first reply."""
+LOCAL_START_BYTES = 8 * CHUNK_BYTES
+"""The same to a consumer on the same platform: a record of up to 32 KiB is one query, and one commit."""
 MIN_QUERY_BYTES = 2048
 """Size of a query on a slow link. A smaller one would consist of headers; a larger one delays urgent records."""
 QUERIES = 8
@@ -45,14 +47,16 @@ class CongestionControl:
 
     Args:
         clock_offset_s: What is added to the times of all calls for times that other hosts share, as UTC.
+        start_bytes: Window before the first reply.
 
     Attributes:
         window_bytes: Payload that may be in flight.
     """
 
-    def __init__(self, clock_offset_s: float = 0.0) -> None:
+    def __init__(self, clock_offset_s: float = 0.0, start_bytes: int = START_BYTES) -> None:
         self._clock_offset_s = clock_offset_s
-        self.window_bytes = float(START_BYTES)
+        self._start_bytes = float(start_bytes)
+        self.window_bytes = self._start_bytes
         self._shortest_s = math.inf
         self._usual_bytes = 0.0
         self._longest_s = 0.0
@@ -130,7 +134,7 @@ class CongestionControl:
         return QUEUE_FACTOR * self._shortest_s + QUEUE_S
 
     def _restart(self, resume_bytes: float) -> None:
-        self.window_bytes = START_BYTES
+        self.window_bytes = self._start_bytes
         self._resume_bytes = resume_bytes
         self._measuring_since_s = 0.0
         self._doubling = self._is_first = True
@@ -152,7 +156,7 @@ class CongestionControl:
                 self._measuring_since_s = self._resume_bytes = 0.0
         elif self._was_full and not self._doubling and period > self._period:
             self._resume_bytes = self.window_bytes
-            self.window_bytes = START_BYTES
+            self.window_bytes = self._start_bytes
             self._measured_s = math.inf
             self._measuring_since_s = now_s
         else:

@@ -58,12 +58,14 @@ class QueuePolicy:
         publish: Also publish each record on its key, once after a start, for subscribers.
         bytes_per_s: Bandwidth limit, None for none.
         held: Send nothing: the consumer is no longer configured.
+        is_local: The consumer is on this platform: no thin link is on the way.
     """
 
     session: Callable[[], zenoh.Session | None] | None = None
     publish: bool = True
     bytes_per_s: float | None = None
     held: bool = False
+    is_local: bool = False
 
 
 class Outbox:
@@ -203,7 +205,8 @@ class QueueSender:
         self._policy = policy
         self._on_acknowledged = on_acknowledged
         now_s = time.monotonic()
-        self._scheduler = DeliveryScheduler(policy.bytes_per_s, now_s, time.time() - now_s)
+        start_bytes = congestion.LOCAL_START_BYTES if policy.is_local else congestion.START_BYTES
+        self._scheduler = DeliveryScheduler(policy.bytes_per_s, now_s, time.time() - now_s, start_bytes)
         self._published: set[int] = set()
         self._in_flight: set[_Query] = set()
         self._ended: deque[_Query] = deque()

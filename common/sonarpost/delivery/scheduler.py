@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import islice
 
-from sonarpost.delivery.congestion import CongestionControl
+from sonarpost.delivery.congestion import START_BYTES, CongestionControl
 from sonarpost.delivery.protocol import BATCH_RECORD_OVERHEAD_BYTES, CHUNK_BYTES, MAX_BATCH_RECORDS
 from sonarpost.delivery.records import OutboxItem
 
@@ -141,6 +141,7 @@ class DeliveryScheduler:
         bytes_per_s: Bandwidth limit, None for none.
         now_s: Start time, from the monotonic clock that all calls use.
         clock_offset_s: UTC minus this clock.
+        start_bytes: Window before the first reply.
 
     Attributes:
         congestion: Window and time-out of the queries.
@@ -149,8 +150,10 @@ class DeliveryScheduler:
         max_batch: Number of records that the consumer accepts in one query.
     """
 
-    def __init__(self, bytes_per_s: float | None, now_s: float, clock_offset_s: float = 0.0) -> None:
-        self.congestion = CongestionControl(clock_offset_s)
+    def __init__(
+        self, bytes_per_s: float | None, now_s: float, clock_offset_s: float = 0.0, start_bytes: int = START_BYTES
+    ) -> None:
+        self.congestion = CongestionControl(clock_offset_s, start_bytes)
         self.active: dict[int, RecordTransfer] = {}
         self.probing = True
         self.max_batch = 0

@@ -23,7 +23,7 @@ from sonarpost.bus.session import lost_reason, open_with_retry
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.inbox import Inbox
 from sonarpost.delivery.outbox import Outbox, QueuePolicy
-from sonarpost.delivery.records import InboxItem, OutboxItem
+from sonarpost.delivery.records import InboxItem, OutboxItem, platform_of
 from sonarpost.delivery.store import HANDLING_RESERVE_BYTES, DiskReserve, Store
 from sonarpost.delivery.transaction import Transaction, UnitOfWork
 from sonarpost.errors import DeliveryError
@@ -143,7 +143,7 @@ class Service(ABC, Generic[C]):
 
     def queue_policy(self, queue: str) -> QueuePolicy:
         """Return the settings with which an outbox queue is sent."""
-        return QueuePolicy(publish=self.PUBLISH)
+        return QueuePolicy(publish=self.PUBLISH, is_local=not platform_of(queue))
 
     def expand(self, tx: Transaction, key: str, payload: bytes, record: Record) -> tuple[bytes, Record]:
         """Return the payload to store for a valid record, and what `handle` receives; by default the given ones.
