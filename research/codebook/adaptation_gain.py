@@ -2,9 +2,8 @@
 
 Three sets of real images are cut into windows of 80 x 140 px without overlap: a Marine Sonic survey line of 2013, a
 survey line of a river bed of 2009, and synthetic-aperture tiles. Both sides of a line are cut at the same pings, so the
-held-out last quarter is the end of the line on both sides. Both codebooks are adapted to each set; each result is a row
-of the table in `docs/research/codebooks.md`. Times are processor time, which does not depend on the load of
-the machine.
+held-out last quarter is the end of the line on both sides. Both codebooks are adapted to each set. Times are processor
+time, which does not depend on the load of the machine.
 """
 
 from __future__ import annotations
