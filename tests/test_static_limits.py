@@ -80,7 +80,7 @@ QUEUES = {
     "common/sonarpost/modem/micromodem/supervisor.py": "commands of the configuration",
     "common/sonarpost/modem/packet_queue.py": "its `limit`",
     "common/sonarpost/network/connections.py": "MAX_REFUSED",
-    "common/sonarpost/sonar/heading.py": "_COURSE_PINGS",
+    "common/sonarpost/sonar/navigation.py": "_COURSE_PINGS",
     "common/sonarpost/sonar/readers/humminbird.py": "three pings",
     "services/console/events.py": "BUFFERED_EVENTS and MAX_BUFFERED_BYTES",
     "services/op_modem/service.py": "MAX_UNSAVED; the source with the most loses its oldest",

@@ -24,10 +24,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from research.codebook.basis import database_of
 from research.codebook.builder import MAX_TILES, TrainingImage, figure_of_merit, refine_once
 from research.codebook.tile_set import IncrementalTileSet
+from research.common.quality import psnr_db
 from sonarpost.codec.interface import Image
-from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.vq.tiles import TileDatabase, Tiles, cut_tiles, join_tiles
 from sonarpost.errors import ConfigError
 
@@ -106,7 +107,7 @@ def adapt(
     places = np.sort(removed)
     tiles = np.concatenate((base.tiles, new[places.size :]))
     tiles[places[: new.shape[0]]] = new[: places.size]
-    adapted = TileDatabase.from_tiles(base.tile_px, tiles, base.dims)
+    adapted = database_of(base.tile_px, tiles, base.dims)
     replaced = int((tiles[: len(base)] != base.tiles).any(axis=1).sum())
     return AdaptedCodebook(adapted, int((uses > 0).sum()), replaced, new.shape[0])
 

@@ -26,11 +26,12 @@ from pathlib import Path
 
 import numpy as np
 
+from research.codebook.basis import database_of
 from research.codebook.build_journal import BuildEntry, BuildJournal, EntryKind
 from research.codebook.tile_set import IncrementalTileSet
+from research.common.quality import ssim
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.interface import Image
-from sonarpost.codec.quality import ssim
 from sonarpost.codec.vq.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase, Tiles, cut_tiles, join_tiles
 from sonarpost.errors import CodebookError, ConfigError
 
@@ -196,7 +197,7 @@ def build(
         tiles = run.tile_set.tiles()
         for number in range(1, passes + 1):
             tiles = run.run_pass(tiles, number, passes)
-    return TileDatabase.from_tiles(tile_px, without_duplicates(tiles) if passes else tiles, dims)
+    return database_of(tile_px, without_duplicates(tiles) if passes else tiles, dims)
 
 
 @dataclass

@@ -29,9 +29,9 @@ from research.common.measurement import (
     scene_reference,
 )
 from research.common.plots import SheetCell, new_figure, save_figure, write_sheet
+from research.common.quality import psnr_db
 from research.common.statistics import bootstrap_weights, finite_mean
 from sonarpost.cli.shared import add_fit_option, in_new_folder
-from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from research.codecs.baselines import comparison_registry
 from research.common.images import SampleImage
 from research.common.nonlocal_means import reference_filtered
-from research.common.quality import ms_ssim
+from research.common.quality import ms_ssim, ssim
 from research.common.scene_measures import (
     ObjectMeasurement,
     clipped_psnr_db,
@@ -25,7 +25,6 @@ from research.common.scene_measures import (
 )
 from sonarpost.codec import emb
 from sonarpost.codec.interface import Codec, Image
-from sonarpost.codec.quality import ssim
 from sonarpost.codec.registry import CodecRegistry, CodecResources
 from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, open_codebook
 from sonarpost.codec.vq.codec import IndexPacking

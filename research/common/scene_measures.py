@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from research.common.quality import psnr_db
 from sonarpost.codec.interface import Image
-from sonarpost.codec.quality import psnr_db
 from sonarpost.detection.detector import height_from_shadow_m
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, TruthObject
 

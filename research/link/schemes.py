@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from research.common.quality import psnr_db, ssim
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import Image, Mask
-from sonarpost.codec.quality import psnr_db, ssim
 from sonarpost.codec.vq.codebook import DEFAULT_TILE_PX, load_default
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
 from sonarpost.link.coding.channel_capacity import LossChannel, received_distribution

@@ -12,6 +12,7 @@ from research.common.command import command_parser, report_progress, run_command
 from research.common.images import simulated_images
 from research.common.measurement import CodecUnderTest, CodedImage
 from research.common.plots import SheetCell, new_figure, save_figure, write_sheet
+from research.common.quality import psnr_db
 from research.paper.dimensions import DISTANCE_ABOVE, FOM_BELOW, TILE_PX, DimensionPoint, sensitivity
 from research.paper.figures import (
     EMB,
@@ -27,7 +28,6 @@ from research.paper.figures import (
     reproduce,
 )
 from sonarpost.codec.interface import Image
-from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
 

@@ -15,10 +15,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from research.codebook.basis import principal_basis
 from research.codebook.builder import figure_of_merit
+from research.common.quality import psnr_db
 from sonarpost.codec.interface import Image
-from sonarpost.codec.quality import psnr_db
-from sonarpost.codec.vq.tiles import BASIS_SCALE, Tiles, cut_tiles, join_tiles, principal_basis
+from sonarpost.codec.vq.tiles import BASIS_SCALE, Tiles, cut_tiles, join_tiles
 
 TILE_PX: Final = 20
 DIMENSIONS: Final = tuple(range(10, 101, 10))

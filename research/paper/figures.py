@@ -10,9 +10,9 @@ from typing import Final
 import numpy as np
 
 from research.common.measurement import CodecUnderTest, CodedImage, code_image
+from research.common.quality import ssim
 from research.common.scene_measures import clipped_psnr_db
 from sonarpost.codec.interface import Image
-from sonarpost.codec.quality import ssim
 from sonarpost.detection.detector import detect
 from sonarpost.detection.snippets import cut_snippet
 from sonarpost.errors import SurveyFileError

@@ -12,9 +12,9 @@ from builders import image_folders
 from builders.image_folders import snippet
 from rich.console import Console
 
+from research.common.quality import psnr_db
 from sonarpost.cli.main import parser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import SonarpostError, StreamError
 from sonarpost.sonar.image_files import read_image, write_png
 

@@ -9,8 +9,9 @@ import pytest
 from builders.images import snippet
 
 import sonarpost.codec as c
+from research.codebook.basis import database_of
 from sonarpost.codec.vq.codebook import Codebook, save
-from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
+from sonarpost.codec.vq.tiles import cut_tiles
 from sonarpost.errors import CodebookError, ConfigError, StreamError
 
 
@@ -18,7 +19,7 @@ from sonarpost.errors import CodebookError, ConfigError, StreamError
 def codebook(tmp_path: Path) -> Path:
     """Return the file of a codebook that is not shipped."""
     path = tmp_path / "own.tiles"
-    save(path, Codebook(TileDatabase.from_tiles(8, cut_tiles(snippet(80, 80), 8)), {}))
+    save(path, Codebook(database_of(8, cut_tiles(snippet(80, 80), 8)), {}))
     return path
 
 

@@ -7,6 +7,7 @@ from importlib.metadata import EntryPoint
 import numpy as np
 import pytest
 
+from research.codebook.basis import database_of
 from sonarpost.codec.registry import (
     BUILTINS,
     ENTRY_POINT_GROUP,
@@ -16,10 +17,9 @@ from sonarpost.codec.registry import (
     codec_plug_ins,
 )
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec
-from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import ConfigError, StreamError
 
-TILES = TileDatabase.from_tiles(8, np.random.default_rng(0).integers(0, 256, (50, 64), dtype=np.uint8))
+TILES = database_of(8, np.random.default_rng(0).integers(0, 256, (50, 64), dtype=np.uint8))
 
 
 def make_nothing(resources: CodecResources) -> VqCodec:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from research.codebook.adaptation import adapt
+from research.codebook.basis import database_of
 from research.codebook.builder import TrainingImage
 from sonarpost.codec.vq.tiles import TileDatabase, cut_tiles
 
@@ -26,12 +27,12 @@ def ripples(seed: int, side_px: int = 64) -> np.ndarray:
 
 def speckle(seed: int, count: int = 120) -> TileDatabase:
     rng = np.random.default_rng(seed)
-    return TileDatabase.from_tiles(8, np.clip(50 * rng.rayleigh(1.0, (count, 64)), 0, 255).astype(np.uint8))
+    return database_of(8, np.clip(50 * rng.rayleigh(1.0, (count, 64)), 0, 255).astype(np.uint8))
 
 
 def test_least_used_tiles_are_replaced_and_others_keep_their_numbers() -> None:
     # Levels 10 and 200 are near those of the images; 100 and 240 are not used.
-    base = TileDatabase.from_tiles(8, cut_tiles(flat(240, 10, 100, 200), 8))
+    base = database_of(8, cut_tiles(flat(240, 10, 100, 200), 8))
     images = training(np.full((24, 24), 12, np.uint8), np.full((24, 24), 180, np.uint8))
     adapted = adapt(base, images, max_tiles=4, keep=2, passes=0)
     assert adapted.used == 2
@@ -43,7 +44,7 @@ def test_least_used_tiles_are_replaced_and_others_keep_their_numbers() -> None:
 
 
 def test_free_places_are_filled_first() -> None:
-    base = TileDatabase.from_tiles(8, cut_tiles(flat(240, 10, 100, 200), 8))
+    base = database_of(8, cut_tiles(flat(240, 10, 100, 200), 8))
     image = np.tile(flat(12, 60, 150), (2, 1))
     adapted = adapt(base, training(image), max_tiles=500, passes=0)
     assert np.array_equal(adapted.tiles.tiles[:4], base.tiles)

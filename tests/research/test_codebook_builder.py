@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from research.codebook.basis import database_of
 from research.codebook.build_journal import MAGIC, BuildEntry, BuildJournal, EntryKind
 from research.codebook.builder import (
     BuildProgress,
@@ -86,7 +87,7 @@ def test_rounds_with_fewer_images() -> None:
 
 
 def test_core_is_extended_and_keeps_its_indices() -> None:
-    core = TileDatabase.from_tiles(8, cut_tiles(flat(5, 150), 8))
+    core = database_of(8, cut_tiles(flat(5, 150), 8))
     database = build(training(flat(6), flat(151, 250)), 8, [Round(ALWAYS, rms_distance(16, 8))], core=core)
     assert levels(database) == [5, 150, 250]
 
@@ -150,7 +151,7 @@ def test_incremental_search_is_exact(tile_px: int) -> None:
 
 
 def test_refinement_uses_the_rounded_mean_and_keeps_unused_tiles() -> None:
-    database = TileDatabase.from_tiles(8, cut_tiles(flat(10, 100, 250), 8))
+    database = database_of(8, cut_tiles(flat(10, 100, 250), 8))
     refined = refine_once(database.tiles, 8, training(flat(8, 9, 12, 101, 102)))
     assert refined.tiles[:, 0].tolist() == [10, 102, 250]  # (8 + 9 + 12) / 3 = 9.67; (101 + 102) / 2 = 101.5 rounds up
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import subspace_angles
 
+from research.codebook.basis import database_of
 from research.codebook.comparison import compare, principal_angles_deg
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CodebookError
@@ -11,7 +12,7 @@ from sonarpost.errors import CodebookError
 
 def database(seed: int, count: int = 60, tile_px: int = 8) -> TileDatabase:
     rng = np.random.default_rng(seed)
-    return TileDatabase.from_tiles(tile_px, rng.integers(0, 256, (count, tile_px**2), dtype=np.uint8), 20)
+    return database_of(tile_px, rng.integers(0, 256, (count, tile_px**2), dtype=np.uint8), 20)
 
 
 def test_codebook_equals_itself_and_other_tile_sizes_are_rejected() -> None:
@@ -30,7 +31,7 @@ def test_tiles_of_one_codebook_only_are_counted_and_measured() -> None:
     one = database(0)
     other_tiles = one.tiles.copy()
     other_tiles[7] = np.where(other_tiles[7] < 128, other_tiles[7] + 5, other_tiles[7] - 5)  # 5 grey levels away
-    other = TileDatabase.from_tiles(8, np.concatenate((other_tiles[::-1], other_tiles[:3])), 20)
+    other = database_of(8, np.concatenate((other_tiles[::-1], other_tiles[:3])), 20)
     difference = compare(one, other)
     assert not difference.same_identity
     assert difference.common == 59
@@ -45,9 +46,9 @@ def test_tiles_of_one_codebook_only_are_counted_and_measured() -> None:
 def test_variance_fraction_of_a_basis() -> None:
     rng = np.random.default_rng(3)
     grey = rng.integers(20, 236, (50, 1)).astype(np.uint8)
-    one = TileDatabase.from_tiles(8, np.repeat(grey, 64, axis=1), 5)  # flat tiles: one dimension
+    one = database_of(8, np.repeat(grey, 64, axis=1), 5)  # flat tiles: one dimension
     step = np.repeat(np.array([1, -1]), 32) * rng.integers(-90, 90, (50, 1)) + 128
-    other = TileDatabase.from_tiles(8, step.astype(np.uint8), 5)  # two opposite halves with the same mean
+    other = database_of(8, step.astype(np.uint8), 5)  # two opposite halves with the same mean
     difference = compare(one, other)
     assert difference.first.variance_own == pytest.approx(1.0, abs=1e-4)
     assert difference.first.variance_other == pytest.approx(0.0, abs=1e-4)

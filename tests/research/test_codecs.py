@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from research.codebook.basis import database_of
 from research.codecs import __main__ as command
 from research.codecs.baselines import comparison_registry
 from research.common import measurement as measuring
 from research.common.images import SampleImage, read_image_folder, sdvd_crops, simulated_images
 from research.common.measurement import CodecUnderTest, code_image, measure_codec
+from research.common.quality import psnr_db
 from research.common.scene_measures import PSNR_LIMIT_DB
 from sonarpost.codec.interface import DecodedImage, StreamHeader
-from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.vq.codebook import Codebook, save
-from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CodebookError, StreamError
 from sonarpost.sonar.image_files import write_png, write_tiff
 
@@ -123,7 +123,7 @@ def test_rows_of_simulated_images_are_compared_with_their_scenes(capsys, monkeyp
 def test_vq_uses_the_given_codebooks(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tiles = np.random.default_rng(3).integers(0, 256, (9, 400), np.uint8)
     own = tmp_path / "own.tiles"
-    save(own, Codebook(TileDatabase.from_tiles(20, tiles), {}))
+    save(own, Codebook(database_of(20, tiles), {}))
     found = {}
     for codebook in (own, "nominal-20"):
         options = ("--images", folder, "--codecs", "vq", "--budgets", "90", "--json")

@@ -7,10 +7,10 @@ from research.common import images as image_sets
 from research.common import speckle
 from research.common.images import simulated_images
 from research.common.nonlocal_means import reference_filtered
+from research.common.quality import psnr_db
 from research.common.scene_measures import ObjectPlace, count_dots, measure_object
 from research.common.speckle import SpecklePair, speckle_pairs
 from research.despeckling.filters import FILTERS
-from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
-from sonarpost.sonar.heading import HeadingChoice
+from sonarpost.sonar.navigation import HeadingChoice
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
 

@@ -6,7 +6,7 @@ tag of the model and the image size. The length of the body is not in the stream
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -224,31 +224,6 @@ def decoder_input(codec: Codec, stream: bytes, received: Mask | None) -> tuple[S
         expected = f"{codec.codec_id:#04x} ({codec.name})"
         raise StreamError("stream", "codec_id", f"{header.codec_id:#04x}", expected)
     return header, *before_gap(stream[header.size :], received)
-
-
-def decode_whole_body(
-    codec: Codec, stream: bytes, received: Mask | None, decode_body: Callable[[bytes, tuple[int, int]], Image]
-) -> DecodedImage:
-    """Decode a stream of a codec that needs its whole body.
-
-    If the bytes before the first gap do not decode, all pixels are missing.
-
-    Args:
-        codec: The codec.
-        stream: See `Codec.decode`.
-        received: See `Codec.decode`.
-        decode_body: Returns the image of a body and an image size, (height_px, width_px).
-
-    Raises:
-        StreamError: As `decoder_input` and, if all bytes arrived, as `decode_body`.
-    """
-    header, body, notes = decoder_input(codec, stream, received)
-    try:
-        return DecodedImage.without_gaps(decode_body(body, (header.height_px, header.width_px)), notes)
-    except StreamError as error:
-        if received is None or received.all():
-            raise
-        return DecodedImage.all_missing(header, [*notes, f"nothing can be decoded: {error}"])
 
 
 def before_gap(body: bytes, received: Mask | None) -> tuple[bytes, list[str]]:

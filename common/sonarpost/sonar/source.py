@@ -13,8 +13,7 @@ from typing_extensions import override
 from sonarpost.errors import SurveyFileError
 from sonarpost.limits import limit
 from sonarpost.sonar.channel_sets import ChannelChoice, ChannelSet
-from sonarpost.sonar.heading import HeadingChoice
-from sonarpost.sonar.navigation import NavigationChecks, PositionJumpFilter, apply_mounting
+from sonarpost.sonar.navigation import HeadingChoice, NavigationChecks, PositionJumpFilter, apply_mounting
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import GridExtent
 from sonarpost.sonar.survey import Ping, Side, Survey

@@ -18,14 +18,14 @@ A truncated codestream is rejected, unless OpenJPEG finds all packets complete.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from PIL import Image as Pillow
 
-from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decode_whole_body, encoder_input
+from sonarpost.codec.interface import Codec, DecodedImage, Image, Mask, SnippetPixels, decoder_input, encoder_input
 from sonarpost.errors import ConfigError, StreamError
 
 RAW_CODEC_ID = 0x02
@@ -51,6 +51,31 @@ _DETAIL_STEPS = (
     (0x7EE0, 0x7EE0, 0x7EA0),
 )
 _SOT, _SOD, _EOC = b"\xff\x90", b"\xff\x93", b"\xff\xd9"
+
+
+def decode_whole_body(
+    codec: Codec, stream: bytes, received: Mask | None, decode_body: Callable[[bytes, tuple[int, int]], Image]
+) -> DecodedImage:
+    """Decode a stream of a codec that needs its whole body.
+
+    If the bytes before the first gap do not decode, all pixels are missing.
+
+    Args:
+        codec: The codec.
+        stream: See `Codec.decode`.
+        received: See `Codec.decode`.
+        decode_body: Returns the image of a body and an image size, (height_px, width_px).
+
+    Raises:
+        StreamError: As `decoder_input` and, if all bytes arrived, as `decode_body`.
+    """
+    header, body, notes = decoder_input(codec, stream, received)
+    try:
+        return DecodedImage.without_gaps(decode_body(body, (header.height_px, header.width_px)), notes)
+    except StreamError as error:
+        if received is None or received.all():
+            raise
+        return DecodedImage.all_missing(header, [*notes, f"nothing can be decoded: {error}"])
 
 
 def main_header(height_px: int, width_px: int, decompositions: int) -> bytes:

@@ -30,7 +30,8 @@ import numpy as np
 from PIL import Image as Pillow
 from PIL import features
 
-from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, decode_whole_body, encoder_input
+from research.codecs.baselines.jpeg2000 import decode_whole_body
+from sonarpost.codec.interface import DecodedImage, Image, Mask, SnippetPixels, encoder_input
 from sonarpost.errors import ConfigError, StreamError
 
 DEFAULT_QUALITY = 30

@@ -17,9 +17,8 @@ import numpy as np
 from research.common.command import command_parser, run_command
 from research.common.images import sdvd_crops
 from research.common.measurement import create_codec
-from research.common.quality import ms_ssim
+from research.common.quality import ms_ssim, psnr_db, ssim
 from research.common.statistics import bd_rate_percent
-from sonarpost.codec.quality import psnr_db, ssim
 from sonarpost.errors import StreamError
 
 BUDGETS = (22, 44, 64, 88, 128, 192, 256, 384, 512)

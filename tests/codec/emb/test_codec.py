@@ -9,13 +9,13 @@ from builders.images import contact
 from hypothesis import given
 from hypothesis import strategies as st
 
+from research.common.quality import psnr_db
 from sonarpost.codec.emb import MODEL_FILES, transform
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.decode import read_body
 from sonarpost.codec.emb.model import parse, shipped_model
 from sonarpost.codec.emb.transform import layout_of
 from sonarpost.codec.interface import StreamHeader
-from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import StreamError
 
 CODEC = EmbCodec()

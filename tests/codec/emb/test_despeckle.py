@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from research.common.quality import psnr_db
 from sonarpost.codec.emb import codec as emb_codec
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.despeckle import ACTIVATION_LIMIT, INPUT_LIMIT, check_strength, despeckled, network
-from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError
 
 

@@ -6,6 +6,7 @@ from builders.images import contact
 from hypothesis import given
 from hypothesis import strategies as st
 
+from research.common.quality import psnr_db
 from sonarpost.codec.emb import rate_distortion_opt, transform
 from sonarpost.codec.emb.codec import EmbCodec, EncodedTrial, TrialEncoder, next_step
 from sonarpost.codec.emb.coder import Coder
@@ -14,7 +15,6 @@ from sonarpost.codec.emb.rate_distortion_opt import TargetCoefficients
 from sonarpost.codec.emb.side_info import UNIT_WEIGHT, RegionOfInterest, SideInfo, region_weights
 from sonarpost.codec.emb.transform import layout_of
 from sonarpost.codec.interface import ExtensibleCodec, StreamHeader
-from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import StreamError
 
 CODEC = EmbCodec()

@@ -8,14 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from research.common.quality import ms_ssim
+from research.common.quality import ms_ssim, psnr_db
 from sonarpost.codec.emb import perceptual_weights, transform
 from sonarpost.codec.emb.codec import EmbCodec, structural_similarity
 from sonarpost.codec.emb.coder import UNIT_SCALE, CoefficientState
 from sonarpost.codec.emb.model import shipped_model
 from sonarpost.codec.emb.side_info import RegionOfInterest
 from sonarpost.codec.emb.transform import HEIGHT, LEVEL, LL, OFFSET, ORIENT, STRIDE, WIDTH, layout_of
-from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.registry import CodecResources, default_registry
 
 STANDARD, STRUCTURE = EmbCodec(), EmbCodec("structure")

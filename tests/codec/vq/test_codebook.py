@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from research.codebook.basis import database_of
 from sonarpost.codec.vq.codebook import (
     DEFAULT_TILE_PX,
     Codebook,
@@ -22,13 +23,12 @@ from sonarpost.codec.vq.codebook import (
     to_bytes,
 )
 from sonarpost.codec.vq.codec import VqCodec, codebook_tag
-from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CodebookError
 
 
 def small() -> Codebook:
     tiles = np.random.default_rng(0).integers(0, 256, (7, 16), dtype=np.uint8)
-    return Codebook(TileDatabase.from_tiles(4, tiles, 3), {"name": "klein", "source": "Rauschen, für den Test"})
+    return Codebook(database_of(4, tiles, 3), {"name": "klein", "source": "Rauschen, für den Test"})
 
 
 def test_codebook_round_trips_through_a_file(tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_shipped_codebook_is_found_by_its_tag() -> None:
 def codebook_file(folder: Path, seed: int) -> tuple[Path, int]:
     """Write a codebook of random tiles; return its path and tag."""
     tiles = np.random.default_rng(seed).integers(0, 256, (7, 16), dtype=np.uint8)
-    codebook = Codebook(TileDatabase.from_tiles(4, tiles, 3), {})
+    codebook = Codebook(database_of(4, tiles, 3), {})
     path = folder / f"{seed}.tiles"
     save(path, codebook)
     return path, codebook_tag(codebook.tiles)

@@ -8,6 +8,7 @@ from builders.common import GOLDEN_FOLDER
 from hypothesis import given
 from hypothesis import strategies as st
 
+from research.codebook.basis import database_of
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.vq.codebook import load
 from sonarpost.codec.vq.codec import IndexPacking, VqCodec, codebook_tag, pack_indices, unpack_indices
@@ -57,7 +58,7 @@ def test_golden_streams_are_reproduced_and_decoded(tiles: TileDatabase, packing:
 
 
 def test_stream_sizes_are_those_of_the_paper() -> None:
-    tiles = TileDatabase.from_tiles(10, np.arange(0, 200, 2, dtype=np.uint8)[:, None].repeat(100, axis=1))
+    tiles = database_of(10, np.arange(0, 200, 2, dtype=np.uint8)[:, None].repeat(100, axis=1))
     image = snippet(140, 80)
     assert [len(VqCodec(tiles, packing).encode(image)) - 4 for packing in PACKINGS] == [196, 224, 336, 560]
 
@@ -169,7 +170,7 @@ def test_short_and_long_bodies_give_notes(tiles: TileDatabase) -> None:
 
 
 def test_error_for_another_codebook_names_both_tags(tiles: TileDatabase) -> None:
-    other = TileDatabase.from_tiles(tiles.tile_px, tiles.tiles[::-1])
+    other = database_of(tiles.tile_px, tiles.tiles[::-1])
     stream = VqCodec(other).encode(snippet(20, 20))
     with pytest.raises(StreamError, match="another identity") as caught:
         VqCodec(tiles).decode(stream)
@@ -201,12 +202,12 @@ def test_identity_and_tag(tiles: TileDatabase) -> None:
 
 
 def test_limits_of_tiles_and_body() -> None:
-    codec = VqCodec(TileDatabase.from_tiles(4, np.eye(16, dtype=np.uint8)), IndexPacking.ASCII5)
+    codec = VqCodec(database_of(4, np.eye(16, dtype=np.uint8)), IndexPacking.ASCII5)
     with pytest.raises(StreamError, match="81924"):
         codec.encode(snippet(512, 512))
     many = np.zeros((0x4000, 16), dtype=np.uint8)
-    database = TileDatabase.from_tiles(4, many)
+    database = database_of(4, many)
     with pytest.raises(ConfigError, match="wider packing"):
         VqCodec(database, IndexPacking.BITS14)
     assert VqCodec(database, IndexPacking.BYTES2).codec_id == 0x11
-    assert VqCodec(TileDatabase.from_tiles(4, many[1:])).codec_id == 0x10
+    assert VqCodec(database_of(4, many[1:])).codec_id == 0x10

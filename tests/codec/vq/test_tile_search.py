@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from research.codebook.basis import database_of
 from sonarpost.codec.vq import tile_search as module
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.tile_search import NearestSearch
-from sonarpost.codec.vq.tiles import TileDatabase
 
 
 def brute_force(vectors: np.ndarray, queries: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -89,7 +89,7 @@ def test_search_in_the_shipped_codebook_is_exact() -> None:
 
 
 def test_search_without_queries_and_with_few_tiles() -> None:
-    database = TileDatabase.from_tiles(4, np.arange(32, dtype=np.uint8).reshape(2, 16))
+    database = database_of(4, np.arange(32, dtype=np.uint8).reshape(2, 16))
     index, distance = database.nearest_in_basis(np.zeros((0, 16), np.uint8), 8)
     assert index.shape == distance.shape == (0, 2)
     index, _ = database.nearest_in_basis(database.tiles, 8)

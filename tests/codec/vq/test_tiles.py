@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sonarpost.codec.vq.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, cut_tiles, join_tiles, principal_basis
+from research.codebook.basis import database_of, principal_basis
+from sonarpost.codec.vq.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, cut_tiles, join_tiles
 from sonarpost.errors import CodebookError
 
 
@@ -27,7 +28,7 @@ def brute_force(database: TileDatabase, tile: np.ndarray) -> list[tuple[int, int
 
 @pytest.mark.parametrize(("tile_px", "dims"), [(4, 16), (5, 7), (10, 70), (16, 20)])
 def test_nearest_in_the_basis_matches_brute_force(tile_px: int, dims: int) -> None:
-    database = TileDatabase.from_tiles(tile_px, random_tiles(24, tile_px), dims)
+    database = database_of(tile_px, random_tiles(24, tile_px), dims)
     queries = np.concatenate([random_tiles(2, tile_px, 1), database.tiles[20:21]])
     indices, distances = database.nearest_in_basis(queries, 5)
     first, _ = database.nearest_in_basis(queries)
@@ -39,7 +40,7 @@ def test_nearest_in_the_basis_matches_brute_force(tile_px: int, dims: int) -> No
 
 
 def test_shortlist_is_compared_in_all_pixels() -> None:
-    database = TileDatabase.from_tiles(10, random_tiles(3000, 10), 6)  # a small basis
+    database = database_of(10, random_tiles(3000, 10), 6)  # a small basis
     queries = random_tiles(20, 10, 1)
     index, distance = database.nearest(queries)
     shortlist, _ = database.nearest_in_basis(queries, SHORTLIST)
@@ -53,7 +54,7 @@ def test_shortlist_is_compared_in_all_pixels() -> None:
 def test_extreme_tiles_give_exact_integers() -> None:
     # Black and white tiles of the largest size have the largest possible distance.
     tiles = np.stack([np.zeros(1024, np.uint8), np.full(1024, 255, np.uint8)])
-    database = TileDatabase.from_tiles(32, tiles)
+    database = database_of(32, tiles)
     assert database.dims == 1
     indices, distances = database.nearest(tiles)
     assert indices.tolist() == [0, 1]
@@ -69,7 +70,7 @@ def test_extreme_tiles_give_exact_integers() -> None:
 def test_lowest_index_of_equal_tiles_is_returned(copies: int) -> None:
     one = random_tiles(2, 4)
     tiles = np.concatenate([one[:1], np.repeat(one[1:], copies, axis=0)])
-    index, distance = TileDatabase.from_tiles(4, tiles).nearest(one)
+    index, distance = database_of(4, tiles).nearest(one)
     assert index.tolist() == [0, 1]
     assert distance.tolist() == [0.0, 0.0]
 
@@ -89,14 +90,14 @@ def test_basis_rows_are_orthonormal_signed_and_ordered_by_variance() -> None:
 
 @pytest.mark.parametrize("tiles", [np.zeros((1, 16), np.uint8), np.full((9, 16), 200, np.uint8)])
 def test_tiles_without_variance_give_a_database(tiles: np.ndarray) -> None:
-    database = TileDatabase.from_tiles(4, tiles)
+    database = database_of(4, tiles)
     assert database.dims == 1
     assert database.nearest(random_tiles(4, 4))[0].tolist() == [0, 0, 0, 0]
 
 
 def test_identity_depends_on_all_data() -> None:
     tiles = random_tiles(40, 4)
-    base = TileDatabase.from_tiles(4, tiles, 8)
+    base = database_of(4, tiles, 8)
     altered, mean, basis = tiles.copy(), base.mean.copy(), base.basis.copy()
     altered[3, 5] ^= 1
     mean[0] ^= 1
@@ -116,7 +117,7 @@ def test_identity_depends_on_all_data() -> None:
 
 def test_database_is_immutable() -> None:
     tiles = random_tiles(10, 4)
-    database = TileDatabase.from_tiles(4, tiles)
+    database = database_of(4, tiles)
     before = database.identity
     tiles[:] = 0
     with pytest.raises(ValueError, match="read-only"):
@@ -127,13 +128,16 @@ def test_database_is_immutable() -> None:
 @pytest.mark.parametrize(
     ("field", "make"),
     [
-        ("tile_px", lambda t: TileDatabase.from_tiles(3, t[:, :9])),
-        ("tile_px", lambda t: TileDatabase.from_tiles(33, np.zeros((1, 33 * 33), np.uint8))),
-        ("tiles.shape", lambda t: TileDatabase.from_tiles(5, t)),
-        ("tiles.shape", lambda t: TileDatabase.from_tiles(4, t[:0])),
-        ("tiles.dtype", lambda t: TileDatabase.from_tiles(4, t.astype(np.int16))),
-        ("dims", lambda t: TileDatabase.from_tiles(4, t, 71)),
-        ("dims", lambda t: TileDatabase.from_tiles(4, t, 0)),
+        ("tile_px", lambda t: database_of(3, t[:, :9])),
+        ("tile_px", lambda t: database_of(33, np.zeros((1, 33 * 33), np.uint8))),
+        ("tiles", lambda t: database_of(5, t)),
+        ("tiles", lambda t: database_of(4, t[:0])),
+        ("tiles", lambda t: database_of(4, t.astype(np.int16))),
+        ("tiles.shape", lambda t: TileDatabase(5, t, t[0], np.ones((2, 16), np.int16))),
+        ("tiles.shape", lambda t: TileDatabase(4, t[:0], t[0], np.ones((2, 16), np.int16))),
+        ("tiles.dtype", lambda t: TileDatabase(4, t.astype(np.int16), t[0], np.ones((2, 16), np.int16))),
+        ("dims", lambda t: database_of(4, t, 71)),
+        ("dims", lambda t: database_of(4, t, 0)),
         ("mean.shape", lambda t: TileDatabase(4, t, t[0, :5], np.ones((2, 16), np.int16))),
         ("basis.dtype", lambda t: TileDatabase(4, t, t[0], np.ones((2, 16)))),
         ("basis.shape", lambda t: TileDatabase(4, t, t[0], np.ones((17, 16), np.int16))),

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from PIL import Image as Pillow
 
 from research.codecs.baselines.jpeg2000 import Jpeg2000Codec, codestream, packets_of
+from research.common.quality import psnr_db
 from sonarpost.codec.interface import StreamHeader
-from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import StreamError
 
 GOLDEN = GOLDEN_FOLDER / "jpeg2000"

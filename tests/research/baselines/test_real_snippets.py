@@ -11,8 +11,8 @@ from builders.images import sdvd_crops
 from research.codecs.baselines.huffman import HuffmanCodec
 from research.codecs.baselines.jpeg2000 import Jpeg2000Codec
 from research.codecs.baselines.spiht import SpihtCodec
+from research.common.quality import psnr_db
 from sonarpost.codec.interface import Codec
-from sonarpost.codec.quality import psnr_db
 
 
 @pytest.mark.system

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from research.codecs.baselines import spiht
 from research.codecs.baselines.spiht import MAX_PLANES, SpihtCodec, forward_transform, wavelet_trees
+from research.common.quality import psnr_db
 from sonarpost.codec.interface import StreamHeader
-from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import StreamError
 
 GOLDEN = GOLDEN_FOLDER / "spiht"

@@ -13,8 +13,8 @@ from PIL import Image as Pillow
 from research.codecs.baselines import comparison_registry, still_images
 from research.codecs.baselines.jpeg2000 import Jpeg2000Codec
 from research.codecs.baselines.still_images import StillImageCodec, StillImageFormat, avif_body, check_av1_frame
+from research.common.quality import psnr_db
 from sonarpost.codec.interface import StreamHeader
-from sonarpost.codec.quality import psnr_db
 from sonarpost.errors import ConfigError, StreamError
 
 GOLDEN = GOLDEN_FOLDER / "modern"

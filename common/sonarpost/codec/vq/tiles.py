@@ -68,24 +68,6 @@ class TileDatabase:
             array.setflags(write=False)
             object.__setattr__(self, name, array)
 
-    @classmethod
-    def from_tiles(cls, tile_px: int, tiles: Tiles, dims: int = MAX_DIMS) -> TileDatabase:
-        """Build a database with the principal components of its own tiles as basis.
-
-        Args:
-            tile_px: Side of a tile in pixels.
-            tiles: Shape (n, tile_px * tile_px), uint8.
-            dims: Dimensions to keep, 1..70. Fewer are kept if the tiles span fewer.
-
-        Raises:
-            CodebookError: A shape, dtype or count is out of range.
-        """
-        _check("dims", dims, f"1..{MAX_DIMS}", 1 <= dims <= MAX_DIMS)
-        _check("tile_px", tile_px, f"{MIN_TILE_PX}..{MAX_TILE_PX}", MIN_TILE_PX <= tile_px <= MAX_TILE_PX)
-        _check_array("tiles", tiles, np.dtype(np.uint8), (max(1, tiles.shape[0]), tile_px * tile_px))
-        mean, basis = principal_basis(tiles, dims)
-        return cls(tile_px, tiles, mean, basis)
-
     def __len__(self) -> int:
         return int(self.tiles.shape[0])
 
@@ -166,30 +148,6 @@ class TileDatabase:
         # 32 x 32 px have coordinates of at most 32 * 255 * 4096 < 2^31.
         vectors = self.projections.astype(np.int32)
         return NearestSearch.over(vectors, self.projections[:, 0], min(self.dims, LEADING))
-
-
-def principal_basis(tiles: Tiles, dims: int) -> tuple[Tiles, Basis]:
-    """Return the rounded mean and the leading principal components of `tiles`, as integers.
-
-    Sums and products of pixels are exact integers. Only the eigenvectors of the covariance are floating point; they are
-    rounded to 1/4096. The first entry of largest magnitude of each component is positive. Components without variance
-    are dropped, except the first.
-
-    Returns:
-        Mean, shape (pixels,), uint8; basis, shape (1..dims, pixels), int16.
-    """
-    count = tiles.shape[0]
-    values = tiles.astype(np.float64)
-    total = values.sum(axis=0)
-    covariance = (values.T @ values) / count - np.outer(total, total) / (count * count)
-    variances, vectors = np.linalg.eigh(covariance)
-    order = np.argsort(-variances, kind="stable")[:dims]
-    kept = max(1, int(np.count_nonzero(variances[order] > 1e-9 * max(float(variances.max()), 1.0))))
-    basis = vectors[:, order[:kept]].T
-    peaks = np.argmax(np.abs(np.round(basis * BASIS_SCALE)), axis=1)
-    signs = np.sign(basis[np.arange(kept), peaks])
-    mean = np.floor(total / count + 0.5).astype(np.uint8)
-    return mean, np.round(basis * signs[:, None] * BASIS_SCALE).astype(np.int16)
 
 
 def cut_tiles(image: npt.NDArray[np.uint8], tile_px: int) -> Tiles:

@@ -22,12 +22,12 @@ import numpy.typing as npt
 
 from research.common.command import command_parser, run_command
 from research.common.images import sdvd_crops
+from research.common.quality import psnr_db
 from sonarpost.codec.emb import transform
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.kernel import I32
 from sonarpost.codec.emb.transform import HEIGHT, LEVEL, ORIENT, WIDTH, Layout, Plane, layout_of
 from sonarpost.codec.interface import Image
-from sonarpost.codec.quality import psnr_db
 
 Floats = npt.NDArray[np.float64]
 Taps = dict[tuple[int, int], Floats]

@@ -24,9 +24,9 @@ import numpy.typing as npt
 
 from research.common.command import command_parser, run_command
 from research.common.images import sdvd_crops
+from research.common.quality import psnr_db
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import Image
-from sonarpost.codec.quality import psnr_db
 from sonarpost.codec.vq.codebook import open_codebook
 
 Floats = npt.NDArray[np.float32]

@@ -15,7 +15,6 @@ from rich.table import Table
 
 from sonarpost.codec import decode_image, get_codec
 from sonarpost.codec.interface import Image, to_uint8
-from sonarpost.codec.quality import psnr_db
 from sonarpost.extensions.simulation.demo.outcome import Outcome
 from sonarpost.extensions.simulation.demo.settings import ChainSettings
 from sonarpost.extensions.simulation.demo.watch import Watcher
@@ -79,6 +78,11 @@ def shown(path: Path) -> str:
     return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
 
 
+def _psnr_db(original: Image, decoded: Image) -> float:
+    mean_square = float(np.mean((original.astype(np.float64) - decoded) ** 2))
+    return float(10.0 * np.log10(255.0**2 / mean_square)) if mean_square else float("inf")
+
+
 def _sheet_contact(watcher: Watcher, image_id: str, encoded: EncodedImage, *, is_paper: bool) -> SheetContact:
     snippet, received = watcher.snippets.get(encoded.contact.contact_id), watcher.shore.get(image_id)
     original = None if snippet is None else to_uint8(snippet.pixels.to_array())
@@ -90,7 +94,7 @@ def _sheet_contact(watcher: Watcher, image_id: str, encoded: EncodedImage, *, is
         if received.despeckle_strength:  # the PSNR says nothing: the original has the speckle
             label += f", despeckled, strength {received.despeckle_strength:.2f}"
         elif original is not None and original.shape == image.shape:
-            label += f", PSNR {psnr_db(original, to_uint8(image)):.1f} dB"
+            label += f", PSNR {_psnr_db(original, to_uint8(image)):.1f} dB"
         at_shore = SheetCell(label, image, received.missing())
     if is_paper:
         third = SheetCell(f"{len(encoded.stream)} B", decode_image(encoded.stream).image)

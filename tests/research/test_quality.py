@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from builders.images import ssim_windows
 
-from sonarpost.codec.quality import psnr_db, ssim
+from research.common.quality import psnr_db, ssim
 from sonarpost.errors import StreamError
 
 
