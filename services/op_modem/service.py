@@ -15,7 +15,7 @@ from typing_extensions import override
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.outbox import QueuePolicy
+from sonarpost.delivery.queue_sender import QueuePolicy
 from sonarpost.errors import DeliveryError, FrameError, PayloadError
 from sonarpost.limits import limit, oldest_of_largest
 from sonarpost.link.downlink.vessel_endpoint import ReceivedContent

@@ -17,9 +17,9 @@ from sonarpost.archive import image_parts
 from sonarpost.bus.connectivity import MonitoredSite, SiteMonitor
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig, TlsConfig
-from sonarpost.delivery.outbox import QueuePolicy
+from sonarpost.delivery.disk_reserve import DiskReserve
+from sonarpost.delivery.queue_sender import QueuePolicy
 from sonarpost.delivery.records import OutboxItem, Topic, consumer_of, queue_of
-from sonarpost.delivery.store import DiskReserve
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import PayloadError
 from sonarpost.logs import kv, log_batch

@@ -16,8 +16,8 @@ import zenoh
 
 from sonarpost import keys
 from sonarpost.delivery.inbox import Inbox
-from sonarpost.delivery.outbox import QueuePolicy, QueueSender
 from sonarpost.delivery.protocol import AckReply
+from sonarpost.delivery.queue_sender import QueuePolicy, QueueSender
 from sonarpost.delivery.records import Topic
 from sonarpost.delivery.store import Store
 from sonarpost.errors import PayloadError

@@ -31,7 +31,8 @@ from builders.fleet_certificates import World
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config
 from sonarpost.codec.registry import default_registry
-from sonarpost.delivery.outbox import Outbox, QueuePolicy
+from sonarpost.delivery.outbox import Outbox
+from sonarpost.delivery.queue_sender import QueuePolicy
 from sonarpost.delivery.store import Store
 from sonarpost.messages import Contact, Health, ImagePart, Pixels, Snippet
 from sonarpost.services.console.store.users import Users

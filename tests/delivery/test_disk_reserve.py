@@ -6,7 +6,7 @@ from contextlib import closing
 
 import pytest
 
-from sonarpost.delivery.store import DiskReserve
+from sonarpost.delivery.disk_reserve import DiskReserve
 from sonarpost.errors import DeliveryError, RetryLaterError
 
 DiskUsage = namedtuple("DiskUsage", "total used free")
@@ -16,7 +16,7 @@ RECORD = bytes(100_000)
 @pytest.fixture
 def disk(monkeypatch):
     free = [0]
-    monkeypatch.setattr("sonarpost.delivery.store.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
+    monkeypatch.setattr("sonarpost.delivery.disk_reserve.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
     return free
 
 
@@ -49,7 +49,7 @@ def test_an_emptied_store_accepts_records_again(store, disk):
 def test_a_log_that_a_reader_kept_long_gives_its_space_back(store, disk, monkeypatch):
     log = store.path.with_name(f"{store.path.name}-wal")
     monkeypatch.setattr(
-        "sonarpost.delivery.store.shutil.disk_usage",
+        "sonarpost.delivery.disk_reserve.shutil.disk_usage",
         lambda folder: DiskUsage(10**7, 0, 10**7 - sum(f.stat().st_size for f in folder.iterdir())),
     )
     reserve = DiskReserve(store, 5_000_000, "records wait")

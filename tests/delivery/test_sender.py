@@ -4,9 +4,9 @@ import pytest
 import zenoh
 from builders.delivery_machine import Network, SteppedSender
 
-from sonarpost.delivery import outbox
-from sonarpost.delivery.outbox import QueuePolicy
+from sonarpost.delivery import queue_sender
 from sonarpost.delivery.protocol import MAX_BATCH_RECORDS, AckReply
+from sonarpost.delivery.queue_sender import QueuePolicy
 from sonarpost.delivery.records import Topic
 from sonarpost.errors import DeliveryError
 
@@ -32,8 +32,8 @@ def network():
 
 @pytest.fixture
 def sender(store, network, monkeypatch):
-    monkeypatch.setattr(outbox, "IDLE_S", 0.0)
-    monkeypatch.setattr(outbox, "BACK_OFF_S", (0.0,))
+    monkeypatch.setattr(queue_sender, "IDLE_S", 0.0)
+    monkeypatch.setattr(queue_sender, "BACK_OFF_S", (0.0,))
     return SteppedSender(network, store, "c", QueuePolicy(), None)
 
 
@@ -111,7 +111,7 @@ def test_a_removal_that_fails_is_not_repeated_before_all_queries_have_ended(send
         raise DeliveryError("disk full")
 
     monkeypatch.setattr(sender, "_remove_acknowledged", fail)
-    monkeypatch.setattr(outbox, "REMOVE_AFTER_S", -1.0)
+    monkeypatch.setattr(queue_sender, "REMOVE_AFTER_S", -1.0)
     network.sent[1].end(STORED)
     sender._step()
     with pytest.raises(DeliveryError):

@@ -21,8 +21,8 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from sonarpost.delivery import duplicate_window, outbox, partial_records
-from sonarpost.delivery.duplicate_window import DuplicateWindow
+from sonarpost.delivery import queue_sender, received
+from sonarpost.delivery.received import DuplicateWindow
 
 DECISION = "sonarpost/v1/vessel-1/contact/decision"
 IMAGE = "sonarpost/v1/vessel-1/image/reconstructed"
@@ -31,11 +31,11 @@ PRODUCER_KEYS = ((DECISION, IMAGE), (IMAGE, OTHER_IMAGE))
 HOSTILE_KEYS = ("sonarpost/v1/other/tasking/a/comment", "sonarpost/v1/other/tasking/b/comment", "sonarpost/v1/other/x")
 MAX_RESTORES = 2
 SMALL_LIMITS = {
-    (outbox, "BACK_OFF_S"): (0.0,),
+    (queue_sender, "BACK_OFF_S"): (0.0,),
     # Two producers with three origins each share a key; all others have fewer windows.
-    (duplicate_window, "MAX_WINDOWS"): 2 * (1 + MAX_RESTORES),
-    (partial_records, "MAX_WRITER_RECORDS"): 2,
-    (partial_records, "MAX_RECORDS"): 10,
+    (received, "MAX_WINDOWS"): 2 * (1 + MAX_RESTORES),
+    (received, "MAX_WRITER_RECORDS"): 2,
+    (received, "MAX_RECORDS"): 10,
 }
 WHICH = st.integers(0, 1)
 ANY = st.integers(0, 10**6)
@@ -227,7 +227,7 @@ class DeliveryFaults(RuleBasedStateMachine):
     @rule(key=st.sampled_from(HOSTILE_KEYS), more=st.integers(1, 3))
     def send_from_many_origins(self, key, more):
         """Fill the windows of a writer, then use new ones together with those that were used least recently."""
-        limit = duplicate_window.MAX_WINDOWS
+        limit = received.MAX_WINDOWS
         for origins in (range(limit), [*range(limit, limit + more), *range(limit)]):
             queries = []
             for number in origins:

@@ -9,7 +9,7 @@ from builders.store_steps import ORIGIN
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.delivery import partial_records
+from sonarpost.delivery import received
 from sonarpost.delivery.records import ReceivedChunk
 from sonarpost.delivery.store import Store
 
@@ -98,7 +98,7 @@ def test_damaged_record_restarts_the_transfer(store):
 
 
 def test_only_the_most_recent_records_of_a_writer_are_kept(store, monkeypatch):
-    monkeypatch.setattr(partial_records, "MAX_WRITER_RECORDS", 3)
+    monkeypatch.setattr(received, "MAX_WRITER_RECORDS", 3)
     firsts = {seq: chunks(b"0123456789", 4, seq=seq) for seq in range(1, 5)}
     for seq in (1, 2, 3):
         assert add(store, firsts[seq][0]) == 4
@@ -111,7 +111,7 @@ def test_only_the_most_recent_records_of_a_writer_are_kept(store, monkeypatch):
 
 
 def test_size_of_incomplete_records_of_a_writer_is_limited(store, monkeypatch):
-    monkeypatch.setattr(partial_records, "MAX_WRITER_BYTES", 100)
+    monkeypatch.setattr(received, "MAX_WRITER_BYTES", 100)
     other = chunks(bytes(200), 90)
     assert add(store, other[0], OTHER_KEY) == 90
     for seq in range(1, 6):
@@ -122,7 +122,7 @@ def test_size_of_incomplete_records_of_a_writer_is_limited(store, monkeypatch):
 
 def test_origin_with_many_bytes_loses_its_records_first(store, monkeypatch):
     """On one key, a flood of incomplete records does not interrupt the transfer of another origin."""
-    monkeypatch.setattr(partial_records, "MAX_WRITER_RECORDS", 4)
+    monkeypatch.setattr(received, "MAX_WRITER_RECORDS", 4)
     first, second = chunks(b"0123456789", 4)
     assert add(store, first) == 4
     for seq in range(1, 20):
@@ -133,8 +133,8 @@ def test_origin_with_many_bytes_loses_its_records_first(store, monkeypatch):
 
 def test_many_names_below_one_prefix_count_as_one_writer(store, monkeypatch):
     """A console may write below tasking under any name; the total limit then affects its own records only."""
-    monkeypatch.setattr(partial_records, "MAX_RECORDS", 6)
-    monkeypatch.setattr(partial_records, "MAX_WRITER_RECORDS", 5)
+    monkeypatch.setattr(received, "MAX_RECORDS", 6)
+    monkeypatch.setattr(received, "MAX_WRITER_RECORDS", 5)
     first, second = chunks(bytes(100), 60)
     assert add(store, first) == 60
     for number in range(30):
@@ -145,7 +145,7 @@ def test_many_names_below_one_prefix_count_as_one_writer(store, monkeypatch):
 
 
 def test_total_limit_deletes_records_of_the_largest_writer(store, monkeypatch):
-    monkeypatch.setattr(partial_records, "MAX_BYTES", 100)
+    monkeypatch.setattr(received, "MAX_BYTES", 100)
     small = chunks(bytes(50), 10)
     assert add(store, small[0]) == 10
     for seq in (1, 2, 3):
@@ -157,7 +157,7 @@ def test_total_limit_deletes_records_of_the_largest_writer(store, monkeypatch):
 def test_incomplete_record_expires(store, monkeypatch):
     now_ns = time.time_ns()
     add(store, chunks(b"0123456789", 4)[0])
-    monkeypatch.setattr(time, "time_ns", lambda: now_ns + (partial_records.EXPIRE_AFTER_S + 60) * 1_000_000_000)
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns + (received.EXPIRE_AFTER_S + 60) * 1_000_000_000)
     assert add(store, chunks(b"abcdefghij", 4, seq=2)[0]) == 4
     assert partials(store) == 1
     assert store._query("SELECT COUNT(*) FROM partial_piece") == [(1,)]

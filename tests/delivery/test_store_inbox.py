@@ -5,7 +5,7 @@ from builders.store_steps import record
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.delivery import duplicate_window
+from sonarpost.delivery import received
 from sonarpost.delivery.store import Store
 
 
@@ -68,8 +68,8 @@ def test_statement_of_the_producer_never_marks_a_number_as_received(store):
 
 
 def test_only_old_digests_below_the_statement_are_deleted(store, monkeypatch):
-    monkeypatch.setattr(duplicate_window, "KEPT_DIGESTS", 10)
-    monkeypatch.setattr(duplicate_window, "PRUNE_EVERY", 20)
+    monkeypatch.setattr(received, "KEPT_DIGESTS", 10)
+    monkeypatch.setattr(received, "PRUNE_EVERY", 20)
     receive(store, "k", *(record(seq, b"x") for seq in range(1, 40)))
     assert digests(store) == set(range(1, 40))
     receive(store, "k", record(40, b"x", done_up_to=5))
@@ -79,8 +79,8 @@ def test_only_old_digests_below_the_statement_are_deleted(store, monkeypatch):
 
 
 def test_number_of_digests_is_limited(store, monkeypatch):
-    monkeypatch.setattr(duplicate_window, "MAX_DIGESTS", 30)
-    monkeypatch.setattr(duplicate_window, "PRUNE_EVERY", 10)
+    monkeypatch.setattr(received, "MAX_DIGESTS", 30)
+    monkeypatch.setattr(received, "PRUNE_EVERY", 10)
     for first in range(1, 101, 10):
         receive(store, "k", *(record(seq, b"x") for seq in range(first, first + 10)))
         assert len(digests(store)) <= 40
@@ -89,7 +89,7 @@ def test_number_of_digests_is_limited(store, monkeypatch):
 
 def test_window_that_is_displaced_in_its_own_transaction_is_written_again(store, monkeypatch):
     """Records of other peers in the transaction are not affected."""
-    monkeypatch.setattr(duplicate_window, "MAX_WINDOWS", 2)
+    monkeypatch.setattr(received, "MAX_WINDOWS", 2)
     for number in (1, 2):
         receive(store, "k", record(1, b"x", bytes([number]) * 16))
     with store.transaction() as tx:
@@ -104,7 +104,7 @@ def test_window_that_is_displaced_in_its_own_transaction_is_written_again(store,
 
 def test_least_recently_used_window_of_a_writer_is_deleted(store, monkeypatch):
     """A console that writes under many names and origins does not displace the window of a vessel."""
-    monkeypatch.setattr(duplicate_window, "MAX_WINDOWS", 3)
+    monkeypatch.setattr(received, "MAX_WINDOWS", 3)
     vessel_key = "sonarpost/v1/shore/inbox/vessel-1"
     receive(store, vessel_key, record(1, b"image"))
     for number in range(8):

@@ -9,9 +9,8 @@ from pathlib import Path
 
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.shared import flag, in_new_folder, option, print_table, time_text
-from sonarpost.delivery.inspection import StoreState, inspect
-from sonarpost.delivery.salvage import TableResult, salvage
 from sonarpost.delivery.schema import VERSION
+from sonarpost.delivery.stopped_store import StoreState, TableResult, inspect, salvage
 from sonarpost.delivery.store import Store, lock_exclusively
 from sonarpost.errors import StoredFileError
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import fcntl
 import logging
-import shutil
 import sqlite3
 import struct
 import threading
@@ -27,7 +26,7 @@ from sonarpost.delivery.records import InboxItem, OutboxItem, Place, Quarantined
 from sonarpost.delivery.transaction import MAX_QUARANTINED_BYTES, Transaction, runs
 from sonarpost.delivery.watermark import SUFFIX as SIDE_CAR_SUFFIX
 from sonarpost.delivery.watermark import LostRecords, Watermark, clear_lost_records, lost_records
-from sonarpost.errors import BadInputError, DeliveryError, RetryLaterError
+from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.files import make_private
 
 log = logging.getLogger(__name__)
@@ -56,8 +55,6 @@ TRUNCATE_TIMEOUT_MS = 200
 """Longest wait for other processes that read the write-ahead log, before its space is returned to the disk."""
 CHECKPOINT_BYTES = 4_096_000
 """Size of the write-ahead log at which its pages are copied into the file."""
-HANDLING_RESERVE_BYTES = 8_388_608
-"""Free space for handling the accepted records: deleting rows writes to the write-ahead log."""
 MAX_CHECKED_BYTES = 268_435_456
 """Maximum size of a file whose pages are checked at the start: 256 MiB take about 0.3 s on a fast disk."""
 
@@ -431,68 +428,6 @@ class Store:
             self._db.close()
             self._watermark.close()
             self._lock_file.close()
-
-
-class DiskReserve:
-    """Minimum free disk space of a store; below it no records are accepted.
-
-    The file of a store never shrinks. Free space inside it counts as free, so that a store that was once full can
-    accept records again after it was emptied.
-
-    Args:
-        store: The store.
-        reserve_bytes: Space that has to stay free.
-        consequence: Effect of the reached reserve, for the health record.
-    """
-
-    def __init__(self, store: Store, reserve_bytes: int, consequence: str) -> None:
-        self._store = store
-        self._folder = store.path.parent
-        self._reserve_bytes = reserve_bytes
-        self._consequence = consequence
-        self._reached = False
-        self._rejection = ""
-
-    def free_bytes(self) -> int:
-        """Return the usable space in bytes.
-
-        Raises:
-            DeliveryError: The store cannot be read.
-        """
-        return shutil.disk_usage(self._folder).free + self._store.reusable_bytes()
-
-    def require(self) -> None:
-        """Check the free space.
-
-        Raises:
-            RetryLaterError: It is below the reserve.
-        """
-        if reason := self._check():
-            self._rejection = reason
-            raise RetryLaterError(reason)
-
-    def degraded_reason(self) -> str:
-        """Return why a record was rejected since the last call, or why none are accepted; empty without a reason."""
-        rejection, self._rejection = self._rejection, ""
-        if not self._reached:
-            return rejection
-        failure = ""
-        try:
-            # Only new records would return this space, and none are accepted.
-            self._store.truncate_log()
-        except DeliveryError as error:
-            failure = str(error)
-        return self._check() or rejection or failure
-
-    def _check(self) -> str:
-        free_bytes = shutil.disk_usage(self._folder).free
-        if free_bytes < self._reserve_bytes:
-            free_bytes = self.free_bytes()
-        self._reached = free_bytes < self._reserve_bytes
-        if not self._reached:
-            return ""
-        reserve = f"the reserve of {self._reserve_bytes}"
-        return f"{self._folder}: {free_bytes} bytes free, below {reserve}: {self._consequence}"
 
 
 def _files_of(path: Path) -> list[Path]:

@@ -15,8 +15,7 @@ from typing import Final
 
 from sonarpost import wire
 from sonarpost.archive.retention import Stored, select_for_removal, vehicle_source
-from sonarpost.delivery.duplicate_window import DuplicateWindow
-from sonarpost.delivery.partial_records import PartialRecords
+from sonarpost.delivery.received import DuplicateWindow, PartialRecords
 from sonarpost.delivery.records import InboxItem, OutboxItem, Place, ReceivedChunk, Topic
 from sonarpost.keys import writer_of
 from sonarpost.limits import limit

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from sonarpost.config import PlatformConfig
+from sonarpost.delivery.disk_reserve import DiskReserve
 from sonarpost.delivery.inbox import Inbox
 from sonarpost.delivery.outbox import Outbox
-from sonarpost.delivery.store import DiskReserve, Store
+from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.errors import DeliveryError
 from sonarpost.logs import IntervalLog, kv

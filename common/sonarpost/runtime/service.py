@@ -21,10 +21,12 @@ import zenoh
 from sonarpost import keys, wire
 from sonarpost.bus.session import lost_reason, open_with_retry
 from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.delivery.disk_reserve import HANDLING_RESERVE_BYTES, DiskReserve
 from sonarpost.delivery.inbox import Inbox
-from sonarpost.delivery.outbox import Outbox, QueuePolicy
+from sonarpost.delivery.outbox import Outbox
+from sonarpost.delivery.queue_sender import QueuePolicy
 from sonarpost.delivery.records import InboxItem, OutboxItem, platform_of
-from sonarpost.delivery.store import HANDLING_RESERVE_BYTES, DiskReserve, Store
+from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction, UnitOfWork
 from sonarpost.errors import DeliveryError
 from sonarpost.logs import IntervalLog, kv

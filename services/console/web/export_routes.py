@@ -19,7 +19,7 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 from typing_extensions import override
 
-from sonarpost.delivery.store import HANDLING_RESERVE_BYTES
+from sonarpost.delivery.disk_reserve import HANDLING_RESERVE_BYTES
 from sonarpost.errors import BadInputError
 from sonarpost.export.contacts import ExportContact
 from sonarpost.export.formats import Format, exporters

@@ -7,16 +7,16 @@ from builders.records import decision_record
 from builders.shore import relayed
 
 from sonarpost import keys
+from sonarpost.delivery.disk_reserve import HANDLING_RESERVE_BYTES
 from sonarpost.delivery.protocol import CHUNK_BYTES, AckReply, attachment
 from sonarpost.delivery.records import OutboxItem
-from sonarpost.delivery.store import HANDLING_RESERVE_BYTES
 
 DiskUsage = namedtuple("DiskUsage", "total used free")
 
 
 def test_incomplete_records_are_deleted_when_the_disk_reserve_is_reached(begin, relay, client, monkeypatch):
     free = [10**12]
-    monkeypatch.setattr("sonarpost.delivery.store.shutil.disk_usage", lambda _: DiskUsage(10**12, 0, free[0]))
+    monkeypatch.setattr("sonarpost.delivery.disk_reserve.shutil.disk_usage", lambda _: DiskUsage(10**12, 0, free[0]))
     service, key = begin(), keys.shore_inbox("vessel-2")
 
     def chunks_bytes():

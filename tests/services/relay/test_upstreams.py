@@ -156,7 +156,7 @@ DiskUsage = namedtuple("DiskUsage", "total used free")
 
 def test_senders_keep_images_below_the_reserve_and_decisions_are_accepted(begin, c2, source, monkeypatch, refused):
     free = [20_000_000]
-    monkeypatch.setattr("sonarpost.delivery.store.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
+    monkeypatch.setattr("sonarpost.delivery.disk_reserve.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, free[0]))
     shore = c2()
     service = begin(disk_reserve_bytes=50_000_000)
     source.send(IMAGES, "relay", image("AAAA"))
@@ -171,7 +171,7 @@ def test_senders_keep_images_below_the_reserve_and_decisions_are_accepted(begin,
 
 
 def test_plain_publication_of_an_image_below_the_reserve_is_refused_and_logged(begin, c2, publish, monkeypatch):
-    monkeypatch.setattr("sonarpost.delivery.store.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, 20_000_000))
+    monkeypatch.setattr("sonarpost.delivery.disk_reserve.shutil.disk_usage", lambda _: DiskUsage(10**9, 0, 20_000_000))
     service = begin(disk_reserve_bytes=50_000_000)
     publish(IMAGES, wire.encode(image()))
     eventually(lambda: service.health().counters.get("records_refused") == 1)
